@@ -14,23 +14,23 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from pisigma.hybrid.calibrator import HybridCalibrator
-from pisigma.hybrid.design import Design
-from pisigma.hybrid.evidence import GaussianPrior
-from pisigma.hybrid.refinement import Refined, linearised, refined_at
-from pisigma.hybrid.regression import regression
-from pisigma.identification.calibrator import GeometricCalibrator
-from pisigma.identification.prediction import predicted_poses
-from pisigma.identification.problem.noise import view_of
-from pisigma.identification.problem.setup import identified_geometry
-from pisigma.identification.result import SolvedCalibration
+from pisigma.calibration.geometric.calibrator import GeometricCalibrator
+from pisigma.calibration.geometric.prediction import predicted_poses
+from pisigma.calibration.geometric.problem.noise import view_of
+from pisigma.calibration.geometric.problem.setup import identified_geometry
+from pisigma.calibration.geometric.result import SolvedCalibration
+from pisigma.calibration.hybrid.calibrator import HybridCalibrator
+from pisigma.calibration.hybrid.design import Design
+from pisigma.calibration.hybrid.evidence import GaussianPrior
+from pisigma.calibration.hybrid.refinement import Refined, linearised, refined_at
+from pisigma.calibration.hybrid.regression import regression
 from pisigma.joint_correction.feature import AbstractFeature
 from pisigma.joint_correction.input_products import InputProducts
-from pisigma.judging.frames.fitted_frames import fit_frames
-from pisigma.judging.frames.frame_fits import LEVER_SHARE, MeasuredPoses
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.groups import held_out_groups
 from pisigma.robot import Robot
+from pisigma.validation.held_out.frames.fitted_frames import fit_frames
+from pisigma.validation.held_out.frames.frame_fits import LEVER_SHARE, MeasuredPoses
 
 DATA = Path(os.environ.get("PISIGMA_DATA", "../shared/data")) / "ur10"
 ROUNDS = 3

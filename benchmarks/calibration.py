@@ -15,12 +15,12 @@ from collections.abc import Callable
 import numpy as np
 import torch
 
-from pisigma.identification.calibrator import GeometricCalibrator
-from pisigma.identification.prediction import predicted_poses
-from pisigma.kinematics.forward import Geometry, forward_kinematics
-from pisigma.kinematics.jacobian import joint_jacobian
+from pisigma.calibration.geometric.calibrator import GeometricCalibrator
+from pisigma.calibration.geometric.prediction import predicted_poses
 from pisigma.measurement.dataset import Measurements
 from pisigma.robot import Robot
+from pisigma.robot.kinematics.forward import Geometry, forward_kinematics
+from pisigma.robot.kinematics.jacobian import joint_jacobian
 
 Calibrate = Callable[[Robot, np.ndarray, np.ndarray], Callable[[np.ndarray], np.ndarray]]
 

@@ -20,18 +20,18 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pisigma.camera.board import Board
-from pisigma.camera.camera import INTRINSICS, USUAL_DEVIATIONS, Camera
-from pisigma.camera.image_rows import Images, Repeatability, image_measurements
-from pisigma.camera.solved_images import IntrinsicsChoice
-from pisigma.identification.calibrator import GeometricCalibrator
-from pisigma.identification.problem.motion import MotionMemory
-from pisigma.identification.problem.parameters import Prior
-from pisigma.kinematics.closed_form.registry import closed_form_solver
-from pisigma.kinematics.forward import forward_kinematics
+from pisigma.calibration.geometric.calibrator import GeometricCalibrator
+from pisigma.calibration.geometric.problem.motion import MotionMemory
+from pisigma.calibration.geometric.problem.parameters import Prior
+from pisigma.measurement.camera.board import Board
+from pisigma.measurement.camera.camera import INTRINSICS, USUAL_DEVIATIONS, Camera
+from pisigma.measurement.camera.image_rows import Images, Repeatability, image_measurements
+from pisigma.measurement.camera.solved_images import IntrinsicsChoice
 from pisigma.measurement.dataset import Measurements
 from pisigma.robot import Robot
-from pisigma.se3 import (
+from pisigma.robot.kinematics.closed_form.registry import closed_form_solver
+from pisigma.robot.kinematics.forward import forward_kinematics
+from pisigma.robot.se3 import (
     invert,
     rotation_from_rpy,
     skew,

@@ -32,13 +32,13 @@ from camera import (
 from scipy.optimize import least_squares
 from scipy.sparse import csr_matrix, lil_matrix
 
-from pisigma.camera.camera import USUAL_DEVIATIONS, Camera
-from pisigma.camera.image_rows import Repeatability, image_measurements
-from pisigma.identification.calibrator import GeometricCalibrator
-from pisigma.identification.initial_guess.base_and_tool import fit_base_and_tool
-from pisigma.kinematics.forward import forward_kinematics
+from pisigma.calibration.geometric.calibrator import GeometricCalibrator
+from pisigma.calibration.geometric.initial_guess.base_and_tool import fit_base_and_tool
+from pisigma.measurement.camera.camera import USUAL_DEVIATIONS, Camera
+from pisigma.measurement.camera.image_rows import Repeatability, image_measurements
 from pisigma.robot import Robot
-from pisigma.se3 import invert, rotation_from_vector
+from pisigma.robot.kinematics.forward import forward_kinematics
+from pisigma.robot.se3 import invert, rotation_from_vector
 
 METHODS = ("TSAI", "PARK", "HORAUD", "ANDREFF", "DANIILIDIS")
 FREE = np.flatnonzero(USUAL_DEVIATIONS)

@@ -18,12 +18,12 @@ import numpy as np
 import torch
 from camera import ANGLE, BOARD, CAMERA, LENGTH, NOISE, ON_FLANGE, POSTURES, PRIOR, aligned_error, positions
 
-from pisigma.camera.detection.checkerboard import detect_checkerboard
-from pisigma.camera.detection.detected_board import DetectedBoard
-from pisigma.camera.image_rows import image_measurements
-from pisigma.identification.calibrator import GeometricCalibrator
+from pisigma.calibration.geometric.calibrator import GeometricCalibrator
+from pisigma.measurement.camera.detection.checkerboard import detect_checkerboard
+from pisigma.measurement.camera.detection.detected_board import DetectedBoard
+from pisigma.measurement.camera.image_rows import image_measurements
 from pisigma.robot import Robot
-from pisigma.se3 import invert, transform_from_xyzrpy, xyzrpy_from_transform
+from pisigma.robot.se3 import invert, transform_from_xyzrpy, xyzrpy_from_transform
 from pisigma.simulation.camera.images import draw_board_poses, images_of, project_corners
 from pisigma.simulation.camera.rendering import Exposure, render_image
 from pisigma.simulation.camera.true_board import TrueBoard

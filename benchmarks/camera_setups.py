@@ -33,16 +33,16 @@ from camera import (
 )
 from torch import Tensor
 
-from pisigma.camera.flatness import bent_corners
-from pisigma.camera.image_rows import Images, image_measurements
-from pisigma.camera.solved_images import IntrinsicsChoice
-from pisigma.hybrid.calibrator import HybridCalibrator
-from pisigma.identification.calibrator import GeometricCalibrator
-from pisigma.kinematics.closed_form.registry import closed_form_solver
-from pisigma.kinematics.forward import forward_kinematics
+from pisigma.calibration.geometric.calibrator import GeometricCalibrator
+from pisigma.calibration.hybrid.calibrator import HybridCalibrator
+from pisigma.measurement.camera.flatness import bent_corners
+from pisigma.measurement.camera.image_rows import Images, image_measurements
+from pisigma.measurement.camera.solved_images import IntrinsicsChoice
 from pisigma.measurement.dataset import Measurements, join
 from pisigma.robot import Robot
-from pisigma.se3 import invert, transform_from_xyzrpy, xyzrpy_from_transform
+from pisigma.robot.kinematics.closed_form.registry import closed_form_solver
+from pisigma.robot.kinematics.forward import forward_kinematics
+from pisigma.robot.se3 import invert, transform_from_xyzrpy, xyzrpy_from_transform
 from pisigma.simulation.camera.images import simulate_images
 from pisigma.simulation.camera.views import far_apart
 

@@ -16,19 +16,19 @@ import torch
 from camera import BOARD, CAMERA, NOISE, PRIOR, Cell, Draw, aligned_error, positions
 from torch import Tensor
 
-from pisigma.camera.image_rows import image_measurements
-from pisigma.camera.solved_images import IntrinsicsChoice
-from pisigma.hybrid.calibrator import HybridCalibrator
-from pisigma.identification.calibrator import GeometricCalibrator
-from pisigma.kinematics.closed_form.registry import closed_form_solver
-from pisigma.kinematics.forward import forward_kinematics
-from pisigma.kinematics.jacobian import joint_jacobian
+from pisigma.calibration.geometric.calibrator import GeometricCalibrator
+from pisigma.calibration.hybrid.calibrator import HybridCalibrator
+from pisigma.measurement.camera.image_rows import image_measurements
+from pisigma.measurement.camera.solved_images import IntrinsicsChoice
 from pisigma.measurement.dataset import Measurements, join
 from pisigma.model.accuracy import deviation_of_rows
 from pisigma.model.geometric_model import model_of_hybrid
 from pisigma.model.row_poses import poses_of_rows
 from pisigma.robot import Robot
-from pisigma.se3 import invert, rotation_from_rpy, transform, transform_from_xyzrpy
+from pisigma.robot.kinematics.closed_form.registry import closed_form_solver
+from pisigma.robot.kinematics.forward import forward_kinematics
+from pisigma.robot.kinematics.jacobian import joint_jacobian
+from pisigma.robot.se3 import invert, rotation_from_rpy, transform, transform_from_xyzrpy
 
 CHOICES: tuple[IntrinsicsChoice, ...] = ("fixed", "prior", "free")
 WITHIN_95 = 1.959964

@@ -17,15 +17,15 @@ from typing import Any
 import torch
 import yaml
 
-from pisigma.errors import RobotError
-from pisigma.hybrid.calibrator import HybridCalibrator
+from pisigma.calibration.hybrid.calibrator import HybridCalibrator
+from pisigma.files.errors import RobotError
+from pisigma.files.yaml_file import parse_yaml
 from pisigma.model.geometric_model import model_of_hybrid
 from pisigma.robot import Robot, RobotDocument
 from pisigma.simulation.measure import simulate
 from pisigma.simulation.noise import MeasurementNoise
 from pisigma.simulation.poses import JointsRandom
 from pisigma.simulation.true_robot import TrueRobot, TrueRobotSection
-from pisigma.yaml_file import parse_yaml
 
 ROWS, JUDGED = 120, 2_000
 NOISE_MM = 0.036

@@ -12,11 +12,11 @@ from collections.abc import Callable
 import numpy as np
 import torch
 
-from pisigma.identification.calibrator import GeometricCalibrator
-from pisigma.identification.result import CalibrationResult
-from pisigma.kinematics.forward import forward_kinematics
+from pisigma.calibration.geometric.calibrator import GeometricCalibrator
+from pisigma.calibration.geometric.result import CalibrationResult
 from pisigma.measurement.dataset import Measurements
 from pisigma.robot import Robot
+from pisigma.robot.kinematics.forward import forward_kinematics
 
 POSE = np.array([3.0, -1.0, 0.5, 0.4, 0.2, -0.7])
 TOOL = np.array([0.02, -0.03, 0.15, 0.0, 0.0, 0.0])

@@ -22,13 +22,13 @@ import torch
 from fleet_prior import begun_with, rms
 from torch import Tensor
 
-from pisigma.fleet.prior import fleet_prior
+from pisigma.lifetime.fleet.prior import fleet_prior
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.planning.choice import choose
 from pisigma.planning.knowledge import Instrument, Knowledge
 from pisigma.robot import Robot
-from pisigma.se3 import rotation_from_vector
+from pisigma.robot.se3 import rotation_from_vector
 from pisigma.workflow.calibrate import CalibrationSettings, calibrate
 
 sys.path.insert(0, os.environ.get("PISIGMA_SIMULATED", "../shared/simulated"))

@@ -18,13 +18,13 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
 from testing.fleet_robots import DRAWN, GEARS, NOISE, common_errors, common_gears, rows_of
 
-from pisigma.fleet.prior import FleetPrior, Population, fleet_prior, mean_robot
+from pisigma.lifetime.fleet.prior import FleetPrior, Population, fleet_prior, mean_robot
+from pisigma.lifetime.recalibration.adaptation import Adaptation, adapt
+from pisigma.lifetime.recalibration.recalibration_problem import owners_in, recalibration_problem
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel
+from pisigma.model.model_posterior import ModelPosterior
 from pisigma.planning.knowledge import Knowledge
-from pisigma.recalibration.adaptation import Adaptation, adapt
-from pisigma.recalibration.model_posterior import ModelPosterior
-from pisigma.recalibration.recalibration_problem import owners_in, recalibration_problem
 from pisigma.workflow.calibrate import CalibrationSettings, calibrate
 from pisigma.workflow.recalibrate import recalibrate
 

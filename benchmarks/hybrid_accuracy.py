@@ -18,11 +18,11 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from pisigma.hybrid.calibrator import HybridCalibrator
-from pisigma.judging.predicted_spread import PredictedSpread, predicted_spread
+from pisigma.calibration.hybrid.calibrator import HybridCalibrator
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.splits import k_folds, with_fewer
 from pisigma.robot import Robot
+from pisigma.validation.held_out.predicted_spread import PredictedSpread, predicted_spread
 
 DATA = Path(os.environ.get("PISIGMA_DATA", "../shared/data"))
 FILES = {"ur5": "ur5/grid.csv", "ur10": "ur10/series_c_train.csv"}

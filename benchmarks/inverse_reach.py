@@ -18,16 +18,16 @@ import numpy as np
 import torch
 from inverse_speed import draw_joints, make_model
 
-from pisigma.errors import ModelError
-from pisigma.inverse.compiled_ik import CompiledIK
-from pisigma.inverse.identified_arm import search
-from pisigma.inverse.reference import ReferenceIK
-from pisigma.kernels.array_kinematics import transform_of
-from pisigma.kinematics.status import Status
-from pisigma.kinematics.task_axes import task_axes
+from pisigma.files.errors import ModelError
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.folder.model_folder import load_model
+from pisigma.model.inverse.compiled_ik import CompiledIK
+from pisigma.model.inverse.identified_arm import search
+from pisigma.model.inverse.reference import ReferenceIK
 from pisigma.robot import Robot
+from pisigma.robot.kernels.array_kinematics import transform_of
+from pisigma.robot.kinematics.status import Status
+from pisigma.robot.kinematics.task_axes import task_axes
 from pisigma.robot.row import Row
 
 MODELS = Path(__file__).parents[1] / "models"

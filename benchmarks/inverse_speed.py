@@ -22,17 +22,17 @@ import numpy as np
 import torch
 from scipy.optimize import least_squares
 
-from pisigma.hybrid.arm import HybridArm, JointCoverage
-from pisigma.inverse.compiled_ik import CompiledIK
-from pisigma.inverse.corrected_ik import CorrectedIK
+from pisigma.calibration.hybrid.arm import HybridArm, JointCoverage
 from pisigma.joint_correction.fourier_series import FourierSeries
 from pisigma.joint_correction.gravity_torques import GravityTorques
 from pisigma.joint_correction.joint_correction import JointCorrection
-from pisigma.kinematics.status import Status
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.compiled_model import save_compiled
 from pisigma.model.folder.model_folder import load_model
+from pisigma.model.inverse.compiled_ik import CompiledIK
+from pisigma.model.inverse.corrected_ik import CorrectedIK
 from pisigma.robot import Robot
+from pisigma.robot.kinematics.status import Status
 
 ERRORS = np.array([1e-3, 5e-4, 5e-4, 1e-3, 1e-3])
 BASE, TOOL = np.array([0.4, -0.7, 0.3, 2.0, 0.5, -1.0]), np.array([0.06, -0.04, 0.13, 0.4, -0.3, 0.8])
@@ -40,7 +40,7 @@ COLD = """
 import time
 start, began = time.perf_counter(), time.process_time()
 import numpy as np
-from pisigma.inverse.compiled_ik import CompiledIK
+from pisigma.model.inverse.compiled_ik import CompiledIK
 CompiledIK.load({file!r}).solve(np.load({pose!r}))
 print(time.perf_counter() - start, time.process_time() - began)
 """
@@ -81,7 +81,7 @@ def make_model(name: str | Robot, harmonics: int, rng: np.random.Generator) -> C
 
 def time_scipy(kernels: object, T: np.ndarray, q: np.ndarray) -> float:
     """Seconds a pose by least squares on the arm without its correction."""
-    from pisigma.kernels.arrays import IDENTIFIED
+    from pisigma.robot.kernels.arrays import IDENTIFIED
 
     def residual(joints: np.ndarray, wanted: np.ndarray) -> np.ndarray:
         return (kernels.forward(joints[None], IDENTIFIED)[0][0, :3] - wanted[:3]).ravel()  # type: ignore[attr-defined]

@@ -25,7 +25,8 @@ from pytorch_kinematics.transforms import Transform3d
 from torch import Tensor
 
 import pisigma
-from pisigma.kinematics.components import (
+from pisigma.robot import Robot, catalogue
+from pisigma.robot.kinematics.components import (
     IDENTITY,
     as_transform,
     follow_xyzrpy,
@@ -34,9 +35,8 @@ from pisigma.kinematics.components import (
     rotate_z,
     translate,
 )
-from pisigma.kinematics.forward import forward_kinematics
-from pisigma.kinematics.jacobian import joint_jacobian
-from pisigma.robot import Robot, catalogue
+from pisigma.robot.kinematics.forward import forward_kinematics
+from pisigma.robot.kinematics.jacobian import joint_jacobian
 
 
 def build_peer(robot: Robot) -> SerialChain:

@@ -15,12 +15,12 @@ import numpy as np
 import torch
 from planning import ARMS, NOISE, Arm
 
-from pisigma.hybrid.calibrator import HybridCalibrator
-from pisigma.judging.few_rows import fit_where_it_helps
+from pisigma.calibration.hybrid.calibrator import HybridCalibrator
 from pisigma.measurement.dataset import Measurements
-from pisigma.measuring.row_judgement import judge_rows
-from pisigma.planning.cell.arm_in_cell import ArmInCell
 from pisigma.planning.plan_settings import PlanSettings
+from pisigma.planning.session.row_judgement import judge_rows
+from pisigma.planning.surroundings.arm_in_cell import ArmInCell
+from pisigma.validation.held_out.few_rows import fit_where_it_helps
 from pisigma.workflow.measure import MeasureSettings, MeasuringSession
 from pisigma.workflow.plan import plan
 

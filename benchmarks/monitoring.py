@@ -20,11 +20,11 @@ import torch
 from recalibration import simulated_arm, simulated_rows
 
 import pisigma
+from pisigma.lifetime.monitoring.session import Session, is_frame, judge_session
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel
-from pisigma.monitoring.session import Session, is_frame, judge_session
-from pisigma.recalibration.model_posterior import ModelPosterior
-from pisigma.se3 import transform_from_xyzrpy
+from pisigma.model.model_posterior import ModelPosterior
+from pisigma.robot.se3 import transform_from_xyzrpy
 
 DATA = Path(os.environ.get("PISIGMA_DATA", "../shared/data"))
 FILES = {"ur10": "ur10/series_b.csv", "ur5": "ur5/grid.csv"}

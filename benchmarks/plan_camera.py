@@ -20,22 +20,22 @@ import torch
 import yaml
 from torch import Tensor
 
-from pisigma.camera.board import Board
-from pisigma.camera.camera import Camera
-from pisigma.camera.image_rows import image_measurements
-from pisigma.identification.calibrator import GeometricCalibrator
-from pisigma.identification.problem.parameters import Prior
-from pisigma.kinematics.forward import forward_kinematics
+from pisigma.calibration.geometric.calibrator import GeometricCalibrator
+from pisigma.calibration.geometric.problem.parameters import Prior
+from pisigma.measurement.camera.board import Board
+from pisigma.measurement.camera.camera import Camera
+from pisigma.measurement.camera.image_rows import image_measurements
 from pisigma.planning.camera_settings import CameraSettings
-from pisigma.planning.cell.arm_in_cell import ArmInCell
-from pisigma.planning.cell.cell import Cell
 from pisigma.planning.choice import Criterion, choose
 from pisigma.planning.expected_accuracy import rms_of
 from pisigma.planning.knowledge import Knowledge
 from pisigma.planning.plan_settings import PlanSettings
+from pisigma.planning.surroundings.arm_in_cell import ArmInCell
+from pisigma.planning.surroundings.cell import Cell
 from pisigma.planning.task import TASK_POSES
 from pisigma.robot import Robot
-from pisigma.se3 import invert, skew, xyzrpy_from_transform
+from pisigma.robot.kinematics.forward import forward_kinematics
+from pisigma.robot.se3 import invert, skew, xyzrpy_from_transform
 from pisigma.simulation.camera.images import ImageNoise, simulate_images
 
 LENGTH, ANGLE, POSTURES = 1e-3, np.deg2rad(0.3), 400

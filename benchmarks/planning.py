@@ -21,16 +21,16 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pisigma.hybrid.calibrator import HybridCalibrator
-from pisigma.hybrid.result import HybridResult
-from pisigma.identification.calibrator import GeometricCalibrator
-from pisigma.judging.few_rows import fit_where_it_helps
-from pisigma.judging.trained_calibrations import Calibrator, Result
+from pisigma.calibration.geometric.calibrator import GeometricCalibrator
+from pisigma.calibration.hybrid.calibrator import HybridCalibrator
+from pisigma.calibration.hybrid.result import HybridResult
 from pisigma.measurement.dataset import Measurements
 from pisigma.planning.choice import Criterion, choose
 from pisigma.planning.expected_accuracy import rms_of
 from pisigma.planning.knowledge import Instrument, Knowledge
 from pisigma.robot import Robot
+from pisigma.validation.held_out.few_rows import fit_where_it_helps
+from pisigma.validation.held_out.trained_calibrations import Calibrator, Result
 
 DATA = Path(os.environ.get("PISIGMA_DATA", "../shared/data"))
 SIMULATED = Path(os.environ.get("PISIGMA_SIMULATED", "../shared/simulated"))

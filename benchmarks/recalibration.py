@@ -21,16 +21,16 @@ from typing import Any
 import numpy as np
 import torch
 
-from pisigma.errors import IdentificationError
-from pisigma.hybrid.calibrator import HybridCalibrator
-from pisigma.judging.trained_calibrations import fit
+from pisigma.calibration.hybrid.calibrator import HybridCalibrator
+from pisigma.files.errors import IdentificationError
+from pisigma.lifetime.recalibration.adaptation import adapt
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.geometric_model import model_of_hybrid
 from pisigma.model.row_poses import poses_of_rows
 from pisigma.planning.plan_settings import PlanSettings
-from pisigma.recalibration.adaptation import adapt
 from pisigma.robot import Robot
+from pisigma.validation.held_out.trained_calibrations import fit
 from pisigma.workflow.plan import plan
 from pisigma.workflow.recalibrate import Recalibration, RecalibrationSettings, recalibrate
 

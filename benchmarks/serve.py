@@ -41,7 +41,7 @@ UNITS = np.array([1e3] * 3 + [180 / np.pi] * 3)
 
 def poses_of(ik: pisigma.CorrectedIK) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Poses `(POSES, 6)` [mm, deg] at training rows, joint values near them, and those that Python gives [rad or m]."""
-    from pisigma.kernels.array_kinematics import transform_of, xyzrpy_of
+    from pisigma.robot.kernels.array_kinematics import transform_of, xyzrpy_of
 
     starts = ik.model.starts.double().numpy()
     near = starts[np.random.default_rng(0).integers(len(starts), size=POSES)]
@@ -52,7 +52,7 @@ def poses_of(ik: pisigma.CorrectedIK) -> tuple[np.ndarray, np.ndarray, np.ndarra
 
 def messages(kind: str, ik: pisigma.CorrectedIK, poses: np.ndarray, near: np.ndarray) -> list[bytes]:
     """The requests, as a client would make them."""
-    from pisigma.kernels.array_kinematics import transform_of
+    from pisigma.robot.kernels.array_kinematics import transform_of
 
     if kind == "binary":
         beside = np.full((len(near), 8), np.nan)
@@ -155,7 +155,7 @@ def answer_frame(ik: pisigma.CorrectedIK, message: bytes) -> bytes:
 
 def answer_line(ik: pisigma.CorrectedIK, message: bytes) -> bytes:
     """One solve between two lines of JSON."""
-    from pisigma.kernels.array_kinematics import transform_of
+    from pisigma.robot.kernels.array_kinematics import transform_of
 
     request, per_unit = json.loads(message), np.where(ik.revolute, 180 / np.pi, 1e3)
     T = transform_of(np.array(request["pose"]) / UNITS)

@@ -29,8 +29,8 @@ sys.path.append(str(Path(__file__).parent.parent / "training" / "papers"))
 import testing.type_checker  # noqa: F401  its place is before pisigma's, which it shall check
 from testing.models import no_type_checker
 
-from pisigma.recipes.reader import read_recipe
-from pisigma.recipes.recipe import InverseRecipe
+from pisigma.workflow.recipes.reader import read_recipe
+from pisigma.workflow.recipes.recipe import InverseRecipe
 
 REPOSITORY = Path(__file__).parent.parent
 

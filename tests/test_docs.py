@@ -14,10 +14,10 @@ import yaml
 from typer.main import get_command
 
 from pisigma.cli.main import app
-from pisigma.kinematics.status import Status
 from pisigma.measurement.csv.columns import column_choices, find_column
-from pisigma.planning.cell.cell import Cell, read_cell
+from pisigma.planning.surroundings.cell import Cell, read_cell
 from pisigma.robot import Robot, catalogue
+from pisigma.robot.kinematics.status import Status
 
 ROOT = Path(__file__).parent.parent
 DOCS = ROOT / "docs"

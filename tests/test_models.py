@@ -9,13 +9,13 @@ from testing.closeness import assert_close
 from testing.models import no_type_checker
 
 import pisigma
-from pisigma.judging.training_summary import JointErrorFigures, TrainingSummary
 from pisigma.model.folder.model_folder import load_model
-from pisigma.recipes.data import simulate
-from pisigma.recipes.reader import read_recipe, recipe_hash
-from pisigma.recipes.recipe import SimulatedData
+from pisigma.network.pairs import build_pairs
 from pisigma.reporting.tables import joint_table
-from pisigma.training.pairs import build_pairs
+from pisigma.validation.held_out.training_summary import JointErrorFigures, TrainingSummary
+from pisigma.workflow.recipes.data import simulate
+from pisigma.workflow.recipes.reader import read_recipe, recipe_hash
+from pisigma.workflow.recipes.recipe import SimulatedData
 
 FOLDERS = sorted(path for path in (Path(__file__).parent.parent / "models").glob("*") if path.is_dir())
 SECTIONS = ("Joint errors", "Figures", "Domain", "Not validated", "Use", "Provenance")

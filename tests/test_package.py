@@ -20,49 +20,28 @@ import yaml
 from testing.models import hand_made_model
 
 import pisigma
-from pisigma.errors import EXTRAS
+from pisigma.files.errors import EXTRAS
 from pisigma.model.folder.model_folder import save_model
 
-LAYERS = (
-    "errors",
-    "plugins",
+ROOMS = (
     "files",
-    "yaml_file",
-    "templates",
-    "engines",
-    "se3",
     "robot",
-    "kinematics",
-    "kernels",
+    "estimation",
     "measurement",
     "network",
-    "onnx",
     "joint_correction",
-    "training",
-    "sensors",
-    "identification",
-    "camera",
     "simulation",
-    "hybrid",
+    "calibration",
     "model",
-    "inverse",
+    "validation",
     "planning",
-    "export",
-    "judging",
-    "recalibration",
-    "monitoring",
-    "comparison",
-    "verification",
-    "measuring",
-    "fleet",
-    "recipes",
+    "lifetime",
+    "deployment",
     "reporting",
     "workflow",
-    "viewing",
-    "serve",
     "cli",
 )
-"""Every module or package may import those before it, and itself."""
+"""A file imports only from its own room and those before it; CONTRIBUTING.md says what each holds."""
 
 PACKAGE = Path(pisigma.__file__).parent
 MODULES = sorted(PACKAGE.rglob("*.py"))
@@ -94,24 +73,25 @@ def imported(path: Path, type_checking: bool = True) -> frozenset[str]:
     return frozenset(found)
 
 
-def layer(module: str) -> str | None:
-    parts = module.split(".")
-    return parts[1] if parts[0] == "pisigma" and len(parts) > 1 and parts[1] in LAYERS else None
-
-
-def test_every_module_has_its_layer():
+def test_there_are_these_rooms_and_nothing_beside_them():
     tops = {path.relative_to(PACKAGE).parts[0].removesuffix(".py") for path in MODULES}
-    assert tops - {"__init__", "__main__"} <= set(LAYERS)
+    assert tops == {"__init__", "__main__", *ROOMS}
+
+
+def test_contributing_says_what_every_room_holds():
+    """One line a room, in the order of imports."""
+    text = (TESTS.parent / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    assert re.findall(r"^- `(\w+)/`: \S.*\.$", text, re.MULTILINE) == list(ROOMS)
 
 
 def test_imports_run_one_way():
     upwards = []
     for path in MODULES:
-        top = path.relative_to(PACKAGE).parts[0].removesuffix(".py")
-        for module in imported(path) if top in LAYERS else ():
-            above = layer(module)
-            if above and LAYERS.index(above) > LAYERS.index(top):
-                upwards.append(f"{name_of(path)} imports {module}, which stands above it")
+        room = path.relative_to(PACKAGE).parts[0]
+        for module in imported(path) if room in ROOMS else ():
+            _, other, *_ = (*module.split("."), "")
+            if module.startswith("pisigma.") and other in ROOMS[ROOMS.index(room) + 1 :]:
+                upwards.append(f"{name_of(path)} imports {module}, which stands below it")
     assert not upwards
 
 
@@ -137,7 +117,7 @@ def test_lightning_is_imported_in_training_only():
         for path in MODULES
         if {module.split(".")[0] for module in imported(path)} & {"lightning", "pytorch_lightning"}
     }
-    assert users <= {"training"}
+    assert users <= {"network"}
 
 
 def test_files_and_folders_stay_small():
@@ -167,15 +147,24 @@ def test_import_is_light_and_has_no_side_effects(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("path", sorted((PACKAGE / "kernels").glob("*.py")), ids=name_of)
+@pytest.mark.parametrize("path", sorted((PACKAGE / "robot" / "kernels").glob("*.py")), ids=name_of)
 def test_the_compiled_route_imports_no_torch(path):
     if path.name == "array_kinematics.py":  # which sends tensors to torch; see its own test
         return
-    light = {"errors", "kinematics.status", "kinematics.tolerances", "kernels"}
+    light = {
+        "files",
+        "files.errors",
+        "robot.kinematics.status",
+        "robot.kinematics.tolerances",
+        "robot.kernels",
+    }
     if path.name == "forms.py":  # which asks for closed forms where kernels are made, see tests/kernels
-        light.add("kinematics.closed_form.registry")
+        light.add("robot.kinematics.closed_form.registry")
     own = {module.removeprefix("pisigma.") for module in imported(path) if module.startswith("pisigma.")}
-    own.discard("kinematics")  # of `from pisigma.kinematics import tolerances`: a package without code
+    own -= {
+        "robot",
+        "robot.kinematics",
+    }  # of `from pisigma.robot.kinematics import tolerances`: a package without code
     assert not {module for module in own if not module.startswith(tuple(light))}
     assert not {module.split(".")[0] for module in imported(path)} & {"torch", "scipy", "jaxtyping"}
 
@@ -183,7 +172,7 @@ def test_the_compiled_route_imports_no_torch(path):
 def test_loading_a_model_needs_neither_lightning_nor_matplotlib():
     script = (
         "import sys\nimport pisigma\npisigma.load\npisigma.CorrectedIK\n"
-        "assert not [name for name in ('lightning', 'matplotlib', 'scipy', 'pisigma.training') if name in "
+        "assert not [name for name in ('lightning', 'matplotlib', 'scipy', 'pisigma.network') if name in "
         "sys.modules]\n"
     )
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
@@ -351,6 +340,6 @@ def _compiled_kernels(folder):
     """A folder for caches with the kernels of this checkout, which are those of its wheel, made already."""
     kept = folder / "caches" / "pisigma"
     kept.mkdir(parents=True)
-    for path in Path(pisigma.__file__).parent.glob("kernels/__pycache__/*.o"):
+    for path in Path(pisigma.__file__).parent.glob("robot/kernels/__pycache__/*.o"):
         shutil.copy(path, kept)
     return kept.parent

@@ -10,8 +10,8 @@ from testing.models import no_type_checker
 from testing.type_checker import type_checked
 from torch import Tensor
 
-from pisigma.kinematics.forward import forward_kinematics
 from pisigma.robot import Robot
+from pisigma.robot.kinematics.forward import forward_kinematics
 
 
 @type_checked

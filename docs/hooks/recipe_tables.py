@@ -13,8 +13,8 @@ from typing import Any
 from pydantic import BaseModel
 from pydantic_core import PydanticUndefined
 
-from pisigma.recipes.recipe import GeometricRecipe, HybridRecipe, InverseRecipe
-from pisigma.yaml_file import OneOf
+from pisigma.files.yaml_file import OneOf
+from pisigma.workflow.recipes.recipe import GeometricRecipe, HybridRecipe, InverseRecipe
 
 PAGE = Path(__file__).parent.parent / "reference" / "recipes.md"
 BEGIN, END = "<!-- begin: keys -->", "<!-- end: keys -->"

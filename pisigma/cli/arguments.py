@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from pisigma.errors import IdentificationError
+from pisigma.files.errors import IdentificationError
 
 
 def complete_robot(incomplete: str) -> list[str]:
@@ -26,8 +26,8 @@ def complete_model(incomplete: str) -> list[str]:
 
 def complete_export(incomplete: str) -> list[str]:
     """Formats of `pisigma export`."""
-    from pisigma.export.registry import export_names
-    from pisigma.plugins import load_installed
+    from pisigma.deployment.export.registry import export_names
+    from pisigma.files.plugins import load_installed
 
     load_installed()
     return [name for name in export_names() if name.startswith(incomplete)]

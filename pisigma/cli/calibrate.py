@@ -26,11 +26,11 @@ from pisigma.cli.output import (
     progress_of,
     saved,
 )
-from pisigma.errors import IdentificationError
+from pisigma.files.errors import IdentificationError
 
 if TYPE_CHECKING:
-    from pisigma.camera.corner_file import CameraFiles
-    from pisigma.judging.calibration_summary import CalibrationSummary
+    from pisigma.measurement.camera.corner_file import CameraFiles
+    from pisigma.validation.held_out.calibration_summary import CalibrationSummary
     from pisigma.workflow.calibrate import CalibrationSettings
 
 RobotName = Annotated[

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 if TYPE_CHECKING:
-    from pisigma.camera.corner_file import CameraFiles
+    from pisigma.measurement.camera.corner_file import CameraFiles
 
 Cameras = Annotated[
     list[Path] | None,
@@ -65,8 +65,8 @@ def stated_cameras(
         BadParameter: another option of cameras is stated without them.
     """
     stated: dict[str, Any] = dict(locals())
-    from pisigma.camera.corner_file import CameraFiles
-    from pisigma.camera.image_rows import Repeatability
+    from pisigma.measurement.camera.corner_file import CameraFiles
+    from pisigma.measurement.camera.image_rows import Repeatability
 
     cameras, boards = (tuple(map(str, files or ())) for files in (camera, board))
     if not cameras and not boards:

@@ -8,7 +8,7 @@ import typer
 
 from pisigma.cli.arguments import AsJson, ModelFolder, Overwrite
 from pisigma.cli.output import command_line, print_json, print_lines, print_table, progress_of
-from pisigma.errors import PoseError, RecipeError
+from pisigma.files.errors import PoseError, RecipeError
 
 if TYPE_CHECKING:
     from pisigma.workflow.distill import Distillation

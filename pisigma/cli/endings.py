@@ -13,8 +13,8 @@ from typing import Annotated, Any, NoReturn
 
 import typer
 
-from pisigma.errors import AcceptanceError, PisigmaError, missing_extra, printable
-from pisigma.plugins import load_files, load_installed
+from pisigma.files.errors import AcceptanceError, PisigmaError, missing_extra, printable
+from pisigma.files.plugins import load_files, load_installed
 
 REFUSED = 2
 """Exit status where the user's input is at fault."""

@@ -8,10 +8,10 @@ from pisigma.cli.arguments import AsJson, SocketDistance, socket_distances
 from pisigma.cli.camera_options import takes_corners
 from pisigma.cli.output import print_json, print_lines
 from pisigma.cli.verify import FitFrame, FitTool, print_comparison
-from pisigma.errors import AcceptanceError
+from pisigma.files.errors import AcceptanceError
 
 if TYPE_CHECKING:
-    from pisigma.camera.corner_file import CameraFiles
+    from pisigma.measurement.camera.corner_file import CameraFiles
     from pisigma.workflow.evaluate import Evaluation
 
 Paths = Annotated[
@@ -71,7 +71,7 @@ def evaluate(
     Balls in sockets, wires and pairs are judged by how well the rows of each agree, and by stated distances.
     """
     from pisigma.files.model_files import check_model_hash
-    from pisigma.judging.bootstrap import Bootstrap
+    from pisigma.validation.held_out.bootstrap import Bootstrap
     from pisigma.workflow import evaluate as workflow
 
     if len(paths) < 2:

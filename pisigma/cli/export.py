@@ -8,10 +8,10 @@ import typer
 from pisigma.cli.arguments import AsJson, ModelFolder, PayloadKg, TemperatureC, complete_export
 from pisigma.cli.endings import NOT_ACCEPTED, fail
 from pisigma.cli.output import print_json, print_line
-from pisigma.export.registry import BUILT_IN
+from pisigma.deployment.export.registry import BUILT_IN
 
 if TYPE_CHECKING:
-    from pisigma.export.export_format import Exported
+    from pisigma.deployment.export.export_format import Exported
 
 Out = Annotated[
     Path,
@@ -121,8 +121,8 @@ def export(
     values are empty in a .csv file, and no program is written. Every program is slow and has to be tested. With
     --program, poses that cannot be reached keep their line, and the exit status is 3.
     """
-    from pisigma.export.export_format import ExportRequest
-    from pisigma.export.registry import export_format, export_model
+    from pisigma.deployment.export.export_format import ExportRequest
+    from pisigma.deployment.export.registry import export_format, export_model
 
     request = ExportRequest(
         model=model,

@@ -1,6 +1,6 @@
 """What the commands print: tables and sentences for people on stdout, or one JSON object.
 
-What files hold reaches a terminal as text only: see `pisigma.errors.printable`.
+What files hold reaches a terminal as text only: see `pisigma.files.errors.printable`.
 """
 
 import json
@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import typer
 
-from pisigma.errors import AcceptanceError, printable
+from pisigma.files.errors import AcceptanceError, printable
 
 if TYPE_CHECKING:
     from rich.table import Table

@@ -185,7 +185,7 @@ def _curve_lines(planned: "Plan") -> list[str]:
 
 def _settings(options: Mapping[str, Any]) -> "PlanSettings":
     """Settings by the options of the command."""
-    from pisigma.errors import PlanningError
+    from pisigma.files.errors import PlanningError
     from pisigma.planning.camera_settings import CameraSettings
     from pisigma.planning.plan_settings import PlanSettings
 
@@ -209,7 +209,7 @@ def _settings(options: Mapping[str, Any]) -> "PlanSettings":
 
 def _box(stated: str | None) -> Any:
     """Lowest and highest x, y, z [mm], from "X,Y,Z,X,Y,Z"."""
-    from pisigma.errors import PlanningError
+    from pisigma.files.errors import PlanningError
 
     try:
         box = None if stated is None else tuple(map(float, stated.split(",")))

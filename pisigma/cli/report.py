@@ -8,10 +8,10 @@ import typer
 from pisigma.cli.arguments import AsJson, ModelFolder
 from pisigma.cli.camera_options import takes_corners
 from pisigma.cli.output import print_json, print_lines, progress_of
-from pisigma.errors import AcceptanceError
+from pisigma.files.errors import AcceptanceError
 
 if TYPE_CHECKING:
-    from pisigma.camera.corner_file import CameraFiles
+    from pisigma.measurement.camera.corner_file import CameraFiles
 
 
 @takes_corners

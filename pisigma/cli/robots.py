@@ -8,7 +8,7 @@ import typer
 
 from pisigma.cli.arguments import AsJson, complete_robot
 from pisigma.cli.output import print_json, print_line, print_lines, print_table
-from pisigma.errors import OutputError
+from pisigma.files.errors import OutputError
 
 if TYPE_CHECKING:
     from pisigma.robot.description import Robot
@@ -77,8 +77,8 @@ def _convert(
     read: Path, like: str, nominal: "Robot", out: Path, max_change_mm: float | None, as_json: bool
 ) -> None:
     """Write the robot that a controller's file makes of the nominal one, which `like` names."""
-    from pisigma.export.controllers.reading import MAX_CHANGE, read_controller_file
-    from pisigma.export.dh_table import dh_yaml
+    from pisigma.deployment.export.controllers.reading import MAX_CHANGE, read_controller_file
+    from pisigma.deployment.export.dh_table import dh_yaml
     from pisigma.files.output_file import check_output, write_whole
 
     check_output(out, (".yaml", ".yml"), "a robot file", (read, Path(like)))
@@ -142,8 +142,8 @@ def _list(as_json: bool) -> None:
 
 def _check(robot: str, base: str | None, tip: str | None, as_json: bool) -> None:
     """Print where a description has the tool."""
-    from pisigma.kinematics.closed_form import closed_form_solver
     from pisigma.robot.description import Robot
+    from pisigma.robot.kinematics.closed_form import closed_form_solver
     from pisigma.robot.pendant_poses import pendant_poses
 
     poses = pendant_poses(robot, base, tip)

@@ -9,7 +9,7 @@ from pisigma.cli.arguments import AsJson
 from pisigma.cli.output import print_json, print_line
 
 if TYPE_CHECKING:
-    from pisigma.recipes.recipe import Recipe
+    from pisigma.workflow.recipes.recipe import Recipe
 
 
 def simulate(
@@ -28,11 +28,11 @@ def simulate(
     as_json: AsJson = False,
 ) -> None:
     """Write the simulated measurements of a recipe as a CSV file, or the images that its camera takes."""
-    from pisigma.errors import RecipeError
+    from pisigma.files.errors import RecipeError
     from pisigma.files.output_file import check_output
-    from pisigma.recipes.data import simulate as simulate_recipe
-    from pisigma.recipes.reader import read_recipe
     from pisigma.robot.robot_file import robot_file
+    from pisigma.workflow.recipes.data import simulate as simulate_recipe
+    from pisigma.workflow.recipes.reader import read_recipe
 
     read = read_recipe(recipe)
     if (out is None) == (images is None):
@@ -52,7 +52,7 @@ def simulate(
 
 
 def _write_images(recipe: "Recipe", folder: Path, as_json: bool) -> None:
-    from pisigma.recipes.data import write_recipe_images
+    from pisigma.workflow.recipes.data import write_recipe_images
 
     count = write_recipe_images(recipe, folder)
     if as_json:

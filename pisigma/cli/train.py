@@ -13,11 +13,11 @@ import typer
 from pisigma.cli.arguments import AcceptImplausible, AsJson, Overwrite
 from pisigma.cli.calibrate import print_calibration
 from pisigma.cli.output import print_json, print_line, print_lines, print_table, progress_of, saved
-from pisigma.errors import printable
+from pisigma.files.errors import printable
 
 if TYPE_CHECKING:
-    from pisigma.judging.calibration_summary import CalibrationSummary
-    from pisigma.judging.training_summary import TrainingSummary
+    from pisigma.validation.held_out.calibration_summary import CalibrationSummary
+    from pisigma.validation.held_out.training_summary import TrainingSummary
 
 Jobs = Annotated[
     int | None,
@@ -55,8 +55,8 @@ def train(
     started = time.perf_counter()
     from pisigma.files.conflicts import check_apart
     from pisigma.files.output_folder import check_folder
-    from pisigma.recipes.reader import read_recipe
     from pisigma.robot.robot_file import robot_file
+    from pisigma.workflow.recipes.reader import read_recipe
     from pisigma.workflow.train import InverseTraining
     from pisigma.workflow.train import train as train_recipe
     from pisigma.workflow.train_networks import TrainSettings

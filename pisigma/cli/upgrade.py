@@ -8,8 +8,8 @@ from pisigma.cli.output import print_json, print_line, print_lines
 
 def upgrade(model: ModelFolder, as_json: AsJson = False) -> None:
     """Rewrite a model folder of an earlier version so that this one reads it, whole or not at all."""
-    from pisigma.inverse.written_model import check_written
     from pisigma.model.folder.upgrade import upgrade_folder
+    from pisigma.model.inverse.written_model import check_written
 
     done = upgrade_folder(model, check_written)
     if as_json:

@@ -8,11 +8,11 @@ import typer
 from pisigma.cli.arguments import AsJson, ModelFolder, SocketDistance, socket_distances
 from pisigma.cli.camera_options import takes_corners
 from pisigma.cli.output import print_json, print_line, print_lines, print_table, progress_of, screen_width
-from pisigma.errors import AcceptanceError
+from pisigma.files.errors import AcceptanceError
 
 if TYPE_CHECKING:
-    from pisigma.camera.corner_file import CameraFiles
-    from pisigma.judging.model_comparison import ModelComparison
+    from pisigma.measurement.camera.corner_file import CameraFiles
+    from pisigma.validation.held_out.model_comparison import ModelComparison
     from pisigma.workflow.verify import Verification
 
 FitFrame = Annotated[

@@ -4,7 +4,7 @@ import os
 from collections.abc import Iterable
 from pathlib import Path
 
-from pisigma.errors import OutputError
+from pisigma.files.errors import OutputError
 from pisigma.files.model_files import is_model
 
 Input = str | os.PathLike[str] | None

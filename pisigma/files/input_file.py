@@ -4,7 +4,7 @@ import os
 import select
 import stat
 
-from pisigma.errors import PisigmaError
+from pisigma.files.errors import PisigmaError
 
 MOST_BYTES = 2**26
 """A file that people or instruments write is smaller: half a million rows of measurements, say."""

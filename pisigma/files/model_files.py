@@ -5,7 +5,7 @@ import os
 import re
 from pathlib import Path
 
-from pisigma.errors import ModelError
+from pisigma.files.errors import ModelError
 from pisigma.files.input_file import MOST_BYTES, read_input
 
 DESCRIPTION = "model.yaml"

@@ -6,8 +6,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TextIO
 
-from pisigma.errors import OutputError
 from pisigma.files.conflicts import Input, check_apart
+from pisigma.files.errors import OutputError
 from pisigma.files.scratch import FILE, scratch_beside, sweep
 
 

@@ -5,8 +5,8 @@ from collections.abc import Collection, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from pisigma.errors import OutputError
 from pisigma.files.conflicts import Input, check_apart
+from pisigma.files.errors import OutputError
 from pisigma.files.model_files import MODEL_FILES, is_model
 from pisigma.files.scratch import ASIDE, FOLDER, KEPT, scratch_beside, sweep
 

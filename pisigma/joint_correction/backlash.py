@@ -8,10 +8,10 @@ from jaxtyping import Float, Float64
 from torch import Tensor
 
 from pisigma.joint_correction.feature import AbstractFeature, FeatureOptions
-from pisigma.kernels.forms import CompiledForm
+from pisigma.joint_correction.onnx_graph import OnnxGraph
 from pisigma.measurement.conditions import APPROACH, JointState
-from pisigma.onnx.graph import OnnxGraph
 from pisigma.robot.description import Robot
+from pisigma.robot.kernels.forms import CompiledForm
 
 
 @no_type_check

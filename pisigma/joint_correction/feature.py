@@ -9,11 +9,11 @@ import torch
 from jaxtyping import Bool, Float, Float64, Int64
 from torch import Tensor
 
-from pisigma.kernels.forms import CompiledForm
+from pisigma.files.yaml_file import Section
+from pisigma.joint_correction.onnx_graph import OnnxGraph
 from pisigma.measurement.conditions import JointState
-from pisigma.onnx.graph import OnnxGraph
 from pisigma.robot.description import Robot
-from pisigma.yaml_file import Section
+from pisigma.robot.kernels.forms import CompiledForm
 
 USUAL_SIZE = 2e-5
 """Prior size [rad] of weights of which nothing else is known."""

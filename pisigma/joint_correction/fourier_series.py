@@ -9,10 +9,10 @@ from pydantic import Field
 from torch import Tensor
 
 from pisigma.joint_correction.feature import AbstractFeature, FeatureOptions, FeatureSection, turning_rate
-from pisigma.kernels.forms import MOST_JOINTS, CompiledForm
+from pisigma.joint_correction.onnx_graph import OnnxGraph
 from pisigma.measurement.conditions import JointState
-from pisigma.onnx.graph import OnnxGraph
 from pisigma.robot.description import Robot
+from pisigma.robot.kernels.forms import MOST_JOINTS, CompiledForm
 
 BAND_STARTS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128, 192, 256)
 """First harmonic of every band of few configurations: about two bands an octave."""

@@ -12,10 +12,10 @@ from torch import Tensor
 
 from pisigma.joint_correction.feature import AbstractFeature, FeatureOptions, FeatureSection, turning_rate
 from pisigma.joint_correction.fourier_series import add_harmonics, sines_cosines
-from pisigma.kernels.forms import CompiledForm
+from pisigma.joint_correction.onnx_graph import OnnxGraph
 from pisigma.measurement.conditions import JointState
-from pisigma.onnx.graph import OnnxGraph
 from pisigma.robot.description import Robot
+from pisigma.robot.kernels.forms import CompiledForm
 
 
 class LinesSection(FeatureSection):

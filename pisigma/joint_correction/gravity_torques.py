@@ -8,12 +8,12 @@ from jaxtyping import Float, Float64
 from torch import Tensor
 
 from pisigma.joint_correction.feature import AbstractFeature, FeatureOptions, FeatureSection
-from pisigma.kernels.forms import CompiledForm
-from pisigma.kinematics.forward import Geometry, iterate_rows
+from pisigma.joint_correction.onnx_chain import add_joint_frames
+from pisigma.joint_correction.onnx_graph import OnnxGraph
 from pisigma.measurement.conditions import JointState
-from pisigma.onnx.chain import add_joint_frames
-from pisigma.onnx.graph import OnnxGraph
 from pisigma.robot.description import Robot
+from pisigma.robot.kernels.forms import CompiledForm
+from pisigma.robot.kinematics.forward import Geometry, iterate_rows
 
 Direction = tuple[float, float, float]
 

@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from pisigma.errors import nearest_choice
+from pisigma.files.errors import nearest_choice
 from pisigma.joint_correction.backlash import Backlash
 from pisigma.joint_correction.conditions import ConditionFeatures
 from pisigma.joint_correction.coupled_series import CoupledSeries
@@ -11,8 +11,8 @@ from pisigma.joint_correction.fourier_series import FourierSeries
 from pisigma.joint_correction.gear_lines import GearLines
 from pisigma.joint_correction.gravity_torques import GravityTorques
 from pisigma.joint_correction.shared_features import NominalPose, ScaledJoints, SinesCosines
-from pisigma.kernels.forms import register_compiled
 from pisigma.robot.description import Robot
+from pisigma.robot.kernels.forms import register_compiled
 
 FEATURES: dict[str, type[AbstractFeature]] = {}
 """All features by name, in the order in which they were registered."""
@@ -95,6 +95,6 @@ for _feature in (
     register_feature(_feature)
 
 if __name__ == "__main__":
-    from pisigma.kernels.build import build
+    from pisigma.robot.kernels.build import build
 
     build()

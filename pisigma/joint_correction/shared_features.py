@@ -9,13 +9,13 @@ from jaxtyping import Float, Float64
 from torch import Tensor
 
 from pisigma.joint_correction.feature import AbstractFeature, scaled_joints, unit_inputs
-from pisigma.kernels.forms import CompiledForm
-from pisigma.kinematics.forward import forward_kinematics
+from pisigma.joint_correction.onnx_chain import add_pose, add_roll_pitch_yaw
+from pisigma.joint_correction.onnx_graph import OnnxGraph
 from pisigma.measurement.conditions import JointState
 from pisigma.network.inputs import Inputs
-from pisigma.onnx.chain import add_pose, add_roll_pitch_yaw
-from pisigma.onnx.graph import OnnxGraph
 from pisigma.robot.description import Robot
+from pisigma.robot.kernels.forms import CompiledForm
+from pisigma.robot.kinematics.forward import forward_kinematics
 
 
 class AbstractSharedFeature(AbstractFeature):

@@ -14,7 +14,7 @@ from pisigma.measurement.fields import LeftOut, MeasuredFields
 from pisigma.measurement.groups import numbers_of_names
 from pisigma.measurement.readings import READINGS
 from pisigma.robot.description import Robot
-from pisigma.se3 import rpy_from_rotation
+from pisigma.robot.se3 import rpy_from_rotation
 
 DEGREE = math.pi / 180
 LENGTH_STEPS = sorted((*(10.0**-k for k in range(3, 10)), *(0.0254 * 10.0**-k for k in range(2, 7))))[::-1]

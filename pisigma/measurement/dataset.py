@@ -14,14 +14,14 @@ import torch
 from jaxtyping import Bool, Float64
 from torch import Tensor
 
-from pisigma.errors import MeasurementError
+from pisigma.files.errors import MeasurementError
 from pisigma.measurement.csv.reading import read_fields
 from pisigma.measurement.csv.writing import write_fields
 from pisigma.measurement.fields import KINDS, Kind, LeftOut, MeasuredFields, OnBadRow, joined_fields
 from pisigma.measurement.readings import READINGS
 from pisigma.measurement.rules import check_fields
 from pisigma.robot import Robot
-from pisigma.se3 import transform
+from pisigma.robot.se3 import transform
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,8 +58,8 @@ class Measurements:
             NaN where that is not stated.
         date: per row, the day it was measured (ISO 8601, such as "2026-11-22"); "" where it is not stated.
         image: per row, the name of the image that it comes from; "" where it comes from none.
-        readings: what registered sensors measured (see `pisigma.sensors.register_sensor`), by column: one number
-            [SI] or one name a row.
+        readings: what registered sensors measured (see `pisigma.measurement.sensors.register_sensor`), by column: one
+            number [SI] or one name a row.
         line: per row, the line in the file it came from (0 where it came from none).
         source: the file, or what made the rows.
         left_out: rows of the file that are not here, and why.

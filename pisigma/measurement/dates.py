@@ -3,7 +3,7 @@
 import datetime
 import re
 
-from pisigma.errors import MeasurementError
+from pisigma.files.errors import MeasurementError
 
 WANTED = "a day from 1970-01-01 to today, such as 2026-11-22"
 """What is expected of a date, for messages."""

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import torch
 
-from pisigma.errors import MeasurementError, printable
+from pisigma.files.errors import MeasurementError, printable
 from pisigma.files.input_file import read_text
 from pisigma.measurement.csv.header import read_header
 from pisigma.measurement.csv.reading import sound_rows

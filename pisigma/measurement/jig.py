@@ -11,8 +11,8 @@ from jaxtyping import Bool, Float64, Int64
 from pydantic import Field, model_validator
 from torch import Tensor
 
-from pisigma.errors import MeasurementError, nearest_choice
-from pisigma.yaml_file import Section, parse_yaml, read_yaml
+from pisigma.files.errors import MeasurementError, nearest_choice
+from pisigma.files.yaml_file import Section, parse_yaml, read_yaml
 
 Side = Literal["-x", "+x", "-y", "+y", "-z", "+z"]
 Millimetres = tuple[float, float, float]

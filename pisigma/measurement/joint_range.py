@@ -5,12 +5,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float64
 
-from pisigma.kinematics.joint_limits import beyond_limits, grossly_beyond
 from pisigma.measurement.copies import copy_warnings
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.rules import rows_where
 from pisigma.robot.coupling import hull
 from pisigma.robot.description import Robot
+from pisigma.robot.kinematics.joint_limits import beyond_limits, grossly_beyond
 from pisigma.robot.row import Row
 
 _NAMED = 5

@@ -1,4 +1,4 @@
-"""Columns that sensors add to measurement files: a registry which `pisigma.sensors` fills."""
+"""Columns that sensors add to measurement files: a registry which `pisigma.measurement.sensors` fills."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -80,7 +80,7 @@ class SensorReadings:
 
 
 READINGS: dict[str, SensorReadings] = {}
-"""By sensor, what `pisigma.sensors.register_sensor` added to the columns of measurement files."""
+"""By sensor, what `pisigma.measurement.sensors.register_sensor` added to the columns of measurement files."""
 
 
 def reading_numbers() -> tuple[str, ...]:

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
-from pisigma.errors import MeasurementError, nearest_choice
+from pisigma.files.errors import MeasurementError, nearest_choice
 from pisigma.measurement.dates import WANTED, is_date
 from pisigma.measurement.fields import NUMBERS, TEXTS, MeasuredFields
 from pisigma.measurement.readings import READINGS, Unit, from_si, reading_numbers, reading_texts

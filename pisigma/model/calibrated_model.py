@@ -10,16 +10,16 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
-from pisigma.hybrid.arm import HybridArm
-from pisigma.hybrid.uncertainty import PositionUncertainty
-from pisigma.kinematics.forward import forward_kinematics
-from pisigma.kinematics.jacobian import joint_jacobian
-from pisigma.kinematics.tolerances import FORWARD_ACCEPTED, FORWARD_ITERATIONS, FORWARD_TOLERANCE
+from pisigma.calibration.hybrid.arm import HybridArm
+from pisigma.calibration.hybrid.uncertainty import PositionUncertainty
 from pisigma.measurement.copies import RowValues
 from pisigma.model.domain import Domain
 from pisigma.model.hybrid_motion import hybrid_motion, hybrid_poses
 from pisigma.network.correction_network import CorrectionNetwork
 from pisigma.robot.description import Robot
+from pisigma.robot.kinematics.forward import forward_kinematics
+from pisigma.robot.kinematics.jacobian import joint_jacobian
+from pisigma.robot.kinematics.tolerances import FORWARD_ACCEPTED, FORWARD_ITERATIONS, FORWARD_TOLERANCE
 
 if TYPE_CHECKING:
     import pytorch_kinematics

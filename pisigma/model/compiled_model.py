@@ -7,20 +7,20 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from pisigma.errors import ModelError
+from pisigma.files.errors import ModelError
 from pisigma.joint_correction.feature import scaled_joints, turning_rate
 from pisigma.joint_correction.joint_correction import JointCorrection
-from pisigma.kernels import arrays
-from pisigma.kernels.array_kinematics import KINDS, arm_ends, arm_rows
-from pisigma.kernels.description_file import write_description
-from pisigma.kernels.forms import MOST_JOINTS, KernelForms
-from pisigma.kinematics.closed_form import AbstractClosedForm, closed_form_solver
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.stored_starts import StoredStarts, middle_of_starts
 from pisigma.network.correction_network import JointGroup
 from pisigma.network.inputs import POSE_INPUTS
 from pisigma.network.pi_sigma import PiSigma
-from pisigma.se3 import invert
+from pisigma.robot.kernels import arrays
+from pisigma.robot.kernels.array_kinematics import KINDS, arm_ends, arm_rows
+from pisigma.robot.kernels.description_file import write_description
+from pisigma.robot.kernels.forms import MOST_JOINTS, KernelForms
+from pisigma.robot.kinematics.closed_form import AbstractClosedForm, closed_form_solver
+from pisigma.robot.se3 import invert
 
 _NUMERIC = ("numeric",)
 _Input = tuple[int, list[float]]

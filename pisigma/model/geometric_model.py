@@ -6,17 +6,17 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
-from pisigma.hybrid.covariance_root import CovarianceRoot
-from pisigma.hybrid.result import HybridResult
-from pisigma.hybrid.uncertainty import PositionUncertainty
-from pisigma.identification.problem.setup import IdentifiedGeometry
-from pisigma.identification.result import CalibrationResult
-from pisigma.kinematics.closed_form import closed_form_solver
+from pisigma.calibration.geometric.problem.setup import IdentifiedGeometry
+from pisigma.calibration.geometric.result import CalibrationResult
+from pisigma.calibration.hybrid.covariance_root import CovarianceRoot
+from pisigma.calibration.hybrid.result import HybridResult
+from pisigma.calibration.hybrid.uncertainty import PositionUncertainty
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel, Provenance
 from pisigma.model.stored_starts import nearest_branch, spread_rows
 from pisigma.model.training_rows import kept_rows
 from pisigma.robot.description import Robot
+from pisigma.robot.kinematics.closed_form import closed_form_solver
 
 
 def model_of_calibration(

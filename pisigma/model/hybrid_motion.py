@@ -4,10 +4,10 @@ import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
-from pisigma.hybrid.arm import HybridArm
-from pisigma.kinematics.jacobian import joint_jacobian
+from pisigma.calibration.hybrid.arm import HybridArm
 from pisigma.measurement.conditions import JointState
 from pisigma.measurement.dataset import Measurements
+from pisigma.robot.kinematics.jacobian import joint_jacobian
 
 CHUNK = 4_096
 """Poses whose features are in memory at a time: a few hundred columns a joint."""

@@ -5,13 +5,13 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
-from pisigma.errors import MeasurementError, nearest_choice
-from pisigma.kinematics.forward import forward_kinematics
+from pisigma.files.errors import MeasurementError, nearest_choice
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.hybrid_motion import corrected_joints
 from pisigma.robot.description import Robot
-from pisigma.se3 import invert, transform_from_xyzrpy
+from pisigma.robot.kinematics.forward import forward_kinematics
+from pisigma.robot.se3 import invert, transform_from_xyzrpy
 
 Frames = dict[str, Float64[np.ndarray, " 6"]]
 """Bases per frame or tools per target: x, y, z [m], roll, pitch, yaw [rad]."""

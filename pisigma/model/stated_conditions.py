@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
-from pisigma.errors import ModelError
+from pisigma.files.errors import ModelError
 from pisigma.joint_correction.conditions import ConditionFeatures, at_conditions, learned_conditions
 from pisigma.measurement.conditions import conditions_of
 from pisigma.measurement.dataset import Measurements

@@ -4,10 +4,10 @@ import torch
 from jaxtyping import Float64, Int64
 from torch import Tensor
 
-from pisigma.kinematics.closed_form import AbstractClosedForm
-from pisigma.kinematics.forward import forward_kinematics
-from pisigma.kinematics.task_axes import WHOLE, TaskAxes
 from pisigma.robot.description import Robot
+from pisigma.robot.kinematics.closed_form import AbstractClosedForm
+from pisigma.robot.kinematics.forward import forward_kinematics
+from pisigma.robot.kinematics.task_axes import WHOLE, TaskAxes
 
 MAXIMUM_STARTS = 512
 

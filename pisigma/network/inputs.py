@@ -9,9 +9,9 @@ import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
-from pisigma.errors import RecipeError, nearest_choice
+from pisigma.files.errors import RecipeError, nearest_choice
 from pisigma.robot.description import Robot
-from pisigma.se3 import rpy_from_rotation
+from pisigma.robot.se3 import rpy_from_rotation
 
 POSE_INPUTS = ("x", "y", "z", "roll", "pitch", "yaw")
 """Coordinates of the pose: x, y, z [m] and angles [rad] of the rotation seen from the reference."""

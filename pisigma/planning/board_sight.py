@@ -6,10 +6,10 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
-from pisigma.camera.board import Board
-from pisigma.camera.camera import Camera
-from pisigma.camera.image_rows import Repeatability
-from pisigma.se3 import invert, skew
+from pisigma.measurement.camera.board import Board
+from pisigma.measurement.camera.camera import Camera
+from pisigma.measurement.camera.image_rows import Repeatability
+from pisigma.robot.se3 import invert, skew
 
 
 @dataclass(frozen=True, eq=False)

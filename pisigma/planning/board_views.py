@@ -8,14 +8,14 @@ import torch
 from jaxtyping import Bool, Float64
 from torch import Tensor
 
-from pisigma.camera.pattern import board_sheet
-from pisigma.kinematics.closed_form.registry import closed_form_solver
-from pisigma.kinematics.forward import forward_kinematics
-from pisigma.kinematics.numeric import solve_numeric
+from pisigma.measurement.camera.pattern import board_sheet
 from pisigma.planning.board_sight import BoardSight
-from pisigma.planning.cell.arm_in_cell import CHUNK, ArmInCell
-from pisigma.planning.cell.cell import ViewSection
-from pisigma.se3 import invert, rotation_from_rpy, transform
+from pisigma.planning.surroundings.arm_in_cell import CHUNK, ArmInCell
+from pisigma.planning.surroundings.cell import ViewSection
+from pisigma.robot.kinematics.closed_form.registry import closed_form_solver
+from pisigma.robot.kinematics.forward import forward_kinematics
+from pisigma.robot.kinematics.numeric import solve_numeric
+from pisigma.robot.se3 import invert, rotation_from_rpy, transform
 
 WHOLE_POSE = 6
 """Joints with which an arm reaches every pose that is near enough, in a closed form."""

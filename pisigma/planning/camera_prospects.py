@@ -6,13 +6,13 @@ import torch
 from jaxtyping import Float64, Int64
 from torch import Tensor
 
-from pisigma.camera.image_rows import Repeatability
+from pisigma.measurement.camera.image_rows import Repeatability
 from pisigma.planning.board_views import BoardViews
 from pisigma.planning.candidates import Candidates
-from pisigma.planning.cell.arm_in_cell import ArmInCell
 from pisigma.planning.choice import choose
 from pisigma.planning.expected_accuracy import rms_of
 from pisigma.planning.knowledge import Knowledge
+from pisigma.planning.surroundings.arm_in_cell import ArmInCell
 
 MORE = 10
 """Images more."""

@@ -3,11 +3,11 @@
 import math
 from dataclasses import dataclass
 
-from pisigma.camera.board import Board
-from pisigma.camera.camera import Camera
-from pisigma.camera.corner_file import CameraFiles
-from pisigma.camera.image_rows import Repeatability
-from pisigma.errors import PlanningError
+from pisigma.files.errors import PlanningError
+from pisigma.measurement.camera.board import Board
+from pisigma.measurement.camera.camera import Camera
+from pisigma.measurement.camera.corner_file import CameraFiles
+from pisigma.measurement.camera.image_rows import Repeatability
 from pisigma.planning.board_sight import BoardSight
 
 FINEST_PX, COARSEST_PX = 1e-3, 100.0

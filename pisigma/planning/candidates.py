@@ -10,13 +10,13 @@ import torch
 from jaxtyping import Bool, Float64, Int64
 from torch import Tensor
 
-from pisigma.errors import PlanningError
-from pisigma.inverse.finishing import nearest_turn
-from pisigma.kinematics.forward import forward_kinematics
+from pisigma.files.errors import PlanningError
 from pisigma.measurement.csv.reading import read_joints
+from pisigma.model.inverse.finishing import nearest_turn
 from pisigma.planning.board_views import BoardViews
-from pisigma.planning.cell.arm_in_cell import ArmInCell, Faults
-from pisigma.se3 import wrap_to_pi
+from pisigma.planning.surroundings.arm_in_cell import ArmInCell, Faults
+from pisigma.robot.kinematics.forward import forward_kinematics
+from pisigma.robot.se3 import wrap_to_pi
 
 MOST_DRAWS = 40
 """So many times as many poses are drawn at most as candidates are wanted."""

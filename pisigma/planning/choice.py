@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float64, Int64
 from torch import Tensor
 
-from pisigma.errors import PlanningError
+from pisigma.files.errors import PlanningError
 
 Criterion = Literal["D", "I"]
 LEAST_VARIANCE = 1e-10

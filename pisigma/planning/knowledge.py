@@ -8,28 +8,28 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
-from pisigma.errors import IdentificationError, ImplausibleError, MeasurementError
-from pisigma.hybrid.calibrator import HybridCalibrator
-from pisigma.hybrid.covariance_root import CovarianceRoot
-from pisigma.hybrid.gravity import USUAL, in_first_row
-from pisigma.hybrid.result import HybridResult
-from pisigma.hybrid.uncertainty import PositionUncertainty
-from pisigma.identification.prediction import predicted_poses
-from pisigma.identification.problem.parameters import ParameterSpace
-from pisigma.identification.problem.prior_sizes import PriorGroup, prior_group_of
-from pisigma.identification.problem.setup import IdentifiedGeometry
+from pisigma.calibration.geometric.prediction import predicted_poses
+from pisigma.calibration.geometric.problem.parameters import ParameterSpace
+from pisigma.calibration.geometric.problem.prior_sizes import PriorGroup, prior_group_of
+from pisigma.calibration.geometric.problem.setup import IdentifiedGeometry
+from pisigma.calibration.hybrid.calibrator import HybridCalibrator
+from pisigma.calibration.hybrid.covariance_root import CovarianceRoot
+from pisigma.calibration.hybrid.gravity import USUAL, in_first_row
+from pisigma.calibration.hybrid.result import HybridResult
+from pisigma.calibration.hybrid.uncertainty import PositionUncertainty
+from pisigma.files.errors import IdentificationError, ImplausibleError, MeasurementError
 from pisigma.joint_correction.feature import AbstractFeature
 from pisigma.joint_correction.fourier_series import FourierSeries
 from pisigma.joint_correction.gravity_torques import Direction, GravityTorques
 from pisigma.joint_correction.joint_correction import JointCorrection
-from pisigma.kinematics.forward import forward_kinematics
 from pisigma.measurement.conditions import JointState
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.planning.board_sight import BoardSight
 from pisigma.robot.description import Robot
+from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.robot.robot_class import RobotClass
-from pisigma.se3 import rotation_vector, skew
+from pisigma.robot.se3 import rotation_vector, skew
 
 SensorKind = Literal["position", "pose", "distance", "camera"]
 WIDE = (*(1.0,) * 6, *(0.1,) * 3, *(1.0,) * 3)

@@ -12,19 +12,19 @@ from jaxtyping import Bool, Float64, Int64
 from pydantic import Field
 from torch import Tensor
 
-from pisigma.errors import MeasurementError, PlanningError
+from pisigma.files.errors import MeasurementError, PlanningError
 from pisigma.files.output_file import write_whole
+from pisigma.files.yaml_file import Section, read_yaml, yaml_text
 from pisigma.measurement.csv.columns import PLAN_COLUMNS
 from pisigma.measurement.csv.reading import read_joints
 from pisigma.measurement.csv.table import Table, read_table
-from pisigma.planning.cell.arm_in_cell import ArmInCell
-from pisigma.planning.cell.cell import Cell
 from pisigma.planning.plan_settings import PlanSettings
+from pisigma.planning.surroundings.arm_in_cell import ArmInCell
+from pisigma.planning.surroundings.cell import Cell
 from pisigma.robot.description import Robot
 from pisigma.robot.robot_file import RobotDocument
 from pisigma.robot.row import Bounded
 from pisigma.robot.writing import robot_document
-from pisigma.yaml_file import Section, read_yaml, yaml_text
 
 YAML_SUFFIX = ".plan.yaml"
 """The plan `poses.csv` has its YAML beside it as `poses.plan.yaml`."""

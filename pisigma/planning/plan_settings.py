@@ -12,8 +12,9 @@ from jaxtyping import Float64
 from pydantic import ConfigDict
 from torch import Tensor
 
-from pisigma.camera.corner_file import read_rows
-from pisigma.errors import PlanningError, nearest_choice
+from pisigma.files.errors import PlanningError, nearest_choice
+from pisigma.files.yaml_file import MOST_POSES
+from pisigma.measurement.camera.corner_file import read_rows
 from pisigma.measurement.csv.reading import holds_measurements, read_joints
 from pisigma.measurement.dataset import Measurements
 from pisigma.planning.board_views import BoardViews
@@ -25,12 +26,11 @@ from pisigma.planning.candidates import (
     read_candidates,
     with_workspace,
 )
-from pisigma.planning.cell.arm_in_cell import ArmInCell
 from pisigma.planning.choice import Criterion
 from pisigma.planning.knowledge import Instrument, SensorKind
+from pisigma.planning.surroundings.arm_in_cell import ArmInCell
 from pisigma.planning.tour import Pace
 from pisigma.robot.description import Robot
-from pisigma.yaml_file import MOST_POSES
 
 SHORTEST_MM, LONGEST_MM = 1e-3, 1e3
 """Of a standard deviation of an instrument, and of an error of a robot: others are slips of the unit."""

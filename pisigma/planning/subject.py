@@ -10,18 +10,18 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
-from pisigma.errors import PlanningError
+from pisigma.files.errors import PlanningError
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.folder.model_folder import load_model
 from pisigma.model.model_source import HoldsModel
 from pisigma.planning.board_views import BoardViews
-from pisigma.planning.cell.arm_in_cell import ArmInCell
-from pisigma.planning.cell.cell import Cell
 from pisigma.planning.knowledge import Knowledge
 from pisigma.planning.plan_settings import PlanSettings
+from pisigma.planning.surroundings.arm_in_cell import ArmInCell
+from pisigma.planning.surroundings.cell import Cell
 from pisigma.robot.description import Robot
 from pisigma.robot.robot_file import FrameSection
-from pisigma.se3 import invert, transform_from_xyzrpy, xyzrpy_from_transform
+from pisigma.robot.se3 import invert, transform_from_xyzrpy, xyzrpy_from_transform
 
 SAME = 1e-6
 """[m or rad] A model was calibrated with the camera and the board of a plan that are so near to where it has them."""

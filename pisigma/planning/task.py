@@ -8,18 +8,18 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
-from pisigma.errors import PlanningError
-from pisigma.inverse.corrected_ik import CorrectedIK
-from pisigma.kinematics.status import Status
-from pisigma.kinematics.tolerances import LIMIT_TOLERANCE
+from pisigma.files.errors import PlanningError
 from pisigma.measurement.csv.columns import find_column
 from pisigma.measurement.csv.poses import read_poses
 from pisigma.measurement.csv.reading import read_joints
 from pisigma.measurement.csv.table import read_table
 from pisigma.model.calibrated_model import CalibratedModel
-from pisigma.planning.cell.arm_in_cell import ArmInCell
+from pisigma.model.inverse.corrected_ik import CorrectedIK
 from pisigma.planning.plan_settings import PlanSettings
+from pisigma.planning.surroundings.arm_in_cell import ArmInCell
 from pisigma.robot import Robot
+from pisigma.robot.kinematics.status import Status
+from pisigma.robot.kinematics.tolerances import LIMIT_TOLERANCE
 
 REACHED = (Status.REACHED, Status.OUTSIDE_DOMAIN)
 

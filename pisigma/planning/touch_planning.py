@@ -9,10 +9,10 @@ import torch
 from jaxtyping import Float64, Int64
 from torch import Tensor
 
-from pisigma.errors import IdentificationError
-from pisigma.identification.problem.parameters import USUAL_ANGLE, USUAL_LENGTH, ParameterSpace, Prior
-from pisigma.kinematics.parameter_jacobian import identification_jacobian
+from pisigma.calibration.geometric.problem.parameters import USUAL_ANGLE, USUAL_LENGTH, ParameterSpace, Prior
+from pisigma.files.errors import IdentificationError
 from pisigma.robot.description import Robot
+from pisigma.robot.kinematics.parameter_jacobian import identification_jacobian
 from pisigma.simulation.touch_candidates import TouchCandidates
 
 VAGUE = 300.0

@@ -10,8 +10,8 @@ import torch
 from jaxtyping import Float64, Int64
 from torch import Tensor
 
-from pisigma.errors import PlanningError
-from pisigma.planning.cell.motion import Motions
+from pisigma.files.errors import PlanningError
+from pisigma.planning.surroundings.motion import Motions
 from pisigma.robot.description import Robot
 
 FIRST_STAGE = 20

@@ -8,9 +8,9 @@ from matplotlib.figure import Figure
 from matplotlib.patches import PathPatch
 from matplotlib.path import Path as Outline
 
-from pisigma.camera.board import Board
-from pisigma.camera.pattern import Pattern, board_pattern
-from pisigma.errors import OutputError
+from pisigma.files.errors import OutputError
+from pisigma.measurement.camera.board import Board
+from pisigma.measurement.camera.pattern import Pattern, board_pattern
 
 PAPERS = {
     "A4": (210.0, 297.0),

@@ -13,12 +13,12 @@ from matplotlib.image import AxesImage
 from matplotlib.ticker import LogLocator, NullFormatter
 from torch import Tensor
 
-from pisigma.identification.identifiability.pairwise import CorrelationTable
+from pisigma.calibration.geometric.identifiability.pairwise import CorrelationTable
 from pisigma.joint_correction.joint_correction import JointCorrection
-from pisigma.judging.predicted_spread import WITHIN, PredictedSpread
-from pisigma.judging.validation_figures import LearningPoint
 from pisigma.measurement.dataset import Measurements
 from pisigma.reporting.figures import save_figure, set_margins
+from pisigma.validation.held_out.predicted_spread import WITHIN, PredictedSpread
+from pisigma.validation.held_out.validation_figures import LearningPoint
 
 _UNITS = {"position": ("mm", 1e3), "rotation": ("deg", float(np.rad2deg(1.0)))}
 JOINT_UNITS = {

@@ -6,21 +6,21 @@ import math
 from collections.abc import Sequence
 from pathlib import Path
 
-from pisigma.identification.identifiability.pairwise import CorrelationTable
-from pisigma.judging.calibration_summary import (
+from pisigma.calibration.geometric.identifiability.pairwise import CorrelationTable
+from pisigma.reporting.rendering import sentences
+from pisigma.reporting.tables import Table, figure_text
+from pisigma.validation.held_out.calibration_summary import (
     CalibrationSummary,
     HybridFigures,
     NoiseFigures,
     ParameterFigures,
     ScaleFigures,
 )
-from pisigma.judging.validation_figures import (
+from pisigma.validation.held_out.validation_figures import (
     AbstractValidationFigures,
     LearningPoint,
     ValidationFigures,
 )
-from pisigma.reporting.rendering import sentences
-from pisigma.reporting.tables import Table, figure_text
 
 PARAMETER_COLUMNS = ("parameter", "unit", "nominal", "estimated", "change", "std. error", "remark")
 TRIAL_COLUMNS = ("tried", "unknowns", "log evidence", "left-out error", "seconds", "kept")

@@ -4,16 +4,16 @@ import math
 from dataclasses import dataclass
 from pathlib import Path
 
+from pisigma.calibration.hybrid.result import HybridResult
 from pisigma.files import model_files
-from pisigma.hybrid.result import HybridResult
-from pisigma.judging.calibration_summary import CalibrationSummary
-from pisigma.judging.calibration_validation import CalibrationValidation
-from pisigma.judging.trained_calibrations import Result, geometric_result
-from pisigma.judging.training_summary import TrainingRun, TrainingSummary
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.reporting import calibration_tables as tables
 from pisigma.reporting.rendering import write_card
+from pisigma.validation.held_out.calibration_summary import CalibrationSummary
+from pisigma.validation.held_out.calibration_validation import CalibrationValidation
+from pisigma.validation.held_out.trained_calibrations import Result, geometric_result
+from pisigma.validation.held_out.training_summary import TrainingRun, TrainingSummary
 
 
 @dataclass(frozen=True)

@@ -2,8 +2,8 @@
 
 from collections.abc import Mapping, Sequence
 
-from pisigma.judging.model_comparison import Difference, Interval, ModelComparison, QuantityErrors
 from pisigma.reporting.tables import Table, figure_text
+from pisigma.validation.held_out.model_comparison import Difference, Interval, ModelComparison, QuantityErrors
 
 _SHOWN = {"rms": "RMS", "mean": "mean", "p95": "95 %", "max": "maximum"}
 _NONE = "-"

@@ -2,10 +2,10 @@
 
 from pathlib import Path
 
-from pisigma.judging.distillation_summary import DistillationSummary
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.reporting.rendering import write_card
 from pisigma.reporting.tables import Table, figure_text
+from pisigma.validation.held_out.distillation_summary import DistillationSummary
 
 _SIZES = ("orders", "harmonics", "unknowns per joint", "tool, RMS [mm]", "kept")
 _STATISTICS = (("mean", "mean"), ("rms", "RMS"), ("max", "max"))

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from pisigma.fleet.prior_summary import FleetPriorSummary
+from pisigma.lifetime.fleet.prior_summary import FleetPriorSummary
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.reporting.rendering import write_card
 from pisigma.reporting.tables import Table

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from pisigma.fleet.status import FleetStatus, RobotStatus
+from pisigma.lifetime.fleet.status import FleetStatus, RobotStatus
 from pisigma.reporting.tables import Table
 
 STATES = ("refused", "missing", "drifting", "overdue", "fine")

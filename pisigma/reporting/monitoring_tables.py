@@ -2,8 +2,8 @@
 
 from collections.abc import Sequence
 
-from pisigma.monitoring.charts import Chart
-from pisigma.monitoring.history import Record
+from pisigma.lifetime.monitoring.charts import Chart
+from pisigma.lifetime.monitoring.history import Record
 from pisigma.reporting.tables import Table
 
 

@@ -2,9 +2,9 @@
 
 from pathlib import Path
 
+from pisigma.lifetime.recalibration.summary import RecalibrationSummary
 from pisigma.model.calibrated_model import CalibratedModel
-from pisigma.recalibration.model_posterior import FLEET_PRIOR
-from pisigma.recalibration.summary import RecalibrationSummary
+from pisigma.model.model_posterior import FLEET_PRIOR
 from pisigma.reporting.rendering import write_card
 from pisigma.reporting.tables import Table, figure_text
 

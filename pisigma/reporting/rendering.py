@@ -6,6 +6,7 @@ from pathlib import Path
 import jinja2
 
 from pisigma.files.model_files import CARD
+from pisigma.files.templates import template_environment
 from pisigma.reporting.tables import (
     distance_table,
     figure_text,
@@ -14,7 +15,6 @@ from pisigma.reporting.tables import (
     percent_text,
     pose_table,
 )
-from pisigma.templates import template_environment
 
 
 def render(template: str, **content: object) -> str:

@@ -3,8 +3,8 @@
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
-from pisigma.judging.training_summary import JointFigures
-from pisigma.judging.validation_figures import ErrorFigures, SocketDistances
+from pisigma.validation.held_out.training_summary import JointFigures
+from pisigma.validation.held_out.validation_figures import ErrorFigures, SocketDistances
 
 _STATISTICS = ("average", "deviation", "maximum")
 _SHOWN = {"rms": "RMS", "p95": "95 %", "max": "maximum"}

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Float64
 
-from pisigma.errors import PoseError, RobotError
+from pisigma.files.errors import PoseError, RobotError
 from pisigma.robot.row import Row
 
 SLACK = 1e-9

@@ -6,10 +6,10 @@ from dataclasses import replace
 import numpy as np
 from pydantic import Field
 
-from pisigma.errors import RobotError, nearest_choice
+from pisigma.files.errors import RobotError, nearest_choice
+from pisigma.files.yaml_file import Section
 from pisigma.robot.coupling import Coupling, FourBar, hull
 from pisigma.robot.row import LARGEST, Bounded, Row
-from pisigma.yaml_file import Section
 
 
 class FourBarSection(Section):

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, get_args
 import numpy as np
 from jaxtyping import Float64
 
-from pisigma.errors import PoseError, RobotError, nearest_choice
+from pisigma.files.errors import PoseError, RobotError, nearest_choice
 from pisigma.robot.coupling import Coupling
 from pisigma.robot.robot_file import read_robot
 from pisigma.robot.row import LARGEST, MOST_ROWS, JointType, Row

@@ -3,7 +3,7 @@
 import numpy as np
 from jaxtyping import Float64
 
-from pisigma.errors import RobotError
+from pisigma.files.errors import RobotError
 from pisigma.robot.urdf_frames import frame_of, shift, turn, xyzrpy_of
 
 

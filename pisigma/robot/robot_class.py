@@ -24,7 +24,7 @@ HOBBY_MAKERS: Final = ("Trossen", "ROBOTIS", "Niryo", "AR4", "Elephant Robotics"
 class GeometricSizes:
     """One size for each kind of geometric parameter.
 
-    The order is that of `pisigma.identification.problem.prior_sizes.PriorGroup`.
+    The order is that of `pisigma.calibration.geometric.problem.prior_sizes.PriorGroup`.
 
     Attributes:
         joint_offset: of theta [rad].

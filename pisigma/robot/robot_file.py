@@ -9,12 +9,12 @@ import numpy as np
 from jaxtyping import Float64
 from pydantic import Field, model_validator
 
-from pisigma.errors import RobotError, UnknownRobotError, nearest_choice
+from pisigma.files.errors import RobotError, UnknownRobotError, nearest_choice
+from pisigma.files.yaml_file import Section, parse_yaml, read_yaml
 from pisigma.robot.coupling_section import CoupledJointSection, coupled
 from pisigma.robot.drawing import Drawing
 from pisigma.robot.modified_dh import from_modified
 from pisigma.robot.row import MOST_ROWS, Bounded, JointType, Row
-from pisigma.yaml_file import Section, parse_yaml, read_yaml
 
 Limits = Annotated[tuple[Bounded, Bounded], Field(description="lower and upper")]
 

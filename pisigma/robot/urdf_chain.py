@@ -12,7 +12,7 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float64
 
-from pisigma.errors import RobotError, nearest_choice, printable
+from pisigma.files.errors import RobotError, nearest_choice, printable
 from pisigma.files.input_file import read_input
 from pisigma.robot.row import LARGEST
 from pisigma.robot.urdf_frames import Frame, frame_of

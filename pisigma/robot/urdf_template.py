@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from pisigma.errors import RobotError
+from pisigma.files.errors import RobotError
 from pisigma.robot.description import Robot
 from pisigma.robot.drawing import Drawing
 from pisigma.robot.urdf_chain import Chain, origin_of, parse_xml, read_chain, read_urdf

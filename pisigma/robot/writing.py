@@ -8,12 +8,12 @@ from xml.etree import ElementTree
 import numpy as np
 from jaxtyping import Float64
 
-from pisigma.errors import OutputError, RobotError
+from pisigma.files.errors import OutputError, RobotError
+from pisigma.files.yaml_file import yaml_text
 from pisigma.robot.coupling_section import coupling_document
 from pisigma.robot.description import Robot
 from pisigma.robot.row import DH_COLUMNS, FRAME_COLUMNS, Row, in_file_units
 from pisigma.robot.urdf_frames import Frame, frame_of, row_frame, shift, turn, xyzrpy_of
-from pisigma.yaml_file import yaml_text
 
 
 def robot_to_yaml(robot: Robot) -> str:

@@ -5,16 +5,16 @@ from jaxtyping import Bool, Float64
 from pydantic import Field, model_validator
 from torch import Tensor
 
-from pisigma.errors import RecipeError, UnreachablePoseError, nearest_choice
-from pisigma.kinematics.closed_form import AbstractClosedForm, InverseSolutions, closed_form_solver
-from pisigma.kinematics.joint_limits import wrap_into_limits, wrapped_difference
-from pisigma.kinematics.numeric import solve_numeric
-from pisigma.kinematics.status import Status
+from pisigma.files.errors import RecipeError, UnreachablePoseError, nearest_choice
+from pisigma.files.yaml_file import Section
 from pisigma.robot.description import Robot
+from pisigma.robot.kinematics.closed_form import AbstractClosedForm, InverseSolutions, closed_form_solver
+from pisigma.robot.kinematics.joint_limits import wrap_into_limits, wrapped_difference
+from pisigma.robot.kinematics.numeric import solve_numeric
+from pisigma.robot.kinematics.status import Status
 from pisigma.simulation.errors.source import stated_joints
 from pisigma.simulation.poses import JointsRandom, WhereToMeasure
 from pisigma.simulation.true_robot import TrueRobot
-from pisigma.yaml_file import Section
 
 
 class BranchSection(Section):

@@ -7,14 +7,14 @@ from jaxtyping import Float64
 from pydantic import Field, field_validator, model_validator
 from torch import Tensor
 
-from pisigma.errors import RecipeError
+from pisigma.files.errors import RecipeError
+from pisigma.files.yaml_file import Count, Section, Seed
 from pisigma.measurement.dataset import Measurements
-from pisigma.se3 import transform
+from pisigma.robot.se3 import transform
 from pisigma.simulation.commanded import AbstractCommanded, BranchSection, joints_for_poses
 from pisigma.simulation.noise import SensorNoise, draw_noise, row_sigma
 from pisigma.simulation.poses import OrientationSection
 from pisigma.simulation.true_robot import TrueRobot
-from pisigma.yaml_file import Count, Section, Seed
 
 
 class SocketSection(Section):

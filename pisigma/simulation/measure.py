@@ -8,6 +8,7 @@ from jaxtyping import Float64
 from pydantic import Discriminator, Field, Tag
 from torch import Tensor
 
+from pisigma.files.yaml_file import Section
 from pisigma.measurement.dataset import Measurements, join
 from pisigma.simulation.camera.simulated_images import SimulatedImages
 from pisigma.simulation.commanded import AbstractCommanded
@@ -15,7 +16,6 @@ from pisigma.simulation.distances import SimulatedDistances, SimulatedPairs, Sim
 from pisigma.simulation.noise import MeasurementNoise
 from pisigma.simulation.touching import SimulatedTouches
 from pisigma.simulation.true_robot import TrueRobot
-from pisigma.yaml_file import Section
 
 
 class SimulatedMeasurements(AbstractCommanded):

@@ -7,8 +7,8 @@ from jaxtyping import Float64
 from pydantic import Field
 from torch import Tensor
 
-from pisigma.se3 import rotation_from_vector, transform
-from pisigma.yaml_file import Section, Seed
+from pisigma.files.yaml_file import Section, Seed
+from pisigma.robot.se3 import rotation_from_vector, transform
 
 
 class MeasurementNoise(Section):

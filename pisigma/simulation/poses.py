@@ -10,11 +10,11 @@ from jaxtyping import Float64
 from pydantic import Field, field_validator, model_validator
 from torch import Tensor
 
-from pisigma.errors import RecipeError
+from pisigma.files.errors import RecipeError
+from pisigma.files.yaml_file import MOST_POSES, Count, Section, Seed
 from pisigma.robot.description import Robot
-from pisigma.se3 import rotation_from_rpy, transform
+from pisigma.robot.se3 import rotation_from_rpy, transform
 from pisigma.simulation.errors.source import stated_joints
-from pisigma.yaml_file import MOST_POSES, Count, Section, Seed
 
 Triple = tuple[float, float, float]
 

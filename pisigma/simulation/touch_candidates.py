@@ -8,17 +8,17 @@ from jaxtyping import Bool, Float64, Int64
 from pydantic import Field
 from torch import Tensor
 
-from pisigma.errors import RecipeError
-from pisigma.kinematics.numeric import solve_numeric
-from pisigma.kinematics.singularity import singularity_measure
-from pisigma.kinematics.status import Status
+from pisigma.files.errors import RecipeError
+from pisigma.files.yaml_file import Count, Section, Seed
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.jig import Jig
 from pisigma.robot.description import Robot
+from pisigma.robot.kinematics.numeric import solve_numeric
+from pisigma.robot.kinematics.singularity import singularity_measure
+from pisigma.robot.kinematics.status import Status
 from pisigma.robot.robot_file import FrameSection
-from pisigma.se3 import invert, rotation_from_rpy, transform, transform_from_xyzrpy
+from pisigma.robot.se3 import invert, rotation_from_rpy, transform, transform_from_xyzrpy
 from pisigma.simulation.commanded import BranchSection
-from pisigma.yaml_file import Count, Section, Seed
 
 
 class JigPlacement(Section):

@@ -9,17 +9,17 @@ from jaxtyping import Bool, Float64
 from pydantic import Field
 from torch import Tensor
 
-from pisigma.errors import UnreachablePoseError
-from pisigma.kinematics.joint_limits import wrap_into_limits
-from pisigma.kinematics.numeric import solve_numeric
-from pisigma.kinematics.status import Status
+from pisigma.files.errors import UnreachablePoseError
+from pisigma.files.yaml_file import Section
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.fields import LeftOut
-from pisigma.se3 import invert, transform
+from pisigma.robot.kinematics.joint_limits import wrap_into_limits
+from pisigma.robot.kinematics.numeric import solve_numeric
+from pisigma.robot.kinematics.status import Status
+from pisigma.robot.se3 import invert, transform
 from pisigma.simulation.noise import NoiseDraws, SensorNoise, draw_noise, row_sigma
 from pisigma.simulation.touch_candidates import JigPlacement, TouchCandidates, TouchCandidatesSection
 from pisigma.simulation.true_robot import TrueRobot
-from pisigma.yaml_file import Section
 
 OnMiss = Literal["error", "leave_out"]
 

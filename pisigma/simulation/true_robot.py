@@ -9,11 +9,12 @@ import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
-from pisigma.errors import RecipeError, UnreachablePoseError
-from pisigma.kinematics.forward import forward_kinematics
-from pisigma.kinematics.numeric import solve_numeric
-from pisigma.kinematics.status import Status
+from pisigma.files.errors import RecipeError, UnreachablePoseError
+from pisigma.files.yaml_file import OneOf, Section
 from pisigma.robot.description import Robot
+from pisigma.robot.kinematics.forward import forward_kinematics
+from pisigma.robot.kinematics.numeric import solve_numeric
+from pisigma.robot.kinematics.status import Status
 from pisigma.simulation.errors.backlash import Backlash
 from pisigma.simulation.errors.coupling import CouplingDeviation
 from pisigma.simulation.errors.encoder import EncoderQuantisation
@@ -29,7 +30,6 @@ from pisigma.simulation.errors.source import (
     JointErrorFunction,
 )
 from pisigma.simulation.errors.transmission import TransmissionHarmonics
-from pisigma.yaml_file import OneOf, Section
 
 ERROR_SOURCES: dict[str, type[AbstractErrorSource]] = {
     "geometric": GeometricDeviation,

@@ -8,37 +8,37 @@ from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Literal, get_args
 
-from pisigma.camera.corner_file import CameraFiles, MeasurementFiles, read_rows
-from pisigma.errors import IdentificationError, MeasurementError, nearest_choice
+from pisigma.calibration.geometric.calibrator import GeometricCalibrator
+from pisigma.calibration.geometric.problem.parameters import Prior
+from pisigma.calibration.hybrid.calibrator import HybridCalibrator
+from pisigma.calibration.hybrid.result import HybridResult
+from pisigma.estimation.loss import HampelLoss, SquaredLoss
+from pisigma.files.errors import IdentificationError, MeasurementError, nearest_choice
 from pisigma.files.model_files import HELD_OUT_CSV
-from pisigma.hybrid.calibrator import HybridCalibrator
-from pisigma.hybrid.result import HybridResult
-from pisigma.identification.calibrator import GeometricCalibrator
-from pisigma.identification.problem.loss import HampelLoss, SquaredLoss
-from pisigma.identification.problem.parameters import Prior
+from pisigma.files.progress import Progress
 from pisigma.joint_correction.registry import features_from_outside
-from pisigma.judging.calibration_summary import CalibrationSummary, summarise
-from pisigma.judging.calibration_validation import CalibrationValidation, joined_repeats, judge
-from pisigma.judging.fit_beside_folds import fit_beside_folds
-from pisigma.judging.held_out_rows import HeldOutRows
-from pisigma.judging.predicted_spread import predicted_at_other_poses
-from pisigma.judging.progress import Progress
-from pisigma.judging.trained_calibrations import Calibrator, Result, geometric_of, trained
+from pisigma.measurement.camera.corner_file import CameraFiles, MeasurementFiles, read_rows
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.groups import groups_to_keep_whole
 from pisigma.measurement.joint_range import row_warnings, with_limits_of_rows
 from pisigma.measurement.new_frames import with_new_frames
+from pisigma.measurement.sensors.socket import matching_sockets
 from pisigma.measurement.splits import SplitBy, TrainTest, draw_rows, holdout, repeats, with_fewer
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.geometric_model import model_of_calibration, model_of_hybrid
 from pisigma.reporting.cards import CardTexts, write_calibration_card
 from pisigma.robot.description import Robot
 from pisigma.robot.robot_class import ClassName
-from pisigma.sensors.socket import matching_sockets
-from pisigma.verification.checks.check import CheckedCalibration
-from pisigma.verification.checks.registry import diagnostics_of
-from pisigma.verification.checks.scale import scale_figures
-from pisigma.verification.checks.setup_fault import explained, setup_diagnostics
+from pisigma.validation.checks.check import CheckedCalibration
+from pisigma.validation.checks.registry import diagnostics_of
+from pisigma.validation.checks.scale import scale_figures
+from pisigma.validation.checks.setup_fault import explained, setup_diagnostics
+from pisigma.validation.held_out.calibration_summary import CalibrationSummary, summarise
+from pisigma.validation.held_out.calibration_validation import CalibrationValidation, joined_repeats, judge
+from pisigma.validation.held_out.fit_beside_folds import fit_beside_folds
+from pisigma.validation.held_out.held_out_rows import HeldOutRows
+from pisigma.validation.held_out.predicted_spread import predicted_at_other_poses
+from pisigma.validation.held_out.trained_calibrations import Calibrator, Result, geometric_of, trained
 from pisigma.workflow.result import AbstractModelResult
 
 FOLDS = 5

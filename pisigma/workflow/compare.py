@@ -7,30 +7,30 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, get_args
 
-from pisigma.camera.corner_file import CameraFiles, MeasurementFiles, read_rows
-from pisigma.comparison.displacement import Displacement
-from pisigma.comparison.model_pair import FrameChoice, ModelPair
-from pisigma.comparison.parameter_differences import (
+from pisigma.files.errors import IdentificationError, nearest_choice
+from pisigma.files.model_files import model_hash
+from pisigma.files.output_file import check_page, write_whole
+from pisigma.lifetime.comparison.displacement import Displacement
+from pisigma.lifetime.comparison.model_pair import FrameChoice, ModelPair
+from pisigma.lifetime.comparison.parameter_differences import (
     LEVEL,
     ParameterDifference,
     ParameterDifferences,
     parameter_differences,
 )
-from pisigma.errors import IdentificationError, nearest_choice
-from pisigma.files.model_files import model_hash
-from pisigma.files.output_file import check_page, write_whole
-from pisigma.judging.bootstrap import Bootstrap
-from pisigma.judging.diagnostic import Diagnostic
-from pisigma.judging.frames.fitted_frames import fitted_kinds
-from pisigma.judging.model_comparison import Difference, ModelComparison, compare_models
+from pisigma.measurement.camera.corner_file import CameraFiles, MeasurementFiles, read_rows
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.joint_range import row_warnings
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.model_source import HoldsModel, ModelSource, model_or_folder
 from pisigma.model.training_rows import training_row_warnings
 from pisigma.planning.task import read_task
-from pisigma.verification.gate import check_rows
-from pisigma.verification.rows.wrong_rows import without_wrong_rows
+from pisigma.validation.checks.rows.wrong_rows import without_wrong_rows
+from pisigma.validation.gate import check_rows
+from pisigma.validation.held_out.bootstrap import Bootstrap
+from pisigma.validation.held_out.diagnostic import Diagnostic
+from pisigma.validation.held_out.frames.fitted_frames import fitted_kinds
+from pisigma.validation.held_out.model_comparison import Difference, ModelComparison, compare_models
 from pisigma.workflow.evaluate import (
     REFERENCES,
     labelled,
@@ -85,7 +85,7 @@ class ComparedModels:
         rows: errors of both models on the same rows; None where none were given.
         program: the same along a program that was taught with the first: what it misses under the second; None where
             none was given.
-        diagnostics: why nothing is to be concluded from the rows; see `pisigma.verification.gate`.
+        diagnostics: why nothing is to be concluded from the rows; see `pisigma.validation.gate`.
         warnings: what to heed, a sentence each.
         seconds: that it took [s].
     """

@@ -13,11 +13,22 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
-from pisigma.errors import IdentificationError, ModelError
+from pisigma.files.errors import IdentificationError, ModelError
 from pisigma.files.model_files import model_hash
-from pisigma.inverse.corrected_ik import CorrectedIK
+from pisigma.files.progress import Progress
 from pisigma.joint_correction.conditions import learned_conditions
-from pisigma.judging.distillation_summary import (
+from pisigma.model.calibrated_model import CalibratedModel, Provenance
+from pisigma.model.domain import Domain
+from pisigma.model.folder.model_folder import load_model
+from pisigma.model.inverse.corrected_ik import CorrectedIK
+from pisigma.model.stored_starts import spread_rows
+from pisigma.reporting.distilled_card import write_distilled_card
+from pisigma.robot.description import Robot
+from pisigma.robot.kinematics.closed_form import closed_form_solver
+from pisigma.robot.kinematics.status import Status
+from pisigma.robot.row import Row
+from pisigma.robot.se3 import pose_error
+from pisigma.validation.held_out.distillation_summary import (
     AbsoluteFigures,
     DistillationSummary,
     DistilledErrors,
@@ -28,19 +39,8 @@ from pisigma.judging.distillation_summary import (
     RegionFigures,
     SizeFigures,
 )
-from pisigma.judging.pose_statistics import PoseErrors
-from pisigma.judging.progress import Progress
-from pisigma.judging.validation_figures import ErrorFigures
-from pisigma.kinematics.closed_form import closed_form_solver
-from pisigma.kinematics.status import Status
-from pisigma.model.calibrated_model import CalibratedModel, Provenance
-from pisigma.model.domain import Domain
-from pisigma.model.folder.model_folder import load_model
-from pisigma.model.stored_starts import spread_rows
-from pisigma.reporting.distilled_card import write_distilled_card
-from pisigma.robot.description import Robot
-from pisigma.robot.row import Row
-from pisigma.se3 import pose_error
+from pisigma.validation.held_out.pose_statistics import PoseErrors
+from pisigma.validation.held_out.validation_figures import ErrorFigures
 from pisigma.workflow.distilled_network import Size, choose_network, sizes_for
 from pisigma.workflow.result import AbstractModelResult
 from pisigma.workflow.solved_poses import SINGULAR_BELOW, Region, SolvedPoses, draw_solved_poses

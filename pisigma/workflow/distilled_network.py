@@ -6,18 +6,18 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
-from pisigma.errors import IdentificationError
-from pisigma.judging.distillation_summary import SizeFigures
-from pisigma.judging.progress import Progress, stage
+from pisigma.files.errors import IdentificationError
+from pisigma.files.progress import Progress, stage
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.network.correction_network import CorrectionNetwork, JointGroup
 from pisigma.network.inputs import Inputs
+from pisigma.network.networks import fit_networks
+from pisigma.network.pairs import TrainingPairs
+from pisigma.network.patterns import build_network, build_patterns
 from pisigma.network.pi_sigma import PiSigma
+from pisigma.network.sections import LevenbergMarquardtSection, NetworkSection
 from pisigma.robot.description import Robot
-from pisigma.training.networks import fit_networks
-from pisigma.training.pairs import TrainingPairs
-from pisigma.training.patterns import build_network, build_patterns
-from pisigma.training.sections import LevenbergMarquardtSection, NetworkSection
+from pisigma.validation.held_out.distillation_summary import SizeFigures
 from pisigma.workflow.solved_poses import SolvedPoses
 
 VALIDATION_SHARE = 0.1

@@ -9,28 +9,28 @@ from pathlib import Path
 
 import torch
 
-from pisigma.camera.corner_file import CameraFiles, MeasurementFiles, read_rows
-from pisigma.errors import MeasurementError, ModelError
-from pisigma.judging.bootstrap import Bootstrap
-from pisigma.judging.diagnostic import Diagnostic
-from pisigma.judging.frames.fitted_frames import FrameKind, fitted_kinds, fitted_remark
-from pisigma.judging.frames.row_errors import places_remark
-from pisigma.judging.model_comparison import ModelComparison, ModelFigures, compare_models
-from pisigma.judging.predicted_spread import image_remark
-from pisigma.judging.reference_models import geometric_model, nominal_model
+from pisigma.files.errors import MeasurementError, ModelError
+from pisigma.measurement.camera.corner_file import CameraFiles, MeasurementFiles, read_rows
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.joint_range import row_warnings
+from pisigma.measurement.sensors.socket import matching_sockets
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.folder.model_folder import load_model
 from pisigma.model.model_source import HoldsModel, ModelSource, model_or_folder
 from pisigma.model.stated_conditions import condition_warnings
 from pisigma.model.training_rows import training_row_warnings
 from pisigma.reporting.tables import figure_text
-from pisigma.sensors.socket import matching_sockets
-from pisigma.verification.gate import check_rows
-from pisigma.verification.rows.other_sensors import missed_distances
-from pisigma.verification.rows.wrong_rows import without_wrong_rows
-from pisigma.verification.setup_faults import is_implausible, unexplained
+from pisigma.validation.checks.rows.other_sensors import missed_distances
+from pisigma.validation.checks.rows.wrong_rows import without_wrong_rows
+from pisigma.validation.gate import check_rows
+from pisigma.validation.held_out.bootstrap import Bootstrap
+from pisigma.validation.held_out.diagnostic import Diagnostic
+from pisigma.validation.held_out.frames.fitted_frames import FrameKind, fitted_kinds, fitted_remark
+from pisigma.validation.held_out.frames.row_errors import places_remark
+from pisigma.validation.held_out.model_comparison import ModelComparison, ModelFigures, compare_models
+from pisigma.validation.held_out.predicted_spread import image_remark
+from pisigma.validation.held_out.reference_models import geometric_model, nominal_model
+from pisigma.validation.setup_faults.setup_faults import is_implausible, unexplained
 
 REFERENCES = ("nominal", "geometric")
 """Names of what a model is compared with: the robot as drawn, and the geometry under a hybrid. Neither has to meet

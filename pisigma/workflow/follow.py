@@ -6,11 +6,11 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
-from pisigma.export.programs.languages import LANGUAGES, check_program
+from pisigma.deployment.export.programs.languages import LANGUAGES, check_program
 from pisigma.files.output_file import check_output
 from pisigma.measurement.growing_file import GrowingFile, Growth
-from pisigma.measuring.state import AccuracyPoint, Alarm, SessionState
 from pisigma.planning.plan_file import YAML_SUFFIX, yaml_of
+from pisigma.planning.session.state import AccuracyPoint, Alarm, SessionState
 from pisigma.robot.description import Robot
 from pisigma.workflow.measure import MeasuringSession
 

@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from pisigma.errors import MeasurementError
+from pisigma.files.errors import MeasurementError
 from pisigma.files.output_file import check_output, write_whole
 from pisigma.measurement.csv.reading import fields_of
 from pisigma.measurement.dataset import Measurements

@@ -14,24 +14,24 @@ import torch
 from jaxtyping import Bool, Int64
 from torch import Tensor
 
-from pisigma.errors import PlanningError
-from pisigma.export.programs.planned import planned_program
+from pisigma.deployment.export.programs.planned import planned_program
+from pisigma.files.errors import PlanningError
 from pisigma.files.output_file import write_whole
-from pisigma.judging.progress import Progress
+from pisigma.files.progress import Progress
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.fields import LeftOut
-from pisigma.measuring.coverage import coverage
-from pisigma.measuring.judged_rows import JudgedRows
-from pisigma.measuring.planned_again import FurtherPoses
-from pisigma.measuring.reached import Reached, cross_validated, expected, reached
-from pisigma.measuring.row_alarms import NEAR_POSE, joint_differences, of_all_rows
-from pisigma.measuring.setup_sentence import setup_sentence
-from pisigma.measuring.state import AccuracyPoint, Advice, Alarm, NextPose, RowsSoFar, SessionState
-from pisigma.measuring.stopping import advice
 from pisigma.planning.plan_file import StoredPlan, read_plan
+from pisigma.planning.session.coverage import coverage
+from pisigma.planning.session.judged_rows import JudgedRows
+from pisigma.planning.session.planned_again import FurtherPoses
+from pisigma.planning.session.reached import Reached, cross_validated, expected, reached
+from pisigma.planning.session.row_alarms import NEAR_POSE, joint_differences, of_all_rows
+from pisigma.planning.session.setup_sentence import setup_sentence
+from pisigma.planning.session.state import AccuracyPoint, Advice, Alarm, NextPose, RowsSoFar, SessionState
+from pisigma.planning.session.stopping import advice
 from pisigma.planning.subject import Subject
 from pisigma.planning.task import task_poses
-from pisigma.se3 import transform_from_xyzrpy
+from pisigma.robot.se3 import transform_from_xyzrpy
 
 STEP = 5
 """Poses between two points of the curve."""

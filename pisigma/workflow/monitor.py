@@ -10,29 +10,37 @@ from typing import Any
 
 import torch
 
-from pisigma.camera.corner_file import CameraFiles, read_rows
-from pisigma.errors import IdentificationError, MeasurementError, ModelError
+from pisigma.files.errors import IdentificationError, MeasurementError, ModelError
 from pisigma.files.model_files import model_hash
 from pisigma.files.output_file import check_page, write_whole
-from pisigma.judging.diagnostic import Diagnostic
-from pisigma.judging.progress import Progress
+from pisigma.files.progress import Progress
+from pisigma.lifetime.monitoring.charts import FALSE_ALARMS_PER_YEAR, SESSIONS_PER_YEAR, Chart
+from pisigma.lifetime.monitoring.history import Record, history_path, in_order, recall, remember
+from pisigma.lifetime.monitoring.rows_again import new_rows, rows_hash
+from pisigma.lifetime.monitoring.session import judge_session
+from pisigma.lifetime.monitoring.trends import (
+    Forecast,
+    Jump,
+    Trend,
+    charts_of,
+    forecast_of,
+    jumps_of,
+    trends_of,
+)
+from pisigma.lifetime.recalibration.motion import session_diagnostics
+from pisigma.lifetime.recalibration.recalibration_problem import owners_in
+from pisigma.measurement.camera.corner_file import CameraFiles, read_rows
 from pisigma.measurement.copies import RowValues
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.dates import WANTED, date_in_name, is_date
 from pisigma.measurement.joint_range import row_warnings
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.folder.model_folder import load_model
+from pisigma.model.model_posterior import FLEET_PRIOR, ModelPosterior
 from pisigma.model.model_source import HoldsModel, ModelSource, model_or_folder
 from pisigma.model.stated_conditions import condition_warnings
-from pisigma.monitoring.charts import FALSE_ALARMS_PER_YEAR, SESSIONS_PER_YEAR, Chart
-from pisigma.monitoring.history import Record, history_path, in_order, recall, remember
-from pisigma.monitoring.rows_again import new_rows, rows_hash
-from pisigma.monitoring.session import judge_session
-from pisigma.monitoring.trends import Forecast, Jump, Trend, charts_of, forecast_of, jumps_of, trends_of
-from pisigma.recalibration.model_posterior import FLEET_PRIOR, ModelPosterior
-from pisigma.recalibration.recalibration_problem import owners_in
-from pisigma.verification.gate import check_rows
-from pisigma.verification.motion import session_diagnostics
+from pisigma.validation.gate import check_rows
+from pisigma.validation.held_out.diagnostic import Diagnostic
 from pisigma.workflow.recalibrate import RecalibrationSettings
 
 FEWEST_ROWS = 5
@@ -164,8 +172,11 @@ class Monitoring:
             for chart in self.charts
             if chart.alarm is not None
         )
-        changes: tuple[Jump | Trend, ...] = (*self.jumps, *(one for one in self.trends if one.clear))
-        trends = (f"{one.sentence}." for one in changes)
+        changes: tuple[Jump | Trend, ...] = (
+            *self.jumps,
+            *(one for one in self.trends if one.clear),
+        )
+        moves = (f"{one.sentence}." for one in changes)
         forecast = () if self.forecast is None else (self.forecast.sentence,)
         advice: tuple[str, ...] = ()
         if (best := self.advised) is not None:
@@ -175,7 +186,7 @@ class Monitoring:
                 f"{best.session.rms * 1e3:.3f} to {best.session.rms_after * 1e3:.3f} mm; run "
                 f"`{command}`.",
             )
-        lines = (*(one.sentence for one in self.untrusted), *alarms, *trends, *forecast, *advice)
+        lines = (*(one.sentence for one in self.untrusted), *alarms, *moves, *forecast, *advice)
         return tuple(f"{line[:1].upper()}{line[1:]}" for line in lines)
 
     def to_json(self) -> dict[str, Any]:
@@ -184,32 +195,14 @@ class Monitoring:
             "seconds": round(self.seconds, 3),
             "model": self.model.name,
             "action": self.action,
-            "sessions": [_session_json(one) for one in self.sessions],
+            "sessions": [one.to_json() for one in self.sessions],
             "untrusted": [one.to_json() for one in self.untrusted],
-            "history": [_session_json(one) for one in self.records],
-            "charts": [_chart_json(one, self.records) for one in self.charts],
+            "history": [one.to_json() for one in self.records],
+            "charts": [one.to_json([record.date for record in self.records]) for one in self.charts],
             "false_alarms_per_year": FALSE_ALARMS_PER_YEAR,
             "sessions_per_year": SESSIONS_PER_YEAR,
-            "trends": [
-                {
-                    "what": one.what,
-                    f"{one.unit}_per_{one.over}": one.slope,
-                    "interval": list(one.interval),
-                    "clear": one.clear,
-                }
-                for one in self.trends
-            ],
-            "jumps": [
-                {
-                    "what": one.what,
-                    f"size_{one.unit}": one.size,
-                    f"deviation_{one.unit}": one.deviation,
-                    "before": one.before,
-                    "after": one.after,
-                    "alone": one.alone,
-                }
-                for one in self.jumps
-            ],
+            "trends": [one.to_json() for one in self.trends],
+            "jumps": [one.to_json() for one in self.jumps],
             "forecast": None if self.forecast is None else vars(self.forecast),
             "says": list(self.sentences),
             "warnings": list(self.warnings),
@@ -362,39 +355,3 @@ def _record(
     temperature = None if rows.temperature is None else float(rows.temperature.nanmean())
     values = RowValues.of(rows.as_fields(), model.robot)
     return Record(file, date, rows_hash(rows), temperature, session, zeros, values)
-
-
-def _session_json(record: Record) -> dict[str, Any]:
-    session = record.session
-    return {
-        "file": record.file,
-        "date": record.date,
-        "rows": session.rows,
-        "verdict": session.verdict,
-        "unchanged_probability": session.unchanged,
-        "moved": [one.to_json() for one in session.moved],
-        "candidates": [{"what": what, "probability": share} for what, share in session.candidates],
-        "unobservable": [f"joint {k}" for k, seen in enumerate(session.observable, 1) if not seen],
-        "remarks": list(session.unobservable),
-        "outliers": list(session.outliers),
-        "rms_mm": session.rms * 1e3,
-        "expected_gain_mm": session.gain * 1e3,
-        "recalibrate": session.recalibrate,
-    }
-
-
-def _chart_json(chart: Chart, records: Sequence[Record]) -> dict[str, Any]:
-    """A chart as plain values; what is no number is None."""
-    values = {
-        f"values_{chart.unit}": chart.values,
-        f"deviations_{chart.unit}": chart.deviations,
-        "scores": chart.scores,
-        "ewma_of_limit": chart.ewma_share,
-        "cusum_of_limit": chart.cusum_share,
-    }
-    return {
-        "what": chart.what,
-        **{name: [None if one != one else one for one in those.tolist()] for name, those in values.items()},
-        "limits": vars(chart.limits),
-        "alarm": None if chart.alarm is None else records[chart.alarm].date,
-    }

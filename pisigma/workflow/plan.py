@@ -12,12 +12,12 @@ import torch
 from jaxtyping import Float64, Int64
 from torch import Tensor
 
-from pisigma.errors import MeasurementError
-from pisigma.export.programs.languages import LANGUAGES, check_program
-from pisigma.export.programs.planned import planned_program
+from pisigma.deployment.export.programs.languages import LANGUAGES, check_program
+from pisigma.deployment.export.programs.planned import planned_program
 from pisigma.files.conflicts import Input
+from pisigma.files.errors import MeasurementError
 from pisigma.files.output_file import check_output, write_whole
-from pisigma.judging.progress import Progress
+from pisigma.files.progress import Progress
 from pisigma.measurement.joint_range import row_warnings
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.model_source import HoldsModel
@@ -25,21 +25,21 @@ from pisigma.model.training_rows import known_rows, training_row_warnings
 from pisigma.planning.board_views import BoardViews
 from pisigma.planning.camera_prospects import CameraProspects
 from pisigma.planning.candidates import Candidates, spread
-from pisigma.planning.cell.arm_in_cell import ArmInCell
-from pisigma.planning.cell.cell import Cell, read_cell
-from pisigma.planning.cell.motion import Motions
 from pisigma.planning.choice import choose
 from pisigma.planning.expected_accuracy import ExpectedAccuracy, RemainingError, curve, remaining_errors
 from pisigma.planning.knowledge import Knowledge
 from pisigma.planning.plan_file import StoredPlan, yaml_of
 from pisigma.planning.plan_settings import PlanSettings
 from pisigma.planning.subject import Subject
+from pisigma.planning.surroundings.arm_in_cell import ArmInCell
+from pisigma.planning.surroundings.cell import Cell, read_cell
+from pisigma.planning.surroundings.motion import Motions
 from pisigma.planning.task import task_poses
 from pisigma.planning.tour import Tour, order_of_use, stages_of, tour
 from pisigma.robot.description import Robot
-from pisigma.verification.checks.camera import view_warnings
-from pisigma.verification.gate import check_rows
-from pisigma.verification.rows.row_check import MOVES
+from pisigma.validation.checks.camera import view_warnings
+from pisigma.validation.checks.rows.row_check import MOVES
+from pisigma.validation.gate import check_rows
 
 STEP = 10
 """Poses between two points of the curve."""

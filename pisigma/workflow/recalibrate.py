@@ -12,50 +12,50 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
-from pisigma.camera.corner_file import CameraFiles, MeasurementFiles, read_rows
-from pisigma.errors import IdentificationError, ModelError, nearest_choice
+from pisigma.calibration.hybrid.calibrator import HybridCalibrator
+from pisigma.calibration.hybrid.result import HybridResult
+from pisigma.files.errors import IdentificationError, ModelError, nearest_choice
 from pisigma.files.model_files import model_hash
-from pisigma.hybrid.calibrator import HybridCalibrator
-from pisigma.hybrid.result import HybridResult
-from pisigma.judging.calibration_validation import errors_under
-from pisigma.judging.distillation_summary import ParentFigures
-from pisigma.judging.few_rows import fit_where_it_helps
-from pisigma.judging.frames.fitted_frames import FrameKind, fitted_kinds
-from pisigma.judging.progress import Progress, stage
-from pisigma.judging.trained_calibrations import fit
-from pisigma.measurement.dataset import Measurements
-from pisigma.measurement.joint_range import row_warnings
-from pisigma.model.calibrated_model import CalibratedModel
-from pisigma.model.folder.model_folder import load_model
-from pisigma.model.geometric_model import model_of_hybrid
-from pisigma.model.model_source import HoldsModel, ModelSource, model_or_folder
-from pisigma.model.stated_conditions import condition_warnings
-from pisigma.model.training_rows import without_known_rows
-from pisigma.model.wide_limits import with_wide_limits
-from pisigma.recalibration.adaptation import Adaptation, adapt
-from pisigma.recalibration.candidates import FAR_BETTER, Gate, gate
-from pisigma.recalibration.elsewhere import owners_elsewhere
-from pisigma.recalibration.model_posterior import FLEET_PRIOR, ModelPosterior, check_fleet_prior
-from pisigma.recalibration.moved import Moved, moved_by, what_moved
-from pisigma.recalibration.recalibrated_model import KIND, recalibrated_model
-from pisigma.recalibration.recalibration_problem import Owner, owners_in, recalibration_problem
-from pisigma.recalibration.summary import (
+from pisigma.files.progress import Progress, stage
+from pisigma.lifetime.recalibration.adaptation import Adaptation, adapt
+from pisigma.lifetime.recalibration.candidates import FAR_BETTER, Gate, gate
+from pisigma.lifetime.recalibration.elsewhere import owners_elsewhere
+from pisigma.lifetime.recalibration.moved import Moved, moved_by, what_moved
+from pisigma.lifetime.recalibration.recalibrated import recalibration_diagnostics
+from pisigma.lifetime.recalibration.recalibrated_model import KIND, recalibrated_model
+from pisigma.lifetime.recalibration.recalibration_problem import Owner, owners_in, recalibration_problem
+from pisigma.lifetime.recalibration.summary import (
     LeftOutFigures,
     MovedFigures,
     RecalibrationSummary,
     WrongRowFigures,
 )
+from pisigma.measurement.camera.corner_file import CameraFiles, MeasurementFiles, read_rows
+from pisigma.measurement.dataset import Measurements
+from pisigma.measurement.joint_range import row_warnings
+from pisigma.model.calibrated_model import CalibratedModel
+from pisigma.model.folder.model_folder import load_model
+from pisigma.model.geometric_model import model_of_hybrid
+from pisigma.model.model_posterior import FLEET_PRIOR, ModelPosterior, check_fleet_prior
+from pisigma.model.model_source import HoldsModel, ModelSource, model_or_folder
+from pisigma.model.stated_conditions import condition_warnings
+from pisigma.model.training_rows import without_known_rows
+from pisigma.model.wide_limits import with_wide_limits
 from pisigma.reporting.recalibration_card import write_recalibration_card
 from pisigma.robot.description import Robot
-from pisigma.verification.explanations import PLAUSIBLE_SHARE
-from pisigma.verification.gate import check_rows
-from pisigma.verification.recalibrated import recalibration_diagnostics
-from pisigma.verification.rows.row_check import MOVES, Move
-from pisigma.verification.rows.wrong_rows import WithoutWrongRows, without_wrong_rows
+from pisigma.validation.checks.rows.row_check import MOVES, Move
+from pisigma.validation.checks.rows.wrong_rows import WithoutWrongRows, without_wrong_rows
+from pisigma.validation.gate import check_rows
+from pisigma.validation.held_out.calibration_validation import errors_under
+from pisigma.validation.held_out.distillation_summary import ParentFigures
+from pisigma.validation.held_out.few_rows import fit_where_it_helps
+from pisigma.validation.held_out.frames.fitted_frames import FrameKind, fitted_kinds
+from pisigma.validation.held_out.trained_calibrations import fit
+from pisigma.validation.setup_faults.explanations import PLAUSIBLE_SHARE
 from pisigma.workflow.result import AbstractModelResult
 
 if TYPE_CHECKING:
-    from pisigma.fleet.likeness import Likeness
+    from pisigma.lifetime.fleet.likeness import Likeness
 
 FEW_ROWS = 5
 """Different poses below which nothing can be said of left-out rows."""
@@ -328,7 +328,7 @@ def _likeness(model: CalibratedModel, rows: Measurements) -> "Likeness | None":
     """How like its fleet the robot of some rows is; None where the model is not the prior of a fleet."""
     if model.kind != FLEET_PRIOR:
         return None
-    from pisigma.fleet.likeness import Likeness  # brings statistics that take half a second
+    from pisigma.lifetime.fleet.likeness import Likeness  # brings statistics that take half a second
 
     return Likeness.of(model, rows)
 

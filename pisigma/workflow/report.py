@@ -7,11 +7,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from pisigma.camera.corner_file import CameraFiles, MeasurementFiles, read_rows
 from pisigma.files.conflicts import Input
 from pisigma.files.output_file import check_output, write_whole
-from pisigma.judging.diagnostic import Diagnostic
-from pisigma.judging.progress import Progress
+from pisigma.files.progress import Progress
+from pisigma.measurement.camera.corner_file import CameraFiles, MeasurementFiles, read_rows
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.joint_range import limit_warnings
 from pisigma.model.calibrated_model import CalibratedModel
@@ -19,8 +18,9 @@ from pisigma.model.folder.model_folder import load_model
 from pisigma.reporting.page.content import ReportContent, report_content
 from pisigma.reporting.page.figures import ReportFigures, check_figures, draw_figures, write_figures
 from pisigma.reporting.page.page import render_page
-from pisigma.verification.gate import check_rows
-from pisigma.verification.rows.wrong_rows import without_wrong_rows
+from pisigma.validation.checks.rows.wrong_rows import without_wrong_rows
+from pisigma.validation.gate import check_rows
+from pisigma.validation.held_out.diagnostic import Diagnostic
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,7 +30,7 @@ class Report:
     Attributes:
         content: figures and sentences.
         figures: drawings of them.
-        diagnostics: why nothing is to be concluded from the rows; see `pisigma.verification.gate`.
+        diagnostics: why nothing is to be concluded from the rows; see `pisigma.validation.gate`.
         seconds: that it took.
     """
 

@@ -6,12 +6,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from pisigma.errors import AcceptanceError, printable
+from pisigma.files.errors import AcceptanceError, printable
 from pisigma.files.output_folder import staged_folder
-from pisigma.inverse.written_model import write_model
-from pisigma.judging.diagnostic import Diagnostic
-from pisigma.judging.summary import AbstractSummary
 from pisigma.model.calibrated_model import CalibratedModel
+from pisigma.model.inverse.written_model import write_model
+from pisigma.validation.held_out.diagnostic import Diagnostic
+from pisigma.validation.held_out.summary import AbstractSummary
 
 
 class AbstractModelResult(ABC):

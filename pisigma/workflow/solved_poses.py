@@ -6,16 +6,16 @@ import torch
 from jaxtyping import Float64, Int64
 from torch import Tensor
 
-from pisigma.errors import IdentificationError
-from pisigma.inverse.corrected_ik import CorrectedIK
-from pisigma.judging.progress import Progress
-from pisigma.kinematics.forward import forward_kinematics
-from pisigma.kinematics.joint_limits import wrapped_difference
-from pisigma.kinematics.singularity import singularity_measure
-from pisigma.kinematics.status import Status
-from pisigma.kinematics.tolerances import LIMIT_TOLERANCE
+from pisigma.files.errors import IdentificationError
+from pisigma.files.progress import Progress
+from pisigma.model.inverse.corrected_ik import CorrectedIK
 from pisigma.robot.description import Robot
-from pisigma.se3 import wrap_to_pi
+from pisigma.robot.kinematics.forward import forward_kinematics
+from pisigma.robot.kinematics.joint_limits import wrapped_difference
+from pisigma.robot.kinematics.singularity import singularity_measure
+from pisigma.robot.kinematics.status import Status
+from pisigma.robot.kinematics.tolerances import LIMIT_TOLERANCE
+from pisigma.robot.se3 import wrap_to_pi
 
 SINGULAR_BELOW = 0.05
 """Poses whose nominal `singularity_measure` is below this are not drawn: corrections are steep there."""

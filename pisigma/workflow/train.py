@@ -5,26 +5,26 @@ import time
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from pisigma.errors import RecipeError
-from pisigma.hybrid.mini_batches import MANY_ROWS
-from pisigma.judging.calibration_summary import summarise
-from pisigma.judging.calibration_validation import errors_under, judge, learning_curve, validate
-from pisigma.judging.pose_statistics import compare_on
-from pisigma.judging.progress import Progress, stage
-from pisigma.judging.training_summary import (
+from pisigma.calibration.hybrid.mini_batches import MANY_ROWS
+from pisigma.files.errors import RecipeError
+from pisigma.files.progress import Progress, stage
+from pisigma.measurement.dataset import Measurements
+from pisigma.model.calibrated_model import CalibratedModel
+from pisigma.reporting.cards import CardTexts, write_training_card
+from pisigma.validation.held_out.calibration_summary import summarise
+from pisigma.validation.held_out.calibration_validation import errors_under, judge, learning_curve, validate
+from pisigma.validation.held_out.pose_statistics import compare_on
+from pisigma.validation.held_out.training_summary import (
     ComparisonFigures,
     TrainingRun,
     TrainingSummary,
     summarise_training,
 )
-from pisigma.judging.validation_figures import ValidationFigures
-from pisigma.measurement.dataset import Measurements
-from pisigma.model.calibrated_model import CalibratedModel
-from pisigma.recipes.data import RecipeData, load_data
-from pisigma.recipes.reader import read_recipe, recipe_hash
-from pisigma.recipes.recipe import GeometricRecipe, HybridRecipe, InverseRecipe, Recipe
-from pisigma.reporting.cards import CardTexts, write_training_card
+from pisigma.validation.held_out.validation_figures import ValidationFigures
 from pisigma.workflow.calibrate import Calibration, compose
+from pisigma.workflow.recipes.data import RecipeData, load_data
+from pisigma.workflow.recipes.reader import read_recipe, recipe_hash
+from pisigma.workflow.recipes.recipe import GeometricRecipe, HybridRecipe, InverseRecipe, Recipe
 from pisigma.workflow.result import AbstractModelResult
 from pisigma.workflow.train_networks import DEFAULTS, TrainSettings, cross_validate, train_networks
 

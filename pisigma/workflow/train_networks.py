@@ -7,23 +7,23 @@ from pathlib import Path
 
 import torch
 
-from pisigma.errors import MeasurementError, RecipeError
-from pisigma.identification.initial_guess.base_and_tool import fit_base_and_tool
-from pisigma.judging.pose_statistics import Comparison, PoseErrors, compare_on
-from pisigma.judging.progress import Progress, silent
-from pisigma.judging.side_by_side import in_processes
-from pisigma.judging.training_summary import ComparisonFigures, JointErrors, TrainingRun
+from pisigma.calibration.geometric.initial_guess.base_and_tool import fit_base_and_tool
+from pisigma.files.errors import MeasurementError, RecipeError
+from pisigma.files.progress import Progress, silent
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.splits import groups_of_equal_joints
 from pisigma.model.calibrated_model import CalibratedModel, Provenance
 from pisigma.model.domain import Domain
 from pisigma.model.stored_starts import spread_rows
-from pisigma.recipes.data import RecipeData
-from pisigma.recipes.recipe import InverseRecipe, SimulatedData
+from pisigma.network.pairs import TrainingPairs, build_pairs
+from pisigma.network.patterns import build_network, build_patterns
+from pisigma.network.sections import LevenbergMarquardtSection
 from pisigma.robot.description import Robot
-from pisigma.training.pairs import TrainingPairs, build_pairs
-from pisigma.training.patterns import build_network, build_patterns
-from pisigma.training.sections import LevenbergMarquardtSection
+from pisigma.validation.held_out.pose_statistics import Comparison, PoseErrors, compare_on
+from pisigma.validation.held_out.side_by_side import in_processes
+from pisigma.validation.held_out.training_summary import ComparisonFigures, JointErrors, TrainingRun
+from pisigma.workflow.recipes.data import RecipeData
+from pisigma.workflow.recipes.recipe import InverseRecipe, SimulatedData
 
 
 @dataclass(frozen=True)
@@ -76,8 +76,8 @@ def train_networks(
     Raises:
         PisigmaError: the data or the recipe do not allow it; the message says what to do.
     """
-    from pisigma.training.networks import fit_networks  # imports lightning, which takes seconds
-    from pisigma.training.trainer import Checkpoints
+    from pisigma.network.networks import fit_networks  # imports lightning, which takes seconds
+    from pisigma.network.trainer import Checkpoints
 
     robot, measurements = data.robot, data.training
     if data.folds is not None:

@@ -8,31 +8,31 @@ from typing import Literal
 
 import numpy as np
 
-from pisigma.camera.corner_file import CameraFiles, MeasurementFiles, read_rows
-from pisigma.judging.bootstrap import Bootstrap
-from pisigma.judging.diagnostic import Diagnostic
-from pisigma.judging.frames.fitted_frames import FrameKind, fitted_kinds, fitted_remark
-from pisigma.judging.frames.row_errors import places_remark
-from pisigma.judging.model_comparison import Difference, ModelComparison, compare_models
-from pisigma.judging.predicted_spread import image_remark
-from pisigma.judging.reference_models import geometric_model, nominal_model
+from pisigma.lifetime.monitoring.session import Session
+from pisigma.lifetime.recalibration.motion import judged_motion, motion_sentence, motion_warnings
+from pisigma.measurement.camera.corner_file import CameraFiles, MeasurementFiles, read_rows
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.joint_range import row_warnings
+from pisigma.measurement.sensors.socket import matching_sockets
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.folder.model_folder import load_model
 from pisigma.model.model_source import HoldsModel, ModelSource, model_or_folder
 from pisigma.model.stated_conditions import condition_warnings
 from pisigma.model.training_rows import training_row_warnings
-from pisigma.monitoring.session import Session
 from pisigma.robot.row import Row
-from pisigma.sensors.socket import matching_sockets
-from pisigma.verification.cause import length_text
-from pisigma.verification.gate import check_rows
-from pisigma.verification.motion import judged_motion, motion_sentence, motion_warnings
-from pisigma.verification.rows.other_sensors import missed_distances
-from pisigma.verification.rows.wrong_rows import without_wrong_rows
-from pisigma.verification.setup_fault import SetupFault
-from pisigma.verification.setup_faults import is_implausible, unexplained
+from pisigma.validation.checks.rows.other_sensors import missed_distances
+from pisigma.validation.checks.rows.wrong_rows import without_wrong_rows
+from pisigma.validation.gate import check_rows
+from pisigma.validation.held_out.bootstrap import Bootstrap
+from pisigma.validation.held_out.diagnostic import Diagnostic
+from pisigma.validation.held_out.frames.fitted_frames import FrameKind, fitted_kinds, fitted_remark
+from pisigma.validation.held_out.frames.row_errors import places_remark
+from pisigma.validation.held_out.model_comparison import Difference, ModelComparison, compare_models
+from pisigma.validation.held_out.predicted_spread import image_remark
+from pisigma.validation.held_out.reference_models import geometric_model, nominal_model
+from pisigma.validation.setup_faults.cause import length_text
+from pisigma.validation.setup_faults.setup_fault import SetupFault
+from pisigma.validation.setup_faults.setup_faults import is_implausible, unexplained
 from pisigma.workflow.evaluate import test_rows
 from pisigma.workflow.recalibrate import RecalibrationSettings
 
@@ -104,7 +104,7 @@ class Verification:
         ratio: mean position error of the corrected model over that of the nominal robot; NaN where that is 0.
         better_share: share of the configurations in which the corrected model is nearer.
         comparison: figures of "nominal", "geometric" (of a hybrid) and "corrected".
-        diagnostics: why nothing is to be concluded from the rows, see `pisigma.verification.gate`.
+        diagnostics: why nothing is to be concluded from the rows, see `pisigma.validation.gate`.
         setup_faults: what explains large errors; nothing where `motion` explains them.
         motion: what has moved since the model was made; None where the model or the rows do not say.
         recalibration: the command that brings the model up to date; empty where that does not pay.

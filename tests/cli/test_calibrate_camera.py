@@ -12,8 +12,8 @@ from click.testing import Result
 from testing.camera_cell import BOARD, CAMERA, aligned_error, camera_cell, corner_lines
 from testing.closeness import assert_close
 
-from pisigma.kinematics.forward import forward_kinematics
 from pisigma.model.folder.model_folder import load_model
+from pisigma.robot.kinematics.forward import forward_kinematics
 
 
 @pytest.fixture(scope="module")

@@ -12,10 +12,10 @@ from testing.models import no_type_checker
 from testing.simulated_arm import simulate
 
 import pisigma
-from pisigma.kinematics.status import Status
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.folder.model_folder import load_model
 from pisigma.robot import Robot
+from pisigma.robot.kinematics.status import Status
 
 POSITION = {"rms_mm", "mean_mm", "p95_mm", "max_mm"}
 POSE = POSITION | {name.replace("mm", "deg") for name in POSITION}
@@ -217,7 +217,7 @@ def targets(poses):
     with no_type_checker():
         T = pisigma.Robot.load("kiro4")
         model = poses.true
-    from pisigma.kinematics.forward import forward_kinematics
+    from pisigma.robot.kinematics.forward import forward_kinematics
 
     names = ("A", "B", "C") * 90
     frames = tuple("left" if row // 9 % 2 else "right" for row in range(270))

@@ -11,7 +11,7 @@ from testing.models import no_type_checker
 from testing.simulated_arm import simulate
 
 import pisigma
-from pisigma.hybrid.calibrator import HybridCalibrator
+from pisigma.calibration.hybrid.calibrator import HybridCalibrator
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.folder.model_folder import load_model
 

@@ -12,10 +12,10 @@ from testing.models import no_type_checker
 from testing.simulated_arm import dh_errors, draw_joints
 from testing.urdf import peer_poses
 
-from pisigma.kinematics.forward import forward_kinematics
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.folder.model_folder import load_model
 from pisigma.robot import Robot
+from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.robot.writing import robot_to_urdf
 
 

@@ -7,7 +7,7 @@ from testing.identified import geometric_model
 from testing.models import hand_made_model
 
 import pisigma
-from pisigma.export.onnx_model import INVERSE
+from pisigma.deployment.export.onnx_model import INVERSE
 from pisigma.model.folder.model_folder import save_model
 
 SMALL = ("--poses", 200, "--orders", "1,2")

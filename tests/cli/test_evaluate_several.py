@@ -8,10 +8,10 @@ from testing.closeness import assert_close
 from testing.hybrid import hybrid_of, joints_in
 from testing.models import no_type_checker
 
-from pisigma.judging.reference_models import geometric_model
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.folder.model_folder import load_model, save_model
 from pisigma.model.geometric_model import model_of_hybrid
+from pisigma.validation.held_out.reference_models import geometric_model
 
 FIGURES = ("rms_mm", "mean_mm", "p95_mm", "max_mm", "intervals", "axes")
 

@@ -13,11 +13,11 @@ from testing.models import joints_around
 from testing.urdf import peer_poses
 
 from pisigma.files.output_folder import staged_folder
-from pisigma.kinematics.forward import forward_kinematics
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.folder.model_folder import load_model, save_model
 from pisigma.robot import Robot
+from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.robot.writing import robot_to_urdf
 
 NOT_TOLD = "The learned joint correction of the model is not in this file"

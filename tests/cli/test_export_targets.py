@@ -12,12 +12,12 @@ from testing.program_readers import READERS
 
 from pisigma.joint_correction.conditions import ConditionFeatures
 from pisigma.joint_correction.fourier_series import FourierSeries
-from pisigma.kinematics.forward import forward_kinematics
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.folder.model_folder import load_model, save_model
 from pisigma.model.row_poses import poses_of_rows
 from pisigma.robot import Robot
-from pisigma.se3 import xyzrpy_from_transform
+from pisigma.robot.kinematics.forward import forward_kinematics
+from pisigma.robot.se3 import xyzrpy_from_transform
 
 COLUMNS = ("x_mm", "y_mm", "z_mm", "roll_deg", "pitch_deg", "yaw_deg")
 FAR = (9000.0, 0.0, 0.0, 0.0, 0.0, 0.0)

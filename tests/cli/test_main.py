@@ -224,7 +224,7 @@ def test_the_inverse_imports_no_lightning_and_no_matplotlib(models):
         "import sys\nfrom pisigma.cli.main import run\n"
         f"sys.argv = ['pisigma', 'ik', {str(models / 'kiro3')!r}, '--pose', '300', '300', '300', '0', '0', "
         "'0', '--json']\ntry:\n    run()\nexcept SystemExit as end:\n    assert not end.code, end.code\n"
-        "heavy = ('lightning', 'matplotlib', 'scipy', 'pisigma.training')\n"
+        "heavy = ('lightning', 'matplotlib', 'scipy', 'pisigma.network')\n"
         "print([name for name in heavy if name in sys.modules], file=sys.stderr)\n"
     )
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)

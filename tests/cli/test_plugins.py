@@ -10,17 +10,17 @@ from testing.engine_work import PicklingEngine
 from testing.models import hand_made_model, no_type_checker
 from testing.simulated_arm import simulate
 
-from pisigma import plugins
-from pisigma.errors import PluginError
-from pisigma.export import registry as exports
+from pisigma.deployment.export import registry as exports
+from pisigma.files import plugins
+from pisigma.files.errors import PluginError
 from pisigma.joint_correction.registry import FEATURES
-from pisigma.kinematics.closed_form.registry import CLOSED_FORMS
-from pisigma.kinematics.forward import forward_kinematics
 from pisigma.measurement import join
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.readings import READINGS
+from pisigma.measurement.sensors.registry import SENSORS
 from pisigma.model.folder.model_folder import save_model
-from pisigma.sensors.registry import SENSORS
+from pisigma.robot.kinematics.closed_form.registry import CLOSED_FORMS
+from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.simulation.true_robot import ERROR_SOURCES
 
 HOW_TO = Path(__file__).parents[2] / "docs" / "how-to"
@@ -141,12 +141,12 @@ def test_an_installed_package_is_loaded_by_every_command(run, example, tmp_path,
     folder = tmp_path / "limits_of_joints-1.0.dist-info"
     folder.mkdir()
     (folder / "METADATA").write_text("Metadata-Version: 2.1\nName: limits-of-joints\nVersion: 1.0\n")
-    (folder / "entry_points.txt").write_text("[pisigma.plugins]\nlimits = limits_of_joints\n")
+    (folder / "entry_points.txt").write_text("[pisigma.files.plugins]\nlimits = limits_of_joints\n")
     monkeypatch.syspath_prepend(tmp_path)
     assert run("robots").exit_code == 0
     assert "limits" in exports.export_names()
     monkeypatch.setattr(plugins, "_loaded", plugins.Plugins())
-    (folder / "entry_points.txt").write_text("[pisigma.plugins]\nlimits = limits_of_nothing\n")
+    (folder / "entry_points.txt").write_text("[pisigma.files.plugins]\nlimits = limits_of_nothing\n")
     result = run("robots")
     assert (result.exit_code, result.stdout) == (2, "")
     assert "plug-in 'limits' of limits-of-joints" in result.stderr

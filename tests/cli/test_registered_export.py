@@ -5,10 +5,10 @@ import json
 import pytest
 
 from pisigma.cli.arguments import complete_export, complete_model, complete_robot
-from pisigma.errors import OutputError
-from pisigma.export import registry
-from pisigma.export.export_format import Exported, ExportFormat, ExportRequest, model_facts
-from pisigma.export.registry import export_names, register_export
+from pisigma.deployment.export import registry
+from pisigma.deployment.export.export_format import Exported, ExportFormat, ExportRequest, model_facts
+from pisigma.deployment.export.registry import export_names, register_export
+from pisigma.files.errors import OutputError
 
 
 def write_limits(request: ExportRequest) -> Exported:

@@ -7,9 +7,9 @@ from testing.closeness import assert_close
 from testing.coupled import COUPLED, coupled_robot
 from testing.identified import geometric_model
 
-from pisigma.kinematics.forward import forward_kinematics
 from pisigma.model.folder.model_folder import save_model
 from pisigma.robot import Robot
+from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.robot.writing import robot_to_urdf
 
 TWO_ENDS = """<link name="camera"/>

@@ -8,10 +8,10 @@ import torch
 from testing.closeness import assert_close
 from testing.models import hand_made_model
 
-from pisigma.judging.pose_statistics import compare_on
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.folder.model_folder import load_model, save_model
 from pisigma.robot import Robot
+from pisigma.validation.held_out.pose_statistics import compare_on
 
 
 @pytest.fixture(scope="module")

@@ -5,8 +5,8 @@ from pathlib import Path
 
 from testing.closeness import assert_close
 
-from pisigma.camera.board import Board
-from pisigma.camera.camera import Camera
+from pisigma.measurement.camera.board import Board
+from pisigma.measurement.camera.camera import Camera
 
 
 def test_images_of_a_recipe_are_written_with_what_a_cell_states(run, tmp_path: Path, repository: Path):

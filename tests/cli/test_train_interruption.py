@@ -10,14 +10,14 @@ from pathlib import Path
 
 from testing.closeness import assert_close
 
-from pisigma.recipes.data import load_data
-from pisigma.recipes.reader import read_recipe
+from pisigma.workflow.recipes.data import load_data
+from pisigma.workflow.recipes.reader import read_recipe
 from pisigma.workflow.train_networks import TrainSettings, train_networks
 
 # Slow enough to be caught in the middle: every epoch waits, the last ones for long, which changes no number.
 SLOW = """
 import sys, time
-from pisigma.training.networks import NetworkTraining
+from pisigma.network.networks import NetworkTraining
 step = NetworkTraining.training_step
 def slow(self, batch, batch_idx):
     time.sleep(WAIT if int(self.epochs_done) < 40 else 100 * WAIT)

@@ -7,8 +7,8 @@ import pytest
 import torch
 from testing.models import hand_made_model, joints_around, no_type_checker
 
-from pisigma.kinematics.forward import forward_kinematics
 from pisigma.measurement.dataset import Measurements
+from pisigma.robot.kinematics.forward import forward_kinematics
 
 
 @pytest.fixture(scope="module")

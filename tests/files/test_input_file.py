@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from pisigma.errors import MeasurementError, RecipeError
 from pisigma.files import input_file
+from pisigma.files.errors import MeasurementError, RecipeError
 from pisigma.files.input_file import read_input, read_text
 
 

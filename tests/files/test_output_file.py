@@ -4,7 +4,7 @@ import os
 
 import pytest
 
-from pisigma.errors import OutputError
+from pisigma.files.errors import OutputError
 from pisigma.files.output_file import check_output, write_whole
 
 

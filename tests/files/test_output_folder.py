@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from testing.models import hand_made_model
 
-from pisigma.errors import OutputError
+from pisigma.files.errors import OutputError
 from pisigma.files.output_folder import check_folder, staged_folder
 from pisigma.model.folder.model_folder import load_model, save_model
 

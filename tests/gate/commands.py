@@ -9,9 +9,9 @@ from testing.aged import model_before
 from testing.measured_plans import measured_plan
 from testing.models import no_type_checker
 
-from pisigma.errors import PisigmaError
-from pisigma.fleet.members import Member, SessionFile
-from pisigma.fleet.record import REFUSED
+from pisigma.files.errors import PisigmaError
+from pisigma.lifetime.fleet.members import Member, SessionFile
+from pisigma.lifetime.fleet.record import REFUSED
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.folder.model_folder import save_model
 from pisigma.planning.plan_settings import PlanSettings

@@ -15,14 +15,14 @@ from testing.simulated_arm import simulate
 from typer.main import get_command
 
 from pisigma.cli.main import app
-from pisigma.export.programs.text import metres_and_rotation_vector, millimetres_and_euler, numbers
-from pisigma.export.rewriting.frame_file import FrameFile
-from pisigma.kinematics.forward import forward_kinematics
+from pisigma.deployment.export.programs.text import metres_and_rotation_vector, millimetres_and_euler, numbers
+from pisigma.deployment.export.rewriting.frame_file import FrameFile
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.folder.model_folder import save_model
 from pisigma.planning.plan_file import read_plan
 from pisigma.robot import Robot
-from pisigma.se3 import xyzrpy_from_transform
+from pisigma.robot.kinematics.forward import forward_kinematics
+from pisigma.robot.se3 import xyzrpy_from_transform
 
 Maker = Callable[[Path, Path], None]
 """Makes a file or folder, from the folder of small inputs."""

@@ -15,14 +15,14 @@ from testing.models import hand_made_model, joints_around, no_type_checker
 from testing.simulated_arm import simulate
 from testing.urdf import DrawnJoint, urdf_text
 
-from pisigma.camera.board import Board
 from pisigma.joint_correction.conditions import ConditionFeatures
 from pisigma.joint_correction.fourier_series import FourierSeries
-from pisigma.kinematics.forward import forward_kinematics
+from pisigma.measurement.camera.board import Board
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.folder.model_folder import save_model
 from pisigma.robot import Robot
-from pisigma.se3 import xyzrpy_from_transform
+from pisigma.robot.kinematics.forward import forward_kinematics
+from pisigma.robot.se3 import xyzrpy_from_transform
 
 REPOSITORY = Path(__file__).parents[2]
 
@@ -110,8 +110,8 @@ def _sockets(folder: Path) -> None:
     robot = Robot.load("ur5")
     arm = simulate("ur5", rows=1, length=3e-4, angle=5e-4)
     rng, lines = np.random.default_rng(1), []
-    from pisigma.kinematics.numeric import solve_numeric
-    from pisigma.se3 import rotation_from_rpy, transform
+    from pisigma.robot.kinematics.numeric import solve_numeric
+    from pisigma.robot.se3 import rotation_from_rpy, transform
 
     tool = arm.true.with_geometry(arm.true.dh, base=np.zeros(6), tool=np.array([0.06, -0.04, 0.13, 0, 0, 0]))
     for place, corner in (("a", (0.45, 0.1, 0.3)), ("b", (0.1, 0.5, 0.2)), ("c", (-0.4, 0.2, 0.4))):

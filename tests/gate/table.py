@@ -9,10 +9,10 @@ import torch
 from testing.aged import model_before, rows_later
 from testing.simulated_arm import dh_errors
 
-from pisigma.kinematics.forward import forward_kinematics
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.row_poses import poses_of_rows
 from pisigma.robot import Robot
+from pisigma.robot.kinematics.forward import forward_kinematics
 
 Change = Callable[[Measurements], Measurements]
 ROWS = 16

@@ -9,8 +9,8 @@ from gate.commands import COMMANDS
 from gate.table import MISTAKES, MOVES, Mistake, right_rows
 from testing.aged import model_before
 
-from pisigma.verification.gate import check_rows
-from pisigma.verification.rows import row_check
+from pisigma.validation.checks.rows import row_check
+from pisigma.validation.gate import check_rows
 
 pytestmark = pytest.mark.usefixtures("without_type_checker")
 

@@ -20,9 +20,9 @@ import numpy as np
 from hostile.kills import contents, start
 from testing.aged import model_before, rows_later
 
+from pisigma.lifetime.monitoring.history import history_path
 from pisigma.model.folder.model_folder import load_model, save_model
-from pisigma.monitoring.history import history_path
-from pisigma.recalibration.model_posterior import ModelPosterior
+from pisigma.model.model_posterior import ModelPosterior
 
 SECONDS = 6.0
 """Of a command, to begin with."""

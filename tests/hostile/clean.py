@@ -14,13 +14,13 @@ from testing.outside_arm import SIMULATOR, sample_joints, simulator
 from testing.sensors import joints, mixed_data, true_robot
 from testing.simulated_arm import simulate
 
-from pisigma.kernels.machine_code import load_kernels
-from pisigma.kinematics.forward import forward_kinematics
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.folder.model_folder import save_model
 from pisigma.model.row_poses import poses_of_rows
 from pisigma.robot import Robot
+from pisigma.robot.kernels.machine_code import load_kernels
+from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.robot.writing import robot_to_urdf, robot_to_yaml
 
 DATA = Path(os.environ.get("PISIGMA_DATA", REPOSITORY / ".." / "shared" / "data")).resolve()

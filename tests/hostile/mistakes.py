@@ -20,11 +20,11 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from pisigma.errors import PisigmaError
-from pisigma.identification.calibrator import GeometricCalibrator
-from pisigma.kinematics.forward import forward_kinematics
+from pisigma.calibration.geometric.calibrator import GeometricCalibrator
+from pisigma.files.errors import PisigmaError
 from pisigma.measurement.dataset import Measurements
 from pisigma.robot.description import Robot
+from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.workflow.calibrate import CalibrationSettings, calibrate
 
 Change = Callable[[Measurements, Robot], Measurements]

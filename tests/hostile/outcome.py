@@ -21,8 +21,8 @@ from hostile.clean import CleanRows
 from testing.models import no_type_checker
 from typer.main import get_command
 
+from pisigma.calibration.geometric.initial_guess.base_and_tool import fit_base_and_tool
 from pisigma.cli.main import app
-from pisigma.identification.initial_guess.base_and_tool import fit_base_and_tool
 from pisigma.measurement.dataset import Measurements
 from pisigma.robot import Robot
 from pisigma.workflow.calibrate import Calibration

@@ -14,8 +14,8 @@ import time
 
 import numpy as np
 
-from pisigma.inverse.corrected_ik import CorrectedIK
-from pisigma.kernels.array_kinematics import transform_of, xyzrpy_of
+from pisigma.model.inverse.corrected_ik import CorrectedIK
+from pisigma.robot.kernels.array_kinematics import transform_of, xyzrpy_of
 
 REQUEST, ANSWER, HEAD = struct.Struct("<4sIQII16d8d"), struct.Struct("<4sIQII8d2d"), struct.Struct("<4sIQII")
 PROTOCOLS = ("json", "binary")

@@ -3,7 +3,7 @@
 from hostile.fleet_kills import BAD, faults_of, write_plant
 from testing.models import no_type_checker
 
-from pisigma.fleet.members import read_fleet
+from pisigma.lifetime.fleet.members import read_fleet
 from pisigma.workflow.calibrate import CalibrationSettings
 from pisigma.workflow.fleet.one_robot import FleetSettings, work_out
 

@@ -10,7 +10,7 @@ from hostile.mistakes import POSES, POSITIONS, SETS, Mistake, answer, clean_rows
 
 from pisigma.measurement.dataset import Measurements
 from pisigma.robot import Robot
-from pisigma.verification.faults_as_drawn import find_faults_as_drawn
+from pisigma.validation.setup_faults.faults_as_drawn import find_faults_as_drawn
 
 pytestmark = pytest.mark.usefixtures("without_type_checker")
 

@@ -6,8 +6,8 @@ from testing.closeness import assert_close
 from testing.coupled import COUPLED, PALLETISER, coupled_robot
 
 import pisigma
-from pisigma.errors import RecipeError
-from pisigma.hybrid.calibrator import HybridCalibrator
+from pisigma.calibration.hybrid.calibrator import HybridCalibrator
+from pisigma.files.errors import RecipeError
 from pisigma.joint_correction.coupled_series import CoupledSeries
 from pisigma.joint_correction.feature import FeatureOptions
 from pisigma.measurement.conditions import JointState

@@ -22,10 +22,10 @@ from pisigma.joint_correction.gravity_torques import GravityTorques
 from pisigma.joint_correction.joint_correction import JointCorrection
 from pisigma.joint_correction.registry import FEATURES, feature_from, feature_section
 from pisigma.joint_correction.shared_features import NominalPose, ScaledJoints, SinesCosines
-from pisigma.kinematics.forward import forward_kinematics
 from pisigma.measurement.conditions import APPROACH, JointState
 from pisigma.robot import Robot, Row
-from pisigma.se3 import rpy_from_rotation
+from pisigma.robot.kinematics.forward import forward_kinematics
+from pisigma.robot.se3 import rpy_from_rotation
 from pisigma.simulation.errors.joint_compliance import LinkMass, gravity_load
 
 GRAVITY = (1.0, -2.0, -9.0)

@@ -10,20 +10,20 @@ from testing.closeness import assert_close
 from testing.models import no_type_checker
 
 import pisigma
-from pisigma.errors import ModelError
-from pisigma.export.onnx_model import export_onnx
-from pisigma.hybrid.calibrator import HybridCalibrator
+from pisigma.calibration.hybrid.calibrator import HybridCalibrator
+from pisigma.deployment.export.onnx_model import export_onnx
+from pisigma.files.errors import ModelError
 from pisigma.joint_correction.feature import AbstractFeature
+from pisigma.joint_correction.onnx_graph import OnnxGraph
 from pisigma.joint_correction.registry import FEATURES, register_feature
-from pisigma.kernels.forms import FORMS, CompiledForm
-from pisigma.kinematics.forward import forward_kinematics
 from pisigma.measurement.conditions import JointState
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.folder.model_folder import load_model, save_model
 from pisigma.model.geometric_model import model_of_hybrid
-from pisigma.onnx.graph import OnnxGraph
 from pisigma.robot import Robot
+from pisigma.robot.kernels.forms import FORMS, CompiledForm
+from pisigma.robot.kinematics.forward import forward_kinematics
 
 ROBOT = Robot.load("rb5")
 SIZE = 4e-4

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from pisigma.camera.corner_file import read_rows
+from pisigma.measurement.camera.corner_file import read_rows
 from pisigma.measurement.copies import CopiedRow, without_copies
 from pisigma.measurement.dataset import Measurements, join
 from pisigma.measurement.joint_range import row_warnings

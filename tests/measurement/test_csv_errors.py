@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from pisigma.errors import MeasurementError
+from pisigma.files.errors import MeasurementError
 from pisigma.measurement import Measurements
 from pisigma.robot import Robot
 

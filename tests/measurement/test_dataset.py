@@ -6,10 +6,10 @@ import pytest
 import torch
 from testing.closeness import assert_close
 
-from pisigma.errors import MeasurementError
+from pisigma.files.errors import MeasurementError
 from pisigma.measurement import LeftOut, Measurements
 from pisigma.measurement.dataset import join
-from pisigma.se3 import rotation_from_quaternion
+from pisigma.robot.se3 import rotation_from_quaternion
 
 
 def make_measurements(rows: int = 4, dof: int = 3, seed: int = 0) -> Measurements:

@@ -4,8 +4,8 @@ import datetime
 
 import pytest
 
-from pisigma.errors import FleetError, MeasurementError
-from pisigma.fleet.members import read_fleet
+from pisigma.files.errors import FleetError, MeasurementError
+from pisigma.lifetime.fleet.members import read_fleet
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.dates import date_in_name, is_date
 from pisigma.robot import Robot

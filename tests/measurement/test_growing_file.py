@@ -6,7 +6,7 @@ import pytest
 from testing.closeness import assert_close
 
 from pisigma import Robot
-from pisigma.errors import MeasurementError
+from pisigma.files.errors import MeasurementError
 from pisigma.measurement.growing_file import GrowingFile
 
 HEADER = "q1_deg,q2_deg,q3_deg,q4_deg,q5_deg,q6_deg,x_mm,y_mm,z_mm\n"

@@ -6,7 +6,7 @@ import pytest
 import torch
 from testing.closeness import assert_close
 
-from pisigma.errors import MeasurementError
+from pisigma.files.errors import MeasurementError
 from pisigma.measurement import Jig
 
 STAIRS = """\

@@ -7,13 +7,13 @@ import pytest
 import torch
 from testing.coupled import coupled_robot
 
-from pisigma.errors import RobotError
+from pisigma.files.errors import RobotError
+from pisigma.files.yaml_file import parse_yaml
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.joint_range import joint_ranges, row_warnings, with_limits_of_rows
 from pisigma.robot import Robot
 from pisigma.robot.robot_file import RobotDocument
 from pisigma.robot.writing import robot_to_yaml
-from pisigma.yaml_file import parse_yaml
 
 
 def rows_at(robot: Robot, q: np.ndarray) -> Measurements:

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from pisigma.errors import MeasurementError
+from pisigma.files.errors import MeasurementError
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.new_frames import with_new_frames
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 from testing.closeness import assert_close
 
-from pisigma.errors import MeasurementError
+from pisigma.files.errors import MeasurementError
 from pisigma.measurement import Measurements, groups_to_keep_whole, holdout, join, k_folds
 
 NAN = float("nan")

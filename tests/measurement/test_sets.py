@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from pisigma.errors import MeasurementError
+from pisigma.files.errors import MeasurementError
 from pisigma.measurement.dataset import Measurements
 
 Q = torch.arange(12, dtype=torch.float64).reshape(6, 2)

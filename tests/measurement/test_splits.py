@@ -7,7 +7,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pisigma.errors import MeasurementError
+from pisigma.files.errors import MeasurementError
 from pisigma.measurement import Measurements, groups_of_equal_joints, holdout, k_folds, placements
 from pisigma.measurement.splits import SplitBy, repeats
 

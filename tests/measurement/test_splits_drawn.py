@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from pisigma.errors import MeasurementError
+from pisigma.files.errors import MeasurementError
 from pisigma.measurement import Measurements, k_folds
 from pisigma.measurement.splits import draw_rows, with_fewer
 

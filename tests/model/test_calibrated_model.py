@@ -7,8 +7,8 @@ import torch
 from testing.closeness import assert_close
 from testing.models import HOMES, hand_made_model, joints_around
 
-from pisigma.inverse.finishing import nearest_turn
-from pisigma.kinematics.forward import forward_kinematics
+from pisigma.model.inverse.finishing import nearest_turn
+from pisigma.robot.kinematics.forward import forward_kinematics
 
 
 @pytest.mark.parametrize("name", HOMES)

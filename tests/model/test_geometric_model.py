@@ -11,22 +11,22 @@ from testing.sensors import true_robot, wire_data
 from testing.simulated_arm import draw_joints, simulate
 
 import pisigma
-from pisigma.errors import ModelError
-from pisigma.hybrid.covariance_root import CovarianceRoot
-from pisigma.hybrid.result import HybridResult
-from pisigma.hybrid.uncertainty import PositionUncertainty
-from pisigma.identification.calibrator import GeometricCalibrator
-from pisigma.identification.problem.setup import IdentifiedGeometry
-from pisigma.inverse.corrected_ik import CorrectedIK
-from pisigma.inverse.identified_arm import within_reach
-from pisigma.kinematics.closed_form import closed_form_solver
-from pisigma.kinematics.forward import forward_kinematics
-from pisigma.kinematics.numeric import solve_numeric
-from pisigma.kinematics.status import Status
+from pisigma.calibration.geometric.calibrator import GeometricCalibrator
+from pisigma.calibration.geometric.problem.setup import IdentifiedGeometry
+from pisigma.calibration.hybrid.covariance_root import CovarianceRoot
+from pisigma.calibration.hybrid.result import HybridResult
+from pisigma.calibration.hybrid.uncertainty import PositionUncertainty
+from pisigma.files.errors import ModelError
 from pisigma.model.accuracy import parameter_posterior
 from pisigma.model.folder.model_folder import load_model, save_model
 from pisigma.model.geometric_model import model_of_calibration, model_of_hybrid
+from pisigma.model.inverse.corrected_ik import CorrectedIK
+from pisigma.model.inverse.identified_arm import within_reach
 from pisigma.model.stored_starts import MAXIMUM_STARTS
+from pisigma.robot.kinematics.closed_form import closed_form_solver
+from pisigma.robot.kinematics.forward import forward_kinematics
+from pisigma.robot.kinematics.numeric import solve_numeric
+from pisigma.robot.kinematics.status import Status
 
 pytestmark = pytest.mark.usefixtures("without_type_checker")  # iterations are slow with one
 
@@ -156,7 +156,7 @@ def test_poses_farther_than_the_arm_is_long_cost_no_search(calibrated, monkeypat
         calls.append(len(T))
         return solve_numeric(robot, T, start, **options)
 
-    monkeypatch.setattr("pisigma.inverse.identified_arm.solve_numeric", counted)
+    monkeypatch.setattr("pisigma.model.inverse.identified_arm.solve_numeric", counted)
     T = torch.eye(4, dtype=torch.float64).repeat(3, 1, 1)
     T[:, 0, 3] = 2 * ik.model.calibrated.reach
     assert not bool(within_reach(ik.model.calibrated, T).any())

@@ -3,8 +3,8 @@
 import pytest
 from testing.models import hand_made_model
 
-from pisigma.errors import PlanningError
-from pisigma.inverse.corrected_ik import CorrectedIK
+from pisigma.files.errors import PlanningError
+from pisigma.model.inverse.corrected_ik import CorrectedIK
 from pisigma.model.model_source import model_or_folder
 from pisigma.planning.subject import Subject
 from pisigma.workflow.evaluate import labelled

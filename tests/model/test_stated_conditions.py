@@ -10,22 +10,22 @@ from testing.hybrid import hybrid_of, joints_in
 from testing.identified import hybrid_model
 from testing.models import joints_around
 
-from pisigma.errors import ModelError
-from pisigma.inverse.corrected_ik import CorrectedIK
+from pisigma.files.errors import ModelError
 from pisigma.joint_correction.conditions import ConditionFeatures, learned_conditions
 from pisigma.joint_correction.fourier_series import FourierSeries
 from pisigma.joint_correction.gravity_torques import GravityTorques
 from pisigma.joint_correction.shared_features import ScaledJoints
-from pisigma.kinematics.status import Status
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.accuracy import deviation_of_rows
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.folder.model_folder import save_model
 from pisigma.model.geometric_model import model_of_hybrid
+from pisigma.model.inverse.corrected_ik import CorrectedIK
 from pisigma.model.row_poses import poses_of_rows
 from pisigma.model.stated_conditions import condition_warnings, under_stated_conditions
 from pisigma.reporting.page.content import report_content
 from pisigma.robot.description import Robot
+from pisigma.robot.kinematics.status import Status
 from pisigma.workflow.evaluate import evaluate
 from pisigma.workflow.verify import verify
 

@@ -7,7 +7,7 @@ import pytest
 import torch
 from testing.calibrated_ur5 import calibrated_ur5, measured
 
-from pisigma.errors import MeasurementError
+from pisigma.files.errors import MeasurementError
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.folder.model_folder import load_model, save_model
 from pisigma.model.stored_starts import MAXIMUM_STARTS, rows_at_starts, spread_rows

@@ -7,12 +7,12 @@ import pytest
 import torch
 from testing.closeness import assert_close
 
-from pisigma.errors import RecipeError
+from pisigma.files.errors import RecipeError
 from pisigma.network.correction_network import CorrectionNetwork, JointGroup
 from pisigma.network.inputs import Inputs
 from pisigma.network.pi_sigma import PiSigma
 from pisigma.robot import Robot, Row
-from pisigma.se3 import transform_from_xyzrpy
+from pisigma.robot.se3 import transform_from_xyzrpy
 
 Q = torch.tensor([0.3, -1.2, 0.7, 2.0, -0.4, 1.1], dtype=torch.float64)
 POSE = torch.tensor([0.1, -0.2, 0.3, 0.4, -0.5, 0.6], dtype=torch.float64)

@@ -7,9 +7,9 @@ from testing.closeness import assert_close
 from testing.models import shipped_training
 
 from elimination_cases import report_correlations, report_eliminations
-from pisigma.errors import RecipeError
-from pisigma.recipes.data import simulate
-from pisigma.recipes.reader import read_recipe
+from pisigma.files.errors import RecipeError
+from pisigma.workflow.recipes.data import simulate
+from pisigma.workflow.recipes.reader import read_recipe
 from published import read_published
 
 

@@ -13,10 +13,10 @@ from jig_recipe import (
     nominal_calibration,
     read_jig_recipe,
 )
-from pisigma.errors import IdentificationError, RecipeError
-from pisigma.recipes.reader import read_recipe
-from pisigma.se3 import wrap_to_pi
+from pisigma.files.errors import IdentificationError, RecipeError
+from pisigma.robot.se3 import wrap_to_pi
 from pisigma.simulation.touch_candidates import JigPlacement
+from pisigma.workflow.recipes.reader import read_recipe
 
 
 @pytest.fixture(scope="module")

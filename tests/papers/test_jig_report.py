@@ -14,8 +14,8 @@ from jig_recipe import JIGS, JigCalibration, calibrate_on, nominal_calibration, 
 from jig_report import FIGURES, run_jigs, seed_figures
 from jig_run import run_jigs_recipe
 from jig_tables import all_tables
-from pisigma.errors import RecipeError
-from pisigma.se3 import rotation_from_rpy
+from pisigma.files.errors import RecipeError
+from pisigma.robot.se3 import rotation_from_rpy
 
 PICTURES = ("touches.png", "errors.png", "straight_lines.png", "seeds.png")
 

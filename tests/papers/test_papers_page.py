@@ -13,7 +13,7 @@ import yaml
 from command import main
 from markdown_text import FIGURES, command_of, link_to, plain, scientific
 from page import PAGE, page_text
-from pisigma.errors import RecipeError
+from pisigma.files.errors import RecipeError
 from pisigma.measurement.dataset import Measurements
 from pisigma.robot import Robot
 from published import read_published

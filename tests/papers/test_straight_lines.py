@@ -6,10 +6,10 @@ import pytest
 import torch
 from testing.closeness import assert_close
 
-from pisigma.errors import UnreachablePoseError
-from pisigma.kinematics.forward import forward_kinematics
+from pisigma.files.errors import UnreachablePoseError
 from pisigma.robot import Robot
-from pisigma.se3 import rotation_from_rpy, transform
+from pisigma.robot.kinematics.forward import forward_kinematics
+from pisigma.robot.se3 import rotation_from_rpy, transform
 from pisigma.simulation.commanded import BranchSection
 from pisigma.simulation.true_robot import TrueRobot, TrueRobotSection
 from straight_lines import Controller, i_move, move_l

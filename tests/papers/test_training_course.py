@@ -3,8 +3,8 @@
 import pytest
 from testing.closeness import assert_close
 
-from pisigma.recipes.data import load_data
-from pisigma.recipes.reader import read_recipe
+from pisigma.workflow.recipes.data import load_data
+from pisigma.workflow.recipes.reader import read_recipe
 from pisigma.workflow.train_networks import train_networks
 from training_course import EPOCHS_SHOWN, epochs_shown, report_course
 

@@ -6,11 +6,11 @@ import torch
 from testing.camera_cell import BOARD, CAMERA, NOISE, camera_cell
 from testing.closeness import assert_close
 
-from pisigma.camera.image_rows import image_measurements
-from pisigma.kinematics.forward import forward_kinematics
+from pisigma.measurement.camera.image_rows import image_measurements
+from pisigma.measurement.sensors.corner import WEIGHT_COLUMN, WEIGHTS
+from pisigma.measurement.sensors.intrinsics import numbers_in
 from pisigma.planning.board_sight import BoardSight
-from pisigma.sensors.corner import WEIGHT_COLUMN, WEIGHTS
-from pisigma.sensors.intrinsics import numbers_in
+from pisigma.robot.kinematics.forward import forward_kinematics
 
 
 @pytest.mark.parametrize("is_fixed", [False, True])

@@ -8,16 +8,16 @@ import torch
 from testing.board_views import CELL, OBLIQUE, arm_before_board, camera_settings, sees_board
 from testing.closeness import assert_close
 
-from pisigma.camera.board import Board
-from pisigma.camera.camera import Camera
-from pisigma.errors import PlanningError
-from pisigma.kinematics.closed_form.registry import closed_form_solver
+from pisigma.files.errors import PlanningError
+from pisigma.measurement.camera.board import Board
+from pisigma.measurement.camera.camera import Camera
 from pisigma.model.stored_starts import nearest_branch
 from pisigma.planning.candidates import Candidates
-from pisigma.planning.cell.arm_in_cell import ArmInCell
-from pisigma.planning.cell.cell import Cell, LensSection, ViewSection
 from pisigma.planning.plan_settings import PlanSettings
+from pisigma.planning.surroundings.arm_in_cell import ArmInCell
+from pisigma.planning.surroundings.cell import Cell, LensSection, ViewSection
 from pisigma.robot import Robot
+from pisigma.robot.kinematics.closed_form.registry import closed_form_solver
 
 
 @pytest.fixture(scope="module")

@@ -7,12 +7,12 @@ import torch
 from testing.cells import CELL
 from testing.closeness import assert_close
 
-from pisigma.errors import PlanningError
-from pisigma.kinematics.forward import forward_kinematics
+from pisigma.files.errors import PlanningError
 from pisigma.planning.candidates import draw_candidates, read_candidates, spread
-from pisigma.planning.cell.arm_in_cell import ArmInCell
-from pisigma.planning.cell.cell import Cell
+from pisigma.planning.surroundings.arm_in_cell import ArmInCell
+from pisigma.planning.surroundings.cell import Cell
 from pisigma.robot import Robot
+from pisigma.robot.kinematics.forward import forward_kinematics
 
 ARM = ArmInCell.of(Robot.load("fanuc_r2000"), CELL)
 

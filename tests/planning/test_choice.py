@@ -4,7 +4,7 @@ import pytest
 import torch
 from testing.closeness import assert_close
 
-from pisigma.errors import PlanningError
+from pisigma.files.errors import PlanningError
 from pisigma.planning.choice import Choice, Criterion, choose, condensed
 from pisigma.planning.expected_accuracy import curve, p95_of, remaining_errors, rms_of
 from pisigma.planning.knowledge import Knowledge

@@ -5,12 +5,12 @@ import pytest
 import torch
 from testing.closeness import assert_close
 
-from pisigma.errors import MeasurementError
-from pisigma.kinematics.forward import forward_kinematics
+from pisigma.files.errors import MeasurementError
 from pisigma.measurement.dataset import Measurements
 from pisigma.planning.knowledge import Instrument, Knowledge
 from pisigma.robot import Robot
-from pisigma.se3 import rotation_from_vector
+from pisigma.robot.kinematics.forward import forward_kinematics
+from pisigma.robot.se3 import rotation_from_vector
 
 
 def random_joints(robot: Robot, count: int, seed: int) -> torch.Tensor:

@@ -7,11 +7,11 @@ import torch
 from testing.cells import CELL
 from testing.closeness import assert_close
 
-from pisigma.errors import MeasurementError, PlanningError
+from pisigma.files.errors import MeasurementError, PlanningError
 from pisigma.planning.candidates import draw_candidates
-from pisigma.planning.cell.arm_in_cell import ArmInCell
 from pisigma.planning.plan_file import StoredPlan, read_plan
 from pisigma.planning.plan_settings import PlanSettings
+from pisigma.planning.surroundings.arm_in_cell import ArmInCell
 from pisigma.robot import Robot
 
 ARM = ArmInCell.of(Robot.load("fanuc_r2000"), CELL)

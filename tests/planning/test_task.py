@@ -7,13 +7,13 @@ import torch
 from testing.closeness import assert_close
 from testing.models import no_type_checker
 
-from pisigma.errors import PisigmaError, PlanningError
-from pisigma.kinematics.forward import forward_kinematics
-from pisigma.planning.cell.arm_in_cell import ArmInCell
+from pisigma.files.errors import PisigmaError, PlanningError
 from pisigma.planning.plan_settings import PlanSettings
+from pisigma.planning.surroundings.arm_in_cell import ArmInCell
 from pisigma.planning.task import TASK_POSES, task_poses
 from pisigma.robot import Robot
-from pisigma.se3 import rpy_from_rotation
+from pisigma.robot.kinematics.forward import forward_kinematics
+from pisigma.robot.se3 import rpy_from_rotation
 
 
 @pytest.mark.parametrize("wanted", ["joints", "poses"])

@@ -9,11 +9,11 @@ import torch
 from testing.cells import CELL
 from testing.closeness import assert_close
 
-from pisigma.errors import PlanningError
+from pisigma.files.errors import PlanningError
 from pisigma.planning.candidates import draw_candidates
-from pisigma.planning.cell.arm_in_cell import ArmInCell
-from pisigma.planning.cell.cell import Cell
-from pisigma.planning.cell.motion import Motions, is_free
+from pisigma.planning.surroundings.arm_in_cell import ArmInCell
+from pisigma.planning.surroundings.cell import Cell
+from pisigma.planning.surroundings.motion import Motions, is_free
 from pisigma.planning.tour import Pace, order_of_use, stages_of, tour
 from pisigma.robot import Robot
 

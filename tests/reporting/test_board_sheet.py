@@ -7,8 +7,8 @@ import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from testing.closeness import assert_close
 
-from pisigma.camera.board import Board
-from pisigma.errors import OutputError
+from pisigma.files.errors import OutputError
+from pisigma.measurement.camera.board import Board
 from pisigma.reporting.board_sheet import board_pdf, draw_board_sheet
 
 DPI = 100
@@ -36,8 +36,8 @@ def test_no_paper_is_large_enough() -> None:
 def test_corners_are_printed_at_their_true_distances() -> None:
     cv2 = pytest.importorskip("cv2", reason="opencv-python-headless is not installed")
     assert cv2.__version__
-    from pisigma.camera.detection.detected_board import DetectedBoard
-    from pisigma.camera.detection.detector import DETECTORS
+    from pisigma.measurement.camera.detection.detected_board import DetectedBoard
+    from pisigma.measurement.camera.detection.detector import DETECTORS
 
     charuco = Board("board", 4, 6, 0.025, "charuco", 0.018, "5x5_100")
     tags = Board("board", 3, 4, 0.04, "apriltag", 0.03, "tag36h11")

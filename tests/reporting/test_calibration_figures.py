@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pisigma.identification.identifiability.pairwise import CorrelationTable
+from pisigma.calibration.geometric.identifiability.pairwise import CorrelationTable
 from pisigma.reporting.calibration_figures import draw_correlations, draw_held_out, draw_residuals
 
 PNG = b"\x89PNG\r\n\x1a\n"

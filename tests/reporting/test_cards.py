@@ -4,9 +4,9 @@ import pytest
 from testing.models import trained_run
 
 from pisigma.files.model_files import CARD
-from pisigma.judging.training_summary import summarise_training
 from pisigma.reporting.cards import CardTexts, write_training_card
 from pisigma.reporting.tables import joint_table
+from pisigma.validation.held_out.training_summary import summarise_training
 
 SECTIONS = ("Data", "Joint errors", "Figures", "Domain", "Not validated", "Use", "Provenance")
 

@@ -7,9 +7,6 @@ from PIL import Image
 from testing.closeness import assert_close
 from testing.hybrid import hybrid_of
 
-from pisigma.judging.calibration_summary import TrialFigures, summarise
-from pisigma.judging.predicted_spread import PredictedSpread
-from pisigma.judging.validation_figures import ErrorFigures, LearningPoint
 from pisigma.reporting.calibration_figures import (
     _over_own_value,
     draw_corrections,
@@ -23,6 +20,9 @@ from pisigma.reporting.calibration_tables import (
     learned_lines,
     trial_table,
 )
+from pisigma.validation.held_out.calibration_summary import TrialFigures, summarise
+from pisigma.validation.held_out.predicted_spread import PredictedSpread
+from pisigma.validation.held_out.validation_figures import ErrorFigures, LearningPoint
 
 
 def ink(path) -> float:

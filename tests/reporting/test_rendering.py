@@ -1,8 +1,8 @@
 """Sentences and cards from templates."""
 
 from pisigma.files.model_files import CARD
-from pisigma.judging.calibration_summary import NoiseFigures, OutlierFigures
 from pisigma.reporting.rendering import sentences, write_card
+from pisigma.validation.held_out.calibration_summary import NoiseFigures, OutlierFigures
 
 
 def outlier(row):

@@ -2,9 +2,9 @@
 
 import pytest
 
-from pisigma.judging.training_summary import JointFigures
-from pisigma.judging.validation_figures import ErrorFigures
 from pisigma.reporting.tables import figure_text, joint_table, pose_table
+from pisigma.validation.held_out.training_summary import JointFigures
+from pisigma.validation.held_out.validation_figures import ErrorFigures
 
 JOINTS = [
     {

@@ -6,10 +6,10 @@ import torch
 from testing.closeness import assert_close
 from testing.coupled import COUPLED, PALLETISER, coupled_robot
 
-from pisigma.errors import PoseError, RobotError
-from pisigma.kernels.array_kinematics import forward_kinematics
+from pisigma.files.errors import PoseError, RobotError
 from pisigma.robot import Robot
 from pisigma.robot.coupling import FourBar
+from pisigma.robot.kernels.array_kinematics import forward_kinematics
 from pisigma.robot.writing import robot_to_yaml
 
 DEG = np.pi / 180

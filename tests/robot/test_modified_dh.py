@@ -6,7 +6,7 @@ from testing.closeness import assert_close
 from testing.coupled import coupled_robot
 
 import pisigma
-from pisigma.errors import RobotError
+from pisigma.files.errors import RobotError
 from pisigma.robot.urdf_frames import frame_of, shift, turn
 
 MODIFIED = """\

@@ -6,8 +6,8 @@ import numpy as np
 import torch
 from testing.closeness import assert_close
 
-from pisigma.kinematics.forward import forward_kinematics
 from pisigma.robot import Robot
+from pisigma.robot.kinematics.forward import forward_kinematics
 
 # The maker's modified DH parameters (Craig): a, d [m], alpha [deg] of the frame before every joint; then the flange.
 MAKER = [

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from testing.closeness import assert_close
 
-from pisigma.errors import PoseError, RobotError, UnknownRobotError
+from pisigma.files.errors import PoseError, RobotError, UnknownRobotError
+from pisigma.files.yaml_file import parse_yaml
 from pisigma.robot import Robot, RobotDocument, Row, catalogue
 from pisigma.robot.writing import robot_to_yaml
-from pisigma.yaml_file import parse_yaml
 
 TEXT = """\
 name: arm

@@ -10,8 +10,8 @@ from testing.closeness import assert_close
 from testing.models import hand_made_model, joints_around
 
 import pisigma
-from pisigma.kinematics.forward import forward_kinematics
 from pisigma.robot import Robot, catalogue
+from pisigma.robot.kinematics.forward import forward_kinematics
 
 
 def joints_of(robot: Robot, count: int) -> torch.Tensor:

@@ -11,7 +11,7 @@ from testing.closeness import assert_close
 from testing.coupled import PALLETISER, coupled_robot
 
 import pisigma
-from pisigma.errors import OutputError, RobotError, UnknownRobotError
+from pisigma.files.errors import OutputError, RobotError, UnknownRobotError
 from pisigma.robot import Robot
 from pisigma.robot.urdf_chain import read_chain
 from pisigma.robot.writing import robot_to_urdf

@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 from testing.closeness import assert_close
 from testing.urdf import DrawnJoint, drawn_pose, peer_poses, urdf_text
 
-from pisigma.kinematics.closed_form import closed_form_solver
-from pisigma.kinematics.forward import forward_kinematics
 from pisigma.robot import Robot, catalogue
+from pisigma.robot.kinematics.closed_form import closed_form_solver
+from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.robot.urdf_rows import NEARLY_PARALLEL
 from pisigma.robot.writing import robot_to_urdf
 

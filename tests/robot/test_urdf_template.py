@@ -9,9 +9,9 @@ from lxml import etree
 from testing.closeness import assert_close
 from testing.urdf import DrawnJoint, peer_poses, urdf_text
 
-from pisigma.errors import RobotError
-from pisigma.kinematics.forward import forward_kinematics
+from pisigma.files.errors import RobotError
 from pisigma.robot import Robot
+from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.robot.urdf_template import robot_into_urdf
 
 TEXT = """\

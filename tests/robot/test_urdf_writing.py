@@ -9,7 +9,7 @@ import pytest
 from lxml import etree
 from testing.closeness import assert_close
 
-from pisigma.errors import OutputError
+from pisigma.files.errors import OutputError
 from pisigma.robot import Robot, Row
 from pisigma.robot.urdf_frames import frame_of, inverse, row_frame, turn, xyzrpy_of
 from pisigma.robot.writing import robot_to_urdf

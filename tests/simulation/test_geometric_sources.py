@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from testing.closeness import assert_close
 
-from pisigma.errors import RecipeError
+from pisigma.files.errors import RecipeError
 from pisigma.robot import Robot
 from pisigma.simulation.errors.geometric import GeometricDeviation, RandomGeometricDeviation
 

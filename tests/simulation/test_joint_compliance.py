@@ -7,9 +7,9 @@ import pytest
 import torch
 from testing.closeness import assert_close
 
-from pisigma.errors import RecipeError
-from pisigma.kinematics.forward import forward_kinematics
+from pisigma.files.errors import RecipeError
 from pisigma.robot import Robot, Row
+from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.simulation.errors.joint_compliance import JointCompliance, LinkMass, gravity_load
 
 GRAVITY = (1.0, -2.0, -9.0)

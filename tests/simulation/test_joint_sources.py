@@ -6,7 +6,7 @@ import pytest
 import torch
 from testing.closeness import assert_close
 
-from pisigma.errors import RecipeError
+from pisigma.files.errors import RecipeError
 from pisigma.robot import Robot
 from pisigma.simulation.errors.encoder import EncoderQuantisation
 from pisigma.simulation.errors.joint_offset import JointOffset

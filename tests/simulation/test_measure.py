@@ -6,14 +6,14 @@ import pytest
 import torch
 from testing.closeness import assert_close
 
-from pisigma.errors import RecipeError, UnreachablePoseError
-from pisigma.kinematics.closed_form import closed_form_solver
+from pisigma.files.errors import RecipeError, UnreachablePoseError
+from pisigma.files.yaml_file import parse_yaml
 from pisigma.robot import Robot
-from pisigma.se3 import pose_error
+from pisigma.robot.kinematics.closed_form import closed_form_solver
+from pisigma.robot.se3 import pose_error
 from pisigma.simulation.measure import SimulatedMeasurements, simulate
 from pisigma.simulation.noise import MeasurementNoise
 from pisigma.simulation.true_robot import TrueRobot, TrueRobotSection
-from pisigma.yaml_file import parse_yaml
 
 OFFSET = {"kind": "joint_offset", "offset_deg": {"theta_1": 0.5, "theta_2": -0.3}}
 ENCODER = {"kind": "encoder", "pulses_per_revolution": {"theta_1": 2048}}

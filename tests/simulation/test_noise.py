@@ -7,7 +7,7 @@ import torch
 from pydantic import ValidationError
 from testing.closeness import assert_close
 
-from pisigma.se3 import check_transforms, pose_error, transform_from_xyzrpy
+from pisigma.robot.se3 import check_transforms, pose_error, transform_from_xyzrpy
 from pisigma.simulation.noise import MeasurementNoise
 
 

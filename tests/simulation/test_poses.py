@@ -7,9 +7,9 @@ import torch
 from pydantic import TypeAdapter, ValidationError
 from testing.closeness import assert_close
 
-from pisigma.errors import RecipeError
+from pisigma.files.errors import RecipeError
 from pisigma.robot import Robot
-from pisigma.se3 import check_transforms, rotation_from_rpy
+from pisigma.robot.se3 import check_transforms, rotation_from_rpy
 from pisigma.simulation.poses import (
     CubeGrid,
     CubeRandom,

@@ -6,12 +6,12 @@ import pytest
 import torch
 from testing.closeness import assert_close
 
-from pisigma.errors import RecipeError
+from pisigma.files.errors import RecipeError
+from pisigma.files.yaml_file import parse_yaml
 from pisigma.robot import Robot
 from pisigma.simulation import TrueRobotSection, register_error_source
 from pisigma.simulation.errors.source import AbstractJointSource, JointErrorFunction, joint_index
 from pisigma.simulation.true_robot import ERROR_SOURCES
-from pisigma.yaml_file import parse_yaml
 
 
 class Drift(AbstractJointSource):

@@ -6,10 +6,10 @@ import pytest
 import torch
 from testing.closeness import assert_close
 
-from pisigma.errors import RecipeError
+from pisigma.files.errors import RecipeError
+from pisigma.files.yaml_file import parse_yaml
 from pisigma.simulation import SimulatedDistances, SimulatedPairs, SimulatedSensors, SimulatedSockets
 from pisigma.simulation.true_robot import TrueRobot, TrueRobotSection
-from pisigma.yaml_file import parse_yaml
 
 DOWN = {"home_rotation": ((1, 0, 0), (0, -1, 0), (0, 0, -1))}
 SOCKETS = {

@@ -6,16 +6,16 @@ import pytest
 import torch
 from testing.closeness import assert_close
 
-from pisigma.errors import RecipeError, UnreachablePoseError
-from pisigma.kinematics.closed_form import closed_form_solver
-from pisigma.kinematics.forward import forward_kinematics
+from pisigma.files.errors import RecipeError, UnreachablePoseError
+from pisigma.files.yaml_file import parse_yaml
 from pisigma.measurement import Jig, Measurements
 from pisigma.robot import Robot
+from pisigma.robot.kinematics.closed_form import closed_form_solver
+from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.simulation.noise import SensorNoise
 from pisigma.simulation.touch_candidates import JigPlacement, TouchCandidatesSection
 from pisigma.simulation.touching import SimulatedTouches, simulate_touches
 from pisigma.simulation.true_robot import TrueRobot, TrueRobotSection
-from pisigma.yaml_file import parse_yaml
 
 # Lim et al., Table 1 and the columns "both" of Table 2; -89 deg and 180 deg are turns about the vertical.
 RIGHT = {

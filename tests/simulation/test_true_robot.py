@@ -6,12 +6,12 @@ import pytest
 import torch
 from testing.closeness import assert_close
 
-from pisigma.errors import PoseError, RecipeError, UnreachablePoseError
-from pisigma.kinematics.forward import forward_kinematics
-from pisigma.kinematics.jacobian import joint_jacobian
+from pisigma.files.errors import PoseError, RecipeError, UnreachablePoseError
+from pisigma.files.yaml_file import parse_yaml
 from pisigma.robot import Robot
+from pisigma.robot.kinematics.forward import forward_kinematics
+from pisigma.robot.kinematics.jacobian import joint_jacobian
 from pisigma.simulation.true_robot import TrueRobot, TrueRobotSection
-from pisigma.yaml_file import parse_yaml
 
 GEOMETRIC = {
     "kind": "geometric",

@@ -10,7 +10,7 @@ from testing.models import no_type_checker
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.geometric_model import model_of_hybrid
-from pisigma.se3 import transform_from_xyzrpy
+from pisigma.robot.se3 import transform_from_xyzrpy
 
 NAME = "rb5"
 

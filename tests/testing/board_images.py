@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 import torch
 
-from pisigma.camera.board import Board
-from pisigma.camera.camera import Camera
-from pisigma.camera.pattern import board_pattern
-from pisigma.se3 import rotation_from_rpy
+from pisigma.measurement.camera.board import Board
+from pisigma.measurement.camera.camera import Camera
+from pisigma.measurement.camera.pattern import board_pattern
+from pisigma.robot.se3 import rotation_from_rpy
 
 cv2 = pytest.importorskip("cv2", reason="opencv-python-headless is not installed")
 

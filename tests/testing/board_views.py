@@ -5,13 +5,13 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from pisigma.camera.board import Board
-from pisigma.camera.camera import Camera
-from pisigma.kinematics.forward import forward_kinematics
+from pisigma.measurement.camera.board import Board
+from pisigma.measurement.camera.camera import Camera
 from pisigma.planning.camera_settings import CameraSettings
-from pisigma.planning.cell.arm_in_cell import ArmInCell
-from pisigma.planning.cell.cell import Cell
+from pisigma.planning.surroundings.arm_in_cell import ArmInCell
+from pisigma.planning.surroundings.cell import Cell
 from pisigma.robot import Robot
+from pisigma.robot.kinematics.forward import forward_kinematics
 
 NEAR, FAR, OBLIQUE, MARGIN = 0.3, 0.7, 45.0, 20.0
 """[m, m, deg, px]"""

@@ -6,7 +6,7 @@ import math
 import numpy as np
 import torch
 
-from pisigma.hybrid.arm import HybridArm, JointCoverage
+from pisigma.calibration.hybrid.arm import HybridArm, JointCoverage
 from pisigma.joint_correction.fourier_series import FourierSeries
 from pisigma.joint_correction.gravity_torques import GravityTorques
 from pisigma.joint_correction.joint_correction import JointCorrection

@@ -8,11 +8,11 @@ from testing.hybrid import joints_in
 from testing.models import no_type_checker
 from testing.simulated_arm import simulate
 
-from pisigma.identification.calibrator import GeometricCalibrator
-from pisigma.kinematics.forward import forward_kinematics
+from pisigma.calibration.geometric.calibrator import GeometricCalibrator
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.geometric_model import model_of_calibration
+from pisigma.robot.kinematics.forward import forward_kinematics
 
 NOISE = 5e-5
 """Standard deviation of a measured coordinate [m]."""

@@ -8,12 +8,12 @@ import torch
 from testing.models import no_type_checker
 from torch import Tensor
 
-from pisigma.camera.board import Board
-from pisigma.camera.camera import Camera
-from pisigma.camera.image_rows import Images
-from pisigma.kinematics.closed_form.registry import closed_form_solver
+from pisigma.measurement.camera.board import Board
+from pisigma.measurement.camera.camera import Camera
+from pisigma.measurement.camera.image_rows import Images
 from pisigma.robot import Robot
-from pisigma.se3 import (
+from pisigma.robot.kinematics.closed_form.registry import closed_form_solver
+from pisigma.robot.se3 import (
     invert,
     rotation_from_rpy,
     transform,

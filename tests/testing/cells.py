@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from pisigma.planning.cell.cell import Cell
+from pisigma.planning.surroundings.cell import Cell
 from pisigma.robot import Robot
 from pisigma.robot.urdf_frames import frame_of, row_frame
 

@@ -1,10 +1,10 @@
 """Calibrations as checks see them."""
 
-from pisigma.identification.calibrator import GeometricCalibrator
-from pisigma.judging.trained_calibrations import trained
+from pisigma.calibration.geometric.calibrator import GeometricCalibrator
 from pisigma.measurement.dataset import Measurements
-from pisigma.verification.checks.check import CheckedCalibration
-from pisigma.verification.checks.registry import diagnostics_of
+from pisigma.validation.checks.check import CheckedCalibration
+from pisigma.validation.checks.registry import diagnostics_of
+from pisigma.validation.held_out.trained_calibrations import trained
 
 
 def checked(calibrator: GeometricCalibrator, rows: Measurements) -> CheckedCalibration:

@@ -5,7 +5,7 @@ import torch
 from torch import Tensor
 
 from pisigma.robot import Robot
-from pisigma.se3 import wrap_to_pi
+from pisigma.robot.se3 import wrap_to_pi
 
 
 def _to_numpy(value: object) -> np.ndarray:

@@ -8,8 +8,8 @@ from testing.aged import NAME, rows_later
 from testing.hybrid import hybrid_of
 from testing.models import no_type_checker
 
-from pisigma.hybrid.calibrator import HybridCalibrator
-from pisigma.identification.calibrator import GeometricCalibrator
+from pisigma.calibration.geometric.calibrator import GeometricCalibrator
+from pisigma.calibration.hybrid.calibrator import HybridCalibrator
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.geometric_model import model_of_hybrid
 

@@ -1,8 +1,8 @@
 """Robots with coupled joints, made up for tests."""
 
-from pisigma.errors import RobotError
+from pisigma.files.errors import RobotError
+from pisigma.files.yaml_file import parse_yaml
 from pisigma.robot import Robot, RobotDocument
-from pisigma.yaml_file import parse_yaml
 
 COUPLED = """\
 name: coupled

@@ -7,9 +7,15 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from pisigma.hybrid.covariance_root import CovarianceRoot
-from pisigma.hybrid.design import Design, Rows
-from pisigma.hybrid.evidence import AbstractRegression, GaussianPrior, LeftOut, Posterior, SensorCount
+from pisigma.calibration.hybrid.covariance_root import CovarianceRoot
+from pisigma.calibration.hybrid.design import Design, Rows
+from pisigma.calibration.hybrid.evidence import (
+    AbstractRegression,
+    GaussianPrior,
+    LeftOut,
+    Posterior,
+    SensorCount,
+)
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,8 +4,8 @@ import os
 import time
 from collections.abc import Callable
 
-from pisigma.engines.engine import AbstractEngine, packed, unpacked, work_on
-from pisigma.errors import IdentificationError
+from pisigma.files.engines.engine import AbstractEngine, packed, unpacked, work_on
+from pisigma.files.errors import IdentificationError
 
 
 def square(number: int) -> int:

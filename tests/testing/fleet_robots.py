@@ -4,10 +4,10 @@ import torch
 from torch import Tensor
 
 from pisigma.joint_correction.fourier_series import FourierSeries
-from pisigma.kinematics.forward import forward_kinematics
 from pisigma.measurement.conditions import JointState
 from pisigma.measurement.dataset import Measurements
 from pisigma.robot import Robot
+from pisigma.robot.kinematics.forward import forward_kinematics
 
 DRAWN = Robot.load("rb5")
 NOISE = 3.5e-5

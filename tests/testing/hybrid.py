@@ -7,12 +7,12 @@ import numpy as np
 import torch
 from testing.models import no_type_checker
 
-from pisigma.hybrid.calibrator import HybridCalibrator
-from pisigma.hybrid.result import HybridResult
-from pisigma.identification.calibrator import GeometricCalibrator
+from pisigma.calibration.geometric.calibrator import GeometricCalibrator
+from pisigma.calibration.hybrid.calibrator import HybridCalibrator
+from pisigma.calibration.hybrid.result import HybridResult
 from pisigma.measurement.dataset import Measurements
 from pisigma.robot import Robot
-from pisigma.se3 import invert, transform_from_xyzrpy
+from pisigma.robot.se3 import invert, transform_from_xyzrpy
 from pisigma.simulation import TrueRobot
 from pisigma.simulation.errors.geometric import RandomGeometricDeviation
 from pisigma.simulation.errors.joint_compliance import JointCompliance, LinkMass

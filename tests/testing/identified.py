@@ -4,7 +4,7 @@ import numpy as np
 import torch
 from testing.models import hand_made_model, joints_around
 
-from pisigma.hybrid.arm import HybridArm, JointCoverage
+from pisigma.calibration.hybrid.arm import HybridArm, JointCoverage
 from pisigma.joint_correction.feature import AbstractFeature
 from pisigma.joint_correction.joint_correction import JointCorrection
 from pisigma.model.calibrated_model import CalibratedModel

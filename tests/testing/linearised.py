@@ -7,20 +7,20 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pisigma.hybrid.design import Design, Rows
-from pisigma.hybrid.normal_equations import NormalEquations
-from pisigma.hybrid.search import Fitted
-from pisigma.hybrid.sensor_values import sensor_values
-from pisigma.identification.calibrator import GeometricCalibrator
-from pisigma.identification.problem.loss import SquaredLoss
-from pisigma.identification.problem.noise import view_of
-from pisigma.identification.problem.setup import CalibrationSetup
+from pisigma.calibration.geometric.calibrator import GeometricCalibrator
+from pisigma.calibration.geometric.problem.noise import view_of
+from pisigma.calibration.geometric.problem.setup import CalibrationSetup
+from pisigma.calibration.hybrid.design import Design, Rows
+from pisigma.calibration.hybrid.normal_equations import NormalEquations
+from pisigma.calibration.hybrid.search import Fitted
+from pisigma.calibration.hybrid.sensor_values import sensor_values
+from pisigma.estimation.loss import SquaredLoss
 from pisigma.joint_correction.feature import AbstractFeature
-from pisigma.kinematics.forward import forward_kinematics
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.groups import held_out_groups
 from pisigma.robot import Robot
-from pisigma.se3 import invert, rotation_from_vector, transform_from_xyzrpy
+from pisigma.robot.kinematics.forward import forward_kinematics
+from pisigma.robot.se3 import invert, rotation_from_vector, transform_from_xyzrpy
 
 FRAMES = torch.tensor(
     [[0.3, -0.2, 0.1, 0.4, -0.2, 0.3], [0.5, -0.3, 0.2, 0.4, -0.2, 1.0]], dtype=torch.float64

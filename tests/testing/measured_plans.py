@@ -8,12 +8,12 @@ from jaxtyping import Float64
 from testing.simulated_arm import BASE, TOOL, dh_errors
 from torch import Tensor
 
-from pisigma.kinematics.forward import forward_kinematics
 from pisigma.measurement.dataset import Measurements
-from pisigma.planning.cell.arm_in_cell import ArmInCell
 from pisigma.planning.plan_file import StoredPlan
 from pisigma.planning.plan_settings import PlanSettings
+from pisigma.planning.surroundings.arm_in_cell import ArmInCell
 from pisigma.robot.description import Robot
+from pisigma.robot.kinematics.forward import forward_kinematics
 
 CHECKS = 3
 """Of the poses check the calibration."""

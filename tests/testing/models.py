@@ -10,16 +10,16 @@ from pathlib import Path
 import jaxtyping
 import torch
 
-from pisigma.inverse.solution import Solution
-from pisigma.kinematics.closed_form import closed_form_solver
-from pisigma.kinematics.forward import forward_kinematics
-from pisigma.kinematics.status import Status
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.domain import Domain
+from pisigma.model.inverse.solution import Solution
 from pisigma.network.correction_network import CorrectionNetwork, JointGroup
 from pisigma.network.inputs import Inputs
 from pisigma.network.pi_sigma import PiSigma
 from pisigma.robot import Robot
+from pisigma.robot.kinematics.closed_form import closed_form_solver
+from pisigma.robot.kinematics.forward import forward_kinematics
+from pisigma.robot.kinematics.status import Status
 
 HOMES = {
     "kiro3": (0.3, 1.2, -0.15, 0.2),
@@ -105,7 +105,7 @@ def small_recipe_text(name: str) -> str:
 def shipped_training(name: str, seed: int | None = None):
     """What `pisigma.train` gives for a shipped recipe, whole, with its own seed or another."""
     import pisigma
-    from pisigma.recipes.reader import read_recipe
+    from pisigma.workflow.recipes.reader import read_recipe
 
     recipe = read_recipe(Path(__file__).parents[2] / "training" / f"{name}.yaml")
     if seed is not None:
@@ -117,11 +117,11 @@ def shipped_training(name: str, seed: int | None = None):
 @functools.cache
 def trained_run(name: str):
     """What a short training of the shipped recipe gives: the recipe and the run."""
-    from pisigma.errors import RecipeError
-    from pisigma.recipes.data import load_data
-    from pisigma.recipes.recipe import InverseRecipe
+    from pisigma.files.errors import RecipeError
+    from pisigma.files.yaml_file import parse_yaml
+    from pisigma.workflow.recipes.data import load_data
+    from pisigma.workflow.recipes.recipe import InverseRecipe
     from pisigma.workflow.train_networks import train_networks
-    from pisigma.yaml_file import parse_yaml
 
     recipe = parse_yaml(small_recipe_text(name), InverseRecipe, RecipeError, name)
     with no_type_checker():

@@ -6,7 +6,7 @@ import numpy as np
 from testing.closeness import assert_close
 from torch import Tensor
 
-from pisigma.hybrid.evidence import AbstractRegression, GaussianPrior, Posterior
+from pisigma.calibration.hybrid.evidence import AbstractRegression, GaussianPrior, Posterior
 
 
 def covariance(fit: AbstractRegression, posterior: Posterior) -> Tensor:

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from pisigma.measurement.dataset import Measurements
 from pisigma.robot import Robot
-from pisigma.se3 import transform_from_xyzrpy
+from pisigma.robot.se3 import transform_from_xyzrpy
 from pisigma.simulation import TrueRobot
 from pisigma.simulation.errors.encoder import EncoderQuantisation
 from pisigma.simulation.errors.geometric import RandomGeometricDeviation

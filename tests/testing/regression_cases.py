@@ -10,8 +10,8 @@ from testing.linearised import LinearisedArm, drawn_joints, linearised, tracker_
 from testing.sensors import mixed_data, true_robot
 from torch import Tensor
 
-from pisigma.hybrid.design import Design, Rows
-from pisigma.hybrid.evidence import GaussianPrior, LeftOut
+from pisigma.calibration.hybrid.design import Design, Rows
+from pisigma.calibration.hybrid.evidence import GaussianPrior, LeftOut
 from pisigma.joint_correction.feature import AbstractFeature
 from pisigma.joint_correction.fourier_series import FourierSeries
 from pisigma.joint_correction.gravity_torques import GravityTorques

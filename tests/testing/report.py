@@ -9,22 +9,22 @@ import torch
 from testing.hybrid import NOISE, HybridArmUnderTest, hybrid_of, joints_in
 from testing.models import no_type_checker
 
+from pisigma.calibration.geometric.calibrator import GeometricCalibrator
+from pisigma.calibration.hybrid.calibrator import HybridCalibrator
 from pisigma.files.model_files import CORRELATION_CSV, HELD_OUT_CSV
-from pisigma.hybrid.calibrator import HybridCalibrator
-from pisigma.identification.calibrator import GeometricCalibrator
-from pisigma.judging.calibration_summary import (
-    CalibrationSummary,
-    ObservabilityFigures,
-    RedundancyFigures,
-    summarise,
-)
-from pisigma.judging.calibration_validation import CalibrationValidation, judge
-from pisigma.judging.held_out_rows import HeldOutRows
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.folder.model_folder import save_model
 from pisigma.model.geometric_model import model_of_calibration, model_of_hybrid
 from pisigma.reporting.calibration_tables import write_correlations
+from pisigma.validation.held_out.calibration_summary import (
+    CalibrationSummary,
+    ObservabilityFigures,
+    RedundancyFigures,
+    summarise,
+)
+from pisigma.validation.held_out.calibration_validation import CalibrationValidation, judge
+from pisigma.validation.held_out.held_out_rows import HeldOutRows
 
 HOSTILE = "</script><script>alert(1)</script><img src=x onerror=alert(2)>\"'&\u2028$x_1$"
 """A name that breaks pages which do not show it as text."""

@@ -8,8 +8,8 @@ import numpy as np
 import torch
 from testing.models import joints_around
 
-from pisigma.export.export_format import ExportRequest
-from pisigma.export.programs.text import (
+from pisigma.deployment.export.export_format import ExportRequest
+from pisigma.deployment.export.programs.text import (
     labelled,
     metres_and_rotation_vector,
     millimetres,
@@ -17,14 +17,14 @@ from pisigma.export.programs.text import (
     numbers,
     quaternion,
 )
-from pisigma.export.rewriting.export import SCANNERS
-from pisigma.export.rewriting.frame_file import FrameFile
-from pisigma.export.rewriting.scan import Frame, ScannedProgram
-from pisigma.kinematics.closed_form import closed_form_solver
-from pisigma.kinematics.forward import forward_kinematics
+from pisigma.deployment.export.rewriting.export import SCANNERS
+from pisigma.deployment.export.rewriting.frame_file import FrameFile
+from pisigma.deployment.export.rewriting.scan import Frame, ScannedProgram
 from pisigma.model.folder.model_folder import load_model
 from pisigma.robot import Robot
-from pisigma.se3 import invert, transform_from_xyzrpy
+from pisigma.robot.kinematics.closed_form import closed_form_solver
+from pisigma.robot.kinematics.forward import forward_kinematics
+from pisigma.robot.se3 import invert, transform_from_xyzrpy
 
 FRAME = transform_from_xyzrpy(torch.tensor([0.4, -0.3, 0.1, 0.5, -0.2, 0.1], dtype=torch.float64))
 TOOL = transform_from_xyzrpy(torch.tensor([0.02, -0.01, 0.15, 0.3, 0.1, -0.4], dtype=torch.float64))

@@ -8,10 +8,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pisigma.kinematics.forward import forward_kinematics
 from pisigma.measurement.dataset import Measurements, join
 from pisigma.robot import Robot
-from pisigma.se3 import transform_from_xyzrpy
+from pisigma.robot.kinematics.forward import forward_kinematics
+from pisigma.robot.se3 import transform_from_xyzrpy
 
 ARM = ["a_1", "a_2", "a_3", "d_4", "theta_2", "theta_3", "theta_4", "theta_5"]
 TRUE_BASES = {

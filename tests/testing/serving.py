@@ -8,8 +8,8 @@ from pathlib import Path
 
 from testing.models import REPOSITORY, no_type_checker
 
-from pisigma.serve.models import ServedModels
-from pisigma.serve.server import Server, ServeSettings
+from pisigma.deployment.serve.models import ServedModels
+from pisigma.deployment.serve.server import Server, ServeSettings
 
 CLIENTS = REPOSITORY / "docs" / "clients"
 

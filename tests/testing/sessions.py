@@ -5,8 +5,7 @@ import math
 import numpy as np
 import torch
 
-from pisigma.kinematics.forward import forward_kinematics
-from pisigma.measuring.state import (
+from pisigma.planning.session.state import (
     AccuracyPoint,
     Advice,
     Alarm,
@@ -15,9 +14,10 @@ from pisigma.measuring.state import (
     RowsSoFar,
     SessionState,
 )
-from pisigma.planning.cell.arm_in_cell import ArmInCell
-from pisigma.planning.cell.cell import Box, Cell, ReflectorSection, TrackerSection
+from pisigma.planning.surroundings.arm_in_cell import ArmInCell
+from pisigma.planning.surroundings.cell import Box, Cell, ReflectorSection, TrackerSection
 from pisigma.robot.description import Robot
+from pisigma.robot.kinematics.forward import forward_kinematics
 
 POSES, JUDGED_FROM = 30, 8
 """In the plan; rows from which on base and tool can be worked out."""

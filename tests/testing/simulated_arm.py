@@ -5,10 +5,10 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from pisigma.kinematics.forward import forward_kinematics
 from pisigma.measurement.dataset import Measurements
 from pisigma.robot import Robot
-from pisigma.se3 import rotation_from_vector
+from pisigma.robot.kinematics.forward import forward_kinematics
+from pisigma.robot.se3 import rotation_from_vector
 
 BASE = np.array([0.4, -0.7, 0.3, 2.0, 0.5, -1.0])
 TOOL = np.array([0.06, -0.04, 0.13, 0.4, -0.3, 0.8])

@@ -8,9 +8,9 @@ from testing.simulated_arm import simulate
 
 import pisigma
 from pisigma.cli.arguments import socket_distances
-from pisigma.errors import IdentificationError, MeasurementError
-from pisigma.judging.calibration_summary import CalibrationSummary
+from pisigma.files.errors import IdentificationError, MeasurementError
 from pisigma.model.folder.model_folder import load_model
+from pisigma.validation.held_out.calibration_summary import CalibrationSummary
 from pisigma.workflow.calibrate import CalibrationSettings
 
 SOCKETS = ("left/0", "left/1", "right/0", "right/1", "right/0", "lonely/0", "")

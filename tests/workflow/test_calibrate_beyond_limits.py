@@ -7,9 +7,9 @@ import torch
 from testing.closeness import assert_close
 
 import pisigma
-from pisigma.kinematics.forward import forward_kinematics
 from pisigma.measurement.dataset import Measurements
 from pisigma.robot import Robot
+from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.workflow.calibrate import CalibrationSettings, calibrate
 
 

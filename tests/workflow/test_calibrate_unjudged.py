@@ -4,7 +4,7 @@ import pytest
 import torch
 from testing.simulated_arm import simulate
 
-from pisigma.judging.calibration_validation import errors_under
+from pisigma.validation.held_out.calibration_validation import errors_under
 from pisigma.workflow.calibrate import CalibrationSettings, calibrate
 
 

@@ -9,7 +9,7 @@ from testing.closeness import assert_close
 from testing.compared import COLLISION, joints_of, model_of
 from testing.models import no_type_checker
 
-from pisigma.errors import IdentificationError
+from pisigma.files.errors import IdentificationError
 from pisigma.measurement.dataset import Measurements
 from pisigma.workflow.compare import ComparisonSettings, compare
 

@@ -7,11 +7,11 @@ import torch
 from testing.closeness import assert_close
 from testing.coupled import coupled_robot
 
-from pisigma.measuring.state import NextPose
 from pisigma.planning.candidates import draw_candidates
-from pisigma.planning.cell.arm_in_cell import ArmInCell
 from pisigma.planning.plan_file import StoredPlan, read_plan
 from pisigma.planning.plan_settings import PlanSettings
+from pisigma.planning.session.state import NextPose
+from pisigma.planning.surroundings.arm_in_cell import ArmInCell
 
 
 def test_a_plan_holds_the_controllers_values_within_its_limits(tmp_path: Path) -> None:

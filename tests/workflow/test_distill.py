@@ -12,15 +12,15 @@ from testing.identified import geometric_model, hybrid_model
 from testing.models import HOMES, hand_made_model, no_type_checker
 
 import pisigma
-from pisigma.errors import IdentificationError, ModelError
-from pisigma.inverse.corrected_ik import CorrectedIK
+from pisigma.files.errors import IdentificationError, ModelError
 from pisigma.joint_correction.fourier_series import FourierSeries
 from pisigma.joint_correction.gravity_torques import GravityTorques
-from pisigma.judging.distillation_summary import DistillationSummary
-from pisigma.kinematics.forward import forward_kinematics
-from pisigma.kinematics.status import Status
 from pisigma.model.calibrated_model import CalibratedModel
+from pisigma.model.inverse.corrected_ik import CorrectedIK
 from pisigma.robot import Robot
+from pisigma.robot.kinematics.forward import forward_kinematics
+from pisigma.robot.kinematics.status import Status
+from pisigma.validation.held_out.distillation_summary import DistillationSummary
 from pisigma.workflow.distill import DistillationSettings, distill
 from pisigma.workflow.distilled_network import Size, sizes_for
 from pisigma.workflow.solved_poses import Region, draw_between, draw_solved_poses

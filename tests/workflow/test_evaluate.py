@@ -7,10 +7,10 @@ import torch
 from testing.calibrated_ur5 import calibrated_ur5, measured
 
 import pisigma
-from pisigma.errors import MeasurementError
-from pisigma.judging.bootstrap import Bootstrap
-from pisigma.judging.model_comparison import ModelFigures, QuantityErrors
-from pisigma.se3 import transform_from_xyzrpy
+from pisigma.files.errors import MeasurementError
+from pisigma.robot.se3 import transform_from_xyzrpy
+from pisigma.validation.held_out.bootstrap import Bootstrap
+from pisigma.validation.held_out.model_comparison import ModelFigures, QuantityErrors
 from pisigma.workflow.evaluate import EvaluationSettings, Limits
 
 

@@ -6,7 +6,7 @@ import pytest
 from testing.aged import model_before, rows_later
 from testing.same_model import differences
 
-from pisigma.inverse.written_model import write_model
+from pisigma.model.inverse.written_model import write_model
 from pisigma.planning.plan_settings import PlanSettings
 from pisigma.workflow.compare import compare
 from pisigma.workflow.monitor import monitor

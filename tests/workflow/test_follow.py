@@ -4,7 +4,7 @@ import pytest
 from testing.measured_plans import header, measured_plan, row_lines
 from testing.models import no_type_checker
 
-from pisigma.errors import MeasurementError, OutputError
+from pisigma.files.errors import MeasurementError, OutputError
 from pisigma.measurement.growing_file import GrowingFile
 from pisigma.workflow.follow import follow, rest_file
 from pisigma.workflow.measure import MeasureSettings, MeasuringSession

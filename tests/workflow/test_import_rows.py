@@ -7,7 +7,7 @@ import pytest
 from testing.models import REPOSITORY
 
 import pisigma
-from pisigma.errors import MeasurementError, OutputError
+from pisigma.files.errors import MeasurementError, OutputError
 from pisigma.workflow.import_rows import ImportSettings, import_rows, propose_import
 
 EXPORTS = (

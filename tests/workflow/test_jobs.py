@@ -6,10 +6,10 @@ from testing.models import no_type_checker, trained_run
 from testing.simulated_arm import simulate
 
 import pisigma
-from pisigma.judging import side_by_side
-from pisigma.judging.progress import silent, stage
-from pisigma.recipes.recipe import MeasuredData
+from pisigma.files.progress import silent, stage
+from pisigma.validation.held_out import side_by_side
 from pisigma.workflow.calibrate import CalibrationSettings
+from pisigma.workflow.recipes.recipe import MeasuredData
 from pisigma.workflow.train_networks import TrainSettings
 
 

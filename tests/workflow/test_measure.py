@@ -9,10 +9,10 @@ import torch
 from testing.measured_plans import CHECKS, measured_plan, with_offset
 from testing.models import no_type_checker
 
-from pisigma.errors import PlanningError
+from pisigma.files.errors import PlanningError
 from pisigma.measurement.fields import LeftOut
-from pisigma.measuring import reached
 from pisigma.planning.plan_file import read_plan
+from pisigma.planning.session import reached
 from pisigma.workflow.measure import MeasureSettings, MeasuringSession
 
 PLAN = measured_plan("kiro3")

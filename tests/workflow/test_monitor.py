@@ -8,7 +8,7 @@ from testing.aged import model_before, rows_later
 from testing.closeness import assert_close
 from testing.hybrid import hybrid_of
 
-from pisigma.errors import IdentificationError, MeasurementError
+from pisigma.files.errors import IdentificationError, MeasurementError
 from pisigma.measurement.dataset import join
 from pisigma.model.folder.model_folder import save_model
 from pisigma.workflow.monitor import MonitorSettings, monitor

@@ -9,12 +9,12 @@ import torch
 from testing.closeness import assert_close
 from testing.sensors import joints, pair_data, socket_data, touch_data, true_robot, wire_data
 
-from pisigma.errors import IdentificationError, MeasurementError
-from pisigma.judging.frames.row_errors import errors_of_rows
+from pisigma.files.errors import IdentificationError, MeasurementError
 from pisigma.measurement.dataset import Measurements, join
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.row_poses import poses_of_rows
-from pisigma.verification.gate import check_rows
+from pisigma.validation.gate import check_rows
+from pisigma.validation.held_out.frames.row_errors import errors_of_rows
 from pisigma.workflow.evaluate import EvaluationSettings, evaluate
 from pisigma.workflow.verify import VerificationSettings, verify
 

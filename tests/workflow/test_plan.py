@@ -11,13 +11,13 @@ from testing.closeness import assert_close
 from testing.models import no_type_checker
 from testing.report import hybrid_under_test
 
-from pisigma.errors import PisigmaError, PlanningError
-from pisigma.kinematics.forward import forward_kinematics
+from pisigma.files.errors import PisigmaError, PlanningError
 from pisigma.measurement.dataset import Measurements
-from pisigma.planning.cell.motion import is_free
 from pisigma.planning.plan_file import read_plan
 from pisigma.planning.plan_settings import PlanSettings
+from pisigma.planning.surroundings.motion import is_free
 from pisigma.robot import Robot
+from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.workflow.plan import Plan, plan
 
 SETTINGS = PlanSettings(count=11, check=3, candidates=40, limit_mm=2.0)

@@ -10,15 +10,15 @@ from testing.closeness import assert_close
 from testing.hybrid import hybrid_of
 
 import pisigma
-from pisigma.errors import AcceptanceError, IdentificationError, MeasurementError, ModelError
-from pisigma.inverse.corrected_ik import CorrectedIK
-from pisigma.kinematics.forward import forward_kinematics
+from pisigma.files.errors import AcceptanceError, IdentificationError, MeasurementError, ModelError
+from pisigma.lifetime.recalibration.summary import RecalibrationSummary
 from pisigma.measurement.dataset import Measurements, join
 from pisigma.model.folder.model_folder import load_model, save_model
+from pisigma.model.inverse.corrected_ik import CorrectedIK
 from pisigma.model.row_poses import poses_of_rows
-from pisigma.recalibration.summary import RecalibrationSummary
 from pisigma.robot import Robot
-from pisigma.se3 import transform_from_xyzrpy
+from pisigma.robot.kinematics.forward import forward_kinematics
+from pisigma.robot.se3 import transform_from_xyzrpy
 from pisigma.workflow.recalibrate import Recalibration, RecalibrationSettings, recalibrate
 
 COLLISION = (0.0, 0.0, math.radians(0.25), 0.0, 0.0, 0.0)

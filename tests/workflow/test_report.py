@@ -6,7 +6,7 @@ import pytest
 from testing.report import geometric_under_test, measured
 
 import pisigma
-from pisigma.errors import MeasurementError, OutputError
+from pisigma.files.errors import MeasurementError, OutputError
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.folder.model_folder import save_model
 

@@ -10,11 +10,11 @@ from testing.aged import model_before, rows_later
 from testing.identified import geometric_model
 from testing.models import no_type_checker
 
-from pisigma.kinematics.forward import forward_kinematics
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.folder.model_folder import load_model, save_model
 from pisigma.robot import Robot
+from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.robot.writing import robot_to_yaml
 from pisigma.workflow.compare import compare
 from pisigma.workflow.evaluate import evaluate

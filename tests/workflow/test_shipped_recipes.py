@@ -10,10 +10,10 @@ from testing.closeness import assert_close
 from testing.models import no_type_checker, shipped_training
 
 import pisigma
-from pisigma.judging.training_summary import TrainingRun
-from pisigma.recipes.data import load_data
-from pisigma.recipes.reader import read_recipe
-from pisigma.recipes.recipe import GeometricRecipe, InverseRecipe, SimulatedData
+from pisigma.validation.held_out.training_summary import TrainingRun
+from pisigma.workflow.recipes.data import load_data
+from pisigma.workflow.recipes.reader import read_recipe
+from pisigma.workflow.recipes.recipe import GeometricRecipe, InverseRecipe, SimulatedData
 from pisigma.workflow.train_networks import train_networks
 
 FOLDER = Path(__file__).parents[2] / "training"

@@ -8,12 +8,12 @@ import torch
 from testing.models import no_type_checker, shipped_training, small_recipe_text, trained_run
 
 import pisigma
-from pisigma.errors import MeasurementError, RecipeError
-from pisigma.judging.pose_statistics import compare_on
-from pisigma.judging.training_summary import ComparisonFigures, summarise_training
-from pisigma.recipes.data import load_data, simulate
-from pisigma.recipes.reader import recipe_hash
-from pisigma.recipes.recipe import MeasuredData, SingularRows
+from pisigma.files.errors import MeasurementError, RecipeError
+from pisigma.validation.held_out.pose_statistics import compare_on
+from pisigma.validation.held_out.training_summary import ComparisonFigures, summarise_training
+from pisigma.workflow.recipes.data import load_data, simulate
+from pisigma.workflow.recipes.reader import recipe_hash
+from pisigma.workflow.recipes.recipe import MeasuredData, SingularRows
 from pisigma.workflow.train import InverseTraining
 from pisigma.workflow.train_networks import TrainSettings, cross_validate, train_networks
 

@@ -10,13 +10,13 @@ from testing.hybrid import hybrid_of, joints_in
 from testing.models import hand_made_model, joints_around, no_type_checker
 from testing.simulated_arm import simulate
 
-from pisigma.errors import MeasurementError
-from pisigma.identification.calibrator import GeometricCalibrator
-from pisigma.kinematics.forward import forward_kinematics
+from pisigma.calibration.geometric.calibrator import GeometricCalibrator
+from pisigma.files.errors import MeasurementError
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.geometric_model import model_of_calibration, model_of_hybrid
 from pisigma.model.row_poses import nominal_poses_of_rows
-from pisigma.se3 import transform_from_xyzrpy
+from pisigma.robot.kinematics.forward import forward_kinematics
+from pisigma.robot.se3 import transform_from_xyzrpy
 from pisigma.workflow.verify import VerificationSettings, read_for_verification, verify
 
 pytestmark = pytest.mark.usefixtures("without_type_checker")

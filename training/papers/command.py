@@ -8,7 +8,7 @@ from pathlib import Path
 from jig_recipe import JIGS, read_jig_recipe
 from page import PAGE, page_text
 from pictures import draw_pictures
-from pisigma.errors import PisigmaError
+from pisigma.files.errors import PisigmaError
 from pisigma.files.output_file import write_whole
 from pisigma.robot.description import Robot
 from published import read_published

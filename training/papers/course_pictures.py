@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullLocator
 
-from pisigma.errors import RecipeError
+from pisigma.files.errors import RecipeError
 from pisigma.reporting.figures import save_figure
 from published import Convergence
 from stored_results import Result

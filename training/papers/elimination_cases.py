@@ -7,15 +7,15 @@ from typing import Any
 
 import numpy as np
 
-from pisigma.errors import RecipeError, nearest_choice
-from pisigma.identification.identifiability.pairwise import CorrelationTable
-from pisigma.identification.problem.parameters import ParameterSpace
-from pisigma.identification.result import CalibrationResult
-from pisigma.judging.calibration_validation import errors_under
+from pisigma.calibration.geometric.identifiability.pairwise import CorrelationTable
+from pisigma.calibration.geometric.problem.parameters import ParameterSpace
+from pisigma.calibration.geometric.result import CalibrationResult
+from pisigma.files.errors import RecipeError, nearest_choice
 from pisigma.measurement.dataset import Measurements
-from pisigma.recipes.recipe import GeometricRecipe
 from pisigma.robot.description import Robot
 from pisigma.simulation.true_robot import TrueRobot
+from pisigma.validation.held_out.calibration_validation import errors_under
+from pisigma.workflow.recipes.recipe import GeometricRecipe
 
 _DECIMALS = 6
 

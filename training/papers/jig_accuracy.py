@@ -8,9 +8,9 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from jig_recipe import JigCalibration, JigRecipe
-from pisigma.kinematics.forward import forward_kinematics
 from pisigma.robot.description import Robot
-from pisigma.se3 import transform_from_xyzrpy
+from pisigma.robot.kinematics.forward import forward_kinematics
+from pisigma.robot.se3 import transform_from_xyzrpy
 from pisigma.simulation.true_robot import TrueRobot
 from straight_lines import Controller
 

@@ -12,16 +12,17 @@ from jaxtyping import Float64
 from pydantic import Field, model_validator
 from torch import Tensor
 
-from pisigma.errors import IdentificationError, RecipeError
-from pisigma.identification.calibrator import GeometricCalibrator
-from pisigma.identification.problem.loss import SquaredLoss
-from pisigma.identification.problem.parameters import Prior
-from pisigma.identification.result import CalibrationResult
-from pisigma.kinematics.singularity import singularity_measure
+from pisigma.calibration.geometric.calibrator import GeometricCalibrator
+from pisigma.calibration.geometric.problem.parameters import Prior
+from pisigma.calibration.geometric.result import CalibrationResult
+from pisigma.estimation.loss import SquaredLoss
+from pisigma.files.errors import IdentificationError, RecipeError
+from pisigma.files.yaml_file import Section, read_yaml
 from pisigma.measurement.dataset import Measurements
 from pisigma.planning.touch_planning import PlanningProblem, build_planning_problem
 from pisigma.robot.description import Robot
-from pisigma.se3 import rotation_from_rpy, transform
+from pisigma.robot.kinematics.singularity import singularity_measure
+from pisigma.robot.se3 import rotation_from_rpy, transform
 from pisigma.simulation.commanded import BranchSection
 from pisigma.simulation.noise import SensorNoise
 from pisigma.simulation.poses import CubeRandom
@@ -33,7 +34,6 @@ from pisigma.simulation.touch_candidates import (
 )
 from pisigma.simulation.touching import simulate_touches
 from pisigma.simulation.true_robot import ErrorSource, TrueRobot
-from pisigma.yaml_file import Section, read_yaml
 
 Triple = tuple[float, float, float]
 Free = Literal["paper", "default"]

@@ -19,7 +19,7 @@ from jig_accuracy import (
     rms,
 )
 from jig_recipe import JigCalibration, JigRecipe, calibrate_on, nominal_calibration
-from pisigma.errors import RecipeError
+from pisigma.files.errors import RecipeError
 from pisigma.measurement.dataset import Measurements
 from pisigma.planning.touch_planning import MeasurementPlan, PlanningProblem, plan_measurements
 from pisigma.robot.description import Robot

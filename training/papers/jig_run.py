@@ -16,11 +16,11 @@ from jig_tables import all_tables
 from pisigma.cli.output import print_table
 from pisigma.files.model_files import MODEL_FILES
 from pisigma.files.output_folder import check_folder, staged_folder
-from pisigma.inverse.written_model import write_model
-from pisigma.judging.calibration_summary import summarise
 from pisigma.model.geometric_model import model_of_calibration
-from pisigma.recipes.reader import recipe_hash
+from pisigma.model.inverse.written_model import write_model
 from pisigma.robot.description import Robot
+from pisigma.validation.held_out.calibration_summary import summarise
+from pisigma.workflow.recipes.reader import recipe_hash
 
 _FILES = MODEL_FILES | {ERRORS_PNG, LINES_PNG, SEEDS_PNG, TOUCHES_PNG}
 

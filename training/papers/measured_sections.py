@@ -1,9 +1,9 @@
 """Recipes that stand beside no paper: mini-batches, a camera, measured robots, and the hybrid."""
 
 from markdown_text import command_block, picture
-from pisigma.judging.training_summary import JointFigures
-from pisigma.judging.validation_figures import ErrorFigures
 from pisigma.reporting.tables import joint_table, markdown_table, pose_table
+from pisigma.validation.held_out.training_summary import JointFigures
+from pisigma.validation.held_out.validation_figures import ErrorFigures
 from published import Published
 from stored_results import Result, StoredResults
 

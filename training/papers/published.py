@@ -5,8 +5,8 @@ from typing import Literal
 
 from pydantic import model_validator
 
-from pisigma.errors import RecipeError
-from pisigma.yaml_file import Section, read_yaml
+from pisigma.files.errors import RecipeError
+from pisigma.files.yaml_file import Section, read_yaml
 
 PUBLISHED = Path("papers") / "published.yaml"
 """Where it stands in the folder of the recipes."""

@@ -8,13 +8,13 @@ from elimination_cases import report_correlations, report_eliminations
 from jig_recipe import JIGS
 from jig_run import run_jigs_recipe
 from markdown_text import command_of
+from pisigma.calibration.geometric.result import CalibrationResult
 from pisigma.files.output_file import write_whole
 from pisigma.files.output_folder import check_folder
-from pisigma.identification.result import CalibrationResult
 from pisigma.measurement.dataset import Measurements
-from pisigma.recipes.data import simulate
-from pisigma.recipes.reader import read_recipe
-from pisigma.recipes.recipe import GeometricRecipe
+from pisigma.workflow.recipes.data import simulate
+from pisigma.workflow.recipes.reader import read_recipe
+from pisigma.workflow.recipes.recipe import GeometricRecipe
 from pisigma.workflow.train import InverseTraining, Training, train
 from pisigma.workflow.train_networks import TrainSettings
 from published import read_published

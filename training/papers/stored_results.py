@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from pisigma.errors import RecipeError
+from pisigma.files.errors import RecipeError
 
 PAPERS = "papers"
 RESULTS = "results"

@@ -6,13 +6,13 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
-from pisigma.errors import UnreachablePoseError
-from pisigma.kinematics.closed_form import closed_form_solver
-from pisigma.kinematics.forward import forward_kinematics
-from pisigma.kinematics.numeric import solve_numeric
-from pisigma.kinematics.status import Status
+from pisigma.files.errors import UnreachablePoseError
 from pisigma.robot.description import Robot
-from pisigma.se3 import rotation_from_vector, rotation_vector, transform
+from pisigma.robot.kinematics.closed_form import closed_form_solver
+from pisigma.robot.kinematics.forward import forward_kinematics
+from pisigma.robot.kinematics.numeric import solve_numeric
+from pisigma.robot.kinematics.status import Status
+from pisigma.robot.se3 import rotation_from_vector, rotation_vector, transform
 from pisigma.simulation.commanded import BranchSection
 from pisigma.simulation.true_robot import TrueRobot
 

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float64, Int64
 from torch import Tensor
 
-from pisigma.judging.training_summary import TrainingRun
+from pisigma.validation.held_out.training_summary import TrainingRun
 
 EPOCHS_SHOWN = 80
 """At most so many epochs are given, close together at the start."""

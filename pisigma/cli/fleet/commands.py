@@ -9,10 +9,10 @@ import typer
 from pisigma.cli.arguments import AsJson, Overwrite
 from pisigma.cli.endings import NOT_ACCEPTED, tell_problems
 from pisigma.cli.output import command_line, print_json, print_lines, print_table, progress_of
-from pisigma.errors import FleetError
+from pisigma.files.errors import FleetError
 
 if TYPE_CHECKING:
-    from pisigma.fleet.status import FleetStatus
+    from pisigma.lifetime.fleet.status import FleetStatus
     from pisigma.workflow.fleet.run import FleetRun
 
 DAYS_AHEAD = 366
@@ -149,8 +149,8 @@ def status(
     Exit status 3 where a robot drifts, was refused, or has not been worked out yet.
     """
     from pisigma.files.output_file import check_output, write_whole
-    from pisigma.fleet.record import expected_robots, read_records
-    from pisigma.fleet.status import FleetStatus
+    from pisigma.lifetime.fleet.record import expected_robots, read_records
+    from pisigma.lifetime.fleet.status import FleetStatus
 
     if page is not None:
         check_output(page, (".html", ".htm"), "a page", (folder / "records",))

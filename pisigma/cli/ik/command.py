@@ -13,7 +13,7 @@ from pisigma.cli.output import print_json, print_line, print_lines, progress_of
 if TYPE_CHECKING:
     import numpy as np
 
-    from pisigma.inverse.corrected_ik import CorrectedIK
+    from pisigma.model.inverse.corrected_ik import CorrectedIK
 
 Pose = tuple[float, float, float, float, float, float]
 
@@ -78,7 +78,7 @@ def ik(
         if given and poses is None:
             raise typer.BadParameter("it goes with --poses", param_hint=f"'{name}'")
     from pisigma.files.output_file import check_output
-    from pisigma.inverse.corrected_ik import load
+    from pisigma.model.inverse.corrected_ik import load
 
     if out is not None:
         check_output(out, inputs=(model, poses))
@@ -185,8 +185,8 @@ def _check_options(
 
 def _transform(pose: Pose) -> "np.ndarray":
     """The wanted pose T_base_tool as a batch of one; values that no pose has are refused."""
-    from pisigma.errors import PoseError
-    from pisigma.kernels.array_kinematics import transform_of
+    from pisigma.files.errors import PoseError
+    from pisigma.robot.kernels.array_kinematics import transform_of
     from pisigma.robot.row import FRAME_COLUMNS, LARGEST
 
     for name, value in zip(FRAME_COLUMNS, pose, strict=True):

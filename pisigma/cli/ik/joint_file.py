@@ -15,13 +15,13 @@ from torch import Tensor
 
 from pisigma.cli.ik.solutions import FAILURES, file_units
 from pisigma.files.output_file import writing_whole
-from pisigma.inverse.corrected_ik import CorrectedIK
-from pisigma.inverse.path import PathSwitch
-from pisigma.inverse.solution import Solution
-from pisigma.kinematics.status import Status
 from pisigma.measurement.csv.poses import CHUNK_ROWS, PoseChunk, read_pose_chunks
 from pisigma.measurement.fields import LeftOut
+from pisigma.model.inverse.corrected_ik import CorrectedIK
+from pisigma.model.inverse.path import PathSwitch
+from pisigma.model.inverse.solution import Solution
 from pisigma.robot.description import Robot
+from pisigma.robot.kinematics.status import Status
 
 BAD_ROW = "bad_row"
 """Status of a row that is no pose."""

@@ -5,9 +5,9 @@ from collections.abc import Sequence
 from typing import Any
 
 from pisigma.cli.output import print_line, print_table
-from pisigma.inverse.corrected_ik import CorrectedIK
-from pisigma.inverse.solution import Solution
-from pisigma.kinematics.status import Status
+from pisigma.model.inverse.corrected_ik import CorrectedIK
+from pisigma.model.inverse.solution import Solution
+from pisigma.robot.kinematics.status import Status
 
 _QUANTITIES = ("q", "q_nominal", "correction")
 _LISTED = 10

@@ -63,8 +63,8 @@ def detect(
 
 def _print_board(board: Path, sheet: Path, as_json: bool) -> None:
     """Write a board as a PDF."""
-    from pisigma.camera.board import Board
     from pisigma.files.output_file import check_output, write_whole
+    from pisigma.measurement.camera.board import Board
     from pisigma.reporting.board_sheet import board_pdf
 
     check_output(sheet, (".pdf",), "a board to print", [board])

@@ -8,10 +8,10 @@ import typer
 from pisigma.cli.arguments import AsJson, complete_model
 from pisigma.cli.camera_options import takes_corners
 from pisigma.cli.output import print_json, print_lines, print_table, progress_of, screen_width
-from pisigma.errors import AcceptanceError
+from pisigma.files.errors import AcceptanceError
 
 if TYPE_CHECKING:
-    from pisigma.camera.corner_file import CameraFiles
+    from pisigma.measurement.camera.corner_file import CameraFiles
     from pisigma.workflow.compare import ComparedModels
 
 First = Annotated[

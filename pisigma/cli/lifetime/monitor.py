@@ -12,7 +12,7 @@ from pisigma.cli.lifetime.recalibrate import Moved, stated_to_move
 from pisigma.cli.output import print_json, print_lines, print_table, progress_of
 
 if TYPE_CHECKING:
-    from pisigma.camera.corner_file import CameraFiles
+    from pisigma.measurement.camera.corner_file import CameraFiles
     from pisigma.workflow.monitor import Monitoring
 
 Sessions = Annotated[

@@ -9,10 +9,10 @@ import typer
 from pisigma.cli.arguments import AcceptImplausible, AsJson, ModelFolder, Overwrite
 from pisigma.cli.camera_options import takes_corners
 from pisigma.cli.output import command_line, print_json, print_lines, print_table, progress_of, saved
-from pisigma.errors import AcceptanceError
+from pisigma.files.errors import AcceptanceError
 
 if TYPE_CHECKING:
-    from pisigma.camera.corner_file import CameraFiles
+    from pisigma.measurement.camera.corner_file import CameraFiles
     from pisigma.robot.description import Robot
     from pisigma.workflow.recalibrate import Recalibration
 

@@ -69,7 +69,7 @@ def measure(
     planned again, it is written beside them. With --json, sentences go to stderr, and one JSON object to stdout at the
     end. Exit status 3 while all rows are wrong alike.
     """
-    from pisigma.measuring.growing_images import growing_file
+    from pisigma.planning.session.growing_images import growing_file
     from pisigma.workflow.follow import check_programs, follow, rest_file
     from pisigma.workflow.measure import MeasureSettings, MeasuringSession
 

@@ -3,8 +3,8 @@
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
-from pisigma.errors import printable
-from pisigma.measuring.state import AccuracyPoint, SessionState
+from pisigma.files.errors import printable
+from pisigma.planning.session.state import AccuracyPoint, SessionState
 from pisigma.workflow.follow import SessionStep
 
 if TYPE_CHECKING:

@@ -13,11 +13,11 @@ import typer
 from pisigma.cli.output import print_line
 
 if TYPE_CHECKING:
-    from pisigma.measuring.state import SessionState
     from pisigma.planning.camera_settings import CameraSettings
-    from pisigma.planning.cell.arm_in_cell import ArmInCell
+    from pisigma.planning.session.state import SessionState
+    from pisigma.planning.surroundings.arm_in_cell import ArmInCell
+    from pisigma.reporting.viewing.mesh_body import MeshBody
     from pisigma.robot.description import Robot
-    from pisigma.viewing.mesh_body import MeshBody
 
 View = Annotated[
     bool, typer.Option("--view", help="Show robot, rows and errors on a page in the browser too.")
@@ -52,7 +52,7 @@ class PageOptions:
         Raises:
             RobotError: the meshes cannot be shown.
         """
-        from pisigma.viewing.mesh_body import MeshBody
+        from pisigma.reporting.viewing.mesh_body import MeshBody
 
         return None if self.urdf is None else MeshBody(robot, self.urdf)
 
@@ -77,7 +77,7 @@ def shown_in_browser(
     if page is None:
         yield lambda state: None
         return
-    from pisigma.viewing.session_view import SessionView
+    from pisigma.reporting.viewing.session_view import SessionView
 
     limit = None if limit_mm is None else limit_mm / 1e3
     sight = None if camera is None else camera.sight()

@@ -10,7 +10,7 @@ from pisigma.cli.arguments import complete_model
 from pisigma.cli.output import print_json, print_line
 
 if TYPE_CHECKING:
-    from pisigma.serve.models import ServedModels
+    from pisigma.deployment.serve.models import ServedModels
 
 Model = Annotated[Path | None, typer.Argument(help="Model folder.", autocompletion=complete_model)]
 Models = Annotated[
@@ -57,9 +57,9 @@ def serve(
 
     When it is ready, it prints one JSON line with its ports. SIGHUP loads models again whose folders have changed.
     """
-    from pisigma.errors import OutputError
+    from pisigma.deployment.serve.server import Server, ServeSettings
+    from pisigma.files.errors import OutputError
     from pisigma.files.input_file import read_input
-    from pisigma.serve.server import Server, ServeSettings
 
     token = (
         None if token_file is None else read_input(token_file, OutputError).decode(errors="replace").strip()
@@ -78,7 +78,7 @@ def serve(
 
 def _load(model: Path | None, models: Path | None) -> "ServedModels":
     """Load the model, or those of a folder."""
-    from pisigma.serve.models import ServedModels, model_folders
+    from pisigma.deployment.serve.models import ServedModels, model_folders
 
     if model is not None and models is None:
         return ServedModels([model])

@@ -4,7 +4,7 @@ import re
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-from pisigma.errors import nearest_choice
+from pisigma.files.errors import nearest_choice
 from pisigma.measurement.fields import TEXTS
 from pisigma.measurement.readings import READINGS, Unit, reading_texts
 
@@ -22,7 +22,7 @@ MISNAMED_UNITS = tuple(
 """Factors on lengths, what they are, and what they are taken for."""
 
 CORNERS = ("corner", "u_px", "v_px")
-"""Columns of files of corners, which `pisigma.camera` reads."""
+"""Columns of files of corners, which `pisigma.measurement.camera` reads."""
 
 PLAN_COLUMNS = ("order", "candidate")
 """What a plan says of its poses; measurements may keep it, and nothing reads it there."""

@@ -3,7 +3,7 @@
 import math
 from dataclasses import dataclass
 
-from pisigma.errors import MeasurementError
+from pisigma.files.errors import MeasurementError
 from pisigma.measurement.csv.columns import (
     ANCHOR_PLACE,
     CORNERS,

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Bool, Float64
 from torch import Tensor
 
-from pisigma.errors import MeasurementError, nearest_choice
+from pisigma.files.errors import MeasurementError, nearest_choice
 from pisigma.files.input_file import open_input
 from pisigma.measurement.csv.columns import POSITION, QUATERNION, RPY, Column, find_column, quoted
 from pisigma.measurement.csv.header import check_separators
@@ -20,7 +20,7 @@ from pisigma.measurement.csv.table import content_lines, header_names, split_lin
 from pisigma.measurement.fields import LeftOut
 from pisigma.measurement.readings import to_si
 from pisigma.robot.row import LARGEST
-from pisigma.se3 import rotation_from_quaternion, rotation_from_rpy, transform
+from pisigma.robot.se3 import rotation_from_quaternion, rotation_from_rpy, transform
 
 CHUNK_ROWS = 20_000
 """Rows that are in memory at a time."""

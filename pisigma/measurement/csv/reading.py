@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
-from pisigma.errors import MeasurementError, nearest_choice
+from pisigma.files.errors import MeasurementError, nearest_choice
 from pisigma.measurement.csv.columns import (
     PRISMATIC_UNITS,
     QUATERNION,
@@ -27,7 +27,7 @@ from pisigma.measurement.foreign.import_hint import import_hint
 from pisigma.measurement.readings import READINGS, reading_texts, to_si
 from pisigma.measurement.rules import Labels, group_faults, row_faults
 from pisigma.robot import Robot
-from pisigma.se3 import rotation_from_quaternion, rotation_from_rpy
+from pisigma.robot.se3 import rotation_from_quaternion, rotation_from_rpy
 
 
 def read_fields(

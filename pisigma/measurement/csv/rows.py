@@ -6,13 +6,13 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float64
 
-from pisigma.kinematics.joint_limits import grossly_beyond
 from pisigma.measurement.csv.columns import QUATERNION, Column, quoted
 from pisigma.measurement.csv.header import Layout
 from pisigma.measurement.csv.table import Faults, Table
 from pisigma.measurement.readings import READINGS, from_si, to_si
 from pisigma.measurement.rules import rows_where
 from pisigma.robot import Robot, Row
+from pisigma.robot.kinematics.joint_limits import grossly_beyond
 from pisigma.robot.row import LARGEST
 
 QUATERNION_TOLERANCE = 1e-3

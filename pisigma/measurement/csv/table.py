@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool
 
-from pisigma.errors import MeasurementError, printable
+from pisigma.files.errors import MeasurementError, printable
 from pisigma.files.input_file import read_text
 
 SPREADSHEET_ERRORS = frozenset(

@@ -11,12 +11,12 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
-from pisigma.errors import MeasurementError
+from pisigma.files.errors import MeasurementError
 from pisigma.files.output_file import write_whole
 from pisigma.measurement.csv.columns import number_fields
 from pisigma.measurement.fields import KINDS, TEXTS, MeasuredFields
 from pisigma.measurement.readings import READINGS, Unit, from_si, reading_texts
-from pisigma.se3 import quaternion_from_rotation
+from pisigma.robot.se3 import quaternion_from_rotation
 
 
 def write_fields(data: MeasuredFields, path: str | os.PathLike[str], revolute: Sequence[bool]) -> None:

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
-from pisigma.errors import MeasurementError
+from pisigma.files.errors import MeasurementError
 from pisigma.measurement.csv.columns import QUATERNION, RPY, find_column
 from pisigma.measurement.foreign.accounting import Place
 from pisigma.measurement.foreign.export_file import ExportFile
@@ -24,7 +24,7 @@ from pisigma.measurement.foreign.quantities import KEYS, LEFT_OUT, MappedColumn,
 from pisigma.measurement.foreign.rotations import ROTATIONS, RotationEncoding
 from pisigma.measurement.foreign.time_stamps import day_first, has_open_date, iso_day
 from pisigma.measurement.foreign.units import AMBIGUOUS, UNITS, scaled
-from pisigma.se3 import quaternion_from_rotation
+from pisigma.robot.se3 import quaternion_from_rotation
 
 
 @dataclass(frozen=True, eq=False)

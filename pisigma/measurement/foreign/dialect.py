@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import get_args
 
-from pisigma.errors import MeasurementError
+from pisigma.files.errors import MeasurementError
 from pisigma.measurement.csv.table import SPREADSHEET_ERRORS
 from pisigma.measurement.foreign.number_format import Decimal, NumberFormat, is_missing
 

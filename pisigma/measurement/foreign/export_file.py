@@ -5,7 +5,7 @@ import re
 from collections import Counter
 from dataclasses import dataclass
 
-from pisigma.errors import MeasurementError, printable
+from pisigma.files.errors import MeasurementError, printable
 from pisigma.files.input_file import MOST_BYTES, read_input
 from pisigma.measurement.csv.table import SPREADSHEET_ERRORS
 from pisigma.measurement.foreign.accounting import LeftOutRow, Place

@@ -3,7 +3,7 @@
 import re
 from dataclasses import dataclass
 
-from pisigma.errors import LONGEST_WORD
+from pisigma.files.errors import LONGEST_WORD
 from pisigma.measurement.csv.columns import find_column
 from pisigma.measurement.foreign.rotations import ROTATIONS
 from pisigma.measurement.foreign.units import ambiguous_unit, unit_symbol

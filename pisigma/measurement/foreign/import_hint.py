@@ -3,7 +3,7 @@
 import os
 import shlex
 
-from pisigma.errors import MeasurementError
+from pisigma.files.errors import MeasurementError
 from pisigma.measurement.csv.columns import CORNERS, find_column
 from pisigma.measurement.csv.table import read_table
 from pisigma.measurement.foreign.export_file import read_export

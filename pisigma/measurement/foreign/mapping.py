@@ -4,7 +4,7 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
-from pisigma.errors import MeasurementError, nearest_choice
+from pisigma.files.errors import MeasurementError, nearest_choice
 from pisigma.measurement.csv.columns import POSITION
 from pisigma.measurement.foreign.export_file import ExportFile
 from pisigma.measurement.foreign.headings import Maker, parse_heading

@@ -4,7 +4,7 @@ import csv
 import io
 from dataclasses import dataclass
 
-from pisigma.errors import MeasurementError
+from pisigma.files.errors import MeasurementError
 from pisigma.measurement.csv.columns import POSITION, QUATERNION, RPY, find_column
 from pisigma.measurement.csv.reading import fields_of
 from pisigma.measurement.csv.table import Table

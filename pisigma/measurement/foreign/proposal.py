@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
-from pisigma.errors import MeasurementError
+from pisigma.files.errors import MeasurementError
 from pisigma.measurement.csv.columns import POSITION, QUATERNION, RPY
 from pisigma.measurement.foreign.export_file import ExportFile
 from pisigma.measurement.foreign.headings import (

@@ -4,7 +4,7 @@ import functools
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-from pisigma.errors import MeasurementError, nearest_choice
+from pisigma.files.errors import MeasurementError, nearest_choice
 from pisigma.measurement.csv.columns import RPY, find_column, number_fields
 from pisigma.measurement.foreign.rotations import ROTATIONS
 from pisigma.measurement.foreign.units import UNITS, UnitKind

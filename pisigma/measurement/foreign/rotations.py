@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Bool, Float64
 from torch import Tensor
 
-from pisigma.se3 import rotation_from_quaternion, rotation_from_vector
+from pisigma.robot.se3 import rotation_from_quaternion, rotation_from_vector
 
 Unit = str
 _Values = Float64[Tensor, "rows values"]

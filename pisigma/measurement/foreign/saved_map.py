@@ -4,10 +4,10 @@ import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from pisigma.errors import MeasurementError
+from pisigma.files.errors import MeasurementError
 from pisigma.files.output_file import write_whole
+from pisigma.files.yaml_file import Section, read_yaml, yaml_text
 from pisigma.measurement.foreign.mapping import FileMapping
-from pisigma.yaml_file import Section, read_yaml, yaml_text
 
 
 class SavedMap(Section):

@@ -2,7 +2,7 @@
 
 import codecs
 
-from pisigma.errors import MeasurementError
+from pisigma.files.errors import MeasurementError
 
 _MARKS = (
     (codecs.BOM_UTF8, "utf-8"),

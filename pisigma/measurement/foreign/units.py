@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-from pisigma.errors import MeasurementError, nearest_choice
+from pisigma.files.errors import MeasurementError, nearest_choice
 
 UnitKind = Literal["length", "angle", "time", "mass", "temperature"]
 _FEWEST = 3

@@ -14,15 +14,16 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pisigma.hybrid.arm import HybridArm, JointCoverage
-from pisigma.hybrid.covariance_root import CovarianceRoot
-from pisigma.hybrid.uncertainty import PositionUncertainty
-from pisigma.identification.problem.parameters import ParameterSpace
-from pisigma.identification.problem.setup import IdentifiedGeometry
+from pisigma.calibration.geometric.problem.parameters import ParameterSpace
+from pisigma.calibration.geometric.problem.setup import IdentifiedGeometry
+from pisigma.calibration.hybrid.arm import HybridArm, JointCoverage
+from pisigma.calibration.hybrid.covariance_root import CovarianceRoot
+from pisigma.calibration.hybrid.uncertainty import PositionUncertainty
 from pisigma.joint_correction.feature import AbstractFeature, turning_rate
 from pisigma.joint_correction.input_products import InputProducts
 from pisigma.joint_correction.joint_correction import JointCorrection
 from pisigma.joint_correction.registry import feature_from
+from pisigma.measurement.sensors.sensor import UnknownGroup
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.folder.model_document import (
     LearnedSection,
@@ -32,7 +33,6 @@ from pisigma.model.folder.model_document import (
 )
 from pisigma.model.row_poses import Frames
 from pisigma.robot.description import Robot
-from pisigma.sensors.sensor import UnknownGroup
 
 Shape = tuple[int | None, ...]
 """Wanted shape of a tensor; None is any length."""

@@ -7,13 +7,13 @@ from typing import Annotated, Any, Literal
 
 from pydantic import ConfigDict, Field, FiniteFloat, PlainValidator
 
-from pisigma.errors import ModelError
+from pisigma.files.errors import ModelError
 from pisigma.files.model_files import read_model_file
+from pisigma.files.yaml_file import Section, parse_yaml, yaml_text
 from pisigma.joint_correction.feature import FeatureSection
 from pisigma.joint_correction.registry import feature_section
+from pisigma.measurement.sensors.sensor import OtherUnit
 from pisigma.robot.robot_file import RobotDocument
-from pisigma.sensors.sensor import OtherUnit
-from pisigma.yaml_file import Section, parse_yaml, yaml_text
 
 FORMAT = 5
 """Of this version; folders of earlier formats are upgraded by `pisigma.model.folder.upgrade`."""
@@ -55,7 +55,7 @@ class LearnedSection(Section):
 
 
 class UnknownsSection(Section):
-    """What the sensors of one kind had to find out about themselves; see `pisigma.sensors.sensor.UnknownGroup`."""
+    """What sensors of a kind had to find out of themselves; see `pisigma.measurement.sensors.sensor.UnknownGroup`."""
 
     name: str
     columns: tuple[str, ...] = Field(min_length=1)
@@ -75,7 +75,7 @@ class UncertaintySection(Section):
         free: which parameters have a row in the root; the others' rows are 0. Behind them come all weights.
         features: names of the features whose weights these are: those of the learned part, and `products` for the
             products of inputs that its product units make up.
-        prior_scale: see `pisigma.hybrid.uncertainty.PositionUncertainty`, as for the noise.
+        prior_scale: see `pisigma.calibration.hybrid.uncertainty.PositionUncertainty`, as for the noise.
     """
 
     unknowns: tuple[UnknownsSection, ...] = ()

@@ -13,9 +13,8 @@ from safetensors.torch import load as load_tensors
 from safetensors.torch import save as save_tensors
 from torch import Tensor
 
-from pisigma.errors import ModelError, PisigmaError, nearest_choice
+from pisigma.files.errors import ModelError, PisigmaError, nearest_choice
 from pisigma.files.model_files import COMPILED, DESCRIPTION, DRAWING, WEIGHTS, content_hash, read_model_file
-from pisigma.kinematics.closed_form import closed_form_solver
 from pisigma.measurement.copies import ROW_READINGS, ROW_STEPS, RowValues
 from pisigma.model.calibrated_model import CalibratedModel, Provenance
 from pisigma.model.compiled_model import save_compiled
@@ -34,6 +33,7 @@ from pisigma.network.correction_network import CorrectionNetwork, JointGroup
 from pisigma.network.inputs import Inputs
 from pisigma.network.pi_sigma import PiSigma
 from pisigma.robot.description import Robot
+from pisigma.robot.kinematics.closed_form import closed_form_solver
 from pisigma.robot.writing import robot_document
 
 _PREFIX = "network."

@@ -10,11 +10,14 @@ from typing import Any
 
 from safetensors.torch import save as save_tensors
 
-from pisigma.errors import ModelError
+from pisigma.files.errors import ModelError
 from pisigma.files.model_files import CARD, COMPILED, DESCRIPTION, MODEL_FILES, WEIGHTS, read_model_file
 from pisigma.files.output_folder import staged_folder
+from pisigma.files.yaml_file import plain_content
 from pisigma.joint_correction.gear_lines import GearLines
 from pisigma.joint_correction.input_products import InputProducts
+from pisigma.measurement.sensors.anchor import ANCHOR_COLUMNS
+from pisigma.measurement.sensors.socket import SOCKET_COLUMNS
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.folder.model_document import (
     FORMAT,
@@ -24,9 +27,6 @@ from pisigma.model.folder.model_document import (
     write_document,
 )
 from pisigma.model.folder.model_folder import describe, load_model, read_weights
-from pisigma.sensors.anchor import ANCHOR_COLUMNS
-from pisigma.sensors.socket import SOCKET_COLUMNS
-from pisigma.yaml_file import plain_content
 
 _RENAMED = {
     "dealings": "repeats",
@@ -90,7 +90,7 @@ def upgrade_folder(folder: str | os.PathLike[str], check: Callable[[CalibratedMo
 
     Args:
         folder: to upgrade.
-        check: raises where a folder does not say what a model in memory says: `pisigma.inverse.written_model`.
+        check: raises where a folder does not say what a model in memory says: `pisigma.model.inverse.written_model`.
 
     Raises:
         ModelError: the folder holds no model, it is truncated, was edited or is of a newer format, or it is a hybrid
@@ -233,7 +233,7 @@ def _renamed(values: Any) -> Any:
 
 
 def _metrics(kind: str, metrics: dict[str, Any]) -> dict[str, Any]:
-    """Metrics in the form of today; see `pisigma.judging`."""
+    """Metrics in the form of today; see `pisigma.validation.held_out`."""
     if kind == "distilled":
         return metrics | {"joints": [_joint(joint) for joint in metrics.get("joints", ())]}
     if kind not in ("geometric_calibration", "hybrid_calibration"):

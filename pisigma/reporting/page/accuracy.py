@@ -6,15 +6,15 @@ from dataclasses import dataclass
 
 import torch
 
-from pisigma.judging.calibration_summary import CalibrationSummary
-from pisigma.judging.pose_statistics import PoseErrors, error_statistics
-from pisigma.judging.training_summary import BeforeAfter, TrainingSummary
-from pisigma.judging.validation_figures import ErrorFigures
 from pisigma.measurement.groups import groups_of_equal_joints
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.reporting.calibration_tables import cross_validation_text
 from pisigma.reporting.page.judged_rows import JudgedRows, means_by_name
 from pisigma.reporting.rendering import sentences
+from pisigma.validation.held_out.calibration_summary import CalibrationSummary
+from pisigma.validation.held_out.pose_statistics import PoseErrors, error_statistics
+from pisigma.validation.held_out.training_summary import BeforeAfter, TrainingSummary
+from pisigma.validation.held_out.validation_figures import ErrorFigures
 
 LABELS = {
     "nominal": "nominal",

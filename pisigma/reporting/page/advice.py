@@ -8,14 +8,14 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
-from pisigma.hybrid.arm import JointCoverage
-from pisigma.judging.calibration_summary import CalibrationSummary
+from pisigma.calibration.hybrid.arm import JointCoverage
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.stated_conditions import condition_warnings
 from pisigma.reporting.calibration_tables import warning_lines
 from pisigma.reporting.page.accuracy import MOSTLY, Accuracy, Limit
 from pisigma.reporting.page.judged_rows import JudgedRows
 from pisigma.reporting.rendering import sentences
+from pisigma.validation.held_out.calibration_summary import CalibrationSummary
 
 _say = functools.partial(sentences, "report.txt.j2")
 

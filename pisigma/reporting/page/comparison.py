@@ -5,9 +5,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from markupsafe import Markup
 
-from pisigma.comparison.displacement import Displacement
-from pisigma.comparison.parameter_differences import ParameterDifferences
-from pisigma.judging.model_comparison import ModelComparison
+from pisigma.lifetime.comparison.displacement import Displacement
+from pisigma.lifetime.comparison.parameter_differences import ParameterDifferences
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.reporting.comparison_tables import comparison_tables
 from pisigma.reporting.difference_tables import difference_table
@@ -16,6 +15,7 @@ from pisigma.reporting.page.figures import Drawing, draw_map
 from pisigma.reporting.page.page import image, resource
 from pisigma.reporting.rendering import render
 from pisigma.reporting.tables import pose_rows
+from pisigma.validation.held_out.model_comparison import ModelComparison
 
 WIDE = 10_000
 """Characters: tables of a page scroll."""

@@ -6,8 +6,6 @@ from pathlib import Path
 from typing import Any
 
 from pisigma.files.model_files import CORRELATION_CSV, CORRELATION_PNG
-from pisigma.judging.calibration_summary import CalibrationSummary
-from pisigma.judging.held_out_rows import read_held_out
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.reporting.calibration_tables import (
@@ -29,6 +27,8 @@ from pisigma.reporting.page.error_map import ErrorMap, map_of_rows, map_of_works
 from pisigma.reporting.page.judged_rows import JudgedRows, rows_of_file, rows_of_folder
 from pisigma.reporting.page.verdict import Verdict, verdict_of
 from pisigma.reporting.rendering import sentences
+from pisigma.validation.held_out.calibration_summary import CalibrationSummary
+from pisigma.validation.held_out.held_out_rows import read_held_out
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,12 +12,12 @@ from jaxtyping import Bool, Float64
 from torch import Tensor
 
 from pisigma.files.model_files import CORRELATION_CSV, read_model_file
-from pisigma.judging.calibration_summary import CalibrationSummary
-from pisigma.kinematics.forward import forward_kinematics
-from pisigma.kinematics.tolerances import MEASURED_ROUNDING
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.reporting.calibration_figures import JOINT_UNITS
 from pisigma.robot.description import Robot
+from pisigma.robot.kinematics.forward import forward_kinematics
+from pisigma.robot.kinematics.tolerances import MEASURED_ROUNDING
+from pisigma.validation.held_out.calibration_summary import CalibrationSummary
 
 POINTS = 1_500
 """Of a curve: 13 to a period of the 110th harmonic over a whole turn."""

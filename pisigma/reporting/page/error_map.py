@@ -8,10 +8,10 @@ import torch
 from jaxtyping import Bool, Float64, Int64
 from torch import Tensor
 
-from pisigma.kinematics.forward import forward_kinematics
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.reporting.page.judged_rows import JudgedRows, inside, place_of, predicted_at
+from pisigma.robot.kinematics.forward import forward_kinematics
 
 MOST_POINTS = 20_000
 """Of more rows so many are shown, the largest errors among them."""

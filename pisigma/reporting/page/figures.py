@@ -19,15 +19,15 @@ from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter, NullLocator
 
-from pisigma.errors import OutputError
 from pisigma.files.conflicts import Input, check_apart
+from pisigma.files.errors import OutputError
 from pisigma.files.output_file import write_whole
-from pisigma.judging.validation_figures import LearningPoint
 from pisigma.reporting.calibration_figures import STYLES, show_correlations
 from pisigma.reporting.page.content import ReportContent
 from pisigma.reporting.page.corrections import CorrectionCurve, Correlations
 from pisigma.reporting.page.dependence import Dependence, binned
 from pisigma.reporting.page.error_map import Layer
+from pisigma.validation.held_out.validation_figures import LearningPoint
 
 SIZE = (5.2, 3.1)
 """Of a panel [inch]."""

@@ -2,7 +2,7 @@
 
 from markupsafe import Markup
 
-from pisigma.fleet.status import FleetStatus
+from pisigma.lifetime.fleet.status import FleetStatus
 from pisigma.reporting.fleet_tables import STATES, WHOSE_ERRORS, not_compared, robot_table, state_table
 from pisigma.reporting.page.page import resource
 from pisigma.reporting.rendering import render

@@ -7,8 +7,8 @@ from markupsafe import Markup
 from matplotlib.figure import Figure
 from PIL import Image
 
-from pisigma.camera.detection.detected_boards import BoardImage, DetectedBoards, rms_of
-from pisigma.camera.detection.detector import read_image
+from pisigma.measurement.camera.detection.detected_boards import BoardImage, DetectedBoards, rms_of
+from pisigma.measurement.camera.detection.detector import read_image
 from pisigma.reporting.page.figures import AFTER, BEFORE, Drawing, drawing_style
 from pisigma.reporting.page.page import image, resource
 from pisigma.reporting.rendering import render

@@ -9,11 +9,7 @@ import torch
 from jaxtyping import Bool, Float64
 from torch import Tensor
 
-from pisigma.errors import MeasurementError, ModelError
-from pisigma.judging.held_out_rows import HeldOutRows
-from pisigma.judging.pose_statistics import PoseErrors
-from pisigma.judging.reference_models import nominal_model
-from pisigma.kinematics.forward import forward_kinematics
+from pisigma.files.errors import MeasurementError, ModelError
 from pisigma.measurement.copies import copy_warnings
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.groups import numbers_of_names
@@ -22,7 +18,11 @@ from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.row_poses import nominal_poses_of_rows, poses_of_rows
 from pisigma.model.training_rows import known_rows, training_row_warnings
 from pisigma.reporting.rendering import sentences
-from pisigma.se3 import invert, transform_from_xyzrpy
+from pisigma.robot.kinematics.forward import forward_kinematics
+from pisigma.robot.se3 import invert, transform_from_xyzrpy
+from pisigma.validation.held_out.held_out_rows import HeldOutRows
+from pisigma.validation.held_out.pose_statistics import PoseErrors
+from pisigma.validation.held_out.reference_models import nominal_model
 
 _say = functools.partial(sentences, "report.txt.j2")
 

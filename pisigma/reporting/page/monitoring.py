@@ -8,10 +8,10 @@ from markupsafe import Markup
 from matplotlib.axes import Axes
 from matplotlib.dates import AutoDateLocator, ConciseDateFormatter
 
+from pisigma.lifetime.monitoring.charts import FALSE_ALARMS_PER_YEAR, SESSIONS_PER_YEAR, Chart
+from pisigma.lifetime.monitoring.history import Record
+from pisigma.lifetime.recalibration.moved import NORMAL_95
 from pisigma.model.calibrated_model import CalibratedModel
-from pisigma.monitoring.charts import FALSE_ALARMS_PER_YEAR, SESSIONS_PER_YEAR, Chart
-from pisigma.monitoring.history import Record
-from pisigma.recalibration.moved import NORMAL_95
 from pisigma.reporting.monitoring_tables import chart_table, session_table
 from pisigma.reporting.page.figures import AFTER, BEFORE, OTHER, Drawing, drawing_style, panel
 from pisigma.reporting.page.page import image, resource

@@ -5,9 +5,9 @@ import os
 from PIL import Image
 
 from pisigma.files.output_folder import staged_folder
+from pisigma.files.yaml_file import yaml_text
 from pisigma.simulation.camera.simulated_images import SimulatedImages
 from pisigma.simulation.true_robot import TrueRobot
-from pisigma.yaml_file import yaml_text
 
 STATED = ("joints.csv", "camera.yaml", "board.yaml")
 

@@ -8,12 +8,12 @@ import torch
 from jaxtyping import Bool, Float64
 from torch import Tensor
 
-from pisigma.camera.board import Board
-from pisigma.camera.camera import Camera
-from pisigma.camera.image_rows import Images, Repeatability
-from pisigma.kinematics.forward import forward_kinematics
+from pisigma.measurement.camera.board import Board
+from pisigma.measurement.camera.camera import Camera
+from pisigma.measurement.camera.image_rows import Images, Repeatability
 from pisigma.robot.description import Robot
-from pisigma.se3 import invert, rotation_from_vector, transform
+from pisigma.robot.kinematics.forward import forward_kinematics
+from pisigma.robot.se3 import invert, rotation_from_vector, transform
 from pisigma.simulation.camera.true_board import TrueBoard
 
 

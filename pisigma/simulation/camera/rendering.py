@@ -6,8 +6,8 @@ import numpy as np
 from jaxtyping import Float, Float64, UInt8
 from scipy.ndimage import gaussian_filter
 
-from pisigma.camera.camera import Camera
-from pisigma.camera.pattern import Pattern
+from pisigma.measurement.camera.camera import Camera
+from pisigma.measurement.camera.pattern import Pattern
 from pisigma.simulation.camera.true_board import TrueBoard
 
 NODE_STEP = 16

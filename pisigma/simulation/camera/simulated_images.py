@@ -10,16 +10,16 @@ from jaxtyping import Float64, UInt8
 from pydantic import Field
 from torch import Tensor
 
-from pisigma.camera.board import BoardDocument
-from pisigma.camera.camera import Camera, CameraDocument, IntrinsicsSection
-from pisigma.camera.image_rows import Repeatability, image_measurements
+from pisigma.files.yaml_file import Section, Seed
+from pisigma.measurement.camera.board import BoardDocument
+from pisigma.measurement.camera.camera import Camera, CameraDocument, IntrinsicsSection
+from pisigma.measurement.camera.image_rows import Repeatability, image_measurements
 from pisigma.measurement.dataset import Measurements
 from pisigma.simulation.camera.images import ImageNoise, draw_board_poses, simulate_images
 from pisigma.simulation.camera.rendering import Exposure, render_image
 from pisigma.simulation.camera.true_board import TrueBoard
 from pisigma.simulation.camera.views import RandomViews
 from pisigma.simulation.true_robot import TrueRobot
-from pisigma.yaml_file import Section, Seed
 
 
 class CornerNoise(Section):

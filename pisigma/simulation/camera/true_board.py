@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64
 
-from pisigma.camera.board import Board
-from pisigma.camera.pattern import Pattern, board_pattern
+from pisigma.measurement.camera.board import Board
+from pisigma.measurement.camera.pattern import Pattern, board_pattern
 
 
 @dataclass(frozen=True)

@@ -6,14 +6,14 @@ from jaxtyping import Float64
 from pydantic import Field
 from torch import Tensor
 
-from pisigma.camera.board import Board
-from pisigma.camera.camera import Camera
-from pisigma.errors import RecipeError
-from pisigma.kinematics.closed_form import AbstractClosedForm, closed_form_solver
-from pisigma.kinematics.status import Status
+from pisigma.files.errors import RecipeError
+from pisigma.files.yaml_file import Count, Section, Seed
+from pisigma.measurement.camera.board import Board
+from pisigma.measurement.camera.camera import Camera
 from pisigma.robot.description import Robot
-from pisigma.se3 import invert, rotation_from_rpy, transform
-from pisigma.yaml_file import Count, Section, Seed
+from pisigma.robot.kinematics.closed_form import AbstractClosedForm, closed_form_solver
+from pisigma.robot.kinematics.status import Status
+from pisigma.robot.se3 import invert, rotation_from_rpy, transform
 
 CANDIDATES = 8
 """For each view, of which those are taken that are far apart in joint space."""

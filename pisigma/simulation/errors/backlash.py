@@ -6,9 +6,9 @@ import numpy as np
 from jaxtyping import Float64
 from pydantic import Field
 
+from pisigma.files.yaml_file import Seed
 from pisigma.robot.description import Robot
 from pisigma.simulation.errors.source import AbstractPlaySource, joint_values
-from pisigma.yaml_file import Seed
 
 
 class Backlash(AbstractPlaySource):

@@ -8,7 +8,7 @@ from jaxtyping import Float
 from pydantic import Field
 from torch import Tensor
 
-from pisigma.errors import RecipeError, RobotError
+from pisigma.files.errors import RecipeError, RobotError
 from pisigma.robot.coupling_section import CoupledJointSection, coupled, coupling_document
 from pisigma.robot.description import Robot
 from pisigma.simulation.errors.source import AbstractJointSource, JointErrorFunction

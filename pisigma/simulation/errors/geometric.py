@@ -7,10 +7,10 @@ import torch
 from jaxtyping import Float64
 from pydantic import Field
 
+from pisigma.files.yaml_file import Seed
 from pisigma.robot.description import Robot
 from pisigma.robot.robot_file import FrameSection, ParameterSection
 from pisigma.simulation.errors.source import AbstractGeometrySource, GeometryChange, row_index
-from pisigma.yaml_file import Seed
 
 
 class GeometricDeviation(AbstractGeometrySource):

@@ -8,10 +8,10 @@ from jaxtyping import Float
 from pydantic import Field, model_validator
 from torch import Tensor
 
-from pisigma.errors import RecipeError, nearest_choice
+from pisigma.files.errors import RecipeError, nearest_choice
+from pisigma.files.yaml_file import Section
 from pisigma.robot.description import Robot
 from pisigma.simulation.errors.source import AbstractJointSource, JointErrorFunction, joint_values
-from pisigma.yaml_file import Section
 
 
 class GuideWave(Section):

@@ -7,11 +7,11 @@ from jaxtyping import Float
 from pydantic import Field
 from torch import Tensor
 
-from pisigma.kinematics.components import Frame, as_transform, follow_xyzrpy
-from pisigma.kinematics.forward import Geometry, iterate_rows
+from pisigma.files.yaml_file import Section
 from pisigma.robot.description import Robot
+from pisigma.robot.kinematics.components import Frame, as_transform, follow_xyzrpy
+from pisigma.robot.kinematics.forward import Geometry, iterate_rows
 from pisigma.simulation.errors.source import AbstractJointSource, JointErrorFunction, joint_values, row_index
-from pisigma.yaml_file import Section
 
 Triple = tuple[float, float, float]
 

@@ -9,9 +9,9 @@ import numpy as np
 from jaxtyping import Float64
 from torch import Tensor
 
-from pisigma.errors import RecipeError, nearest_choice
+from pisigma.files.errors import RecipeError, nearest_choice
+from pisigma.files.yaml_file import Section
 from pisigma.robot.description import Robot
-from pisigma.yaml_file import Section
 
 Value = TypeVar("Value")
 

@@ -8,7 +8,8 @@ from jaxtyping import Float
 from pydantic import Field, model_validator
 from torch import Tensor
 
-from pisigma.errors import RecipeError
+from pisigma.files.errors import RecipeError
+from pisigma.files.yaml_file import Section
 from pisigma.robot.description import Robot
 from pisigma.simulation.errors.source import (
     AbstractJointSource,
@@ -16,7 +17,6 @@ from pisigma.simulation.errors.source import (
     joint_index,
     joint_values,
 )
-from pisigma.yaml_file import Section
 
 
 class Harmonic(Section):

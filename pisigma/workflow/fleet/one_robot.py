@@ -7,14 +7,14 @@ from typing import Literal, get_args
 
 from pydantic import TypeAdapter, ValidationError
 
-from pisigma.camera.corner_file import CameraFiles
-from pisigma.errors import FleetError, OutputError, PisigmaError, nearest_choice
-from pisigma.fleet.members import Member, SessionFile
-from pisigma.fleet.record import REFUSED, ParameterValue, RobotRecord, SessionRecord, write_record
-from pisigma.judging.validation_figures import AbstractValidationFigures
+from pisigma.files.errors import FleetError, OutputError, PisigmaError, nearest_choice
+from pisigma.lifetime.fleet.members import Member, SessionFile
+from pisigma.lifetime.fleet.record import REFUSED, ParameterValue, RobotRecord, SessionRecord, write_record
+from pisigma.measurement.camera.corner_file import CameraFiles
+from pisigma.measurement.sensors.sensor import SHOWN_UNITS
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.robot.description import Robot
-from pisigma.sensors.sensor import SHOWN_UNITS
+from pisigma.validation.held_out.validation_figures import AbstractValidationFigures
 from pisigma.workflow.calibrate import Calibration, CalibrationSettings, calibrate
 from pisigma.workflow.monitor import MonitorSettings, monitor
 from pisigma.workflow.recalibrate import Recalibration, RecalibrationSettings, recalibrate

@@ -9,18 +9,18 @@ from typing import Any
 
 import numpy as np
 
-from pisigma.camera.corner_file import read_rows
-from pisigma.errors import FleetError, MeasurementError, RobotError
-from pisigma.fleet.members import Member, read_fleet
-from pisigma.fleet.prior import FEWEST_ROBOTS, FleetPrior, fleet_prior
-from pisigma.fleet.prior_summary import FleetPriorSummary, summarise_prior
-from pisigma.judging.progress import Progress
+from pisigma.files.errors import FleetError, MeasurementError, RobotError
+from pisigma.files.progress import Progress
+from pisigma.lifetime.fleet.members import Member, read_fleet
+from pisigma.lifetime.fleet.prior import FEWEST_ROBOTS, FleetPrior, fleet_prior
+from pisigma.lifetime.fleet.prior_summary import FleetPriorSummary, summarise_prior
+from pisigma.measurement.camera.corner_file import read_rows
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.joint_range import row_warnings, with_limits_of_rows
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.reporting.fleet_prior_card import write_fleet_prior_card
 from pisigma.robot.description import Robot
-from pisigma.verification.checks.setup_fault import setup_diagnostics
+from pisigma.validation.checks.setup_fault import setup_diagnostics
 from pisigma.workflow.result import AbstractModelResult
 
 
@@ -52,7 +52,7 @@ def estimate_fleet_prior(
     """Estimate means and covariances of the errors of robots of one type from the first session of each.
 
     Args:
-        source: manifest (CSV) or folder; see `pisigma.fleet.members.read_fleet`.
+        source: manifest (CSV) or folder; see `pisigma.lifetime.fleet.members.read_fleet`.
         robot: as drawn, of those robots that state none.
         progress: called with what is being done.
 

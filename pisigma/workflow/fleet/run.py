@@ -12,18 +12,25 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from pisigma.engines.engine import AbstractEngine
-from pisigma.engines.processes import ProcessEngine
-from pisigma.errors import OutputError, PisigmaError
 from pisigma.files.conflicts import check_apart
+from pisigma.files.engines.engine import AbstractEngine
+from pisigma.files.engines.processes import ProcessEngine
+from pisigma.files.errors import OutputError, PisigmaError
 from pisigma.files.model_files import is_model, model_hash
-from pisigma.fleet.members import Member, read_fleet
-from pisigma.fleet.record import MARK, RobotRecord, expect_robots, read_record, read_records, record_path
-from pisigma.fleet.results_table import RESULTS, write_results
-from pisigma.judging.progress import Progress
+from pisigma.files.plugins import loaded
+from pisigma.files.progress import Progress
+from pisigma.lifetime.fleet.members import Member, read_fleet
+from pisigma.lifetime.fleet.record import (
+    MARK,
+    RobotRecord,
+    expect_robots,
+    read_record,
+    read_records,
+    record_path,
+)
+from pisigma.lifetime.fleet.results_table import RESULTS, write_results
 from pisigma.model.folder.model_folder import load_model
-from pisigma.plugins import loaded
-from pisigma.recalibration.model_posterior import check_fleet_prior
+from pisigma.model.model_posterior import check_fleet_prior
 from pisigma.workflow.calibrate import CalibrationSettings
 from pisigma.workflow.fleet.one_robot import FleetSettings, work_out
 
@@ -82,7 +89,7 @@ def run_fleet(
     its model is gone, or it was refused for want of space.
 
     Args:
-        source: manifest (CSV) or folder; see `pisigma.fleet.members.read_fleet`.
+        source: manifest (CSV) or folder; see `pisigma.lifetime.fleet.members.read_fleet`.
         out: folder to write: `results.parquet`, `records/ID.json` and `models/ID/SESSION`.
         settings: what is done, and where; None for the usual.
         robot: as drawn, of those robots that state none.
@@ -153,7 +160,7 @@ def _engine(settings: FleetSettings, items: int) -> Iterator[AbstractEngine]:
     if settings.engine == "processes" or not items:
         yield ProcessEngine(max(1, min(jobs, items)))
         return
-    from pisigma.engines.ray_cluster import RayEngine
+    from pisigma.files.engines.ray_cluster import RayEngine
 
     engine = RayEngine(settings.jobs, settings.address)
     try:

@@ -8,16 +8,20 @@ from pathlib import Path
 
 import numpy as np
 
-from pisigma.camera.board import Board
-from pisigma.camera.camera import INTRINSICS
-from pisigma.camera.detection.detected_board import DetectedBoard
-from pisigma.camera.detection.detected_boards import DetectedBoards, predict_boards
-from pisigma.camera.detection.detector import MOST_BLUR, detect_boards, image_files
-from pisigma.camera.intrinsic_calibration import BoardView, IntrinsicCalibration, calibrate_intrinsics
-from pisigma.errors import MeasurementError
+from pisigma.files.errors import MeasurementError
 from pisigma.files.output_file import check_page, write_whole
+from pisigma.measurement.camera.board import Board
+from pisigma.measurement.camera.camera import INTRINSICS
+from pisigma.measurement.camera.detection.detected_board import DetectedBoard
+from pisigma.measurement.camera.detection.detected_boards import DetectedBoards, predict_boards
+from pisigma.measurement.camera.detection.detector import MOST_BLUR, detect_boards, image_files
+from pisigma.measurement.camera.intrinsic_calibration import (
+    BoardView,
+    IntrinsicCalibration,
+    calibrate_intrinsics,
+)
+from pisigma.measurement.sensors.intrinsics import CAMERA_UNITS
 from pisigma.reporting.tables import Table
-from pisigma.sensors.intrinsics import CAMERA_UNITS
 
 OBLIQUE = np.deg2rad(15.0)
 """Where fewer than a third of the images are more oblique, focal length and distance go together."""

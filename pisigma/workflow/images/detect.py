@@ -7,13 +7,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from pisigma.camera.board import Board
-from pisigma.camera.camera import Camera
-from pisigma.camera.detection.detected_boards import DetectedBoards, predict_boards
-from pisigma.camera.detection.detector import MOST_BLUR, detect_boards, image_files
-from pisigma.camera.detection.joined_joints import JoinedJoints, join_joints
-from pisigma.errors import MeasurementError
+from pisigma.files.errors import MeasurementError
 from pisigma.files.output_file import check_page, write_whole
+from pisigma.measurement.camera.board import Board
+from pisigma.measurement.camera.camera import Camera
+from pisigma.measurement.camera.detection.detected_boards import DetectedBoards, predict_boards
+from pisigma.measurement.camera.detection.detector import MOST_BLUR, detect_boards, image_files
+from pisigma.measurement.camera.detection.joined_joints import JoinedJoints, join_joints
 from pisigma.measurement.foreign.joining import WITHIN
 from pisigma.reporting.tables import Table
 

@@ -10,7 +10,7 @@ from testing.models import no_type_checker
 from testing.pose_files import write_poses
 
 from pisigma.model.folder.model_folder import save_model
-from pisigma.se3 import xyzrpy_from_transform
+from pisigma.robot.se3 import xyzrpy_from_transform
 
 
 @pytest.fixture(scope="module")

@@ -11,10 +11,10 @@ from testing.closeness import assert_close
 from testing.models import HOMES, joints_around
 from testing.pose_files import COLUMNS, write_poses
 
-from pisigma.inverse.corrected_ik import load
-from pisigma.kinematics.forward import forward_kinematics
+from pisigma.model.inverse.corrected_ik import load
 from pisigma.robot import Robot
-from pisigma.se3 import xyzrpy_from_transform
+from pisigma.robot.kinematics.forward import forward_kinematics
+from pisigma.robot.se3 import xyzrpy_from_transform
 
 
 def pose_of(name: str, q: torch.Tensor) -> list[float]:

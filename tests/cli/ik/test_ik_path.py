@@ -9,11 +9,11 @@ import torch
 from testing.closeness import assert_close
 from testing.models import no_type_checker
 
-from pisigma.kinematics.forward import forward_kinematics
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.folder.model_folder import save_model
 from pisigma.robot import Robot
-from pisigma.se3 import xyzrpy_from_transform
+from pisigma.robot.kinematics.forward import forward_kinematics
+from pisigma.robot.se3 import xyzrpy_from_transform
 
 
 @pytest.fixture(scope="module")

@@ -8,8 +8,8 @@ import pytest
 from testing.board_images import CAMERA, cv2, draw_board, view
 from testing.closeness import assert_close
 
-from pisigma.camera.board import Board
-from pisigma.camera.camera import Camera
+from pisigma.measurement.camera.board import Board
+from pisigma.measurement.camera.camera import Camera
 
 BOARD = Board("board", 4, 4, 0.03)
 """Which end of it is which, intrinsics do not depend on."""

@@ -10,7 +10,7 @@ import pytest
 from testing.board_images import CAMERA, cv2, draw_board, view
 from testing.closeness import assert_close
 
-from pisigma.camera.board import Board
+from pisigma.measurement.camera.board import Board
 
 BOARD = Board("board", 4, 5, 0.03)
 VIEWS = [view(BOARD, 0.33, (roll, 0.4, -0.3)) for roll in (0.0, 2.0, 0.1, 5.0)]
@@ -128,7 +128,7 @@ def test_a_page_shows_every_image(run, files, tmp_path):
 def test_without_opencv_the_extra_is_named(refuses, files, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "cv2", None)
     for name in list(sys.modules):
-        if name.startswith(("pisigma.camera.detection", "pisigma.workflow.images")):
+        if name.startswith(("pisigma.measurement.camera.detection", "pisigma.workflow.images")):
             monkeypatch.delitem(sys.modules, name)
     message = refuses("detect", *options(files), "--out", tmp_path / "corners.csv")
     assert message.startswith("this needs the package opencv-python-headless, which is not installed")

@@ -6,10 +6,10 @@ import pytest
 import torch
 from testing.closeness import assert_close
 
-from pisigma.errors import MeasurementError
 from pisigma.files import input_file
+from pisigma.files.errors import MeasurementError
 from pisigma.measurement.csv.poses import read_pose_chunks, read_poses
-from pisigma.se3 import transform_from_xyzrpy
+from pisigma.robot.se3 import transform_from_xyzrpy
 
 RPY = "x_mm,y_mm,z_mm,roll_deg,pitch_deg,yaw_deg"
 QUATERNION = "x_m,y_m,z_m,qx,qy,qz,qw"

@@ -5,7 +5,7 @@ import math
 import pytest
 from testing.closeness import assert_close
 
-from pisigma.errors import MeasurementError
+from pisigma.files.errors import MeasurementError
 from pisigma.measurement.csv.reading import read_joints
 from pisigma.robot import Robot
 

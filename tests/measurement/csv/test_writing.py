@@ -11,11 +11,11 @@ from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 from testing.closeness import assert_close
 
-from pisigma.errors import MeasurementError, OutputError
+from pisigma.files.errors import MeasurementError, OutputError
 from pisigma.measurement import Measurements
 from pisigma.measurement.rules import TEMPERATURES
 from pisigma.robot import Robot
-from pisigma.se3 import rotation_from_quaternion, rotation_from_rpy
+from pisigma.robot.se3 import rotation_from_quaternion, rotation_from_rpy
 
 TEXT = st.text(st.characters(exclude_categories=("Cs", "Cc")), max_size=6).filter(
     lambda text: text == text.strip()

@@ -2,7 +2,7 @@
 
 import pytest
 
-from pisigma.errors import MeasurementError
+from pisigma.files.errors import MeasurementError
 from pisigma.measurement.foreign.dialect import Dialect, sniff
 from pisigma.measurement.foreign.number_format import Decimal
 

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from pisigma.errors import MeasurementError
+from pisigma.files.errors import MeasurementError
 from pisigma.measurement.foreign.export_file import ExportFile, read_export
 
 

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from pisigma.errors import MeasurementError
+from pisigma.files.errors import MeasurementError
 from pisigma.measurement.dataset import Measurements
 
 ROWS = "170,-20,1200.5,-300,400\n171,-21,1201.5,-301,401\n"

@@ -2,7 +2,7 @@
 
 import pytest
 
-from pisigma.errors import MeasurementError
+from pisigma.files.errors import MeasurementError
 from pisigma.measurement.foreign.accounting import sentences
 from pisigma.measurement.foreign.conversion import ConvertedRows
 from pisigma.measurement.foreign.joining import join_rows

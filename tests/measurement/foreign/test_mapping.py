@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from pisigma.errors import MeasurementError
+from pisigma.files.errors import MeasurementError
 from pisigma.measurement.foreign.conversion import convert
 from pisigma.measurement.foreign.doubts import doubts
 from pisigma.measurement.foreign.export_file import read_export

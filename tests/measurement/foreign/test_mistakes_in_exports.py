@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from pisigma.errors import MeasurementError
+from pisigma.files.errors import MeasurementError
 from pisigma.workflow.import_rows import ImportedRows, ImportSettings, import_rows
 
 NAMES = ["J1", "J2", "J3", "J4", "J5", "J6", "X", "Y", "Z"]

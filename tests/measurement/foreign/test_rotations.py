@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from testing.closeness import assert_close
 
 from pisigma.measurement.foreign.rotations import ROTATIONS, encodings_of
-from pisigma.se3 import rotation_from_quaternion, rotation_from_rpy
+from pisigma.robot.se3 import rotation_from_quaternion, rotation_from_rpy
 
 ANGLES = np.random.default_rng(1).uniform(-1.4, 1.4, (20, 3))
 

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from pisigma.errors import MeasurementError
+from pisigma.files.errors import MeasurementError
 from pisigma.measurement.foreign.saved_map import check_used, map_for, parse_map
 
 

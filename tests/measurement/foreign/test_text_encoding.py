@@ -2,7 +2,7 @@
 
 import pytest
 
-from pisigma.errors import MeasurementError
+from pisigma.files.errors import MeasurementError
 from pisigma.measurement.foreign.text_encoding import decoded
 
 TEXT = "Prüfpunkt;J1 [°]\n1;2,5\n"

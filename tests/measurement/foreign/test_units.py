@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from pisigma.errors import MeasurementError
+from pisigma.files.errors import MeasurementError
 from pisigma.measurement.foreign.units import (
     doubt,
     is_certain,

@@ -13,12 +13,12 @@ from safetensors.torch import load_file, save_file
 from testing.closeness import assert_close
 from testing.models import HOMES, hand_made_model, joints_around
 
-from pisigma.errors import ModelError
+from pisigma.files.errors import ModelError
 from pisigma.files.model_files import check_model_hash
-from pisigma.inverse.corrected_ik import load
-from pisigma.kinematics.forward import forward_kinematics
 from pisigma.model.calibrated_model import CalibratedModel, Provenance
 from pisigma.model.folder.model_folder import load_model, save_model
+from pisigma.model.inverse.corrected_ik import load
+from pisigma.robot.kinematics.forward import forward_kinematics
 
 PROVENANCE = Provenance(
     recipe="test",

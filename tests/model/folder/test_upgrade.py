@@ -12,14 +12,14 @@ from testing.identified import hybrid_model
 from testing.models import hand_made_model
 from testing.report import hybrid_under_test
 
-from pisigma.errors import ModelError, OutputError
-from pisigma.inverse.written_model import check_written
+from pisigma.files.errors import ModelError, OutputError
 from pisigma.joint_correction.conditions import ConditionFeatures
-from pisigma.judging.calibration_summary import CalibrationSummary
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.folder.model_folder import load_model, save_model
 from pisigma.model.folder.upgrade import Upgrade, upgrade_folder
+from pisigma.model.inverse.written_model import check_written
 from pisigma.robot import Robot
+from pisigma.validation.held_out.calibration_summary import CalibrationSummary
 
 pytestmark = pytest.mark.usefixtures("without_type_checker")
 

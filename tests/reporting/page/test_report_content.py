@@ -12,9 +12,7 @@ from testing.closeness import assert_close
 from testing.models import hand_made_model, joints_around
 from testing.report import folder_with_held_out, geometric_under_test, hybrid_under_test, measured
 
-from pisigma.errors import MeasurementError
-from pisigma.judging.calibration_summary import CalibrationSummary
-from pisigma.judging.validation_figures import ErrorFigures
+from pisigma.files.errors import MeasurementError
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.row_poses import poses_of_rows
 from pisigma.reporting.page.accuracy import limit_of
@@ -22,6 +20,8 @@ from pisigma.reporting.page.advice import measured_stretches
 from pisigma.reporting.page.content import report_content
 from pisigma.reporting.page.corrections import correction_curves
 from pisigma.reporting.page.judged_rows import MOST_PREDICTED, predicted_at
+from pisigma.validation.held_out.calibration_summary import CalibrationSummary
+from pisigma.validation.held_out.validation_figures import ErrorFigures
 
 pytestmark = pytest.mark.usefixtures("without_type_checker")
 

@@ -14,7 +14,7 @@ from testing.hybrid import hybrid_of
 from testing.models import no_type_checker
 from testing.report import HOSTILE, folder_with_held_out, geometric_under_test, hybrid_under_test, measured
 
-from pisigma.errors import OutputError
+from pisigma.files.errors import OutputError
 from pisigma.reporting.page.content import report_content
 from pisigma.reporting.page.figures import check_figures, draw_dependence, draw_figures, write_figures
 from pisigma.reporting.page.page import render_page, script_json

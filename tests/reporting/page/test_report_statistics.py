@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from testing.closeness import assert_close
 
-from pisigma.judging.rank_tests import SIGNIFICANT
 from pisigma.reporting.page.dependence import binned
 from pisigma.reporting.page.verdict import CELLS, worst_region
+from pisigma.validation.held_out.rank_tests import SIGNIFICANT
 
 
 def test_a_planted_region_is_found():

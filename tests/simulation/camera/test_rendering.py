@@ -7,9 +7,9 @@ import pytest
 import torch
 from testing.closeness import assert_close
 
-from pisigma.camera.board import Board
-from pisigma.camera.camera import Camera
-from pisigma.se3 import rotation_from_rpy
+from pisigma.measurement.camera.board import Board
+from pisigma.measurement.camera.camera import Camera
+from pisigma.robot.se3 import rotation_from_rpy
 from pisigma.simulation.camera.rendering import Exposure, render_image
 from pisigma.simulation.camera.true_board import TrueBoard
 
@@ -65,8 +65,8 @@ def test_blur_grows_away_from_the_distance_in_focus():
 def test_corners_are_detected_where_the_camera_projects_them(bow: float):
     """Of a board that is larger than stated and bowed, through a lens with distortion."""
     pytest.importorskip("cv2", reason="opencv-python-headless is not installed")
-    from pisigma.camera.detection.checkerboard import detect_checkerboard
-    from pisigma.camera.detection.detected_board import DetectedBoard
+    from pisigma.measurement.camera.detection.checkerboard import detect_checkerboard
+    from pisigma.measurement.camera.detection.detected_board import DetectedBoard
 
     board, T = TrueBoard(BOARD, 1.01, bow), pose(0.3, (0.2, -0.3, 0.4))
     image = rendered(Exposure(focus=0.3), T, board)

@@ -8,12 +8,12 @@ import pytest
 import torch
 from testing.closeness import assert_close
 
-from pisigma.errors import RecipeError
-from pisigma.recipes.reader import read_recipe
-from pisigma.recipes.recipe import GeometricRecipe
+from pisigma.files.errors import RecipeError
 from pisigma.robot import Robot
 from pisigma.simulation.camera.simulated_images import SimulatedImages
 from pisigma.simulation.true_robot import TrueRobot
+from pisigma.workflow.recipes.reader import read_recipe
+from pisigma.workflow.recipes.recipe import GeometricRecipe
 
 
 @pytest.fixture(scope="module")
@@ -86,8 +86,8 @@ def test_joints_are_read_late(recipe: GeometricRecipe, robot: TrueRobot):
 
 def test_rendered_images_are_those_of_the_poses(recipe: GeometricRecipe, robot: TrueRobot):
     pytest.importorskip("cv2", reason="opencv-python-headless is not installed")
-    from pisigma.camera.detection.checkerboard import detect_checkerboard
-    from pisigma.camera.detection.detected_board import DetectedBoard
+    from pisigma.measurement.camera.detection.checkerboard import detect_checkerboard
+    from pisigma.measurement.camera.detection.detected_board import DetectedBoard
 
     half = {"width": 960, "height": 600, "fx": 700.0, "fy": 700.0, "cx": 480.0, "cy": 300.0}
     section = images(recipe, camera=half)

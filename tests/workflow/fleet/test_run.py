@@ -8,9 +8,9 @@ from dataclasses import replace
 import pytest
 from testing.aged import model_before, rows_later
 
-from pisigma.engines.processes import ProcessEngine
-from pisigma.errors import FleetError, OutputError
-from pisigma.fleet.record import read_records
+from pisigma.files.engines.processes import ProcessEngine
+from pisigma.files.errors import FleetError, OutputError
+from pisigma.lifetime.fleet.record import read_records
 from pisigma.model.folder.model_folder import load_model, save_model
 from pisigma.workflow.fleet import run as workflow
 from pisigma.workflow.fleet.one_robot import FleetSettings

@@ -1,0 +1,119 @@
+"""How well a set of poses determines parameters: indices O1 to O5, and the weak directions in words."""
+
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float64
+from torch import Tensor
+
+from pisigma.calibration.geometric.problem.least_squares import Linearisation
+from pisigma.calibration.geometric.problem.noise import view_of
+from pisigma.calibration.geometric.problem.problem import CalibrationProblem
+
+ROUNDING = 1e-12
+"""Information of less than this share of the largest cannot be distinguished from none."""
+SHOWN = 0.25
+"""Parameters with at least this share of a direction are named."""
+
+
+@dataclass(frozen=True)
+class Observability:
+    """How well poses determine the chosen parameters: from the singular values s_1 ≥ ... ≥ s_L of their Jacobian.
+
+    The scaling: parameters in mm and mrad, positions in mm, rotations in mrad; the Jacobian is not divided
+    by noise.
+
+    Attributes:
+        O1: `(s_1 · ... · s_L)^(1/L) / sqrt(poses)` (Borm and Menq 1991).
+        O2: `s_L / s_1`, the inverse condition number (Driels and Pathre 1990).
+        O3: `s_L` (Nahvi et al. 1994).
+        O4: `s_L² / s_1`, the noise amplification index (Nahvi and Hollerbach 1996).
+        O5: `1 / (1/s_1 + ... + 1/s_L)` (Sun and Hollerbach 2008).
+    """
+
+    O1: float
+    O2: float
+    O3: float
+    O4: float
+    O5: float
+
+    @property
+    def condition_number(self) -> float:
+        """`s_1 / s_L`."""
+        return float("inf") if self.O2 == 0 else 1 / self.O2
+
+
+def observability_of(gram: Float64[Tensor, "chosen chosen"], poses: int) -> Observability:
+    """The indices for the parameters of a Gram matrix `J^T J`; all 0 where the data do not see one of them.
+
+    Args:
+        gram: of the Jacobian scaled as said above.
+        poses: number of rows measured.
+    """
+    square = torch.linalg.eigvalsh(gram).flip(0)
+    if len(square) == 0 or float(square[-1]) <= 1e-15 * float(square[0]):
+        return Observability(0.0, 0.0, 0.0, 0.0, 0.0)
+    s = square.sqrt()
+    return Observability(
+        O1=float(s.log().mean().exp()) / poses**0.5,
+        O2=float(s[-1] / s[0]),
+        O3=float(s[-1]),
+        O4=float(s[-1] ** 2 / s[0]),
+        O5=float(1 / (1 / s).sum()),
+    )
+
+
+def find_weak_directions(problem: CalibrationProblem, here: Linearisation[Tensor]) -> tuple[str, ...]:
+    """Find directions of the free arm parameters that the data determine less well than the prior does.
+
+    Base and tool are marginalised: what they can mimic does not count as determined. The directions are
+    eigenvectors of the data's information in units of the prior's standard deviations (1 mm and 1 mrad
+    where there is none).
+
+    Args:
+        problem: with its free parameters.
+        here: its linearisation at the solution.
+    """
+    view, stated = view_of(here), problem.precision[problem.active]
+    precision = view.scaled(stated, problem.prior_group)
+    held = bool((precision > 0).any())
+    data = here.normal - torch.diag(precision)
+    wide = replace(view, prior_scale=view.prior_scale.clamp(min=1.0))
+    precision = wide.scaled(stated, problem.prior_group)
+    usual = torch.where(precision > 0, precision.clamp(min=1e-30).rsqrt(), problem.step_scale)
+    data = data * usual * usual[:, None]
+    arm = problem.active < problem.space.arm_size
+    if not bool(arm.any()):
+        return ()
+    cross = data[arm][:, ~arm]
+    schur = (
+        data[arm][:, arm]
+        - cross @ torch.linalg.pinv(data[~arm][:, ~arm], rtol=1e-12, hermitian=True) @ cross.mT
+    )
+    values, vectors = torch.linalg.eigh((schur + schur.mT) / 2)
+    names = [problem.space.names[i] for i in problem.active[arm].tolist()]
+    end = "it stays near its nominal value" if held else "without a prior it may be anything"
+    sentences = []
+    rounding = ROUNDING * float(values[-1])
+    for value, vector in zip(values.tolist(), vectors.t(), strict=True):
+        if value >= max(1.0, rounding):
+            break
+        width = value**-0.5 if value > max(1e-12, rounding) else float("inf")
+        sentences.append(
+            f"{_in_words(vector, names)}: the data determine it only to {width:.2g} times its tolerance; {end}"
+        )
+    return tuple(sentences)
+
+
+def _in_words(vector: Tensor, names: list[str]) -> str:
+    """The large components of a direction, in units of the tolerances."""
+    order = vector.abs().argsort(descending=True).tolist()
+    sign = 1.0 if float(vector[order[0]]) > 0 else -1.0
+    text = ""
+    for index in order:
+        part = sign * float(vector[index])
+        if text and abs(part) < SHOWN:
+            break
+        term = names[index] if abs(part) > 0.97 else f"{abs(part):.2f} {names[index]}"
+        text += f" {'-' if part < 0 else '+'} {term}" if text else term
+    return text

@@ -1,0 +1,124 @@
+"""Redundant parameters the paper's way: Pearson correlation of the Jacobian's columns."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float64
+
+from pisigma.calibration.geometric.identifiability.redundancy import NO_EFFECT, preferences
+from pisigma.calibration.geometric.problem.information import Information
+
+CORRELATION_TOLERANCE = 1e-6
+"""Correlations within this of ±1 count as ±1."""
+PAPER_ORDER = ("a", "d", "alpha", "theta", "beta", "base", "tool")
+
+
+@dataclass(frozen=True, eq=False)
+class CorrelationTable:
+    """Pearson correlations of the columns of parameters of one unit.
+
+    Attributes:
+        names: the parameters.
+        values: symmetric, 1 on the diagonal; NaN for parameters without effect.
+    """
+
+    names: tuple[str, ...]
+    values: Float64[np.ndarray, "parameters parameters"]
+
+    def __str__(self) -> str:
+        """The table as text, as the paper prints it."""
+        width = max(8, *(len(name) + 2 for name in self.names))
+        lines = [" " * width + "".join(name.rjust(width) for name in self.names)]
+        for name, row in zip(self.names, self.values, strict=True):
+            cells = ("NaN" if np.isnan(value) else f"{value:.3f}" for value in row)
+            lines.append(name.ljust(width) + "".join(cell.rjust(width) for cell in cells))
+        return "\n".join(lines)
+
+
+@dataclass(frozen=True, eq=False)
+class PairwiseRedundancy:
+    """Parameters that are redundant in pairs.
+
+    Attributes:
+        lengths: correlations of the length parameters.
+        angles: correlations of the angle parameters.
+        sets: parameters that act alike; a leading "-" says against the first of its set.
+        no_effect: parameters that change no measured value.
+        kept: all parameters but the redundant ones, one of each set among them.
+        tolerance: by how much a correlation may miss ±1.
+    """
+
+    lengths: CorrelationTable
+    angles: CorrelationTable
+    sets: tuple[tuple[str, ...], ...]
+    no_effect: tuple[str, ...]
+    kept: tuple[str, ...]
+    tolerance: float
+
+
+def find_pairwise_redundancy(
+    information: Information,
+    sizes: Float64[np.ndarray, " parameters"],
+    tolerance: float = CORRELATION_TOLERANCE,
+) -> PairwiseRedundancy:
+    """Find redundant pairs by Park et al. 2022, section 3.2: |r| = 1 between columns of the Jacobian.
+
+    Lengths and angles are looked at apart. It cannot see dependencies of three and more parameters that are
+    not pairs; `find_redundancies` does.
+
+    Args:
+        information: the condensed Jacobian.
+        sizes: nominal values, see `find_redundancies`.
+        tolerance: see `CORRELATION_TOLERANCE`.
+    """
+    columns = information.jacobian
+    lengths = np.linalg.norm(columns, axis=0)
+    acting = lengths > NO_EFFECT * max(lengths.max(initial=0.0), 1e-300)
+    parameters, preference = information.parameters, preferences(information.parameters, sizes)
+    order = sorted(range(len(parameters)), key=lambda i: (PAPER_ORDER.index(parameters[i].group), i))
+    tables, sets, dropped = [], [], set()
+    for unit in ("m", "rad"):
+        chosen = [i for i in order if parameters[i].unit == unit]
+        table = CorrelationTable(
+            tuple(parameters[i].name for i in chosen),
+            _correlations(information.centred[:, chosen], acting[chosen]),
+        )
+        tables.append(table)
+        for members, signs in _sets(table.values, tolerance):
+            indices = [chosen[k] for k in members]
+            sets.append(
+                tuple(
+                    ("-" if s < 0 else "") + parameters[i].name for i, s in zip(indices, signs, strict=True)
+                )
+            )
+            best = max(indices, key=preference.__getitem__)
+            dropped |= set(indices) - {best}
+    return PairwiseRedundancy(
+        lengths=tables[0],
+        angles=tables[1],
+        sets=tuple(sets),
+        no_effect=tuple(parameters[i].name for i in order if not acting[i]),
+        kept=tuple(name for i, name in enumerate(information.names) if i not in dropped),
+        tolerance=tolerance,
+    )
+
+
+def _correlations(centred: np.ndarray, acting: np.ndarray) -> np.ndarray:
+    deviations = np.linalg.norm(centred, axis=0)
+    varies = acting & (deviations > 0)
+    unit = np.where(varies, centred / np.where(varies, deviations, 1.0), np.nan)
+    return unit.T @ unit
+
+
+def _sets(correlations: np.ndarray, tolerance: float) -> list[tuple[list[int], list[int]]]:
+    """Sets of two or more parameters that act alike: their indices, and their signs against the first."""
+    sets, taken = [], set()
+    for first in range(len(correlations)):
+        if first in taken:
+            continue
+        alike = [k for k in range(len(correlations)) if abs(correlations[first, k]) >= 1 - tolerance]
+        members = [k for k in alike if k not in taken]
+        taken |= set(members)
+        if len(members) > 1:
+            sets.append((members, [int(np.sign(correlations[first, k])) for k in members]))
+    return sets

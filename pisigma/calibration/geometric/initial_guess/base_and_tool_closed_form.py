@@ -1,0 +1,236 @@
+"""Closed-form starts for base and tool: no guess is asked for."""
+
+import itertools
+from collections.abc import Iterator
+
+import torch
+from jaxtyping import Float64
+from torch import Tensor
+
+from pisigma.calibration.geometric.initial_guess.base_and_tool_problem import BaseToolProblem, BaseToolState
+from pisigma.robot.description import Robot
+from pisigma.robot.se3 import nearest_rotation, rotation_from_rpy
+
+ALTERNATIONS = 60
+LINEAR_ROWS = 13
+"""Rows from which base and tool follow from a linear system."""
+DEPENDENT = 1e-9
+"""Singular values of the linear system below this share of the largest count as zero."""
+LEFT_OPEN = 1e-9
+"""Weight of the rotation that is taken where points leave it open, beside theirs."""
+SINGLE = 0.9
+"""A second singular value above this share of the first may mean that the rotations are not unique."""
+
+
+def base_and_tool_starts(robot: Robot, problem: BaseToolProblem) -> Iterator[BaseToolState]:
+    """Starts to be polished and compared; one is enough except with positions of few or special poses.
+
+    Args:
+        robot: gives the tool, which decides what the data leave open, and what is not free.
+        problem: flange poses and measurements.
+    """
+    like = problem.position
+    R_tool, R_base = (rotation_from_rpy(like.new_tensor(frame[3:])) for frame in (robot.tool, robot.base))
+    point, p_base = like.new_tensor(robot.tool[:3]), like.new_tensor(robot.base[:3])
+    rows = problem.rotated if problem.turned else problem.target == problem.target.mode().values
+    R_flange, p_flange = problem.R_flange[rows], problem.p_flange[rows]
+    position, rotation = problem.position[rows], problem.rotation[rows]
+    candidates: Iterator[tuple[Tensor, Tensor, Tensor, Tensor]]
+    if not problem.free_base and not problem.free_tool:
+        candidates = iter([(R_base, p_base, R_tool, point)])
+    elif not problem.free_base:
+        candidates = iter(
+            [_tool_start(R_base, p_base, R_flange, p_flange, position, rotation, problem.turned, R_tool)]
+        )
+    elif not problem.free_tool:
+        arm = p_flange + R_flange @ point
+        R_fitted = _procrustes(arm, position)
+        if problem.turned:
+            R_fitted = nearest_rotation((rotation @ R_tool.mT @ R_flange.mT).sum(0))
+        candidates = iter([(R_fitted, (position - arm @ R_fitted.mT).mean(0), R_tool, point)])
+    else:
+        starts = starts_from_positions(R_flange, p_flange, position, point, robot.reach)
+        if problem.turned:
+            first = start_from_poses(R_flange, p_flange, position, rotation, R_tool)
+            rest = ((R, p, _mean_turn(R, R_flange, rotation), place) for R, p, place in starts)
+            candidates = itertools.chain([first], rest)
+        else:
+            candidates = ((R, p, R_tool, place) for R, p, place in starts)
+    for R_start, p_start, R_tool_start, place in candidates:
+        yield BaseToolState(R_start, p_start, R_tool_start, place.expand(len(problem.targets), 3))
+
+
+def start_from_poses(
+    R_flange: Float64[Tensor, "rows 3 3"],
+    p_flange: Float64[Tensor, "rows 3"],
+    position: Float64[Tensor, "rows 3"],
+    rotation: Float64[Tensor, "rows 3 3"],
+    R_tool_nominal: Float64[Tensor, "3 3"],
+) -> tuple[Float64[Tensor, "3 3"], Float64[Tensor, " 3"], Float64[Tensor, "3 3"], Float64[Tensor, " 3"]]:
+    """Solve measured = base · flange · tool for base and tool (robot-world and hand-eye).
+
+    With Z the inverse of the tool's rotation, `R_measured · Z · R_flange^T = R_base`, so
+    `K vec(Z) = rows · vec(R_base)` with `K = Σ R_measured ⊗ R_flange` (Shah 2013, J. Mechanisms Robotics
+    5(3), in row-major order). Where the leading singular value of K is not single (all axes parallel, as in
+    a SCARA) its vectors are no rotations; therefore the pair that maximises `vec(R_base)^T K vec(Z)` is
+    found by alternating projections onto the rotations: from the singular vector, and where that is not
+    unique, from the nominal tool and the 24 rotations of a cube too, the nominal one winning ties.
+    Translations then are linear.
+
+    Returns:
+        R_base, p_base [m], R_tool, p_tool [m].
+    """
+    rows = R_flange.shape[0]
+    K = torch.einsum("nab,ncd->acbd", rotation, R_flange).reshape(9, 9) / rows
+    _, singular, Vh = torch.linalg.svd(K)
+    leading = Vh[0].reshape(3, 3)
+    starts = torch.stack([leading, -leading])
+    if float(singular[1]) > SINGLE * float(singular[0]):
+        starts = torch.cat([R_tool_nominal.mT[None], starts, _cube_rotations(K)])
+    Z = nearest_rotation(starts)
+    agreement = torch.zeros(len(Z)).to(K)
+    for _ in range(ALTERNATIONS):
+        R_base = nearest_rotation((Z.reshape(-1, 9) @ K.mT).reshape(-1, 3, 3))
+        Z = nearest_rotation((R_base.reshape(-1, 9) @ K).reshape(-1, 3, 3))
+        before = agreement
+        agreement = ((R_base.reshape(-1, 9) @ K) * Z.reshape(-1, 9)).sum(-1)
+        if (agreement - before).abs().max() < 1e-12:
+            break
+    best = int((agreement > agreement.max() - 1e-9).nonzero()[0, 0])
+    p_base, p_tool = _translations(R_base[best], R_flange, p_flange, position)
+    return R_base[best], p_base, Z[best].mT, p_tool
+
+
+def starts_from_positions(
+    R_flange: Float64[Tensor, "rows 3 3"],
+    p_flange: Float64[Tensor, "rows 3"],
+    position: Float64[Tensor, "rows 3"],
+    nominal_point: Float64[Tensor, " 3"],
+    reach: float,
+) -> Iterator[tuple[Float64[Tensor, "3 3"], Float64[Tensor, " 3"], Float64[Tensor, " 3"]]]:
+    """Candidates for `position = R_base (R_flange · point + p_flange) + p_base`, to be polished and compared.
+
+    The first is that of `start_from_products`, where there are enough rows. The others assume a point (the
+    nominal one, none, a tenth of the reach along each axis) and find the base by Procrustes; they serve
+    where the linear system is singular, as with parallel axes or few rows.
+
+    Returns:
+        R_base, p_base [m], point [m], each.
+    """
+    if position.shape[0] >= LINEAR_ROWS:
+        yield start_from_products(R_flange, p_flange, position)
+    along = 0.1 * reach * torch.eye(3).to(position)
+    assumed = torch.cat([nominal_point[None], torch.zeros_like(nominal_point)[None], along, -along])
+    for point in assumed.unbind():
+        arm = p_flange + R_flange @ point
+        yield *base_by_points(arm, position), point
+
+
+def start_from_products(
+    R_flange: Float64[Tensor, "*batch rows 3 3"],
+    p_flange: Float64[Tensor, "*batch rows 3"],
+    position: Float64[Tensor, "*batch rows 3"],
+) -> tuple[Float64[Tensor, "*batch 3 3"], Float64[Tensor, "*batch 3"], Float64[Tensor, "*batch 3"]]:
+    """Solve `position = R_base (R_flange · point + p_flange) + p_base` for base and point.
+
+    Written out, every coordinate is linear in 13 unknowns: the products of `R_base`'s row with the point
+    (9), the row itself (3) and the shift (1).
+
+    Returns:
+        R_base, p_base [m], point [m].
+    """
+    regressor = torch.cat([R_flange.flatten(-2), p_flange, torch.ones_like(p_flange[..., :1])], -1)
+    solution = _least_squares(regressor, position)
+    R_base = nearest_rotation(solution[..., 9:12, :].mT)
+    return R_base, *_translations(R_base, R_flange, p_flange, position)
+
+
+def base_by_points(
+    points: Float64[Tensor, "rows 3"],
+    position: Float64[Tensor, "rows 3"],
+    like: Float64[Tensor, "3 3"] | None = None,
+) -> tuple[Float64[Tensor, "3 3"], Float64[Tensor, " 3"]]:
+    """Rotation and position [m] of the base that puts points, seen from it, best onto measured positions.
+
+    Where they are on one line, or fewer than three, the rotation is `like` one, as far as they leave it open.
+    """
+    R_base = _procrustes(points, position, like)
+    return R_base, (position - points @ R_base.mT).mean(0)
+
+
+def _tool_start(
+    R_base: Tensor,
+    p_base: Tensor,
+    R_flange: Tensor,
+    p_flange: Tensor,
+    position: Tensor,
+    rotation: Tensor,
+    turned: bool,
+    R_tool: Tensor,
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """The tool for a fixed base: the mean of what each row says."""
+    in_base = (position - p_base) @ R_base
+    point = (R_flange.mT @ (in_base - p_flange)[..., None])[..., 0].mean(0)
+    if turned:
+        R_tool = _mean_turn(R_base, R_flange, rotation)
+    return R_base, p_base, R_tool, point
+
+
+def _mean_turn(R_base: Tensor, R_flange: Tensor, rotation: Tensor) -> Tensor:
+    """The tool's rotation for a fixed rotation of the base."""
+    return nearest_rotation((R_flange.mT @ R_base.mT @ rotation).sum(0))
+
+
+def _procrustes(points: Tensor, position: Tensor, like: Tensor | None = None) -> Tensor:
+    """The rotation that turns the points best onto the positions, both about their means; see `base_by_points`."""
+    M = (position - position.mean(0)).mT @ (points - points.mean(0))
+    return nearest_rotation(M if like is None else M + like * (LEFT_OPEN * M.norm()).clamp(min=1e-12))
+
+
+def _least_squares(
+    A: Float64[Tensor, "*batch rows columns"], b: Float64[Tensor, "*batch rows values"]
+) -> Float64[Tensor, "*batch columns values"]:
+    """Solve `A x = b` in least squares; the shortest solution where columns depend on others.
+
+    That needs singular values, which are not worked out where the inverse of the triangle is short enough to show that
+    none is to be left out.
+    """
+    Q, R = torch.linalg.qr(A)
+    inverse = torch.linalg.solve_triangular(R, torch.eye(R.shape[-1]).to(R), upper=True)
+    condition = inverse.flatten(-2).norm(dim=-1) * R.flatten(-2).norm(dim=-1)
+    if not bool((condition < 1 / DEPENDENT).all()):
+        inverse = torch.linalg.pinv(R, rtol=DEPENDENT)
+    solution: Tensor = inverse @ (Q.mT @ b)
+    return solution
+
+
+def _translations(
+    R_base: Float64[Tensor, "*batch 3 3"],
+    R_flange: Float64[Tensor, "*batch rows 3 3"],
+    p_flange: Float64[Tensor, "*batch rows 3"],
+    position: Float64[Tensor, "*batch rows 3"],
+) -> tuple[Float64[Tensor, "*batch 3"], Float64[Tensor, "*batch 3"]]:
+    """Positions of base and tool for a fixed rotation of the base; they are linear then.
+
+    In the base's axes the regressor of a row is `[1 R_flange]`, and rotations are orthogonal.
+    """
+    b = position @ R_base - p_flange
+    turns, same = R_flange.mean(-3), torch.eye(3).to(position).expand_as(R_base)
+    normal = torch.cat([torch.cat([same, turns], -1), torch.cat([turns.mT, same], -1)], -2)
+    seen = torch.einsum("...nij,...ni->...j", R_flange, b) / b.shape[-2]
+    descent = torch.cat([b.mean(-2), seen], -1)[..., None]
+    solution = torch.linalg.pinv(normal, rtol=1e-10, hermitian=True) @ descent
+    return (R_base @ solution[..., :3, :])[..., 0], solution[..., 3:, 0]
+
+
+def _cube_rotations(like: Tensor) -> Tensor:
+    """The 24 rotations that map a cube onto itself."""
+    rotations = []
+    for order in itertools.permutations(range(3)):
+        for signs in itertools.product((1.0, -1.0), repeat=3):
+            M = torch.zeros(3, 3).to(like)
+            for row, (column, sign) in enumerate(zip(order, signs, strict=True)):
+                M[row, column] = sign
+            if torch.linalg.det(M) > 0:
+                rotations.append(M)
+    return torch.stack(rotations)

@@ -1,0 +1,396 @@
+"""The initial guess of everything but the arm: bases, tools and the sensors' unknowns."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float64, Int64
+from torch import Tensor
+
+from pisigma.calibration.geometric.initial_guess.base_and_tool import guess_base_and_tool
+from pisigma.calibration.geometric.initial_guess.base_and_tool_closed_form import (
+    base_by_points,
+)
+from pisigma.calibration.geometric.initial_guess.tool_from_distances import (
+    base_from_anchors,
+    tools_from_distances,
+)
+from pisigma.calibration.geometric.problem.parameters import ParameterSpace
+from pisigma.files.errors import IdentificationError, nearest_choice
+from pisigma.measurement.dataset import Measurements
+from pisigma.measurement.sensors.registry import SENSORS
+from pisigma.measurement.sensors.sensor import names_of, numbers_of
+from pisigma.measurement.sensors.socket import means
+from pisigma.robot.description import Robot
+from pisigma.robot.kinematics.forward import forward_kinematics
+from pisigma.robot.se3 import (
+    nearest_rotation,
+    rotation_from_rpy,
+    rotation_from_vector,
+    rpy_from_rotation,
+    skew,
+    transform_from_xyzrpy,
+)
+
+GUESS_ROWS = 1_024
+"""Rows from which base and tool are guessed."""
+FEW = 9
+"""Positions below which a frame's base is guessed with tools of other frames, not with tools of its own."""
+ENOUGH = 5
+"""Positions in a touched frame from which base and tool are found in closed form."""
+LEAST_TURN = 0.02
+"""Directions of the tool that the orientations in sockets determine less than this stay as drawn."""
+FEWEST_TOUCHES = 4
+"""Touches along an axis from which its direction is found."""
+CLEAR = 0.03
+"""The least spread of the tips, as a share of their largest, from which a direction is found."""
+POLISH = 10
+"""Steps after the linear solution of a touched frame."""
+NEAR = 0.05
+"""A guess must meet the touches to this share of the robot's reach."""
+BASE_UNKNOWNS = 6
+
+
+@dataclass(frozen=True, eq=False)
+class InitialGuess:
+    """Initial values in the user's coordinates.
+
+    Attributes:
+        bases: per frame, x, y, z [m], roll, pitch, yaw [rad].
+        tools: per target, the same.
+        unknowns: by group of the sensors' unknowns, those of every owner in its frame [m or rad].
+        free_unknowns: which of them are to be identified; the others are stated by the measurements.
+    """
+
+    bases: Float64[np.ndarray, "frames 6"]
+    tools: Float64[np.ndarray, "targets 6"]
+    unknowns: Mapping[str, Float64[Tensor, "owners columns"]]
+    free_unknowns: Mapping[str, Bool[Tensor, "owners columns"]]
+
+
+def guess(
+    space: ParameterSpace,
+    measurements: Measurements,
+    free_base: bool,
+    free_tool: bool,
+    turn_tool: bool,
+    stated: Mapping[str, tuple[float, ...]],
+) -> InitialGuess:
+    """Guess where everything is, the arm being taken as drawn.
+
+    Frames with positions get base and tool in closed form; then sockets, wires and pairs determine tools that have
+    none yet; touches, and wires from anchors at stated places, determine their frame by the tool; then the sensors
+    guess their own unknowns, such as sockets at the mean of the tool's positions and anchors by multilateration. A
+    frame without any of these (sockets and unknown anchors only) starts at the robot's own base, which it cannot
+    determine.
+
+    Args:
+        space: names and robot.
+        measurements: usable rows; those of pairs come first.
+        free_base: whether bases are to be identified; else they are as stated, or the robot's.
+        free_tool: whether tools are.
+        turn_tool: whether their rotations are.
+        stated: bases of frames that the user states.
+
+    Raises:
+        IdentificationError: too little was measured for a guess, or something that cannot be.
+    """
+    _check_frame_names(stated, space.frames, measurements.source)
+    if free_base:
+        _check_frame_values(measurements, space.frames)
+    bases = {name: np.array(base, dtype=np.float64) for name, base in stated.items()}
+    bases, tools = _from_positions(space, measurements, free_base, free_tool, bases)
+    touched = {} if not free_base else _touched_rows(space, measurements, bases)
+    wired = [name for name in space.frames if free_base and name not in bases and name not in touched]
+    for name in space.frames:
+        if name not in bases and name not in touched:
+            bases[name] = space.robot.base
+    poses_alone = measurements.kinds <= {"pose", "position", "rotation"}
+    if not poses_alone:
+        arm = space.robot.with_geometry(base=np.zeros(6), tool=np.zeros(6))
+        T_flange = forward_kinematics(arm, measurements.q.cpu())
+        if free_tool:
+            tools = _from_sockets(space, measurements, T_flange, tools)
+        tools = tools_from_distances(space, measurements, T_flange, tools, free_tool)
+    if not turn_tool:
+        tools = {name: np.concatenate([tool[:3], space.robot.tool[3:]]) for name, tool in tools.items()}
+    all_tools = np.stack([tools.get(name, space.robot.tool) for name in space.targets])
+    if poses_alone:
+        return InitialGuess(np.stack([bases[name] for name in space.frames]), all_tools, {}, {})
+    target = numbers_of(measurements.target, space.targets, measurements.rows)
+    T_tool = T_flange @ transform_from_xyzrpy(torch.from_numpy(all_tools))[target]
+    for name, rows in touched.items():
+        bases[name] = _from_touches(space, measurements, name, rows, T_tool[:, :3, 3])
+    for name in wired:
+        bases[name] = base_from_anchors(measurements, name, T_tool[:, :3, 3], bases[name])
+    all_bases = np.stack([bases[name] for name in space.frames])
+    frame = numbers_of(measurements.frame, space.frames, measurements.rows)
+    T = transform_from_xyzrpy(torch.from_numpy(all_bases))[frame] @ T_tool
+    unknowns, free = {}, {}
+    for sensor in SENSORS.values():
+        group, own = sensor.unknowns(measurements), sensor.initial_guess(measurements, T, space.robot.reach)
+        if group is not None and own is not None:
+            unknowns[group.name], free[group.name] = own.values, own.free
+    return InitialGuess(all_bases, all_tools, unknowns, free)
+
+
+def _from_positions(
+    space: ParameterSpace,
+    measurements: Measurements,
+    free_base: bool,
+    free_tool: bool,
+    stated: dict[str, np.ndarray],
+) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+    """Bases and tools of frames with positions."""
+    bases, tools = dict(stated), dict[str, np.ndarray]()
+    if measurements.position is None:
+        return bases, tools
+    positions = (measurements.measured("position") | measurements.measured("pose")).cpu()
+    touches = measurements.measured("touch").cpu()
+    frame = numbers_of(measurements.frame, space.frames, measurements.rows)
+    count = [int((positions & (frame == number)).sum()) for number in range(len(space.frames))]
+    for number in sorted(range(len(space.frames)), key=lambda number: -count[number]):
+        name, rows = space.frames[number], (positions & (frame == number)).nonzero()[:, 0]
+        if len(rows) == 0 or (len(rows) < ENOUGH and bool((touches & (frame == number)).any())):
+            continue
+        robot = space.robot if name not in stated else space.robot.with_geometry(base=stated[name])
+        part = measurements
+        if len(rows) < measurements.rows or len(rows) > GUESS_ROWS:
+            part = measurements.select(rows[chosen_rows(len(rows), GUESS_ROWS)].to(measurements.q.device))
+        if part.pair is not None:
+            part = replace(part, pair=None, distance=None)
+        find_base = free_base and name not in stated
+        turned = bool(part.measured("pose").any())
+        if find_base and 3 <= len(rows) < FEW and not turned and set(part.target) <= set(tools):
+            bases[name] = _base_by_tools(robot, part, tools)
+            continue
+        base, guessed = guess_base_and_tool(robot, part, find_base, free_tool)
+        if free_base:
+            bases[name] = base if find_base else robot.base
+        if free_tool:
+            tools = {**guessed, **tools}
+    return bases, tools
+
+
+def _base_by_tools(
+    robot: Robot, measurements: Measurements, tools: Mapping[str, np.ndarray]
+) -> Float64[np.ndarray, " 6"]:
+    """The base of a frame with few positions, by the tools of other frames."""
+    assert measurements.position is not None
+    arm = robot.with_geometry(base=np.zeros(6), tool=np.zeros(6))
+    T = forward_kinematics(arm, measurements.q.cpu())
+    tool = torch.from_numpy(np.stack([tools[name][:3] for name in measurements.target]))
+    points = (T[:, :3, :3] @ tool[..., None])[..., 0] + T[:, :3, 3]
+    R_base, place = base_by_points(points, measurements.position.cpu())
+    return torch.cat([place, rpy_from_rotation(R_base)]).numpy()
+
+
+def chosen_rows(rows: int, most: int) -> Int64[Tensor, " chosen"]:
+    """All rows, or so many of them in a random order that is always the same."""
+    if rows <= most:
+        return torch.arange(rows)
+    return torch.randperm(rows, generator=torch.Generator().manual_seed(0))[:most]
+
+
+def _touched_rows(
+    space: ParameterSpace, measurements: Measurements, bases: Mapping[str, np.ndarray]
+) -> dict[str, Bool[Tensor, " rows"]]:
+    """The touches of frames that have no base yet."""
+    if measurements.touch is None:
+        return {}
+    touches = measurements.measured("touch").cpu()
+    frame = numbers_of(measurements.frame, space.frames, measurements.rows)
+    touched = {name: touches & (frame == number) for number, name in enumerate(space.frames)}
+    return {name: rows for name, rows in touched.items() if bool(rows.any()) and name not in bases}
+
+
+def _from_sockets(
+    space: ParameterSpace,
+    measurements: Measurements,
+    T_flange: Float64[Tensor, "rows 4 4"],
+    tools: Mapping[str, np.ndarray],
+) -> dict[str, np.ndarray]:
+    """All tools, those that have no guess yet by the sockets that their ball sat in."""
+    tools = dict(tools)
+    socket = numbers_of(measurements.socket, names_of(measurements.socket), measurements.rows)
+    target = numbers_of(measurements.target, space.targets, measurements.rows)
+    for number, name in enumerate(space.targets):
+        rows = (socket >= 0) & (target == number)
+        if name in tools or not bool(rows.any()):
+            continue
+        drawn = space.robot.tool
+        T = T_flange[rows]
+        position = tool_from_sockets(
+            T[:, :3, :3],
+            T[:, :3, 3],
+            torch.unique(socket[rows], return_inverse=True)[1],
+            torch.from_numpy(drawn[:3].copy()),
+        )
+        tools[name] = np.concatenate([position.numpy(), drawn[3:]])
+    return tools
+
+
+def _from_touches(
+    space: ParameterSpace,
+    measurements: Measurements,
+    name: str,
+    rows: Bool[Tensor, " rows"],
+    tip: Float64[Tensor, "rows 3"],
+) -> np.ndarray:
+    """The base of one frame by its touches."""
+    assert measurements.touch is not None
+    part = measurements.select(rows.nonzero()[:, 0].to(measurements.q.device))
+    axis = numbers_of(part.touch_axis, ("x", "y", "z"), part.rows)
+    assert part.touch is not None
+    base, rms = touched_base(tip[rows], axis, part.touch.cpu(), torch.from_numpy(space.robot.base.copy()))
+    _check_touched_base(part, name, rms, space.robot.reach)
+    guessed: np.ndarray = base.numpy()
+    return guessed
+
+
+def tool_from_sockets(
+    R: Float64[Tensor, "rows 3 3"],
+    p: Float64[Tensor, "rows 3"],
+    socket: Int64[Tensor, " rows"],
+    guess: Float64[Tensor, " 3"],
+) -> Float64[Tensor, " 3"]:
+    """Find the ball behind the flange such that the rows of every socket meet best.
+
+    `R · ball + p - socket = 0` is linear in both; the sockets drop out with the means over their rows.
+    Directions that the orientations hardly determine stay at the guess.
+
+    Args:
+        R: orientations of the flange, one target's rows.
+        p: its positions [m].
+        socket: number of every row's socket.
+        guess: where the ball is as drawn [m].
+    """
+    turn = _centred(R.flatten(1), socket).view(-1, 3, 3).flatten(0, 1)
+    off = -_centred(p + (R @ guess), socket).flatten()
+    rtol = LEAST_TURN * len(R) ** 0.5 / max(float(torch.linalg.matrix_norm(turn, 2)), 1e-12)
+    ball: Tensor = guess + torch.linalg.pinv(turn, rtol=min(rtol, 1.0)) @ off
+    return ball
+
+
+def _centred(values: Tensor, number: Tensor) -> Tensor:
+    return values - means(values, number, int(number.max()) + 1)[number]
+
+
+def touched_base(
+    tip: Float64[Tensor, "touches 3"],
+    axis: Int64[Tensor, " touches"],
+    touch: Float64[Tensor, " touches"],
+    guess: Float64[Tensor, " 6"],
+) -> tuple[Float64[Tensor, " 6"], float]:
+    """Find T_frame_robot from touches, the tips being given in the robot's frame.
+
+    `touch = R[axis] · tip + p[axis]` is linear in R and p for every axis on its own; from two axes the third
+    follows. Then all six unknowns are polished together. Where the linear solution is unclear, the guess is
+    polished instead.
+
+    Args:
+        tip: where the robot as drawn has its tip [m].
+        axis: which axis of the frame was touched along.
+        touch: the coordinate there [m].
+        guess: the robot's own base, x, y, z [m], roll, pitch, yaw [rad].
+
+    Returns:
+        The base, and the root mean square by which it misses the touches [m].
+    """
+    starts = [(rotation_from_rpy(guess[3:]), guess[:3])]
+    linear = _linear_rotation(tip, axis, touch)
+    if linear is not None:
+        starts.insert(0, (linear, torch.zeros(3).to(tip)))
+    best, miss = guess, float("inf")
+    for R, p in starts:
+        R, p, rms = _polished(tip, axis, touch, R, p)
+        if rms < miss:
+            best, miss = torch.cat([p, rpy_from_rotation(R)]), rms
+    return best, miss
+
+
+def _linear_rotation(tip: Tensor, axis: Tensor, touch: Tensor) -> Tensor | None:
+    rows: list[Tensor | None] = []
+    for k in range(3):
+        points, values = tip[axis == k], touch[axis == k]
+        rows.append(None)
+        if len(points) < FEWEST_TOUCHES:
+            continue
+        centred = points - points.mean(0)
+        singular = torch.linalg.svdvals(centred)
+        if float(singular[-1]) > CLEAR * float(singular[0]):
+            row = torch.linalg.lstsq(centred, (values - values.mean())[:, None]).solution[:, 0]
+            rows[k] = row / row.norm().clamp(min=1e-12)
+    for k in range(3):
+        following, last = rows[(k + 1) % 3], rows[(k + 2) % 3]
+        if rows[k] is None and following is not None and last is not None:
+            rows[k] = torch.linalg.cross(following, last)
+    directions = [row for row in rows if row is not None]
+    return nearest_rotation(torch.stack(directions)) if len(directions) == 3 else None
+
+
+def _polished(tip: Tensor, axis: Tensor, touch: Tensor, R: Tensor, p: Tensor) -> tuple[Tensor, Tensor, float]:
+    rows = torch.arange(len(tip))
+    eye = torch.eye(3).to(tip)[axis]
+    residual = touch - (tip @ R.mT + p)[rows, axis]
+    for _ in range(POLISH):
+        turned = tip @ R.mT
+        J = torch.cat([eye, (-skew(turned))[rows, axis]], -1)
+        step = torch.linalg.pinv(J, rtol=1e-6) @ residual
+        R, p = rotation_from_vector(step[3:]) @ R, p + step[:3]
+        residual = touch - (tip @ R.mT + p)[rows, axis]
+    return R, p, float(residual.square().mean().sqrt())
+
+
+def _check_touched_base(measurements: Measurements, name: str, rms: float, reach: float) -> None:
+    """Refuse a guess of a touched frame that is nowhere near its touches.
+
+    Raises:
+        IdentificationError: see above.
+    """
+    if rms <= NEAR * reach:
+        return
+    counts = ", ".join(f"{(measurements.touch_axis or ()).count(axis)} along {axis}" for axis in "xyz")
+    raise IdentificationError(
+        f"{measurements.source}: the touches of frame '{name}' ({counts}) do not determine where it stands (the best "
+        f"fit misses them by {rms * 1e3:.3g} mm); check that they are all of this frame, or say about where "
+        f"the robot's base is in it, frames={{'{name}': (x, y, z, roll, pitch, yaw)}}."
+    )
+
+
+def _check_frame_values(measurements: Measurements, names: tuple[str, ...]) -> None:
+    """Refuse frames with touches that are used up by the six unknowns of the frame.
+
+    Raises:
+        IdentificationError: see above.
+    """
+    if measurements.touch is None:
+        return
+    touch = measurements.measured("touch").tolist()
+    other = (measurements.measured("position") | measurements.measured("pose")).tolist()
+    for name in names:
+        rows = [row for row, frame in enumerate(measurements.frame) if frame == name]
+        touches = sum(touch[row] for row in rows)
+        if not touches or any(other[row] for row in rows) or touches > BASE_UNKNOWNS:
+            continue
+        times = "once" if touches == 1 else f"{touches} times"
+        raise IdentificationError(
+            f"{measurements.source}: frame '{name}' was touched {times} only, which does not even determine where it "
+            f"stands ({BASE_UNKNOWNS} unknowns); touch it about {3 * BASE_UNKNOWNS} times along x, y and z, or leave "
+            "its rows out."
+        )
+
+
+def _check_frame_names(stated: Mapping[str, object], frames: tuple[str, ...], source: str) -> None:
+    """Refuse guesses of frames that were not measured in.
+
+    Raises:
+        IdentificationError: see above.
+    """
+    for name in stated:
+        if name not in frames:
+            raise IdentificationError(
+                f"{source}: frames states a guess of '{name}', but no row is in a frame of that name; "
+                f"{nearest_choice(name, frames)}"
+            )

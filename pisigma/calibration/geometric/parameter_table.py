@@ -1,0 +1,155 @@
+"""The table of parameters: nominal and estimated values, standard errors, and what is to be said of each."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float64
+from torch import Tensor
+
+from pisigma.calibration.geometric.identifiability.redundancy import Findings, Redundancy
+from pisigma.calibration.geometric.problem.least_squares import Linearisation
+from pisigma.calibration.geometric.problem.noise import view_of
+from pisigma.calibration.geometric.problem.problem import CalibrationProblem
+from pisigma.calibration.geometric.problem.setup import (
+    CalibrationSetup,
+    IdentifiedGeometry,
+    unknowns_in_frames,
+)
+from pisigma.robot.row import FRAME_COLUMNS
+from pisigma.robot.se3 import wrap_to_pi
+
+LOST = 1e-10
+"""Information, columns scaled to 1, with a smaller eigenvalue does not determine some direction."""
+HELD = 0.7
+"""A parameter whose standard error is more than this share of its prior's is not determined by the data."""
+
+
+@dataclass(frozen=True)
+class ParameterEstimate:
+    """One row of the parameter table, in SI units.
+
+    Attributes:
+        name: such as "theta_1".
+        unit: "m" or "rad".
+        nominal: as drawn.
+        estimated: as identified.
+        change: estimated - nominal.
+        standard_error: of the estimate; NaN where it was not estimated.
+        remark: "identified", what it is only identified together with, or why it was not estimated.
+        label: the remark in a few words, for tables.
+    """
+
+    name: str
+    unit: str
+    nominal: float
+    estimated: float
+    change: float
+    standard_error: float
+    remark: str
+    label: str
+
+    @property
+    def free(self) -> bool:
+        """Whether it was estimated."""
+        return not np.isnan(self.standard_error)
+
+
+def parameter_table(
+    setup: CalibrationSetup,
+    problem: CalibrationProblem,
+    findings: Findings,
+    here: Linearisation[Tensor],
+    geometry: IdentifiedGeometry,
+    covariance: Float64[np.ndarray, "parameters parameters"],
+) -> tuple[ParameterEstimate, ...]:
+    """List all parameters with their nominal and estimated values and standard errors, and say what each is worth.
+
+    Args:
+        setup: the problem at its start.
+        problem: with its free parameters.
+        findings: what the rank analysis says about them.
+        here: the problem's linearisation at the solution.
+        geometry: the solution in the user's coordinates.
+        covariance: of all parameters in these coordinates.
+    """
+    space, robot = problem.space, problem.space.robot
+    bases, tools = np.tile(robot.base, (len(space.frames), 1)), np.tile(robot.tool, (len(space.targets), 1))
+    nominal = space.values(bases, tools, unknowns_in_frames(setup, setup.start))
+    values = geometry.values_of(space)
+    change = values - nominal
+    angle = torch.tensor([parameter.unit == "rad" for parameter in space.parameters])
+    change = torch.where(angle, wrap_to_pi(change), change)
+    errors = np.sqrt(np.maximum(covariance.diagonal(), 0))
+    held = errors * np.sqrt(_prior_precision(problem, here)) > HELD
+    active = set(problem.active.tolist())
+    silent = _without_rows(problem, here.normal.cpu(), findings)
+    undetermined = (geometry.change[:, silent] != 0).any(1).tolist()
+    rows = []
+    columns = (nominal.tolist(), values.tolist(), change.tolist())
+    for index, (parameter, before, after, moved) in enumerate(zip(space.parameters, *columns, strict=True)):
+        free = index in active or bool(errors[index] > 0)
+        remark, label = _remark(parameter.name, free, index in findings.extended, findings.redundancy)
+        if free and held[index]:
+            remark += "; the data hardly determine it, the prior holds it"
+            label = "held by the prior" if label == "identified" else f"{label}; prior"
+        if undetermined[index]:
+            free, label = False, "outliers"
+            remark = "too few rows that count show it, the others are outliers"
+        error = float(errors[index]) if free else float("nan")
+        name, unit = parameter.name, parameter.unit
+        rows.append(ParameterEstimate(name, unit, before, after, moved, error, remark, label))
+    return tuple(rows)
+
+
+def _without_rows(
+    problem: CalibrationProblem, normal: Float64[Tensor, "active active"], findings: Findings
+) -> list[int]:
+    """Free parameters that the rows left over do not hold: those that none shows, and bases not wholly determined.
+
+    Not those that all rows together would not show either.
+    """
+    active = problem.active.cpu()
+    names = [problem.space.names[i] for i in active.tolist()]
+    shown = torch.tensor([name not in findings.redundancy.no_effect for name in names], dtype=torch.bool)
+    lost = (normal.diagonal() <= 0) & shown
+    bases = problem.space.of("base")
+    for start in range(bases.start, bases.stop, len(FRAME_COLUMNS)):
+        own = ((active >= start) & (active < start + len(FRAME_COLUMNS)) & shown).nonzero()[:, 0]
+        at_start = findings.information
+        columns = [at_start.names.index(names[k]) for k in own.tolist()]
+        J = torch.from_numpy(at_start.jacobian[:, columns])
+        if len(own) and _determines_all(J.t() @ J) and not _determines_all(normal[own[:, None], own]):
+            lost[own] = True
+    indices: list[int] = active[lost].tolist()
+    return indices
+
+
+def _determines_all(information: Float64[Tensor, "own own"]) -> bool:
+    """Whether information holds its parameters in every direction."""
+    scale = information.diagonal().clamp(min=1e-300).rsqrt()
+    return float(torch.linalg.eigvalsh(information * scale * scale[:, None])[0]) >= LOST
+
+
+def _prior_precision(problem: CalibrationProblem, here: Linearisation[Tensor]) -> np.ndarray:
+    """1 / variance of all parameters by the prior, 0 where they are not free."""
+    full = torch.zeros_like(problem.precision)
+    full[problem.active] = view_of(here).scaled(problem.precision[problem.active], problem.prior_group)
+    precision: np.ndarray = full.cpu().numpy()
+    return precision
+
+
+def _remark(name: str, free: bool, extended: bool, redundancy: Redundancy) -> tuple[str, str]:
+    """What is to be said of a parameter, in full and in a few words."""
+    if name not in redundancy.names:
+        remark = "identified" if free else "fixed"
+        return remark, remark
+    if extended:
+        remark = "identified at the solution, though redundant at the nominal geometry"
+        return remark, "only at solution"
+    if name in redundancy.no_effect:
+        return "without effect on what was measured", "no effect"
+    if (sentence := redundancy.group(name)) is not None:
+        return sentence, "in a sum"
+    remark = "identified" if free else "left out"
+    return remark, remark

@@ -1,0 +1,77 @@
+"""What a calibration says of all its parameters together: values, and a covariance with every correlation."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+from jaxtyping import Float64
+from torch import Tensor
+
+from pisigma.calibration.geometric.problem.parameters import Parameter, ParameterSpace
+from pisigma.calibration.geometric.problem.setup import IdentifiedGeometry
+from pisigma.files.errors import IdentificationError, nearest_choice
+
+
+@dataclass(frozen=True, eq=False)
+class ParameterPosterior:
+    """Normal distribution of all parameters, in the user's coordinates.
+
+    They are geometry, bases of all frames, tools of all targets, and what the sensors found out about themselves
+    (sockets, anchors, zeros), in the frame of their owner.
+
+    Attributes:
+        parameters: the parameters in their order, with their names and units.
+        mean: their values [m or rad]; NaN where a model from before these were kept does not hold one.
+        root: `R` with the covariance `R R^T` [m and rad], of all parameters (0 for those that were not free) and then
+            of the weights of a joint correction where there is one, which have no names.
+    """
+
+    parameters: tuple[Parameter, ...]
+    mean: Float64[Tensor, " parameters"]
+    root: Float64[Tensor, "unknowns directions"]
+
+    @staticmethod
+    def of(
+        space: ParameterSpace, geometry: IdentifiedGeometry, root: Float64[Tensor, "unknowns directions"]
+    ) -> "ParameterPosterior":
+        """Put together the parameters of a space, their values in the user's coordinates and their covariance."""
+        return ParameterPosterior(space.parameters, geometry.values_of(space), root)
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """Names of the parameters, such as "theta_1", "base_x" or "socket_plate/0_x"."""
+        return tuple(parameter.name for parameter in self.parameters)
+
+    @property
+    def weights(self) -> int:
+        """Number of weights of a joint correction behind the parameters."""
+        return len(self.root) - len(self.parameters)
+
+    @cached_property
+    def covariance(self) -> Float64[Tensor, "unknowns unknowns"]:
+        """Covariance of all parameters and then all weights [m and rad]."""
+        return self.root @ self.root.t()
+
+    @property
+    def standard_errors(self) -> Float64[Tensor, " parameters"]:
+        """Standard deviation of every parameter [m or rad], 0 where it was not free."""
+        errors: Tensor = torch.linalg.vector_norm(self.root[: len(self.parameters)], dim=1)
+        return errors
+
+    def select(self, names: Sequence[str]) -> "ParameterPosterior":
+        """Return the distribution of some of the parameters, whatever the others are.
+
+        Raises:
+            IdentificationError: there is no parameter of one of the names.
+        """
+        number = {name: index for index, name in enumerate(self.names)}
+        for name in names:
+            if name not in number:
+                raise IdentificationError(
+                    f"there is no parameter '{name}'; {nearest_choice(name, self.names)}"
+                )
+        rows = [number[name] for name in names]
+        return ParameterPosterior(
+            tuple(self.parameters[row] for row in rows), self.mean[rows], self.root[rows]
+        )

@@ -1,0 +1,55 @@
+"""Where a robot says that targets were, in measurements that it need not have been fitted to."""
+
+import numpy as np
+import torch
+from jaxtyping import Float64
+from torch import Tensor
+
+from pisigma.files.errors import IdentificationError, nearest_choice
+from pisigma.measurement.dataset import Measurements
+from pisigma.robot.description import Robot
+from pisigma.robot.kinematics.forward import forward_kinematics
+from pisigma.robot.se3 import transform_from_xyzrpy
+
+
+def predicted_poses(
+    robot: Robot,
+    bases: dict[str, Float64[np.ndarray, " 6"]],
+    tools: dict[str, Float64[np.ndarray, " 6"]],
+    measurements: Measurements,
+) -> Float64[Tensor, "rows 4 4"]:
+    """Where a robot says that the targets were, each in the frame of its row.
+
+    Args:
+        robot: its rows are used, its base and tool are not.
+        bases: per frame x, y, z [m], roll, pitch, yaw [rad].
+        tools: the same per target.
+        measurements: joint values, frames and targets.
+
+    Raises:
+        IdentificationError: a row has a frame or a target that was not calibrated.
+        PoseError: the joint values do not fit the robot.
+    """
+    T_arm = forward_kinematics(robot.with_geometry(base=np.zeros(6), tool=np.zeros(6)), measurements.q)
+    T_base = _of_rows(bases, measurements.frame, "frame", measurements)
+    T_tool = _of_rows(tools, measurements.target, "target", measurements)
+    return T_base @ T_arm @ T_tool
+
+
+def _of_rows(
+    frames: dict[str, Float64[np.ndarray, " 6"]],
+    names: tuple[str, ...],
+    what: str,
+    measurements: Measurements,
+) -> Float64[Tensor, "rows 4 4"]:
+    order = tuple(frames)
+    for name in dict.fromkeys(names):
+        if name not in frames:
+            row = names.index(name)
+            raise IdentificationError(
+                f"{measurements.place(row)}: {what} '{name}' was not calibrated; "
+                f"{nearest_choice(name, order)}"
+            )
+    T = transform_from_xyzrpy(torch.from_numpy(np.stack([frames[name] for name in order])))
+    index = torch.tensor([order.index(name) for name in names], dtype=torch.int64)
+    return T[index].to(measurements.q.device)

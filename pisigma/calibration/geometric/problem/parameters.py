@@ -1,0 +1,294 @@
+"""The parameters of an identification: names, units, expected errors, and how they make up a geometry."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from types import MappingProxyType
+from typing import Literal
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float64, Int64
+from torch import Tensor
+
+from pisigma.calibration.geometric.problem.prior_sizes import PriorGroup, prior_group_of
+from pisigma.files.errors import IdentificationError, nearest_choice
+from pisigma.measurement.sensors.sensor import ParameterUnit, UnknownGroup, Unknowns
+from pisigma.robot.description import Robot
+from pisigma.robot.kinematics.parameter_jacobian import motion_order
+from pisigma.robot.row import DH_COLUMNS, FRAME_COLUMNS
+
+LENGTHS = frozenset({"d", "a", "x", "y", "z"})
+EVERYWHERE, NOWHERE = -1, -2
+"""Instead of a frame or a target: a parameter that moves the tool in all rows, or in none."""
+USUAL_LENGTH = 1e-3
+"""[m] Scale of length parameters where no prior gives one."""
+USUAL_ANGLE = 1e-3
+"""[rad]"""
+USUAL_ERRORS: dict[ParameterUnit, float] = {"m": USUAL_LENGTH, "rad": USUAL_ANGLE, "px": 1.0, "1": 1e-3}
+SMALLEST_PRIOR = 1e-12
+"""[m or rad] A parameter with less uncertainty is fixed: leave it out of `free`."""
+
+PriorSizes = Literal["stated", "widened", "estimated"]
+"""Whether the prior's sizes stand, may only grow, or are estimated."""
+
+
+@dataclass(frozen=True)
+class Prior:
+    """What the maker's tolerances say: standard deviations of the parameters' errors, by class.
+
+    Base and tool have none, they are wherever they were put.
+
+    Attributes:
+        theta: joint offsets [rad].
+        d: link offsets [m].
+        a: link lengths [m].
+        alpha: twists [rad].
+        beta: Hayati's angles [rad].
+    """
+
+    theta: float = 1e-3
+    d: float = 1e-3
+    a: float = 1e-3
+    alpha: float = 1e-3
+    beta: float = 1e-3
+
+    def __post_init__(self) -> None:
+        """Refuse standard deviations that are none."""
+        for name in DH_COLUMNS:
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value >= SMALLEST_PRIOR):
+                raise IdentificationError(
+                    f"prior '{name}': a standard deviation in {'m' if name in LENGTHS else 'rad'} of "
+                    f"{SMALLEST_PRIOR:g} or more was wanted, got {value:g}; use prior=None for none."
+                )
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One number that can be identified.
+
+    Attributes:
+        name: such as "theta_1", "d_EE", "base_x" or, with several targets, "tool_B_x".
+        group: "theta", "d", "a", "alpha", "beta", "base", "tool", or that of a sensor's unknowns, such as "socket".
+        unit: "m", "rad", "px", or "1" of a plain number.
+        owner: the row, frame or target it belongs to, or such as the socket.
+    """
+
+    name: str
+    group: str
+    unit: ParameterUnit
+    owner: str
+
+    @property
+    def usual_error(self) -> float:
+        """A usual size of its error, for scaling: 1 mm, 1 mrad, 1 px or 1e-3."""
+        return USUAL_ERRORS[self.unit]
+
+
+@dataclass(frozen=True, eq=False)
+class ParameterSpace:
+    """All parameters of a robot measured in some frames with some targets, in their order.
+
+    Attributes:
+        robot: the nominal robot.
+        frames: names of the measuring frames, each with its own base.
+        targets: names of the targets, each with its own tool.
+        unknowns: what the sensors have to find out about themselves, such as where sockets are.
+    """
+
+    robot: Robot
+    frames: tuple[str, ...] = ("",)
+    targets: tuple[str, ...] = ("",)
+    unknowns: tuple[UnknownGroup, ...] = ()
+
+    @cached_property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """Rows x (theta, d, a, alpha, beta), frames x base, targets x tool, then owners x unknowns, group by group."""
+        parameters = []
+        for label, row in zip(row_labels(self.robot), self.robot.rows, strict=True):
+            parameters += [_parameter(column, f"{column}_{label}", column, row.name) for column in DH_COLUMNS]
+        for group, owners in (("base", self.frames), ("tool", self.targets)):
+            for owner in owners:
+                stem = f"{group}_{owner}" if len(owners) > 1 else group
+                parameters += [
+                    _parameter(column, f"{stem}_{column}", group, owner) for column in FRAME_COLUMNS
+                ]
+        for own in self.unknowns:
+            for owner in own.owners:
+                parameters += [
+                    Parameter(
+                        f"{own.name}_{owner}_{column}",
+                        own.name,
+                        own.unit(column),
+                        owner,
+                    )
+                    for column in own.columns
+                ]
+        return tuple(parameters)
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """Names of the parameters."""
+        return tuple(parameter.name for parameter in self.parameters)
+
+    @property
+    def arm_size(self) -> int:
+        """Number of parameters of the rows, which come first."""
+        return 5 * len(self.robot.rows)
+
+    @cached_property
+    def usual_errors(self) -> Float64[np.ndarray, " parameters"]:
+        """Scale of every parameter [m or rad]."""
+        return np.array([parameter.usual_error for parameter in self.parameters])
+
+    @cached_property
+    def motion_columns(self) -> Int64[Tensor, "3 parameters"]:
+        """Per parameter: its column in a `ToolMotion`, the number of its frame and that of its target."""
+        order = motion_order(len(self.robot.rows))
+        arm, frames, targets = order[:-12], len(self.frames), len(self.targets)
+        others = len(self.parameters) - len(arm) - 6 * (frames + targets)
+        columns = arm + order[-12:-6] * frames + order[-6:] * targets + [0] * others
+        in_frames = [f for f in range(frames) for _ in range(6)]
+        at_targets = [t for t in range(targets) for _ in range(6)]
+        frame = [EVERYWHERE] * len(arm) + in_frames + [EVERYWHERE] * 6 * targets + [NOWHERE] * others
+        target = [EVERYWHERE] * (len(arm) + 6 * frames) + at_targets + [NOWHERE] * others
+        return torch.tensor([columns, frame, target])
+
+    @cached_property
+    def is_length(self) -> Bool[Tensor, " parameters"]:
+        """Which parameters are lengths."""
+        return torch.tensor([parameter.unit == "m" for parameter in self.parameters])
+
+    @cached_property
+    def prior_groups(self) -> Int64[Tensor, "2 parameters"]:
+        """Which size of the prior every parameter has: as drawn 0, and as drawn otherwise; see `prior_group_of`."""
+        others = [int(PriorGroup.JOINT_OFFSET)] * (len(self.parameters) - self.arm_size)
+        of_row = ([prior_group_of(column, drawn) for column in DH_COLUMNS] for drawn in (False, True))
+        return torch.tensor([groups * len(self.robot.rows) + others for groups in of_row])
+
+    @property
+    def always_moving(self) -> bool:
+        """Whether every parameter moves the tool in all rows."""
+        return len(self.frames) == len(self.targets) == 1 and not self.unknowns
+
+    def most_independent(self, turning: bool) -> int:
+        """How many numbers of arm, bases and tools can be told apart at most, whatever is measured in whatever poses.
+
+        A turning axis is a line in space (4 numbers), a sliding one a direction (2), a target a pose (6) or a point
+        (3) behind them, and a frame but the first a pose (6). With one frame and one pose that is `4 R + 2 P + 6` for R
+        turning and P sliding joints (Everett, Driels and Mooring 1987, ICRA).
+
+        Args:
+            turning: whether the tool's orientation is seen.
+        """
+        axes = sum(2 if joint.type == "prismatic" else 4 for joint in self.robot.joints)
+        return axes + (6 if turning else 3) * len(self.targets) + 6 * (len(self.frames) - 1)
+
+    def index(self, name: str) -> int:
+        """Where a parameter stands.
+
+        Raises:
+            IdentificationError: there is none of that name.
+        """
+        if name not in self._numbers:
+            raise IdentificationError(
+                f"robot '{self.robot.name}' has no parameter '{name}'; {nearest_choice(name, self.names)}"
+            )
+        return self._numbers[name]
+
+    @cached_property
+    def _numbers(self) -> dict[str, int]:
+        return {name: number for number, name in enumerate(self.names)}
+
+    def indices(self, name: str) -> list[int]:
+        """Where a parameter stands; with several frames or targets "base_x" and "tool_x" mean all of theirs.
+
+        Raises:
+            IdentificationError: there is none of that name.
+        """
+        group, _, column = name.partition("_")
+        several = {"base": len(self.frames) > 1, "tool": len(self.targets) > 1}.get(group, False)
+        if name in self.names or not several or column not in FRAME_COLUMNS:
+            return [self.index(name)]
+        return list(self.of(group))[FRAME_COLUMNS.index(column) :: 6]
+
+    def of(self, group: str) -> range:
+        """Indices of all parameters of a group behind the arm's: "base", "tool", or of sensors' unknowns."""
+        return self._stretches[group]
+
+    @cached_property
+    def _stretches(self) -> dict[str, range]:
+        sizes = {"base": 6 * len(self.frames), "tool": 6 * len(self.targets)}
+        sizes |= {own.name: len(own.columns) * len(own.owners) for own in self.unknowns}
+        start, stretches = self.arm_size, {}
+        for name, size in sizes.items():
+            stretches[name] = range(start, start + size)
+            start += size
+        return stretches
+
+    def values(
+        self,
+        bases: Float64[np.ndarray, "frames 6"],
+        tools: Float64[np.ndarray, "targets 6"],
+        unknowns: Mapping[str, Float64[np.ndarray, "owners columns"]] = MappingProxyType({}),
+    ) -> Float64[Tensor, " parameters"]:
+        """All parameters as one vector: the robot's rows, and these; unknowns of groups that are not here are 0."""
+        blocks = [self.robot.dh, bases, tools]
+        for own in self.unknowns:
+            blocks.append(unknowns.get(own.name, np.zeros((len(own.owners), len(own.columns)))))
+        return torch.from_numpy(np.concatenate([block.ravel() for block in blocks]))
+
+    def split(
+        self, values: Float64[Tensor, "*robots parameters"]
+    ) -> tuple[
+        Float64[Tensor, "*robots rows 5"],
+        Float64[Tensor, "*robots frames 6"],
+        Float64[Tensor, "*robots targets 6"],
+    ]:
+        """Rows, bases and tools of a vector of all parameters, or of one a robot."""
+        bases, tools = (values[..., self.of(group).start : self.of(group).stop] for group in ("base", "tool"))
+        arm = values[..., : self.arm_size]
+        blocks = ((arm, 5), (bases, 6), (tools, 6))
+        rows, frames, targets = (block.reshape(*block.shape[:-1], -1, size) for block, size in blocks)
+        return rows, frames, targets
+
+    def sensor_unknowns(self, values: Float64[Tensor, "*robots parameters"]) -> Unknowns:
+        """What a vector of all parameters says of the sensors' unknowns, which several robots side by side lack."""
+        return {
+            own.name: values[self.of(own.name).start : self.of(own.name).stop].view(-1, len(own.columns)).t()
+            for own in self.unknowns
+        }
+
+    def positions_of(
+        self, group: str, active: Int64[Tensor, " active"]
+    ) -> tuple[Int64[Tensor, " own"], Int64[Tensor, " own"], Int64[Tensor, " own"]]:
+        """Where a group of unknowns stands among some parameters: position, index of the owner, and column."""
+        size = next(len(own.columns) for own in self.unknowns if own.name == group)
+        stretch = self.of(group)
+        positions = ((active >= stretch.start) & (active < stretch.stop)).nonzero()[:, 0]
+        number = active[positions] - stretch.start
+        return positions, number // size, number % size
+
+    def precision(self, prior: Prior | None) -> Float64[np.ndarray, " parameters"]:
+        """1 / variance of every parameter's error by the prior; 0 where it says nothing."""
+        precision = np.zeros(len(self.parameters))
+        if prior is not None:
+            of_row = [getattr(prior, column) ** -2 for column in DH_COLUMNS]
+            precision[: self.arm_size] = np.tile(of_row, len(self.robot.rows))
+        return precision
+
+
+def row_labels(robot: Robot) -> tuple[str, ...]:
+    """What names end in: the joint's number, or a fixed row's name ("EE" for an end effector)."""
+    labels, joint = [], 0
+    for row in robot.rows:
+        joint += row.type != "fixed"
+        fixed = "EE" if row.name.lower() in ("end_effector", "ee") else row.name
+        labels.append(fixed if row.type == "fixed" else str(joint))
+    return tuple(labels)
+
+
+def _parameter(column: str, name: str, group: str, owner: str) -> Parameter:
+    return Parameter(name, group, "m" if column in LENGTHS else "rad", owner)

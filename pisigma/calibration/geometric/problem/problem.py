@@ -1,0 +1,400 @@
+"""The calibration as a least-squares problem: normal equations summed over chunks of poses.
+
+A problem may be that of several robots of one type, with equally many rows, values in the same of them and the same
+free parameters. Rows stand robot by robot; what is one a robot has an axis of robots first.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property, partial
+
+import torch
+from jaxtyping import Float64, Int64
+from torch import Tensor
+
+from pisigma.calibration.geometric.problem.least_squares import (
+    AbstractLeastSquares,
+    Linearisation,
+    covariance_of,
+)
+from pisigma.calibration.geometric.problem.motion import MotionMemory, motion_at
+from pisigma.calibration.geometric.problem.noise import (
+    ALWAYS_GOOD,
+    SensorSums,
+    SensorView,
+    angle_disagreement,
+    group_variance_ratio,
+    joined_sums,
+    loss_scale,
+    rejecting,
+    renumbered,
+    values_used,
+    view_of,
+)
+from pisigma.calibration.geometric.problem.parameters import EVERYWHERE, ParameterSpace, PriorSizes
+from pisigma.calibration.geometric.problem.prior_sizes import (
+    SMALLEST_PRIOR,
+    alike,
+    prior_scales,
+    settled_scales,
+)
+from pisigma.calibration.geometric.problem.robots import of_robots, with_robots
+from pisigma.estimation.loss import AbstractLoss, SquaredLoss
+from pisigma.measurement.conditions import JointState
+from pisigma.measurement.sensors.sensor import AbstractSensor, Unknowns
+from pisigma.robot.kinematics.parameter_jacobian import JACOBIAN_CHUNK, ToolMotion, motion_shape
+
+CERTAIN_LOSS = SquaredLoss()
+SETTLED = 1e-2
+"""Estimates of noise and prior sizes have settled that change by a smaller share from point to point."""
+
+
+@dataclass(frozen=True, eq=False)
+class CalibrationProblem(AbstractLeastSquares[Tensor]):
+    """Rows, sensors, the parameters that are free and what the prior says of them; of one robot or of several.
+
+    Attributes:
+        space: the parameters; a point is a vector of all of them, or one a robot.
+        q: joint values [rad or m] of the rows.
+        frame: index of every row's frame.
+        target: index of every row's target.
+        sensors: what was measured in the rows.
+        loss: how rows far from their prediction count.
+        nominal: values of all parameters that the prior is about.
+        precision: 1 / variance of their errors by the prior, 0 where it says nothing.
+        active: indices of the free parameters.
+        pose: number of every row's pose (joint values, frame, target), None where no pose is repeated.
+        configuration: number of every row's joint values and frame, None where none is seen of several targets.
+        pairs: so many pairs of rows, the first ones, are measured together.
+        stated: what rows state beside their joint values (see `JointState`), for corrections that depend on it.
+        prior_sizes: "stated": the prior as it is; "widened": wider where errors are larger; "estimated": either way.
+        memory: the last motion; shared with problems that differ in their free parameters or prior only.
+    """
+
+    space: ParameterSpace
+    q: Float64[Tensor, "rows dof"]
+    frame: Int64[Tensor, " rows"]
+    target: Int64[Tensor, " rows"]
+    sensors: tuple[AbstractSensor, ...]
+    loss: AbstractLoss
+    nominal: Float64[Tensor, "*robots parameters"]
+    precision: Float64[Tensor, " parameters"]
+    active: Int64[Tensor, " active"]
+    pose: Int64[Tensor, " rows"] | None = None
+    configuration: Int64[Tensor, " rows"] | None = None
+    pairs: int = 0
+    stated: Mapping[str, Tensor] = field(default_factory=dict)
+    prior_sizes: PriorSizes = "widened"
+    memory: MotionMemory = field(default_factory=MotionMemory, repr=False)
+
+    @cached_property
+    def step_scale(self) -> Float64[Tensor, " active"]:
+        """1 mm and 1 mrad."""
+        return torch.from_numpy(self.space.usual_errors).to(self.q.device)[self.active]
+
+    @property
+    def robots(self) -> torch.Size:
+        """The axis of robots, of several; no axis of one."""
+        return self.nominal.shape[:-1]
+
+    @cached_property
+    def rows(self) -> int:
+        """Number of rows of every robot."""
+        return self.q.shape[0] // self.robots.numel()
+
+    @cached_property
+    def values_measured(self) -> tuple[int, ...]:
+        """Number of values of every sensor for a robot."""
+        return tuple(int(sensor.present[: self.rows].sum()) * sensor.components for sensor in self.sensors)
+
+    @cached_property
+    def prior_group(self) -> Int64[Tensor, " active"]:
+        """Which size of the prior every free parameter has: of its `PriorGroup`, or for lengths and for angles."""
+        active = self.active
+        if self.prior_sizes != "estimated":
+            return self.space.is_length.to(active.device)[active].long()
+        nominal = self.nominal.reshape(-1, len(self.precision))[0]  # robots of one type are drawn alike
+        drawn = (nominal.square() * self.precision > 1)[active].long()
+        return self.space.prior_groups.to(active.device)[drawn, active]
+
+    def with_active(self, active: Sequence[int]) -> "CalibrationProblem":
+        """The same with other free parameters."""
+        return replace(self, active=torch.tensor(sorted(active), dtype=torch.int64, device=self.q.device))
+
+    def without_prior(self) -> "CalibrationProblem":
+        """The same without a prior."""
+        return replace(self, precision=torch.zeros_like(self.precision))
+
+    def with_partners(self, rows: Int64[Tensor, " chosen"]) -> Int64[Tensor, " _rows"]:
+        """Some rows and, of pairs, the other ones; in ascending order where there are pairs."""
+        if not self.pairs:
+            return rows
+        partner = torch.where(rows < 2 * self.pairs, rows ^ 1, rows)
+        both: Tensor = torch.unique(torch.cat([rows, partner]))
+        return both
+
+    def select(self, rows: Int64[Tensor, " chosen"]) -> "CalibrationProblem":
+        """Some of the rows; of a pair both."""
+        rows = self.with_partners(rows)
+        return replace(
+            self,
+            q=self.q[rows],
+            frame=self.frame[rows],
+            target=self.target[rows],
+            sensors=tuple(sensor.select(rows) for sensor in self.sensors),
+            pose=None if self.pose is None else renumbered(self.pose[rows]),
+            configuration=None if self.configuration is None else renumbered(self.configuration[rows]),
+            pairs=int((rows < 2 * self.pairs).sum()) // 2,
+            stated={name: values[rows] for name, values in self.stated.items()},
+            memory=MotionMemory(),
+        )
+
+    def of_robots(self, robots: Int64[Tensor, " chosen"]) -> "CalibrationProblem":
+        """Those of several robots that are chosen."""
+        robots = robots.to(self.q.device)
+        rows = (robots[:, None] * self.rows + torch.arange(self.rows, device=robots.device)).flatten()
+        return replace(self.select(rows), nominal=self.nominal[robots])
+
+    @cached_property
+    def state(self) -> JointState:
+        """Joint values of the rows, and what is stated beside them."""
+        return JointState(self.q, self.stated)
+
+    def moved(self, point: Tensor, step: Tensor) -> Tensor:
+        """The parameters after a step of the free ones."""
+        return point.index_add(-1, self.active, step)
+
+    def rms(self, linearisation: Linearisation[Tensor]) -> Float64[Tensor, "*robots"]:
+        """Root mean square of the first sensor's residuals' lengths [m or rad]."""
+        return view_of(linearisation).sums[0].rms
+
+    def linearise(self, point: Tensor, like: Linearisation[Tensor] | None) -> Linearisation[Tensor]:
+        """Sum up the normal equations; rows are weighted by the noise of `like`, all alike where None."""
+        before = None if like is None else view_of(like)
+        unknowns = self.space.sensor_unknowns(point)
+        chunks = []
+        for rows in self.chunks():
+            motion = self.motion(point, rows, self.active)
+            noise = None if before is None else self._of_rows(before.noise, rows)
+            chunks.append([self._sums(k, noise, motion, unknowns, rows) for k in range(len(self.sensors))])
+        sums = tuple(joined_sums(of_sensor) for of_sensor in zip(*chunks, strict=True))
+        view = SensorView.without_noise(sums) if before is None else replace(before, sums=sums)
+        return self.combined(point, view)
+
+    def begin(self, point: Tensor) -> Linearisation[Tensor]:
+        """See the problem from a start, the rows being weighted by what they show of the noise.
+
+        Gross errors would decide the first step otherwise, where the loss rejects any.
+        """
+        weighted = self.renewed(self.linearise(point, None))[0]
+        rejects = rejecting(
+            self.sensors, [self.loss_of(sensor) for sensor in self.sensors], view_of(weighted)
+        )
+        if not bool(rejects.any()):
+            return weighted
+        if bool(rejects.all()):
+            return self.renewed(self.linearise(point, weighted))[0]
+        robots = rejects.nonzero()[:, 0]
+        some = self.of_robots(robots)
+        theirs = some.renewed(some.linearise(point[robots], of_robots(weighted, robots)))[0]
+        return with_robots(weighted, robots, theirs)
+
+    def renewed(self, linearisation: Linearisation[Tensor]) -> tuple[Linearisation[Tensor], Tensor]:
+        """Estimate the noise robustly, what repeats are worth, and how wide the prior has to be."""
+        return self._renewed(linearisation, refine=False)
+
+    def refined(self, linearisation: Linearisation[Tensor]) -> Linearisation[Tensor]:
+        """The same with the noise estimated from all good rows, for the end of a search."""
+        return self._renewed(linearisation, refine=True)[0]
+
+    def _renewed(
+        self, linearisation: Linearisation[Tensor], refine: bool
+    ) -> tuple[Linearisation[Tensor], Tensor]:
+        view = view_of(linearisation)
+        covariance = covariance_of(linearisation.normal)
+        used = values_used(view, covariance)
+        noise = loss_scale(self.sensors, self.loss, view, used, refine)
+        repetition = view.repetition
+        if self.pose is not None or self.configuration is not None:
+            renewed_noise = replace(view, noise=noise)
+            shape = (*self.robots, self.rows)
+            groups = (None if one is None else one.view(shape) for one in (self.pose, self.configuration))
+            repetition = group_variance_ratio(self.sensors, self.loss, renewed_noise, used, *groups)
+        off = self._off(linearisation.point)
+        renewed = replace(view, noise=noise, repetition=repetition)
+        if not refine and any(sensor.unit == "rad" for sensor in self.sensors):
+            held = view.scaled(self._prior, self.prior_group)
+            renewed = replace(
+                renewed, disagreement=angle_disagreement(self.sensors, renewed, held, -held * off)
+            )
+        if self._sized:
+            renewed = replace(renewed, prior_scale=self._prior_scales(renewed, off, covariance, refine))
+        before, after = (
+            torch.cat([one.noise, one.repetition, one.disagreement, one.prior_scale], -1)
+            for one in (view, renewed)
+        )
+        return self.combined(linearisation.point, renewed), alike(before, after, SETTLED)
+
+    def _prior_scales(
+        self, view: SensorView, off: Tensor, covariance: Tensor, refine: bool
+    ) -> Float64[Tensor, "*robots groups"]:
+        """Estimate the prior's sizes; during a search with the step they lead to, the residuals being linear in it."""
+        floor, prior = (
+            1.0 if self.prior_sizes == "widened" else SMALLEST_PRIOR,
+            (self._prior, self.prior_group),
+        )
+        scale = prior_scales(off, *prior, view.prior_scale, covariance, floor)
+        if refine:
+            return scale
+        normal, descent = self._data_sums(view)
+        pull = (descent + (normal @ off[..., None])[..., 0])[..., None]
+        return settled_scales(normal, pull, *prior, scale, floor)
+
+    @cached_property
+    def _sized(self) -> bool:
+        """Whether there is a prior whose sizes are estimated."""
+        return self.prior_sizes != "stated" and bool((self._prior > 0).any())
+
+    def _off(self, point: Tensor) -> Float64[Tensor, "*robots active"]:
+        """Distance of the free parameters from where the prior has them."""
+        return (point - self.nominal).index_select(-1, self.active)
+
+    def loss_of(self, sensor: AbstractSensor) -> AbstractLoss:
+        """How a sensor's rows count."""
+        return CERTAIN_LOSS if sensor.certain else self.loss
+
+    def chunks(self) -> list[slice]:
+        """Rows that are worked on together; all or none of a robot where there are several."""
+        # several robots take more operations a chunk, which larger chunks make up for
+        size = JACOBIAN_CHUNK if not self.robots else max(2 * JACOBIAN_CHUNK // self.rows, 1) * self.rows
+        count = self.q.shape[0]
+        return [slice(start, min(start + size, count)) for start in range(0, count, size)]
+
+    def _of_rows(self, values: Float64[Tensor, "*robots size"], rows: slice) -> Float64[Tensor, "*some size"]:
+        """What has one entry a robot, for the robots of some rows."""
+        return values[rows.start // self.rows : rows.stop // self.rows] if self.robots else values
+
+    def by_robot(self, values: Tensor) -> Tensor:
+        """Values of rows, their last axis, with an axis of robots first where there are several."""
+        return torch.unflatten(values, -1, (-1, self.rows)).movedim(-2, 0) if self.robots else values
+
+    def motion(self, point: Tensor, rows: slice, active: Tensor) -> ToolMotion:
+        """Tool pose of some rows and its derivative by some parameters.
+
+        The columns are 0 for base and tool in rows of other frames and targets, and for parameters that do not
+        move the tool.
+        """
+        of_rows = (self._of_rows(point, rows), self.q[rows], self.frame[rows], self.target[rows])
+        make = partial(motion_at, self.space, *of_rows, self.turning)
+        made_from = (point, self.space, self.q, self.frame, self.target, self.turning)
+        if self.robots or rows == slice(0, self.q.shape[0]):
+            shape = motion_shape(self.space.robot, self.turning)
+            motion = self.memory.motion(made_from, rows, shape, self.q, make)
+        else:
+            motion = make()
+        columns = self.space.motion_columns.to(active.device)
+        J = motion.derivative.index_select(0, columns[0].index_select(0, active))
+        if not self.space.always_moving:
+            f, t = columns[1:, active, None]
+            moving = ((f == EVERYWHERE) | (f == self.frame[rows])) & (
+                (t == EVERYWHERE) | (t == self.target[rows])
+            )
+            J = J * moving[:, None, :]
+        return ToolMotion(motion.position, motion.rotation, J)
+
+    def derivative(
+        self, sensor: AbstractSensor, motion: ToolMotion, unknowns: Unknowns, rows: slice, active: Tensor
+    ) -> Tensor:
+        """Derivative of a sensor's values by the parameters that the motion was made for."""
+        J = sensor.derivative(motion, unknowns, rows)
+        for block in sensor.unknown_derivatives(motion, unknowns, rows):
+            positions, owner, column = self.space.positions_of(block.group, active)
+            if len(positions):
+                theirs = (owner[:, None] == block.owner)[:, None, :]
+                J = J.index_add(0, positions, block.derivative[column] * theirs)
+        return J
+
+    def combined(self, point: Tensor, view: SensorView) -> Linearisation[Tensor]:
+        """Divide the sums by their variances and add the prior."""
+        off = self._off(point)
+        precision = view.scaled(self._prior, self.prior_group)
+        pull = off * precision
+        normal, descent = self._data_sums(view)
+        normal.diagonal(dim1=-2, dim2=-1).add_(precision)
+        descent.sub_(pull)
+        costs = [
+            self.loss_of(sensor).cost(sums.distance / view.scale(k)[..., None], sensor.components).sum(-1)
+            for k, (sensor, sums) in enumerate(zip(self.sensors, view.sums, strict=True))
+        ]
+        misfit = (torch.stack(costs, -1) * view.scales.square() / view.variances).sum(-1)
+        rounding = (self._rounding / view.variances).sum(-1)
+        cost = misfit + (off * pull).sum(-1)
+        return Linearisation(point, cost, descent, normal, misfit, rounding, view)
+
+    def _data_sums(
+        self, view: SensorView
+    ) -> tuple[Float64[Tensor, "*robots active active"], Float64[Tensor, "*robots active"]]:
+        """Divide the sums by their variances; the prior is not in it."""
+        terms = [
+            (sums.normal / variance[..., None, None], sums.descent / variance[..., None])
+            for sums, variance in zip(view.sums, view.variances.unbind(-1), strict=True)
+        ]
+        normal, descent = terms[0]
+        for more_normal, more_descent in terms[1:]:
+            normal.add_(more_normal)
+            descent.add_(more_descent)
+        return normal, descent
+
+    @cached_property
+    def _rounding(self) -> Float64[Tensor, " sensors"]:
+        """Sum of squares of what rounding makes of every sensor's residuals [m² or rad²]."""
+        sizes = (self.space.robot.reach if sensor.unit == "m" else 1.0 for sensor in self.sensors)
+        pairs = zip(self.values_measured, sizes, strict=True)
+        epsilon = torch.finfo(self.q.dtype).eps
+        return self.q.new_tensor([values * (epsilon * size) ** 2 for values, size in pairs])
+
+    @cached_property
+    def turning(self) -> bool:
+        """Whether any sensor needs the tool's rotation."""
+        return any(sensor.turning for sensor in self.sensors)
+
+    @cached_property
+    def _prior(self) -> Float64[Tensor, " active"]:
+        return self.precision[self.active]
+
+    @cached_property
+    def measured_everywhere(self) -> tuple[bool, ...]:
+        """Per sensor, whether it has a value in every row."""
+        return tuple(
+            values == self.rows * sensor.components
+            for values, sensor in zip(self.values_measured, self.sensors, strict=True)
+        )
+
+    def _sums(
+        self, number: int, noise: Tensor | None, motion: ToolMotion, unknowns: Unknowns, rows: slice
+    ) -> SensorSums:
+        """What one sensor contributes in some rows, weighted by its noise, or all alike where that is None."""
+        sensor, everywhere = self.sensors[number], self.measured_everywhere[number]
+        residual = sensor.residual(motion, unknowns, rows)
+        if not everywhere:
+            residual = torch.where(sensor.present[rows], residual, 0.0)
+        distance = residual.square().sum(0).sqrt_()
+        if sensor.sigma is not None:
+            distance = torch.where(sensor.present[rows], distance / sensor.sigma[rows], 0.0)
+        residual, distance = self.by_robot(residual), self.by_robot(distance)
+        if noise is None:
+            root = torch.ones_like(distance)
+        else:
+            scale = noise[..., number, None].clamp(min=ALWAYS_GOOD)
+            root = self.loss_of(sensor).weight(distance / scale, sensor.components).sqrt_()
+        if sensor.sigma is not None:
+            root = root / self.by_robot(sensor.sigma[rows])
+        if not everywhere:
+            root = torch.where(self.by_robot(sensor.present[rows]), root, 0.0)
+        J = self.by_robot(self.derivative(sensor, motion, unknowns, rows, self.active))
+        A = J.new_empty((*J.shape[:-3], J.shape[-3] + 1, *J.shape[-2:]))  # the residual is its last row
+        torch.mul(J, root[..., None, None, :], out=A[..., :-1, :, :])
+        torch.mul(residual, root[..., None, :], out=A[..., -1, :, :])
+        A = A.flatten(-2)
+        sums, measured = A @ A.mT, self.values_measured[number] // sensor.components
+        return SensorSums(sums[..., :-1, :-1], sums[..., :-1, -1], residual, distance, measured)

@@ -1,0 +1,393 @@
+"""The calibration problem with its initial guess, and points of the problem in the user's coordinates."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+import torch
+from jaxtyping import Float64, Int64
+from torch import Tensor
+
+from pisigma.calibration.geometric.initial_guess.initial_guess import InitialGuess, guess
+from pisigma.calibration.geometric.problem.noise import renumbered
+from pisigma.calibration.geometric.problem.parameters import ParameterSpace, Prior, PriorSizes
+from pisigma.calibration.geometric.problem.problem import CalibrationProblem
+from pisigma.estimation.loss import AbstractLoss
+from pisigma.files.errors import IdentificationError
+from pisigma.measurement.conditions import JointState, repeat_key
+from pisigma.measurement.dataset import Measurements
+from pisigma.measurement.fields import KINDS
+from pisigma.measurement.readings import READINGS
+from pisigma.measurement.sensors.registry import build_sensors, pairs_first, unknown_groups
+from pisigma.measurement.sensors.sensor import SensorRows, numbers_of
+from pisigma.measurement.sensors.socket import PairOfSockets, SocketDistanceSensor
+from pisigma.robot.description import Robot
+from pisigma.robot.se3 import invert, rotation_from_rpy, rpy_from_rotation, transform_from_xyzrpy
+
+MULTIPLIER, FACTOR = 6_364_136_223_846_793_005, 1_442_695_040_888_963_407
+"""Of the linear congruential generator by which joint values are mixed (Knuth, MMIX)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Anchors:
+    """Where base and tool started; parameters are changes from there, so no angle nears its singularity.
+
+    Attributes:
+        bases: per frame, what stands before the base of the problem: `base = anchor · base_of_problem`. Points that
+            sensors have to find are behind it too.
+        tools: per target, what stands behind the tool's rotation: `R_tool = R_of_problem · anchor`.
+    """
+
+    bases: Float64[Tensor, "frames 4 4"]
+    tools: Float64[Tensor, "targets 3 3"]
+
+
+@dataclass(frozen=True, eq=False)
+class CalibrationSetup:
+    """A problem ready to be solved.
+
+    Attributes:
+        problem: with no parameter free yet.
+        start: values of all parameters.
+        anchors: what base and tool are relative to.
+        rows: which rows of the measurements the problem has, in its order.
+        unknown_frames: by group of the sensors' unknowns, the index of every owner's frame.
+        free_unknowns: indices of the sensors' unknowns that are to be identified, such as where sockets are.
+        measurements: the rows of the problem, in its order.
+    """
+
+    problem: CalibrationProblem
+    start: Float64[Tensor, " parameters"]
+    anchors: Anchors
+    rows: Tensor
+    unknown_frames: Mapping[str, Int64[Tensor, " owners"]]
+    free_unknowns: list[int]
+    measurements: Measurements
+
+
+@dataclass(frozen=True)
+class SetupOptions:
+    """What the user says of base, tool and sensors.
+
+    Attributes:
+        free_base: whether bases are to be identified.
+        free_tool: whether tools are to be identified.
+        turn_tool: whether their rotations are.
+        frames: initial guesses of bases by frame; x, y, z [m], roll, pitch, yaw [rad].
+        socket_distances: distances between two sockets [m].
+        socket_sigma: their standard deviation [m].
+        prior_sizes: see `CalibrationProblem`.
+    """
+
+    free_base: bool
+    free_tool: bool
+    turn_tool: bool = True
+    frames: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
+    socket_distances: Mapping[PairOfSockets, float] = field(default_factory=dict)
+    socket_sigma: float = 1e-5
+    prior_sizes: PriorSizes = "widened"
+
+
+def build_setup(
+    robot: Robot,
+    measurements: Measurements,
+    options: SetupOptions,
+    prior: Prior | None,
+    loss: AbstractLoss,
+) -> CalibrationSetup:
+    """Guess where everything but the arm is, and state the problem relative to it.
+
+    Raises:
+        IdentificationError: nothing usable was measured, too little for what has to be identified, or something
+            that cannot be.
+        PoseError: the joint values do not fit the robot.
+    """
+    robot.check_joint_count(measurements.q.shape[1])
+    rows, measurements = usable_rows(measurements)
+    space = ParameterSpace(
+        robot,
+        tuple(dict.fromkeys(measurements.frame)),
+        tuple(dict.fromkeys(measurements.target)),
+        unknown_groups(measurements),
+    )
+    guessed = guess(
+        space, measurements, options.free_base, options.free_tool, options.turn_tool, options.frames
+    )
+    return setup_around(space, guessed, (rows, measurements), options, prior, loss)
+
+
+def setup_around(
+    space: ParameterSpace,
+    guessed: InitialGuess,
+    usable: tuple[Tensor, Measurements],
+    options: SetupOptions,
+    prior: Prior | None,
+    loss: AbstractLoss,
+) -> CalibrationSetup:
+    """State the problem relative to where everything but the arm is.
+
+    Args:
+        space: the parameters.
+        guessed: bases, tools and sensors' unknowns.
+        usable: from `usable_rows`.
+        options: what the user says.
+        prior: of the arm's errors.
+        loss: how far-off rows count.
+    """
+    rows, measurements = usable
+    device = measurements.q.device
+    frame = numbers_of(measurements.frame, space.frames, measurements.rows).to(device)
+    target = numbers_of(measurements.target, space.targets, measurements.rows).to(device)
+    unknown_frames = {
+        own.name: torch.tensor([space.frames.index(name) for name in own.frames]) for own in space.unknowns
+    }
+    anchors, start = _anchored(space, guessed, options, unknown_frames)
+    start = start.to(device)
+    sensors = build_sensors(
+        SensorRows(measurements, anchors.bases.to(device)[frame], anchors.tools.to(device)[target])
+    )
+    distances = SocketDistanceSensor.between(measurements, options.socket_distances, options.socket_sigma)
+    repeats = repeat_key(measurements)
+    problem = CalibrationProblem(
+        space=space,
+        q=measurements.q,
+        frame=frame,
+        target=target,
+        sensors=tuple(sensors if distances is None else [*sensors, distances]),
+        loss=loss,
+        nominal=start,
+        precision=torch.from_numpy(space.precision(prior)).to(device),
+        active=torch.zeros(0, dtype=torch.int64, device=device),
+        pose=repeated(repeats, frame, target),
+        configuration=repeated(repeats, frame) if len(space.targets) > 1 else None,
+        pairs=len(set(measurements.pair or ()) - {""}),
+        stated=JointState.of(measurements).stated,
+        prior_sizes=options.prior_sizes,
+    )
+    free = [
+        space.of(own.name).start + index
+        for own in space.unknowns
+        for index in guessed.free_unknowns[own.name].flatten().nonzero()[:, 0].tolist()
+    ]
+    return CalibrationSetup(problem, start, anchors, rows, unknown_frames, free, measurements)
+
+
+def usable_rows(measurements: Measurements) -> tuple[Tensor, Measurements]:
+    """Select the rows in which something was measured; those of pairs come first, side by side.
+
+    Returns:
+        Their numbers, and the rows.
+
+    Raises:
+        IdentificationError: no row has a measured value, or all are of one pose.
+    """
+    usable = torch.stack([measurements.measured(kind) for kind in (*KINDS, *READINGS)]).any(0)
+    if not bool(usable.any()):
+        raise IdentificationError(
+            f"{measurements.source}: none of its {len(usable)} rows has a measured value; give positions or poses "
+            "(columns x_mm, y_mm, z_mm), touches, sockets or distances."
+        )
+    rows = pairs_first(measurements, usable.nonzero()[:, 0])
+    whole = len(rows) == len(usable) and measurements.pair is None
+    chosen = measurements if whole else measurements.select(rows)
+    q = chosen.q
+    if q.shape[0] > 1 and float((q - q[0]).abs().max()) < 1e-9:
+        raise IdentificationError(
+            f"{measurements.source}: all {q.shape[0]} rows are one pose, which determines the noise but no "
+            "parameter; measure at other joint values, spread over the workspace."
+        )
+    return rows, chosen
+
+
+def repeated(q: Tensor, *names: Tensor) -> Tensor | None:
+    """Number every row's joint values (with payload, to 1e-9) and names, such as of frame and target.
+
+    Returns:
+        None where no two rows are the same.
+    """
+    numbers = renumbered(mixed_keys(q, *names))
+    return None if int(numbers.max()) + 1 == len(q) else numbers
+
+
+def mixed_keys(q: Float64[Tensor, "*batch rows dof"], *names: Tensor) -> Int64[Tensor, "*batch rows"]:
+    """Mix every row's joint values (to 1e-9) and names into one number, which is the same where they are."""
+    keys, dof = (q * 1e9).round().long(), q.shape[-1]
+    factors = [FACTOR * pow(MULTIPLIER, dof - 1 - joint, 2**64) for joint in range(dof)]
+    signed = [(factor + 2**63) % 2**64 - 2**63 for factor in factors]
+    mixed: Tensor = (keys * torch.tensor(signed, device=q.device)).sum(-1)  # integers wrap around
+    for name in names:
+        mixed = mixed * MULTIPLIER + name * FACTOR
+    return mixed
+
+
+def _anchored(
+    space: ParameterSpace,
+    guessed: InitialGuess,
+    options: SetupOptions,
+    unknown_frames: Mapping[str, Int64[Tensor, " owners"]],
+) -> tuple[Anchors, Float64[Tensor, " parameters"]]:
+    """Bases start at their anchor, tools where they are, turned like their anchor; what is fixed has none."""
+    bases, tools = guessed.bases.copy(), guessed.tools.copy()
+    anchors = Anchors(
+        torch.eye(4).double().repeat(len(bases), 1, 1), torch.eye(3).double().repeat(len(tools), 1, 1)
+    )
+    if options.free_base:
+        anchors = Anchors(transform_from_xyzrpy(torch.from_numpy(bases)), anchors.tools)
+        bases = np.zeros_like(bases)
+    if options.free_tool:
+        anchors = Anchors(anchors.bases, rotation_from_rpy(torch.from_numpy(tools[:, 3:])))
+        tools[:, 3:] = 0
+    unknowns = {
+        own.name: _moved(
+            invert(anchors.bases)[unknown_frames[own.name]], guessed.unknowns[own.name], own.has_point
+        ).numpy()
+        for own in space.unknowns
+    }
+    return anchors, space.values(bases, tools, unknowns)
+
+
+def _moved(
+    T: Float64[Tensor, "owners 4 4"], values: Float64[Tensor, "owners columns"], has_point: bool
+) -> Float64[Tensor, "owners columns"]:
+    """Unknowns of sensors whose points were moved."""
+    if not has_point:
+        return values
+    points = (T[:, :3, :3] @ values[:, :3, None])[..., 0] + T[:, :3, 3]
+    return torch.cat([points, values[:, 3:]], 1)
+
+
+@dataclass(frozen=True, eq=False)
+class IdentifiedGeometry:
+    """A robot, where it stood, what it carried and what its sensors found out about themselves.
+
+    Attributes:
+        robot: with the base of the first frame and the tool of the first target.
+        bases: per frame x, y, z [m], roll, pitch, yaw [rad].
+        tools: the same per target.
+        unknowns: by group and owner, the sensors' unknowns in the owner's frame, such as
+            `unknowns["socket"]["plate/0"]` [m or rad].
+        setup: the problem that it solves; None where that is not at hand any more.
+        point: the solution in the problem's coordinates.
+    """
+
+    robot: Robot
+    bases: dict[str, Float64[np.ndarray, " 6"]]
+    tools: dict[str, Float64[np.ndarray, " 6"]]
+    unknowns: dict[str, dict[str, Float64[np.ndarray, " columns"]]]
+    setup: CalibrationSetup | None = field(default=None, repr=False)
+    point: Float64[Tensor, " parameters"] | None = field(default=None, repr=False)
+
+    @cached_property
+    def change(self) -> Float64[Tensor, "parameters parameters"]:
+        """`d(all parameters in these coordinates) / d(the problem's)`; there is one with a problem only."""
+        assert self.setup is not None
+        assert self.point is not None
+        return coordinate_change(self.setup, self.point.cpu())
+
+    def values_of(self, space: ParameterSpace) -> Float64[Tensor, " parameters"]:
+        """Return all parameters of a space as one vector; NaN for sensors' unknowns that are not here."""
+        unknowns = []
+        for own in space.unknowns:
+            missing, values = np.full(len(own.columns), np.nan), self.unknowns.get(own.name, {})
+            unknowns += [values.get(owner, missing) for owner in own.owners]
+        blocks = (self.robot.dh.ravel(), *self.bases.values(), *self.tools.values(), *unknowns)
+        return torch.from_numpy(np.concatenate(blocks))
+
+
+def identified_geometry(setup: CalibrationSetup, point: Float64[Tensor, " parameters"]) -> IdentifiedGeometry:
+    """Put the anchors back; as rotation vectors, small turns mean the same with and without them."""
+    return identified_geometries([setup], point[None])[0]
+
+
+def identified_geometries(
+    setups: Sequence[CalibrationSetup], points: Float64[Tensor, "robots parameters"]
+) -> list[IdentifiedGeometry]:
+    """Put the anchors back of robots of one type with the same frames and targets; see `identified_geometry`."""
+    space = setups[0].problem.space
+    blocks = zip(*behind_anchors(setups, points), strict=True)
+    return [
+        IdentifiedGeometry(
+            robot=space.robot.with_geometry(dh=dh, base=bases[0], tool=tools[0]),
+            bases=dict(zip(space.frames, bases, strict=True)),
+            tools=dict(zip(space.targets, tools, strict=True)),
+            unknowns={
+                own.name: dict(zip(own.owners, values, strict=True))
+                for own, values in zip(space.unknowns, unknowns_in_frames(setup, point).values(), strict=True)
+            },
+            setup=setup,
+            point=point,
+        )
+        for setup, point, (dh, bases, tools) in zip(setups, points, blocks, strict=True)
+    ]
+
+
+def behind_anchors(
+    setups: Sequence[CalibrationSetup], points: Float64[Tensor, "robots parameters"]
+) -> tuple[
+    Float64[np.ndarray, "robots rows 5"],
+    Float64[np.ndarray, "robots frames 6"],
+    Float64[np.ndarray, "robots targets 6"],
+]:
+    """Return rows, bases and tools at points of problems with one space, in the user's coordinates."""
+    dh, bases, tools = (block.clone() for block in setups[0].problem.space.split(points.cpu()))
+    T_anchor, R_tool = (
+        torch.stack([getattr(setup.anchors, name) for setup in setups]).cpu() for name in ("bases", "tools")
+    )
+    R_anchor, frames = T_anchor[..., :3, :3], bases.shape[1]
+    turned = rotation_from_rpy(torch.cat([bases, tools], 1)[..., 3:])
+    rpy = rpy_from_rotation(torch.cat([R_anchor @ turned[:, :frames], turned[:, frames:] @ R_tool], 1))
+    bases[..., :3] = (R_anchor @ bases[..., :3, None])[..., 0] + T_anchor[..., :3, 3]
+    bases[..., 3:], tools[..., 3:] = rpy[:, :frames], rpy[:, frames:]
+    return dh.numpy(), bases.numpy(), tools.numpy()
+
+
+def coordinate_change(
+    setup: CalibrationSetup, point: Float64[Tensor, " parameters"]
+) -> Float64[Tensor, "parameters parameters"]:
+    """Return the derivative of all parameters in the user's coordinates by those of the problem.
+
+    Args:
+        setup: with the anchors that the problem's bases and tools are relative to.
+        point: where the derivative is taken, in the problem's coordinates.
+    """
+    space, anchors = setup.problem.space, setup.anchors
+    _, bases, tools = space.split(point)
+    _, user_bases, user_tools = (torch.from_numpy(block[0]) for block in behind_anchors([setup], point[None]))
+    change = torch.eye(len(point), dtype=point.dtype)
+    for k, anchor in enumerate(anchors.bases.cpu()):
+        first = space.of("base").start + 6 * k
+        change[first : first + 3, first : first + 3] = anchor[:3, :3]
+        back = torch.linalg.pinv(turning_axes(user_bases[k, 3:]), rtol=1e-9)
+        turns = slice(first + 3, first + 6)
+        change[turns, turns] = back @ anchor[:3, :3] @ turning_axes(bases[k, 3:])
+    for k in range(len(tools)):
+        first = space.of("tool").start + 6 * k + 3
+        back = torch.linalg.pinv(turning_axes(user_tools[k, 3:]), rtol=1e-9)
+        change[first : first + 3, first : first + 3] = back @ turning_axes(tools[k, 3:])
+    for own in space.unknowns:
+        if own.has_point:
+            for k, number in enumerate(setup.unknown_frames[own.name].tolist()):
+                first = space.of(own.name).start + len(own.columns) * k
+                change[first : first + 3, first : first + 3] = anchors.bases[number, :3, :3].cpu()
+    return change
+
+
+def unknowns_in_frames(
+    setup: CalibrationSetup, point: Float64[Tensor, " parameters"]
+) -> dict[str, Float64[np.ndarray, "owners columns"]]:
+    """Return the sensors' unknowns at a point of the problem by group, in the frames of their owners."""
+    space, bases = setup.problem.space, setup.anchors.bases.cpu()
+    values = space.sensor_unknowns(point.cpu())
+    return {
+        own.name: _moved(bases[setup.unknown_frames[own.name]], values[own.name].t(), own.has_point).numpy()
+        for own in space.unknowns
+    }
+
+
+def turning_axes(rpy: Float64[Tensor, " 3"]) -> Float64[Tensor, "3 3"]:
+    """The axes that roll, pitch and yaw turn about, as columns: `RotZ(roll) · RotY(pitch) · RotX(yaw)`."""
+    roll, pitch, _ = rpy.tolist()
+    (cr, cp), (sr, sp) = ((turn(roll), turn(pitch)) for turn in (math.cos, math.sin))
+    return rpy.new_tensor([[0.0, -sr, cr * cp], [0.0, cr, sr * cp], [1.0, 0.0, -sp]])

@@ -1,0 +1,395 @@
+"""What a calibration comes to: the robot, its parameters with their errors, and what the data cannot determine."""
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Literal
+
+import numpy as np
+import torch
+from jaxtyping import Float64
+from torch import Tensor
+
+from pisigma.calibration.geometric.identifiability.observability import (
+    Observability,
+    find_weak_directions,
+    observability_of,
+)
+from pisigma.calibration.geometric.identifiability.pairwise import (
+    PairwiseRedundancy,
+    find_pairwise_redundancy,
+)
+from pisigma.calibration.geometric.identifiability.plausibility import misfitting_frames
+from pisigma.calibration.geometric.identifiability.redundancy import Findings, Redundancy
+from pisigma.calibration.geometric.identifiability.sufficiency import what_to_measure
+from pisigma.calibration.geometric.outliers import Outlier, outliers_of
+from pisigma.calibration.geometric.parameter_table import ParameterEstimate, parameter_table
+from pisigma.calibration.geometric.posterior import ParameterPosterior
+from pisigma.calibration.geometric.prediction import predicted_poses
+from pisigma.calibration.geometric.problem.least_squares import (
+    Linearisation,
+    Solution,
+    SolutionStatus,
+    covariance_of,
+)
+from pisigma.calibration.geometric.problem.noise import values_used, view_of
+from pisigma.calibration.geometric.problem.prior_sizes import LENGTH_GROUPS, PriorGroup, effective_parameters
+from pisigma.calibration.geometric.problem.problem import CalibrationProblem
+from pisigma.calibration.geometric.problem.setup import CalibrationSetup, IdentifiedGeometry
+from pisigma.measurement.dataset import Measurements
+from pisigma.measurement.sensors.registry import measured_errors
+from pisigma.robot.description import Robot
+
+DISAGREEING = 10.0
+"""Angles whose variance had to be enlarged by more are worth a warning."""
+
+
+@dataclass(frozen=True)
+class PriorRatio:
+    """How many times as large as the prior says the errors of some parameters are.
+
+    Attributes:
+        kind: "length" or "angle".
+        group: the group of parameters.
+        prior: the smallest standard deviation that the prior states for one of the group [m or rad].
+        value: the estimated ratio.
+        at_least: two standard deviations below it. The estimate from n effective parameters has a relative standard
+            deviation of about `1 / sqrt(2 n)`, so this is `exp(-sqrt(2 / n))` times the estimate.
+    """
+
+    kind: Literal["length", "angle"]
+    group: PriorGroup
+    prior: float
+    value: float
+    at_least: float
+
+    @property
+    def size(self) -> float:
+        """The estimated standard deviation of the errors [m or rad]."""
+        return self.value * self.prior
+
+    @property
+    def size_at_least(self) -> float:
+        """The same, two standard deviations below it."""
+        return self.at_least * self.prior
+
+
+@dataclass(frozen=True)
+class SensorNoise:
+    """Noise of one kind of sensor, as the residuals show it.
+
+    Attributes:
+        sensor: "position", "rotation", "touch", "socket", "distance", "pair", or the name of a registered sensor.
+        sigma: standard deviation of one value [m or rad]; where the rows state their own, the factor on it.
+        unit: "m" or "rad", or "stated" for a factor on what the rows state.
+        values: number of measured values.
+        used: how many of them the parameters used up.
+        rms: root mean square of the residuals' lengths, all rows [m or rad].
+        quantity: "m" where the sensor measures lengths, "rad" where it measures angles.
+        components: values a row.
+    """
+
+    sensor: str
+    sigma: float
+    unit: str
+    values: int
+    used: float
+    rms: float
+    quantity: Literal["m", "rad"]
+    components: int
+
+
+@dataclass(frozen=True, eq=False)
+class SolvedCalibration:
+    """A calibration problem with its solution.
+
+    Attributes:
+        measurements: all rows, also those that could not be used.
+        setup: start, and what base and tool are relative to.
+        problem: with its free parameters.
+        solution: of it.
+        findings: on the parameters.
+        geometry: the solution in the user's coordinates.
+    """
+
+    measurements: Measurements
+    setup: CalibrationSetup
+    problem: CalibrationProblem
+    solution: Solution[Tensor]
+    findings: Findings
+    geometry: IdentifiedGeometry
+
+    def result(self) -> "CalibrationResult":
+        """Return the calibration in the user's coordinates."""
+        geometry = self.geometry
+        return CalibrationResult(geometry.robot, geometry.bases, geometry.tools, geometry.unknowns, self)
+
+    @cached_property
+    def refined(self) -> Linearisation[Tensor]:
+        """The problem at its solution, the noise estimated from all good rows."""
+        return self.problem.refined(self.solution.linearisation)
+
+    @cached_property
+    def covariance(self) -> Float64[np.ndarray, "parameters parameters"]:
+        """Covariance of all parameters in the user's coordinates (SI), zero where they were not free."""
+        change = self.geometry.change[:, self.problem.active.cpu()]
+        covariance: np.ndarray = (change @ covariance_of(self.refined.normal).cpu() @ change.mT).numpy()
+        return covariance
+
+    @cached_property
+    def root(self) -> Float64[Tensor, "parameters directions"]:
+        """`R` with the covariance `R R^T` of all parameters in the user's coordinates."""
+        covariance = covariance_of(self.refined.normal).cpu()
+        scale = covariance.diagonal().clamp(min=0.0).sqrt()
+        inverse = torch.where(scale > 0, 1 / scale, 0.0)
+        values, axes = torch.linalg.eigh(covariance * inverse * inverse[:, None])
+        half = scale[:, None] * axes * values.clamp(min=0.0).sqrt()
+        root: Tensor = self.geometry.change[:, self.problem.active.cpu()] @ half
+        return root
+
+
+@dataclass(frozen=True, eq=False)
+class CalibrationResult:
+    """A geometric calibration. Whatever predictions do not need is worked out when it is asked for.
+
+    Attributes:
+        robot: the calibrated robot, with the base of the first frame and the tool of the first target.
+        bases: per frame x, y, z [m], roll, pitch, yaw [rad].
+        tools: the same per target.
+        unknowns: by group and owner, what the sensors found out about themselves, in the owner's frame: of a
+            "socket" x, y, z [m], of an "anchor" x, y, z and what its sensor shows at no distance [m].
+        solved: the problem with its solution.
+    """
+
+    robot: Robot
+    bases: dict[str, Float64[np.ndarray, " 6"]]
+    tools: dict[str, Float64[np.ndarray, " 6"]]
+    unknowns: dict[str, dict[str, Float64[np.ndarray, " columns"]]]
+    solved: SolvedCalibration
+
+    @cached_property
+    def parameters(self) -> tuple[ParameterEstimate, ...]:
+        """All parameters, free or not."""
+        solved = self.solved
+        return parameter_table(
+            solved.setup,
+            solved.problem,
+            solved.findings,
+            solved.refined,
+            solved.geometry,
+            solved.covariance,
+        )
+
+    @property
+    def covariance(self) -> Float64[np.ndarray, "parameters parameters"]:
+        """Covariance of all parameters in their order (SI), zero where they were not free."""
+        return self.solved.covariance
+
+    @cached_property
+    def posterior(self) -> ParameterPosterior:
+        """What is known of all parameters together, in the user's coordinates; see `ParameterPosterior`."""
+        solved = self.solved
+        return ParameterPosterior.of(solved.problem.space, solved.geometry, solved.root)
+
+    @cached_property
+    def residuals(self) -> dict[str, Float64[np.ndarray, "rows components"]]:
+        """Per sensor, measured - predicted of every row [m or rad], NaN where it measured nothing."""
+        return _residuals(self.solved)
+
+    @cached_property
+    def outliers(self) -> tuple[Outlier, ...]:
+        """Rows that counted for less than half, the worst first."""
+        return _outliers(self.solved)
+
+    @cached_property
+    def noise(self) -> tuple[SensorNoise, ...]:
+        """Noise of every sensor whose values are measured rather than stated."""
+        return _noise(self.solved)
+
+    @property
+    def redundancy(self) -> Redundancy:
+        """Rank, chosen parameters and dependencies at the start."""
+        return self.solved.findings.redundancy
+
+    @cached_property
+    def pairwise(self) -> PairwiseRedundancy:
+        """Redundancy the paper's way, by Pearson correlation."""
+        findings = self.solved.findings
+        return find_pairwise_redundancy(findings.information, findings.sizes)
+
+    @property
+    def extended(self) -> tuple[str, ...]:
+        """Names of parameters that were added because at the solution the data do determine them."""
+        names = self.solved.problem.space.names
+        return tuple(names[i] for i in self.solved.findings.extended)
+
+    @cached_property
+    def weak_directions(self) -> tuple[str, ...]:
+        """Directions that the data hardly determine, in words; there the nominal value stands."""
+        return find_weak_directions(self.solved.problem, self.solved.refined)
+
+    @cached_property
+    def observability(self) -> Observability:
+        """Indices O1 to O5 of the free parameters at the solution."""
+        problem, here = self.solved.problem, self.solved.refined
+        gram = sum((sums.normal for sums in view_of(here).sums), torch.zeros_like(here.normal))
+        usual = problem.step_scale * 1e3  # to rows in mm and mrad, columns per 1 mm and 1 mrad
+        poses = int(torch.stack([sensor.present for sensor in problem.sensors]).any(0).sum())
+        return observability_of(gram * usual * usual[:, None], poses)
+
+    @property
+    def iterations(self) -> int:
+        """Steps tried."""
+        return self.solved.solution.iterations
+
+    @property
+    def cost(self) -> float:
+        """Sum of squared residuals over variances, with loss and prior."""
+        return float(self.solved.refined.cost)
+
+    @property
+    def status(self) -> SolutionStatus:
+        """Why the search ended."""
+        return self.solved.solution.status
+
+    @cached_property
+    def rms_path(self) -> tuple[float, ...]:
+        """RMS of the first sensor's residuals' lengths at every point passed [m or rad], the start first."""
+        return self.solved.solution.path
+
+    @cached_property
+    def warnings(self) -> tuple[str, ...]:
+        """What to measure next, and what does not fit, in sentences."""
+        return (
+            *what_to_measure(self.solved.setup, self.solved.findings.wanted),
+            *_warnings(self.solved),
+        )
+
+    @cached_property
+    def prior_ratios(self) -> tuple[PriorRatio, ...]:
+        """How many times as large as the prior says the errors are, by group of parameters that have a prior."""
+        problem, view = self.solved.problem, view_of(self.solved.refined)
+        precision, group = problem.precision[problem.active], problem.prior_group
+        covariance = covariance_of(self.solved.refined.normal)
+        effective = effective_parameters(precision, group, view.prior_scale, covariance).tolist()
+        ratios = []
+        for number in sorted(set(group[precision > 0].tolist())):
+            if effective[number] > 0:
+                scale = float(view.prior_scale[number])
+                prior = float(precision[(group == number) & (precision > 0)].max()) ** -0.5
+                at_least = scale * math.exp(-((2 / effective[number]) ** 0.5))
+                kind: Literal["length", "angle"] = "length" if number in LENGTH_GROUPS else "angle"
+                ratios.append(PriorRatio(kind, PriorGroup(number), prior, scale, at_least))
+        return tuple(ratios)
+
+    @property
+    def rank(self) -> int:
+        """How many independent combinations of the parameters the data determine, at the nominal geometry.
+
+        Counted after the sensors' own unknowns, which may take any value.
+        """
+        return self.redundancy.rank
+
+    @property
+    def condition_number(self) -> float:
+        """Of the Jacobian of the free parameters, in mm and mrad."""
+        return self.observability.condition_number
+
+    @property
+    def free(self) -> tuple[str, ...]:
+        """Names of the parameters that were estimated."""
+        return tuple(parameter.name for parameter in self.parameters if parameter.free)
+
+    def parameter(self, name: str) -> ParameterEstimate:
+        """The row of the parameter table with that name.
+
+        Raises:
+            KeyError: there is none.
+        """
+        for parameter in self.parameters:
+            if parameter.name == name:
+                return parameter
+        raise KeyError(name)
+
+    def predicted_poses(self, measurements: Measurements) -> Float64[Tensor, "rows 4 4"]:
+        """Where the targets were, each in the frame of its row; see `pisigma.calibration.geometric.prediction`."""
+        return predicted_poses(self.robot, self.bases, self.tools, measurements)
+
+    def errors_of(self, measurements: Measurements) -> dict[str, Float64[Tensor, "rows components"]]:
+        """Measured - predicted of any measurements in calibrated frames with calibrated targets, such as held-out ones.
+
+        Returns:
+            By sensor [m or rad], NaN where a row has no value; see
+            `pisigma.measurement.sensors.registry.measured_errors`. A socket that was not calibrated is where its
+            own rows meet on average.
+
+        Raises:
+            IdentificationError: a row has a frame, a target or an anchor that was not calibrated.
+        """
+        return measured_errors(self.predicted_poses(measurements), measurements, self.unknowns)
+
+
+def _warnings(solved: SolvedCalibration) -> tuple[str, ...]:
+    """Sentences on angles that disagree with lengths, and on frames that do not fit."""
+    disagreement = float(view_of(solved.refined).disagreement.max())
+    sentences = []
+    if disagreement > DISAGREEING:
+        sentences.append(
+            "the measured angles disagree with the measured lengths by far more than their noise, so they count with "
+            f"1/{disagreement:.2g} of their weight; look for a wrist that wobbles, or for an orientation error of "
+            "the sensor that depends on the pose."
+        )
+    return (*sentences, *misfitting_frames(solved.problem, solved.refined))
+
+
+def _residuals(solved: SolvedCalibration) -> dict[str, Float64[np.ndarray, "rows components"]]:
+    """Residuals turned back into the measuring frames."""
+    measurements, setup, problem = solved.measurements, solved.setup, solved.problem
+    R = setup.anchors.bases[:, :3, :3].to(problem.frame.device)[problem.frame]
+    residuals = {}
+    for sensor, sums in zip(problem.sensors, view_of(solved.refined).sums, strict=True):
+        own = sums.residual.t()
+        if sensor.components == 3:
+            own = (R @ own[..., None])[..., 0]
+        values = torch.full((measurements.q.shape[0], sensor.components), torch.nan, dtype=own.dtype)
+        values[setup.rows.cpu()] = torch.where(sensor.present[:, None], own, torch.nan).cpu()
+        residuals[sensor.name] = values.numpy()
+    return residuals
+
+
+def _outliers(solved: SolvedCalibration) -> tuple[Outlier, ...]:
+    found = []
+    view = view_of(solved.refined)
+    for number, (sensor, sums) in enumerate(zip(solved.problem.sensors, view.sums, strict=True)):
+        deviations = sums.distance / view.scale(number)
+        weight = solved.problem.loss_of(sensor).weight(deviations, sensor.components)
+        rows = torch.arange(len(weight))
+        found += outliers_of(
+            solved.setup, solved.measurements, sensor, rows, sums.residual.norm(dim=0), deviations, weight
+        )
+    return tuple(sorted(found, key=lambda outlier: -outlier.deviations))
+
+
+def _noise(solved: SolvedCalibration) -> tuple[SensorNoise, ...]:
+    noise = []
+    problem, here = solved.problem, solved.refined
+    view = view_of(here)
+    used = values_used(view, covariance_of(here.normal)).tolist()
+    for k, (sensor, sums) in enumerate(zip(problem.sensors, view.sums, strict=True)):
+        if sensor.certain:
+            continue
+        sigma = float(view.noise[k])
+        unit = sensor.unit if sensor.sigma is None else "stated"
+        noise.append(
+            SensorNoise(
+                sensor=sensor.name,
+                sigma=sigma,
+                unit=unit,
+                values=problem.values_measured[k],
+                used=used[k],
+                rms=float(sums.rms),
+                quantity=sensor.unit,
+                components=sensor.components,
+            )
+        )
+    return tuple(noise)

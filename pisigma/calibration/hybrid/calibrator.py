@@ -1,0 +1,312 @@
+"""The hybrid calibrator: geometry, base, tool, sensor unknowns and a Pi-Sigma joint correction together."""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from jaxtyping import Int64
+from torch import Tensor
+
+from pisigma.calibration.geometric.calibrator import GeometricCalibrator
+from pisigma.calibration.geometric.initial_guess.initial_guess import chosen_rows
+from pisigma.calibration.geometric.outliers import Outlier, outliers_of
+from pisigma.calibration.geometric.problem.noise import renumbered, view_of
+from pisigma.calibration.geometric.problem.problem import CalibrationProblem
+from pisigma.calibration.geometric.problem.setup import identified_geometry
+from pisigma.calibration.geometric.result import SolvedCalibration
+from pisigma.calibration.hybrid.arm import JointCoverage
+from pisigma.calibration.hybrid.delivery import Delivered, delivered
+from pisigma.calibration.hybrid.design import Design, Rows, weigh
+from pisigma.calibration.hybrid.evidence import SMALLEST_NOISE
+from pisigma.calibration.hybrid.gravity import USUAL, gravity_by_evidence, gravity_sentence, in_first_row
+from pisigma.calibration.hybrid.mini_batches import (
+    MANY_ROWS,
+    MiniBatches,
+    batch_checkpoints,
+    refine_in_batches,
+)
+from pisigma.calibration.hybrid.refinement import Refined, in_chunks, linearised, refine, with_frames_of
+from pisigma.calibration.hybrid.regression import regression
+from pisigma.calibration.hybrid.result import HybridResult, LearnedPart
+from pisigma.calibration.hybrid.search import FIRST_MODEL_SIZES, Choice, Fitted, Search
+from pisigma.calibration.hybrid.sensor_values import sensor_values
+from pisigma.calibration.hybrid.spectrum import lines, odds_against_a_line
+from pisigma.calibration.hybrid.uncertainty import position_uncertainty
+from pisigma.files.errors import IdentificationError, nearest_choice
+from pisigma.joint_correction.feature import AbstractFeature, FeatureOptions
+from pisigma.joint_correction.fourier_series import USUAL_HARMONICS
+from pisigma.joint_correction.gear_lines import GearLines
+from pisigma.joint_correction.gravity_torques import Direction
+from pisigma.joint_correction.input_products import InputProducts
+from pisigma.joint_correction.registry import FEATURES, feature_named
+from pisigma.measurement.conditions import stated_conditions
+from pisigma.measurement.dataset import Measurements
+from pisigma.measurement.groups import groups_of_equal_joints, held_out_groups
+from pisigma.robot.description import Robot
+
+SEARCHED_ROWS = 4_000
+"""Features are chosen on so many rows at most; everything is fitted to all in the end."""
+GROSS = 50.0
+"""[standard deviations of the geometric calibration] Rows that are farther off take no part in the first model."""
+
+_TOO_FEW_ROWS = (
+    "A joint correction would take up nearly all that the few rows say, so the geometric calibration stands; measure "
+    "more poses."
+)
+
+_NOTHING_SERVES = (
+    "No joint correction predicts left-out rows of every sensor at least as well as the geometry alone, and of one "
+    "clearly better, so the geometric calibration stands."
+)
+
+
+@dataclass(frozen=True)
+class HybridCalibrator:
+    """Fits `T(q) = base · Π A_i(q_i + Δ_i(q); dh_i + ε_i) · tool` to measurements, Δ a Pi-Sigma network.
+
+    All unknowns are normal with means at nominal. The prior sizes of weights maximise the evidence, those of geometric
+    errors are the geometric calibration's. Whatever does not raise the evidence, or predicts left-out rows worse, is
+    left out, and what is left has to predict rows left out of exact fits better than the geometric calibration does; if
+    nothing is left, the result is that of the geometric calibration.
+
+    Attributes:
+        robot: the nominal robot; or its geometric calibrator, where that needs other settings than its defaults.
+        features: that are tried, by the names of `joint_correction.registry.FEATURES`.
+        harmonics: of the Fourier series, tried in this order.
+        products: whether product units are tried, which need two joints; without them the correction is additive.
+        gravity: direction in which things fall, in the frame of the robot's base; None for the axis of the base that
+            has the highest evidence.
+        mini_batches: whether the unknowns of the chosen model are trained on mini-batches instead of with the
+            normal equations of all rows: True or False; how; or "auto", which does so from `MANY_ROWS` rows on.
+    """
+
+    robot: Robot | GeometricCalibrator
+    features: tuple[str, ...] = ("gravity", "conditions", "backlash", "coupling", "lines", "series")
+    harmonics: tuple[int, ...] = (8, 24, 56, 110, 160)
+    products: bool = True
+    gravity: tuple[float, float, float] | None = None
+    mini_batches: MiniBatches | bool | Literal["auto"] = "auto"
+
+    def __post_init__(self) -> None:
+        """Refuse choices that do not exist."""
+        for name in self.features:
+            if name not in FEATURES:
+                raise IdentificationError(
+                    f"features: '{name}' is no choice; {nearest_choice(name, FEATURES)}"
+                )
+        if self.gravity is not None and not 0 < math.hypot(*self.gravity) < math.inf:
+            raise IdentificationError(
+                f"gravity={self.gravity}: a direction in the frame of the robot's base was wanted, such as (0, 0, -1)."
+            )
+        if "series" in self.features and (not self.harmonics or min(self.harmonics) < 1):
+            raise IdentificationError(
+                f"harmonics={self.harmonics}: whole numbers of at least 1 were wanted for the series; leave "
+                "'series' out of features for none."
+            )
+
+    @property
+    def geometric(self) -> GeometricCalibrator:
+        """The geometric calibrator, whose sensors, priors and loss are used."""
+        return GeometricCalibrator(self.robot) if isinstance(self.robot, Robot) else self.robot
+
+    def fit(
+        self,
+        measurements: Measurements,
+        progress: Callable[[str], None] = lambda what: None,
+        checkpoints: Path | None = None,
+        resume: bool = False,
+    ) -> HybridResult:
+        """Calibrate.
+
+        Args:
+            measurements: what was measured.
+            progress: called with what is being tried.
+            checkpoints: folder for checkpoints of a training on mini-batches; None keeps none.
+            resume: go on from the checkpoint there.
+
+        Returns:
+            The result. After a training on mini-batches its verdict says how near to the optimum that came.
+
+        Raises:
+            IdentificationError: see `GeometricCalibrator.solve`.
+            PoseError: the joint values do not fit the robot.
+            TrainingError: the training diverged, or there is no checkpoint of this calibration to resume.
+            OutputError: checkpoints cannot be written.
+        """
+        batches = self._batches(measurements.rows)
+        kept = None
+        if batches is not None and checkpoints is not None:
+            kept = batch_checkpoints(checkpoints, f"{self}|{measurements.content_hash()}", resume)
+        solved = self.geometric.solve(measurements)
+        group = held_out_groups(solved.setup.measurements)
+        choice = self._chosen(solved, group, progress)
+        if not choice.best.design.features:
+            verdict = "Nothing beyond the geometry was found in the data: the geometric calibration stands."
+            return _geometric_alone(solved, choice, verdict)
+        progress("looking at exact left-out rows")
+        serving = delivered(solved, choice, progress)
+        if serving is None:
+            return _geometric_alone(solved, choice, _NOTHING_SERVES)
+        choice = serving.choice
+        progress("solving for everything")
+        trained = ""
+        if batches is None:
+            whole = solved.problem.q.shape[0] == choice.rows.problem.q.shape[0]
+            refined = serving.refined if whole else refine(solved.problem, group, choice)
+        else:
+            refined, trained = refine_in_batches(
+                solved, serving.refined, group, batches=batches, progress=progress, checkpoints=kept
+            )
+        if refined.regression.effective_share(refined.posterior) > choice.best.largest_share:
+            return _geometric_alone(solved, choice, _TOO_FEW_ROWS)
+        falling = gravity_sentence(self.geometric.robot, choice.best.design.features)
+        verdict, trials = " ".join(filter(None, (_kept_sentence(serving), falling, trained))), choice.trials
+        learned = self._learned(solved, refined)
+        progress("looking at left-out rows")
+        uncertainty = position_uncertainty(
+            refined.rows,
+            refined.design,
+            refined.regression,
+            refined.posterior,
+            learned.geometry,
+            refined.left_out,
+        )
+        return HybridResult(solved.result(), learned, uncertainty, trials, verdict)
+
+    def _learned(self, solved: SolvedCalibration, refined: Refined) -> LearnedPart:
+        """The correction with the geometry that belongs to it, and where it was measured."""
+        noise = zip(solved.problem.sensors, refined.posterior.noise, strict=True)
+        return LearnedPart(
+            geometry=with_frames_of(solved, refined),
+            correction=refined.correction,
+            coverage=JointCoverage.of(self.geometric.robot, solved.problem.q),
+            noise={sensor.name: sigma for sensor, sigma in noise if not sensor.certain},
+            unknowns=refined.design.unknowns,
+            effective=refined.posterior.effective,
+            rounds=refined.rounds,
+            outliers=_outliers(solved, refined),
+        )
+
+    def _batches(self, rows: int) -> MiniBatches | None:
+        """How so many rows are trained on mini-batches; None where they are not."""
+        if isinstance(self.mini_batches, MiniBatches):
+            return self.mini_batches
+        wanted = rows >= MANY_ROWS if self.mini_batches == "auto" else self.mini_batches
+        return MiniBatches() if wanted else None
+
+    def _chosen(
+        self, solved: SolvedCalibration, group: Int64[Tensor, " rows"], progress: Callable[[str], None]
+    ) -> Choice:
+        """Features, chosen on at most `SEARCHED_ROWS` rows.
+
+        What a geometric calibration does not explain is not for that reason wrong: a first hybrid model is fitted to
+        all rows but those that are beyond any robot's errors, and rows are weighted by their distance from that.
+
+        Where gravity seems to act in another direction than down, everything is tried with both: what torques along
+        other axes imitate may be products.
+        """
+        problem, view = solved.problem, view_of(solved.solution.linearisation)
+        noise, prior_scale = tuple(view.noise.tolist()), tuple(view.prior_scale.tolist())
+        if problem.q.shape[0] > SEARCHED_ROWS:
+            chosen = chosen_rows(problem.q.shape[0], SEARCHED_ROWS).to(problem.q.device)
+            chosen = problem.with_partners(chosen)
+            problem, group = problem.select(chosen), renumbered(group[chosen])
+        design, point = Design(problem, ()), solved.solution.linearisation.point
+        values = sensor_values(problem, point)
+        distances = [one.residual.norm(dim=1) * one.root / view.scale(k) for k, one in enumerate(values)]
+        weights = [
+            ((distance < GROSS) | one.certain).to(distance)
+            for distance, one in zip(distances, values, strict=True)
+        ]
+        rows = Rows.linearised(design, (point - problem.nominal)[problem.active], values, weights, group)
+        pairs = zip(noise, values, strict=True)
+        if all(sigma <= SMALLEST_NOISE for sigma, one in pairs if not one.certain):
+            # The geometry leaves nothing to learn; features would fit the errors of the linearisation.
+            search = Search(rows, noise, prior_scale, [], progress)
+            return search.extended(search.geometry, None)
+        robot = self.geometric.robot
+        gravity = self.gravity or gravity_by_evidence(robot, rows, noise, prior_scale)
+        directions = dict.fromkeys((gravity, self.gravity or USUAL))
+        tried = [self._features(solved, problem, in_first_row(robot, one)) for one in directions]
+        growing, others = tried[0]
+        first = Design(problem, (*others, *growing[:FIRST_MODEL_SIZES][-1:]))
+        posterior = regression(first, rows).maximise_evidence(first.prior(prior_scale), noise)
+        rows = linearised(first, posterior.x, posterior.effective, group)
+        products = [InputProducts(robot)] if self.products and robot.dof > 1 else []
+        choices = []
+        for growing, others in tried:
+            largest = [*others, *growing[-1:], *products]
+            search = Search(rows, noise, prior_scale, largest, progress)
+            best = search.best(growing, others, products)
+            orders = self._lines(rows, best)
+            odds = odds_against_a_line(robot.dof) * sum(map(len, orders))
+            choices.append(search.extended(best, GearLines(robot, orders) if odds else None, odds))
+        return max(choices, key=lambda choice: choice.best.posterior.log_evidence)
+
+    def _lines(self, rows: Rows, best: Fitted) -> tuple[tuple[int, ...], ...]:
+        """Orders of the lines that stand out of what a fit leaves, beyond the harmonics of its series."""
+        if "lines" not in self.features:
+            return ()
+        lowest = 1 + (max((one.size for one in best.design.features), default=0) or USUAL_HARMONICS)
+        return lines(best.design, rows, best.posterior, lowest)
+
+    def _features(
+        self, solved: SolvedCalibration, problem: CalibrationProblem, gravity: Direction
+    ) -> tuple[list[AbstractFeature], list[AbstractFeature]]:
+        """What is tried: ever larger features of one name, and one feature each of the other names.
+
+        Raises:
+            IdentificationError: two features would be tried in several sizes.
+        """
+        varying = stated_conditions(solved.setup.measurements)
+        options = FeatureOptions(
+            self.harmonics, gravity, int(groups_of_equal_joints(problem.q).max()) + 1, varying
+        )
+        growing: list[AbstractFeature] = []
+        others: list[AbstractFeature] = []
+        for name in self.features:
+            tried = feature_named(name).candidates(self.geometric.robot, options, solved.problem.state)
+            if not any(feature.size for feature in tried):
+                others += tried
+            elif growing:
+                raise IdentificationError(
+                    f"features: '{growing[0].name}' and '{name}' both come in several sizes, but one such feature can "
+                    "be tried at a time; leave one out."
+                )
+            else:
+                growing += tried
+        return growing, others
+
+
+def _outliers(solved: SolvedCalibration, refined: Refined) -> tuple[Outlier, ...]:
+    """Rows that count for less than half by their distance from what the hybrid predicts, the worst first."""
+    problem, setup, found = solved.problem, solved.setup, []
+    values = sensor_values(problem, refined.point, in_chunks(refined.correction))
+    weights = weigh(problem, values, refined.posterior.effective)
+    for number, (one, weight) in enumerate(zip(values, weights, strict=True)):
+        length, sensor = one.residual.norm(dim=1), problem.sensors[number]
+        deviations = length * one.root / refined.posterior.noise[number]
+        found += outliers_of(setup, solved.measurements, sensor, one.row, length, deviations, weight)
+    return tuple(sorted(found, key=lambda outlier: -outlier.deviations))
+
+
+def _kept_sentence(serving: Delivered) -> str:
+    """What was kept, and how much better left-out rows are predicted with it."""
+    best = serving.choice.best
+    return (
+        f"A joint correction was kept ({best.name}): left-out rows are predicted with {serving.left_out:.2f} times the "
+        "error of the geometric calibration."
+    )
+
+
+def _geometric_alone(solved: SolvedCalibration, choice: Choice, verdict: str) -> HybridResult:
+    """The geometric calibration, with the uncertainty of its positions."""
+    geometry = identified_geometry(solved.setup, solved.solution.linearisation.point)
+    first = choice.geometry
+    fit = regression(first.design, choice.rows)
+    uncertainty = position_uncertainty(
+        choice.rows, first.design, fit, first.posterior, geometry, first.left_out
+    )
+    return HybridResult(solved.result(), None, uncertainty, choice.trials, verdict)

@@ -1,0 +1,190 @@
+"""Solve the chosen model on all rows: linearisation and posterior in turn until they agree."""
+
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float64, Int64
+from torch import Tensor
+
+from pisigma.calibration.geometric.identifiability.sufficiency import floating_frames
+from pisigma.calibration.geometric.prediction import predicted_poses
+from pisigma.calibration.geometric.problem.problem import CalibrationProblem
+from pisigma.calibration.geometric.problem.setup import IdentifiedGeometry, identified_geometry
+from pisigma.calibration.geometric.result import SolvedCalibration
+from pisigma.calibration.hybrid.design import Design, Rows, chunks, weigh
+from pisigma.calibration.hybrid.evidence import AbstractRegression, LeftOut, Posterior
+from pisigma.calibration.hybrid.regression import regression
+from pisigma.calibration.hybrid.search import Choice
+from pisigma.calibration.hybrid.sensor_values import Shift, sensor_values
+from pisigma.joint_correction.input_products import InputProducts
+from pisigma.joint_correction.joint_correction import JointCorrection
+from pisigma.measurement.dataset import Measurements
+from pisigma.robot.se3 import transform
+
+MOST_ROUNDS = 5
+SETTLED = 0.05
+"""Rounds end when linearised and true residuals, weighted, differ by less variance for every determined unknown."""
+ARM = 0.1
+"""Points of the tool at this share of the reach from its origin are met as well, so that rotations count."""
+
+
+@dataclass(frozen=True, eq=False)
+class Refined:
+    """A solved hybrid.
+
+    Attributes:
+        rows: as last linearised and weighted.
+        design: all unknowns.
+        posterior: of them.
+        regression: of the rows on them.
+        point: all parameters of the problem.
+        correction: the network.
+        rounds: linearisations made.
+        left_out: values of the folds of the search, predicted without them; None where another fit followed.
+    """
+
+    rows: Rows
+    design: Design
+    posterior: Posterior
+    regression: AbstractRegression
+    point: Float64[Tensor, " parameters"]
+    correction: JointCorrection
+    rounds: int
+    left_out: LeftOut | None = None
+
+
+def refine(problem: CalibrationProblem, group: Int64[Tensor, " rows"], choice: Choice) -> Refined:
+    """Fit the chosen features to all rows.
+
+    Args:
+        problem: of all rows.
+        group: see `Rows.group`.
+        choice: of the features, as fitted to some of the rows or all.
+    """
+    design, posterior = Design(problem, choice.best.design.features), choice.best.posterior
+    rows, fit, rounds = choice.rows, choice.regression, 1
+    while rounds < MOST_ROUNDS:
+        there = linearised(design, posterior.x, posterior.effective, group)
+        differs = there.difference(rows, posterior.x, design, posterior.noise)
+        if differs < SETTLED * posterior.effective:
+            break
+        rows, fit = there, None  # one system of equations at a time: they are large
+        fit = regression(design, there)
+        posterior = fit.maximise_evidence(posterior.prior, posterior.noise)
+        rounds += 1
+    refined = _refined(rows, design, posterior, fit or regression(design, rows), rounds)
+    return replace(refined, left_out=choice.best.left_out) if rounds == 1 else refined
+
+
+def refined_at(design: Design, posterior: Posterior, group: Int64[Tensor, " rows"], rounds: int) -> Refined:
+    """All rows linearised and weighted at the most probable values of a posterior, and the posterior there.
+
+    Args:
+        design: all unknowns.
+        posterior: where to look from, with prior sizes, which stand, and noise, which is renewed.
+        group: see `Rows.group`.
+        rounds: rounds that it took to get there.
+    """
+    rows = linearised(design, posterior.x, posterior.effective, group)
+    fit = regression(design, rows)
+    there = fit.solve(posterior.prior, posterior.noise)
+    there = fit.solve(posterior.prior, fit.renewed_noise(there))
+    return _refined(rows, design, there, fit, rounds)
+
+
+def _refined(
+    rows: Rows, design: Design, posterior: Posterior, fit: AbstractRegression, rounds: int
+) -> Refined:
+    problem = design.problem
+    point = problem.nominal.index_add(0, problem.active, posterior.x[: design.active])
+    return Refined(rows, design, posterior, fit, point, network(design, posterior.x), rounds)
+
+
+def network(design: Design, x: Float64[Tensor, " unknowns"]) -> JointCorrection:
+    """The network with the weights of some unknowns; products of inputs as product units."""
+    features = [chosen for chosen in design.features if not isinstance(chosen, InputProducts)]
+    factors, linear = None, []
+    for number, chosen in enumerate(design.features):
+        weights = x[design.stretch(number)].cpu()
+        if isinstance(chosen, InputProducts):
+            factors = chosen.factors(weights)
+        else:
+            linear.append(torch.zeros(chosen.used.shape).to(weights).masked_scatter(chosen.used, weights))
+    orders = () if factors is None else (2,) * (factors.shape[1] // 2)
+    made = JointCorrection(design.problem.space.robot, features, orders)
+    with torch.no_grad():
+        for parameter, values in zip(made.linear, linear, strict=True):
+            parameter.copy_(values)
+        if factors is not None:
+            made.weight.copy_(factors)
+    made.requires_grad_(False)
+    return made
+
+
+def in_chunks(correction: JointCorrection) -> Shift:
+    """The correction of many rows, with the features of some of them in memory at a time."""
+    return lambda state: torch.cat([correction(state[rows]) for rows in chunks(len(state.q))])
+
+
+def linearised(
+    design: Design, x: Float64[Tensor, " unknowns"], effective: float, group: Int64[Tensor, " rows"]
+) -> Rows:
+    """All rows linearised at some unknowns, weighted by their distance from what these predict.
+
+    Args:
+        design: of the unknowns.
+        x: the unknowns, parameters counted from nominal.
+        effective: how many of them the data determine.
+        group: see `Rows.group`.
+    """
+    problem = design.problem
+    point = problem.nominal.index_add(0, problem.active, x[: design.active])
+    values = sensor_values(problem, point, in_chunks(network(design, x)) if design.features else None)
+    return Rows.linearised(design, x, values, weigh(problem, values, effective), group)
+
+
+def with_frames_of(solved: SolvedCalibration, refined: Refined) -> IdentifiedGeometry:
+    """The hybrid's geometry; frames that nothing determines are moved onto those of the geometric calibration.
+
+    Sockets, and distances from anchors at unknown points, are met as well after any motion of the whole frame.
+    Nominal joint values and predictions of both calibrations belong to one base, however; so every such frame gets the
+    motion that takes the hybrid's poses nearest to the geometric ones.
+
+    Args:
+        solved: the geometric calibration.
+        refined: the hybrid one.
+    """
+    setup, rows = solved.setup, solved.measurements
+    geometry = identified_geometry(setup, refined.point)
+    frames = floating_frames(setup)
+    if not frames:
+        return geometry
+    with torch.no_grad():
+        moved = replace(rows, q=rows.q + refined.correction.of_rows(rows))
+    points = _points(geometry, moved), _points(solved.geometry, rows)
+    bases = setup.anchors.bases.clone()
+    for frame in frames:
+        here = torch.tensor([name == frame for name in rows.frame])
+        motion = nearest_motion(points[0][here].flatten(0, 1), points[1][here].flatten(0, 1))
+        number = setup.problem.space.frames.index(frame)
+        bases[number] = motion.to(bases) @ bases[number]
+    return identified_geometry(replace(setup, anchors=replace(setup.anchors, bases=bases)), refined.point)
+
+
+def nearest_motion(
+    points: Float64[Tensor, "points 3"], onto: Float64[Tensor, "points 3"]
+) -> Float64[Tensor, "4 4"]:
+    """The rigid motion T that minimises `Σ |T p - p'|²` (Kabsch 1976, Acta Crystallographica A32, 922-923)."""
+    middle, middle_onto = points.mean(0), onto.mean(0)
+    U, _, V = torch.linalg.svd((onto - middle_onto).t() @ (points - middle))
+    turned = torch.ones(3, dtype=points.dtype, device=points.device)
+    turned[2] = torch.linalg.det(U @ V)
+    R = U @ (turned[:, None] * V)
+    return transform(R, middle_onto - R @ middle)
+
+
+def _points(geometry: IdentifiedGeometry, rows: Measurements) -> Float64[Tensor, "rows 4 3"]:
+    """The tool's origin and a point along each of its axes, in the frame of the row."""
+    T = predicted_poses(geometry.robot, geometry.bases, geometry.tools, rows)
+    origin = T[:, None, :3, 3]
+    return torch.cat([origin, origin + ARM * geometry.robot.reach * T[:, :3, :3].mT], 1)

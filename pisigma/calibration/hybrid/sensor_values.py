@@ -1,0 +1,217 @@
+"""All measured values linearised at one point: residuals and their derivatives by geometry and by joint values."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float64, Int64
+from torch import Tensor
+
+from pisigma.calibration.geometric.problem.noise import renumbered
+from pisigma.calibration.geometric.problem.parameters import ParameterSpace
+from pisigma.calibration.geometric.problem.problem import CalibrationProblem
+from pisigma.joint_correction.feature import AbstractFeature
+from pisigma.measurement.conditions import JointState
+
+Shift = Callable[[JointState], Tensor]
+"""Joint corrections [rad or m] as a function of joint values and what is stated beside them."""
+
+
+@dataclass(frozen=True, eq=False)
+class SensorValues:
+    """The rows in which one sensor saw something.
+
+    Attributes:
+        name: of the sensor.
+        row: number of every row in the problem.
+        geometry: derivative of the predicted values by the free parameters.
+        joints: the same by the joint values.
+        residual: measured minus predicted.
+        root: 1 / standard deviation where the rows state their own, else 1.
+        stated: whether the rows state their own standard deviation.
+        certain: whether the values are certain rather than measured.
+        other_row: of distances between the targets of two rows, the number of the other one; else None.
+        other_joints: derivative by the joint values of that row.
+        repetition: 1 or more: so many values of one configuration say no more than one, because what the model gets
+            wrong there is the same for several targets (the design effect, Kish 1965).
+    """
+
+    name: str
+    row: Int64[Tensor, " values"]
+    geometry: Float64[Tensor, "values components active"]
+    joints: Float64[Tensor, "values components dof"]
+    residual: Float64[Tensor, "values components"]
+    root: Float64[Tensor, " values"]
+    stated: bool
+    certain: bool
+    other_row: Int64[Tensor, " values"] | None = None
+    other_joints: Float64[Tensor, "values components dof"] | None = None
+    repetition: float = 1.0
+
+    @property
+    def sides(self) -> list[tuple[Tensor, Tensor]]:
+        """Rows of the problem, and the derivative by their joint values; two of distances between two rows."""
+        sides = [(self.row, self.joints)]
+        if self.other_row is not None and self.other_joints is not None:
+            sides.append((self.other_row, self.other_joints))
+        return sides
+
+    def feature_columns(
+        self, chosen: AbstractFeature, state: JointState, rows: slice
+    ) -> Float64[Tensor, "values components weights"]:
+        """Derivative of the predicted values by the weights of the used columns of some features.
+
+        Args:
+            chosen: the features.
+            state: of all rows of the problem.
+            rows: which of the rows of this sensor.
+        """
+        blocks = [weight_columns(joints[rows], chosen, state[row[rows]]) for row, joints in self.sides]
+        return blocks[0] if len(blocks) == 1 else blocks[0] + blocks[1]
+
+    @property
+    def components(self) -> int:
+        """Values a row."""
+        return self.residual.shape[1]
+
+    def select(self, chosen: Tensor | slice) -> "SensorValues":
+        """Some of the rows, by index or mask."""
+        return replace(
+            self,
+            row=self.row[chosen],
+            geometry=self.geometry[chosen],
+            joints=self.joints[chosen],
+            residual=self.residual[chosen],
+            root=self.root[chosen],
+            other_row=None if self.other_row is None else self.other_row[chosen],
+            other_joints=None if self.other_joints is None else self.other_joints[chosen],
+        )
+
+    def weighted(self, weight: Float64[Tensor, " values"]) -> "SensorValues":
+        """The same with rows that count more or less; those that do not count at all are left out."""
+        kept = weight > 0
+        return replace(self.select(kept), root=(self.root * weight.sqrt())[kept])
+
+    def collapsed(self, pose: Int64[Tensor, " rows"]) -> "SensorValues":
+        """Repeats of a pose as one row that counts for all of them.
+
+        What a model gets wrong at a pose is the same in all its repeats; counted one by one they would say
+        more than they do. Rows of a pose that see something else of it, such as touches along another axis or
+        distances from another anchor, have other derivatives and stay apart.
+        """
+        if not len(self.row) or self.other_row is not None:
+            return self
+        key = renumbered(pose[self.row] * len(self.row) + self._sights())
+        poses = int(key.max()) + 1
+        if poses == len(key):
+            return self
+        weight = self.root.square()
+        total = weight.new_zeros(poses).index_add(0, key, weight)
+
+        def mean(values: Tensor) -> Tensor:
+            shape = (-1, *[1] * (values.ndim - 1))
+            summed = values.new_zeros(poses, *values.shape[1:]).index_add(0, key, values * weight.view(shape))
+            return summed / total.view(shape)
+
+        first = torch.full((poses,), len(self.row), dtype=torch.int64, device=key.device)
+        first = first.scatter_reduce(0, key, torch.arange(len(key), device=key.device), "amin")
+        return replace(
+            self,
+            row=self.row[first],
+            geometry=mean(self.geometry),
+            joints=mean(self.joints),
+            residual=mean(self.residual),
+            root=total.sqrt(),
+        )
+
+    def shared(self, configuration: Int64[Tensor, " rows"]) -> "SensorValues":
+        """The same with rows that count less where the residuals of several targets of a configuration are alike."""
+        if not len(self.row) or self.certain or self.other_row is not None:
+            return self
+        key = renumbered(configuration[self.row])
+        groups = int(key.max()) + 1
+        weight = self.root.square()
+        total = weight.new_zeros(groups).index_add(0, key, weight)
+        summed = self.residual.new_zeros((groups, self.components)).index_add(
+            0, key, self.residual * weight[:, None]
+        )
+        square = float((self.residual.square() * weight[:, None]).sum()) / len(key)
+        shared = float((summed.square().sum(1) / total).sum()) / groups
+        repetition = max(shared / max(square, 1e-300), 1.0)
+        return replace(self, repetition=repetition, root=self.root * repetition**-0.5)
+
+    def _sights(self) -> Int64[Tensor, " values"]:
+        """Number of every row's derivatives among the different ones."""
+        key = self.geometry.new_zeros(len(self.row))
+        for J in (self.geometry.flatten(1), self.joints.flatten(1)):
+            key = key + J @ torch.arange(1, J.shape[1] + 1).to(J).sin()
+        return renumbered((key / key.abs().max().clamp(min=1e-300) * 1e6).round().to(torch.int64))
+
+
+def weight_columns(
+    joints: Float64[Tensor, "values components dof"], chosen: AbstractFeature, state: JointState
+) -> Float64[Tensor, "values components _weights"]:
+    """Derivative by the weights of the used columns of some features, side by side for all joints.
+
+    Args:
+        joints: derivative by the joint values.
+        chosen: the features.
+        state: of every row.
+    """
+    used = chosen.used.flatten()
+    block = (joints[..., None] * chosen.columns(state)[:, None]).flatten(2)
+    return block if bool(used.all()) else block[..., used]
+
+
+def sensor_values(
+    problem: CalibrationProblem, point: Float64[Tensor, " parameters"], shift: Shift | None = None
+) -> tuple[SensorValues, ...]:
+    """Linearise every sensor at a point.
+
+    Args:
+        problem: rows, sensors and free parameters.
+        point: values of all parameters.
+        shift: joint corrections that are in force already; None for none.
+    """
+    robot = problem.space.robot
+    moved = problem if shift is None else replace(problem, q=problem.q + shift(problem.state))
+    index = torch.cat([problem.active, joint_columns(problem.space).to(problem.q.device)])
+    direction = problem.q.new_tensor(robot.directions)
+    unknowns = problem.space.sensor_unknowns(point)
+    collected: list[list[tuple[Tensor, ...]]] = [[] for _ in problem.sensors]
+    for rows in moved.chunks():
+        motion = moved.motion(point, rows, index)
+        for sensor, columns in zip(moved.sensors, collected, strict=True):
+            present = sensor.present[rows].nonzero()[:, 0]
+            J = moved.derivative(sensor, motion, unknowns, rows, index)[..., present].permute(2, 1, 0)
+            r = sensor.residual(motion, unknowns, rows)[..., present].t()
+            other = sensor.partner_derivative(motion)[len(problem.active) :][..., present].permute(2, 1, 0)
+            columns.append((present + rows.start, J, r, other))
+    values = []
+    for sensor, columns in zip(problem.sensors, collected, strict=True):
+        row, J, r, other = (torch.cat(column) for column in zip(*columns, strict=True))
+        joints, paired = J[..., len(problem.active) :] * direction, sensor.paired
+        root = torch.ones_like(r[:, 0]) if sensor.sigma is None else 1 / sensor.sigma[row]
+        values.append(
+            SensorValues(
+                name=sensor.name,
+                row=row,
+                geometry=J[..., : len(problem.active)].contiguous(),
+                joints=joints - other * direction if paired else joints,
+                residual=r.contiguous(),
+                root=root,
+                stated=sensor.sigma is not None,
+                certain=sensor.certain,
+                other_row=row + 1 if paired else None,
+                other_joints=other * direction if paired else None,
+            )
+        )
+    return tuple(values)
+
+
+def joint_columns(space: ParameterSpace) -> Int64[Tensor, " dof"]:
+    """Which parameter moves like the value of every joint: theta of turning, d of sliding ones."""
+    robot = space.robot
+    return torch.tensor(
+        [5 * row + (0 if turns else 1) for row, turns in zip(robot.joint_rows, robot.revolute, strict=True)]
+    )

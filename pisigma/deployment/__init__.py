@@ -1,0 +1,1 @@
+"""Calibrated models for controllers and clients: files that others read, and a server."""

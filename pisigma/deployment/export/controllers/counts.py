@@ -1,0 +1,138 @@
+"""Joint offsets in encoder counts: Epson's home offsets, FANUC's mastering counts."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float64, Int64
+
+from pisigma.deployment.export.controllers.controller_file import ControllerFile, FileText, untried
+from pisigma.deployment.export.controllers.offset_table import read_offsets
+from pisigma.deployment.export.dh_table import cells, csv_table
+from pisigma.deployment.export.export_format import ExportRequest
+from pisigma.deployment.export.joint_offsets import joints_by_axes, offsets_between
+from pisigma.deployment.export.projection import joint_offsets
+from pisigma.files.errors import OutputError
+from pisigma.robot.description import Robot
+from pisigma.robot.row import FRAME_COLUMNS, in_file_units
+
+COLUMNS = ("counts_per_turn", "present_count", "new_count")
+
+
+@dataclass(frozen=True)
+class Counts:
+    """Zero positions of joints as an encoder counts.
+
+    The controller has a joint at (encoder - count) / (counts per turn), so an offset that is added to the joint value
+    is taken from the count.
+
+    Attributes:
+        per_turn: encoder counts for a turn of the joint, the gear in between included, or for 1 mm where it slides;
+            negative where the encoder counts the other way.
+        present: the counts that the controller has now.
+        new: those that it shall have.
+    """
+
+    per_turn: Float64[np.ndarray, " axes"]
+    present: Int64[np.ndarray, " axes"]
+    new: Int64[np.ndarray, " axes"]
+
+    def offsets(self, robot: Robot) -> Float64[np.ndarray, " axes"]:
+        """The joint offsets [rad or m] that the new counts make."""
+        offsets: np.ndarray = (self.present - self.new) / self.per_turn * _unit(robot)
+        return offsets
+
+
+def _unit(robot: Robot) -> Float64[np.ndarray, " axes"]:
+    """What one turn, or 1 mm, is [rad or m] per axis of the controller."""
+    return np.where([axis.type == "revolute" for axis in robot.axes], 2 * np.pi, 1e-3)
+
+
+def write_counts(content: FileText) -> str:
+    """One line a joint with its offset and counts, then base and tool; the offset is that of whole counts."""
+    nominal, robot, request = content.nominal, content.robot, content.request
+    per_turn = _numbers(request.counts_per_turn, "counts-per-turn", nominal)
+    present = _numbers(request.present_counts, "present-counts", nominal)
+    if (present % 1).any() or not per_turn.all():
+        raise OutputError("--present-counts are whole numbers, and no --counts-per-turn is 0; correct them.")
+    moved = offsets_between(nominal, robot) / _unit(nominal) * per_turn
+    counts = Counts(per_turn, present.astype(np.int64), np.rint(present - moved).astype(np.int64))
+    lines: list[dict[str, object]] = []
+    columns = (counts.per_turn, counts.present, counts.new, counts.offsets(nominal))
+    for axis, *values, offset in zip(nominal.axes, *columns, strict=True):
+        entry = {"part": "joint", "name": axis.name, f"offset_{axis.file_unit}": axis.in_file_unit(offset)}
+        lines.append(entry | {column: f"{value:.17g}" for column, value in zip(COLUMNS, values, strict=True)})
+    lines += [{"part": part, **cells(FRAME_COLUMNS, getattr(robot, part))} for part in ("base", "tool")]
+    frame = in_file_units(FRAME_COLUMNS, robot.base)
+    return csv_table(("part", "name", "offset_deg", "offset_mm", *COLUMNS, *frame), lines, content.said)
+
+
+def _numbers(stated: str | None, option: str, robot: Robot) -> Float64[np.ndarray, " axes"]:
+    """Numbers of an option, one a joint."""
+    try:
+        values = np.array([float(word) for word in (stated or "").split(",")])
+    except ValueError:
+        values = np.array([np.nan])
+    if len(values) != len(robot.axes) or not np.isfinite(values).all():
+        raise OutputError(
+            f"--{option} '{stated}': {len(robot.axes)} numbers with commas between were wanted, one a joint of robot "
+            f"'{robot.name}'."
+        )
+    return values
+
+
+def check_robot(robot: Robot) -> None:
+    """Refuse robots whose axes have no zeros of their own; see `joints_by_axes`."""
+    joints_by_axes(robot)
+
+
+def _refuse(request: ExportRequest) -> None:
+    for name, value in (
+        ("counts-per-turn", request.counts_per_turn),
+        ("present-counts", request.present_counts),
+    ):
+        if value is None:
+            raise OutputError(
+                f"this format counts in pulses of the encoders and needs --{name}, one number a joint: give both "
+                "--counts-per-turn (pulses of the encoder for a turn of the joint, with the gear, or for 1 mm) and "
+                "--present-counts (those that the controller has now)."
+            )
+
+
+_SIGN = (
+    "The controller has to compute joint values as (encoder - count) / (counts per turn); try one joint first, and "
+    "give negative counts per turn where it moves the other way.",
+    "The file holds neither links nor angles between axes. Command the joint values of the controller as before; set "
+    "base and tool below on the controller.",
+)
+
+
+def _file(name: str, contents: str, source: str, meaning: str) -> ControllerFile:
+    return ControllerFile(
+        name=name,
+        contents=contents,
+        suffixes=(".csv",),
+        source=untried(source),
+        relies=(meaning, *_SIGN),
+        text=write_counts,
+        read=read_offsets,
+        check=check_robot,
+        parameters=joint_offsets,
+        options=frozenset(("counts_per_turn", "present_counts")),
+        refuse=_refuse,
+    )
+
+
+EPSON = _file(
+    "epson",
+    "the home offsets of an Epson controller",
+    "download.epson.biz/robots, SPEL+ language reference, Hofs and HofsJointAccuracy",
+    "Enter the new counts with Hofs (or HofsJointAccuracy), joint 1 first; its present values are those that Hofs "
+    "shows.",
+).export_format()
+FANUC = _file(
+    "fanuc-mastering",
+    "the mastering counts of a FANUC controller",
+    "industrialmonitordirect.com, Reset FANUC Extended Axis Master Count; position = (encoder - master count) * scale",
+    "Enter the new counts into $DMR_GRP[1].$MASTER_COUN, joint 1 first; its present values are those of that variable. "
+    "Counts per turn are the pulses of the motor's encoder times the gear ratio of the joint.",
+).export_format()

@@ -1,0 +1,85 @@
+"""Tables of joint offsets that `pisigma export` writes, read back as a robot."""
+
+import csv
+from collections.abc import Mapping
+
+import numpy as np
+
+from pisigma.deployment.export.joint_offsets import joints_by_axes
+from pisigma.deployment.export.projection import joint_offsets
+from pisigma.files.errors import RobotError
+from pisigma.files.yaml_file import plain_content
+from pisigma.robot.description import Robot
+from pisigma.robot.robot_file import FrameSection
+from pisigma.robot.row import Row
+
+
+def read_offsets(text: str, source: str, nominal: Robot) -> Robot:
+    """The robot that a table of joint offsets makes of the nominal one, with base and tool of the table.
+
+    The table is CSV or YAML as `--format offsets` writes it, or CSV with counts, which then say the offsets.
+
+    Raises:
+        RobotError: an entry is missing or no number, or the joints are not the robot's.
+    """
+    entries = _csv_entries(text) if text.lstrip("# ").find("part,") >= 0 else _yaml_entries(text, source)
+    joints = {str(entry.get("name")): entry for entry in entries if entry.get("part") == "joint"}
+    if set(joints) != {axis.name for axis in nominal.axes}:
+        names = ", ".join(axis.name for axis in nominal.axes)
+        raise RobotError(
+            f"{source}: offsets of the joints {names} were wanted, got {', '.join(joints) or 'none'}."
+        )
+    offsets = np.array([_offset(axis, joints[axis.name], source) for axis in nominal.axes])
+    dh = nominal.dh.copy()
+    dh.reshape(-1)[list(joint_offsets(nominal))] += joints_by_axes(nominal) @ offsets
+    frames = {
+        str(entry["part"]): _frame(entry, source)
+        for entry in entries
+        if entry.get("part") in ("base", "tool")
+    }
+    return nominal.with_geometry(dh=dh, base=frames.get("base"), tool=frames.get("tool"))
+
+
+def _csv_entries(text: str) -> list[Mapping[str, object]]:
+    lines = (line for line in text.splitlines() if not line.startswith("#"))
+    return [dict(line) for line in csv.DictReader(lines)]
+
+
+def _yaml_entries(text: str, source: str) -> list[Mapping[str, object]]:
+    content = plain_content(text, RobotError, source)
+    joints = content.get("joints") if isinstance(content, dict) else None
+    if not isinstance(joints, list) or not all(isinstance(joint, dict) for joint in joints):
+        raise RobotError(f"{source}: a table of joint offsets was wanted, as --format offsets writes it.")
+    frames = [
+        {"part": part, **content[part]} for part in ("base", "tool") if isinstance(content.get(part), dict)
+    ]
+    return [*({"part": "joint", **joint} for joint in joints), *frames]
+
+
+def _offset(axis: Row, entry: Mapping[str, object], source: str) -> float:
+    """The offset [rad or m], of the counts where there are some."""
+    turn, millimetre = 2 * np.pi, 1e-3
+    if entry.get("new_count"):
+        present, new, per_turn = (
+            _number(entry, column, source) for column in ("present_count", "new_count", "counts_per_turn")
+        )
+        return (present - new) / per_turn * (turn if axis.type == "revolute" else millimetre)
+    value = _number(entry, f"offset_{axis.file_unit}", source)
+    return float(np.deg2rad(value)) if axis.type == "revolute" else value * millimetre
+
+
+def _frame(entry: Mapping[str, object], source: str) -> np.ndarray:
+    columns = FrameSection.model_fields
+    return FrameSection(**{column: _number(entry, column, source) for column in columns}).to_si()
+
+
+def _number(entry: Mapping[str, object], column: str, source: str) -> float:
+    try:
+        value = float(str(entry.get(column)))
+    except ValueError:
+        value = np.nan
+    if not np.isfinite(value):
+        raise RobotError(
+            f"{source}: {column} of {entry.get('name', entry.get('part'))} is no finite number; correct it."
+        )
+    return value

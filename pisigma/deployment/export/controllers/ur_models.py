@@ -1,0 +1,262 @@
+"""Universal Robots' own DH parameters, and where a drawing of an arm has their frames."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float64
+
+from pisigma.deployment.export.controllers.controller_file import Convention, Frames, check_plain_joints
+from pisigma.deployment.export.projection import ProjectionProblem, solve_projection
+from pisigma.files.errors import RobotError
+from pisigma.robot.chains import joint_origins
+from pisigma.robot.description import Robot
+from pisigma.robot.kinematics.forward import forward_kinematics
+from pisigma.robot.urdf_frames import Frame, frame_of, inverse, shift, turn, xyzrpy_of
+
+JOINTS = 6
+SOURCE = "universal-robots.com, DH parameters for calculations of kinematics and dynamics"
+_D_AND_A = {
+    "UR3": ((0.1519, 0.11235, 0.08535, 0.0819), (0.24365, 0.21325)),
+    "UR3e": ((0.15185, 0.13105, 0.08535, 0.0921), (0.24355, 0.2132)),
+    "UR5": ((0.089159, 0.10915, 0.09465, 0.0823), (0.425, 0.39225)),
+    "UR5e": ((0.1625, 0.1333, 0.0997, 0.0996), (0.425, 0.3922)),
+    "UR10": ((0.1273, 0.163941, 0.1157, 0.0922), (0.612, 0.5723)),
+    "UR10e": ((0.1807, 0.17415, 0.11985, 0.11655), (0.6127, 0.57155)),
+    "UR16e": ((0.1807, 0.17415, 0.11985, 0.11655), (0.4784, 0.36)),
+    "UR20": ((0.2363, 0.2010, 0.1593, 0.1543), (0.8620, 0.7287)),
+    "UR30": ((0.2363, 0.2010, 0.1593, 0.1543), (0.6370, 0.5037)),
+}
+"""Of the UR30 from UniversalRobots/Universal_Robots_ROS2_Description, config/ur30/default_kinematics.yaml.
+
+By model d of the joints 1, 4, 5 and 6, and how much shorter than 0 a of the joints 2 and 3 is [m]."""
+_ALPHA = np.array([1.0, 0.0, 0.0, 1.0, -1.0, 0.0]) * np.pi / 2
+
+FARTHEST = 5e-3
+"""Mean distance [m] of the tool from that of a model up to which a drawing may be of it: factory calibrations move it
+by 1 to 4 mm, and the models differ by 10 mm and more."""
+_EXACT = 1e-9
+_NEAR_ANGLE, _NEAR_LENGTH = np.deg2rad(0.5), 0.01
+"""Frames of a calibrated robot that are as near to right angles [rad] and to the origin [m] are taken for these."""
+_POSES = 200
+
+
+_DRIVER = "github.com/UniversalRobots/Universal_Robots_ROS_Driver"
+_DEFAULTS = "github.com/ros-industrial/universal_robot, ur_description/config, default_kinematics.yaml"
+_USERS = {
+    "UR3": "a user's calibration.conf (github.com/MyRobotLab/pyrobotlab/issues/145)",
+    "UR5": "a user's calibration.conf (github.com/ros-industrial-attic/ur_modern_driver/issues/179), another's DH "
+    f"parameters with the driver's hash ({_DRIVER}/issues/457)",
+    "UR5e": "a user's calibration.conf with 18 poses of the controller (github.com/weijieyong/UR_kinematics_calib)",
+    "UR10": "two calibrations and two positions of the driver's tests (ur_calibration/test/calibration_test.cpp)",
+    "UR10e": "the calibration of the driver's documentation (ur_calibration/doc/algorithm.rst)",
+}
+"""By model whose values the files were tried against, besides `_DEFAULTS` of `_WITH_DEFAULTS`."""
+_WITH_DEFAULTS = frozenset(("UR3", "UR3e", "UR5", "UR5e", "UR10", "UR10e"))
+
+
+@dataclass(frozen=True, eq=False)
+class OwnGeometry:
+    """An arm as its controller computes it, `Π RotZ(theta + q) Trans(a, 0, d) RotX(alpha)`, from `base` to the flange.
+
+    Attributes:
+        model: the maker's name, such as "UR5e", or the robot's name where it is drawn in this way and not in the table.
+        robot: the nominal parameters, with the names and limits of the drawing.
+        T_drawn_base: maps the controller's frame `base` into the frame of the drawing's poses.
+        T_flange_tool: maps the drawing's tool into the controller's flange.
+        drawing: the robot as it is drawn.
+    """
+
+    model: str
+    robot: Robot
+    T_drawn_base: Frame
+    T_flange_tool: Frame
+    drawing: Robot
+
+    def origins(self, calibrated: Robot) -> tuple[list[Frame], Robot]:
+        """The frames of a calibrated robot's joints where the controller has them, each in the one before.
+
+        A joint's frame may be moved along and about its axis without changing the motion, so the tool stays.
+
+        Args:
+            calibrated: the drawing with other parameters, base and tool.
+
+        Returns:
+            The frames, the first in `base`, and the nominal robot with the base and the tool that belong to them.
+        """
+        T_rows_base = inverse(frame_of(self.drawing.base)) @ self.T_drawn_base
+        before, moved = T_rows_base, []
+        origins, end = joint_origins(calibrated)
+        for origin, screw in zip(origins, self._screws(T_rows_base), strict=True):
+            moved.append(inverse(before) @ origin @ screw)
+            before = screw
+        base = frame_of(calibrated.base) @ T_rows_base
+        tool = inverse(before) @ end @ frame_of(calibrated.tool)
+        return moved, self.robot.with_geometry(base=xyzrpy_of(base), tool=xyzrpy_of(tool))
+
+    def _screws(self, T_rows_base: Frame) -> list[Frame]:
+        """By joint how far along and about its axis the controller has the frame that the drawing has elsewhere."""
+        drawn, own, screws = np.eye(4), T_rows_base, []
+        origins, end = joint_origins(self.drawing)
+        for drawn_origin, own_origin in zip(origins[:-1], joint_origins(self.robot)[0][:-1], strict=True):
+            drawn, own = drawn @ drawn_origin, own @ own_origin
+            screws.append(_screw(inverse(drawn) @ own))
+        # Behind the last joint is the flange and nothing else.
+        return [*screws, _screw(end @ frame_of(self.drawing.tool) @ inverse(self.T_flange_tool))]
+
+    def frames(self) -> Frames:
+        """What differs between the drawing's frames and the controller's."""
+        base, tool = xyzrpy_of(self.T_drawn_base), xyzrpy_of(self.T_flange_tool)
+        return Frames(self._said(), base, tool)
+
+    def _said(self) -> str:
+        base, tool = _frame_words(self.T_drawn_base), _frame_words(self.T_flange_tool)
+        said = f"Poses are those of the {self.model}'s flange in the controller's frame 'base'"
+        if not base and not tool:
+            return f"{said}, which are the frames of robot '{self.drawing.name}' too."
+        differences = [
+            f"'base' is at {base} in the frame of its poses" if base else "",
+            f"its tool is at {tool} on the flange" if tool else "",
+        ]
+        return f"{said}; robot '{self.drawing.name}' is drawn otherwise: {' and '.join(filter(None, differences))}."
+
+
+def _screw(T: Frame) -> Frame:
+    """What of a transform is along and about the z axis."""
+    angle = float(np.arctan2(T[1, 0] - T[0, 1], T[0, 0] + T[1, 1]))
+    screw: Frame = turn(2, angle) @ shift(0.0, 0.0, float(T[2, 3]))
+    return screw
+
+
+def _frame_words(T: Frame) -> str:
+    """A frame in words; "" where it is none."""
+    x, y, z, *angles = xyzrpy_of(T)
+    lengths = [f"{name} {value * 1e3:.6g} mm" for name, value in zip("xyz", (x, y, z), strict=True) if value]
+    names = ("roll", "pitch", "yaw")
+    turns = [f"{name} {np.rad2deg(a):.6g} deg" for name, a in zip(names, angles, strict=True) if a]
+    return ", ".join(lengths + turns)
+
+
+def own_geometry(drawing: Robot) -> OwnGeometry:
+    """The model of Universal Robots that a robot is, as drawn or calibrated, and how the two lie to each other.
+
+    Raises:
+        RobotError: it is none of those that are known.
+    """
+    check_robot(drawing)
+    candidates = [_placed(model, _robot(drawing, model), drawing) for model in _D_AND_A]
+    distance, own = min(candidates, key=lambda candidate: candidate[0])
+    if distance <= FARTHEST:
+        return own
+    if _drawn_as_own(drawing):
+        plain = drawing.with_geometry(base=np.zeros(6), tool=np.zeros(6))
+        return OwnGeometry(drawing.name, plain, frame_of(drawing.base), frame_of(drawing.tool), drawing)
+    raise RobotError(
+        f"expected an arm of Universal Robots ({', '.join(_D_AND_A)}), got robot '{drawing.name}', whose tool is "
+        f"{distance * 1e3:.3g} mm from that of a {own.model} in the mean; for another of their arms give a robot file "
+        "in the maker's DH parameters (theta 0, a negative, alpha 90, 0, 0, 90, -90, 0 deg)."
+    )
+
+
+def convention(drawing: Robot) -> Convention:
+    """How the controller has an arm, and what its files were tried against."""
+    own = own_geometry(drawing)
+    values = [_USERS[own.model]] if own.model in _USERS else []
+    if own.model in _WITH_DEFAULTS:
+        values.append(f"the maker's default kinematics and hash of the {own.model} ({_DEFAULTS})")
+    return Convention(own.robot, own.frames(), " and ".join(values) or None)
+
+
+def check_robot(robot: Robot) -> None:
+    """Refuse robots that the maker's files cannot hold.
+
+    Raises:
+        RobotError: there are other than six joints that turn.
+    """
+    check_plain_joints(robot, "a file of Universal Robots", JOINTS)
+
+
+def _robot(drawing: Robot, model: str) -> Robot:
+    """The nominal robot of a model with the names and limits of a drawing."""
+    (d_1, *wrist), (a_2, a_3) = _D_AND_A[model]
+    dh = np.zeros((JOINTS, 5))
+    dh[:, 1], dh[:, 2], dh[:, 3] = (d_1, 0, 0, *wrist), (0, -a_2, -a_3, 0, 0, 0), _ALPHA
+    return drawing.with_geometry(dh, np.zeros(6), np.zeros(6))
+
+
+def _drawn_as_own(robot: Robot) -> bool:
+    """Whether a robot is drawn in the maker's way, with lengths of its own."""
+    theta, _, a, alpha, beta = robot.dh.T
+    return not (theta.any() or beta.any() or a[[0, 3, 4, 5]].any()) and bool(
+        (a[[1, 2]] < 0).all() and np.allclose(alpha, _ALPHA, atol=1e-8)
+    )
+
+
+def _placed(model: str, own: Robot, drawing: Robot) -> tuple[float, OwnGeometry]:
+    """A model laid on a drawing, and the mean distance [m] of their tools."""
+    base, tool = _by_first_axes(own, drawing)
+    q = torch.rand((_POSES, JOINTS), generator=torch.Generator().manual_seed(0), dtype=torch.float64) * 6 - 3
+    T = forward_kinematics(drawing, q)
+
+    def laid(base: Frame, tool: Frame) -> tuple[float, Robot]:
+        robot = own.with_geometry(base=xyzrpy_of(base), tool=xyzrpy_of(tool))
+        return float((forward_kinematics(robot, q) - T)[:, :3, 3].norm(dim=-1).mean()), robot
+
+    distance, robot = laid(base, tool)
+    if _EXACT < distance < 4 * FARTHEST:
+        robot, _ = solve_projection(ProjectionProblem(robot, q, T, ()))
+        base, tool = _right(frame_of(robot.base)), _right(frame_of(robot.tool))
+        distance, robot = laid(base, tool)
+    return distance, OwnGeometry(model, own, base, tool, drawing)
+
+
+def _by_first_axes(own: Robot, drawing: Robot) -> tuple[Frame, Frame]:
+    """The controller's base in a drawing's frame by axes 1 and 2, and the drawing's tool on the flange at zero."""
+    first, second = _zero_frames(drawing)[:2]
+    z, across = first[:3, 2], second[:3, 2] - first[:3, 2] * (second[:3, 2] @ first[:3, 2])
+    base = np.eye(4)
+    if np.linalg.norm(across) > _EXACT:
+        y = -across / np.linalg.norm(across)
+        base[:3, :3] = np.column_stack([np.cross(y, z), y, z])
+    # the foot of the common normal of both axes: along the first as far as both are apart in the plane of the normal
+    apart = second[:3, 3] - first[:3, 3]
+    along = apart @ z - (apart @ base[:3, 1]) * (second[:3, 2] @ z) / (second[:3, 2] @ base[:3, 1] or 1.0)
+    base[:3, 3] = first[:3, 3] + (along - own.dh[0, 1]) * z
+    base = _clean(base)
+    zero = torch.zeros(1, JOINTS, dtype=torch.float64)
+    ends = [forward_kinematics(robot, zero)[0].numpy() for robot in (own, drawing)]
+    return base, _clean(inverse(base @ ends[0]) @ ends[1])
+
+
+def _zero_frames(robot: Robot) -> list[Frame]:
+    """Frames of the joints where all are at 0, in the frame of poses."""
+    frames, last = [], frame_of(robot.base)
+    for origin in joint_origins(robot)[0]:
+        last = last @ origin
+        frames.append(last)
+    return frames
+
+
+def _clean(T: Frame) -> Frame:
+    """A frame without rounding errors: right angles to 1e-9 rad, zeros to 1e-12 m."""
+    return frame_of(_rounded(xyzrpy_of(T), 1e-9, 1e-12))
+
+
+def _right(T: Frame) -> Frame:
+    """The frame that a calibrated robot's one was before, where that is one of right angles at the origin."""
+    values = xyzrpy_of(T)
+    rounded = _rounded(values, _NEAR_ANGLE, _NEAR_LENGTH)
+    quarters = rounded[3:] / (np.pi / 2)
+    whole = not rounded[:3].any() and bool((quarters == np.rint(quarters)).all())
+    return frame_of(rounded if whole else values)
+
+
+def _rounded(xyzrpy: Float64[np.ndarray, " 6"], angle: float, length: float) -> Float64[np.ndarray, " 6"]:
+    lengths, angles = xyzrpy[:3], xyzrpy[3:]
+    quarters = np.rint(angles / (np.pi / 2)) * (np.pi / 2)
+    return np.concatenate(
+        [
+            np.where(np.abs(lengths) <= length, 0.0, lengths),
+            np.where(np.abs(angles - quarters) <= angle, quarters, angles),
+        ]
+    )

@@ -1,0 +1,161 @@
+"""The kinematics YAML of Universal Robots' ROS driver: one transform a link, and the hash of the calibration."""
+
+import numpy as np
+from pydantic import Field
+
+from pisigma.deployment.export.controllers.controller_file import (
+    ControllerFile,
+    FileText,
+    frame_sentences,
+    untried,
+    with_frames,
+)
+from pisigma.deployment.export.controllers.universal_robots import without_beta
+from pisigma.deployment.export.controllers.ur_models import JOINTS, check_robot, convention, own_geometry
+from pisigma.deployment.export.dh_table import head
+from pisigma.files.errors import RobotError
+from pisigma.files.yaml_file import Section, parse_yaml, yaml_text
+from pisigma.robot.chains import robot_of_origins
+from pisigma.robot.description import Robot
+from pisigma.robot.row import Bounded
+from pisigma.robot.urdf_frames import Frame, frame_of, shift, turn, xyzrpy_of
+
+COLUMNS = ("x", "y", "z", "yaw", "pitch", "roll")
+"""In the order of `frame_of`: the driver's roll is about x, pisigma's about z."""
+
+
+class LinkSection(Section):
+    """A joint's frame in that of the joint before: x, y, z [m], then roll about x, pitch about y, yaw about z [rad]."""
+
+    x: Bounded = 0.0
+    y: Bounded = 0.0
+    z: Bounded = 0.0
+    roll: Bounded = 0.0
+    pitch: Bounded = 0.0
+    yaw: Bounded = 0.0
+
+    def frame(self, as_urdf: bool) -> Frame:
+        """The frame.
+
+        Args:
+            as_urdf: the rotation is `RotZ(yaw) · RotY(pitch) · RotX(roll)`, as URDF reads the numbers, else
+                `RotX(roll) · RotY(pitch) · RotZ(yaw)`, as the driver writes them.
+        """
+        if as_urdf:
+            return frame_of([getattr(self, column) for column in COLUMNS])
+        T: Frame = (
+            shift(self.x, self.y, self.z) @ turn(0, self.roll) @ turn(1, self.pitch) @ turn(2, self.yaw)
+        )
+        return T
+
+
+class KinematicsSection(Section):
+    """The links of the arm in order, and the hash."""
+
+    shoulder: LinkSection
+    upper_arm: LinkSection
+    forearm: LinkSection
+    wrist_1: LinkSection
+    wrist_2: LinkSection
+    wrist_3: LinkSection
+    hash: str = Field(min_length=1)
+
+
+class KinematicsDocument(Section):
+    """The whole file."""
+
+    kinematics: KinematicsSection
+
+
+LINKS = tuple(KinematicsSection.model_fields)[:JOINTS]
+
+
+ORDER = "Rotations are RotZ(yaw) RotY(pitch) RotX(roll), as URDF reads them."
+"""Sentence in the files of pisigma, by which it knows them."""
+
+
+def write_kinematics(content: FileText) -> str:
+    """The text of the file; what is behind the last joint goes into the tool of the comments."""
+    origins, own = own_geometry(content.nominal).origins(content.robot)
+    links: dict[str, object] = {
+        link: {column: float(value) + 0.0 for column, value in zip(COLUMNS, xyzrpy_of(origin), strict=True)}
+        for link, origin in zip(LINKS, origins, strict=True)
+    }
+    links["hash"] = calibration_hash(without_beta(origins, own))
+    return head((*content.said, *frame_sentences(own))) + yaml_text({"kinematics": links})
+
+
+def read_kinematics(text: str, source: str, nominal: Robot) -> Robot:
+    """The robot that the file describes, with the names and limits of the nominal one.
+
+    The driver extracts angles in one order and URDF reads them in the other (ur_calibration/src/calibration.cpp,
+    `eulerAngles(0, 1, 2)`), which makes some 0.1 mm. The order is taken that gives the hash of the file; where none
+    does, URDF's if pisigma wrote the file, else the driver's.
+
+    Poses are those of the link `tool0` in the controller's frame `base` (the driver's `base_link_inertia`), or of the
+    tool and in the base of the comments that pisigma writes.
+
+    Raises:
+        RobotError: the file is no such YAML, or the robot has other joints.
+    """
+    own = own_geometry(nominal).robot
+    links = parse_yaml(text, KinematicsDocument, RobotError, source).kinematics
+    first = ORDER in " ".join(text.replace("#", " ").split())
+    candidates = [[getattr(links, link).frame(order) for link in LINKS] for order in (first, not first)]
+    found = (c for c in candidates if calibration_hash(without_beta(c, own)) == links.hash)
+    origins = next(found, candidates[0])
+    return robot_of_origins(with_frames(own, text), origins, np.eye(4))
+
+
+def calibration_hash(robot: Robot) -> str:
+    """The driver's hash of DH parameters, which it compares with those of the robot that it connects to.
+
+    `calib_` and the GNU C++ library's `std::hash` of theta, d, a and alpha of joint after joint as C++ streams print
+    them, to 6 digits and with nothing between.
+    """
+    text = "".join(
+        f"{value + 0.0:g}" for theta, d, a, alpha, _ in robot.dh.tolist() for value in (theta, d, a, alpha)
+    )
+    return f"calib_{_murmur_hash(text.encode())}"
+
+
+_WORD = 2**64 - 1
+
+
+def _murmur_hash(data: bytes) -> int:
+    """MurmurHash64A (A. Appleby) with the GNU library's seed and its rounds, which differ in the shifts."""
+    factor = 0xC6A4A7935BD1E995
+
+    def mixed(value: int) -> int:
+        return value ^ value >> 47
+
+    value = 0xC70F6907 ^ len(data) * factor & _WORD
+    whole = len(data) // 8 * 8
+    for start in range(0, whole, 8):
+        word = int.from_bytes(data[start : start + 8], "little") * factor & _WORD
+        value = (value ^ mixed(word) * factor & _WORD) * factor & _WORD
+    if whole < len(data):
+        value = (value ^ int.from_bytes(data[whole:], "little")) * factor & _WORD
+    return mixed(mixed(value) * factor & _WORD)
+
+
+FILE = ControllerFile(
+    name="ur-ros",
+    contents="the kinematics YAML of Universal Robots' ROS driver",
+    suffixes=(".yaml", ".yml"),
+    source=untried(
+        "github.com/UniversalRobots/Universal_Robots_ROS2_Driver, ur_calibration/doc/algorithm.rst"
+    ),
+    relies=(
+        "The driver warns where the hash is not that of the robot it connects to: it is that of the calibration.conf "
+        "which --format ur-calibration writes of the same model.",
+        ORDER,
+        "The file holds neither base nor tool: it leads from the controller's frame 'base' (the driver's link "
+        "base_link_inertia) to the link tool0. The lines 'base' and 'tool' below say where these two are.",
+    ),
+    text=write_kinematics,
+    read=read_kinematics,
+    check=check_robot,
+    convention=convention,
+)
+FORMAT = FILE.export_format()

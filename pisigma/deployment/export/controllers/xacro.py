@@ -1,0 +1,59 @@
+"""A xacro file that lays calibrated origins over a URDF: every origin is a property, and all else is the URDF's."""
+
+import re
+
+from pisigma.deployment.export.controllers.controller_file import ControllerFile, FileText
+from pisigma.deployment.export.urdf import drawn_into
+from pisigma.files.errors import OutputError
+from pisigma.robot.urdf_chain import XACRO
+
+
+def with_properties(urdf: str) -> str:
+    """URDF text with the origins of its joints as properties on top."""
+    from lxml import etree
+
+    root = etree.fromstring(urdf.encode())
+    top = etree.Element("robot", root.attrib, nsmap={**root.nsmap, "xacro": XACRO})
+    properties = []
+    for joint in root.iterchildren("{*}joint"):
+        for origin in joint.iterchildren("{*}origin"):
+            for key in ("xyz", "rpy"):
+                name = re.sub(r"\W", "_", f"{joint.get('name')}_{key}")
+                value = origin.get(key, "0 0 0")
+                properties.append(etree.Element(f"{{{XACRO}}}property", name=name, value=value))
+                origin.set(key, f"${{{name}}}")
+    comments = [node for node in root if node.tag is etree.Comment]
+    top.extend([*comments, *properties, *[node for node in root if node.tag is not etree.Comment]])
+    etree.indent(top)
+    return f'<?xml version="1.0"?>\n{etree.tostring(top, encoding="unicode")}\n'
+
+
+def write_overlay(content: FileText) -> str:
+    """The text of the overlay over the URDF file that the nominal robot was loaded from.
+
+    Raises:
+        OutputError: there is none.
+    """
+    urdf = drawn_into(content.request, content.robot, content.nominal, content.said)
+    if urdf is None:
+        raise OutputError(
+            "--format xacro lays origins over a URDF file; give the one of the robot with --like."
+        )
+    return with_properties(urdf)
+
+
+FILE = ControllerFile(
+    name="xacro",
+    contents="a xacro overlay",
+    suffixes=(".xacro",),
+    source="Written from the published description (wiki.ros.org/xacro), and expanded with the package xacro 2.1.1.",
+    relies=(
+        "The origins of the joints are properties, so one calibration can be exchanged for another; `xacro FILE` "
+        "expands it. The link calibrated_frame is the frame of the poses, calibrated_tool the tool.",
+    ),
+    text=write_overlay,
+    read=None,
+    check=lambda robot: None,
+    options=frozenset(("like", "tip")),
+)
+FORMAT = FILE.export_format()

@@ -1,0 +1,90 @@
+"""DH + Hayati tables of a robot as CSV and YAML, in millimetres and degrees with all digits."""
+
+import csv
+import io
+import json
+from collections.abc import Iterable, Mapping
+
+import numpy as np
+
+from pisigma.deployment.export.export_format import Exported, ExportFormat, ExportRequest, model_facts
+from pisigma.deployment.export.geometry import check_geometry, chosen_geometry
+from pisigma.robot.coupling_section import coupling_document
+from pisigma.robot.description import Robot
+from pisigma.robot.row import DH_COLUMNS, FRAME_COLUMNS, in_file_units
+from pisigma.robot.writing import robot_to_yaml
+
+CONVENTION = (
+    "A_i = RotZ(theta_i + direction q_i) Trans(a_i, 0, d_i) RotX(alpha_i) RotY(beta_i), a prismatic joint adds "
+    "to d_i instead; T_base_tool = base A_1 ... A_n tool, where base and tool are "
+    "Trans(x, y, z) RotZ(roll) RotY(pitch) RotX(yaw)."
+)
+
+TABLE_SUFFIXES = (".csv", ".yaml", ".yml")
+
+
+def dh_yaml(robot: Robot, comments: tuple[str, ...] = ()) -> str:
+    """The robot as a robot file, which `Robot.load` reads back, with sentences on top."""
+    return head((CONVENTION, *comments)) + robot_to_yaml(robot)
+
+
+def dh_csv(robot: Robot, comments: tuple[str, ...] = ()) -> str:
+    """The robot as a table: base, one line a row, tool; cells that do not apply are empty.
+
+    Lines at the top that begin with # hold the convention and the sentences given.
+    """
+    limits = ("lower_deg", "upper_deg", "lower_mm", "upper_mm")
+    parameters = (*in_file_units(DH_COLUMNS, robot.dh[0]), *in_file_units(FRAME_COLUMNS, robot.base))
+    columns = ("part", "name", "type", "direction", *limits, *parameters)
+    lines = [{"part": "base", **cells(FRAME_COLUMNS, robot.base)}]
+    for row, values in zip(robot.rows, robot.dh, strict=True):
+        line = {"part": "row", "name": row.name, "type": row.type, "direction": str(row.direction)}
+        for side, limit in (("lower", row.lower), ("upper", row.upper)):
+            if np.isfinite(limit):
+                line[f"{side}_{row.file_unit}"] = repr(row.in_file_unit(limit))
+        lines.append(line | cells(DH_COLUMNS, values))
+    lines.append({"part": "tool", **cells(FRAME_COLUMNS, robot.tool)})
+    return csv_table(columns, lines, (CONVENTION, *_coupling_sentences(robot), *comments))
+
+
+def _coupling_sentences(robot: Robot) -> tuple[str, ...]:
+    """How coupled joints follow the controller's values, of which the table holds the limits of the joints alone."""
+    if robot.coupling is None:
+        return ()
+    stated = json.dumps(coupling_document(robot.coupling, robot.joints))
+    return (
+        f"q_i are the joints' values, which follow the controller's as a robot file says: coupling: {stated}",
+    )
+
+
+def csv_table(
+    columns: Iterable[str], lines: Iterable[Mapping[str, object]], sentences: tuple[str, ...]
+) -> str:
+    """Lines as CSV with sentences on top; cells that a line does not have are empty."""
+    text = io.StringIO()
+    writer = csv.DictWriter(text, tuple(columns), restval="", lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(lines)
+    return head(sentences) + text.getvalue()
+
+
+def cells(names: tuple[str, ...], values: np.ndarray) -> dict[str, str]:
+    """Parameters by column [mm, deg], with all digits."""
+    return {column: repr(value) for column, value in in_file_units(names, values).items()}
+
+
+def head(sentences: tuple[str, ...]) -> str:
+    """Sentences as lines that begin with #."""
+    return "".join(f"# {' '.join(sentence.split())}\n" for sentence in sentences)
+
+
+def _write(request: ExportRequest) -> Exported:
+    model = request.load()
+    chosen = chosen_geometry(model, request.geometry)
+    write = dh_csv if request.as_csv else dh_yaml
+    return Exported(
+        write(chosen.robot, chosen.said), model_facts(model) | {"geometry": chosen.name}, chosen.said
+    )
+
+
+FORMAT = ExportFormat("dh", "a DH table", TABLE_SUFFIXES, _write, frozenset(("geometry",)), check_geometry)

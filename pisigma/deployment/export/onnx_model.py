@@ -1,0 +1,289 @@
+"""A model's network or joint correction as an ONNX graph, for programs that run no Python."""
+
+import json
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from pisigma.calibration.hybrid.arm import HybridArm, JointCoverage
+from pisigma.deployment.export.export_format import Exported, ExportFormat, ExportRequest, model_facts
+from pisigma.deployment.export.geometry import HYBRID
+from pisigma.files.errors import ModelError
+from pisigma.files.model_files import model_hash
+from pisigma.joint_correction.conditions import learned_conditions
+from pisigma.joint_correction.joint_correction import JointCorrection
+from pisigma.joint_correction.onnx_chain import add_roll_pitch_yaw
+from pisigma.joint_correction.onnx_graph import OnnxGraph, import_onnx
+from pisigma.joint_correction.shared_features import add_unit_inputs
+from pisigma.model.calibrated_model import CalibratedModel
+from pisigma.network.correction_network import CorrectionNetwork, JointGroup
+from pisigma.network.inputs import POSE_INPUTS
+from pisigma.network.pi_sigma import PiSigma
+
+
+def needs_pose(network: CorrectionNetwork) -> bool:
+    """Whether an input is a coordinate of the pose."""
+    return any(set(group.inputs.names) & set(POSE_INPUTS) for group in network.groups)
+
+
+def add_network(graph: OnnxGraph, network: CorrectionNetwork, q: str, T: str | None) -> str:
+    """Add a network; gives the corrections `(batch, dof)` [rad or m].
+
+    Args:
+        graph: to add to.
+        network: of the model.
+        q: nominal joint values.
+        T: poses; None where no input is a coordinate of them.
+    """
+    joints: list[int] = []
+    outputs: list[str] = []
+    for group, net in network.members():
+        outputs.append(_add_group(graph, group, net, q, T))
+        joints += group.joints
+    every = outputs[0] if len(outputs) == 1 else graph.node("Concat", *outputs, axis=1)
+    return graph.node("MatMul", every, np.eye(network.dof)[joints])
+
+
+def _add_group(graph: OnnxGraph, group: JointGroup, net: PiSigma, q: str, T: str | None) -> str:
+    """Outputs of one network, `(batch, outputs)`."""
+    values, order = _add_inputs(graph, group, q, T)
+    offset, scale = (part.detach().numpy()[order] for part in (net.input_offset, net.input_scale))
+    scaled = graph.node("Div", graph.node("Sub", values, offset), scale)
+    weight = (net.weight * net.fixed[..., None]).detach().numpy()[..., order].reshape(-1, net.inputs)
+    bias = (net.bias * net.fixed).detach().numpy().ravel()
+    sums = graph.node("Add", graph.node("MatMul", scaled, weight.T), bias)
+    factors = graph.reshape(sums, [net.outputs, sum(net.orders)])
+    product = graph.sum_of_products(factors, net.orders)
+    scaled_back = graph.node("Mul", product, net.output_scale.detach().numpy())
+    return graph.node("Add", scaled_back, net.output_offset.detach().numpy())
+
+
+def _add_inputs(graph: OnnxGraph, group: JointGroup, q: str, T: str | None) -> tuple[str, list[int]]:
+    """The inputs `(batch, inputs)` in an order of kinds, and which input stands where."""
+    names = group.inputs.names
+    terms = [group.inputs.combination(name) for name in names]
+    parts: list[str] = []
+    order: list[int] = []
+    for function, operator in (("sin", "Sin"), ("cos", "Cos"), ("", "")):
+        rows = [i for i, (kind, factors) in enumerate(terms) if factors and kind == function]
+        if rows:
+            angle = graph.node("MatMul", q, np.array([terms[i][1] for i in rows]).T)
+            parts.append(graph.node(operator, angle) if operator else angle)
+            order += rows
+    coordinates = [i for i, (_, factors) in enumerate(terms) if not factors]
+    if coordinates:
+        assert T is not None
+        pose = _add_coordinates(graph, group.inputs.reference, T)
+        parts += [pose[POSE_INPUTS.index(names[i])] for i in coordinates]
+        order += coordinates
+    return (parts[0] if len(parts) == 1 else graph.node("Concat", *parts, axis=1)), order
+
+
+def _add_coordinates(graph: OnnxGraph, reference: np.ndarray, T: str) -> Sequence[str]:
+    """x, y, z, roll, pitch, yaw of poses, each `(batch, 1)`."""
+    cells = graph.reshape(T, [16])
+    place = [graph.column(cells, 4 * axis + 3) for axis in range(3)]
+    rotation = graph.columns(cells, [0, 1, 2, 4, 5, 6, 8, 9, 10])
+    turned = graph.node("MatMul", rotation, np.kron(reference, np.eye(3)))  # reference.T @ R, cell by cell
+    return [*place, *add_roll_pitch_yaw(graph, turned)]
+
+
+def add_joint_correction(graph: OnnxGraph, correction: JointCorrection, q: str) -> str:
+    """Add a correction under the usual conditions; gives `(batch, dof)` [rad or m].
+
+    Raises:
+        ModelError: it uses features that have no ONNX form.
+    """
+    robot, terms = correction.robot, []
+    for feature, weight in zip(correction.features, correction.linear, strict=True):
+        if feature.usually_zero:
+            continue
+        term = feature.add_onnx(graph, weight.detach().numpy(), q)
+        if term is None:
+            raise ModelError(
+                f"the learned correction uses the feature '{feature.name}', which has no ONNX form; calibrate without "
+                "it, or give it the method `add_onnx`."
+            )
+        terms.append(term)
+    if correction.orders:
+        dof, factors, inputs = correction.weight.shape
+        weight = (correction.weight * correction.fixed[..., None]).detach().numpy()
+        bias = (correction.bias * correction.fixed).detach().numpy().ravel()
+        phi = add_unit_inputs(graph, robot, q)
+        sums = graph.node("Add", graph.node("MatMul", phi, weight.reshape(-1, inputs).T), bias)
+        terms.append(graph.sum_of_products(graph.reshape(sums, [dof, factors]), correction.orders))
+    total = terms[0] if terms else graph.node("Mul", q, 0.0)
+    for term in terms[1:]:
+        total = graph.node("Add", total, term)
+    return total
+
+
+def add_beyond(graph: OnnxGraph, coverage: JointCoverage, q: str) -> str:
+    """Add the angle of the joint farthest beyond its measured values, `(batch, 1)` [rad]; see `JointCoverage`."""
+    node, joint = graph.node, coverage.joint.numpy()
+    angle = node("Mul", graph.columns(q, joint.tolist()), coverage.rate.numpy()[joint])
+    off = node("Sub", angle, coverage.middle.numpy())
+    turning = np.array(coverage.turning)[joint].astype(np.float64)
+    turns = node("Round", node("Div", off, 2 * math.pi))
+    off = node("Sub", off, node("Mul", turns, 2 * math.pi * turning))
+    beyond = node("Max", node("Sub", node("Abs", off), coverage.half.numpy()), 0.0)
+    per_joint = [
+        node("ReduceMin", graph.columns(beyond, np.flatnonzero(joint == j).tolist()), axes=[1], keepdims=1)
+        for j in range(len(coverage.turning))
+    ]
+    return node("ReduceMax", node("Concat", *per_joint, axis=1), axes=[1], keepdims=1)
+
+
+FORWARD = "forward_joint_correction"
+INVERSE = "inverse_joint_correction"
+"""What a graph computes, in its metadata."""
+
+
+def export_onnx(model: CalibratedModel, model_sha256: str = "") -> bytes:
+    """A model's network as the content of an ONNX file.
+
+    All numbers are double, the first axis of every input and output is the batch. Units, frames, joints and the domain
+    stand in the descriptions of inputs and outputs and in the metadata.
+
+    With a network on nominal joint values (inverse calibration, distilled): `q_nominal`, and `T_base_tool` where the
+    network looks at the pose, to `q_corrected` and `correction`. With a hybrid's joint correction: `q` to `correction`
+    and `beyond_measured`.
+
+    Args:
+        model: the model.
+        model_sha256: hash of its `model.yaml`, for the metadata.
+
+    Raises:
+        MissingExtraError: onnx is not installed.
+        ModelError: the model has no network, or one without ONNX form, or its joints are coupled.
+    """
+    import_onnx()
+    if model.robot.coupling is not None:
+        raise ModelError(
+            f"model '{model.name}': its joints are coupled, and a graph would take their values, not the controller's; "
+            "use pisigma.load, which turns one into the other."
+        )
+    if model.network is not None:
+        return _inverse(model, model.network, model_sha256)
+    if model.hybrid is not None:
+        return _forward(model, model.hybrid, model_sha256)
+    raise ModelError(
+        f"model '{model.name}' has no network, only geometry; export that with --format urdf or dh, or make a network "
+        "of it with `pisigma distill`."
+    )
+
+
+def onnx_remarks(model: CalibratedModel) -> tuple[str, ...]:
+    """What a reader of the file should know."""
+    if model.network is not None:
+        return (
+            "q_nominal has to come from the model's nominal robot on its base and with its tool; inputs outside the "
+            "domain are not refused.",
+        )
+    return (
+        "The graph corrects joint values on the way forward: the pose is that of the hybrid geometry (--format urdf or "
+        "dh --geometry hybrid), not of the geometric fit, at q + correction. For nominal to commanded "
+        "joint values export a model of `pisigma distill`.",
+    )
+
+
+def _inverse(model: CalibratedModel, network: CorrectionNetwork, sha256: str) -> bytes:
+    graph, dof, units = OnnxGraph(), model.robot.dof, _units(model)
+    about = f"{_joints(model)} [{units}], as the controller counts"
+    q = graph.add_input("q_nominal", [dof], f"nominal joint values {about}")
+    T = None
+    if needs_pose(network):
+        T = graph.add_input("T_base_tool", [4, 4], "wanted poses of the tool in the base frame [m]")
+    correction = add_network(graph, network, q, T)
+    corrected = graph.node("Add", q, correction)
+    graph.add_output(
+        corrected, "q_corrected", [dof], f"joint values to command {about}: q_nominal + correction"
+    )
+    graph.add_output(correction, "correction", [dof], f"what is added to the nominal joint values [{units}]")
+    doc = (
+        f"Corrections of nominal joint values of robot {model.robot.name}, model {model.name}. Nominal joint values "
+        "are the inverse kinematics of the nominal robot on the base and with the tool of the model."
+    )
+    return graph.finish(f"pisigma {model.name}", doc, _metadata(model, INVERSE, sha256))
+
+
+def _forward(model: CalibratedModel, arm: HybridArm, sha256: str) -> bytes:
+    graph, dof, units = OnnxGraph(), model.robot.dof, _units(model)
+    q = graph.add_input(
+        "q", [dof], f"commanded joint values {_joints(model)} [{units}], as the controller counts"
+    )
+    correction = add_joint_correction(graph, arm.correction, q)
+    graph.add_output(correction, "correction", [dof], f"what is added to the joint values [{units}]")
+    graph.add_output(
+        add_beyond(graph, arm.coverage, q),
+        "beyond_measured",
+        [1],
+        "0 where every joint value was measured, else how far the farthest joint lies beyond [rad]",
+    )
+    doc = (
+        f"Joint corrections of robot {model.robot.name}, model {model.name}, under the usual conditions. The pose is "
+        "that of the hybrid geometry (pisigma export --geometry hybrid), not of the geometric fit, at q + correction."
+    )
+    return graph.finish(f"pisigma {model.name}", doc, _metadata(model, FORWARD, sha256))
+
+
+def _metadata(model: CalibratedModel, computes: str, sha256: str) -> dict[str, str]:
+    """Everything as text, lists and tables as JSON; base and tool go with the graph."""
+    arm = model.hybrid if computes == FORWARD else None
+    robot = model.robot if arm is None else arm.robot
+    values: dict[str, Any] = {
+        "model": model.name,
+        "kind": model.kind,
+        "model_yaml_sha256": sha256,
+        "computes": computes,
+        "robot": model.robot.name,
+        "joints": [joint.name for joint in model.robot.joints],
+        "joint_units": ["rad" if turns else "m" for turns in model.robot.revolute],
+        "length_unit": "m",
+        "pose_frame": "T_base_tool maps coordinates of the tool into the base frame",
+        "geometry": "nominal" if arm is None else HYBRID,
+        "base_xyzrpy": robot.base.tolist(),
+        "tool_xyzrpy": robot.tool.tolist(),
+        "branches": list(model.branches),
+        "domain": _domain(model),
+    }
+    learned = None if arm is None else learned_conditions(arm.correction)
+    if learned is not None:
+        values["usual_conditions"] = dict(zip(learned.names, learned.mean, strict=True))
+    return {key: value if isinstance(value, str) else json.dumps(value) for key, value in values.items()}
+
+
+def _domain(model: CalibratedModel) -> dict[str, Any]:
+    """Where it holds: the range of training rows, and of a hybrid the stretches of every joint that were measured."""
+    domain: dict[str, Any] = {}
+    if len(model.starts):
+        low, high = model.starts.aminmax(dim=0)
+        domain |= {"q_lower": low.tolist(), "q_upper": high.tolist()}
+    if model.network is None and model.hybrid is not None:
+        coverage = model.hybrid.coverage
+        stretches: list[list[list[float]]] = [[] for _ in range(model.robot.dof)]
+        columns = (coverage.joint.tolist(), coverage.middle.tolist(), coverage.half.tolist())
+        for j, middle, half in zip(*columns, strict=True):
+            rate = float(coverage.rate[j])
+            stretches[j].append([(middle - half) / rate, (middle + half) / rate])
+        domain["measured"] = stretches
+    return domain
+
+
+def _joints(model: CalibratedModel) -> str:
+    return ", ".join(joint.name for joint in model.robot.joints)
+
+
+def _units(model: CalibratedModel) -> str:
+    return " or ".join(dict.fromkeys("rad" if turns else "m" for turns in model.robot.revolute))
+
+
+def _write(request: ExportRequest) -> Exported:
+    model = request.load()
+    content = export_onnx(model, model_hash(request.model))
+    return Exported(content, model_facts(model), onnx_remarks(model))
+
+
+FORMAT = ExportFormat("onnx", "an ONNX graph", (".onnx",), _write)

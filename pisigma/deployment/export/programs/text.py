@@ -1,0 +1,75 @@
+"""Numbers, frames and comments of a program, as templates write them."""
+
+import math
+import textwrap
+from collections.abc import Iterable
+
+import torch
+from jaxtyping import Float64
+from torch import Tensor
+
+from pisigma.robot.se3 import rotation_vector, rpy_from_rotation
+
+DIGITS = 6
+"""Decimals of degrees and millimetres: joints are rounded by 1e-8 rad, which moves no tool by a micrometre. Radians,
+metres and quaternions have 9."""
+
+
+def numbers(values: Iterable[float], digits: int = DIGITS) -> str:
+    """Numbers with a comma and a blank between them; see `number`."""
+    return ", ".join(number(value, digits) for value in values)
+
+
+def number(value: float, digits: int) -> str:
+    """A number with a decimal point, without exponent and without a sign before zero."""
+    assert math.isfinite(value), "a program holds finite numbers only"
+    written = f"{value:.{digits}f}"
+    return written.removeprefix("-") if not float(written) else written
+
+
+def labelled(values: Iterable[float], labels: Iterable[str], unit: str = "") -> str:
+    """Numbers, each behind its label and before its unit, such as `X 1.000000, Y 2.000000`."""
+    return ", ".join(f"{label} {number(v, DIGITS)}{unit}" for label, v in zip(labels, values, strict=True))
+
+
+def comments(sentences: Iterable[str], mark: str, width: int = 100) -> str:
+    """Sentences as lines of printable ASCII, each behind a mark; other characters are written as `?`."""
+    lines = []
+    for sentence in sentences:
+        plain = " ".join(sentence.split()).encode("ascii", "replace").decode()
+        plain = "".join(letter if letter.isprintable() else "?" for letter in plain)
+        lines += [f"{mark}{line}" for line in textwrap.wrap(plain, width, break_on_hyphens=False)]
+    return "\n".join(lines)
+
+
+def millimetres(T: Float64[Tensor, "*batch 4 4"]) -> list[float]:
+    """x, y, z [mm]."""
+    position: list[float] = (T[..., :3, 3] * 1e3).tolist()
+    return position
+
+
+def metres_and_rotation_vector(T: Float64[Tensor, "4 4"]) -> list[float]:
+    """x, y, z [m] and rotation vector [rad]."""
+    values: list[float] = torch.cat([T[:3, 3], rotation_vector(T[:3, :3])]).tolist()
+    return values
+
+
+def quaternion(T: Float64[Tensor, "4 4"]) -> list[float]:
+    """Unit quaternion (w, x, y, z) with w >= 0 of a rotation: `cos(t/2), n sin(t/2)` of axis n and angle t."""
+    vector = rotation_vector(T[:3, :3])
+    half = torch.linalg.vector_norm(vector, dim=-1, keepdim=True) / 2
+    values: list[float] = torch.cat([torch.cos(half), vector / 2 * torch.sinc(half / torch.pi)], -1).tolist()
+    return values
+
+
+def millimetres_and_euler(T: Float64[Tensor, "*batch 4 4"]) -> Float64[Tensor, "*batch 6"]:
+    """x, y, z [mm] and the angles [deg] of `RotZ(a) RotY(b) RotX(c)` in the order a, b, c.
+
+    Where b is near ±90 deg, a is hardly determined; c is computed from what is left of the rotation without a and
+    so makes up for it: `RotZ(-a) R = RotY(b) RotX(c)`, whose second row is `0, cos c, -sin c`.
+    """
+    R = T[..., :3, :3]
+    a, b, _ = rpy_from_rotation(R).unbind(-1)
+    row = torch.cos(a)[..., None] * R[..., 1, :] - torch.sin(a)[..., None] * R[..., 0, :]
+    angles = torch.stack([a, b, torch.atan2(-row[..., 2], row[..., 1])], -1)
+    return torch.cat([T[..., :3, 3] * 1e3, torch.rad2deg(angles)], -1)

@@ -1,0 +1,258 @@
+"""Corrected targets in place of a program's, and way points where a move would leave its line or its arc."""
+
+import difflib
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float64
+from torch import Tensor
+
+from pisigma.deployment.export.programs.targets import WITH_TARGET
+from pisigma.deployment.export.rewriting.arcs import Arcs, is_straight
+from pisigma.deployment.export.rewriting.scan import Edit, Frame, PathMove, Pose, ScannedProgram, Target
+from pisigma.model.inverse.corrected_ik import CorrectedIK
+from pisigma.robot.kinematics.forward import forward_kinematics
+from pisigma.robot.kinematics.status import Status
+from pisigma.robot.se3 import invert, rotation_from_vector, rotation_vector, transform, transform_from_xyzrpy
+
+SPACING = 0.01
+"""[m] The way is looked at in steps of at most this length, or of two degrees."""
+STEP_ANGLE = 0.035
+MOST_STEPS = 512
+LEVER = 0.1
+"""[m] An angle off the straight way counts as the distance that it makes at this distance from the tool."""
+
+
+_LINE_NUMBER = re.compile(r"(?m)^ *\d+:")
+
+
+@dataclass(frozen=True, eq=False)
+class CorrectedProgram:
+    """A program with corrected targets.
+
+    Attributes:
+        text: of the program.
+        statuses: of every target: its line, and whether it is reached.
+        way_points: how many were put in.
+        left: line and reason of whatever was left alone.
+        largest_shift: of a target [m].
+        branches: names of those that the targets were corrected on.
+    """
+
+    text: str
+    statuses: tuple[tuple[int, Status], ...]
+    way_points: int
+    left: tuple[tuple[int, str], ...]
+    largest_shift: float
+    branches: tuple[str, ...]
+
+    @property
+    def unreached(self) -> tuple[tuple[int, Status], ...]:
+        """Line and status of targets that keep their line."""
+        return tuple((line, status) for line, status in self.statuses if status not in WITH_TARGET)
+
+    def diff(self, before: str, names: tuple[str, str]) -> str:
+        """What has changed, as a unified diff, in which numbers of lines do not count."""
+        old, new = (_LINE_NUMBER.sub(":", text).splitlines() for text in (before, self.text))
+        lines = difflib.unified_diff(old, new, *names, lineterm="", n=0)
+        return "\n".join(lines)
+
+
+@dataclass(frozen=True, eq=False)
+class Commanded:
+    """What to command for wanted poses.
+
+    Attributes:
+        T: poses of the robot as drawn, in the frame of the wanted ones.
+        status: of every pose.
+        branches: those that they lie on.
+    """
+
+    T: Float64[Tensor, "poses 4 4"]
+    status: tuple[Status, ...]
+    branches: frozenset[int]
+
+    @property
+    def reached(self) -> bool:
+        """Whether all poses are."""
+        return set(self.status) <= set(WITH_TARGET)
+
+
+@dataclass(frozen=True)
+class ProgramCorrection:
+    """Corrects programs for a controller that computes with the robot as drawn.
+
+    Attributes:
+        solver: the model.
+        branch: to take instead of the trained one.
+        tolerance: how far the tool may leave a straight line or an arc between way points [m].
+    """
+
+    solver: CorrectedIK
+    branch: str | None
+    tolerance: float
+
+    def correct(self, program: ScannedProgram) -> CorrectedProgram:
+        """Rewrite what is understood and can be reached; the rest keeps its text.
+
+        A target is the pose that the real tool shall take. Its place takes the pose at which the robot as drawn stands
+        at the corrected joint values. A straight move is cut where the line between two of these leaves the corrected
+        line by more than the tolerance; an arc likewise, into arcs.
+        """
+        targets, ways = program.targets, {move: self.path(move) for move in program.moves}
+        paths = {move: way for move, way in ways.items() if isinstance(way, Tensor)}
+        answers = self.commanded(
+            [*targets, *(move.end for move in paths)],
+            [*(target.pose.T[None] for target in targets), *paths.values()],
+        )
+        points = {
+            move: self.way_points(move, there)
+            for move, there in zip(paths, answers[len(targets) :], strict=True)
+        }
+        reasons = {move.line: why for move, why in (ways | points).items() if isinstance(why, str)}
+        cuts = [(move, way) for move, way in points.items() if way and not isinstance(way, str)]
+        answered = list(zip(targets, answers, strict=False))
+        reached = [(target.pose, there) for target, there in answered if there.reached]
+        text = program.finish(_edited(program.text, _edits(reached, cuts)))
+        branches = sorted({index for _, there in reached for index in there.branches})
+        return CorrectedProgram(
+            text,
+            tuple((target.line, there.status[0]) for target, there in answered),
+            sum(len(way) for _, way in cuts),
+            tuple(sorted((reasons | dict(program.left)).items())),
+            max((float((there.T[0] - pose.T)[:3, 3].norm()) for pose, there in reached), default=0.0),
+            tuple(self.solver.branches[index] for index in branches),
+        )
+
+    def commanded(
+        self, targets: Sequence[Target], poses: Sequence[Float64[Tensor, "_poses 4 4"]]
+    ) -> list[Commanded]:
+        """What to command for the wanted poses of each target's tool in its frame."""
+        robot, counts = self.solver.model.robot, torch.tensor([len(T) for T in poses])
+        base, tool = (
+            transform_from_xyzrpy(torch.from_numpy(frame.copy())) for frame in (robot.base, robot.tool)
+        )
+        before = base @ torch.stack([target.T_root_frame for target in targets])
+        after = invert(torch.stack([target.T_flange_tool for target in targets])) @ tool
+        before, after = (T.repeat_interleave(counts, 0) for T in (before, after))
+        solution = self.solver(before @ torch.cat(list(poses)) @ after, branch=self.branch)
+        drawn = forward_kinematics(robot, robot.to_dh(solution.q.detach().to("cpu", torch.float64)))
+        parts = (invert(before) @ drawn @ invert(after), solution.status, solution.branch)
+        split = (part.split(counts.tolist()) for part in parts)
+        return [
+            Commanded(T, tuple(Status(value) for value in status.tolist()), frozenset(branch.tolist()))
+            for T, status, branch in zip(*split, strict=True)
+        ]
+
+    def path(self, move: PathMove) -> Float64[Tensor, "points 4 4"] | str:
+        """The way that the program means, of the end's tool in the end's frame; or why that is not known."""
+        if move.start is None or (move.circular and move.via is None):
+            where = "begins or what it passes" if move.circular else "begins"
+            return f"where the {_kind(move)} {where} is not stated, so only its end is corrected"
+        start, end = _seen_from(move.end, move.start), move.end.pose.T[None]
+        if move.via is None:
+            return _between(start, end, _steps(start, end, _distance(start, end)))[0]
+        via = _seen_from(move.end, move.via)
+        if is_straight(*(T[:, :3, 3] for T in (start, via, end))):
+            return "the points of the arc lie on a line or in one place, so it has no way points"
+        arc = Arcs.through(*(T[:, :3, 3] for T in (start, via, end)))
+        between = start[:, :3, :3] @ rotation_from_vector(arc.passing / arc.angle * _turn(start, end))
+        if LEVER * float(rotation_vector(between.mT @ via[:, :3, :3]).norm()) > self.tolerance:
+            return "the tool turns along the arc otherwise than from its begin to its end, so it has no way points"
+        length = float(arc.angle * arc.radius.norm())
+        return _round(start, via, end, _steps(start, end, length))[0]
+
+    def way_points(self, move: PathMove, there: Commanded) -> list[Frame] | str:
+        """The way points of a move, see `PathMove.way_points`; or why it is not cut."""
+        if not there.reached:
+            return f"the {_kind(move)} cannot be followed everywhere, so it has no way points"
+        if len(there.branches) > 1:
+            return f"the {_kind(move)} passes from one branch to another, so it has no way points"
+        whole = stride = len(there.T) - 1
+        least = 2 if move.circular else 1
+        while stride > least and _off(there.T, stride, move.circular) > self.tolerance:
+            stride //= 2
+        between = stride // least
+        return list(there.T[between:-1:between]) if stride < whole else []
+
+
+def _kind(move: PathMove) -> str:
+    return "arc" if move.circular else "straight move"
+
+
+def _edits(
+    reached: Sequence[tuple[Pose, Commanded]], cuts: Sequence[tuple[PathMove, list[Frame]]]
+) -> list[Edit]:
+    """The new poses of targets and the way points of moves, where an arc's replaces what it passed before."""
+    added = [edit for move, way in cuts for edit in move.way_points(way)]
+    replaced = [edit.span for edit in added if edit.span[0] < edit.span[1]]
+    corrected = [Edit(pose.span, pose.write(there.T[0])) for pose, there in reached]
+    return added + [
+        edit
+        for edit in corrected
+        if not any(begin <= edit.span[0] and edit.span[1] <= end for begin, end in replaced)
+    ]
+
+
+def _seen_from(end: Target, target: Target) -> Float64[Tensor, "1 4 4"]:
+    """The pose of the end's tool in the end's frame when the robot stands at a target."""
+    T_flange = target.T_root_frame @ target.pose.T @ invert(target.T_flange_tool)
+    return (invert(end.T_root_frame) @ T_flange @ end.T_flange_tool)[None]
+
+
+def _off(T: Float64[Tensor, "points 4 4"], stride: int, circular: bool) -> float:
+    """How far poses are at most off the straight lines, or arcs, between every so many of them [m]."""
+    start, end = T[:-1:stride], T[stride::stride]
+    drawn = _round(start, T[stride // 2 :: stride], end, stride) if circular else _between(start, end, stride)
+    drawn = drawn[:, :-1].flatten(0, 1)
+    turn = rotation_vector(drawn[:, :3, :3].mT @ T[:-1, :3, :3]).norm(dim=-1)
+    return float(((drawn - T[:-1])[:, :3, 3].norm(dim=-1) + LEVER * turn).max())
+
+
+def _steps(start: Float64[Tensor, "1 4 4"], end: Float64[Tensor, "1 4 4"], length: float) -> int:
+    """A power of two: steps of a way of a length [m] that are short enough to see the correction change."""
+    angle = float(_turn(start, end).norm())
+    steps = 8
+    while steps < MOST_STEPS and steps < max(length / SPACING, angle / STEP_ANGLE):
+        steps *= 2
+    return steps
+
+
+def _distance(start: Float64[Tensor, "1 4 4"], end: Float64[Tensor, "1 4 4"]) -> float:
+    return float((end - start)[:, :3, 3].norm())
+
+
+def _turn(start: Float64[Tensor, "ways 4 4"], end: Float64[Tensor, "ways 4 4"]) -> Float64[Tensor, "ways 3"]:
+    """Rotation vectors from poses to others [rad], in the frames of the former."""
+    return rotation_vector(start[:, :3, :3].mT @ end[:, :3, :3])
+
+
+def _round(
+    start: Float64[Tensor, "ways 4 4"],
+    via: Float64[Tensor, "ways 4 4"],
+    end: Float64[Tensor, "ways 4 4"],
+    steps: int,
+) -> Float64[Tensor, "ways points 4 4"]:
+    """Poses from ones by others to third ones: an arc, and a turn about one axis from begin to end."""
+    arcs = Arcs.through(*(T[:, :3, 3] for T in (start, via, end)))
+    return transform(_between(start, end, steps)[..., :3, :3], arcs.points(steps))
+
+
+def _between(
+    start: Float64[Tensor, "ways 4 4"], end: Float64[Tensor, "ways 4 4"], steps: int
+) -> Float64[Tensor, "ways points 4 4"]:
+    """Poses from ones to others: a straight line, and a turn about one axis."""
+    share = torch.linspace(0, 1, steps + 1, dtype=torch.float64)[:, None]
+    R = start[:, None, :3, :3] @ rotation_from_vector(share * _turn(start, end)[:, None])
+    return transform(R, start[:, None, :3, 3] + share * (end - start)[:, None, :3, 3])
+
+
+def _edited(text: str, edits: Sequence[Edit]) -> str:
+    """The text with all edits; those at one place stay in their order."""
+    parts, position = [], 0
+    for edit in sorted(edits, key=lambda edit: edit.span):
+        parts += [text[position : edit.span[0]], edit.text]
+        position = edit.span[1]
+    return "".join([*parts, text[position:]])

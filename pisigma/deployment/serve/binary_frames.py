@@ -1,0 +1,112 @@
+"""Requests and answers as frames of fixed length, for control loops: poses only."""
+
+import enum
+import math
+import struct
+import time
+
+from pisigma.deployment.serve.metrics import Metrics
+from pisigma.deployment.serve.models import ServedModel, ServedModels
+from pisigma.deployment.serve.protocol import AbstractProtocol, BrokenStreamError, Reply
+from pisigma.files.errors import RequestError
+from pisigma.robot.kinematics.status import Status
+
+MAGIC = b"PSI1"
+JOINTS = 8
+"""Of every frame, whatever the robot has."""
+HEAD = struct.Struct("<4sIQII")
+"""Magic, length of the whole frame, id; then model index and flags, or status and number of joints."""
+REQUEST = struct.Struct(f"<4sIQII16d{JOINTS}d")
+"""The pose T_base_tool row by row [m], and the joint values to be near to [rad or m], NaN for none."""
+_POSE, _NEAR = HEAD.size, HEAD.size + 128
+ANSWER = struct.Struct(f"<4sIQII{JOINTS}d2d")
+"""Joint values [rad or m], NaN behind the last joint, and the residuals of position [m] and rotation [rad]."""
+LONGEST_TOKEN = 1024
+"""[bytes]"""
+
+TOKEN = 1
+"""Flag of a first frame that holds a token behind its head."""
+
+
+class Refusal(enum.IntEnum):
+    """Statuses of answers besides those of `Status`."""
+
+    NO_SUCH_MODEL = 100
+    UNKNOWN_FLAGS = 101
+    BROKEN_FRAME = 102
+    WRONG_TOKEN = 103
+    DEFECT = 104
+
+
+_NO_JOINTS = (math.nan,) * JOINTS
+_NAMES = {float(status): status.name.lower() for status in Status}
+
+
+class BinaryFrames(AbstractProtocol):
+    """A frame in, a frame out; see docs/reference/serve-protocol.md."""
+
+    def __init__(self, models: ServedModels, metrics: Metrics) -> None:
+        self._models, self._metrics = models, metrics
+
+    def cut(self, received: bytearray) -> int:
+        """Give the length of the first frame; see `AbstractProtocol`.
+
+        Raises:
+            BrokenStreamError: the magic or the length is wrong.
+        """
+        count = len(received)
+        if not received.startswith(MAGIC[:count]):
+            raise BrokenStreamError(self.broken())
+        if count < HEAD.size:
+            return 0
+        _, length, name, _, flags = HEAD.unpack_from(received)
+        fits = HEAD.size < length <= HEAD.size + LONGEST_TOKEN if flags == TOKEN else length == REQUEST.size
+        if not fits:
+            raise BrokenStreamError(_refusal(name, Refusal.BROKEN_FRAME))
+        return length if count >= length else 0
+
+    def answer(self, message: bytes) -> Reply:
+        """Answer a frame."""
+        begun = time.perf_counter_ns()
+        _, _, name, index, flags = HEAD.unpack_from(message)
+        if flags:
+            return self._refuse(name, Refusal.UNKNOWN_FLAGS, begun)
+        try:
+            model = self._models.find(index)
+        except RequestError:
+            return self._refuse(name, Refusal.NO_SUCH_MODEL, begun)
+        if model.quick:
+            return self._solve(model, message, name, begun)
+        return lambda: self._solve(model, message, name, begun)
+
+    def broken(self) -> bytes:
+        """Say that what came is no frame."""
+        return _refusal(0, Refusal.BROKEN_FRAME)
+
+    def token_of(self, message: bytes) -> bytes | None:
+        """What stands behind the head of a frame with the flag `TOKEN`."""
+        return message[HEAD.size :] if HEAD.unpack_from(message)[4] == TOKEN else None
+
+    def admission(self, admitted: bool) -> bytes:
+        """Say whether the token was the right one: status 0 if so."""
+        return _refusal(0, 0 if admitted else Refusal.WRONG_TOKEN)
+
+    def _solve(self, model: ServedModel, message: bytes, name: int, begun: int) -> bytes:
+        try:
+            dof = len(model.ik.joints)
+            row = model.solve(message[_POSE:_NEAR], message[_NEAR : _NEAR + 8 * dof])
+            position, rotation, _, status, _ = row[2 * dof :]
+            q = *row[:dof], *_NO_JOINTS[dof:]
+            reply = ANSWER.pack(MAGIC, ANSWER.size, name, int(status), dof, *q, position, rotation)
+        except Exception:
+            return self._refuse(name, Refusal.DEFECT, begun)
+        self._metrics.count(_NAMES[status], begun)
+        return reply
+
+    def _refuse(self, name: int, why: Refusal, begun: int) -> bytes:
+        self._metrics.count("refused", begun)
+        return _refusal(name, why)
+
+
+def _refusal(name: int, status: int) -> bytes:
+    return ANSWER.pack(MAGIC, ANSWER.size, name, status, 0, *_NO_JOINTS, math.nan, math.nan)

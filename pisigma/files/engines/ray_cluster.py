@@ -1,0 +1,56 @@
+"""The engine of a Ray cluster, or of Ray's workers on this machine."""
+
+import logging
+import os
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
+
+from pisigma.files.engines.engine import ONE_THREAD, AbstractEngine, Item, Result, packed, unpacked, work_on
+
+
+class RayEngine(AbstractEngine):
+    """Works in Ray's tasks, one core each; all machines must see the files under the same paths."""
+
+    def __init__(self, workers: int | None, address: str | None = None) -> None:
+        """Start Ray on this machine with so many workers, or join a cluster.
+
+        Args:
+            workers: on this machine; None for all of its cores. A cluster has its own.
+            address: of a cluster, such as "auto" or "ray://head:10001"; None for this machine.
+
+        Raises:
+            ImportError: Ray is not installed.
+        """
+        import ray
+
+        self._ray: Any = ray  # most of it has no types
+        stated = {"address": address} if address else {"num_cpus": workers}
+        variables = ONE_THREAD if address else {**ONE_THREAD, "PYTHONPATH": os.pathsep.join(sys.path)}
+        self._ray.init(
+            log_to_driver=False, logging_level=logging.ERROR, runtime_env={"env_vars": variables}, **stated
+        )
+        self._workers = max(1, int(self._ray.cluster_resources().get("CPU", 1)))
+
+    @property
+    def workers(self) -> int:
+        """How many cores the cluster has."""
+        return self._workers
+
+    def close(self) -> None:
+        """Leave the cluster, or end Ray on this machine."""
+        self._ray.shutdown()
+
+    def _chunks(
+        self, work: Callable[[Item], Result], chunks: Sequence[Sequence[Item]]
+    ) -> Iterator[tuple[Sequence[Item], list[Result] | None]]:
+        """See `AbstractEngine`."""
+        task = self._ray.remote(num_cpus=1, max_retries=0)(work_on)
+        running = {task.remote(*packed(work, chunk)): chunk for chunk in chunks}
+        while running:
+            (ended,), _ = self._ray.wait(list(running), num_returns=1)
+            chunk = running.pop(ended)
+            try:
+                yield chunk, unpacked(self._ray.get(ended))
+            except (self._ray.exceptions.WorkerCrashedError, self._ray.exceptions.OutOfMemoryError):
+                yield chunk, None

@@ -1,0 +1,121 @@
+"""Plug-ins: modules from outside the package that register sensors, features, exports, error sources or closed forms.
+
+A plug-in is a program that runs with the rights of whoever calls pisigma. So only installed packages (entry points of
+the group `pisigma.plugins`) and the command line (`--plugin FILE`) name one: never a model, a recipe, a manifest or a
+cell, which others may have sent.
+"""
+
+import contextlib
+import hashlib
+import os
+import sys
+import traceback
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from importlib.machinery import SourceFileLoader
+from importlib.util import module_from_spec, spec_from_file_location
+from pathlib import Path
+
+from pisigma.files.errors import PluginError
+
+ENTRY_POINTS = "pisigma.plugins"
+"""Group of the entry points of installed packages."""
+
+
+@dataclass(frozen=True)
+class Plugins:
+    """What this process has loaded, for other processes to load too.
+
+    Attributes:
+        files: absolute paths, in the order in which they were loaded.
+        installed: whether the entry points of installed packages were loaded.
+    """
+
+    files: tuple[str, ...] = ()
+    installed: bool = False
+
+    def load(self) -> None:
+        """Load all that this process has not loaded yet.
+
+        Raises:
+            PluginError: a file or an entry point cannot be loaded.
+        """
+        if self.installed:
+            load_installed()
+        load_files(self.files)
+
+    def content(self) -> tuple[str, ...]:
+        """SHA-256 of every file, for results that depend on what they do."""
+        return tuple(hashlib.sha256(Path(file).read_bytes()).hexdigest() for file in self.files)
+
+
+_loaded = Plugins()
+
+
+def loaded() -> Plugins:
+    """Give what this process has loaded."""
+    return _loaded
+
+
+def load_installed() -> None:
+    """Import the modules that installed packages name as entry points; once a process.
+
+    Raises:
+        PluginError: one cannot be imported.
+    """
+    global _loaded
+    if _loaded.installed:
+        return
+    from importlib.metadata import entry_points  # takes 0.1 s
+
+    for point in entry_points(group=ENTRY_POINTS):
+        origin = f"plug-in '{point.name}'" + (f" of {point.dist.name}" if point.dist else "")
+        with _as_plugin(origin, "mend or uninstall the package"):
+            point.load()
+    _loaded = Plugins(_loaded.files, True)
+
+
+def load_files(files: Iterable[str | os.PathLike[str]]) -> None:
+    """Run Python files as modules, each once a process.
+
+    Raises:
+        PluginError: a file is missing, is no Python file, or cannot be run.
+    """
+    global _loaded
+    for file in files:
+        path = Path(file).resolve()
+        if str(path) in _loaded.files:
+            continue
+        if path.suffix != ".py" or not path.is_file():
+            raise PluginError(f"--plugin: expected a Python file (.py), got '{file}'; check the path.")
+        with _as_plugin(str(file), "correct the file"):
+            _run(path)
+        _loaded = Plugins((*_loaded.files, str(path)), _loaded.installed)
+
+
+def _run(path: Path) -> None:
+    """Run a file as a module of a name of its own, under which other processes unpickle what it defines."""
+    name = f"pisigma_plugin_{path.stem}_{hashlib.sha256(str(path).encode()).hexdigest()[:8]}"
+    spec = spec_from_file_location(name, path, loader=SourceFileLoader(name, str(path)))
+    assert spec is not None
+    assert spec.loader is not None
+    sys.modules[name] = module_from_spec(spec)  # before it runs: dataclasses look their module up
+    try:
+        spec.loader.exec_module(sys.modules[name])
+    except BaseException:
+        del sys.modules[name]
+        raise
+
+
+@contextlib.contextmanager
+def _as_plugin(origin: str, advice: str) -> Iterator[None]:
+    """Say of a problem that it is the plug-in's; what it prints goes to stderr, as stdout is for results."""
+    try:
+        with contextlib.redirect_stdout(sys.stderr):
+            yield
+    except (Exception, SystemExit) as problem:  # nor may it end the command, as if that were done
+        frames = traceback.extract_tb(problem.__traceback__)
+        line = f", line {frames[-1].lineno} of {Path(frames[-1].filename).name}" if frames else ""
+        raise PluginError(
+            f"{origin}: the plug-in cannot be loaded ({type(problem).__name__}: {problem}{line}); {advice}."
+        ) from problem

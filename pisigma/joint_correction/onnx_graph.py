@@ -1,0 +1,150 @@
+"""Writing an ONNX graph node by node, in double precision."""
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from pisigma.files.errors import missing_extra
+
+OPSET, IR_VERSION = 17, 8
+"""Old enough for runtimes of 2022."""
+
+BATCH = "batch"
+"""Name of the first axis of every input and output."""
+
+_TINY = 1e-300
+
+
+def import_onnx() -> Any:
+    """The package onnx, which is not among the requirements.
+
+    Raises:
+        MissingExtraError: it is not installed.
+    """
+    try:
+        import onnx
+    except ImportError as problem:
+        raise missing_extra(problem) or problem from None
+    return onnx
+
+
+class OnnxGraph:
+    """Nodes, constants, inputs and outputs; values are called by their names.
+
+    Attributes:
+        nodes: so far.
+        inputs: descriptions of inputs.
+        outputs: descriptions of outputs.
+    """
+
+    def __init__(self) -> None:
+        """Begin an empty graph.
+
+        Raises:
+            MissingExtraError: onnx is not installed.
+        """
+        self._onnx = import_onnx()
+        self.nodes: list[Any] = []
+        self.inputs: list[Any] = []
+        self.outputs: list[Any] = []
+        self._constants: list[Any] = []
+
+    def add_input(self, name: str, shape: Sequence[int], doc: str) -> str:
+        """Declare an input `(batch, *shape)`, once; gives its name."""
+        if name not in {known.name for known in self.inputs}:
+            self.inputs.append(self._described(name, shape, doc))
+        return name
+
+    def add_output(self, value: str, name: str, shape: Sequence[int], doc: str) -> None:
+        """Give a value out as `(batch, *shape)` under a name."""
+        self.nodes.append(self._onnx.helper.make_node("Identity", [value], [name]))
+        self.outputs.append(self._described(name, shape, doc))
+
+    def constant(self, values: Any) -> str:
+        """A constant of floats (as double) or integers; gives its name."""
+        array = np.asarray(values)
+        array = array.astype(np.int64 if array.dtype.kind in "iu" else np.float64)
+        name = f"constant_{len(self._constants)}"
+        self._constants.append(self._onnx.numpy_helper.from_array(np.ascontiguousarray(array), name))
+        return name
+
+    def node(self, operator: str, *operands: Any, **attributes: Any) -> str:
+        """Apply an operator to values (by name) and constants (numbers or arrays); gives the name of its result."""
+        names = [value if isinstance(value, str) else self.constant(value) for value in operands]
+        result = f"{operator.lower()}_{len(self.nodes)}"
+        self.nodes.append(self._onnx.helper.make_node(operator, names, [result], **attributes))
+        return result
+
+    def columns(self, value: str, indices: Sequence[int]) -> str:
+        """Some columns of `(batch, n)`, or slices of the second axis."""
+        return self.node("Gather", value, np.array(indices, dtype=np.int64), axis=1)
+
+    def column(self, value: str, index: int) -> str:
+        """One column of `(batch, n)` as `(batch, 1)`."""
+        return self.columns(value, [index])
+
+    def reshape(self, value: str, shape: Sequence[int]) -> str:
+        """A value as `(batch, *shape)`; one of them may be -1 if the batch is not to be guessed."""
+        return self.node("Reshape", value, np.array([0, *shape], dtype=np.int64))
+
+    def total(self, value: str, axis: int) -> str:
+        """Sum over an axis, which goes away."""
+        return self.node("ReduceSum", value, np.array([axis], dtype=np.int64), keepdims=0)
+
+    def sum_of_products(self, factors: str, orders: Sequence[int]) -> str:
+        """Sum over units of the products of their factors: `(batch, outputs, factors)` to `(batch, outputs)`."""
+        total, first = "", 0
+        for order in orders:
+            own = self.node("Gather", factors, np.arange(first, first + order), axis=2)
+            value = self.node("ReduceProd", own, axes=[2], keepdims=0)
+            total = self.node("Add", total, value) if total else value
+            first += order
+        return total
+
+    def angle(self, sine: str, cosine: str) -> str:
+        """`atan2(sine, cosine)` to the last digits, of values of any length.
+
+        Runtimes have no arc functions in double. That in float gives an angle a; from there the angle is
+        `a + asin(u)` with `u = (sine cos a - cosine sin a) / length`, some 1e-7, so that two terms of asin do.
+        """
+        node, doubles, floats = self.node, self._onnx.TensorProto.DOUBLE, self._onnx.TensorProto.FLOAT
+        high, wide = node("Abs", sine), node("Abs", cosine)
+        ratio = node("Div", node("Min", high, wide), node("Max", high, wide, _TINY))
+        a = node("Cast", node("Atan", node("Cast", ratio, to=floats)), to=doubles)
+        a = node("Where", node("Greater", high, wide), node("Sub", math.pi / 2, a), a)
+        a = node("Where", node("Less", cosine, 0.0), node("Sub", math.pi, a), a)
+        below = node("Less", node("Reciprocal", sine), 0.0)  # -0 lies below, as for atan2
+        a = node("Where", below, node("Neg", a), a)
+        square = node("Add", node("Mul", sine, sine), node("Mul", cosine, cosine))
+        length = node("Max", node("Sqrt", square), _TINY)
+        off = node("Sub", node("Mul", sine, node("Cos", a)), node("Mul", cosine, node("Sin", a)))
+        u = node("Div", off, length)
+        third = node("Div", node("Mul", u, node("Mul", u, u)), 6.0)
+        return node("Add", a, node("Add", u, third))
+
+    def finish(self, name: str, doc: str, metadata: dict[str, str]) -> bytes:
+        """The model as the content of a file, checked."""
+        from pisigma import __version__
+
+        helper = self._onnx.helper
+        graph = helper.make_graph(
+            self.nodes, name, self.inputs, self.outputs, self._constants, doc_string=doc
+        )
+        model = helper.make_model(
+            graph,
+            opset_imports=[helper.make_opsetid("", OPSET)],
+            ir_version=IR_VERSION,
+            producer_name="pisigma",
+            producer_version=__version__,
+            doc_string=doc,
+        )
+        helper.set_model_props(model, metadata)
+        self._onnx.checker.check_model(model, full_check=True)
+        content: bytes = model.SerializeToString()
+        return content
+
+    def _described(self, name: str, shape: Sequence[int], doc: str) -> Any:
+        double = self._onnx.TensorProto.DOUBLE
+        return self._onnx.helper.make_tensor_value_info(name, double, [BATCH, *shape], doc_string=doc)

@@ -1,6 +1,0 @@
-"""Inverse kinematics in closed form, all branches, for families of robots; a registry."""
-
-from pisigma.kinematics.closed_form.interface import AbstractClosedForm, InverseSolutions
-from pisigma.kinematics.closed_form.registry import closed_form_solver, register_closed_form
-
-__all__ = ["AbstractClosedForm", "InverseSolutions", "closed_form_solver", "register_closed_form"]

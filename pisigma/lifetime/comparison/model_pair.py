@@ -1,0 +1,210 @@
+"""Two models of one robot, with bases and tools that can be compared."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import torch
+from jaxtyping import Float64
+from torch import Tensor
+
+from pisigma.files.errors import ModelError
+from pisigma.measurement.dataset import Measurements
+from pisigma.model.calibrated_model import CalibratedModel
+from pisigma.model.row_poses import poses_of_rows
+from pisigma.robot.description import Robot
+from pisigma.robot.se3 import pose_error, transform_from_xyzrpy
+from pisigma.validation.held_out.frames.frame_fits import LEVER_SHARE, MeasuredPoses, best_base_and_tool
+
+FrameChoice = Literal["fitted", "fixed"]
+"""Whether base and tool of the second model are fitted to those of the first, or are the same by their names."""
+
+POINTS = 60
+"""Joint vectors at which models are compared with their uncertainties, from both models alike."""
+SAMPLES = 3_000
+"""Of the workspace."""
+FITTED = 300
+"""Of these, base and tool are fitted to so many."""
+DRAWN_ALIKE = 0.02
+"""[rad, or of the reach] Drawings that differ by less are of one robot."""
+
+
+@dataclass(frozen=True, eq=False)
+class ModelPair:
+    """Two models of one robot.
+
+    Attributes:
+        first: that the other is compared with.
+        second: the other.
+        frames: how bases and tools are treated.
+        owner: per model the names of the frame and the target that it is compared in.
+        T_base: moves poses of the second into the frame of the first; the identity where frames are fixed.
+        T_tool: the tool of the first as seen from that of the second; likewise.
+    """
+
+    first: CalibratedModel
+    second: CalibratedModel
+    frames: FrameChoice
+    owner: tuple[tuple[str, str], tuple[str, str]]
+    T_base: Float64[Tensor, "4 4"]
+    T_tool: Float64[Tensor, "4 4"]
+
+    @staticmethod
+    def of(first: CalibratedModel, second: CalibratedModel, frames: FrameChoice) -> "ModelPair":
+        """Pair two models.
+
+        Args:
+            first: that the other is compared with.
+            second: the other.
+            frames: "fitted" moves base and tool of the second so that the arms agree best.
+
+        Raises:
+            ModelError: they are models of different robots, have no frame or target in common where these are fixed, or
+                keep no joint values at which both predict a pose.
+        """
+        _check_one_robot(first, second)
+        owner = _owners(first, second, frames)
+        eye = torch.eye(4, dtype=torch.float64)
+        pair = ModelPair(first, second, frames, owner, eye, eye)
+        T_first, T_second = pair.poses(pair.workspace[:: SAMPLES // FITTED])
+        there = torch.isfinite(T_first + T_second).all(-1).all(-1)
+        if not bool(there.any()):
+            raise ModelError(
+                f"models {first.name} and {second.name} keep no joint values at which both predict a pose; make them "
+                "again with `pisigma calibrate` or `pisigma train`."
+            )
+        if frames == "fixed":
+            return pair
+        lever = LEVER_SHARE * first.robot.reach
+        measured = MeasuredPoses(T_first[there, :3, 3], T_first[there, :3, :3], there[there], lever)
+        return ModelPair(first, second, frames, owner, *best_base_and_tool(T_second[there], measured))
+
+    @property
+    def points(self) -> Float64[Tensor, "points dof"]:
+        """Joint values [rad or m] that the models keep of their training rows, from both alike."""
+        generator = torch.Generator().manual_seed(0)
+        drawn = [
+            model.starts[torch.randperm(len(model.starts), generator=generator)[: POINTS // 2]]
+            for model in (self.first, self.second)
+        ]
+        return torch.cat(drawn)
+
+    @property
+    def workspace(self) -> Float64[Tensor, "samples dof"]:
+        """Joint values that both models keep, and others drawn within the ranges that both have in common."""
+        kept = torch.unique(torch.cat([self.first.starts, self.second.starts]), dim=0)
+        ranges = [(model.starts.amin(0), model.starts.amax(0)) for model in (self.first, self.second)]
+        low, high = torch.maximum(ranges[0][0], ranges[1][0]), torch.minimum(ranges[0][1], ranges[1][1])
+        inside = ((kept >= low) & (kept <= high)).all(1)
+        kept = kept[inside] if bool(inside.any()) else kept
+        if bool((low > high).any()):  # the models were measured in different places
+            low, high = kept.amin(0), kept.amax(0)
+        generator = torch.Generator().manual_seed(0)
+        drawn = torch.rand(max(SAMPLES - len(kept), 0), kept.shape[1], generator=generator, dtype=kept.dtype)
+        return torch.cat([kept[:SAMPLES], low + drawn * (high - low)])
+
+    def poses(
+        self, q: Float64[Tensor, "poses dof"]
+    ) -> tuple[Float64[Tensor, "poses 4 4"], Float64[Tensor, "poses 4 4"]]:
+        """Poses of the tool that both models predict, in the frame of the first; NaN where one predicts none."""
+        first, second = (
+            poses_of_rows(model, Measurements(q=q, frame=(frame,) * len(q), target=(target,) * len(q)))
+            for model, (frame, target) in zip((self.first, self.second), self.owner, strict=True)
+        )
+        return first, self.T_base @ second @ self.T_tool
+
+    @torch.no_grad()
+    def displacement(self, q: Float64[Tensor, "poses dof"]) -> Float64[Tensor, "poses 6"]:
+        """By how much the second model has the tool elsewhere: shift [m], and turn as a rotation vector [rad]."""
+        first, second = self.poses(q)
+        there = torch.isfinite(first + second).all(-1).all(-1)[:, None, None]
+        eye = torch.eye(4, dtype=torch.float64)
+        error = pose_error(torch.where(there, second, eye), torch.where(there, first, eye))
+        return torch.where(there[..., 0], error, torch.nan)
+
+    def frames_of_second(self) -> tuple[Float64[Tensor, "4 4"], Float64[Tensor, "4 4"]]:
+        """Base and tool of the second model where they are compared with those of the first."""
+        base, tool = frames_of(self.second, self.owner[1])
+        return self.T_base @ base, tool @ self.T_tool
+
+
+def frames_of(
+    model: CalibratedModel, owner: tuple[str, str]
+) -> tuple[Float64[Tensor, "4 4"], Float64[Tensor, "4 4"]]:
+    """Base and tool of the geometry that a model predicts with, by the names of a frame and a target."""
+    robot = model.identified
+    bases, tools = (
+        (model.bases, model.tools) if model.hybrid is None else (model.hybrid_bases, model.hybrid_tools)
+    )
+    base, tool = bases.get(owner[0], robot.base), tools.get(owner[1], robot.tool)
+    T = [transform_from_xyzrpy(torch.from_numpy(np.array(frame))) for frame in (base, tool)]
+    return T[0], T[1]
+
+
+def as_drawn(model: CalibratedModel) -> Robot:
+    """The robot that a model was made of."""
+    return model.drawn or model.robot
+
+
+def _owners(
+    first: CalibratedModel, second: CalibratedModel, frames: FrameChoice
+) -> tuple[tuple[str, str], tuple[str, str]]:
+    """Frame and target that every model is compared in: the first that both have, else the first of each."""
+    owners: tuple[list[str], list[str]] = ([], [])
+    for what, mine, others in (
+        ("frame", first.bases, second.bases),
+        ("target", first.tools, second.tools),
+    ):
+        names = list(mine) or [""], list(others) or [""]
+        common = [name for name in names[0] if name in names[1]]
+        if not common and frames == "fixed" and "" not in (names[0][0], names[1][0]):
+            raise ModelError(
+                f"models {first.name} and {second.name} have no {what} in common ({', '.join(names[0])} and "
+                f"{', '.join(names[1])}); compare them with fitted frames."
+            )
+        for own, chosen in zip(owners, names, strict=True):
+            own.append(common[0] if common else chosen[0])
+    return (owners[0][0], owners[0][1]), (owners[1][0], owners[1][1])
+
+
+def _check_one_robot(first: CalibratedModel, second: CalibratedModel) -> None:
+    """Refuse models of different robots, with what is different."""
+    robots = as_drawn(first), as_drawn(second)
+    what = _difference(*robots)
+    if what:
+        raise ModelError(
+            f"models {first.name} (robot '{robots[0].name}') and {second.name} (robot '{robots[1].name}') are of "
+            f"different robots: {what}; give two models of one robot."
+        )
+
+
+def _difference(one: Robot, other: Robot) -> str:
+    """Say what two robots as drawn differ in; "" where they are one."""
+    if one.dof != other.dof:
+        return f"one has {one.dof} joints and the other {other.dof}"
+    types = [[row.type for row in robot.rows] for robot in (one, other)]
+    if types[0] != types[1]:
+        return f"their rows are {', '.join(types[0])} and {', '.join(types[1])}"
+    if tuple(one.directions) != tuple(other.directions):
+        return "a joint turns the other way"
+    if not _coupled_alike(one, other):
+        return "their controllers couple the joints differently"
+    scale = np.array([1.0, one.reach, one.reach, 1.0, 1.0])
+    by = one.dh - other.dh
+    by[:, [0, 3, 4]] = 2 * np.sin(by[:, [0, 3, 4]] / 2)  # angles are the same after a full turn
+    apart = np.abs(by) / scale
+    row, column = np.unravel_index(int(apart.argmax()), apart.shape)
+    if apart[row, column] <= DRAWN_ALIKE:
+        return ""
+    name = ("theta", "d", "a", "alpha", "beta")[int(column)]
+    unit, factor = ("mm", 1e3) if name in ("d", "a") else ("deg", float(np.rad2deg(1.0)))
+    values = [f"{robot.dh[row, column] * factor:.6g}" for robot in (one, other)]
+    return f"{name} of row '{one.rows[row].name}' is drawn as {values[0]} and as {values[1]} {unit}"
+
+
+def _coupled_alike(one: Robot, other: Robot) -> bool:
+    """Whether the controllers' values mean the same joint values."""
+    if len(one.axes) != len(other.axes):
+        return False
+    values = np.eye(len(one.axes))
+    return bool(np.allclose(one.to_dh(values), other.to_dh(values), equal_nan=True))

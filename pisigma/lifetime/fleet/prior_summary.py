@@ -1,0 +1,103 @@
+"""The figures of a fleet prior as one typed value, which its card, tables and JSON render."""
+
+import math
+from collections.abc import Sequence
+
+from pydantic import Field
+
+from pisigma.files.yaml_file import Section
+from pisigma.lifetime.fleet.prior import FleetPrior
+from pisigma.measurement.sensors.sensor import SHOWN_UNITS
+from pisigma.model.model_posterior import FLEET_PRIOR
+from pisigma.validation.held_out.summary import AbstractSummary
+
+
+class CommonFigures(Section):
+    """What the robots have in common of one parameter.
+
+    Attributes:
+        name: such as "theta_1".
+        unit: "mm" or "deg".
+        mean: of the errors.
+        deviation: standard deviation between robots.
+    """
+
+    name: str
+    unit: str
+    mean: float
+    deviation: float
+
+
+class SpectrumFigures(Section):
+    """Standard deviation between robots of the weights of a feature.
+
+    Attributes:
+        group: such as "harmonics 1 to 1".
+        deg: root mean square over the weights of the group [deg, or the same of lengths over the reach].
+    """
+
+    group: str
+    deg: float
+
+
+class FleetPriorSummary(AbstractSummary):
+    """All figures of a fleet prior.
+
+    Attributes:
+        robots: number of robots that count.
+        odd: ids of those that are unlike the others and do not.
+        refused: by id why the file of a robot cannot be read, which does not count either.
+        remarks: on the rows of robots that count, a sentence each.
+        rows: of all robots.
+        parameters: what they have in common.
+        spectrum: of the joint correction.
+    """
+
+    kinds = (FLEET_PRIOR,)
+
+    robots: int
+    odd: tuple[str, ...]
+    refused: dict[str, str] = Field(default_factory=dict)
+    remarks: tuple[str, ...] = ()
+    rows: int
+    parameters: tuple[CommonFigures, ...]
+    spectrum: tuple[SpectrumFigures, ...]
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What to heed, a sentence each."""
+        odd = (f"Robot '{name}' is unlike the others and did not count." for name in self.odd)
+        refused = (f"Robot '{name}' did not count: {reason}" for name, reason in self.refused.items())
+        return (*odd, *refused, *self.remarks)
+
+
+def summarise_prior(prior: FleetPrior, ids: Sequence[str]) -> FleetPriorSummary:
+    """Give all figures.
+
+    Args:
+        prior: of the fleet.
+        ids: of its robots.
+    """
+    population, uncertainty = prior.population, prior.model.uncertainty
+    assert uncertainty is not None
+    deviation = population.covariance.diagonal().sqrt()
+    parameters = []
+    for number, name in enumerate(prior.names):
+        unit, scale = SHOWN_UNITS[uncertainty.space.parameters[number].unit]
+        mean, spread = float(population.mean[number]) * scale, float(deviation[number]) * scale
+        parameters.append(CommonFigures(name=name, unit=unit, mean=mean, deviation=spread))
+    weights, start, spectrum = deviation[population.geometric :], 0, []
+    for feature in uncertainty.features:
+        group = feature.group[feature.used]
+        chosen = weights[start : start + len(group)]
+        start += len(group)
+        for number, what in enumerate(feature.group_names):
+            size = float(chosen[group == number].square().mean().sqrt())
+            spectrum.append(SpectrumFigures(group=f"{feature.name}: {what}", deg=math.degrees(size)))
+    return FleetPriorSummary(
+        robots=len(ids) - len(prior.odd),
+        odd=tuple(ids[number] for number in prior.odd),
+        rows=prior.model.provenance.rows,
+        parameters=tuple(parameters),
+        spectrum=tuple(spectrum),
+    )

@@ -1,0 +1,187 @@
+"""Control charts over sessions: EWMA and CUSUM of what should not change, with a stated rate of false alarms."""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cache, cached_property
+from typing import Any, Literal
+
+import torch
+from jaxtyping import Bool, Float64
+from torch import Tensor
+
+from pisigma.measurement.sensors.sensor import ShownUnit
+
+FALSE_ALARMS_PER_YEAR = 0.05
+"""Of all charts of a robot together, where nothing changes."""
+SESSIONS_PER_YEAR = 12
+WEIGHT = 0.2
+"""Of the newest session in the moving average."""
+ALLOWANCE = 0.5
+"""[standard deviations of a session] Shifts of half of it do not add to the cumulative sum."""
+STATES = 101
+OVERSHOOT = 1.166
+
+AlarmKind = Literal["EWMA", "CUSUM"]
+
+
+@dataclass(frozen=True)
+class Limits:
+    """Limits of the statistics of a chart [standard deviations].
+
+    Attributes:
+        ewma: of the exponentially weighted moving average.
+        cusum: of the cumulative sums.
+    """
+
+    ewma: float
+    cusum: float
+
+
+@dataclass(frozen=True, eq=False)
+class Chart:
+    """One quantity over sessions, each compared with what the earlier ones and the model let expect.
+
+    Attributes:
+        what: is charted, such as "joint 2" or "error".
+        unit: of the values.
+        values: per session; NaN where it says nothing of the quantity.
+        deviations: their standard deviations where nothing changes.
+        scores: of the sessions, independent and of standard deviation 1 where nothing changes.
+        limits: of EWMA and CUSUM.
+        one_sided: whether only a rise counts.
+    """
+
+    what: str
+    unit: ShownUnit
+    values: Float64[Tensor, " sessions"]
+    deviations: Float64[Tensor, " sessions"]
+    scores: Float64[Tensor, " sessions"]
+    limits: Limits
+    one_sided: bool = False
+
+    @cached_property
+    def ewma(self) -> Float64[Tensor, " sessions"]:
+        """Moving average of the scores [standard deviations of a score]; Roberts 1959, Technometrics 1(3)."""
+        average, averages = 0.0, []
+        for score in self.scores.tolist():
+            average = average if math.isnan(score) else (1 - WEIGHT) * average + WEIGHT * score
+            averages.append(average)
+        return torch.tensor(averages, dtype=torch.float64)
+
+    @cached_property
+    def cusum(self) -> Float64[Tensor, "sessions 2"]:
+        """Cumulative sums of rises and of falls; Page 1954, Biometrika 41."""
+        rise = fall = 0.0
+        sums = []
+        for score in self.scores.tolist():
+            if not math.isnan(score):
+                rise, fall = max(rise + score - ALLOWANCE, 0.0), max(fall - score - ALLOWANCE, 0.0)
+            sums.append((rise, fall))
+        return torch.tensor(sums, dtype=torch.float64).reshape(-1, 2)
+
+    @property
+    def ewma_share(self) -> Float64[Tensor, " sessions"]:
+        """Moving average over its limit; more than 1 is an alarm."""
+        return (self.ewma if self.one_sided else self.ewma.abs()) / self.limits.ewma
+
+    @property
+    def cusum_share(self) -> Float64[Tensor, " sessions"]:
+        """The larger cumulative sum over its limit; more than 1 is an alarm."""
+        return (self.cusum[:, 0] if self.one_sided else self.cusum.amax(1)) / self.limits.cusum
+
+    @cached_property
+    def outside(self) -> dict[AlarmKind, Bool[Tensor, " sessions"]]:
+        """By statistic, the sessions at which it is outside its limit."""
+        return {"EWMA": self.ewma_share > 1, "CUSUM": self.cusum_share > 1}
+
+    @property
+    def alarm(self) -> int | None:
+        """Number of the session from which on a statistic has been outside its limit until now; None if neither is."""
+        outside = torch.stack(list(self.outside.values())).any(0)
+        if not len(outside) or not bool(outside[-1]):
+            return None
+        inside = (~outside).nonzero()[:, 0]
+        return int(inside[-1]) + 1 if len(inside) else 0
+
+    @property
+    def kinds(self) -> tuple[AlarmKind, ...]:
+        """Which statistics are outside their limits at the last session."""
+        return tuple(kind for kind, outside in self.outside.items() if len(outside) and bool(outside[-1]))
+
+    def to_json(self, dates: Sequence[str]) -> dict[str, Any]:
+        """The chart of sessions of these dates as plain values; what is no number is None."""
+        values = {
+            f"values_{self.unit}": self.values,
+            f"deviations_{self.unit}": self.deviations,
+            "scores": self.scores,
+            "ewma_of_limit": self.ewma_share,
+            "cusum_of_limit": self.cusum_share,
+        }
+        numbers = {
+            name: [None if math.isnan(one) else one for one in those.tolist()]
+            for name, those in values.items()
+        }
+        alarm = None if self.alarm is None else dates[self.alarm]
+        return {"what": self.what, **numbers, "limits": vars(self.limits), "alarm": alarm}
+
+
+def innovations(
+    values: Float64[Tensor, " sessions"], covariance: Float64[Tensor, "sessions sessions"]
+) -> Float64[Tensor, " sessions"]:
+    """Independent scores of values that err together, such as by the same error of the model.
+
+    With the covariance `L L^T` the scores are `L^-1 values`: every value minus what the earlier ones let expect, over
+    the standard deviation of that. NaN stays NaN.
+    """
+    scores = torch.full_like(values, torch.nan)
+    there = torch.isfinite(values).nonzero()[:, 0]
+    L = torch.linalg.cholesky(covariance[there[:, None], there])
+    scores[there] = torch.linalg.solve_triangular(L, values[there, None], upper=False)[:, 0]
+    return scores
+
+
+@cache
+def limits_of(charts: int, one_sided: bool = False) -> Limits:
+    """Limits with which all charts of a robot give `FALSE_ALARMS_PER_YEAR` together.
+
+    The mean number of sessions to a false alarm is that of Brook and Evans 1972 (Biometrika 59(3)) for the moving
+    average, as a chain of states, and Siegmund's 1985 (Sequential Analysis, eq. 2.57) for the sums.
+
+    Args:
+        charts: how many there are, each with both statistics.
+        one_sided: whether only a rise counts.
+    """
+    sessions = 2 * charts * SESSIONS_PER_YEAR / FALSE_ALARMS_PER_YEAR
+    sides = 1 if one_sided else 2
+    return Limits(
+        ewma=_solved(lambda limit: ewma_sessions(limit, one_sided), sessions, 0.1, 3.0),
+        cusum=_solved(lambda limit: cusum_sessions(limit) / sides, sessions, 0.5, 20.0),
+    )
+
+
+def ewma_sessions(limit: float, one_sided: bool) -> float:
+    """Mean number of sessions until the moving average passes a limit, or either limit."""
+    low = -4.0 * math.sqrt(WEIGHT / (2 - WEIGHT)) if one_sided else -limit
+    edges = torch.linspace(low, limit, STATES + 1, dtype=torch.float64)
+    middle = (edges[1:] + edges[:-1]) / 2
+    until = torch.special.ndtr((edges - (1 - WEIGHT) * middle[:, None]) / WEIGHT)
+    moves = until.diff(dim=1)
+    if one_sided:  # what falls lower stays in the lowest state
+        moves[:, 0] += until[:, 0]
+    mean = torch.linalg.solve(torch.eye(STATES, dtype=torch.float64) - moves, torch.ones_like(middle))
+    return float(mean[int(middle.abs().argmin())])
+
+
+def cusum_sessions(limit: float) -> float:
+    """Mean number of sessions until a cumulative sum passes its limit."""
+    b = 2 * ALLOWANCE * (limit + OVERSHOOT)
+    return (math.exp(b) - b - 1) / (2 * ALLOWANCE**2)
+
+
+def _solved(sessions_of: Callable[[float], float], wanted: float, low: float, high: float) -> float:
+    """The limit with a wanted mean number of sessions, by bisection."""
+    for _ in range(40):
+        middle = (low + high) / 2
+        low, high = (middle, high) if sessions_of(middle) < wanted else (low, middle)
+    return high

@@ -1,0 +1,174 @@
+"""What a model's sessions were judged to be, in a small SQLite file beside the model folder."""
+
+import io
+import os
+import sqlite3
+from collections.abc import Iterator, Sequence
+from contextlib import closing, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from pydantic import TypeAdapter, ValidationError
+
+from pisigma.files.errors import OutputError
+from pisigma.lifetime.monitoring.session import JointZeros, Session
+from pisigma.measurement.copies import RowValues
+
+SUFFIX = ".history.sqlite"
+LONGEST_WAIT = 10.0
+"""[s] For another process that writes."""
+_TABLE = """CREATE TABLE IF NOT EXISTS sessions (
+    model TEXT NOT NULL, rows TEXT NOT NULL, file TEXT NOT NULL, date TEXT NOT NULL, temperature_c REAL,
+    session TEXT NOT NULL, zeros BLOB NOT NULL, PRIMARY KEY (model, rows))"""
+_SESSION = TypeAdapter(Session)
+_VALUES = ("numbers", "steps", "kind", "file")
+
+
+@dataclass(frozen=True, eq=False)
+class Record:
+    """A session with its day.
+
+    Attributes:
+        file: that the rows came from.
+        date: of the measurement, as ISO 8601 writes it.
+        rows_sha256: of the rows.
+        temperature_c: mean of the rows [deg C]; None where they do not state it.
+        session: what it says.
+        zeros: of the joints.
+        values: joint values and readings of its rows, by which they are recognised when they come again; None in
+            histories of earlier versions.
+    """
+
+    file: str
+    date: str
+    rows_sha256: str
+    temperature_c: float | None
+    session: Session
+    zeros: JointZeros
+    values: RowValues | None = None
+
+    def to_json(self) -> dict[str, Any]:
+        """The session as plain values, in mm."""
+        session = self.session
+        return {
+            "file": self.file,
+            "date": self.date,
+            "rows": session.rows,
+            "verdict": session.verdict,
+            "unchanged_probability": session.unchanged,
+            "moved": [one.to_json() for one in session.moved],
+            "candidates": [{"what": what, "probability": share} for what, share in session.candidates],
+            "unobservable": [f"joint {k}" for k, seen in enumerate(session.observable, 1) if not seen],
+            "remarks": list(session.unobservable),
+            "outliers": list(session.outliers),
+            "rms_mm": session.rms * 1e3,
+            "expected_gain_mm": session.gain * 1e3,
+            "recalibrate": session.recalibrate,
+        }
+
+
+def history_path(model: str | os.PathLike[str]) -> Path:
+    """Where the history of a model folder is kept: `MODEL.history.sqlite` beside it."""
+    folder = Path(os.path.realpath(model))
+    return folder.with_name(folder.name + SUFFIX)
+
+
+def remember(path: Path, model: str, records: Sequence[Record]) -> tuple[Record, ...]:
+    """Add sessions to a history and give all of it.
+
+    All are added in one transaction, or none where the process ends before. A session with the same rows takes the
+    place of the one that is there.
+
+    Args:
+        path: of the history; made where missing.
+        model: hash of the model, whose sessions alone are given back.
+        records: to add.
+
+    Returns:
+        All sessions of the model, by their dates.
+
+    Raises:
+        OutputError: the file is no history or cannot be written.
+    """
+    with _opened(path) as database:
+        with database:  # one transaction
+            database.execute(_TABLE)
+            database.executemany(
+                "INSERT OR REPLACE INTO sessions VALUES (?, ?, ?, ?, ?, ?, ?)",
+                [
+                    (
+                        *(model, one.rows_sha256, one.file, one.date, one.temperature_c),
+                        *(_SESSION.dump_json(one.session).decode(), _packed(one.zeros, one.values)),
+                    )
+                    for one in records
+                ],
+            )
+        return _records(database, model)
+
+
+def recall(path: Path, model: str) -> tuple[Record, ...]:
+    """Give all sessions of a model in a history, which may not be there yet, by their dates.
+
+    Raises:
+        OutputError: the file is no history.
+    """
+    if not path.exists():
+        return ()
+    with _opened(path) as database:
+        there = database.execute("SELECT name FROM sqlite_master WHERE name = 'sessions'").fetchall()
+        return _records(database, model) if there else ()
+
+
+def _records(database: sqlite3.Connection, model: str) -> tuple[Record, ...]:
+    rows = database.execute(
+        "SELECT file, date, rows, temperature_c, session, zeros FROM sessions WHERE model = ?", (model,)
+    )
+    return in_order(
+        [
+            Record(file, date, sha256, temperature, _SESSION.validate_json(session), *_unpacked(zeros))
+            for file, date, sha256, temperature, session, zeros in rows
+        ]
+    )
+
+
+def in_order(records: Sequence[Record]) -> tuple[Record, ...]:
+    """Sessions by their dates; of one day by their files."""
+    return tuple(sorted(records, key=lambda one: (one.date, one.file, one.rows_sha256)))
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[sqlite3.Connection]:
+    try:
+        with closing(sqlite3.connect(path, timeout=LONGEST_WAIT)) as database:
+            yield database
+    except (sqlite3.Error, ValidationError, ValueError, KeyError) as problem:
+        raise OutputError(
+            f"{path}: the history of the model cannot be used ({problem}); move the file away to begin a new one, or "
+            "monitor without a history (--no-history)."
+        ) from None
+
+
+def _packed(zeros: JointZeros, values: RowValues | None) -> bytes:
+    stream = io.BytesIO()
+    rows = {} if values is None else {f"rows_{name}": getattr(values, name).numpy() for name in _VALUES}
+    np.savez(
+        stream,
+        shift=zeros.shift.numpy(),
+        deviation=zeros.deviation.numpy(),
+        influence=zeros.influence.numpy(),
+        own=zeros.own.numpy(),
+        **rows,
+    )
+    return stream.getvalue()
+
+
+def _unpacked(content: bytes) -> tuple[JointZeros, RowValues | None]:
+    with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
+        names = ("shift", "deviation", "influence", "own")
+        zeros = JointZeros(*(torch.from_numpy(arrays[name].astype(np.float64)) for name in names))
+        if not {f"rows_{name}" for name in _VALUES} <= set(arrays):
+            return zeros, None
+        return zeros, RowValues(*(torch.from_numpy(arrays[f"rows_{name}"]) for name in _VALUES))

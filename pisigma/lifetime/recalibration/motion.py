@@ -1,0 +1,118 @@
+"""What has moved since a model was made, where the model holds a posterior that says how sure that is."""
+
+from collections.abc import Collection
+from contextlib import suppress
+from dataclasses import replace
+
+import torch
+
+from pisigma.files.errors import IdentificationError, ModelError
+from pisigma.lifetime.monitoring.session import Session, is_frame, judge_session, shown_probability
+from pisigma.lifetime.recalibration.recalibration_problem import owners_in
+from pisigma.lifetime.recalibration.wear import beyond_wear
+from pisigma.measurement.dataset import Measurements
+from pisigma.model.calibrated_model import CalibratedModel
+from pisigma.model.model_posterior import ModelPosterior
+from pisigma.validation.checks.rows.mixed_rows import MOST_WRONG, many_wrong
+from pisigma.validation.held_out.diagnostic import Diagnostic
+from pisigma.validation.held_out.frames.fitted_frames import FrameKind
+from pisigma.validation.held_out.model_comparison import ModelComparison
+from pisigma.validation.setup_faults.cause import joined, length_text
+from pisigma.validation.setup_faults.explanations import PLAUSIBLE_SHARE
+from pisigma.validation.setup_faults.faults_as_drawn import measured_rows, spread
+from pisigma.validation.setup_faults.setup_faults import judged_values
+
+MOST_ROWS = 60
+"""Rows that the question is decided on; its covariance is of all their values."""
+
+
+def judged_motion(
+    model: CalibratedModel, rows: Measurements, fitted: Collection[FrameKind] = ()
+) -> Session | None:
+    """Say which joint, length, base or tool has moved since a model was made; see `judge_session`.
+
+    Args:
+        model: the model.
+        rows: in frames and of targets that the model has or that are fitted.
+        fitted: what stands elsewhere for certain.
+
+    Returns:
+        What it says, without what is fitted; None where the model holds no posterior, where the rows do not determine
+        what is fitted, and where it is not to be trusted, see `session_diagnostics`.
+    """
+    with suppress(IdentificationError, ModelError):
+        posterior = ModelPosterior.of(model)
+        some = judged_values(model, rows)
+        if rows.position is not None:
+            some = replace(some.select(spread(measured_rows(rows), MOST_ROWS)), pair=None, distance=None)
+        some = posterior.renamed(some)
+        with torch.no_grad():
+            session, _ = judge_session(model, posterior, some, owners_in(some, fitted) if fitted else None)
+        moved = tuple(one for one in session.moved if one.moved.what.split()[0] not in fitted)
+        if not session_diagnostics(model, some, session):
+            return replace(session, moved=moved)
+    return None
+
+
+def session_diagnostics(
+    model: CalibratedModel, rows: Measurements, session: Session
+) -> tuple[Diagnostic, ...]:
+    """Say why what a session shows is not to be trusted, although the checks of its rows found nothing.
+
+    Args:
+        model: that it was compared with.
+        rows: of the session.
+        session: what it says.
+    """
+    if len(session.outliers) > MOST_WRONG * rows.rows:
+        wrong = [rows.place(row) in session.outliers for row in range(rows.rows)]
+        return (many_wrong(rows, torch.tensor(wrong)),)
+    limit = PLAUSIBLE_SHARE * model.robot.reach
+    if session.rms_after > limit:
+        sentence = (
+            f"{rows.source}: the errors are {session.rms * 1e3:.4g} mm, and no motion explains them that leaves less "
+            f"than {limit * 1e3:.3g} mm: another robot than that of model '{model.name}' was measured, or a column or "
+            "a unit is wrong; run `pisigma verify` on them."
+        )
+        return (Diagnostic(kind="implausible_errors", severity="implausible", sentence=sentence),)
+    return beyond_wear(model.robot, [one.moved for one in session.moved])
+
+
+def motion_sentence(motion: Session, comparison: ModelComparison) -> str:
+    """Say what of the arm has moved, how sure that is, and what recalibrating is expected to gain."""
+    means = (length_text(comparison.models[index].position.statistics["mean"] / 1e3) for index in (-1, 0))
+    errors = (length_text(rms) for rms in (motion.rms, motion.rms_after))
+    return (
+        f"{motion_text(motion)}, and the mean error is {next(means)} ({next(means)} under the nominal robot). "
+        f"Recalibrating is expected to lower the RMS error from {next(errors)} to {next(errors)}."
+    )
+
+
+def motion_warnings(motion: Session) -> tuple[str, ...]:
+    """Say what has moved so little that it changes no verdict, or that something has and it is not clear what."""
+    if motion.verdict == "unchanged":
+        return ()
+    return (
+        (f"{motion_text(motion)}.",)
+        if motion.moved
+        else (f"{motion.sentence[:1].upper()}{motion.sentence[1:]}",)
+    )
+
+
+def motion_text(motion: Session) -> str:
+    """Say what has moved, such as "Joint 3 has moved by 0.24 ± 0.01 deg (probability more than 99.9 %)"."""
+    amounts: dict[tuple[str, float], list[str]] = {}
+    for one in motion.moved:
+        amounts.setdefault((one.moved.what, one.probability), []).append(one.moved.size)
+    text = joined(
+        f"{_subject(what)} by {joined(those)} (probability {shown_probability(probability)})"
+        for (what, probability), those in amounts.items()
+    )
+    return f"{text[:1].upper()}{text[1:]}"
+
+
+def _subject(what: str) -> str:
+    """Say that a base or a tool, a joint or a geometric parameter such as "d_4" is another one."""
+    if is_frame(what):
+        return f"the {what} has moved"
+    return f"the parameter {what} has changed" if "_" in what else f"{what} has moved"

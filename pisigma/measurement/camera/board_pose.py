@@ -1,0 +1,157 @@
+"""The pose of a board in one image, and its covariance."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float64
+
+from pisigma.estimation.loss import AbstractLoss
+from pisigma.measurement.camera.camera import Camera
+from pisigma.robot.se3 import nearest_rotation, rotation_from_vector, skew
+
+FEWEST_CORNERS = 6
+"""Of an image: four determine the pose, two more show whether one is wrong."""
+STEPS = 20
+SMALLEST_STEP = 1e-10
+"""[m or rad] Steps are not continued below."""
+SMALLEST_NOISE = 1e-6
+"""[px] Floor of the noise of corners, for exact ones."""
+POSE = 6
+
+
+@dataclass(frozen=True, eq=False)
+class BoardPose:
+    """Where a board was in front of a camera.
+
+    Attributes:
+        R: R_camera_board.
+        t: origin of the board in the camera's frame [m].
+        cofactor: covariance of an error (shift of t [m], turn of R as a rotation vector in the camera's frame [rad])
+            for a noise of the corners of 1 px.
+        distance: by how much every corner misses its prediction [px: of corners of the usual deviation].
+        weight: how much every corner counts by the loss.
+        by_intrinsics: derivative of the pose (shift of t [m], turn of R as a rotation vector in the camera's frame
+            [rad]) by the intrinsics, which the corners are solved anew with.
+        root: with `rest` what the corners say of the intrinsics k whatever the pose is, for a noise of 1 px:
+            `root (k - present) = rest`.
+        rest: see root [px].
+    """
+
+    R: Float64[np.ndarray, "3 3"]
+    t: Float64[np.ndarray, " 3"]
+    cofactor: Float64[np.ndarray, "6 6"]
+    distance: Float64[np.ndarray, " corners"]
+    weight: Float64[np.ndarray, " corners"]
+    by_intrinsics: Float64[np.ndarray, "6 9"]
+    root: Float64[np.ndarray, "9 9"]
+    rest: Float64[np.ndarray, " 9"]
+
+
+def solve_board_pose(
+    camera: Camera,
+    corners: Float64[np.ndarray, "corners 3"],
+    pixels: Float64[np.ndarray, "corners 2"],
+    loss: AbstractLoss,
+    sigma: Float64[np.ndarray, " corners"] | None = None,
+) -> BoardPose:
+    """Find the pose of a flat board by Gauss-Newton steps, from the homography of its corners (Zhang 2000).
+
+    With the point `P = R X + t` of a corner X, a shift δ and a turn ω move P by `δ + ω × R X`.
+
+    Args:
+        camera: its intrinsics are taken as they are.
+        corners: in the frame of the board [m], all with z near 0 and not on one line.
+        pixels: where the image shows them [px].
+        loss: how corners count that are far from their prediction.
+        sigma: standard deviation of every corner over the usual one; None where all are alike.
+    """
+    sigma = np.ones(len(pixels)) if sigma is None else sigma
+    R, t = _by_homography(corners, camera.undistort(pixels))
+    for _ in range(STEPS):
+        residual, J, _ = linearised(camera, corners, pixels, sigma, R, t)
+        root = np.sqrt(_weights(residual, loss))[:, None]
+        A, b = (root[..., None] * J).reshape(-1, POSE), (root * residual).ravel()
+        step = np.linalg.solve(A.T @ A, A.T @ b)
+        t, R = t + step[:3], rotation_from_vector(torch.from_numpy(step[3:])).numpy() @ R
+        if np.abs(step).max() < SMALLEST_STEP:
+            break
+    residual, J, _ = linearised(camera, corners, pixels, sigma, R, t)
+    weight = _weights(residual, loss)
+    by_intrinsics = camera.by_intrinsics(corners @ R.T + t) / sigma[:, None, None]
+    columns = np.concatenate([J, by_intrinsics, residual[..., None]], -1)
+    factor = triangle((np.sqrt(weight)[:, None, None] * columns).reshape(-1, columns.shape[-1]))
+    inverse = np.linalg.inv(factor[:POSE, :POSE])
+    return BoardPose(
+        R,
+        t,
+        inverse @ inverse.T,
+        np.linalg.norm(residual, axis=1),
+        weight,
+        by_intrinsics=-inverse @ factor[:POSE, POSE:-1],
+        root=factor[POSE:-1, POSE:-1],
+        rest=factor[POSE:-1, -1],
+    )
+
+
+def triangle(columns: Float64[np.ndarray, "values columns"]) -> Float64[np.ndarray, "columns columns"]:
+    """Return the triangular factor of a matrix, square also where it has fewer rows than columns.
+
+    Its first rows belong to the pose, the next ones to what is left for other unknowns once the pose is eliminated.
+    """
+    count = columns.shape[1]
+    padded = np.concatenate([columns, np.zeros((count, count))])
+    factor: np.ndarray = np.linalg.qr(padded, mode="r")  # type: ignore[assignment]
+    return factor
+
+
+def linearised(
+    camera: Camera, corners: np.ndarray, pixels: np.ndarray, sigma: np.ndarray, R: np.ndarray, t: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return measured minus predicted pixels, and the predicted ones' derivative by pose and by point, over sigma."""
+    turned = corners @ R.T
+    predicted, by_point = camera.project(turned + t)
+    by_turn = -by_point @ skew(torch.from_numpy(turned)).numpy()
+    J = np.concatenate([by_point, by_turn], -1)
+    return (pixels - predicted) / sigma[:, None], J / sigma[:, None, None], by_point / sigma[:, None, None]
+
+
+def _weights(residual: np.ndarray, loss: AbstractLoss) -> np.ndarray:
+    distance = torch.from_numpy(np.linalg.norm(residual, axis=1))
+    scale = max(float(loss.scale(distance, 2, float(POSE))), SMALLEST_NOISE)
+    weights: np.ndarray = loss.weight(distance / scale, 2).numpy()
+    return weights
+
+
+def homography(
+    plane: Float64[np.ndarray, "corners 2"], image: Float64[np.ndarray, "corners 2"]
+) -> Float64[np.ndarray, "3 3"]:
+    """Find H of `image ~ H (x, y, 1)`, linear in its nine numbers up to their scale; depths come out positive.
+
+    Args:
+        plane: points on a plane, in any unit.
+        image: where they appear, as x / z and y / z or in another unit that makes them about 1.
+    """
+    middle, size = plane.mean(0), np.ptp(plane, axis=0).max()
+    at = np.concatenate([(plane - middle) / size, np.ones((len(plane), 1))], 1)
+    zero = np.zeros_like(at)
+    A = np.concatenate(
+        [
+            np.concatenate([at, zero, -image[:, :1] * at], 1),
+            np.concatenate([zero, at, -image[:, 1:] * at], 1),
+        ]
+    )
+    H: np.ndarray = np.linalg.svd(A, full_matrices=False)[2][-1].reshape(3, 3)
+    H *= np.sign(H[2, 2]) / np.array([size, size, 1.0])
+    H[:, 2] -= H[:, :2] @ middle
+    return H
+
+
+def _by_homography(corners: np.ndarray, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Pose of a flat board from `ray ~ [r1 r2 t] (x, y, 1)`."""
+    H = homography(corners[:, :2], rays)
+    middle = corners[:, :2].mean(0)
+    H = 2 * H / (np.linalg.norm(H[:, 0]) + np.linalg.norm(H[:, 1]))
+    R = np.column_stack([H[:, :2], np.cross(H[:, 0], H[:, 1])])
+    R = nearest_rotation(torch.from_numpy(R)).numpy()
+    return R, H[:, 2] + (H[:, :2] - R[:, :2]) @ middle

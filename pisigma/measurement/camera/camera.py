@@ -1,0 +1,277 @@
+"""A camera: its intrinsics, how it projects points, and the files that hold them."""
+
+import os
+import re
+from dataclasses import dataclass, replace
+from typing import Annotated, Literal
+
+import numpy as np
+from jaxtyping import Float64
+from pydantic import BaseModel, ConfigDict, Field, field_validator
+
+from pisigma.files.errors import MeasurementError
+from pisigma.files.input_file import read_text
+from pisigma.files.yaml_file import MOST_BYTES, Section, parse_yaml, yaml_text
+from pisigma.measurement.sensors.intrinsics import CAMERA_UNITS
+
+INTRINSICS = tuple(CAMERA_UNITS)
+USUAL_DEVIATIONS = (0.5, 0.5, 1.0, 1.0, 0.002, 0.01, 2e-4, 2e-4, 0.0)
+"""Standard deviations of the intrinsics that a usual calibration leaves, with 0 for k3, which it seldom frees."""
+
+Positive = Annotated[float, Field(gt=0)]
+UNDISTORTED = 1e-14
+"""A shorter Newton step to the undistorted point is rounding."""
+UNDISTORT_STEPS = 20
+"""Newton steps from a distorted to the undistorted point; ordinary lenses take four."""
+
+
+class IntrinsicsSection(Section):
+    """A number for each of a camera's intrinsics, such as its standard deviation; those that are not stated are 0.
+
+    Attributes:
+        fx: of the focal length along u [px].
+        fy: of the focal length along v [px].
+        cx: of the principal point, u [px].
+        cy: of the principal point, v [px].
+        k1: of the radial distortion, as k2 and k3.
+        k2: see k1.
+        p1: of the tangential distortion, as p2.
+        p2: see p1.
+        k3: see k1.
+    """
+
+    fx: float = 0.0
+    fy: float = 0.0
+    cx: float = 0.0
+    cy: float = 0.0
+    k1: float = 0.0
+    k2: float = 0.0
+    p1: float = 0.0
+    p2: float = 0.0
+    k3: float = 0.0
+
+    @property
+    def numbers(self) -> tuple[float, ...]:
+        """All of them, in the order of `INTRINSICS`."""
+        return tuple(self.model_dump().values())
+
+
+class CameraDocument(Section):
+    """A camera as pisigma's own files state it, with OpenCV's distortion.
+
+    Attributes:
+        name: of the camera.
+        width: of its images [px].
+        height: of its images [px].
+        fx: focal length along u [px].
+        fy: focal length along v [px].
+        cx: principal point, u [px].
+        cy: principal point, v [px].
+        k1: radial distortion, as k2 and k3.
+        k2: see k1.
+        p1: tangential distortion, as p2.
+        p2: see p1.
+        k3: see k1.
+        sigma: standard deviations of all of these.
+        is_fixed: whether it stands beside the robot and the board is on the flange; else the other way round.
+    """
+
+    name: str = "camera"
+    width: int = Field(gt=0)
+    height: int = Field(gt=0)
+    fx: Positive
+    fy: Positive
+    cx: float
+    cy: float
+    k1: float = 0.0
+    k2: float = 0.0
+    p1: float = 0.0
+    p2: float = 0.0
+    k3: float = 0.0
+    sigma: IntrinsicsSection | None = None
+    is_fixed: bool = False
+
+    @field_validator("sigma")
+    @classmethod
+    def _not_negative(cls, sigma: IntrinsicsSection | None) -> IntrinsicsSection | None:
+        """Refuse a standard deviation below 0."""
+        for name, number in () if sigma is None else sigma:
+            if number < 0:
+                raise ValueError(f"{name} is {number:g}, but a standard deviation of 0 or more was wanted")
+        return sigma
+
+    def camera(self) -> "Camera":
+        """The camera that it states."""
+        sigma = None if self.sigma is None else self.sigma.numbers
+        return Camera(**self.model_dump(exclude={"sigma"}), sigma=sigma)
+
+
+class MatrixSection(BaseModel):
+    """A matrix of a ROS or OpenCV file, row by row; its other keys are not looked at."""
+
+    model_config = ConfigDict(frozen=True, extra="ignore", allow_inf_nan=False)
+    data: tuple[float, ...]
+
+
+class MatrixDocument(BaseModel):
+    """A camera as `camera_info` of ROS and the calibration sample of OpenCV write it.
+
+    Fisheye lenses, whose coefficients mean something else, and binned images, whose pixels do, are refused.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="ignore", allow_inf_nan=False)
+    camera_name: str = "camera"
+    image_width: int = Field(gt=0)
+    image_height: int = Field(gt=0)
+    distortion_model: Literal["plumb_bob"] = "plumb_bob"
+    fisheye_model: Literal[0] = 0
+    binning_x: Literal[0, 1] = 0
+    binning_y: Literal[0, 1] = 0
+    camera_matrix: MatrixSection
+    distortion_coefficients: MatrixSection
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A pinhole camera with radial and tangential distortion (Brown 1971, as in OpenCV and ROS's plumb_bob).
+
+    z looks out of the camera, x to the right and y down in the image.
+
+    Attributes:
+        name: of the camera.
+        width: of its images [px].
+        height: of its images [px].
+        fx: focal length along u [px].
+        fy: focal length along v [px].
+        cx: principal point, u [px].
+        cy: principal point, v [px].
+        k1: radial distortion, as k2 and k3 without a unit.
+        k2: see k1.
+        p1: tangential distortion, as p2 without a unit.
+        p2: see p1.
+        k3: see k1.
+        sigma: standard deviations of fx, fy, cx, cy [px], k1, k2, p1, p2, k3; None where none are stated.
+        is_fixed: whether it stands beside the robot and the board is on the flange; else the other way round.
+    """
+
+    name: str
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    k1: float = 0.0
+    k2: float = 0.0
+    p1: float = 0.0
+    p2: float = 0.0
+    k3: float = 0.0
+    sigma: tuple[float, ...] | None = None
+    is_fixed: bool = False
+
+    @staticmethod
+    def load(path: str | os.PathLike[str]) -> "Camera":
+        """Read a camera from pisigma's own YAML, a ROS `camera_info` or an OpenCV file.
+
+        Raises:
+            MeasurementError: the file cannot be read or describes no such camera; the message names file and key.
+        """
+        source = os.fspath(path)
+        text = read_text(path, MeasurementError, "YAML", MOST_BYTES)
+        if not re.search(r"^\s*camera_matrix\s*:", text, re.MULTILINE):
+            return parse_yaml(text, CameraDocument, MeasurementError, source).camera()
+        # OpenCV writes a directive and a tag that YAML does not know; commented out, they keep the lines' numbers
+        plain = re.sub(r"^%YAML.*$|^---\s*$", "#", text, flags=re.MULTILINE).replace("!!opencv-matrix", "")
+        document = parse_yaml(plain, MatrixDocument, MeasurementError, source)
+        matrix, bent = document.camera_matrix.data, document.distortion_coefficients.data
+        if len(matrix) != 9 or matrix[0] <= 0 or matrix[4] <= 0 or any(matrix[k] for k in (1, 3, 6, 7)):
+            raise MeasurementError(
+                f"{source}: camera_matrix.data as fx, 0, cx, 0, fy, cy, 0, 0, 1 was wanted, got {matrix}."
+            )
+        if len(bent) < 4 or any(bent[5:]):
+            raise MeasurementError(
+                f"{source}: distortion_coefficients.data as k1, k2, p1, p2 and k3 was wanted, got {bent}; calibrate "
+                "the camera with that model."
+            )
+        size = (document.camera_name, document.image_width, document.image_height)
+        k1, k2, p1, p2, k3 = (*bent, 0.0)[:5]
+        return Camera(*size, matrix[0], matrix[4], matrix[2], matrix[5], k1, k2, p1, p2, k3)
+
+    def to_yaml(self) -> str:
+        """Write the camera as a file that `load` reads."""
+        numbers = dict(zip(INTRINSICS, self.intrinsics.tolist(), strict=True))
+        content = {"name": self.name, "width": self.width, "height": self.height, **numbers}
+        if self.is_fixed:
+            content["is_fixed"] = True
+        sigma = {} if self.sigma is None else {"sigma": dict(zip(INTRINSICS, self.sigma, strict=True))}
+        return yaml_text(content | sigma)
+
+    @property
+    def intrinsics(self) -> Float64[np.ndarray, " 9"]:
+        """All numbers of the model, in the order of `INTRINSICS` [px, and 1 from k1 on]."""
+        return np.array([getattr(self, name) for name in INTRINSICS])
+
+    def with_intrinsics(self, values: Float64[np.ndarray, " 9"]) -> "Camera":
+        """Return the camera with other numbers in the order of `INTRINSICS`."""
+        return replace(self, **dict(zip(INTRINSICS, values.tolist(), strict=True)))
+
+    def project(
+        self, points: Float64[np.ndarray, "*batch 3"]
+    ) -> tuple[Float64[np.ndarray, "*batch 2"], Float64[np.ndarray, "*batch 2 3"]]:
+        """Return the pixels of points in the camera's frame [m] and their derivative by the points [px/m]."""
+        xy = points[..., :2] / points[..., 2:]
+        bent, derivative = self._distorted(xy)
+        scale = np.array([self.fx, self.fy])
+        by_point = np.zeros((*xy.shape, 3))
+        by_point[..., 0, 0] = by_point[..., 1, 1] = 1.0
+        by_point[..., 2] = -xy
+        by_point /= points[..., 2, None, None]
+        return bent * scale + (self.cx, self.cy), scale[:, None] * (derivative @ by_point)
+
+    def by_intrinsics(self, points: Float64[np.ndarray, "*batch 3"]) -> Float64[np.ndarray, "*batch 2 9"]:
+        """Return the derivative of the pixels of points in the camera's frame [m] by the intrinsics.
+
+        The pixels are linear in the focal lengths times a polynomial that is linear in the distortion, so the columns
+        are these factors themselves.
+        """
+        xy = points[..., :2] / points[..., 2:]
+        x, y = xy[..., 0], xy[..., 1]
+        square = x * x + y * y
+        derivative = np.zeros((*xy.shape, len(INTRINSICS)))
+        bent = self._distorted(xy)[0]
+        for axis, focal in enumerate((self.fx, self.fy)):
+            derivative[..., axis, axis] = bent[..., axis]
+            derivative[..., axis, 2 + axis] = 1.0
+            for column, power in ((4, square), (5, square**2), (8, square**3)):
+                derivative[..., axis, column] = focal * xy[..., axis] * power
+        derivative[..., 0, 6], derivative[..., 0, 7] = self.fx * 2 * x * y, self.fx * (square + 2 * x * x)
+        derivative[..., 1, 6], derivative[..., 1, 7] = self.fy * (square + 2 * y * y), self.fy * 2 * x * y
+        return derivative
+
+    def undistort(self, pixels: Float64[np.ndarray, "*batch 2"]) -> Float64[np.ndarray, "*batch 2"]:
+        """Return x / z and y / z of the rays of pixels, by Newton's method."""
+        bent = (pixels - (self.cx, self.cy)) / (self.fx, self.fy)
+        xy = bent.copy()
+        for _ in range(UNDISTORT_STEPS):
+            now, derivative = self._distorted(xy)
+            step = np.linalg.solve(derivative, (bent - now)[..., None])[..., 0]
+            xy += step
+            if not np.abs(step).max(initial=0.0) > UNDISTORTED:
+                break
+        return xy
+
+    def _distorted(self, xy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Distorted x / z and y / z, and their derivative by the undistorted ones."""
+        x, y = xy[..., 0], xy[..., 1]
+        square = x * x + y * y
+        radial = 1 + square * (self.k1 + square * (self.k2 + square * self.k3))
+        slope = self.k1 + square * (2 * self.k2 + 3 * self.k3 * square)
+        bent = xy * radial[..., None]
+        bent[..., 0] += 2 * self.p1 * x * y + self.p2 * (square + 2 * x * x)
+        bent[..., 1] += self.p1 * (square + 2 * y * y) + 2 * self.p2 * x * y
+        derivative = np.empty((*xy.shape, 2))
+        derivative[..., 0, 0] = radial + 2 * x * x * slope + 2 * self.p1 * y + 6 * self.p2 * x
+        derivative[..., 1, 1] = radial + 2 * y * y * slope + 6 * self.p1 * y + 2 * self.p2 * x
+        mixed = 2 * (x * y * slope + self.p1 * x + self.p2 * y)
+        derivative[..., 0, 1] = derivative[..., 1, 0] = mixed
+        return bent, derivative

@@ -1,0 +1,140 @@
+"""The boards in many images, and how well their poses predict the corners."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float64
+
+from pisigma.estimation.loss import HampelLoss
+from pisigma.files.errors import MeasurementError
+from pisigma.measurement.camera.board import Board
+from pisigma.measurement.camera.board_pose import solve_board_pose
+from pisigma.measurement.camera.camera import Camera
+from pisigma.measurement.camera.detection.detected_board import DetectedBoard, NoBoard
+from pisigma.measurement.camera.image_rows import LARGEST_MISS
+
+
+@dataclass(frozen=True, eq=False)
+class BoardImage:
+    """The image of a file, and the board in it.
+
+    Attributes:
+        file: of the image.
+        size: its width and height [px]; 0 where the file cannot be read.
+        board: the corners that can be used, or why there are none.
+        blur: standard deviation of the blur of the board's edges [px]; NaN where none was found.
+    """
+
+    file: Path
+    size: tuple[int, int]
+    board: DetectedBoard | NoBoard
+    blur: float
+
+    @property
+    def name(self) -> str:
+        """That of the file, without ending."""
+        return self.file.stem
+
+    @property
+    def is_read(self) -> bool:
+        """Whether the file is a whole image."""
+        return self.size != (0, 0)
+
+
+@dataclass(frozen=True, eq=False)
+class DetectedBoards:
+    """Boards in images, and where their poses predict the corners.
+
+    Attributes:
+        images: with a board and without, in the order of the files.
+        predicted: pixels of the corners of every image that has some, by its name [px].
+    """
+
+    images: tuple[BoardImage, ...]
+    predicted: dict[str, Float64[np.ndarray, "_corners 2"]]
+
+    @property
+    def boards(self) -> dict[str, DetectedBoard]:
+        """The boards that can be used, by the names of their images."""
+        return {one.name: one.board for one in self.images if isinstance(one.board, DetectedBoard)}
+
+    @property
+    def left_out(self) -> dict[str, str]:
+        """Why images have no board that can be used, by their names."""
+        return {one.name: one.board.reason for one in self.images if isinstance(one.board, NoBoard)}
+
+    @property
+    def residuals(self) -> dict[str, Float64[np.ndarray, "_corners 2"]]:
+        """Detected minus predicted pixels, by the names of the images [px]."""
+        return {name: board.pixels - self.predicted[name] for name, board in self.boards.items()}
+
+    @property
+    def rms(self) -> float:
+        """Root mean square of u and v of the residuals [px]; NaN without corners."""
+        residuals = list(self.residuals.values())
+        return rms_of(np.concatenate(residuals)) if residuals else np.nan
+
+    @property
+    def sentences(self) -> tuple[str, ...]:
+        """What the images show, and which are left out and why; some board can be used."""
+        boards = self.boards
+        count = sum(len(board.corners) for board in boards.values())
+        used = [one for one in self.images if one.name in boards]
+        blurred = max(used, key=lambda one: one.blur)
+        return (
+            f"{len(boards)} of {len(self.images)} images show the board: {count:,} corners, which camera and pose of "
+            f"the board in each image predict to {self.rms:.3f} px (RMS of u and v).",
+            f"Edges are blurred by {np.median([one.blur for one in used]):.2f} px (median of the standard deviations), "
+            f"most of all by {blurred.blur:.2f} px in {blurred.name}.",
+            *(f"{name} is left out: {reason}." for name, reason in self.left_out.items()),
+        )
+
+    def to_json(self) -> dict[str, object]:
+        """Return figures of the images as plain values."""
+        residuals, left_out = self.residuals, self.left_out
+        return {
+            "rms_px": self.rms,
+            "images": [
+                {
+                    "image": one.name,
+                    "file": str(one.file),
+                    "corners": len(residuals.get(one.name, ())),
+                    "rms_px": None if one.name in left_out else rms_of(residuals[one.name]),
+                    "blur_px": one.blur if np.isfinite(one.blur) else None,
+                    "left_out": left_out.get(one.name),
+                }
+                for one in self.images
+            ],
+        }
+
+
+def rms_of(residual: Float64[np.ndarray, "*corners 2"]) -> float:
+    """Root mean square of u and v [px]."""
+    return float(np.sqrt(np.square(residual).mean()))
+
+
+def predict_boards(images: Sequence[BoardImage], camera: Camera, board: Board) -> DetectedBoards:
+    """Predict corners by the pose of the board in every image; images that no pose explains lose their corners.
+
+    Raises:
+        MeasurementError: an image is not as large as those of the camera.
+    """
+    checked, predicted, corners = list[BoardImage](), {}, board.corners
+    for one in images:
+        if one.is_read and one.size != (camera.width, camera.height):
+            raise MeasurementError(
+                f"{one.file}: an image of {camera.width} x {camera.height} px was wanted, as the camera "
+                f"'{camera.name}' takes them, got {one.size[0]} x {one.size[1]}; check the camera."
+            )
+        if isinstance(one.board, DetectedBoard):
+            at = corners[one.board.corners]
+            pose = solve_board_pose(camera, at, one.board.pixels, HampelLoss())
+            if (miss := float(np.median(pose.distance))) < LARGEST_MISS:
+                predicted[one.name] = camera.project(at @ pose.R.T + pose.t)[0]
+            else:
+                reason = f"half of its corners miss board and camera by {miss:.3g} px or more"
+                one = replace(one, board=NoBoard(reason))
+        checked.append(one)
+    return DetectedBoards(tuple(checked), predicted)

@@ -1,0 +1,85 @@
+"""ChArUco boards and grids of AprilTags in images, and what their markers look like."""
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float64
+
+from pisigma.files.errors import MeasurementError
+from pisigma.measurement.camera.board import Board
+from pisigma.measurement.camera.detection.detected_board import (
+    DetectedBoard,
+    EdgeProfiles,
+    Image,
+    NoBoard,
+    refined,
+)
+
+ROUNDS = 2
+"""How often the sides of tags are searched: the first time, they may be off by a pixel."""
+
+
+def detect_charuco(image: Image, board: Board) -> DetectedBoard | NoBoard:
+    """Find the corners of a ChArUco board beside whose squares markers are read, which may be some of them."""
+    size = (board.columns + 1, board.rows + 1)
+    printed = cv2.aruco.CharucoBoard(size, board.square, board.marker, dictionary_of(board))
+    corners, numbers, _, _ = cv2.aruco.CharucoDetector(printed).detectBoard(image)
+    if corners is None or not len(corners):
+        return NoBoard(f"no corner of a ChArUco board with markers {board.dictionary} is found in it")
+    pixels = np.asarray(corners, dtype=np.float64).reshape(-1, 2)
+    return refined(image, DetectedBoard(np.asarray(numbers, dtype=np.int64).ravel(), pixels), board)
+
+
+def detect_apriltags(image: Image, board: Board) -> DetectedBoard | NoBoard:
+    """Find the corners of the AprilTags that are in an image whole: where lines along their sides cross.
+
+    Corners of tags are rounded by blur, so that their gradients lead inwards; their sides are not.
+    """
+    quads, numbers, _ = cv2.aruco.ArucoDetector(dictionary_of(board)).detectMarkers(image)
+    number = np.zeros(0, dtype=np.int64) if numbers is None else np.asarray(numbers, dtype=np.int64).ravel()
+    used = np.flatnonzero((number < board.rows * board.columns) & (np.bincount(number)[number] == 1))
+    if not len(used):
+        return NoBoard(f"no AprilTag of family {board.dictionary} of the board is found in it")
+    tags = np.asarray(quads, dtype=np.float64).reshape(-1, 4, 2)[used]
+    for _ in range(ROUNDS):
+        tags = _crossings(image, tags, board.clearance)
+    corners = 4 * number[used, None] + np.arange(4)
+    return DetectedBoard(corners.ravel(), tags.reshape(-1, 2))
+
+
+def _crossings(
+    image: Image, tags: Float64[np.ndarray, "tags 4 2"], clearance: float
+) -> Float64[np.ndarray, "tags 4 2"]:
+    """Corners of tags as crossings of the lines through the points of their sides, the first after the last side."""
+    ends = np.stack([tags, np.roll(tags, -1, 1)], 2).reshape(-1, 2, 2)
+    points = EdgeProfiles.of(image, ends, clearance).points
+    middle = points.mean(1)
+    normal = np.linalg.svd(points - middle[:, None])[2][:, -1].reshape(tags.shape)
+    distance = (normal * middle.reshape(tags.shape)).sum(-1)
+    both = np.stack([np.roll(normal, 1, 1), normal], 2)
+    crossing: np.ndarray = np.linalg.solve(
+        both, np.stack([np.roll(distance, 1, 1), distance], -1)[..., None]
+    )[..., 0]
+    return crossing
+
+
+def dictionary_of(board: Board) -> cv2.aruco.Dictionary:
+    """Return the markers of which a board has the first ones.
+
+    Raises:
+        MeasurementError: the board needs more.
+    """
+    is_grid = board.kind == "apriltag"
+    name = f"APRILTAG_{board.dictionary.removeprefix('tag')}" if is_grid else board.dictionary.upper()
+    dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{name}"))
+    needed = board.rows * board.columns if is_grid else (board.rows + 1) * (board.columns + 1) // 2
+    if needed > (there := len(dictionary.bytesList)):
+        raise MeasurementError(
+            f"board '{board.name}': {needed} markers are needed, but {board.dictionary} has {there}; take another."
+        )
+    return dictionary
+
+
+def marker_cells(board: Board, number: int) -> Bool[np.ndarray, "cells cells"]:
+    """Say which cells of a marker are black, row by row, its black border included."""
+    dictionary = dictionary_of(board)
+    return np.asarray(cv2.aruco.generateImageMarker(dictionary, number, dictionary.markerSize + 2) == 0)

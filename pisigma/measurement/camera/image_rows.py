@@ -1,0 +1,238 @@
+"""Images of boards as measurements: one row an image, with the pose that its corners give and its covariance."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from jaxtyping import Float64
+
+from pisigma.estimation.loss import AbstractLoss, HampelLoss
+from pisigma.files.errors import IdentificationError, MeasurementError
+from pisigma.measurement.camera.board import Board
+from pisigma.measurement.camera.board_pose import POSE, BoardPose, solve_board_pose
+from pisigma.measurement.camera.camera import Camera
+from pisigma.measurement.camera.flatness import SHAPES, bent_corners, bent_further
+from pisigma.measurement.camera.solved_images import (
+    IntrinsicsChoice,
+    SolvedImages,
+    corner_noise,
+    prior_deviations,
+    solve_images,
+)
+from pisigma.measurement.dataset import Measurements
+from pisigma.measurement.sensors.corner import WEIGHT_COLUMN, weight_text
+from pisigma.measurement.sensors.intrinsics import (
+    CAMERA_COLUMN,
+    INTRINSICS_COLUMN,
+    NOISE_COLUMN,
+    SCALE_COLUMN,
+)
+from pisigma.robot.se3 import skew
+
+MOST_BENDS = 4
+"""Steps by which a board is bent at one set of intrinsics; the second is near rounding, where no corner is wrong."""
+SMALLEST_BEND = 1e-6
+"""[m] A board is not bent further by less."""
+LARGEST_MISS = 10.0
+"""[px] Where half of the corners of an image miss their prediction by more, they are not of this board."""
+MOST_REPEATABILITY = 0.01, 0.105
+"""[m] and [rad] More is that of no robot, but of another unit."""
+
+
+@dataclass(frozen=True)
+class Repeatability:
+    """By how much the robot misses, anew in every image, the pose that its joint values mean.
+
+    Attributes:
+        length: standard deviation of each coordinate of the target's position [m].
+        angle: standard deviation of its turn about each axis [rad].
+    """
+
+    length: float = 2e-5
+    angle: float = 1.75e-4
+
+    def __post_init__(self) -> None:
+        """Refuse what is no standard deviation."""
+        if not (0 <= self.length <= MOST_REPEATABILITY[0] and 0 <= self.angle <= MOST_REPEATABILITY[1]):
+            raise IdentificationError(
+                f"repeatability: standard deviations of 0 to 10 mm and 0 to 6 deg were wanted, got "
+                f"{self.length * 1e3:g} mm and {np.rad2deg(self.angle):g} deg."
+            )
+
+
+@dataclass(frozen=True, eq=False)
+class Images:
+    """The corners of images that one camera took of one board.
+
+    Attributes:
+        source: the file.
+        names: of the images, in the order in which they come.
+        q: joint values of every image [rad or m].
+        lines: where the first corner of every image stands.
+        corners: numbers of the corners that every image shows.
+        pixels: where it shows them [px].
+        sigma: standard deviation of every corner, whose common factor is estimated; nothing where all are alike.
+    """
+
+    source: str
+    names: tuple[str, ...]
+    q: Float64[torch.Tensor, "images dof"]
+    lines: tuple[int, ...]
+    corners: tuple[np.ndarray, ...]
+    pixels: tuple[Float64[np.ndarray, "_corners 2"], ...]
+    sigma: tuple[Float64[np.ndarray, " _corners"], ...] = ()
+
+    @property
+    def relative_sigma(self) -> tuple[Float64[np.ndarray, " _corners"], ...]:
+        """Standard deviations over the usual one of all corners."""
+        if not self.sigma:
+            return tuple(np.ones(len(corners)) for corners in self.corners)
+        usual = np.median(np.concatenate(self.sigma))
+        return tuple(of_image / usual for of_image in self.sigma)
+
+
+def image_measurements(
+    images: Images,
+    camera: Camera,
+    board: Board,
+    is_fixed: bool,
+    repeatability: Repeatability,
+    intrinsics: IntrinsicsChoice = "prior",
+) -> Measurements:
+    """Solve the pose of the board in every image.
+
+    Args:
+        images: of one camera and one board.
+        camera: that took them.
+        board: that they show; corners are numbered as there.
+        is_fixed: whether the camera is fixed and the board on the flange.
+        repeatability: of the robot.
+        intrinsics: whether the camera's are held, under their prior, or free; see `prior_deviations`.
+
+    Returns:
+        One row an image, in the frame of the board with the camera as target (of a fixed camera the other way
+        round), with the weights of `CornerSensor`.
+
+    Raises:
+        MeasurementError: the corners of an image are not of this board.
+    """
+    loss, bend = HampelLoss(), np.zeros(SHAPES)
+
+    def solve(present: Camera) -> list[BoardPose]:
+        nonlocal bend
+        poses, bend = _board_poses(images, present, board, bend, loss)
+        return poses
+
+    solved = solve_images(camera, prior_deviations(camera, intrinsics), solve, loss, images.source)
+    rotations, positions, changes = zip(*(_target_pose(pose, is_fixed) for pose in solved.poses), strict=True)
+    count, names = len(rotations), (board.name, camera.name)
+    frame, target = reversed(names) if is_fixed else names
+    return Measurements(
+        q=images.q,
+        position=torch.from_numpy(np.stack(positions)),
+        rotation=torch.from_numpy(np.stack(rotations)),
+        frame=(frame,) * count,
+        target=(target,) * count,
+        readings=_readings(solved, changes, board, repeatability),
+        image=images.names,
+        line=images.lines,
+        source=images.source,
+    )
+
+
+def _readings(
+    solved: SolvedImages, changes: Sequence[np.ndarray], board: Board, repeatability: Repeatability
+) -> dict[str, torch.Tensor | tuple[str, ...]]:
+    """Return the columns of `CornerSensor`, by how the pose of every row changes with that of its board."""
+    at_board = solved.noise / solved.camera.fx * float(np.median([pose.t[2] for pose in solved.poses]))
+    of_robot = np.diag([repeatability.length**2] * 3 + [repeatability.angle**2] * 3)
+    of_corners = [
+        solved.noise**2 * change @ pose.cofactor @ change.T
+        for pose, change in zip(solved.poses, changes, strict=True)
+    ]
+    count = len(changes)
+    readings: dict[str, torch.Tensor | tuple[str, ...]] = {
+        NOISE_COLUMN: torch.full((count,), at_board, dtype=torch.float64),
+        WEIGHT_COLUMN: tuple(weight_text(_inverse_root(one + of_robot)) for one in of_corners),
+        CAMERA_COLUMN: (solved.camera.name,) * count,
+    }
+    if solved.sigma.any():
+        by = np.stack(changes) @ solved.intrinsics.by
+        readings[INTRINSICS_COLUMN] = replace(solved.intrinsics, by=by).texts
+    if board.scale_deviation is not None:
+        readings[SCALE_COLUMN] = (f"{board.scale_deviation:.17g}",) * count
+    return readings
+
+
+def _board_poses(
+    images: Images, camera: Camera, board: Board, bend: Float64[np.ndarray, " 3"], loss: AbstractLoss
+) -> tuple[list[BoardPose], Float64[np.ndarray, " 3"]]:
+    """Solve the poses of a board at some intrinsics, bent as the images show it where it need not be flat.
+
+    Returns:
+        The poses, and the heights of the board's shapes [m].
+
+    Raises:
+        MeasurementError: the corners of an image are not of this board.
+    """
+    observed = images.corners, images.pixels, images.relative_sigma
+    for _ in range(MOST_BENDS):
+        corners = bent_corners(board, bend)
+        poses = [
+            solve_board_pose(camera, corners[number], pixels, loss, sigma)
+            for number, pixels, sigma in zip(*observed, strict=True)
+        ]
+        _refuse_other_boards(images, board, poses)
+        if not board.flatness:
+            break
+        before, noise = bend, corner_noise(poses, loss)
+        bend = bent_further(bend, board, camera, *observed, poses, noise)
+        if np.abs(bend - before).max() < SMALLEST_BEND:
+            break
+    return poses, bend
+
+
+def _refuse_other_boards(images: Images, board: Board, poses: Sequence[BoardPose]) -> None:
+    """Refuse images whose corners are not where a board of this kind has them.
+
+    Raises:
+        MeasurementError: see above.
+    """
+    for name, line, pose in zip(images.names, images.lines, poses, strict=True):
+        miss = float(np.median(pose.distance))
+        if not miss < LARGEST_MISS:
+            raise MeasurementError(
+                f"{images.source}, line {line}: half of the corners of image '{name}' are {miss:.3g} px or more from "
+                f"where a board of {board.rows} x {board.columns} corners has them; check the numbers of the corners, "
+                "the board and the camera, or remove the image."
+            )
+    from_front = np.array([pose.R[:, 2] @ pose.t > 0 for pose in poses])
+    if from_front.any() and not from_front.all():
+        fewer = np.flatnonzero(from_front == (2 * from_front.sum() < len(from_front)))
+        raise MeasurementError(
+            f"{images.source}, line {images.lines[fewer[0]]}: image '{images.names[fewer[0]]}' shows the board "
+            f"mirrored against {len(poses) - len(fewer)} of the {len(poses)} images; check whether it is mirrored, "
+            "and whether its corners are numbered as in the others."
+        )
+
+
+def _target_pose(pose: BoardPose, is_fixed: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Pose of the target in its frame, and its change in the axes of the frame by that of the board's pose.
+
+    Of the inverse pose, position `-R^T t` moves by `-R^T (shift + t × turn)`, and the rotation turns by `-R^T turn`.
+    """
+    if is_fixed:
+        return pose.R, pose.t, np.eye(POSE)
+    back = pose.R.T
+    change = np.zeros((POSE, POSE))
+    change[:3, :3] = change[3:, 3:] = -back
+    change[:3, 3:] = -back @ skew(torch.from_numpy(pose.t)).numpy()
+    return back, -back @ pose.t, change
+
+
+def _inverse_root(covariance: np.ndarray) -> np.ndarray:
+    """Lower triangular W with `W^T W` = inverse of a covariance, scaled first, as metres and radians differ."""
+    scale = np.sqrt(covariance.diagonal())
+    root: np.ndarray = np.linalg.inv(np.linalg.cholesky(covariance / scale / scale[:, None])) / scale
+    return root

@@ -1,0 +1,27 @@
+"""What sensors measure: columns of files, residuals, derivatives and held-out errors, one file a sensor."""
+
+from pisigma.measurement.readings import ReadingColumn, Readings, RowFault, SensorReadings
+from pisigma.measurement.sensors.registry import SENSORS, register_sensor
+from pisigma.measurement.sensors.sensor import (
+    AbstractSensor,
+    InitialUnknowns,
+    SensorRows,
+    UnknownDerivative,
+    UnknownGroup,
+    Unknowns,
+)
+
+__all__ = [
+    "SENSORS",
+    "AbstractSensor",
+    "InitialUnknowns",
+    "ReadingColumn",
+    "Readings",
+    "RowFault",
+    "SensorReadings",
+    "SensorRows",
+    "UnknownDerivative",
+    "UnknownGroup",
+    "Unknowns",
+    "register_sensor",
+]

@@ -1,0 +1,335 @@
+"""What images say of their camera's intrinsics and of the scale of their board, whatever the poses are."""
+
+import math
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float64, Int64
+from torch import Tensor
+
+from pisigma.measurement.dataset import Measurements
+from pisigma.measurement.readings import ReadingColumn
+from pisigma.measurement.sensors.sensor import (
+    AbstractSensor,
+    Derivative,
+    InitialUnknowns,
+    OtherUnit,
+    Poses,
+    SensorRows,
+    UnknownDerivative,
+    UnknownGroup,
+    Unknowns,
+    Values,
+    names_of,
+    numbers_of,
+    owners_of,
+)
+from pisigma.robot.kinematics.parameter_jacobian import ToolMotion
+
+NOISE_COLUMN, CAMERA_COLUMN = "corner_noise", "corner_camera"
+INTRINSICS_COLUMN, SCALE_COLUMN = "corner_intrinsics", "corner_scale"
+COLUMNS = tuple(
+    ReadingColumn(name, is_text=True, is_optional=True)
+    for name in (CAMERA_COLUMN, INTRINSICS_COLUMN, SCALE_COLUMN)
+)
+PIXELS: tuple[str, ...] = ("fx", "fy", "cx", "cy")
+CAMERA_UNITS: dict[str, OtherUnit] = {
+    name: "px" if name in PIXELS else "1" for name in (*PIXELS, "k1", "k2", "p1", "p2", "k3")
+}
+NUMBERS = len(CAMERA_UNITS)
+UNSTATED = 1e3
+"""Times as large as stated, deviations say nothing beside what the images show."""
+USUAL_SCALE = 1e-3
+"""Standard deviation of the scale of a board that states none: so much printers and paper are off."""
+
+
+@dataclass(frozen=True, eq=False)
+class ImageIntrinsics:
+    """What the corners of images say of their camera's intrinsics k, linearised at `at`.
+
+    Attributes:
+        by: derivative of the measured position and rotation vector, in the axes of the row's frame, by k.
+        root: with `residual` what the corners say of k whatever the poses are: `root (k - at) = residual` with unit
+            variances.
+        residual: see root.
+        at: where the images were linearised.
+        stated: what the file of the camera says.
+        sigma: its standard deviations, 0 of what is held.
+    """
+
+    by: Float64[np.ndarray, "*rows 6 9"]
+    root: Float64[np.ndarray, "*rows 9 9"]
+    residual: Float64[np.ndarray, "*rows 9"]
+    at: Float64[np.ndarray, "*rows 9"]
+    stated: Float64[np.ndarray, "*rows 9"]
+    sigma: Float64[np.ndarray, "*rows 9"]
+
+    def select(self, rows: Bool[np.ndarray, " rows"]) -> "ImageIntrinsics":
+        """Return some of the images."""
+        return ImageIntrinsics(*(getattr(self, item.name)[rows] for item in fields(self)))
+
+    @property
+    def texts(self) -> tuple[str, ...]:
+        """What cells of the column of intrinsics hold: all numbers of an image with blanks between."""
+        blocks = [getattr(self, item.name).reshape(len(self.at), -1) for item in fields(self)]
+        return tuple(" ".join(f"{value:.17g}" for value in row) for row in np.concatenate(blocks, 1))
+
+    @staticmethod
+    def of(texts: tuple[str, ...]) -> "ImageIntrinsics":
+        """Return what cells hold, 0 where one is empty."""
+        empty = [0.0] * SIZE
+        block = np.array([numbers_in(text, SIZE) or empty for text in texts]).reshape(-1, 19, NUMBERS)
+        return ImageIntrinsics(block[:, :6], block[:, 6:15], *(block[:, row] for row in range(15, 19)))
+
+
+SIZE = 19 * NUMBERS
+"""Numbers of a cell of the column of intrinsics."""
+
+
+def intrinsics_information(
+    images: ImageIntrinsics,
+) -> tuple[Float64[np.ndarray, "9 9"], Float64[np.ndarray, " 9"]]:
+    """Add up what the images of one camera and its stated deviations say of its intrinsics, whatever the poses are.
+
+    Returns:
+        U [1/px, and 1 from k1 on], with `U^T U` the information (0 of intrinsics that are held), and the mean [px, and
+        1 from k1 on].
+    """
+    sigma, at = images.sigma[0], images.at[0]
+    free = np.flatnonzero(sigma > 0)
+    scaled = images.root[:, :, free] * sigma[free]
+    information = np.eye(len(free)) + np.einsum("nij,nik->jk", scaled, scaled)
+    residual = images.residual + np.einsum("nij,nj->ni", images.root, images.at - at)
+    pull = np.einsum("nij,ni->j", scaled, residual) + (images.stated[0] - at)[free] / sigma[free]
+    U, mean = np.zeros((NUMBERS, NUMBERS)), at.copy()
+    U[np.ix_(free, free)] = np.linalg.cholesky(information).T / sigma[free]
+    mean[free] += sigma[free] * np.linalg.solve(information, pull)
+    return U, mean
+
+
+def without_stated(measurements: Measurements, counted: Mapping[str, Collection[str]]) -> Measurements:
+    """Return rows of images that say of some cameras and boards only what their corners show.
+
+    Args:
+        measurements: with rows of images or without.
+        counted: by group the owners whose stated deviations a model has counted already.
+    """
+    if CAMERA_COLUMN not in measurements.readings:
+        return measurements
+    stated, scales = (texts_of(measurements, name) for name in (INTRINSICS_COLUMN, SCALE_COLUMN))
+    images, names = ImageIntrinsics.of(stated), cameras(measurements) or ("",) * len(stated)
+    is_counted = np.array([name in counted.get("camera", ()) for name in names])
+    images = replace(images, sigma=np.where(is_counted[:, None], UNSTATED, 1.0) * images.sigma)
+    texts = {
+        INTRINSICS_COLUMN: tuple(
+            text if name else "" for name, text in zip(names, images.texts, strict=True)
+        ),
+        SCALE_COLUMN: tuple(
+            "1" if board in counted.get("board", ()) else text
+            for board, text in zip(boards(measurements) or (), scales, strict=True)
+        ),
+    }
+    return replace(measurements, readings={**measurements.readings, **texts})
+
+
+def numbers_in(text: str, count: int) -> list[float]:
+    """Return so many numbers with blanks between; none where the text holds anything else."""
+    try:
+        numbers = [float(word) for word in text.split()]
+    except ValueError:
+        return []
+    return numbers if len(numbers) == count and all(map(math.isfinite, numbers)) else []
+
+
+def texts_of(measurements: Measurements, name: str) -> tuple[str, ...]:
+    """Return a column of names that sensors add, "" in every row where it is not there."""
+    return measurements.as_fields().text(name)
+
+
+def cameras(measurements: Measurements) -> tuple[str, ...] | None:
+    """Name per row the camera whose intrinsics are to be identified, "" where there is none; None in all of them."""
+    stated = zip(
+        texts_of(measurements, CAMERA_COLUMN), texts_of(measurements, INTRINSICS_COLUMN), strict=True
+    )
+    names = tuple(camera if numbers else "" for camera, numbers in stated)
+    return names if any(names) else None
+
+
+def boards(measurements: Measurements) -> tuple[str, ...] | None:
+    """Name per row the board of an image, which is its frame or its target, whichever is not the camera.
+
+    Where a model names neither, it is called "board".
+    """
+    cells = zip(texts_of(measurements, CAMERA_COLUMN), measurements.frame, measurements.target, strict=True)
+    names = tuple(
+        (target if frame == camera else frame) or "board" if camera else "" for camera, frame, target in cells
+    )
+    return names if any(names) else None
+
+
+def scale_deviations(measurements: Measurements) -> Float64[Tensor, " boards"]:
+    """Return per board the prior standard deviation of its scale [1], 0 where the scale is held.
+
+    It is held where no deviation is stated and no other row has a length that could correct it.
+    """
+    names, stated = boards(measurements), texts_of(measurements, SCALE_COLUMN)
+    other_lengths = bool((~measurements.measured("corner") & ~measurements.measured("rotation")).any())
+    usual = USUAL_SCALE if other_lengths else 0.0
+    texts = [stated[(names or ()).index(board)] for board in names_of(names)]
+    return torch.tensor([float(text) if text else usual for text in texts], dtype=torch.float64)
+
+
+@dataclass(frozen=True, eq=False)
+class IntrinsicsSensor(AbstractSensor):
+    """What all images of a camera and its calibration say of its intrinsics, in one row of the camera.
+
+    The poses of the boards are eliminated from the images (variable projection, Golub and Pereyra 1973); what is left
+    adds up over images, and the stated deviations are added to it. Values are the noise of one corner, as a length at
+    the board, times `U (mean - k)` with `U^T U` the sum of the information.
+
+    Attributes:
+        owner: index of the camera of every row, -1 where the row holds none.
+        root: noise times U [m per px or 1].
+        mean: what all of it says of k [px or 1].
+        present: whether a row holds a camera's.
+        sigma: the noise [m].
+    """
+
+    name = "intrinsics"
+    unit = "m"
+    components = NUMBERS
+    certain = True
+    holds_frame = False
+    owner: Int64[Tensor, " rows"]
+    root: Float64[Tensor, "9 9 rows"]
+    mean: Float64[Tensor, "9 rows"]
+    present: Bool[Tensor, " rows"]
+    sigma: Float64[Tensor, " rows"]
+
+    @classmethod
+    def build(cls, rows: SensorRows) -> "IntrinsicsSensor | None":
+        """Add up the information of every camera; None where no intrinsics are to be identified."""
+        data, names = rows.measurements, cameras(rows.measurements)
+        if names is None or not bool(rows.by_corners.any()):
+            return None
+        images = ImageIntrinsics.of(texts_of(data, INTRINSICS_COLUMN))
+        noise = torch.nan_to_num(rows.readings(NOISE_COLUMN), nan=1.0)
+        number = numbers_of(names, names_of(names), data.rows).numpy()
+        owners = np.full(data.rows, -1)
+        roots, means = np.zeros((NUMBERS, NUMBERS, data.rows)), np.zeros((NUMBERS, data.rows))
+        for camera in range(number.max() + 1):
+            chosen = number == camera
+            first = int(chosen.argmax())
+            U, means[:, first] = intrinsics_information(images.select(chosen))
+            owners[first], roots[..., first] = camera, U * float(noise[first])
+        owner, root, mean = (torch.from_numpy(those).to(noise.device) for those in (owners, roots, means))
+        return cls(owner, root, mean, owner >= 0, noise)
+
+    def residual(self, motion: ToolMotion, unknowns: Unknowns, rows: slice) -> Values:
+        """Return the weighted errors of the intrinsics [m]."""
+        off = self.mean[:, rows] - unknowns["camera"][:, self.owner[rows]]
+        residual: Tensor = torch.einsum("ijn,jn->in", self.root[..., rows], off)
+        return residual
+
+    def derivative(self, motion: ToolMotion, unknowns: Unknowns, rows: slice) -> Derivative:
+        """Return 0: the tool has no part in it."""
+        return torch.zeros_like(motion.derivative[:, :1]).expand(-1, NUMBERS, -1)
+
+    def unknown_derivatives(
+        self, motion: ToolMotion, unknowns: Unknowns, rows: slice
+    ) -> tuple[UnknownDerivative, ...]:
+        """Return the weights."""
+        return (UnknownDerivative("camera", self.owner[rows], self.root[..., rows].transpose(0, 1)),)
+
+    @classmethod
+    def unknowns(cls, measurements: Measurements) -> UnknownGroup | None:
+        """Name the cameras whose intrinsics are to be identified."""
+        owners, frames = owners_of(measurements, cameras(measurements))
+        return (
+            UnknownGroup("camera", tuple(CAMERA_UNITS), owners, frames, units=CAMERA_UNITS)
+            if owners
+            else None
+        )
+
+    @classmethod
+    def initial_guess(cls, measurements: Measurements, T: Poses, reach: float) -> InitialUnknowns | None:
+        """Start at the stated intrinsics; those without a deviation stay."""
+        names = cameras(measurements)
+        if names is None:
+            return None
+        images = ImageIntrinsics.of(texts_of(measurements, INTRINSICS_COLUMN))
+        first = [names.index(name) for name in names_of(names)]
+        return InitialUnknowns(
+            torch.from_numpy(images.stated[first]), torch.from_numpy(images.sigma[first] > 0)
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class BoardScaleSensor(AbstractSensor):
+    """How sure the stated scale of a board is, in one row of the board.
+
+    The unknown s makes every length of the board `1 + s` times as long as stated.
+
+    Attributes:
+        owner: index of the board of every row, -1 where the row holds none.
+        weight: the noise over the prior standard deviation of s [m].
+        present: whether a row holds a board's.
+        sigma: of the values [m]: the noise of one corner as a length at the board.
+    """
+
+    name = "board scale"
+    unit = "m"
+    components = 1
+    certain = True
+    holds_frame = False
+    owner: Int64[Tensor, " rows"]
+    weight: Float64[Tensor, " rows"]
+    present: Bool[Tensor, " rows"]
+    sigma: Float64[Tensor, " rows"]
+
+    @classmethod
+    def build(cls, rows: SensorRows) -> "BoardScaleSensor | None":
+        """Put every board that may be of another scale into its first row; None where there is none."""
+        data, names = rows.measurements, boards(rows.measurements)
+        deviations = scale_deviations(data)
+        if names is None or not bool((deviations > 0).any()) or not bool(rows.by_corners.any()):
+            return None
+        noise = torch.nan_to_num(rows.readings(NOISE_COLUMN), nan=1.0)
+        owner, weight = torch.full((data.rows,), -1).to(noise.device), torch.zeros_like(noise)
+        for number, name in enumerate(names_of(names)):
+            row, deviation = names.index(name), float(deviations[number])
+            if deviation > 0:
+                owner[row], weight[row] = number, noise[row] / deviation
+        return cls(owner, weight, owner >= 0, noise)
+
+    def residual(self, motion: ToolMotion, unknowns: Unknowns, rows: slice) -> Values:
+        """Return minus the scale by its deviation, as a share of the noise [m]."""
+        scale = unknowns["board"][:, self.owner[rows]]
+        residual: Tensor = -scale * self.weight[rows]
+        return residual
+
+    def derivative(self, motion: ToolMotion, unknowns: Unknowns, rows: slice) -> Derivative:
+        """Return 0: the tool has no part in it."""
+        return torch.zeros_like(motion.derivative[:, :1])
+
+    def unknown_derivatives(
+        self, motion: ToolMotion, unknowns: Unknowns, rows: slice
+    ) -> tuple[UnknownDerivative, ...]:
+        """Return the weight."""
+        return (UnknownDerivative("board", self.owner[rows], self.weight[None, None, rows]),)
+
+    @classmethod
+    def unknowns(cls, measurements: Measurements) -> UnknownGroup | None:
+        """Name the boards."""
+        owners, frames = owners_of(measurements, boards(measurements))
+        return UnknownGroup("board", ("scale",), owners, frames, units={"scale": "1"}) if owners else None
+
+    @classmethod
+    def initial_guess(cls, measurements: Measurements, T: Poses, reach: float) -> InitialUnknowns | None:
+        """Start at the stated scale."""
+        if boards(measurements) is None:
+            return None
+        free = scale_deviations(measurements)[:, None] > 0
+        return InitialUnknowns(torch.zeros(free.shape, dtype=torch.float64), free)

@@ -1,0 +1,181 @@
+"""The registry of sensors: a new kind of sensor is a file of its own and one line here."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+import torch
+from jaxtyping import Float64, Int64
+from torch import Tensor
+
+from pisigma.files.errors import MeasurementError
+from pisigma.measurement.csv.columns import find_column
+from pisigma.measurement.dataset import Measurements
+from pisigma.measurement.readings import READINGS
+from pisigma.measurement.sensors.anchor import AnchorSensor
+from pisigma.measurement.sensors.corner import CornerSensor, as_poses
+from pisigma.measurement.sensors.intrinsics import BoardScaleSensor, IntrinsicsSensor
+from pisigma.measurement.sensors.pair import PairSensor
+from pisigma.measurement.sensors.pose import PositionSensor, RotationSensor
+from pisigma.measurement.sensors.sensor import AbstractSensor, SensorRows, UnknownGroup, names_of, numbers_of
+from pisigma.measurement.sensors.socket import SocketSensor
+from pisigma.measurement.sensors.touch import TouchSensor
+from pisigma.robot.kinematics.parameter_jacobian import ToolMotion
+from pisigma.robot.se3 import transform
+
+SENSORS: dict[str, type[AbstractSensor]] = {}
+"""All kinds of sensors by name, in the order in which their residuals are added up."""
+
+GROSS, ROUNDS = 4.0, 3
+"""Rows that are farther off than so many times the median of their owner's do not count for where it is, found in so
+many rounds."""
+
+IdentifiedUnknowns = Mapping[str, Mapping[str, Float64[np.ndarray, " columns"]]]
+"""By group and owner, what was identified of a sensor's own, in the frame of the owner [m or rad]."""
+
+
+def register_sensor(sensor: type[AbstractSensor]) -> type[AbstractSensor]:
+    """Register a kind of sensor with measurement files, calibration and judging; also a class decorator.
+
+    Args:
+        sensor: a final subclass of `AbstractSensor`. Its `readings` say which columns it adds to measurement files;
+            only the sensors that come with pisigma may have none.
+
+    Returns:
+        The same class.
+
+    Raises:
+        MeasurementError: there is a sensor of that name already, or one of its columns exists already.
+    """
+    if sensor.name in SENSORS:
+        raise MeasurementError(
+            f"a sensor called '{sensor.name}' is registered already; give yours another name."
+        )
+    if sensor.readings is not None:
+        for column in sensor.readings.columns:
+            for name in (f"{column.name}_{unit}" if unit else column.name for unit in column.units):
+                if find_column(name) is not None:
+                    raise MeasurementError(
+                        f"sensor '{sensor.name}': measurement files have a column '{name}' already; name it otherwise."
+                    )
+        READINGS[sensor.name] = sensor.readings
+    SENSORS[sensor.name] = sensor
+    return sensor
+
+
+for _sensor in (
+    PositionSensor,
+    RotationSensor,
+    TouchSensor,
+    SocketSensor,
+    AnchorSensor,
+    PairSensor,
+    CornerSensor,
+    IntrinsicsSensor,
+    BoardScaleSensor,
+):
+    register_sensor(_sensor)
+
+
+def build_sensors(rows: SensorRows) -> list[AbstractSensor]:
+    """Gather the measured values of every kind.
+
+    Raises:
+        IdentificationError: a standard deviation is stated in some rows of a kind only.
+    """
+    built = (sensor.build(rows) for sensor in SENSORS.values())
+    return [sensor for sensor in built if sensor is not None]
+
+
+def unknown_groups(measurements: Measurements) -> tuple[UnknownGroup, ...]:
+    """Name what the sensors of some rows have to find out about themselves."""
+    groups = (sensor.unknowns(measurements) for sensor in SENSORS.values())
+    return tuple(group for group in groups if group is not None)
+
+
+def pairs_first(measurements: Measurements, rows: Int64[Tensor, " rows"]) -> Int64[Tensor, " rows"]:
+    """Sort rows such that those of pairs come first, side by side; the others keep their order."""
+    if measurements.pair is None:
+        return rows
+    order = names_of(measurements.pair)
+    number = numbers_of(measurements.pair, order, measurements.rows).to(rows.device)[rows]
+    number = torch.where(number < 0, len(order), number)
+    return rows[torch.sort(number, stable=True).indices]
+
+
+def measured_errors(
+    T: Float64[Tensor, "rows 4 4"], measurements: Measurements, unknowns: IdentifiedUnknowns | None
+) -> dict[str, Float64[Tensor, "rows components"]]:
+    """Measured minus predicted values for tool poses that some model predicts.
+
+    Args:
+        T: where the model has the target, in the frame of every row.
+        measurements: what was measured.
+        unknowns: what was identified of the sensors' own; see `AbstractSensor.uncalibrated` for owners that are not
+            here. None for those that fit the rows best; the errors of n values that p unknowns of an owner were fitted
+            to are multiplied by `sqrt(n / (n - p))` then, and NaN where nothing is left of them.
+
+    Returns:
+        By sensor [m or rad], NaN in rows without a value; the error of a pair stands in both of its rows, and that of
+        an image is that of its pose. Sensors that no row has are left out.
+
+    Raises:
+        IdentificationError: the rows of an owner that was not calibrated do not determine its unknowns.
+    """
+    rows = pairs_first(measurements, torch.arange(measurements.rows, device=T.device))
+    data = replace(as_poses(measurements, unknowns or {}), sigma_position=None, sigma_rotation=None).select(
+        rows
+    )
+    T = T[rows]
+    still = torch.zeros(0, 6, len(T), dtype=T.dtype, device=T.device)
+    motion = ToolMotion(T[:, :3, 3].t(), T[:, :3, :3].permute(1, 2, 0), still)
+    eye = torch.eye(4, dtype=T.dtype, device=T.device).expand(len(T), 4, 4)
+    errors = {}
+    for sensor in build_sensors(SensorRows(data, eye, eye[:, :3, :3])):
+        group, columns, factor = type(sensor).unknowns(data), {}, T.new_ones(len(T))
+        if group is not None and unknowns is None:
+            columns[group.name], factor = _fitting_best(sensor, group, data, motion)
+        elif group is not None and unknowns is not None:
+            identified = unknowns.get(group.name, {})
+            values = [
+                torch.from_numpy(identified[owner].copy()).to(T)
+                if owner in identified
+                else type(sensor).uncalibrated(data, owner, T, tuple(identified))
+                for owner in group.owners
+            ]
+            columns[group.name] = torch.stack(values, 1)
+        residual = sensor.residual(motion, columns, slice(None)).t() * factor[:, None]
+        error = torch.full_like(residual, torch.nan)
+        error[rows[sensor.present]] = residual[sensor.present]
+        if sensor.paired:
+            error[rows[sensor.present.roll(1)]] = residual[sensor.present]
+        errors[sensor.name] = error
+    return errors
+
+
+def _fitting_best(
+    sensor: AbstractSensor, group: UnknownGroup, data: Measurements, motion: ToolMotion
+) -> tuple[Float64[Tensor, "columns owners"], Float64[Tensor, " rows"]]:
+    """The unknowns of all owners that fit their rows best, but for gross errors, and the factor on the errors."""
+    T = transform(motion.rotation.permute(2, 0, 1), motion.position.t())
+    kept, count = torch.ones(len(T), dtype=torch.bool), len(group.owners)
+    for _ in range(ROUNDS):
+        some = kept.nonzero()[:, 0]
+        guess = type(sensor).initial_guess(data.select(some), T[some], math.inf)
+        there = type(sensor).unknowns(data.select(some))
+        assert guess is not None
+        assert there is not None
+        order = [there.owners.index(owner) for owner in group.owners]
+        columns, free = guess.values[order].t().to(T), guess.free[order].sum(1)
+        owner = sensor.unknown_derivatives(motion, {group.name: columns}, slice(None))[0].owner
+        size = sensor.residual(motion, {group.name: columns}, slice(None)).norm(dim=0)
+        counted, kept = kept, kept.clone()
+        for number in range(count):
+            own = sensor.present & (owner == number)
+            kept[own] = size[own] <= GROSS * size[own].quantile(0.5)
+        if torch.equal(kept, counted):
+            break
+    values = torch.bincount(owner[sensor.present & counted], minlength=count) * sensor.components
+    factor = torch.where(values > free, (values / (values - free).clamp(min=1)).sqrt(), torch.nan)
+    return columns, torch.where(sensor.present, factor[owner], 1.0).to(T)

@@ -1,0 +1,187 @@
+"""Corrected inverse kinematics of coupled joints: the controller's values in and out, DH values in between."""
+
+from copy import copy
+from dataclasses import replace
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pisigma.files.errors import PoseError
+from pisigma.model.inverse.joint_input import as_array, pose_array
+from pisigma.model.inverse.passive_joints import nearest_starts, solve, solve_from
+from pisigma.model.inverse.solution import Solution
+from pisigma.robot.kernels.array_kinematics import forward_kinematics, is_tensor, joint_jacobian
+from pisigma.robot.kinematics.status import Status
+from pisigma.robot.kinematics.task_axes import TaskAxes
+
+if TYPE_CHECKING:  # names in full, which type checkers at run time find without these imports
+    import pisigma.model.inverse.corrected_ik
+    import pisigma.robot.coupling
+
+
+class ControllerValues:
+    """Solves in DH values, where limits are wider than the controller's, and brings the answers into these.
+
+    Full turns of coupled joints change the controller's values together. Where no turns bring a solution into the
+    controller's limits, the other branches are tried, in order or the nearest first.
+    """
+
+    def __init__(
+        self,
+        ik: "pisigma.model.inverse.corrected_ik.CorrectedIK",
+        coupling: "pisigma.robot.coupling.Coupling",
+    ) -> None:
+        """Take the inverse kinematics of DH values, and how these follow the controller's."""
+        self.ik, self.coupling = ik, coupling
+
+    def for_axes(self, axes: TaskAxes) -> "ControllerValues":
+        """The same where other axes of the tool count.
+
+        Raises:
+            PoseError: the arm has passive joints, which are solved in the usual axes only.
+        """
+        if self.coupling.passive:
+            raise PoseError(
+                "an arm with passive joints takes no other axes of the tool than the usual; state none."
+            )
+        ik = copy(self.ik)
+        ik.axes = axes
+        return ControllerValues(ik, self.coupling)
+
+    def solve(self, T: Any, near: Any, owner: Any, branch: str | None = None, **options: Any) -> Solution:
+        """See `CorrectedIK.__call__`.
+
+        Args:
+            T: poses.
+            near: checked, of the controller; None without.
+            owner: of the solutions.
+            branch: name of the only branch that may be taken.
+            options: of `CorrectedIK.__call__`.
+        """
+        if self.coupling.passive:
+            return self._solve_passive(T, near, owner)
+        if (sides := options.get("approach")) is not None:
+            options["approach"] = self.coupling.approach_to_dh(np.asarray(sides, dtype=np.float64))
+        beside = None if near is None else self.coupling.to_dh(np.asarray(near, dtype=np.float64))
+        first = self.ik(T, near=beside, branch=branch, **options)
+        q, outside = self._inside(np.asarray(as_array(first.q)), beside)
+        if outside.any() and branch is None:
+            self._other_branches(pose_array(T)[0], q, outside, beside, options)
+        if not np.array_equal(q, as_array(first.q), equal_nan=True):
+            first = self.ik(T, near=np.nan_to_num(q), branch=branch, **options)
+        return self._answer(first, owner)
+
+    def all_branches(self, T: Any, owner: Any, **options: Any) -> Solution:
+        """See `CorrectedIK.all_branches`."""
+        if self.coupling.passive:
+            return self._solve_passive(T[..., None, :, :], None, owner)
+        every = self.ik.all_branches(T, **options)
+        q, _ = self._inside(np.asarray(as_array(every.q)), None)
+        return self._answer(replace(every, q=every.q * 0 + _as(q, every.q)), owner)
+
+    def forward(self, q: Any, approach: Any) -> Any:
+        """See `CorrectedIK.forward`."""
+        sides = None if approach is None else self.coupling.approach_to_dh(approach)
+        return self.ik.forward(self._to_dh(q), approach=sides)
+
+    def jacobian(self, q: Any) -> Any:
+        """See `CorrectedIK.jacobian`: by the controller's values."""
+        return self.ik.jacobian(self._to_dh(q)) @ _as(self.coupling.slope(as_array(q)), q)
+
+    def accuracy(self, q: Any) -> Any:
+        """See `CorrectedIK.accuracy`."""
+        return self.ik.accuracy(self._to_dh(q))
+
+    def _to_dh(self, q: Any) -> Any:
+        return self.coupling.to_dh(q if is_tensor(q) else np.asarray(q, dtype=np.float64))
+
+    def _solve_passive(self, T: Any, near: Any, owner: Any) -> Solution:
+        """Solve an arm with passive joints, from `near` or from the stored joint values whose poses are nearest."""
+        poses, axes = pose_array(T)[0], len(self.coupling.axes)
+        rows, batch = poses.reshape(-1, 4, 4), poses.shape[:-2]
+        if near is None:
+            stored = self.coupling.to_controller(self.ik.model.starts.double().cpu().numpy())
+            starts = nearest_starts(self._motion, rows, stored)
+        else:
+            starts = np.broadcast_to(near, (*batch, axes)).reshape(-1, 1, axes)
+        found = solve_from(
+            self._motion, rows, starts, lambda q: self.coupling.is_inside(self.coupling.to_dh(q))
+        )
+        nominal = solve(partial(self._motion, nominal=True), rows, found.q)
+        q, q_nominal = found.known(found.q), nominal.known(nominal.q)
+        solution = Solution(
+            q.reshape(*batch, axes),
+            np.where(np.isfinite(q), q_nominal, np.nan).reshape(*batch, axes),
+            np.zeros(batch, dtype=int),
+            self.ik.branches[:1],
+            np.where(found.reached, int(Status.REACHED), int(Status.UNREACHABLE)).reshape(batch),
+            found.known(found.position).reshape(batch),
+            found.known(found.rotation).reshape(batch),
+            np.full(batch, np.nan),
+            owner,
+        )
+        outside = found.reached & ~self.coupling.is_inside(self.coupling.to_dh(found.q))
+        beyond = int(Status.OUTSIDE_JOINT_LIMITS)
+        solution = replace(solution, status=np.where(outside.reshape(batch), beyond, solution.status))
+        return solution.map(T.new_tensor) if is_tensor(T) else solution
+
+    def _motion(self, q: Any, nominal: bool = False) -> tuple[Any, Any]:
+        """Pose and Jacobian at the controller's values of the calibrated arm, or of the nominal one."""
+        dh, slope = self.coupling.to_dh(q), self.coupling.slope(q)
+        if nominal:
+            robot = self.ik.model.robot
+            return forward_kinematics(robot, dh), joint_jacobian(robot, dh) @ slope
+        return self.ik.forward(dh), self.ik.jacobian(dh) @ slope
+
+    def _inside(self, q: Any, near: Any) -> tuple[Any, Any]:
+        """DH values turned so that the controller's are within its limits, and which of them cannot be."""
+        rows = q.reshape(-1, q.shape[-1])
+        beside = None if near is None else np.broadcast_to(near, q.shape).reshape(rows.shape)
+        turned, inside = self.coupling.turned_inside(rows, beside)
+        return turned.reshape(q.shape), (~inside & np.isfinite(rows).all(-1)).reshape(q.shape[:-1])
+
+    def _other_branches(self, T: Any, q: Any, outside: Any, near: Any, options: dict[str, Any]) -> None:
+        """Put joint values of the best branch within the limits into `q`, where there is one."""
+        poses = T[outside] if T.ndim > 2 else T[None]
+        every, excluded = self._inside(
+            np.asarray(self.ik.all_branches(poses, approach=_of_rows(options.get("approach"), outside)).q),
+            None,
+        )
+        allowed = ~excluded & np.isfinite(every).all(-1)
+        if near is None:
+            cost = np.argsort(self.ik.order)[None].astype(float)
+        else:
+            cost = np.abs(every - np.broadcast_to(near, q.shape)[outside].reshape(-1, 1, q.shape[-1])).sum(-1)
+        best = np.where(allowed, cost, np.inf).argmin(-1)
+        chosen = every[np.arange(len(best)), best]
+        some = allowed.any(-1)
+        rows = q.reshape(-1, q.shape[-1])
+        index = np.flatnonzero(outside)[some]
+        rows[index] = chosen[some]
+        q[...] = rows.reshape(q.shape)
+
+    def _answer(self, solution: Solution, owner: Any) -> Solution:
+        """The solution in the controller's values, with the status that its limits give."""
+        status = np.asarray(as_array(solution.status))
+        dh = np.asarray(as_array(solution.q))
+        beyond = ~self.coupling.is_inside(dh) & np.isfinite(dh).all(-1)
+        status = np.where(beyond, int(Status.OUTSIDE_JOINT_LIMITS), status)
+        plain = int(status) if np.ndim(solution.status) == 0 and not is_tensor(solution.status) else status
+        return replace(
+            solution,
+            q=self.coupling.to_controller(solution.q),
+            q_nominal=self.coupling.to_controller(solution.q_nominal),
+            status=_as(plain, solution.status),
+            owner=owner,
+        )
+
+
+def _as(values: Any, like: Any) -> Any:
+    """Values as a tensor where others are one."""
+    return like.new_tensor(values) if is_tensor(like) else values
+
+
+def _of_rows(values: Any, rows: Any) -> Any:
+    """Those of some rows, where there is one a row."""
+    return values[rows] if values is not None and np.ndim(values) > 1 else values

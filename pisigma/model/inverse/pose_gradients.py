@@ -1,0 +1,160 @@
+"""Gradients of joint values with respect to the wanted pose, by the implicit function theorem."""
+
+from dataclasses import replace
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float64
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from pisigma.model.calibrated_model import CalibratedModel
+from pisigma.model.hybrid_motion import hybrid_motion
+from pisigma.model.inverse.finishing import as_trained
+from pisigma.model.inverse.solution import Solution
+from pisigma.robot.description import Robot
+from pisigma.robot.kinematics.jacobian import joint_jacobian
+from pisigma.robot.kinematics.numeric import Motion
+from pisigma.robot.kinematics.singularity import characteristic_length, dimensionless_jacobian
+from pisigma.robot.kinematics.task_axes import WHOLE, TaskAxes
+from pisigma.robot.kinematics.task_error import task_error
+from pisigma.robot.kinematics.tolerances import SINGULAR_TOLERANCE
+from pisigma.robot.se3 import skew
+
+if TYPE_CHECKING:
+    import pisigma.model.inverse.corrected_ik
+
+
+def as_tensors(
+    solution: Solution,
+    poses: Float[Tensor, "*batch 4 4"],
+    model: CalibratedModel | None,
+    owner: "pisigma.model.inverse.corrected_ik.CorrectedIK",
+    axes: TaskAxes,
+) -> Solution:
+    """Solutions as they are handed out for tensors: like the poses, and with gradients to them.
+
+    Args:
+        solution: in float64 on the CPU, as arrays or tensors; with a last batch axis more than the poses where it is of
+            all branches.
+        poses: as they were given.
+        model: what solved for the poses, where gradients are wanted.
+        owner: see `Solution`.
+        axes: which axes of the tool count.
+    """
+    result = solution.map(_tensor)
+    if model is not None and torch.is_grad_enabled():
+        every = poses.unsqueeze(-3) if result.status.ndim > poses.ndim - 2 else poses
+        result = differentiable(model, result, every.expand(*result.status.shape, 4, 4), axes)
+    return replace(
+        result,
+        q=result.q.to(poses),
+        q_nominal=result.q_nominal.to(poses),
+        branch=result.branch.to(poses.device),
+        status=result.status.to(poses.device),
+        domain_measure=result.domain_measure.to(poses),
+        owner=owner,
+    )
+
+
+def _tensor(values: Any) -> Tensor:
+    return values if isinstance(values, Tensor) else torch.from_numpy(np.asarray(values, order="C"))
+
+
+def differentiable(
+    model: CalibratedModel, result: Solution, T: Float[Tensor, "*batch 4 4"], axes: TaskAxes = WHOLE
+) -> Solution:
+    """The same solutions, from whose `q` and `q_nominal` gradients flow to the poses.
+
+    A solution satisfies `FK(q) = T`. When the pose moves by a twist ξ (translation, rotation vector, both in the base
+    frame) the joints follow it by `dq = J⁺ ξ`, with J the Jacobian of the whole calibrated arm, the slope of its
+    correction within. A network on nominal joint values is differentiated as such: `q = q_nominal + Δ(T, q_nominal)`,
+    with `dq_nominal = J_nominal⁺ ξ`.
+
+    J⁺ is the pseudo-inverse in characteristic lengths, without singular values below `SINGULAR_TOLERANCE`: the
+    inverse where there is one; with joints to spare the least motion of them; with fewer than six joints, or at a
+    singular pose, that part of ξ which the tool can follow. Changes of T that are no motion (shear, scale) count as
+    none. A solution that is NaN has the gradient 0, so that it can be masked. There are first derivatives only. Where
+    some axes of the tool do not count, ξ and J are taken in the others alone.
+
+    Args:
+        model: what solved for the poses.
+        result: the solutions, on the CPU in float64.
+        T: the poses that require gradients, in any dtype and on any device.
+        axes: which axes of the tool count.
+    """
+    T = T.to("cpu", torch.float64)
+    q_nominal = _attached(model.robot, T, axes, result.q_nominal, partial(joint_jacobian, model.robot))
+    if model.calibrated is not None:
+        identified, hybrid = model.identified, model.hybrid
+
+        motion: Motion = (
+            partial(joint_jacobian, identified) if hybrid is None else partial(hybrid_motion, hybrid)
+        )
+        q = _attached(model.robot, T, axes, result.q, motion)
+        return replace(result, q=q, q_nominal=q_nominal)
+    if model.network is None:
+        return replace(result, q=q_nominal + result.correction, q_nominal=q_nominal)
+    known = torch.isfinite(result.q).all(-1, keepdim=True)
+    safe = torch.where(known, q_nominal, 0.0)
+    on_turn = safe + (as_trained(model, safe.detach()) - safe.detach())
+    correction = torch.where(known, model.network(T, on_turn), torch.nan)
+    return replace(result, q=q_nominal + correction, q_nominal=q_nominal)
+
+
+def _twist(T: Float64[Tensor, "*batch 4 4"]) -> Float64[Tensor, "*batch 6"]:
+    """Motion of poses from where they are [m, rad]: 0, with the derivatives of the motion."""
+    still = T.detach()
+    turn = T[..., :3, :3] @ still[..., :3, :3].mT
+    turned = [turn[..., k, j] - turn[..., j, k] for j, k in ((1, 2), (2, 0), (0, 1))]
+    return torch.cat([T[..., :3, 3] - still[..., :3, 3], torch.stack(turned, -1) / 2], -1)
+
+
+def _attached(robot: Robot, T: Tensor, axes: TaskAxes, q: Tensor, motion: Motion) -> Tensor:
+    """Joint values that follow the poses; the motion is that of rows of joint values."""
+    flat = q.detach().reshape(-1, q.shape[-1])
+    rows = torch.isfinite(flat).all(-1).nonzero()[:, 0]
+    inverse = flat.new_zeros(len(flat), q.shape[-1], 6)
+    if len(rows):
+        inverse[rows] = _inverse(robot, T.detach().reshape(-1, 4, 4)[rows], axes, *motion(flat[rows]))
+    result: Tensor = _Implicit.apply(_twist(T), q.detach(), inverse.reshape(*q.shape, 6))  # type: ignore[no-untyped-call]
+    return result
+
+
+def _inverse(robot: Robot, T: Tensor, axes: TaskAxes, reached: Tensor, J: Tensor) -> Tensor:
+    """Takes twists of wanted poses to joint motions in the axes that count, `(poses, dof, 6)`."""
+    if axes.whole:
+        return pseudo_inverse(robot, J)
+    _, turn = task_error(axes, T, reached)
+    turn = turn * turn.new_tensor(axes.weights(robot.dof))[:, None]
+    wanted = turn.clone()  # what is off along axes that do not count turns with the wanted tool
+    wanted[:, :, 3:] += turn[:, :, :3] @ skew(T[:, :3, 3] - reached[:, :3, 3])
+    return pseudo_inverse(robot, turn @ J) @ wanted
+
+
+def pseudo_inverse(robot: Robot, J: Float64[Tensor, "poses 6 dof"]) -> Float64[Tensor, "poses dof 6"]:
+    """Takes twists [m, rad] to joint motions [rad or m]; see `differentiable`."""
+    length = characteristic_length(robot)
+    result: Tensor = torch.linalg.pinv(
+        dimensionless_jacobian(robot, J).contiguous(), atol=SINGULAR_TOLERANCE, rtol=0.0
+    )
+    joints = J.new_tensor([1.0 if revolute else length for revolute in robot.revolute])
+    scaled: Tensor = joints[:, None] * result * J.new_tensor([1 / length] * 3 + [1.0] * 3)
+    return scaled
+
+
+class _Implicit(torch.autograd.Function):
+    """Values as they are, with a derivative that is known by other means than differentiating what made them."""
+
+    @staticmethod
+    def forward(ctx: Any, twist: Tensor, q: Tensor, inverse: Tensor) -> Tensor:
+        ctx.save_for_backward(inverse)
+        return q.clone()
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None, None]:
+        (inverse,) = ctx.saved_tensors
+        return (gradient[..., None, :] @ inverse)[..., 0, :], None, None

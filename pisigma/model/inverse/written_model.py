@@ -1,0 +1,96 @@
+"""Models that are written are read again: they must say what the model in memory says before a folder gets its name."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from pisigma.files.errors import ModelError
+from pisigma.measurement.dataset import Measurements
+from pisigma.model.accuracy import deviation_of_rows
+from pisigma.model.calibrated_model import CalibratedModel
+from pisigma.model.folder.model_folder import load_model, save_model
+from pisigma.model.inverse.corrected_ik import CorrectedIK, load
+from pisigma.model.row_poses import poses_of_rows
+
+PROBED = 20
+"""Joint values at which the model in memory and the one in the folder are compared."""
+AROUND = 0.1
+"""[rad or m] They are so near to those of training rows."""
+SAME, SAME_JOINTS = 1e-12, 1e-9
+"""[m or rad] Largest difference of predictions, and of joint values, which come out of an iteration."""
+
+
+def write_model(model: CalibratedModel, folder: Path) -> None:
+    """Write the files of a model into a scratch folder, and make sure that they say what the model says.
+
+    Raises:
+        ModelError: see `save_model`.
+        AssertionError: the folder does not load, or says something else, which is a defect of pisigma.
+    """
+    save_model(model, folder)
+    check_written(model, folder)
+
+
+def check_written(model: CalibratedModel, folder: Path) -> None:
+    """Compare a model with its folder: poses, corrected IK, predicted deviations and prior sizes of weights.
+
+    Raises:
+        AssertionError: they differ.
+    """
+    try:
+        loaded, ik = load_model(folder), load(folder)
+    except ModelError as problem:
+        raise AssertionError(f"the folder that was just written cannot be read: {problem}") from problem
+    rows = _probe(model)
+    with torch.no_grad():
+        _check("poses", poses_of_rows(model, rows), poses_of_rows(loaded, rows), SAME)
+        T = model.forward(rows.q)
+    _check("predicted deviations", deviation_of_rows(model, rows), deviation_of_rows(loaded, rows), SAME)
+    _check("prior sizes of weights", _prior_sizes(model), _prior_sizes(loaded), 0.0)
+    finite = T[torch.isfinite(T).flatten(1).all(1)].numpy()
+    before, after = CorrectedIK(model)(finite, throw=False), ik(finite, throw=False)
+    _check("joint values", torch.as_tensor(before.q), torch.as_tensor(after.q), SAME_JOINTS)
+    _check("statuses", torch.as_tensor(before.status).double(), torch.as_tensor(after.status).double(), 0.0)
+
+
+def _prior_sizes(model: CalibratedModel) -> Tensor:
+    """By weight, the number and the usual value of its prior size, which is how far it may drift."""
+    rows = [torch.zeros(0, 2, dtype=torch.float64)]
+    for feature in model.uncertainty.features if model.uncertainty else ():
+        number = feature.group[feature.used]
+        rows.append(torch.stack([number.double(), torch.tensor(feature.usual_sizes).double()[number]], 1))
+    return torch.cat(rows)
+
+
+def _probe(model: CalibratedModel) -> Measurements:
+    """Rows near those that were trained on, in all frames and of all targets in turn, with all that a row may state."""
+    generator = torch.Generator().manual_seed(0)
+    starts = model.starts.double().cpu()
+    if not len(starts):
+        starts = torch.zeros(1, model.robot.dof, dtype=torch.float64)
+    numbers = torch.linspace(0, len(starts) - 1, PROBED).round().long()
+    around = 2 * torch.rand((PROBED, model.robot.dof), generator=generator, dtype=torch.float64) - 1
+    frames, targets = list(model.bases) or [""], list(model.tools) or [""]
+    rows = Measurements(
+        q=starts[numbers] + AROUND * around,
+        frame=tuple(frames[k % len(frames)] for k in range(PROBED)),
+        target=tuple(targets[k // len(frames) % len(targets)] for k in range(PROBED)),
+    )
+    return replace(
+        rows,
+        approach=2.0 * torch.randint(0, 2, rows.q.shape, generator=generator).double() - 1.0,
+        payload=torch.linspace(0.0, 5.0, PROBED, dtype=torch.float64),
+        temperature=torch.linspace(15.0, 30.0, PROBED, dtype=torch.float64),
+    )
+
+
+def _check(what: str, before: Tensor, after: Tensor, tolerance: float) -> None:
+    """Refuse values that are not the same; NaN is the same as NaN."""
+    same = torch.isclose(before, after, rtol=0.0, atol=tolerance, equal_nan=True)
+    if before.shape != after.shape or not bool(same.all()):
+        most = float((before - after).abs().nan_to_num(torch.inf).max())
+        raise AssertionError(
+            f"{what} of the model in the folder differ by {most:.3g} from those of the model in memory"
+        )

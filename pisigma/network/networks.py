@@ -1,0 +1,264 @@
+"""Fitting Pi-Sigma networks with Lightning: the paper's gradient descent, Levenberg-Marquardt, or mini-batches."""
+
+import math
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import lightning
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.utils.data import DataLoader, Sampler, TensorDataset
+
+from pisigma.files.errors import TrainingError
+from pisigma.network.energy import energy, energy_gradient
+from pisigma.network.history import TrainingHistory
+from pisigma.network.levenberg_marquardt import LevenbergMarquardt, Patterns
+from pisigma.network.pi_sigma import PiSigma
+from pisigma.network.sections import FitSection, GradientDescentSection, MiniBatchSection
+from pisigma.network.trainer import SAVED, Checkpoints, train
+
+
+def fit_networks(
+    networks: Sequence[PiSigma],
+    patterns: Sequence[Patterns],
+    labels: Sequence[Sequence[str]],
+    fit: FitSection,
+    *,
+    checkpoints: Checkpoints | None = None,
+    show_progress: bool = False,
+    logs: Path | None = None,
+) -> TrainingHistory:
+    """Train networks in place.
+
+    Args:
+        networks: one per joint group.
+        patterns: their scaled patterns.
+        labels: names of the joints of every group.
+        fit: method and settings.
+        checkpoints: where they are kept; None keeps none.
+        show_progress: draw a bar on stderr, if that is a terminal.
+        logs: folder for the energies of every epoch as `metrics.csv`; None writes none.
+
+    Raises:
+        TrainingError: a pattern is not finite, the training diverged, or there is no checkpoint of these settings
+            and data to resume from.
+        OutputError: checkpoints cannot be written.
+    """
+    _check_finite(patterns, labels)
+    module = NetworkTraining(networks, fit, labels)
+    batches, epochs = _batches(patterns, fit)
+    train(module, batches, epochs, checkpoints=checkpoints, show_progress=show_progress, logs=logs)
+    module.write_networks()
+    return TrainingHistory(tuple(module.labels), module.history, module.resumed_from)
+
+
+def _check_finite(patterns: Sequence[Patterns], labels: Sequence[Sequence[str]]) -> None:
+    for group, names in zip(patterns, labels, strict=True):
+        for values in (group.x, group.d):
+            if not torch.isfinite(values).all():
+                row = int((~torch.isfinite(values)).nonzero()[0, 0])
+                raise TrainingError(
+                    f"pattern {row} (counted from 0) of {', '.join(names)} is not finite; leave that row out."
+                )
+
+
+def _batches(patterns: Sequence[Patterns], fit: FitSection) -> tuple[Any, int]:
+    """What gives Lightning its batches, and the number of its epochs.
+
+    Where every step takes all patterns, an epoch of Lightning's is a twentieth of the training: its hooks cost more
+    than a step. The module ends the last one early where the number of steps is no multiple of twenty.
+    """
+    tensors = [values for group in patterns for values in (group.x, group.d, group.validation)]
+    if not isinstance(fit, MiniBatchSection):
+        share = math.ceil(fit.epochs / SAVED)
+        return WholeBatches(tensors, share), math.ceil(fit.epochs / share)
+    order = ShuffledBatches(len(patterns[0].d), fit.batch_rows, fit.seed)
+    return DataLoader(TensorDataset(*tensors), batch_size=None, sampler=order), fit.epochs
+
+
+class WholeBatches:
+    """A loader that gives all patterns again and again: a DataLoader would double the time of a step."""
+
+    def __init__(self, batch: list[Tensor], count: int) -> None:
+        """Keep the batch of all patterns; an epoch has `count` of it."""
+        self._batch, self._count = batch, count
+
+    def __iter__(self) -> Iterator[list[Tensor]]:
+        """Give the batch as often as an epoch wants it."""
+        for _ in range(self._count):
+            yield self._batch
+
+    def __len__(self) -> int:
+        """Batches of an epoch."""
+        return self._count
+
+
+class ShuffledBatches(Sampler[Tensor]):
+    """Rows of the batches, in an order that only seed and epoch decide, so that a training resumes exactly."""
+
+    def __init__(self, rows: int, batch_rows: int, seed: int) -> None:
+        """Number of rows in all and of a batch, and the seed of their order."""
+        self._rows, self._batch_rows, self._seed, self._epoch = rows, batch_rows, seed, 0
+
+    def set_epoch(self, epoch: int) -> None:
+        """Lightning calls this before every epoch."""
+        self._epoch = epoch
+
+    def __iter__(self) -> Iterator[Tensor]:
+        """Give the rows of every batch."""
+        generator = torch.Generator().manual_seed(self._seed + self._epoch)
+        yield from torch.split(torch.randperm(self._rows, generator=generator), self._batch_rows)
+
+    def __len__(self) -> int:
+        """Batches of an epoch."""
+        return math.ceil(self._rows / self._batch_rows)
+
+
+class NetworkTraining(lightning.LightningModule):
+    """Trains the networks of all joint groups side by side, each output for itself.
+
+    Attributes:
+        energies: `(epochs, joints)`: see `TrainingHistory`; NaN for epochs that have not been.
+        epochs_done: epochs that have been.
+        resumed_from: epochs that were done in the checkpoint with which the training went on.
+    """
+
+    energies: Tensor
+    epochs_done: Tensor
+
+    def __init__(self, networks: Sequence[PiSigma], fit: FitSection, labels: Sequence[Sequence[str]]) -> None:
+        """Prepare the training.
+
+        Args:
+            networks: one per joint group; they are trained in place.
+            fit: method and settings.
+            labels: names of the joints of every group.
+        """
+        super().__init__()
+        self.automatic_optimization = isinstance(fit, MiniBatchSection)
+        self.networks = nn.ModuleList(networks)
+        self.fit, self.resumed_from = fit, 0
+        self.labels = [name for names in labels for name in names]
+        generator = torch.Generator().manual_seed(fit.seed)
+        self.solvers = nn.ModuleList()
+        for network in networks:
+            if isinstance(fit, GradientDescentSection | MiniBatchSection):
+                network.initialise(fit.spread, generator)
+            else:
+                self.solvers.append(LevenbergMarquardt(network, fit.starts, fit.spread, fit.ridge, generator))
+        self._rates = (
+            [fit.rates(group) for group in labels] if isinstance(fit, GradientDescentSection) else []
+        )
+        energies = torch.full((fit.epochs, len(self.labels)), torch.nan, dtype=torch.float64)
+        self.register_buffer("energies", energies)
+        self.register_buffer("epochs_done", torch.zeros((), dtype=torch.int64))
+
+    def configure_optimizers(self) -> Any:
+        """The optimiser of the method."""
+        if not isinstance(self.fit, MiniBatchSection):
+            # `_descend` writes gradients times rates. Solvers write none: they keep the state, but Lightning counts
+            # steps, and saves, by an optimiser.
+            return torch.optim.SGD(self.networks.parameters(), lr=1.0)
+        optimiser, steps = self.fit.build(self.networks.parameters()), self.trainer.estimated_stepping_batches
+        falling = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, int(steps))
+        return {"optimizer": optimiser, "lr_scheduler": {"scheduler": falling, "interval": "step"}}
+
+    def training_step(self, batch: list[Tensor], batch_idx: int) -> Tensor | None:
+        """Do one step.
+
+        Raises:
+            TrainingError: the training diverged.
+        """
+        patterns = [Patterns(*batch[k : k + 3]) for k in range(0, len(batch), 3)]
+        if isinstance(self.fit, MiniBatchSection):
+            return self._descend_by_batch(patterns, batch_idx)
+        step = self._iterate if len(self.solvers) else self._descend
+        self._count(self.optimizers().step(lambda: step(patterns)))  # type: ignore[union-attr]
+        self._stop_when_done()
+        return None
+
+    def on_train_epoch_end(self) -> None:
+        """Count an epoch of mini-batches."""
+        if isinstance(self.fit, MiniBatchSection):
+            self._count(self.energies[int(self.epochs_done)].clone())
+
+    def on_train_start(self) -> None:
+        """Do nothing more where a resumed training had ended already."""
+        self._stop_when_done()
+
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Read how many epochs were done in the checkpoint."""
+        self.resumed_from = int(checkpoint["state_dict"]["epochs_done"])
+
+    def write_networks(self) -> None:
+        """Give every network its best start, once the training has ended.
+
+        Not a hook: Lightning runs none when a training that had come to its end is resumed.
+
+        Raises:
+            TrainingError: a weight is not finite, because the last step diverged.
+        """
+        for network, solver in zip(self.networks, self.solvers, strict=False):
+            solver.write_best(network)  # type: ignore[operator]
+        start = 0
+        for network in self.networks:
+            outputs = torch.cat([p.detach().flatten(1) for p in network.parameters()], 1)
+            self._check(start, outputs.sum(1))
+            start += len(outputs)
+
+    @property
+    def history(self) -> Float[Tensor, "epochs joints"]:
+        """The energies of the epochs that have been."""
+        return self.energies[: int(self.epochs_done)].clone()
+
+    def _descend(self, patterns: list[Patterns]) -> Tensor:
+        """Write `η ∂E/∂w` (Jeong et al. 1998, eq. 4) into the parameters' `grad`; give the energy of every output."""
+        energies = []
+        for network, group, rates in zip(self.networks, patterns, self._rates, strict=True):
+            value, by_weight, by_bias = energy_gradient(network, group.x, group.d)  # type: ignore[arg-type]
+            network.weight.grad, network.bias.grad = (
+                by_weight * rates[:, None, None],
+                by_bias * rates[:, None],
+            )
+            energies.append(value)
+        return torch.cat(energies)
+
+    def _iterate(self, patterns: list[Patterns]) -> Tensor:
+        return torch.cat([s.iterate(p) for s, p in zip(self.solvers, patterns, strict=True)])  # type: ignore[operator]
+
+    def _descend_by_batch(self, patterns: list[Patterns], batch_idx: int) -> Tensor:
+        """Cost of a batch, with the weight of all rows; the epoch's energies are the mean over its batches."""
+        energies = torch.cat(
+            [energy(net.products(p.x), p.d) for net, p in zip(self.networks, patterns, strict=True)]  # type: ignore[operator]
+        )
+        epoch = self.energies[int(self.epochs_done)]
+        epoch.copy_(energies.detach() + (epoch if batch_idx else 0.0))
+        return energies.sum() * self.trainer.num_training_batches
+
+    def _count(self, energies: Tensor) -> None:
+        """Keep the energies of an epoch that is done."""
+        self._check(0, energies)
+        self.energies[int(self.epochs_done)] = energies.to(self.energies)
+        self.epochs_done += 1
+        if self.trainer.loggers or self.trainer.progress_bar_callback:
+            values = dict(zip((f"energy_{name}" for name in self.labels), energies, strict=True))
+            self.log_dict(values, batch_size=1)
+            self.log("energy", energies.sum(), prog_bar=True, logger=False, batch_size=1)
+
+    def _stop_when_done(self) -> None:
+        converged = len(self.solvers) > 0 and all(solver.converged for solver in self.solvers)
+        if converged or int(self.epochs_done) >= self.fit.epochs:
+            self.trainer.should_stop = True
+
+    def _check(self, first: int, values: Tensor) -> None:
+        """Refuse values, one per joint from number `first` on, that are not finite."""
+        bad = ~torch.isfinite(values)
+        if bad.any():
+            name = self.labels[first + int(bad.nonzero()[0])]
+            rate = f".{name}" if isinstance(self.fit, GradientDescentSection) else ""
+            raise TrainingError(
+                f"the training of {name} diverged in epoch {int(self.epochs_done) + 1} (its energy is no longer "
+                f"finite); lower 'fit.learning_rate{rate}' in the recipe or use method levenberg_marquardt."
+            )

@@ -1,0 +1,123 @@
+"""From training pairs to a scaled network and its patterns."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float64, Int64
+from torch import Tensor
+
+from pisigma.files.errors import IdentificationError
+from pisigma.network.correction_network import CorrectionNetwork, JointGroup
+from pisigma.network.inputs import Inputs
+from pisigma.network.levenberg_marquardt import Patterns
+from pisigma.network.pairs import TrainingPairs
+from pisigma.network.pi_sigma import PiSigma
+from pisigma.network.sections import NetworkSection
+from pisigma.robot.description import Robot
+
+TARGET_RANGE = 1.25
+"""Products start near 1, so targets are scaled to [0, 1.25]: the start lies among them, and no product has to
+change its sign. With [-1, 1] some starts end in poor minima, with [0, 2] the paper's learning rates
+diverge."""
+
+_FLAT_INPUT = 1e-9
+"""[m, rad or 1] An input that varies less does not vary."""
+_FLAT_TARGET = 1e-12
+"""[rad or m] Smallest width that targets are scaled by."""
+
+
+def build_network(
+    robot: Robot, sections: Sequence[NetworkSection], pairs: TrainingPairs
+) -> CorrectionNetwork:
+    """Build the network of a recipe, scaled by the rows that are used for training.
+
+    Inputs are scaled from their range in the data to [-1, 1] and targets to [0, 1.25] / sqrt(n), n being the
+    number of patterns; the fixed weights of a unit have the product 1 / sqrt(n) too. The energy of eq. (3) is
+    then half the mean square of the error in units of the scaled range, and a learning rate means the same
+    for 100 rows as for 1000.
+
+    A target that does not vary is scaled as one that varies by 1e-12: the correction is then that constant.
+
+    Raises:
+        RecipeError: an input is unknown; the message lists the valid ones.
+        IdentificationError: an input does not vary in the used rows, so nothing can be learned from it.
+    """
+    names = [joint.name for joint in robot.joints]
+    used = pairs.used
+    groups, networks = [], []
+    for section in sections:
+        inputs = Inputs.of(robot, section.inputs, np.array(section.reference, dtype=np.float64))
+        group = JointGroup(tuple(names.index(name) for name in section.joints), inputs)
+        rows = int(used.sum())
+        network = PiSigma(len(section.inputs), len(section.joints), section.orders, fixed_product=rows**-0.5)
+        x = inputs(pairs.T[used], pairs.q_nominal[used])
+        d = pairs.target[used][:, list(group.joints)]
+        input_width, target_width = x.amax(0) - x.amin(0), d.amax(0) - d.amin(0)
+        _check_varying(section.inputs, input_width, rows)
+        network.input_offset, network.input_scale = (x.amax(0) + x.amin(0)) / 2, input_width / 2
+        network.output_offset = d.amin(0)
+        network.output_scale = target_width.clamp_min(_FLAT_TARGET) / TARGET_RANGE * rows**0.5
+        groups.append(group)
+        networks.append(network)
+    return CorrectionNetwork(robot.dof, groups, networks)
+
+
+def build_patterns(
+    network: CorrectionNetwork,
+    pairs: TrainingPairs,
+    validation_share: float,
+    groups_of_rows: Int64[Tensor, " rows"],
+    generator: torch.Generator,
+) -> list[Patterns]:
+    """Scaled patterns of every joint group; the validation rows are drawn once for all.
+
+    Args:
+        network: built by `build_network` from the same pairs.
+        pairs: the training pairs.
+        validation_share: share of the used rows that only validates.
+        groups_of_rows: rows of equal number stay on one side.
+        generator: draws the validation rows.
+
+    Raises:
+        IdentificationError: fewer rows are left to fit than the network has free parameters per joint.
+    """
+    validation = _draw_validation(pairs.used, groups_of_rows, validation_share, generator)[pairs.used]
+    patterns = []
+    for group, net in network.members():
+        _check_count(group, net, int((~validation).sum()))
+        x = net.scale_inputs(group.inputs(pairs.T, pairs.q_nominal))[pairs.used]
+        d = net.scale_targets(pairs.target[:, list(group.joints)])[pairs.used]
+        patterns.append(Patterns(x, d, validation))
+    return patterns
+
+
+def _check_varying(names: Sequence[str], width: Float64[Tensor, " inputs"], rows: int) -> None:
+    if (width < _FLAT_INPUT).any():
+        name = names[int((width < _FLAT_INPUT).nonzero()[0])]
+        raise IdentificationError(
+            f"the network input '{name}' does not vary over the {rows} training rows, so no correction can "
+            "be learned from it; measure where it varies, or leave it out of the recipe."
+        )
+
+
+def _check_count(group: JointGroup, network: PiSigma, fitted: int) -> None:
+    """Refuse to fit more free parameters than rows; a product's factors trade scale, which frees none."""
+    free = sum(network.orders) * (network.inputs + 1) - sum(order - 1 for order in network.orders)
+    if fitted < free:
+        raise IdentificationError(
+            f"{fitted} rows are there to fit, but the network of inputs {', '.join(group.inputs.names)} has "
+            f"{free} free parameters per joint; measure more poses, or give it fewer inputs or lower orders."
+        )
+
+
+def _draw_validation(
+    used: Bool[Tensor, " rows"], groups: Int64[Tensor, " rows"], share: float, generator: torch.Generator
+) -> Bool[Tensor, " rows"]:
+    """Whole groups of rows at random, until their share is reached; one group is always fitted."""
+    present, counts = torch.unique(groups[used], return_counts=True)
+    order = torch.randperm(len(present), generator=generator)
+    before = counts[order].cumsum(0) - counts[order]
+    enough = int((before < round(share * int(used.sum()))).sum())
+    chosen = present[order[: min(enough, len(present) - 1)]]
+    return torch.isin(groups, chosen) & used

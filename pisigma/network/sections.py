@@ -1,0 +1,129 @@
+"""Sections of recipes: a network, and how it is trained."""
+
+from collections.abc import Iterable, Sequence
+from typing import Annotated, Literal
+
+import numpy as np
+import torch
+from jaxtyping import Float64
+from pydantic import AfterValidator, Field, PositiveFloat, PositiveInt
+from torch import Tensor, nn
+
+from pisigma.files.errors import RecipeError
+from pisigma.files.yaml_file import Section, Seed
+
+Epochs = Annotated[int, Field(ge=1, le=1_000_000)]
+
+_Row = tuple[float, float, float]
+
+
+def _check_rotation(rows: tuple[_Row, _Row, _Row]) -> tuple[_Row, _Row, _Row]:
+    R = np.array(rows, dtype=np.float64)
+    if np.abs(R @ R.T - np.eye(3)).max() > 1e-6 or np.linalg.det(R) < 0:
+        raise ValueError("the three rows are no rotation; give an orthonormal, right-handed matrix")
+    return rows
+
+
+Rotation = Annotated[tuple[_Row, _Row, _Row], AfterValidator(_check_rotation)]
+
+
+class NetworkSection(Section):
+    """One group of joints whose corrections depend on the same inputs. See `pisigma.network.inputs.Inputs`.
+
+    Attributes:
+        joints: names of the joints.
+        inputs: names of the inputs.
+        orders: summing units of every product unit; `[3]` is the paper's network, `[1, 2, 3]` a ridge
+            polynomial.
+        reference: rotation from which roll, pitch and yaw are counted, as three rows.
+    """
+
+    joints: Annotated[tuple[str, ...], Field(min_length=1)]
+    inputs: Annotated[tuple[str, ...], Field(min_length=1)]
+    orders: Annotated[tuple[Annotated[int, Field(ge=1, le=20)], ...], Field(min_length=1, max_length=20)]
+    reference: Rotation = ((1, 0, 0), (0, 1, 0), (0, 0, 1))
+
+
+class GradientDescentSection(Section):
+    """The paper's rule: `Δw = -η ∂E/∂w` over all patterns at once (Jeong et al. 1998, eqs 3 and 4).
+
+    Attributes:
+        learning_rate: η of every joint, by name.
+        epochs: number of steps.
+        seed: of the start.
+        spread: half width of the uniform start of weights (around 0) and biases (around 1).
+    """
+
+    method: Literal["gradient_descent"]
+    learning_rate: dict[str, PositiveFloat]
+    epochs: Epochs = 3000
+    seed: Seed = 0
+    spread: PositiveFloat = 0.3
+
+    def rates(self, joints: Sequence[str]) -> Float64[Tensor, " outputs"]:
+        """Learning rates in the order of the joints.
+
+        Raises:
+            RecipeError: a joint has none.
+        """
+        for joint in joints:
+            if joint not in self.learning_rate:
+                stated = ", ".join(sorted(self.learning_rate)) or "none"
+                raise RecipeError(
+                    f"'fit.learning_rate' has no rate for joint '{joint}'; add one to those stated ({stated})."
+                )
+        return torch.tensor([self.learning_rate[joint] for joint in joints], dtype=torch.float64)
+
+
+class LevenbergMarquardtSection(Section):
+    """Least squares for every output, from several starts; the best by validation error is kept.
+
+    Attributes:
+        epochs: largest number of iterations; it stops earlier when nothing moves any more.
+        starts: number of starts of every output.
+        validation_share: share of the patterns that only choose between starts.
+        ridge: pull of the weights (not the biases) towards 0, beside a mean square of 1.
+        seed: of starts and validation patterns.
+        spread: half width of the uniform start of weights (around 0) and biases (around 1).
+    """
+
+    method: Literal["levenberg_marquardt"]
+    epochs: Epochs = 300
+    starts: Annotated[int, Field(ge=1, le=1000)] = 8
+    validation_share: Annotated[float, Field(ge=0, lt=0.9)] = 0.2
+    ridge: Annotated[float, Field(ge=0)] = 0.0
+    seed: Seed = 0
+    spread: PositiveFloat = 0.3
+
+
+class MiniBatchSection(Section):
+    """Stochastic gradient descent on mini-batches, for data with many rows.
+
+    The learning rate falls along half a cosine to 0 at the last step.
+
+    Attributes:
+        batch_rows: rows of a mini-batch.
+        epochs: how often every row is visited.
+        optimiser: "adam", "adamw", or "sgd" with momentum 0.9.
+        learning_rate: of the first step.
+        seed: of the start and of the order of the rows.
+        spread: half width of the uniform start of weights (around 0) and biases (around 1).
+    """
+
+    method: Literal["mini_batches"]
+    batch_rows: PositiveInt = 256
+    epochs: Epochs = 100
+    optimiser: Literal["adam", "adamw", "sgd"] = "adam"
+    learning_rate: PositiveFloat = 0.02
+    seed: Seed = 0
+    spread: PositiveFloat = 0.3
+
+    def build(self, parameters: Iterable[nn.Parameter]) -> torch.optim.Optimizer:
+        """The optimiser of these parameters."""
+        if self.optimiser == "sgd":
+            return torch.optim.SGD(parameters, lr=self.learning_rate, momentum=0.9)
+        kind = torch.optim.Adam if self.optimiser == "adam" else torch.optim.AdamW
+        return kind(parameters, lr=self.learning_rate)
+
+
+FitSection = GradientDescentSection | LevenbergMarquardtSection | MiniBatchSection

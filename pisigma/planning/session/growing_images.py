@@ -1,0 +1,84 @@
+"""Corners that a growing file gets image by image, as measurements."""
+
+import os
+import re
+from dataclasses import replace
+
+import torch
+
+from pisigma.files.errors import MeasurementError
+from pisigma.measurement.camera.corner_file import CameraFiles
+from pisigma.measurement.csv.table import Table
+from pisigma.measurement.dataset import Measurements, join
+from pisigma.measurement.fields import LeftOut, MeasuredFields
+from pisigma.measurement.growing_file import GrowingFile
+from pisigma.planning.plan_settings import PlanSettings
+from pisigma.robot.description import Robot
+
+
+def growing_file(path: str | os.PathLike[str], robot: Robot, settings: PlanSettings) -> GrowingFile:
+    """Give the file that gets the rows of a plan, or the corners of images where a camera measures."""
+    camera = settings.camera
+    return GrowingFile(path, robot, None if camera is None else ImageReader(camera.files, robot))
+
+
+class ImageReader:
+    """Reads every image of a file of corners on its own, so that a faulty one harms no other.
+
+    An image is complete where rows of another one follow it, or where nothing comes any more.
+    """
+
+    def __init__(self, files: CameraFiles, robot: Robot) -> None:
+        """Read corners of a camera.
+
+        Args:
+            files: of the camera and its board.
+            robot: that is measured.
+        """
+        self._files, self._robot = files, robot
+        self._read: dict[str, Measurements | LeftOut] = {}
+
+    def __call__(self, table: Table, final: bool) -> MeasuredFields:
+        """Solve the images that are complete; those that cannot be used are left out."""
+        images = list(_images(table))
+        read = [self._once(image) for image in (images if final else images[:-1])]
+        left_out = tuple(one for one in read if isinstance(one, LeftOut))
+        rows = [one for one in read if isinstance(one, Measurements)]
+        if not rows:
+            q = torch.zeros(0, self._robot.dof, dtype=torch.float64)
+            return MeasuredFields({"q": q}, {}, (), table.source, left_out)
+        return replace(join(rows).as_fields(), left_out=left_out)
+
+    def _once(self, image: Table) -> Measurements | LeftOut:
+        key = repr((image.lines[0], image.records))
+        if key not in self._read:
+            try:
+                self._read[key] = self._files.of_table(image, self._robot)
+            except MeasurementError as problem:
+                self._read[key] = _left_out(str(problem), image)
+        return self._read[key]
+
+
+def _images(table: Table) -> list[Table]:
+    """The rows of every image; a row without an image is one of its own."""
+    column = table.header.index("image") if "image" in table.header else len(table.header)
+    groups: dict[str, list[int]] = {}
+    for row, fields in enumerate(table.records):
+        name = fields[column].strip() if column < len(fields) else ""
+        groups.setdefault(name or f"line {table.lines[row]}", []).append(row)
+    return [
+        replace(
+            table,
+            records=[table.records[row] for row in rows],
+            lines=tuple(table.lines[row] for row in rows),
+            broken={number: table.broken[row] for number, row in enumerate(rows) if row in table.broken},
+        )
+        for rows in groups.values()
+    ]
+
+
+def _left_out(problem: str, image: Table) -> LeftOut:
+    """The line that a complaint names, and what it says of it."""
+    named = re.match(rf"{re.escape(image.source)}, line (\d+)[,:] ", problem)
+    line, said = (image.lines[0], problem) if named is None else (int(named[1]), problem[named.end() :])
+    return LeftOut(line, said.removesuffix("."))

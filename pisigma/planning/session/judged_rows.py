@@ -1,0 +1,148 @@
+"""The rows of a session: which of them count, and what is wrong with the others."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float64
+from torch import Tensor
+
+from pisigma.calibration.geometric.prediction import predicted_poses
+from pisigma.measurement.camera.corner_file import with_one_noise
+from pisigma.measurement.dataset import Measurements, join
+from pisigma.measurement.fields import LeftOut
+from pisigma.planning.session.row_alarms import (
+    cleared,
+    contradicted,
+    is_wrong,
+    other_joint_values,
+    stale_readings,
+    unreadable,
+)
+from pisigma.planning.session.row_judgement import FEW_ROWS, RowJudgement, judge_rows
+from pisigma.planning.session.state import Alarm
+from pisigma.robot.description import Robot
+from pisigma.robot.se3 import invert, transform_from_xyzrpy
+
+
+class JudgedRows:
+    """Rows that are judged as they come, each by all others.
+
+    Attributes:
+        rows: all of them that can be read, in the order of the file; None where there are none.
+        usable: those that are no copies.
+        judgement: of the usable ones.
+        alarms: what is wrong with which line, beside all rows alike.
+    """
+
+    def __init__(self, robot: Robot, sigma: float) -> None:
+        """Begin without rows.
+
+        Args:
+            robot: as drawn.
+            sigma: standard deviation of the sensor's lengths [m] where rows state none.
+        """
+        self._robot, self._sigma = robot, sigma
+        self.rows: Measurements | None = None
+        self.usable = torch.zeros(0, dtype=torch.bool)
+        self.judgement = RowJudgement(self.usable)
+        self._fixed: list[Alarm] = []
+        self._contradicted: dict[int, Alarm] = {}
+
+    @property
+    def alarms(self) -> tuple[Alarm, ...]:
+        """See the class."""
+        return (*self._fixed, *self._contradicted.values())
+
+    @property
+    def counting(self) -> Bool[Tensor, " rows"]:
+        """Rows that count."""
+        counting = self.usable.clone()
+        counting[self.usable] = self.judgement.counts
+        return counting
+
+    def add(
+        self,
+        new: Measurements | None,
+        left_out: Sequence[LeftOut],
+        planned: Float64[Tensor, "poses dof"],
+        names: Sequence[str],
+    ) -> list[Alarm]:
+        """Judge rows that were measured since, all of them together.
+
+        Args:
+            new: the rows in their order; None where there are none.
+            left_out: rows that cannot be read.
+            planned: joint values of all poses that were planned [rad or m].
+            names: of these.
+
+        Returns:
+            What is wrong with them, or with earlier ones in the light of them.
+        """
+        alarms = [unreadable(row) for row in left_out]
+        changed: list[Alarm] = []
+        if new is not None and new.rows:
+            start = 0 if self.rows is None else self.rows.rows
+            self.rows = rows = new if self.rows is None else with_one_noise(join([self.rows, new]))
+            stale = list(stale_readings(rows, start))
+            copies = {alarm.line for alarm in stale}
+            usable = torch.tensor([line not in copies for line in rows.line[start:]])
+            remarks = other_joint_values(self._robot, rows, start, planned, names)
+            alarms += [*stale, *(alarm for alarm in remarks if alarm.line not in copies)]
+            self.usable = torch.cat([self.usable, usable])
+            changed = self._judge(rows, planned, names)
+        self._fixed += [*alarms, *(alarm for alarm in changed if alarm.kind == "cleared")]
+        return [*alarms, *changed]
+
+    def _judge(
+        self, rows: Measurements, planned: Float64[Tensor, "poses dof"], names: Sequence[str]
+    ) -> list[Alarm]:
+        """Judge all rows that are no copies, and say what is new."""
+        numbers = self.usable.nonzero()[:, 0]
+        usable, judgement = rows.select(numbers), self.judgement
+        for upto in _steps(len(judgement.counts), len(numbers)):
+            trusted = torch.zeros(upto, dtype=torch.bool)
+            trusted[: len(judgement.counts)] = judgement.counts
+            some = usable.select(torch.arange(upto))
+            judgement = judge_rows(self._robot, some, self._sigma, trusted)
+        self.judgement = judgement
+        wrong = {
+            int(numbers[row]): contradicted(usable, judgement, row, planned, names)
+            for row in is_wrong(judgement).nonzero()[:, 0].tolist()
+        }
+        agreed = [cleared(rows.line[row]) for row in self._contradicted if row not in wrong]
+        new = [alarm for row, alarm in wrong.items() if row not in self._contradicted]
+        self._contradicted = {row: self._contradicted.get(row, alarm) for row, alarm in wrong.items()}
+        return [*new, *agreed]
+
+    def errors(self) -> tuple[Float64[np.ndarray, "rows 3"], Float64[np.ndarray, "rows 3"]]:
+        """Where the target is predicted, and measured - predicted position, in the robot's base frame [m].
+
+        NaN where they cannot be said.
+        """
+        rows, model, errors = self.rows, self.judgement.model, self.judgement.errors
+        position, error = torch.full((2, len(self.usable), 3), torch.nan, dtype=torch.float64)
+        if rows is not None and model is not None and errors is not None:
+            geometry, usable = model.geometry, self.usable
+            at = replace(rows.select(usable), rotation=None)
+            T = predicted_poses(geometry.robot, geometry.bases, geometry.tools, at)
+            those = [torch.from_numpy(geometry.bases[name]) for name in at.frame]
+            bases = transform_from_xyzrpy(torch.stack(those))
+            position[usable] = (invert(bases) @ T)[:, :3, 3]
+            error[usable] = (bases[:, :3, :3].mT @ errors.position[..., None])[..., 0]
+        return position.numpy(), error.numpy()
+
+
+def _steps(known: int, count: int) -> Iterator[int]:
+    """Numbers of rows that are judged in turn, when some were judged before.
+
+    As rows are judged by those that counted before, no more than these are added at once; of several that were added at
+    once, each is then judged by the others, too.
+    """
+    upto = known
+    while upto < count:
+        upto = min(count, max(FEW_ROWS, 2 * upto))
+        yield upto
+    if count > max(known + 1, FEW_ROWS):
+        yield count

@@ -1,0 +1,257 @@
+"""A robot in its cell: which joint values are within the limits, free of collisions, and seen by the tracker."""
+
+import math
+from collections import Counter
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float64, Int64
+from torch import Tensor
+
+from pisigma.planning.surroundings.capsules import TOOL_RADIUS, Capsules
+from pisigma.planning.surroundings.cell import Cell, LinkSection
+from pisigma.planning.surroundings.distances import box_distance, segment_distance
+from pisigma.robot.description import Robot
+from pisigma.robot.kinematics.forward import forward_kinematics
+from pisigma.robot.kinematics.tolerances import LIMIT_TOLERANCE
+
+CHUNK = 2048
+"""Poses that are looked at together: some MB."""
+ROUNDING = 1e-9
+"""[m] By which a measured pose is free."""
+
+
+@dataclass(frozen=True, eq=False)
+class Faults:
+    """Why poses are not allowed.
+
+    Attributes:
+        reasons: what a pose may fail for, each a sentence without its full stop.
+        failed: per pose and reason.
+    """
+
+    reasons: tuple[str, ...]
+    failed: Bool[Tensor, "poses reasons"]
+
+    @property
+    def allowed(self) -> Bool[Tensor, " poses"]:
+        """Poses that fail for nothing."""
+        return ~self.failed.any(1)
+
+    def counts(self) -> Counter[str]:
+        """How many poses fail for what; a pose counts for its first reason only."""
+        first = self.failed[self.failed.any(1)].int().argmax(1)
+        return Counter(self.reasons[reason] for reason in first.tolist())
+
+    def sentence(self, pose: int) -> str | None:
+        """Why a pose is not allowed; None where it is."""
+        failed = self.failed[pose].nonzero()[:, 0].tolist()
+        return "; ".join(self.reasons[column] for column in failed) + "." if failed else None
+
+
+@dataclass(frozen=True, eq=False)
+class ArmInCell:
+    """A robot in its cell.
+
+    Attributes:
+        drawn: the robot as drawn; its base is that of the cell.
+        robot: the same with the reflector as its tool.
+        cell: what stands around it.
+        capsules: along its links.
+        pairs: of pieces of links that may touch each other.
+        room: that has to be between the pieces of every pair [m].
+        beside: pieces that must not stand in the tracker's beam: none of the link with the reflector, and none that
+            is so near to the reflector that it touches every beam.
+        limits: of the controller's values, with their margins [rad or m].
+    """
+
+    drawn: Robot
+    robot: Robot
+    cell: Cell
+    capsules: Capsules
+    pairs: Int64[Tensor, "pairs 2"]
+    room: Float64[Tensor, " pairs"]
+    beside: Int64[Tensor, " pieces"]
+    limits: Float64[Tensor, "axes 2"]
+
+    @staticmethod
+    def of(robot: Robot, cell: Cell | None = None) -> "ArmInCell":
+        """Put a robot into its cell; None for an empty one, in which only limits and self-collision count."""
+        cell = cell or Cell()
+        capsules = cell.capsules(robot)
+        pairs = capsules.pairs(cell.clearance / 2)
+        return ArmInCell(
+            robot,
+            capsules.robot,
+            cell,
+            capsules,
+            pairs,
+            torch.full((len(pairs),), cell.clearance / 2, dtype=torch.float64),
+            _beside(capsules, cell.clearance),
+            cell.joints.limits(robot),
+        )
+
+    def with_measured(self, q: Float64[Tensor, "poses dof"]) -> "ArmInCell":
+        """The same where poses that were measured are free of self-collision, however thick the links are drawn.
+
+        Args:
+            q: joint values of these poses [rad or m].
+        """
+        room = self.room
+        for chunk in torch.split(q, CHUNK):
+            apart = self._apart(self.capsules.segments(chunk))
+            room = torch.minimum(room, apart.amin(0) - ROUNDING)
+        return replace(self, room=room)
+
+    @property
+    def too_thick(self) -> tuple[str, ...]:
+        """Which links the cell states so thick that nothing keeps them apart any more, a sentence; mostly none.
+
+        Links that touch in more than half of random poses are not kept apart, see `Capsules.pairs`.
+        """
+        tool = (
+            None
+            if self.cell.tool is None
+            else self.cell.tool.model_copy(update={"radius_mm": TOOL_RADIUS * 1e3})
+        )
+        usual = self.cell.model_copy(update={"links": LinkSection(), "tool": tool}).capsules(self.drawn)
+        looked_at = set(map(tuple, self.pairs.tolist()))
+        lost = [
+            pair for pair in usual.pairs(self.cell.clearance / 2).tolist() if tuple(pair) not in looked_at
+        ]
+        links = {tuple(self.capsules.link[pair].tolist()) for pair in lost}
+        if not links:
+            return ()
+        names = ("the base", *(f"link {joint.name}" for joint in self.robot.joints))
+        text = ", ".join(f"{names[one]} and {names[other]}" for one, other in sorted(links))
+        return (
+            f"With the stated radii {text} touch in more than half of all poses, so nothing keeps them apart; if they "
+            "do not touch by construction, state smaller radii [mm] of links or tool in the cell's file.",
+        )
+
+    def faults(self, q: Float64[Tensor, "poses dof"]) -> Faults:
+        """Say why which joint values [rad or m] are not allowed.
+
+        Raises:
+            PoseError: they do not fit the robot.
+        """
+        self.robot.check_joint_count(q.shape[-1])
+        chunks = [self._faults(chunk) for chunk in torch.split(q, CHUNK)]
+        return Faults(tuple(chunks[0]), torch.cat([torch.stack([*chunk.values()], 1) for chunk in chunks]))
+
+    def gap(self, q: Float64[Tensor, "poses dof"]) -> Float64[Tensor, " poses"]:
+        """The least room [m] between the links and what they must not touch, above the clearance.
+
+        Negative where it is not kept, infinite where there is nothing to touch.
+        """
+        gaps = [
+            torch.stack([*self._gaps(self.capsules.segments(chunk)).values()])
+            for chunk in torch.split(q, CHUNK)
+        ]
+        return torch.cat(gaps, -1).min(0).values
+
+    @cached_property
+    def lever(self) -> Float64[Tensor, " dof"]:
+        """How far a point of the robot moves at most per joint value [m/rad, or 1 for joints that slide]."""
+        d, strokes = np.abs(self.robot.dh[:, 1]), np.zeros(len(self.robot.rows))
+        for index, row in enumerate(self.robot.rows):
+            bounds = [abs(bound) for bound in (row.lower, row.upper) if math.isfinite(bound)]
+            strokes[index] = max(bounds, default=0.0) if row.type == "prismatic" else 0.0
+            strokes[index] += float(np.linalg.norm(row.drawn_at))
+        lengths = np.append(np.hypot(d + strokes, self.robot.dh[:, 2]), np.linalg.norm(self.robot.tool[:3]))
+        beyond = np.cumsum(lengths[::-1])[::-1][list(self.robot.joint_rows)]
+        return torch.from_numpy(np.where(self.robot.revolute, beyond, 1.0))
+
+    def _faults(self, q: Float64[Tensor, "poses dof"]) -> dict[str, Bool[Tensor, " poses"]]:
+        segments = self.capsules.segments(q)
+        values, (lower, upper) = self.robot.to_controller(q), self.limits.t()
+        outside = (values < lower - LIMIT_TOLERANCE) | (values > upper + LIMIT_TOLERANCE)
+        if self.robot.coupling is not None:
+            outside |= ~torch.from_numpy(self.robot.coupling.is_inside(q.numpy()))[:, None]
+        faults = {"a joint is outside its limits or their margin": outside.any(-1)}
+        faults |= {reason: gap < 0 for reason, gap in self._gaps(segments).items()}
+        if self.cell.tracker is not None:
+            T = forward_kinematics(self.robot, q)
+            beam = torch.stack([self.cell.tracker.position.expand_as(T[:, :3, 3]), T[:, :3, 3]], -2)
+            faults |= self._hidden(segments, beam[:, None], "the reflector from the tracker")
+            faults |= self._turned_away(T, beam)
+        return faults
+
+    def _gaps(self, segments: Float64[Tensor, "poses pieces 2 3"]) -> dict[str, Float64[Tensor, " poses"]]:
+        """Room between the links and everything that they must not touch [m], above the clearance."""
+        clearance, radius = self.cell.clearance, self.capsules.radius
+        infinite = segments.new_full((len(segments), 1), torch.inf)
+        gaps = {"links of the robot touch each other": _least(self._apart(segments) - self.room, infinite)}
+        moving = ~self.capsules.carrier
+        if self.cell.floor_mm is not None:
+            height = segments[:, moving, 1, 2] - radius[moving] - self.cell.floor_mm / 1e3
+            gaps["the robot touches the floor"] = _least(height, infinite) - clearance
+        for box in self.cell.boxes:
+            distance = box_distance(box.within(segments[:, moving]), box.half_size) - radius[moving]
+            gaps[f"the robot touches the box '{box.name}'"] = _least(distance, infinite) - clearance
+        return gaps
+
+    def _apart(self, segments: Float64[Tensor, "poses pieces 2 3"]) -> Float64[Tensor, "poses pairs"]:
+        """Room between the pieces of every pair [m]."""
+        first, second = self.pairs.unbind(-1)
+        radius = self.capsules.radius
+        return segment_distance(segments[:, first], segments[:, second]) - radius[first] - radius[second]
+
+    def hidden(
+        self, q: Float64[Tensor, "poses dof"], lines: Float64[Tensor, "poses lines 2 3"], what: str
+    ) -> dict[str, Bool[Tensor, " poses"]]:
+        """Say in which poses something stands in a line of sight, by what it is.
+
+        Args:
+            q: joint values [rad or m].
+            lines: both ends of the lines, in the cell's frame [m].
+            what: that would be hidden, such as "the reflector from the tracker".
+        """
+        return self._hidden(self.capsules.segments(q), lines, what)
+
+    def _hidden(
+        self,
+        segments: Float64[Tensor, "poses pieces 2 3"],
+        lines: Float64[Tensor, "poses lines 2 3"],
+        what: str,
+    ) -> dict[str, Bool[Tensor, " poses"]]:
+        """Poses in which a line of sight has less room than the clearance."""
+        clearance = self.cell.clearance
+        infinite = lines.new_full((len(lines), 1), torch.inf)
+        distance = (
+            segment_distance(lines[:, :, None], segments[:, None, self.beside])
+            - self.capsules.radius[self.beside]
+        )
+        hidden = {f"a link hides {what}": _least(distance.flatten(1), infinite) < clearance}
+        for box in self.cell.boxes:
+            distance = box_distance(box.within(lines), box.half_size)
+            hidden[f"the box '{box.name}' hides {what}"] = distance.amin(1) < clearance
+        return hidden
+
+    def _turned_away(
+        self, T: Float64[Tensor, "poses 4 4"], beam: Float64[Tensor, "poses 2 3"]
+    ) -> dict[str, Bool[Tensor, " poses"]]:
+        """Poses in which the tracker stands outside the cone in which the reflector reflects."""
+        reflector = self.cell.reflector
+        if reflector is None:
+            return {}
+        axis = torch.nn.functional.normalize(torch.tensor(reflector.axis, dtype=torch.float64), dim=0)
+        to_tracker = torch.nn.functional.normalize(beam[:, 0] - beam[:, 1], dim=-1)
+        cosine = ((T[:, :3, :3] @ axis) * to_tracker).sum(-1).clamp(-1, 1)
+        turned_away = torch.rad2deg(torch.acos(cosine)) > reflector.acceptance_deg
+        return {f"the reflector ({reflector.name}) is turned away from the tracker": turned_away}
+
+
+def _beside(capsules: Capsules, clearance: float) -> Int64[Tensor, " pieces"]:
+    """Pieces that do not touch the reflector by construction; see `Capsules.pairs`."""
+    q = capsules.random_joints()
+    reflector = forward_kinematics(capsules.robot, q)[:, None, None, :3, 3].expand(-1, 1, 2, 3)
+    touches = segment_distance(reflector, capsules.segments(q)) < capsules.radius + clearance
+    wanted = (capsules.link < capsules.link.max()) & (touches.double().mean(0) < 0.5)
+    return wanted.nonzero()[:, 0]
+
+
+def _least(gaps: Float64[Tensor, "poses things"], infinite: Float64[Tensor, "poses 1"]) -> Tensor:
+    return torch.cat([gaps, infinite], 1).min(1).values

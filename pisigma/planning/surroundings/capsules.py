@@ -1,0 +1,175 @@
+"""Capsules along the links of a robot: what of it must not touch anything."""
+
+import itertools
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float64, Int64
+from torch import Tensor
+
+from pisigma.planning.surroundings.distances import segment_distance
+from pisigma.robot.description import Robot
+from pisigma.robot.kinematics.components import as_transform
+from pisigma.robot.kinematics.forward import Geometry, iterate_rows
+from pisigma.robot.urdf_frames import inverse, row_frame
+
+RADIUS_SHARES = (0.05, 0.05, 0.05, 0.035)
+"""Radius of links where none is stated, from the first joint on, as a share of the length of the drawn arm; the last
+is that of all further links."""
+TOOL_RADIUS = 0.025
+"""[m] Of the tool where none is stated: a bracket with a reflector of 1.5 inches."""
+SHORTEST = 1e-6
+"""[m] Shorter pieces of links need no capsule, their neighbours cover them."""
+SAMPLES = 500
+"""Random poses that show which pieces touch by construction."""
+
+
+@dataclass(frozen=True, eq=False)
+class Capsules:
+    """Pieces of the links as line segments with a radius, each fixed to two frames of the robot.
+
+    A row of the drawing leads from its joint along the joint's axis by d, and then by a to the next row: these are
+    the pieces of its link. A URDF file says where joints are, so its links are straight from joint to joint. The last
+    piece is the tool.
+
+    Attributes:
+        robot: as drawn, with the tool.
+        frame: per piece and end, the frame that the end is fixed to: 0 is the base, i the frame behind row i.
+        point: per piece and end, where it is in that frame [m].
+        link: per piece, the number of the joint that moves it; 0 for what stands still.
+        radius: per piece [m].
+        carrier: per piece, whether it carries the robot: it stands before the first joint, or on its axis.
+    """
+
+    robot: Robot
+    frame: Int64[Tensor, "pieces 2"]
+    point: Float64[Tensor, "pieces 2 3"]
+    link: Int64[Tensor, " pieces"]
+    radius: Float64[Tensor, " pieces"]
+    carrier: Bool[Tensor, " pieces"]
+
+    @staticmethod
+    def of(
+        robot: Robot,
+        tip: Float64[np.ndarray, " 3"] | None = None,
+        radius: float | None = None,
+        radii: Mapping[str, float] | None = None,
+        tool_radius: float = TOOL_RADIUS,
+    ) -> "Capsules":
+        """Lay capsules along the drawing.
+
+        Args:
+            robot: as drawn, with the reflector as its tool.
+            tip: where the tool of the drawing is in the frame behind the last row [m], between which and the reflector
+                there is the reflector's bracket; None where it is that frame.
+            radius: of all links [m]; None for `RADIUS_SHARES` of the arm's length.
+            radii: of single links by the names of their rows [m].
+            tool_radius: of the tool [m].
+        """
+        tip = np.zeros(3) if tip is None else tip
+        pieces = [*_pieces_of_rows(robot, tip)]
+        last = len(robot.rows)
+        pieces.append(_Piece(last - 1, False, (last, last), (tip, robot.tool[:3])))
+        length = float(np.hypot(robot.dh[:, 1], robot.dh[:, 2]).sum())
+        link = np.cumsum([row.type != "fixed" for row in robot.rows])[[piece.row for piece in pieces]]
+        sizes = length * np.array(RADIUS_SHARES)[np.clip(link, 1, len(RADIUS_SHARES)) - 1]
+        sizes = np.full_like(sizes, radius) if radius is not None else sizes
+        stated = [(radii or {}).get(robot.rows[piece.row].name) for piece in pieces]
+        sizes = np.where([size is None for size in stated], sizes, np.array(stated, dtype=np.float64))
+        sizes[-1] = tool_radius
+        capsules = Capsules(
+            robot,
+            torch.tensor([piece.frame for piece in pieces]),
+            torch.from_numpy(np.array([piece.point for piece in pieces])),
+            torch.from_numpy(link),
+            torch.from_numpy(sizes),
+            torch.tensor([piece.carrier for piece in pieces]),
+        )
+        segments = capsules.segments(capsules.random_joints())
+        return capsules._of((segments[:, :, 1] - segments[:, :, 0]).norm(dim=-1).amax(0) > SHORTEST)
+
+    def _of(self, kept: Bool[Tensor, " pieces"]) -> "Capsules":
+        """The same with some of the pieces only."""
+        values = (self.frame, self.point, self.link, self.radius, self.carrier)
+        return Capsules(self.robot, *(value[kept] for value in values))
+
+    def segments(self, q: Float64[Tensor, "*batch dof"]) -> Float64[Tensor, "*batch pieces 2 3"]:
+        """Both ends of every piece [m], in the frame that poses are given in, at joint values q [rad or m]."""
+        frames = torch.stack([*self._frames(q)], -3)[..., self.frame, :, :]
+        return (frames[..., :3, :3] @ self.point[..., None])[..., 0] + frames[..., :3, 3]
+
+    def _frames(self, q: Float64[Tensor, "*batch dof"]) -> list[Float64[Tensor, "*batch 4 4"]]:
+        rows = list(iterate_rows(self.robot, Geometry.of(self.robot), q.unbind(-1)))
+        return [as_transform(frame, q[..., 0]) for frame in (rows[0].before, *(row.after for row in rows))]
+
+    def pairs(self, clearance: float) -> Int64[Tensor, "pairs 2"]:
+        """Pairs of pieces that must not touch each other: of links that are no neighbours.
+
+        Pairs that touch in more than half of random poses do so by construction, as in a wrist; the joint limits have
+        to keep these apart. Pairs whose distance never changes need no look at it.
+
+        Args:
+            clearance: that is wanted between them [m].
+        """
+        first, second = torch.combinations(torch.arange(len(self.link))).unbind(-1)
+        segments = self.segments(self.random_joints())
+        distance = segment_distance(segments[:, first], segments[:, second])
+        touches = distance < self.radius[first] + self.radius[second] + clearance
+        changes = distance.amax(0) - distance.amin(0) > SHORTEST
+        wanted = ((self.link[second] - self.link[first]) > 1) & (touches.double().mean(0) < 0.5) & changes
+        return torch.stack([first, second], -1)[wanted]
+
+    def random_joints(self) -> Float64[Tensor, "poses dof"]:
+        """Joint values [rad or m] within the limits, the same at every call."""
+        generator = torch.Generator().manual_seed(0)
+        limits = torch.from_numpy(self.robot.axis_limits).clamp(-np.pi, np.pi)
+        draws = torch.rand(SAMPLES, len(limits), generator=generator, dtype=torch.float64)
+        q: Float64[Tensor, "poses dof"] = self.robot.to_dh(
+            limits[:, 0] + (limits[:, 1] - limits[:, 0]) * draws
+        )
+        return q
+
+
+class _Piece(NamedTuple):
+    """One piece of a link.
+
+    Attributes:
+        row: whose link it belongs to.
+        carrier: see `Capsules`.
+        frame: the frames that its ends are fixed to.
+        point: where these are in them [m].
+    """
+
+    row: int
+    carrier: bool
+    frame: tuple[int, int]
+    point: tuple[Float64[np.ndarray, " 3"], Float64[np.ndarray, " 3"]]
+
+
+def _pieces_of_rows(robot: Robot, tip: Float64[np.ndarray, " 3"]) -> Iterator[_Piece]:
+    """Pieces from joint to joint and to the tip: straight where the drawing says where joints are, else by d and a."""
+    has_seats = any(any(row.drawn_at) for row in robot.rows)
+    seats = [np.array(row.drawn_at) for row in robot.rows] + [tip if has_seats else np.zeros(3)]
+    first = robot.joint_rows[0]
+    if has_seats:
+        yield _Piece(0, True, (0, 0), (np.zeros(3), seats[0]))
+    for i, row in enumerate(robot.rows):
+        corners = [(i, seats[i]), (i + 1, seats[i + 1])]
+        if row.type == "prismatic":  # the joint's stroke, and then the link that slides
+            corners.insert(1, (i + 1, _behind(robot, i, seats[i])))
+        elif not has_seats:
+            corners.insert(1, (i + 1, _behind(robot, i, np.array([0.0, 0.0, robot.dh[i, 1]]))))
+        for number, (start, end) in enumerate(itertools.pairwise(corners)):
+            carrier = i < first or (i == first and number == 0 and len(corners) > 2)
+            yield _Piece(i, carrier, (start[0], end[0]), (start[1], end[1]))
+    if not has_seats:
+        yield _Piece(i, False, (i + 1, i + 1), (np.zeros(3), tip))
+
+
+def _behind(robot: Robot, row: int, point: Float64[np.ndarray, " 3"]) -> Float64[np.ndarray, " 3"]:
+    """A point of the frame before a row in the frame behind it, at the joint value 0 [m]."""
+    result: np.ndarray = (inverse(row_frame(*robot.dh[row].tolist())) @ np.append(point, 1.0))[:3]
+    return result

@@ -1,0 +1,330 @@
+"""What stands around a robot that is measured, as people write it down: joint margins, floor, boxes, tracker."""
+
+import os
+from typing import Annotated
+
+import numpy as np
+import torch
+from jaxtyping import Float64
+from pydantic import Field, model_validator
+from torch import Tensor
+
+from pisigma.files.errors import PlanningError, RecipeError, nearest_choice
+from pisigma.files.yaml_file import Section, line_of, read_yaml
+from pisigma.planning.surroundings.capsules import TOOL_RADIUS, Capsules
+from pisigma.robot.description import Robot
+from pisigma.robot.robot_file import FrameSection, Limits
+from pisigma.robot.row import Bounded
+from pisigma.robot.se3 import rotation_from_rpy, transform_from_xyzrpy, xyzrpy_from_transform
+from pisigma.simulation.errors.source import stated_joints
+
+Positive = Annotated[Bounded, Field(gt=0)]
+NotNegative = Annotated[Bounded, Field(ge=0)]
+Point = tuple[Bounded, Bounded, Bounded]
+
+
+class JointSection(Section):
+    """How far joints may move here.
+
+    Attributes:
+        margin_deg: that joints which turn keep from their limits [deg].
+        margin_mm: the same of joints that slide [mm].
+        limits_deg: narrower limits of joints that turn, by name [deg].
+        limits_mm: the same of joints that slide [mm].
+    """
+
+    margin_deg: NotNegative = 0.0
+    margin_mm: NotNegative = 0.0
+    limits_deg: dict[str, Limits] = Field(default_factory=dict)
+    limits_mm: dict[str, Limits] = Field(default_factory=dict)
+
+    def limits(self, robot: Robot) -> Float64[Tensor, "axes 2"]:
+        """Lowest and highest of the controller's values that are allowed [rad or m]; infinite where there is no limit.
+
+        Raises:
+            RecipeError: a name is no joint, or one of the other kind.
+            PlanningError: nothing is left of a joint's range.
+        """
+        fields = ("limits_deg", "limits_mm")
+        stated = stated_joints(robot, self.limits_deg, self.limits_mm, fields, "joints", axes=True)
+        limits = robot.axis_limits
+        for index, joint in enumerate(robot.axes):
+            to_si = (
+                np.deg2rad
+                if joint.type == "revolute"
+                else (lambda millimetres: np.asarray(millimetres) / 1e3)
+            )
+            margin = to_si(self.margin_deg if joint.type == "revolute" else self.margin_mm)
+            if index in stated:
+                lower, upper = to_si(stated[index])
+                limits[index] = max(lower, limits[index, 0]), min(upper, limits[index, 1])
+            limits[index] += (margin, -margin)
+            if not limits[index, 0] < limits[index, 1]:
+                raise PlanningError(
+                    f"joints: the limits and margins leave nothing of the range of joint '{joint.name}'; "
+                    "make them wider."
+                )
+        return torch.from_numpy(limits)
+
+
+class Box(Section):
+    """A box that the robot keeps out of, and that hides what is behind it.
+
+    Attributes:
+        name: for messages.
+        center_mm: its centre in the robot's base frame [mm].
+        size_mm: its edges along its own axes [mm].
+        yaw_deg: by which it is turned about the base frame's z axis [deg].
+    """
+
+    name: str = Field(min_length=1)
+    center_mm: Point
+    size_mm: tuple[Positive, Positive, Positive]
+    yaw_deg: Bounded = 0.0
+
+    @property
+    def center(self) -> Float64[Tensor, " 3"]:
+        """Its centre [m]."""
+        return torch.tensor(self.center_mm, dtype=torch.float64) / 1e3
+
+    @property
+    def half_size(self) -> Float64[Tensor, " 3"]:
+        """Half of its edges [m]."""
+        return torch.tensor(self.size_mm, dtype=torch.float64) / 2e3
+
+    @property
+    def rotation(self) -> Float64[Tensor, "3 3"]:
+        """Its axes in the base frame, as columns."""
+        return rotation_from_rpy(torch.tensor([np.deg2rad(self.yaw_deg), 0.0, 0.0], dtype=torch.float64))
+
+    def within(self, points: Float64[Tensor, "*batch 3"]) -> Float64[Tensor, "*batch 3"]:
+        """Points of the base frame in the frame of the box [m]."""
+        return (points - self.center) @ self.rotation
+
+
+class LinkSection(Section):
+    """How thick links are.
+
+    Attributes:
+        radius_mm: of all links [mm]; None for a share of the arm's length, see `capsules.RADIUS_SHARES`.
+        radii_mm: of single links, by the names of their rows [mm].
+    """
+
+    radius_mm: Positive | None = None
+    radii_mm: dict[str, Positive] = Field(default_factory=dict)
+
+
+class ToolSection(FrameSection):
+    """Where the reflector is mounted, seen from the tool of the drawing (a URDF file's tip), in mm and deg.
+
+    Attributes:
+        radius_mm: of what carries it [mm].
+    """
+
+    radius_mm: Positive = TOOL_RADIUS * 1e3
+
+
+class TrackerSection(Section):
+    """Where the tracker stands in the robot's base frame; near is enough."""
+
+    x_mm: Bounded
+    y_mm: Bounded
+    z_mm: Bounded
+
+    @property
+    def position(self) -> Float64[Tensor, " 3"]:
+        """Its origin [m]."""
+        return torch.tensor([self.x_mm, self.y_mm, self.z_mm], dtype=torch.float64) / 1e3
+
+
+class ReflectorSection(Section):
+    """A reflector that is not turned by hand between poses: from where the tracker sees it.
+
+    Attributes:
+        name: such as "cat's eye".
+        axis: where it looks, in the frame of the tool.
+        acceptance_deg: half the angle of the cone in which it reflects [deg].
+    """
+
+    name: str = "SMR of 1.5 inches"
+    axis: Point = (0.0, 0.0, 1.0)
+    acceptance_deg: Annotated[float, Field(gt=0, le=180)] = 30.0
+
+    @model_validator(mode="after")
+    def _has_direction(self) -> "ReflectorSection":
+        if not any(self.axis):
+            raise ValueError("axis: a direction was wanted, such as [0, 0, 1]")
+        return self
+
+
+class LensSection(Section):
+    """What the depth of field of a camera follows from.
+
+    Attributes:
+        aperture: f-number.
+        focus_mm: depth at which corners are sharpest [mm].
+        pixel_um: edge of a pixel [um].
+        blur_px: diameter of a point's image that still counts as sharp [px].
+    """
+
+    aperture: Positive
+    focus_mm: Positive
+    pixel_um: Positive
+    blur_px: Positive = 1.0
+
+    def depths(self, f: float) -> tuple[float, float]:
+        """Give the nearest and the farthest depth that is sharp [m]; the farthest may be infinite.
+
+        With the image at v = f · pixel behind the lens, focused at s, the focal length is `v s / (v + s)` (thin lens),
+        and a point at depth z has an image with the diameter `A v |1/s - 1/z|` with the aperture A (Hecht, "Optics",
+        section 5.2.3).
+
+        Args:
+            f: focal length of the focused camera [px].
+        """
+        s, pixel = self.focus_mm / 1e3, self.pixel_um / 1e6
+        v = f * pixel
+        opening = v * s / (v + s) / self.aperture
+        reach = self.blur_px * pixel / (opening * v)
+        return 1 / (1 / s + reach), 1 / (1 / s - reach) if reach < 1 / s else float("inf")
+
+
+class ViewSection(Section):
+    """From where a camera has to see its board: whole, sharp, and not too obliquely.
+
+    Attributes:
+        frame: where the board is in the base frame, or a camera that stands beside the robot; None where a model says
+            that. The board's x leads along its rows, y from row to row, and z away from who looks at it.
+        near_mm: depth of the board in front of the camera at least [mm]; None by the lens.
+        far_mm: and at most [mm].
+        lens: what both follow from, where they are not stated.
+        oblique_deg: angle between the board's normal and the line of sight at most [deg].
+        margin_px: that the board keeps from the edges of the image [px].
+    """
+
+    frame: FrameSection | None = None
+    near_mm: Positive | None = None
+    far_mm: Positive | None = None
+    lens: LensSection | None = None
+    oblique_deg: Annotated[float, Field(gt=0, le=80)] = 45.0
+    margin_px: NotNegative = 20.0
+
+    @model_validator(mode="after")
+    def _has_depths(self) -> "ViewSection":
+        stated = self.near_mm is not None and self.far_mm is not None
+        if (self.near_mm is None) != (self.far_mm is None) or stated == (self.lens is not None):
+            raise ValueError(
+                "near_mm and far_mm, or else the lens, were wanted: between which depths are images sharp?"
+            )
+        if stated and not self.near_mm < self.far_mm:  # type: ignore[operator]
+            raise ValueError(f"near_mm below far_mm was wanted, got {self.near_mm:g} and {self.far_mm:g}")
+        return self
+
+    @property
+    def T_cell_frame(self) -> Float64[Tensor, "4 4"] | None:
+        """The frame [m]; None where it is not stated."""
+        return None if self.frame is None else transform_from_xyzrpy(torch.from_numpy(self.frame.to_si()))
+
+    def depths(self, f: float) -> tuple[float, float]:
+        """Give the nearest and the farthest depth [m] for a focal length [px]."""
+        if self.lens is not None:
+            return self.lens.depths(f)
+        assert self.near_mm is not None
+        assert self.far_mm is not None
+        return self.near_mm / 1e3, self.far_mm / 1e3
+
+
+class Cell(Section):
+    """What stands around a robot: everything is optional, and in the frame of the robot's base in mm and deg.
+
+    Attributes:
+        clearance_mm: that links and the tracker's beam keep from everything, and links half of it from each other
+            [mm].
+        floor_mm: height of the floor [mm]; None for no floor.
+        joints: margins and limits.
+        boxes: that the robot keeps out of.
+        links: how thick the links are.
+        tool: where the reflector is, or what a camera needs on the flange (camera or board); None for the tool of the
+            robot.
+        tracker: that has to see the reflector; None where the sensor needs no line of sight.
+        reflector: from where it can be seen; None where it is turned to the tracker at every pose.
+        view: from where a camera has to see its board; None without a camera.
+    """
+
+    clearance_mm: NotNegative = 20.0
+    floor_mm: Bounded | None = None
+    joints: JointSection = JointSection()
+    boxes: tuple[Box, ...] = Field(default=(), max_length=100)
+    links: LinkSection = LinkSection()
+    tool: ToolSection | None = None
+    tracker: TrackerSection | None = None
+    reflector: ReflectorSection | None = None
+    view: ViewSection | None = None
+
+    @model_validator(mode="after")
+    def _fits_together(self) -> "Cell":
+        names = [box.name for box in self.boxes]
+        if twice := sorted({name for name in names if names.count(name) > 1}):
+            raise ValueError(f"the name '{twice[0]}' stands twice in boxes; names must differ")
+        if self.reflector is not None and self.tracker is None:
+            raise ValueError(
+                "a reflector is seen from a tracker; add the section tracker, or leave reflector out"
+            )
+        for box in self.boxes if self.tracker is not None else ():
+            assert self.tracker is not None
+            if bool((box.within(self.tracker.position).abs() <= box.half_size).all()):
+                raise ValueError(f"the tracker stands inside the box '{box.name}'; correct one of them")
+        return self
+
+    @property
+    def clearance(self) -> float:
+        """What links and the tracker's beam keep from everything but the robot's other links [m]."""
+        return self.clearance_mm / 1e3
+
+    def robot_with_tool(self, robot: Robot) -> Robot:
+        """The robot with the reflector as its tool, where the cell says where that is."""
+        if self.tool is None:
+            return robot
+        drawn, reflector = (
+            transform_from_xyzrpy(torch.tensor(tool)) for tool in (robot.tool, self.tool.to_si())
+        )
+        return robot.with_geometry(tool=xyzrpy_from_transform(drawn @ reflector).numpy())
+
+    def capsules(self, robot: Robot) -> Capsules:
+        """Capsules along the links of a robot and its reflector's bracket."""
+        radius = self.links.radius_mm
+        radii = {name: size / 1e3 for name, size in self.links.radii_mm.items()}
+        tool_radius = TOOL_RADIUS if self.tool is None else self.tool.radius_mm / 1e3
+        return Capsules.of(
+            self.robot_with_tool(robot),
+            robot.tool[:3],
+            None if radius is None else radius / 1e3,
+            radii,
+            tool_radius,
+        )
+
+
+def read_cell(path: str | os.PathLike[str], robot: Robot) -> Cell:
+    """Read the file of a cell.
+
+    Args:
+        path: the YAML file.
+        robot: that stands in it.
+
+    Raises:
+        PlanningError: the file cannot be used, or it names links or joints that the robot has not; the message names
+            file, line and key.
+    """
+    cell = read_yaml(path, Cell, PlanningError)
+    names = [row.name for row in robot.rows]
+    for name in cell.links.radii_mm:
+        if name not in names:
+            line = line_of(path, ("links", "radii_mm", name))
+            raise PlanningError(
+                f"{path}, line {line}: robot '{robot.name}' has no row '{name}'; {nearest_choice(name, names)}"
+            )
+    try:
+        cell.joints.limits(robot)
+    except (RecipeError, PlanningError) as problem:
+        raise PlanningError(f"{path}, line {line_of(path, ('joints',))}: {problem}") from None
+    return cell

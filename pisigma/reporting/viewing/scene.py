@@ -1,0 +1,161 @@
+"""The robot, its cell and the rows so far in three dimensions, in the robot's base frame [m]."""
+
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+import torch
+from jaxtyping import Float64, UInt8
+from scipy.spatial.transform import Rotation
+
+from pisigma.planning.board_sight import BoardSight
+from pisigma.planning.session.state import RowsSoFar, SessionState
+from pisigma.planning.surroundings.arm_in_cell import ArmInCell
+from pisigma.reporting.viewing.board import draw_board
+from pisigma.reporting.viewing.body import AbstractBody
+from pisigma.reporting.viewing.cell import draw_cell, draw_sight
+from pisigma.reporting.viewing.colors import ALARM, LINKS, NEXT, PLANNED, Color, shades
+from pisigma.robot.kinematics.forward import forward_kinematics
+from pisigma.robot.se3 import invert
+
+if TYPE_CHECKING:  # names in full, which type checkers at run time find without these imports
+    import viser
+
+GHOST = 0.35
+"""Opacity of the robot at the next pose."""
+
+DOT, SHAFT, HEAD, LONGEST, AXES = 0.02, 0.003, 0.008, 0.3, 0.2
+"""Shares of the robot's reach: diameter of a point, radii of shaft and head of an arrow, its largest length,
+and the axes of the base."""
+
+
+class SessionScene:
+    """Draws the robot and the rows; every call replaces what the call before has drawn."""
+
+    def __init__(
+        self, scene: "viser.SceneApi", arm: ArmInCell, body: AbstractBody, sight: BoardSight | None = None
+    ) -> None:
+        """Draw the cell.
+
+        Args:
+            scene: where to.
+            arm: the robot in its cell.
+            body: what the robot looks like.
+            sight: camera and board; None without a camera.
+        """
+        self._sight = sight
+        self._scene, self._arm, self._robot, self._body = scene, arm, arm.robot, body
+        self._groups: dict[str, viser.FrameHandle] = {}
+        self._ghost = scene.add_frame("/ghost", show_axes=False)
+        scene.set_up_direction("+z")
+        axes = AXES * arm.robot.reach
+        scene.add_frame("/base", axes_length=axes, axes_radius=axes / 20)
+        draw_cell(scene, arm.cell, arm.robot.reach)
+
+    def show_robot(self, state: SessionState) -> None:
+        """Draw the robot at the last row and as a ghost at the next pose."""
+        measured = state.rows.q if state.rows.line else np.zeros((1, self._robot.dof))
+        self._body.draw(self._scene, "/robot", measured[-1], LINKS, None)
+        self._begin("/next")
+        self._ghost.visible = state.next_pose is not None
+        if state.next_pose is not None:
+            pose, T = state.next_pose, self._poses(state.next_pose.q)
+            self._body.draw(self._scene, "/ghost/robot", pose.q, NEXT, GHOST)
+            self._label("/next/label", f"next: pose {pose.number}", T[:3, 3])
+            draw_sight(self._scene, "/next", self._arm.cell, T, self._robot.reach)
+            if self._sight is not None and self._sight.is_fixed:
+                self._scene.add_frame("/next/board", show_axes=False, wxyz=_quaternion(T), position=T[:3, 3])
+                draw_board(self._scene, "/next/board", self._sight.board)
+        if len(state.remaining):
+            self._dots("/next/remaining", self._poses(state.remaining)[:, :3, 3], PLANNED, 0.5)
+
+    def show_sensor(self, T_sensor_base: Float64[np.ndarray, "4 4"]) -> None:
+        """Draw the axes of the frame that was measured in, as the rows determine it."""
+        T = invert(torch.from_numpy(T_sensor_base)).numpy()
+        axes = AXES * self._robot.reach
+        self._scene.add_frame(
+            "/sensor", axes_length=axes, axes_radius=axes / 20, wxyz=_quaternion(T), position=T[:3, 3]
+        )
+        if self._sight is not None:
+            self._label("/sensor/label", "camera" if self._sight.is_fixed else "board", np.zeros(3))
+            if not self._sight.is_fixed:
+                draw_board(self._scene, "/sensor", self._sight.board)
+        elif self._arm.cell.tracker is None:
+            self._label("/sensor/label", "frame of the sensor", np.zeros(3))
+
+    def show_rows(self, rows: RowsSoFar, top: float, magnification: float) -> None:
+        """Draw a point for every row, in the colour of its error, and the error as an arrow.
+
+        Args:
+            rows: the rows; such as cannot be judged yet stand where the robot as drawn has its tool.
+            top: error [m] at which the scale of colours ends.
+            magnification: by how much arrows are longer than the errors.
+        """
+        self._begin("/rows")
+        if not rows.line:
+            return
+        drawn = self._poses(rows.q)[:, :3, 3]
+        position = np.where(np.isfinite(rows.position), rows.position, drawn)
+        colors = shades(np.linalg.norm(rows.error, axis=1), top)
+        colors[rows.alarmed] = ALARM
+        if not rows.check.all():
+            self._dots("/rows/measured", position[~rows.check], colors[~rows.check])
+        if rows.check.any():
+            self._dots("/rows/check", position[rows.check], colors[rows.check], shape="diamond")
+        for row in np.flatnonzero(rows.alarmed):
+            self._label(f"/rows/alarm_{row}", f"line {rows.line[row]}", position[row])
+        self._arrows(position, rows, colors, magnification)
+
+    def _arrows(
+        self,
+        position: Float64[np.ndarray, "rows 3"],
+        rows: RowsSoFar,
+        colors: UInt8[np.ndarray, "rows 3"],
+        magnification: float,
+    ) -> None:
+        judged, reach = np.isfinite(rows.error).all(axis=1), self._robot.reach
+        if not judged.any() or magnification == 0:
+            return
+        lengths = magnification * np.linalg.norm(rows.error, axis=1, keepdims=True)
+        drawn = magnification * rows.error * np.minimum(1.0, LONGEST * reach / np.maximum(lengths, 1e-12))
+        ends = np.stack([position, position + drawn], axis=1)
+        self._scene.add_arrows(
+            "/rows/errors",
+            ends[judged],
+            colors[judged],
+            shaft_radius=SHAFT * reach,
+            head_radius=HEAD * reach,
+            head_length=3 * HEAD * reach,
+        )
+
+    def _poses(self, q: Float64[np.ndarray, "*batch dof"]) -> Float64[np.ndarray, "*batch 4 4"]:
+        """T_base_tool [m] of the robot as drawn."""
+        T: Float64[np.ndarray, "*batch 4 4"] = forward_kinematics(self._robot, torch.from_numpy(q)).numpy()
+        return T
+
+    def _begin(self, name: str) -> None:
+        """Start a group of nodes anew."""
+        if name in self._groups:
+            self._groups[name].remove()
+        self._groups[name] = self._scene.add_frame(name, show_axes=False)
+
+    def _label(self, name: str, text: str, position: Float64[np.ndarray, " 3"]) -> None:
+        self._scene.add_label(name, text, position=position, anchor="bottom-left")
+
+    def _dots(
+        self,
+        name: str,
+        position: Float64[np.ndarray, "points 3"],
+        colors: UInt8[np.ndarray, "points 3"] | Color,
+        size: float = 1.0,
+        shape: Literal["circle", "diamond"] = "circle",
+    ) -> None:
+        diameter = size * DOT * self._robot.reach
+        self._scene.add_point_cloud(
+            name, position, colors, point_size=diameter, point_shape=shape, precision="float32"
+        )
+
+
+def _quaternion(T: Float64[np.ndarray, "4 4"]) -> Float64[np.ndarray, " 4"]:
+    """The rotation of a pose as viser wants it, w first."""
+    wxyz: Float64[np.ndarray, " 4"] = Rotation.from_matrix(T[:3, :3]).as_quat(scalar_first=True)
+    return wxyz

@@ -1,0 +1,229 @@
+"""Forward kinematics and joint Jacobians of arrays by compiled kernels, without torch; tensors go through torch."""
+
+import functools
+import math
+import sys
+import threading
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+from weakref import WeakKeyDictionary
+
+import numpy as np
+
+from pisigma.files.errors import ModelError
+from pisigma.robot.kernels.arrays import FIXED, FORWARD, PRISMATIC, REVOLUTE
+from pisigma.robot.kernels.layout import DESCRIPTION, DOF, ROWS, make_memory
+
+if TYPE_CHECKING:  # names in full, which type checkers at run time find without these imports
+    import pisigma.robot.description
+
+KINDS = {"fixed": FIXED, "revolute": REVOLUTE, "prismatic": PRISMATIC}
+
+
+def forward_kinematics(robot: "pisigma.robot.description.Robot", q: Any) -> Any:
+    """Tool pose of a robot: `base · Π RotZ(theta + q) Trans(a, 0, d) RotX(alpha) RotY(beta) · tool`.
+
+    Arrays and nested lists go through compiled kernels on one thread: some microseconds for a pose, a tenth of one in a
+    batch. Tensors go through torch on their device, with gradients; see `kinematics.forward`.
+
+    Args:
+        robot: the robot.
+        q: `(*batch, dof)` joint values [rad or m], as the controller counts.
+
+    Returns:
+        T_base_tool `(*batch, 4, 4)` [m]: a float64 array for an array, a tensor for a tensor.
+
+    Raises:
+        PoseError: q has another number of columns than the robot has joints.
+    """
+    if robot.coupling is not None:
+        q = robot.to_dh(q if is_tensor(q) else np.asarray(q, dtype=np.float64))
+    chain = _chain(robot, q)
+    if chain is not None:
+        return chain.move(q, False)[0]
+    from pisigma.robot.kinematics.forward import forward_kinematics as of_tensors
+
+    return by_torch(functools.partial(of_tensors, robot), q)
+
+
+def joint_jacobian(robot: "pisigma.robot.description.Robot", q: Any) -> Any:
+    """Geometric Jacobian of a robot's tool pose, in the base frame and at the tool's origin.
+
+    `J @ dq` is the translation [m] and the rotation vector [rad] of the tool (Siciliano et al. 2009, eq. 3.30). Arrays
+    and tensors go the ways of `forward_kinematics`.
+
+    Args:
+        robot: the robot.
+        q: `(*batch, dof)` joint values [rad or m], as the controller counts.
+
+    Returns:
+        `(*batch, 6, dof)`: a float64 array for an array, a tensor for a tensor.
+
+    Raises:
+        PoseError: q has another number of columns than the robot has joints.
+    """
+    if robot.coupling is not None:
+        values = robot.to_dh(q) if is_tensor(q) else robot.to_dh(np.asarray(q, dtype=np.float64))
+        slope = robot.coupling.slope(q)
+        return joint_jacobian(replace(robot, coupling=None), values) @ (
+            q.new_tensor(slope) if is_tensor(q) else slope
+        )
+    chain = _chain(robot, q)
+    if chain is not None:
+        return chain.move(q, True)[1]
+    from pisigma.robot.kinematics.jacobian import joint_jacobian as of_tensors
+
+    return by_torch(lambda values: of_tensors(robot, values)[1], q)
+
+
+def is_tensor(values: Any) -> bool:
+    """Whether values are a tensor; torch need not be imported to know."""
+    torch = sys.modules.get("torch")
+    return torch is not None and isinstance(values, torch.Tensor)
+
+
+def by_torch(function: Callable[[Any], Any], q: Any) -> Any:
+    """A function of tensors; of an array in float64, as an array."""
+    import torch
+
+    if is_tensor(q):
+        return function(q)
+    return function(torch.from_numpy(np.array(q, dtype=np.float64))).numpy()
+
+
+class _Chain:
+    """A robot as the kernels take it, ready for calls from several threads."""
+
+    def __init__(self, robot: "pisigma.robot.description.Robot") -> None:
+        """Pack a robot.
+
+        Raises:
+            ModelError: the robot is larger than the kernels allow, or there are no kernels for this machine.
+        """
+        from pisigma.robot.kernels.machine_code import (  # here: LLVM takes 40 MB from the fits
+            IGNORED,
+            load_kernels,
+        )
+
+        if len(robot.rows) > ROWS or robot.dof > DOF:
+            raise ModelError(
+                f"robot '{robot.name}' is larger than the kernels allow ({DOF} joints, {ROWS} rows)."
+            )
+        self._packed = np.zeros(1, DESCRIPTION)
+        arms, rows = self._packed["arms"], len(robot.rows)
+        arms["dof"], arms["rows_used"] = robot.dof, rows
+        arms["kind"][0, :rows] = [KINDS[row.type] for row in robot.rows]
+        arms["rows"][0, 0, :rows] = arm_rows(robot)
+        arms["ends"][0, 0] = arm_ends(robot)
+        arms["direction"][0, : robot.dof] = robot.directions
+        arms["revolute"][0, : robot.dof] = robot.revolute
+        self._dof, self._check = robot.dof, robot.check_joint_count
+        self._address, self._memory = address_of(self._packed), threading.local()
+        self._run = functools.partial(load_kernels(), IGNORED, IGNORED, self._address)
+
+    def move(self, q: Any, with_jacobian: bool) -> tuple[Any, Any]:
+        """Poses `(*batch, 4, 4)` [m], and Jacobians `(*batch, 6, dof)` where these are wanted."""
+        values = np.ascontiguousarray(q, dtype=np.float64) if np.ndim(q) else np.zeros(0)
+        batch, dof = values.shape[:-1], self._dof
+        if values.shape[-1] != dof:
+            self._check(values.shape[-1])
+        T, J = np.empty((*batch, 4, 4)), np.empty((*batch, 6, dof) if with_jacobian else 0)
+        try:
+            memory = self._memory.address
+        except AttributeError:
+            self._memory.kept = make_memory()
+            memory = self._memory.address = address_of(self._memory.kept)
+        at, poses, rows = address_of(values), address_of(T), math.prod(batch)
+        jacobians = address_of(J) if with_jacobian else 0
+        self._run(
+            memory,
+            FORWARD,
+            rows,
+            poses,
+            at,
+            rows,
+            0,
+            0,
+            0,
+            0,
+            0,
+            0,
+            0,
+            jacobians,
+            with_jacobian,
+        )
+        return T, J
+
+
+_chains: "WeakKeyDictionary[pisigma.robot.description.Robot, _Chain | None]" = WeakKeyDictionary()
+
+
+def _chain(robot: "pisigma.robot.description.Robot", q: Any) -> _Chain | None:
+    """The robot for kernels; None of tensors, and where there are no kernels."""
+    if is_tensor(q):
+        return None
+    try:
+        return _chains[robot]
+    except KeyError:
+        with suppress(ModelError):
+            return _chains.setdefault(robot, _Chain(robot))
+        return _chains.setdefault(robot, None)
+
+
+def arm_rows(robot: "pisigma.robot.description.Robot") -> np.ndarray:
+    """The rows of an arm for kernels, `(rows, 9)`: theta [rad], d, a [m], cosine and sine of alpha, beta and theta."""
+    return np.array(
+        [
+            (theta, d, a, *_cosine_sine(alpha), *_cosine_sine(beta), *_cosine_sine(theta))
+            for theta, d, a, alpha, beta in robot.dh.tolist()
+        ]
+    )
+
+
+def arm_ends(robot: "pisigma.robot.description.Robot") -> np.ndarray:
+    """Base and tool of an arm as transforms without their last rows, `(2, 3, 4)`."""
+    return np.stack([transform_of(end)[:3] for end in (robot.base.tolist(), robot.tool.tolist())])
+
+
+def transform_of(xyzrpy: Any) -> np.ndarray:
+    """The transform `Trans(x, y, z) · RotZ(roll) · RotY(pitch) · RotX(yaw)`, `(4, 4)`; lengths [m] and angles [rad]."""
+    return np.array(transform_entries(*xyzrpy)).reshape(4, 4)
+
+
+def transform_entries(
+    x: float, y: float, z: float, roll: float, pitch: float, yaw: float
+) -> tuple[float, ...]:
+    """The 16 entries of `transform_of`, row by row."""
+    (c, s), (c_p, s_p), (c_y, s_y) = _cosine_sine(roll), _cosine_sine(pitch), _cosine_sine(yaw)
+    first = c * c_p, c * s_p * s_y - s * c_y, c * s_p * c_y + s * s_y, x
+    second = s * c_p, s * s_p * s_y + c * c_y, s * s_p * c_y - c * s_y, y
+    return (*first, *second, -s_p, c_p * s_y, c_p * c_y, z, 0.0, 0.0, 0.0, 1.0)
+
+
+def xyzrpy_of(T: Any) -> tuple[float, ...]:
+    """x, y, z [m], roll, pitch and yaw [rad] of a transform `(4, 4)`: the inverse of `transform_of`.
+
+    The pitch lies within ±90 deg; at ±90 deg yaw is taken as 0.
+    """
+    rows = np.asarray(T).tolist()
+    (a, b, _, x), (c, d, _, y), (e, f, g, z), _ = rows
+    horizontal = math.hypot(a, c)
+    pitch = math.atan2(-e, horizontal)
+    if horizontal > 1e-12:
+        return x, y, z, math.atan2(c, a), pitch, math.atan2(f, g)
+    return x, y, z, math.atan2(-b, d), pitch, 0.0
+
+
+def _cosine_sine(angle: float) -> tuple[float, float]:
+    """Cosine and sine; within 1e-15 rad of a multiple of 90 deg they are exactly 0 and ±1."""
+    quarter = angle / (math.pi / 2)
+    if abs(quarter - round(quarter)) < 1e-15 * max(1.0, abs(quarter)):
+        return ((1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0))[round(quarter) % 4]
+    return math.cos(angle), math.sin(angle)
+
+
+def address_of(array: Any) -> int:
+    """Where the numbers of a contiguous array lie in memory."""
+    return array.__array_interface__["data"][0]

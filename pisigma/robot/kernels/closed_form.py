@@ -1,0 +1,114 @@
+"""Closed-form inverses of the nominal arm, branch by branch, on plain numbers.
+
+The formulas stand in the files of `pisigma.robot.kinematics.closed_form`, which hand in plain functions.
+"""
+
+import math
+from typing import Any
+
+from pisigma.robot.kernels.forms import compiled_closed_forms, compiled_plain
+from pisigma.robot.kernels.rotations import wrap
+from pisigma.robot.kernels.rows import Array, Record, kernel
+from pisigma.robot.kinematics.tolerances import LIMIT_TOLERANCE
+
+
+def _chained() -> Any:
+    """One function that calls the closed form that an arm has."""
+
+    @kernel
+    def chain(form: Record, P: Array, only: int, rounding: float, q: Array) -> None:
+        pass
+
+    for kind, function in enumerate(compiled_closed_forms().values(), 1):
+        chain = _then(chain, compiled_plain(function, kernel), kind)
+    return chain
+
+
+def _then(chain: Any, function: Any, kind: int) -> Any:
+    @kernel
+    def both(form: Record, P: Array, only: int, rounding: float, q: Array) -> None:
+        if form.kind == kind:
+            function(form, P, only, rounding, q)
+        else:
+            chain(form, P, only, rounding, q)
+
+    return both
+
+
+_solve = _chained()
+
+
+@kernel
+def all_branches(
+    arms: Record, form: Record, T: Array, only: int, rounding: float, P: Array, q: Array
+) -> None:
+    """Write joint values of every branch, the first of them NaN where it does not reach the pose.
+
+    Args:
+        arms: the arms, for limits.
+        form: the nominal arm with canonical twists.
+        T: wanted T_base_tool.
+        only: the only branch that is wanted, -1 for all, NEAREST for all with the nearest joint values of those that do
+            not reach the pose. Of others the first joint value is NaN.
+        rounding: relative size below which a cosine beyond 1 or a length counts as rounding of T.
+        P: `(4, 4)`, overwritten.
+        q: `(8, dof)`, written [rad or m]: in (-pi, pi], or a full turn from there within the limits.
+    """
+    for branch in range(form.branches):
+        q[branch, 0] = math.nan
+    _canonical_pose(form, T, P)
+    _solve(form, P, only, rounding, q)
+    for branch in range(form.branches):
+        if math.isnan(q[branch, 0]):
+            continue
+        for j in range(arms.dof):
+            value = form.direction[j] * (form.sign[j] * q[branch, j] - form.offset[j])
+            q[branch, j] = wrap(value) if arms.revolute[j] else value
+        wrap_into_limits(arms, q[branch])
+
+
+@kernel
+def wrap_into_limits(arms: Record, q: Array) -> bool:
+    """Move joints by full turns into their limits where that is possible; whether all are inside."""
+    all_inside = True
+    for j in range(arms.dof):
+        lower, upper = arms.limits[j, 0] - LIMIT_TOLERANCE, arms.limits[j, 1] + LIMIT_TOLERANCE
+        if lower <= q[j] <= upper:
+            continue
+        moved = q[j]
+        if arms.revolute[j] and q[j] < lower:
+            moved += 2 * math.pi * math.ceil((lower - q[j]) / (2 * math.pi))
+        elif arms.revolute[j]:
+            moved -= 2 * math.pi * math.ceil((q[j] - upper) / (2 * math.pi))
+        if lower <= moved <= upper:
+            q[j] = moved
+        else:
+            all_inside = False
+    return all_inside
+
+
+@kernel
+def nearest_turn(arms: Record, q: Array, near: Array, within_limits: bool) -> None:
+    """Move revolute joints by full turns as near to given values as they can come."""
+    for j in range(arms.dof):
+        if not arms.revolute[j]:
+            continue
+        turns = math.floor((near[j] - q[j]) / (2 * math.pi) + 0.5)
+        if within_limits:
+            lowest = math.ceil((arms.limits[j, 0] - LIMIT_TOLERANCE - q[j]) / (2 * math.pi))
+            highest = math.floor((arms.limits[j, 1] + LIMIT_TOLERANCE - q[j]) / (2 * math.pi))
+            turns = max(min(turns, highest), lowest) if lowest <= highest else 0.0
+        if turns != 0.0:
+            q[j] += 2 * math.pi * turns
+
+
+@kernel
+def _canonical_pose(form: Record, T: Array, P: Array) -> None:
+    """Pose of the last joint's frame, turned, in the frame before the first joint: `first · T · last`."""
+    for i in range(3):
+        for k in range(4):
+            P[3, k] = form.first[i, 0] * T[0, k] + form.first[i, 1] * T[1, k] + form.first[i, 2] * T[2, k]
+        P[3, 3] += form.first[i, 3]
+        for k in range(4):
+            P[i, k] = P[3, 0] * form.last[0, k] + P[3, 1] * form.last[1, k] + P[3, 2] * form.last[2, k]
+        P[i, 3] += P[3, 3]

@@ -1,0 +1,203 @@
+"""The one function that is compiled for calls from Python; everything else is compiled into it."""
+
+import math
+from typing import Any, no_type_check
+
+from numba import carray  # type: ignore[attr-defined]
+
+from pisigma.robot.kernels import arrays
+from pisigma.robot.kernels.chain import walk_many
+from pisigma.robot.kernels.inverse import solve_every, solve_pose
+from pisigma.robot.kernels.joint_correction import beyond_measured, move
+from pisigma.robot.kernels.rows import Array, Record, fill, kernel
+from pisigma.robot.kernels.task_axes import state_task
+from pisigma.robot.kinematics.tolerances import POSE_TOLERANCE, POSE_TOLERANCE_SINGLE, ROUNDINGS
+
+Pointer = Any
+
+_EPSILON, _EPSILON_SINGLE = 2.220446049250313e-16, 1.1920928955078125e-07
+"""Of float64 and float32."""
+
+
+@no_type_check
+def run(
+    description: Pointer,
+    memory: Pointer,
+    task: int,
+    rows: int,
+    T: Pointer,
+    near: Pointer,
+    near_rows: int,
+    approach: Pointer,
+    approach_rows: int,
+    axes: Pointer,
+    axes_rows: int,
+    branch: int,
+    mark: int,
+    single: int,
+    out: Pointer,
+    count: int,
+) -> int:
+    """Solve poses, evaluate the arm at joint values, or only say where it stands and how it moves.
+
+    See `solve_poses`, `evaluate` and `chain.walk_many`.
+
+    Args:
+        description: one struct, see `kernels.layout`.
+        memory: one struct to work in.
+        task: SOLVE, EVALUATE or FORWARD.
+        rows: how many poses.
+        T: `(rows, 4, 4)`: wanted poses to read, or poses to write.
+        near: `(near_rows, dof)`: joint values [rad or m].
+        near_rows: 0, 1 or as many as poses.
+        approach: `(approach_rows, dof)`: +1 or -1 for the side from which a joint comes, 0 where that is not stated.
+        approach_rows: 0, 1 or as many as poses.
+        axes: `(axes_rows, 8)`: which axes of the tool count, see `kinematics.task_axes.TaskAxes.row`.
+        axes_rows: 0 where all six count, else 1.
+        branch: which branch, or which arm to evaluate.
+        mark: 1 to mark what is no pose, 0 to stop there.
+        single: 1 where the poses were rounded to float32, else 0.
+        out: written: `(rows, count, 2 · dof + 5)` to SOLVE, `(rows, 7 · dof + 1)` to EVALUATE, `(rows · count, 6, dof)`
+            FORWARD.
+        count: how many solutions a pose gets; for FORWARD 1 where Jacobians are wanted, else 0.
+    """
+    arm, work = carray(description, 1)[0], carray(memory, 1)[0]
+    dof = arm.arms.dof
+    poses, joints = carray(T, (rows, 4, 4)), carray(near, (near_rows, dof))
+    if task == arrays.SOLVE:
+        sides = carray(approach, (approach_rows, dof))
+        solutions = carray(out, (rows, count, 2 * dof + 5))
+        stated = carray(axes, (axes_rows, 8))
+        return solve_poses(arm, work, poses, joints, sides, stated, branch, mark != 0, single != 0, solutions)
+    if task == arrays.EVALUATE:
+        sides = carray(approach, (approach_rows, dof))
+        return evaluate(arm, work, branch, joints, sides, poses, carray(out, (rows, 7 * dof + 1)))
+    walk_many(arm.arms, branch, work, joints, poses, carray(out, (rows * count, 6, dof)))
+    return arrays.FINE
+
+
+@kernel
+def solve_poses(
+    description: Record,
+    memory: Record,
+    T: Array,
+    near: Array,
+    approach: Array,
+    axes: Array,
+    branch: int,
+    mark: bool,
+    single: bool,
+    out: Array,
+) -> int:
+    """Solve poses, every one on as many branches as `out` has.
+
+    Gives -1, or `8 · row + what is wrong` with the first bad pose, if these are not to be marked.
+    """
+    dof, has_near = description.arms.dof, near.shape[0] > 0
+    tolerance = POSE_TOLERANCE_SINGLE if single else POSE_TOLERANCE
+    state_task(description.arms, memory, description.arms.reach[arrays.IDENTIFIED], axes)
+    every = branch == arrays.EVERY_BRANCH and description.closed_form.kind == arrays.NO_CLOSED_FORM
+    memory.rounding = ROUNDINGS * (_EPSILON_SINGLE if single else _EPSILON)
+    for row in range(T.shape[0]):
+        wrong = _check_pose(T[row], tolerance)
+        if has_near:
+            _take_row(near, row, memory.near, dof)
+            if wrong == arrays.FINE:
+                wrong = _check_near(memory.near, dof)
+        _take_approach(approach, row, memory.approach, dof)
+        if wrong != arrays.FINE and not mark:
+            return 8 * row + wrong
+        for i in range(4):
+            for k in range(4):
+                memory.pose[i, k] = T[row, i, k]
+        if wrong == arrays.FINE and every and not description.network.used:
+            solve_every(description, memory, out[row])
+            continue
+        for index in range(out.shape[1]):
+            asked = index if branch == arrays.EVERY_BRANCH else branch
+            if wrong == arrays.FINE:
+                solve_pose(description, memory, has_near, asked, out[row, index])
+            else:
+                _mark(description, asked, out[row, index])
+    return arrays.FINE
+
+
+@kernel
+def _take_row(values: Array, row: int, target: Array, dof: int) -> None:
+    """Copy the row of a pose, or the only one."""
+    for j in range(dof):
+        target[j] = values[row if values.shape[0] > 1 else 0, j]
+
+
+@kernel
+def _take_approach(approach: Array, row: int, target: Array, dof: int) -> None:
+    """The same for approaches, which are all 0 where none is stated."""
+    if approach.shape[0] > 0:
+        _take_row(approach, row, target, dof)
+    else:
+        fill(target, 0.0)
+
+
+@kernel
+def _check_pose(T: Array, tolerance: float) -> int:
+    """What is wrong with a matrix, in the order in which `se3.check_transforms` looks."""
+    total = 0.0
+    for i in range(4):
+        for k in range(4):
+            total += T[i, k] * 0.0
+    if total != 0.0:
+        return arrays.NOT_FINITE
+    for k in range(4):
+        if abs(T[3, k] - (1.0 if k == 3 else 0.0)) > tolerance:
+            return arrays.LAST_ROW
+    for i in range(3):
+        for k in range(i + 1):
+            product = T[0, i] * T[0, k] + T[1, i] * T[1, k] + T[2, i] * T[2, k]
+            if abs(product - (1.0 if i == k else 0.0)) > tolerance:
+                return arrays.NOT_ORTHONORMAL
+    x = T[1, 0] * T[2, 1] - T[2, 0] * T[1, 1]
+    y = T[2, 0] * T[0, 1] - T[0, 0] * T[2, 1]
+    z = T[0, 0] * T[1, 1] - T[1, 0] * T[0, 1]
+    return arrays.FINE if x * T[0, 2] + y * T[1, 2] + z * T[2, 2] > 0 else arrays.LEFT_HANDED
+
+
+@kernel
+def _check_near(near: Array, dof: int) -> int:
+    total = 0.0
+    for j in range(dof):
+        total += near[j] * 0.0
+    return arrays.FINE if total == 0.0 else arrays.NEAR_NOT_FINITE
+
+
+@kernel
+def _mark(description: Record, branch: int, out: Array) -> None:
+    """Say that there is no pose to solve for."""
+    fill(out, math.nan)
+    out[out.shape[0] - 2] = arrays.INVALID
+    out[out.shape[0] - 1] = description.closed_form.order[0] if branch < 0 else branch
+
+
+@kernel
+def evaluate(
+    description: Record, memory: Record, arm: int, q: Array, approach: Array, T: Array, out: Array
+) -> int:
+    """Write poses at joint values, and in a row Jacobian, correction, and angle beyond measured values; gives -1."""
+    dof = description.arms.dof
+    for row in range(q.shape[0]):
+        for j in range(dof):
+            memory.q[j] = q[row, j]
+        _take_approach(approach, row, memory.approach, dof)
+        fill(out[row], 0.0)
+        move(description, memory, arm, memory.q)
+        if arm == arrays.CORRECTED:
+            for j in range(dof):
+                out[row, 6 * dof + j] = memory.delta[j]
+            out[row, 7 * dof] = beyond_measured(description, memory.q)
+        for k in range(4):
+            for i in range(3):
+                T[row, i, k] = memory.T[i, k]
+            T[row, 3, k] = 1.0 if k == 3 else 0.0
+        for i in range(6):
+            for j in range(dof):
+                out[row, i * dof + j] = memory.J[i, j]
+    return arrays.FINE

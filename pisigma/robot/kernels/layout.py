@@ -1,0 +1,216 @@
+"""One struct for an arm and one for working memory: kernels get a pointer each, whatever the robot.
+
+Arrays are as long as the largest robot needs, with counts beside them, so that one compiled function serves all.
+"""
+
+from typing import Any
+
+import numpy as np
+
+from pisigma.files.errors import ModelError
+from pisigma.robot.kernels.arrays import PARTS, Description
+from pisigma.robot.kernels.forms import MOST_JOINTS, MOST_KINDS, MOST_VALUES, KernelForms
+
+DOF = MOST_JOINTS
+ROWS, FACTORS, UNITS, STRETCHES, STARTS = 24, 24, 12, 96, 512
+"""The largest numbers of rows, factors and product units, stretches and starts."""
+BRANCHES, CANDIDATES = 8, 16
+"""The largest numbers of branches of a closed form, and of joint values that are kept to search from."""
+INPUTS = 2 * DOF
+"""The largest number of inputs of product units."""
+GROUPS, SEEN, GROUP_INPUTS, SAMPLES, ENTRIES = 8, 512, 80, 2048, 2048 * 320
+"""The largest numbers of groups of a network, inputs of all and of one, rows of a domain, and entries of these."""
+
+LANES = 16
+"""Poses whose forward kinematics is computed abreast."""
+
+_Field = tuple[str, Any, tuple[int, ...]]
+
+
+def _floats(**shapes: tuple[int, ...]) -> list[_Field]:
+    return [(name, np.float64, shape) for name, shape in shapes.items()]
+
+
+def _integers(**shapes: tuple[int, ...]) -> list[_Field]:
+    return [(name, np.int64, shape) for name, shape in shapes.items()]
+
+
+_ARMS = _integers(dof=(), rows_used=(), corrected=(), kind=(ROWS,), revolute=(DOF,)) + _floats(
+    rows=(3, ROWS, 9), ends=(3, 2, 3, 4), reach=(3,), direction=(DOF,), limits=(DOF, 2)
+)
+_CORRECTION = _integers(
+    inputs=(), products=(), frames=(), periodic=(), orders=(UNITS,), first=(MOST_KINDS,)
+) + _floats(
+    rate=(DOF,),
+    middle=(DOF,),
+    half=(DOF,),
+    values=(MOST_VALUES,),
+    weight=(FACTORS, INPUTS, DOF),
+    bias=(FACTORS, DOF),
+)
+_COVERAGE = _integers(stretches=(), joint=(STRETCHES,)) + _floats(
+    middle=(STRETCHES,), half=(STRETCHES,), rate=(DOF,)
+)
+_NETWORK = _integers(
+    used=(),
+    inputs=(),
+    samples=(),
+    columns=(),
+    coarse=(),
+    column=(SEEN,),
+    source=(SEEN,),
+    first=(GROUPS + 1,),
+    products=(GROUPS,),
+    orders=(GROUPS, UNITS),
+    group=(DOF,),
+) + _floats(
+    factors=(SEEN, DOF),
+    offset=(SEEN,),
+    scale=(SEEN,),
+    reference=(GROUPS, 3, 3),
+    weight=(DOF, FACTORS, GROUP_INPUTS),
+    bias=(DOF, FACTORS),
+    output_offset=(DOF,),
+    output_scale=(DOF,),
+    centre=(DOF,),
+    times=(SEEN,),
+    rows=(ENTRIES,),
+    radius=(),
+)
+_CLOSED_FORM = _integers(kind=(), branches=(), trained=(), order=(BRANCHES,)) + _floats(
+    first=(3, 4), last=(3, 4), sign=(DOF,), direction=(DOF,), offset=(DOF,), theta=(DOF,), d=(DOF,), a=(DOF,)
+)
+_STARTS = _integers(count=()) + _floats(q=(STARTS, DOF), points=(STARTS, 12), lever=())
+
+_STRUCTS = (_ARMS, _CORRECTION, _COVERAGE, _NETWORK, _CLOSED_FORM, _STARTS)
+DESCRIPTION = np.dtype([(part, np.dtype(fields)) for part, fields in zip(PARTS, _STRUCTS, strict=True)])
+"""What kernels know of an arm: the fields of `compiled.arrays`, and counts."""
+
+MEMORY = np.dtype(
+    _floats(
+        pose=(4, 4),  # the wanted pose
+        near=(DOF,),  # joint values to stay near to
+        approach=(DOF,),  # from which side every joint comes: +1 or -1, 0 where that is not stated
+        rounding=(),  # relative size of what counts as rounding of the wanted poses
+        solution=(DOF,),  # joint values found
+        nominal=(DOF,),  # those of the nominal arm
+        axes=(DOF, 6),  # of the joints: direction and origin
+        T=(3, 4),  # pose and Jacobian of an arm
+        J=(7, DOF),
+        R=(3, 3),
+        error=(7,),  # of the pose at a trial, and of the elbow angle
+        best=(7,),  # of the pose at the best so far, and the Jacobian there
+        J_best=(7, DOF),
+        trial=(DOF,),
+        theta=(DOF,),  # joint values with correction
+        delta=(DOF,),  # the correction, and the slope of its series
+        slope=(DOF,),
+        step=(DOF,),
+        turning=(2, DOF),  # sines and cosines
+        phi=(INPUTS,),  # inputs of product units
+        frames=(DOF, 18),  # on which gravity acts
+        scaled=(7, DOF),  # dimensionless Jacobian, normal equations and their right side
+        square=(7, 7),
+        right=(7,),
+        scale=(
+            DOF,
+        ),  # of the columns of the Jacobian: [rad or m] that count as one; 0 for a joint that is held
+        branches=(BRANCHES, DOF),  # closed-form joint values of all branches
+        others=(BRANCHES, DOF),  # the same of other poses, or as near to the pose as branches come
+        wanted=(4, 4),  # a pose in the frames of the closed form
+        q=(DOF,),  # joint values of a candidate
+        start=(DOF,),  # joint values to start from
+        kept=(DOF,),  # joint values outside their limits, in case there are no others
+        checked=(DOF,),  # joint values that T, J and error belong to, NaN where they belong to none
+        lanes=(12, LANES),  # frames of many poses, entry by entry
+        lane_turns=(2, LANES),  # cosines and sines of a joint
+        lane_axes=(DOF, 6, LANES),  # directions and origins of the joints
+        seen=(SEEN,),  # scaled inputs of a network
+        angles=(3,),  # roll, pitch and yaw
+        tolerance=(6,),  # of the axes of the tool, see `kinematics.task_axes.TaskAxes.row`
+        weight=(6,),  # of these axes in least squares
+        turned=(6,),  # an error in these axes
+        elbow=(),  # elbow angle wanted, NaN where any will do, and on the way there
+        elbow_now=(),
+        line=(3,),  # from shoulder to wrist; upright, bend and beside go with it
+        upright=(3,),
+        bend=(3,),
+        beside=(3,),
+        level=(4, 4),  # the wanted pose as the nominal arm can take it
+        candidates=(CANDIDATES, DOF),  # joint values to search from, the most promising first
+        rank=(CANDIDATES,),
+        preferred=(DOF,),  # joint values that a redundant arm is to come near to
+        chosen=(DOF,),  # the best of several solutions
+        first=(DOF,),  # joint values that a search began at
+        distance=(SAMPLES,),  # squared, of scaled inputs from rows of a domain, or of poses from stored ones
+    )
+    + _integers(
+        nearest=(128,),  # stored starts
+        whole=(),  # 1 where all six axes count exactly, else 0
+        loose=(),  # 1 where the arm has too few joints for all axes that count, so that tolerances weigh them
+        pivot=(),  # the axis about which rotations are split into twist and swing, or -1
+        rows=(),  # how many axes count now
+        height=(),  # 6, or 7 where the elbow angle counts too
+    )
+)
+"""What kernels work in: overwritten all the time, and nothing in it outlives a pose."""
+
+
+def pack(description: Description, name: str, forms: KernelForms) -> np.ndarray:
+    """A description as one struct, `(1,)` of `DESCRIPTION`.
+
+    Args:
+        description: the arm as arrays.
+        name: of the model, for complaints.
+        forms: what the kernels evaluate.
+
+    Raises:
+        ModelError: the arm is larger than the compiled kernels allow, or needs what they do not evaluate.
+    """
+    packed = np.zeros(1, DESCRIPTION)
+    for part, kind in PARTS.items():
+        for field in (name for name in kind._fields if name in (packed[part].dtype.names or ())):
+            value = np.asarray(getattr(getattr(description, part), field))
+            room = packed[part][field][0]
+            if value.ndim != np.ndim(room) or any(
+                n > most for n, most in zip(value.shape, room.shape, strict=True)
+            ):
+                raise ModelError(
+                    f"model '{name}': {part}.{field} has the shape {value.shape}, but the compiled kernels have room "
+                    f"for {np.shape(room)}; use pisigma.load."
+                )
+            packed[part][field][(0, *(slice(n) for n in value.shape))] = value
+    arms, correction = description.arms, description.correction
+    packed["arms"]["dof"], packed["arms"]["rows_used"] = len(arms.direction), len(arms.kind)
+    packed["correction"]["half"][0, len(arms.direction) :] = 1.0
+    packed["correction"]["inputs"] = correction.weight.shape[1]
+    packed["correction"]["products"] = len(correction.orders)
+    packed["correction"]["first"] = -1
+    wanted = description.forms
+    if not forms.cover(wanted):
+        lacking = {*wanted.features, *wanted.closed_forms} - {*forms.features, *forms.closed_forms}
+        raise ModelError(
+            f"model '{name}': it uses {', '.join(map(repr, sorted(lacking)))}, which these kernels do not evaluate; "
+            "import what registers it, and install pisigma[compile]."
+        )
+    for feature, start in zip(wanted.features, correction.starts, strict=True):
+        packed["correction"]["first"][0, forms.features.index(feature)] = start
+    for form in wanted.closed_forms:
+        packed["closed_form"]["kind"] = 1 + forms.closed_forms.index(form)
+    network = description.network
+    if network.samples > SAMPLES:
+        raise ModelError(
+            f"model '{name}': its domain has {network.samples} training rows, but the compiled kernels have room for "
+            f"{SAMPLES}; use pisigma.load."
+        )
+    packed["network"]["inputs"] = len(network.source)
+    packed["network"]["columns"] = len(network.column)
+    packed["network"]["products"][0, : len(network.orders)] = (network.orders > 0).sum(-1)
+    packed["coverage"]["stretches"] = len(description.coverage.joint)
+    packed["starts"]["count"] = len(description.starts.q)
+    return packed
+
+
+def make_memory() -> np.ndarray:
+    """Fresh memory to work in, `(1,)` of `MEMORY`."""
+    return np.zeros(1, MEMORY)

@@ -1,0 +1,262 @@
+"""The kernels as machine code of this processor, made by llvmlite from their intermediate code and kept in a file.
+
+numba is not needed where the intermediate code comes with the package. The kernels call nothing but the mathematical
+functions of the C library, so their object code can be loaded by llvmlite alone.
+"""
+
+import ctypes
+import functools
+import hashlib
+import os
+import stat
+import sys
+import tempfile
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import llvmlite  # type: ignore[import-untyped]
+import llvmlite.binding as llvm  # type: ignore[import-untyped]
+
+from pisigma.files.errors import ModelError
+from pisigma.robot.kernels.build import (
+    ARGUMENTS,
+    ENTRY,
+    intermediate_code,
+    read_ready,
+    ready_forms,
+    source_hash,
+)
+from pisigma.robot.kernels.forms import KernelForms
+
+_ALLOWED = {"acos", "atan2", "ceil", "cos", "fabs", "floor", "hypot", "log", "pow", "sin", "sqrt"}
+_ALLOWED |= {"memcpy", "memset"}
+"""Functions of the C library that every process has."""
+_OPTIONS = "speed 3, vectors up to 256 bits, internal linkage"
+"""What `optimised_object` does, as far as the code depends on it; part of the key of kept code."""
+_PATIENCE = 2.0
+"""[s] Kernels that are on disk are loaded in far less."""
+_COMPILING = "pisigma: preparing the inverse kinematics for this processor, once, in some seconds ...\n"
+Said = ctypes.c_int64 * 1
+"""What a call of the kernels says."""
+IGNORED = Said()
+"""Where nobody asks for that."""
+_lock = threading.Lock()
+_kept: list[Any] = []
+
+
+@functools.cache
+def _ready_forms() -> KernelForms | None:
+    return ready_forms()
+
+
+_NOTHING = KernelForms()
+
+
+def kernel_forms(wanted: KernelForms = _NOTHING) -> KernelForms:
+    """What the kernels evaluate that `load_kernels` gives.
+
+    That is what the code that comes with the package evaluates where this is all that is wanted; else what is
+    registered.
+    """
+    ready = _ready_forms()
+    return ready if ready is not None and ready.cover(wanted) else KernelForms.registered()
+
+
+def load_kernels(wanted: KernelForms = _NOTHING) -> Callable[..., int]:
+    """The function `kernels.run`, on addresses and numbers; bytes and ctypes arrays count as their addresses.
+
+    Two arguments come before those of `run`: a `Said`, into which -1 is written, or what `kernels.solve_poses` says;
+    and `IGNORED`, for what was raised: nothing ever is.
+
+    Machine code is made when it is first wanted on a machine, in some seconds, and read from a file afterwards.
+    Somebody at a terminal reads why that takes so long.
+
+    Args:
+        wanted: what they have to evaluate.
+
+    Raises:
+        ModelError: there is no intermediate code of the present sources, and numba, which makes it, is not installed.
+    """
+    notice = threading.Timer(_PATIENCE, sys.stderr.write, (_COMPILING,))
+    notice.daemon = True
+    if sys.stderr.isatty():
+        notice.start()
+    try:
+        with _lock:
+            return _load(kernel_forms(wanted))
+    finally:
+        notice.cancel()
+
+
+@functools.cache
+def _load(forms: KernelForms) -> Callable[..., int]:
+    llvm.initialize_native_target()
+    llvm.initialize_native_asmprinter()
+    code = _code(forms, _native_machine(), "kernels")
+    engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), _native_machine())
+    engine.add_object_file(llvm.ObjectFileRef.from_data(code))
+    engine.finalize_object()
+    _kept.append(engine)
+    kinds = [ctypes.c_void_p if kind == "p" else ctypes.c_int64 for kind in ARGUMENTS]
+    prototype = ctypes.CFUNCTYPE(ctypes.c_int32, ctypes.c_void_p, ctypes.c_void_p, *kinds)
+    return prototype(engine.get_function_address(ENTRY))
+
+
+def _code(forms: KernelForms, machine: Any, use: str) -> bytes:
+    """Object code, from a file or made now."""
+    name = f"{use}-{_key(forms)}.o"
+    code = next((kept for folder in cache_folders() if (kept := read_code(folder / name)) is not None), None)
+    if code is None:
+        code = optimised_object(_intermediate_code(forms), machine)
+        any(write_code(folder / name, code) for folder in cache_folders())
+    return code
+
+
+def library_object(wanted: KernelForms) -> bytes:
+    """Object code of the kernels for a shared library, on any processor of the kind of this one.
+
+    Args:
+        wanted: what they have to evaluate.
+
+    Raises:
+        ModelError: see `load_kernels`.
+    """
+    with _lock:
+        llvm.initialize_native_target()
+        llvm.initialize_native_asmprinter()
+        triple = llvm.get_process_triple()
+        machine = llvm.Target.from_triple(triple).create_target_machine(
+            opt=3, reloc="pic", codemodel="default"
+        )
+        return _code(kernel_forms(wanted), machine, "library")
+
+
+def _key(forms: KernelForms) -> str:
+    """What the machine code depends on: sources, options, the versions of the compiler, and the processor."""
+    digest = hashlib.sha256()
+    for word in (
+        source_hash(),
+        *forms.fingerprints(_ready_forms() or _NOTHING),
+        _OPTIONS,
+        llvmlite.__version__,
+        str(llvm.llvm_version_info),
+        llvm.get_process_triple(),
+        llvm.get_host_cpu_name(),
+        llvm.get_host_cpu_features().flatten(),
+    ):
+        digest.update(word.encode() + b"\0")
+    return digest.hexdigest()[:16]
+
+
+def _intermediate_code(forms: KernelForms) -> str:
+    """What comes with the package, where it is of the present sources and forms; else what numba makes."""
+    ready = read_ready() if _ready_forms() == forms else None
+    if ready is not None:
+        return ready
+    try:
+        return intermediate_code()
+    except ImportError:
+        raise ModelError(
+            "the package holds no compiled inverse kinematics of its present sources; install pisigma[compile], which "
+            "makes it, or go without, which is some hundred times slower."
+        ) from None
+
+
+def _native_machine() -> Any:
+    """The processor that this process runs on, without its registers of 512 bits.
+
+    Sums over six joints do not fill them, and after a millisecond without any the processor takes its time to switch
+    them on: a pose of a UR10 hybrid took 15.3 us then, 12.3 us in a row, and without them 12.5 and 11.2 us.
+    """
+    features = (
+        llvm.get_host_cpu_features().flatten().replace("+avx512", "-avx512").replace("+avx10", "-avx10")
+    )
+    return target_machine(llvm.get_process_triple(), llvm.get_host_cpu_name(), features)
+
+
+def target_machine(triple: str, cpu: str = "", features: str = "") -> Any:
+    """LLVM's description of a processor."""
+    target = llvm.Target.from_triple(triple)
+    return target.create_target_machine(
+        opt=3, jit=True, cpu=cpu, features=features, reloc="default", codemodel="jitdefault"
+    )
+
+
+def optimised_object(code: str, machine: Any) -> bytes:
+    """Object code of intermediate code: what is called, optimised as one program, with vectors."""
+    module = llvm.parse_assembly(code)
+    module.triple, module.data_layout = machine.triple, str(machine.target_data)
+    for item in [*module.functions, *module.global_variables]:
+        if not item.is_declaration and item.name != ENTRY:
+            item.linkage = llvm.Linkage.internal
+    options = llvm.create_pipeline_tuning_options(speed_level=3)
+    options.slp_vectorization = True
+    options.loop_vectorization = True
+    builder = llvm.create_pass_builder(machine, options)
+    builder.getModulePassManager().run(module, builder)
+    called = {item.name for item in module.functions if item.is_declaration}
+    foreign = {name for name in called if not name.startswith("llvm.") and name not in _ALLOWED}
+    assert not foreign, f"the kernels call {sorted(foreign)}, which only numba knows"
+    code_of_machine: bytes = machine.emit_object(module)
+    return code_of_machine
+
+
+def cache_folders() -> list[Path]:
+    """Where machine code is kept: beside the package, or with the user's other caches where that is not possible.
+
+    `XDG_CACHE_HOME` counts where it is an absolute path, as its specification says; without a home there is no cache
+    of the user.
+    """
+    folders = [Path(__file__).parent / "__pycache__"]
+    stated = os.environ.get("XDG_CACHE_HOME", "")
+    try:
+        cache = Path(stated) if os.path.isabs(stated) else Path.home() / ".cache"
+    except RuntimeError:
+        return folders
+    return [*folders, cache / "pisigma"] if cache.is_absolute() else folders
+
+
+def read_code(path: Path) -> bytes | None:
+    """The code in a file; None where there is none, it is damaged, or somebody else could have written it."""
+    try:
+        if not _trusted(os.stat(path.parent)):
+            return None
+        with open(os.open(path, os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0)), "rb") as stream:
+            status = os.fstat(stream.fileno())
+            content = stream.read() if stat.S_ISREG(status.st_mode) and _trusted(status) else b""
+    except OSError:
+        return None
+    code = content[32:]
+    return code if code and hashlib.sha256(code).digest() == content[:32] else None
+
+
+def write_code(path: Path, code: bytes) -> bool:
+    """Write a file whole or not at all, in folders that only the user can enter; whether that succeeded."""
+    try:
+        _make_private(path.parent)
+        if not _trusted(os.stat(path.parent)):
+            return False
+        with tempfile.NamedTemporaryFile(dir=path.parent, delete=False) as stream:
+            stream.write(hashlib.sha256(code).digest() + code)
+        os.chmod(stream.name, 0o644)
+        os.replace(stream.name, path)
+    except OSError:
+        return False
+    return True
+
+
+def _make_private(folder: Path) -> None:
+    """Make a folder, and those above it that are missing, which only the user can enter."""
+    if not folder.is_dir():
+        if folder.parent != folder:
+            _make_private(folder.parent)
+        folder.mkdir(mode=0o700, exist_ok=True)
+
+
+def _trusted(status: os.stat_result) -> bool:
+    """Whether a file or folder belongs to the user or root, and nobody else can write it."""
+    if not hasattr(os, "geteuid"):  # Windows, where the folders of a user are closed to others
+        return True
+    return status.st_uid in (0, os.geteuid()) and not status.st_mode & (stat.S_IWGRP | stat.S_IWOTH)

@@ -1,0 +1,111 @@
+"""Rows rewritten with the twists of a textbook robot, so that one set of formulas serves its mirror images.
+
+`RotX(pi) · RotZ(t) · Trans(a, 0, d) = RotZ(-t) · Trans(a, 0, -d) · RotX(pi)`: a twist that differs by 180 deg
+from the textbook's changes the sign of t and d in all later rows, and what is left over is carried into the
+tool.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Float64
+from torch import Tensor
+
+from pisigma.robot.description import Robot
+from pisigma.robot.kinematics.components import (
+    IDENTITY,
+    Frame,
+    as_transform,
+    cosine_sine,
+    follow_row,
+    follow_xyzrpy,
+    rotate_x,
+)
+from pisigma.robot.row import JointType
+
+
+@dataclass(frozen=True, eq=False)
+class CanonicalRows:
+    """A robot as a product of rows with canonical twists.
+
+    `T_base_tool = T_base_first · Π RotZ(t_i) Trans(a_i, 0, d_i) RotX(twist_i) · RotZ(t_n) · T_last_tool`. The
+    joint variable v (t of a revolute, d of a prismatic joint) is `sign · (direction · q + offset)`.
+
+    Attributes:
+        T_base_first: frame before the first joint; base and leading fixed rows.
+        T_last_tool: tool in the last joint's frame after its turn; the rest of its row, trailing fixed rows,
+            tool.
+        sign: +1 or -1 per joint.
+        direction: +1 or -1 per joint, how the controller counts.
+        offset: theta [rad] of a revolute and d [m] of a prismatic row.
+        theta: sign · theta [rad] of every joint's row.
+        d: sign · d [m] of every joint's row.
+        a: a [m] of every joint's row.
+    """
+
+    T_base_first: Float64[Tensor, "4 4"]
+    T_last_tool: Float64[Tensor, "4 4"]
+    sign: Float64[Tensor, " dof"]
+    direction: Float64[Tensor, " dof"]
+    offset: Float64[Tensor, " dof"]
+    theta: tuple[float, ...]
+    d: tuple[float, ...]
+    a: tuple[float, ...]
+
+    def joint_values(self, variables: Float[Tensor, "*batch dof"]) -> Float[Tensor, "*batch dof"]:
+        """Joint values as the controller counts, from the canonical variables."""
+        sign, direction, offset = (x.to(variables) for x in (self.sign, self.direction, self.offset))
+        return direction * (sign * variables - offset)
+
+    def variable_at_zero(self, joint: int) -> float:
+        """The canonical variable of a joint whose joint value is 0."""
+        return float(self.sign[joint] * self.offset[joint])
+
+
+def canonical_rows(robot: Robot, types: Sequence[JointType], twists: Sequence[float]) -> CanonicalRows | None:
+    """Rewrite the rows with the given twists [rad], or return None where the robot is of another kind.
+
+    Args:
+        robot: the robot; fixed rows may stand before the first and behind the last joint only.
+        types: the joint types wanted.
+        twists: alpha of every joint's row but the last, up to 180 deg; beta must be 0 in these rows.
+    """
+    joint_rows = robot.joint_rows
+    first, last = joint_rows[0], joint_rows[-1]
+    if tuple(row.type for row in robot.joints) != tuple(types) or last - first + 1 != len(joint_rows):
+        return None
+    signs = [1.0]
+    for (_, _, _, alpha, beta), twist in zip(robot.dh[first:last].tolist(), twists, strict=True):
+        cosine, sine = cosine_sine(alpha - twist)
+        if beta != 0.0 or sine != 0.0:
+            return None
+        signs.append(signs[-1] * float(cosine))
+    dh = robot.dh[first : last + 1].tolist()
+    offset = [
+        row[1] if joint.type == "prismatic" else row[0] for joint, row in zip(robot.joints, dh, strict=True)
+    ]
+    frame = rotate_x(IDENTITY, 0.0 if signs[-1] > 0 else math.pi)
+    frame = follow_row(frame, (0.0, *dh[-1][1:]))
+    like = torch.zeros((), dtype=torch.float64)
+    return CanonicalRows(
+        T_base_first=as_transform(
+            _follow_fixed(robot, follow_xyzrpy(IDENTITY, robot.base.tolist()), 0, first), like
+        ),
+        T_last_tool=as_transform(
+            follow_xyzrpy(_follow_fixed(robot, frame, last + 1, len(robot.rows)), robot.tool.tolist()), like
+        ),
+        sign=torch.tensor(signs, dtype=torch.float64),
+        direction=torch.from_numpy(robot.directions),
+        offset=torch.tensor(offset, dtype=torch.float64),
+        theta=tuple(sign * row[0] for sign, row in zip(signs, dh, strict=True)),
+        d=tuple(sign * row[1] for sign, row in zip(signs, dh, strict=True)),
+        a=tuple(row[2] for row in dh),
+    )
+
+
+def _follow_fixed(robot: Robot, frame: Frame, start: int, stop: int) -> Frame:
+    for parameters in robot.dh[start:stop].tolist():
+        frame = follow_row(frame, parameters)
+    return frame

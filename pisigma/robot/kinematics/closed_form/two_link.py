@@ -1,0 +1,138 @@
+"""Joint 1, and two links in a plane, which closed forms share, and from what size on they take a number for 0."""
+
+import itertools
+import math
+from dataclasses import dataclass
+from typing import Any, no_type_check
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from pisigma.robot.kinematics.components import Scalar
+from pisigma.robot.kinematics.tolerances import ROUNDINGS
+
+ARM_BRANCHES = tuple(
+    "/".join(choices)
+    for choices in itertools.product(("front", "back"), ("elbow_up", "elbow_down"), ("no_flip", "flip"))
+)
+"""Names `shoulder/elbow/wrist` of the branches of arms with six joints."""
+
+SINGULAR_TOLERANCE = 1e-6
+"""A solution is SINGULAR where the sine of its elbow angle or of its wrist's bend, or the distance of the
+wrist centre from axis 1 over the arm's reach, is smaller (in float32: than 1.2e-5)."""
+
+
+def singular_tolerance(dtype: torch.dtype) -> float:
+    """`SINGULAR_TOLERANCE`, or what rounding allows in a shorter float type."""
+    return max(SINGULAR_TOLERANCE, 100 * torch.finfo(dtype).eps)
+
+
+def rounding(dtype: torch.dtype) -> float:
+    """Relative size below which a cosine beyond 1 or a length is taken for rounding (1.1e-13 in float64)."""
+    return ROUNDINGS * torch.finfo(dtype).eps
+
+
+@dataclass(frozen=True, eq=False)
+class TwoLink:
+    """Solutions of `(x, y) = R(first) · ((a, 0) + R(elbow) · (b, 0))`.
+
+    Attributes:
+        first: angle of the first link [rad].
+        elbow: angle from the first link to the second [rad].
+        reached: whether the point is within reach.
+        singular: whether the arm is stretched or folded.
+    """
+
+    first: Float[Tensor, "*batch"]
+    elbow: Float[Tensor, "*batch"]
+    reached: Bool[Tensor, "..."]
+    singular: Bool[Tensor, "..."]
+
+
+def solve_first_joint(
+    x: Tensor, y: Tensor, side: float, scale: float, shoulder: Scalar, free: float, margin: float
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Joint 1, which brings a point to a distance `side` from the plane of the arm: `c_1 y - s_1 x = side`.
+
+    Args:
+        x: the point [m].
+        y: the point [m].
+        side: how far the point lies to the left of the arm's plane [m].
+        scale: length of the arm [m], which rounding is compared with.
+        shoulder: +1 where the point lies ahead of axis 1, -1 where it lies behind it; broadcasts.
+        free: azimuth [rad] of a point on axis 1, for which any would do.
+        margin: of the squared scale, what the square of how far ahead the point lies is not below.
+
+    Returns:
+        The angle [rad], how far ahead of axis 1 the point lies in the plane [m], and whether there is such an angle.
+    """
+    square = x * x + y * y - side * side
+    reached = square >= -rounding(x.dtype) * scale * scale
+    ahead = shoulder * square.clamp(min=margin * scale * scale).sqrt()
+    on_axis = torch.hypot(x, y) <= rounding(x.dtype) * scale
+    azimuth = torch.where(on_axis, free, torch.atan2(y, x))
+    angle = azimuth - torch.atan2(torch.full_like(ahead, side), ahead)
+    back = azimuth - math.copysign(math.pi, side)
+    return torch.where(on_axis & ahead.signbit(), back, angle), ahead, reached
+
+
+def solve_two_link(
+    x: Tensor, y: Tensor, a: float, b: float, elbow_sign: Scalar, first_when_free: float, margin: float
+) -> TwoLink:
+    """Angles of two links that end in a point: appendix A's `C_2`, `S_2`, `K_1`, `K_2` for any lengths.
+
+    Args:
+        x: the point [m].
+        y: the point [m].
+        a: length of the first link [m], not 0; may be negative.
+        b: length of the second link [m], positive.
+        elbow_sign: +1 or -1, the sign of the sine of the elbow angle; broadcasts.
+        first_when_free: the first angle [rad] where the point lies on its axis, so that any would do.
+        margin: what is kept between the cosine of the elbow angle and 1.
+
+    Returns:
+        The angles; where the point is out of reach they are those of the nearest arm and `reached` is False.
+        A cosine beyond 1 by rounding counts as 1.
+    """
+    cosine = (x * x + y * y - (a * a + b * b)) / (2 * a * b)
+    reached = cosine.abs() <= 1 + rounding(x.dtype)
+    cosine = cosine.clamp(margin - 1, 1 - margin)
+    sine = elbow_sign * ((1 - cosine) * (1 + cosine)).sqrt()
+    on_axis = torch.hypot(x, y) <= rounding(x.dtype) * (abs(a) + b)
+    free = torch.atan2(b * sine, a + b * cosine)
+    first = torch.where(on_axis, first_when_free, torch.atan2(y, x) - free)
+    return TwoLink(first, torch.atan2(sine, cosine), reached, sine.abs() < singular_tolerance(x.dtype))
+
+
+@no_type_check
+def two_link(
+    x: float, y: float, a: float, b: float, elbow_sign: float, free: float, rounding: float, margin: float
+) -> tuple[float, float, bool]:
+    """The same as `solve_two_link` on plain numbers: the angles [rad], and whether the point is within reach."""
+    cosine = (x * x + y * y - (a * a + b * b)) / (2 * a * b)
+    reached = abs(cosine) <= 1 + rounding
+    cosine = min(max(cosine, margin - 1), 1 - margin)
+    sine = elbow_sign * math.sqrt((1 - cosine) * (1 + cosine))
+    first = free
+    if math.sqrt(x * x + y * y) > rounding * (abs(a) + b):
+        first = math.atan2(y, x) - math.atan2(b * sine, a + b * cosine)
+    return first, math.atan2(sine, cosine), reached
+
+
+@no_type_check
+def first_joint(
+    P: Any, side: float, scale: float, zero: float, rounding: float, margin: float
+) -> tuple[float, float, bool, bool]:
+    """What joint 1 of an arm brings a point to, whose distance from the plane of the arm is `side` [m].
+
+    Returns:
+        The distance [m] ahead of axis 1, the azimuth [rad], whether there is such a joint value, and whether the point
+        lies on the axis, so that any would do.
+    """
+    x, y = P[0, 3], P[1, 3]
+    square = x * x + y * y - side * side
+    on_axis = math.hypot(x, y) <= rounding * scale
+    azimuth = zero if on_axis else math.atan2(y, x)
+    ahead = math.sqrt(max(square, margin * scale * scale))
+    return ahead, azimuth, square >= -rounding * scale * scale, on_axis

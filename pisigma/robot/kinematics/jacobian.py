@@ -1,0 +1,93 @@
+"""Joint Jacobian of the tool pose, batched and in closed form."""
+
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from pisigma.robot.description import Robot
+from pisigma.robot.kinematics.components import (
+    IDENTITY,
+    Frame,
+    Scalar,
+    as_transform,
+    cross,
+    follow_xyzrpy,
+    product,
+    stack_components,
+    subtract,
+)
+from pisigma.robot.kinematics.forward import Geometry, iterate_chunks, iterate_rows
+
+
+def joint_jacobian(
+    robot: Robot, q: Float[Tensor, "*batch dof"]
+) -> tuple[Float[Tensor, "*batch 4 4"], Float[Tensor, "*batch 6 dof"]]:
+    """Tool pose and geometric Jacobian, in the base frame and at the tool's origin.
+
+    Column j is `direction_j · [z × (p_tool - p); z]` for a revolute and `direction_j · [z; 0]` for a
+    prismatic joint, with z and p the axis and origin of the frame before the joint's row (Siciliano et al.
+    2009, eq. 3.30).
+
+    Args:
+        robot: the robot.
+        q: joint values [rad or m].
+
+    Returns:
+        T_base_tool, and J with `J @ dq` = [translation [m]; rotation vector [rad]] of the tool, both in the
+        base frame. Both may be views of memory in which the batch runs fastest; call ``.contiguous()`` where
+        that matters.
+
+    Raises:
+        PoseError: q has another number of columns than the robot has joints.
+    """
+    robot.check_joint_count(q.shape[-1])
+    batch = q.shape[:-1]
+    geometry = Geometry.of(robot)
+    chunks = [_jacobian_chunk(robot, geometry, chunk) for chunk in iterate_chunks(q)]
+    T, J = chunks[0]
+    if len(chunks) > 1:
+        T, J = _join([T for T, _ in chunks]), _join([J for _, J in chunks])
+    return T.reshape(*batch, 4, 4), J.reshape(*batch, 6, robot.dof)
+
+
+def _join(chunks: list[Tensor]) -> Tensor:
+    """Chunks one after the other, copied in the order in which they lie in memory, the batch fastest."""
+    return torch.cat([chunk.movedim(0, -1) for chunk in chunks], -1).movedim(-1, 0)
+
+
+def _jacobian_chunk(
+    robot: Robot, geometry: Geometry, q: Float[Tensor, "poses dof"]
+) -> tuple[Float[Tensor, "poses 4 4"], Float[Tensor, "poses 6 dof"]]:
+    columns = q.t().contiguous().unbind(0)
+    tool, rows = motion_components(robot, geometry, columns)
+    J = stack_components([value for entries in rows for value in entries], like=columns[0])
+    return as_transform(tool, like=columns[0]), J.reshape(-1, 6, robot.dof)
+
+
+def motion_components(
+    robot: Robot, geometry: Geometry, q: Sequence[Scalar]
+) -> tuple[Frame, list[list[Scalar]]]:
+    """Frame of the tool and the six rows of the joint Jacobian, as `joint_jacobian` gives them, on components.
+
+    Args:
+        robot: the robot.
+        geometry: its parameters, or others for the same rows.
+        q: one joint value [rad or m] per joint, each a tensor with the batch shape.
+    """
+    joints: list[Frame] = []
+    frame = IDENTITY
+    for row, frames in zip(robot.rows, iterate_rows(robot, geometry, q), strict=True):
+        if row.type != "fixed":
+            joints.append(frames.before)
+        frame = frames.after
+    tool = follow_xyzrpy(frame, geometry.tool)
+    rows: list[list[Scalar]] = [[] for _ in range(6)]
+    for joint, before in zip(robot.joints, joints, strict=True):
+        axis, origin = before[2], before[3]
+        linear = axis if joint.type == "prismatic" else cross(axis, subtract(tool[3], origin))
+        angular = (0.0, 0.0, 0.0) if joint.type == "prismatic" else axis
+        for entries, value in zip(rows, (*linear, *angular), strict=True):
+            entries.append(product(float(joint.direction), value))
+    return tool, rows

@@ -1,0 +1,71 @@
+"""Joint limits: values moved inside by full turns where that can be, and those that cannot be of the joint at all."""
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Float64
+from torch import Tensor
+
+from pisigma.robot.description import Robot
+from pisigma.robot.kinematics.tolerances import LIMIT_TOLERANCE
+from pisigma.robot.row import Row
+from pisigma.robot.se3 import wrap_to_pi
+
+
+def wrapped_difference(
+    robot: Robot, q: Float[Tensor, "*#batch dof"], other: Float[Tensor, "*#batch dof"]
+) -> Float[Tensor, "*_batch dof"]:
+    """`q - other` [rad or m], wrapped to (-pi, pi] for the joints that turn; the batches broadcast."""
+    difference = q - other
+    return torch.where(torch.tensor(robot.revolute, device=q.device), wrap_to_pi(difference), difference)
+
+
+def wrap_into_limits(
+    robot: Robot, q: Float[Tensor, "*batch dof"]
+) -> tuple[Float[Tensor, "*batch dof"], Bool[Tensor, "*batch"]]:
+    """Move revolute joints that are outside their limits by full turns where that brings them inside.
+
+    Args:
+        robot: the robot, for the limits; where joints are coupled, those of the controller's values.
+        q: joint values [rad or m]; NaN stays NaN.
+
+    Returns:
+        The joint values, and whether all joints of a pose are inside (False where one is NaN). A value that
+        no full turn brings inside is left as it came.
+    """
+    limits = torch.from_numpy(robot.limits).to(q)
+    tolerance = max(LIMIT_TOLERANCE, 8 * torch.finfo(q.dtype).eps)
+    lower, upper = limits[:, 0] - tolerance, limits[:, 1] + tolerance
+    turn = 2 * torch.pi * torch.tensor(robot.revolute).to(q)
+    up = torch.where(q < lower, torch.ceil((lower - q) / (2 * torch.pi)), 0.0)
+    down = torch.where(q > upper, torch.ceil((q - upper) / (2 * torch.pi)), 0.0)
+    moved = q + (up - down) * turn
+    inside = (moved >= lower) & (moved <= upper)
+    moved, every = torch.where(inside, moved, q), inside.all(-1)
+    if robot.coupling is None:
+        return moved, every
+    turned, allowed = robot.coupling.turned_inside(
+        moved.detach().double().cpu().numpy().reshape(-1, robot.dof)
+    )
+    return torch.from_numpy(turned).to(q).reshape(q.shape), every & torch.from_numpy(allowed).to(
+        every
+    ).reshape(every.shape)
+
+
+GROSS_ANGLE = np.pi / 4
+"""[rad] A value that is farther outside is of another joint, unit or zero; drawings were off by up to 14 deg."""
+GROSS_SHARE = 0.25
+"""Share of the stroke of a sliding joint for the same."""
+
+
+def beyond_limits(
+    q: Float64[np.ndarray, " rows"], axis: Row, slack: float = LIMIT_TOLERANCE
+) -> Bool[np.ndarray, " rows"]:
+    """Which values [rad or m] lie farther than `slack` outside the limits of an axis."""
+    outside: np.ndarray = (q < axis.lower - slack) | (q > axis.upper + slack)
+    return outside
+
+
+def grossly_beyond(q: Float64[np.ndarray, " rows"], axis: Row) -> Bool[np.ndarray, " rows"]:
+    """Which values cannot be those of an axis, whatever its drawing says of its limits."""
+    stroke = axis.upper - axis.lower
+    return beyond_limits(q, axis, GROSS_SHARE * stroke if axis.type == "prismatic" else GROSS_ANGLE)

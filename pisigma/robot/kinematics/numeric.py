@@ -1,0 +1,264 @@
+"""Numeric inverse kinematics from a given start, for any robot: damped Newton, batched."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int64
+from torch import Tensor
+
+from pisigma.files.errors import PoseError
+from pisigma.robot.description import Robot
+from pisigma.robot.kinematics import tolerances
+from pisigma.robot.kinematics.jacobian import joint_jacobian
+from pisigma.robot.kinematics.joint_limits import wrap_into_limits
+from pisigma.robot.kinematics.singularity import (
+    characteristic_length,
+    dimensionless_jacobian,
+    smallest_singular_value,
+)
+from pisigma.robot.kinematics.status import Status
+from pisigma.robot.kinematics.task_axes import WHOLE, TaskAxes
+from pisigma.robot.kinematics.task_error import task_error
+from pisigma.robot.se3 import check_transforms, pose_error
+
+Motion = Callable[[Tensor], tuple[Tensor, Tensor]]
+"""Pose T_base_tool and joint Jacobian of an arm at joint values, as `joint_jacobian` gives them."""
+
+
+@dataclass(frozen=True, eq=False)
+class NumericSolution:
+    """What the iteration found for every pose.
+
+    Attributes:
+        q: joint values [rad or m]; where the status is NOT_CONVERGED the best found, which do not reach the
+            pose.
+        status: a `Status` for every pose: REACHED, SINGULAR, OUTSIDE_JOINT_LIMITS or NOT_CONVERGED.
+        position_residual: distance of the tool from the wanted position [m].
+        rotation_residual: angle of the tool to the wanted orientation [rad].
+        iterations: Jacobians computed for the pose.
+    """
+
+    q: Float[Tensor, "*batch dof"]
+    status: Int64[Tensor, "*batch"]
+    position_residual: Float[Tensor, "*batch"]
+    rotation_residual: Float[Tensor, "*batch"]
+    iterations: Int64[Tensor, "*batch"]
+
+
+@dataclass
+class _Iterate:
+    """State of all poses, of which only the active ones are still worked on.
+
+    Attributes:
+        q: best joint values so far.
+        error: pose error there: translation [m], rotation vector [rad].
+        J: joint Jacobian there.
+        damping: factor of the squared scaled error in the damping.
+        iterations: Jacobians computed.
+    """
+
+    q: Float[Tensor, "poses dof"]
+    error: Float[Tensor, "poses 6"]
+    J: Float[Tensor, "poses 6 dof"]
+    damping: Float[Tensor, " poses"]
+    iterations: Int64[Tensor, " poses"]
+
+    def converged(self, tolerance: float) -> Bool[Tensor, " poses"]:
+        """Whether both residuals are below the tolerance [m, rad]."""
+        position, rotation = self.residuals()
+        return (position < tolerance) & (rotation < tolerance)
+
+    def residuals(self) -> tuple[Float[Tensor, " poses"], Float[Tensor, " poses"]]:
+        """Distance [m] and angle [rad] from the wanted pose."""
+        return torch.linalg.vector_norm(self.error[:, :3], dim=-1), torch.linalg.vector_norm(
+            self.error[:, 3:], dim=-1
+        )
+
+
+def solve_numeric(
+    robot: Robot,
+    T: Tensor,
+    start: Float[Tensor, "*starts dof"],
+    *,
+    tolerance: float | None = None,
+    max_iterations: int = tolerances.ITERATIONS,
+    motion: Motion | None = None,
+    axes: TaskAxes = WHOLE,
+    weights: Sequence[float] | None = None,
+) -> NumericSolution:
+    """Joint values near a start that take the tool to the poses.
+
+    Each step solves `(JᵀJ + λ) dq = Jᵀe` with lengths in characteristic lengths and the damping λ in
+    proportion to the squared error (Sugihara 2011), so that convergence is quadratic at the end. The factor
+    grows after a step that makes the error larger, which is not taken, and shrinks after others, for each
+    pose on its own. Converged poses are worked on no more. Nothing is differentiated through; joint limits
+    are looked at when all is done.
+
+    Args:
+        robot: the robot, of any number of joints.
+        T: wanted T_base_tool, `(*batch, 4, 4)` [m].
+        start: joint values to begin with [rad or m]; batch dimensions broadcast with those of T.
+        tolerance: residuals to come below [m and rad]; None: 1e-13 in float64, 1e-5 in shorter types.
+        max_iterations: when to give up.
+        motion: where the tool of an arm with joint corrections is and how it moves; its Jacobian need not be
+            exact. None: that of the robot.
+        axes: which axes of the tool count.
+        weights: of these axes in least squares, 0 for one that does not count; None for `axes.weights`.
+
+    Returns:
+        The solution nearest in the sense of the iteration. Where no solution was found the status is
+        NOT_CONVERGED and q, the best found, does not reach the pose: see the residuals.
+
+    Raises:
+        PoseError: T is no stack of rigid transforms, or start is not finite or does not fit robot or T.
+    """
+    check_transforms(T, "T_base_tool")
+    _check_start(robot, T, start)
+    if tolerance is None:
+        tolerance = tolerances.TOLERANCE if T.dtype == torch.float64 else 1e-5
+    batch = np.broadcast_shapes(T.shape[:-2], start.shape[:-1])
+    T_flat = T.detach().expand(*batch, 4, 4).reshape(-1, 4, 4)
+    with torch.no_grad():
+        counted = T_flat.new_tensor(weights or axes.weights(robot.dof))
+        task = TaskMotion(motion or partial(joint_jacobian, robot), axes, counted)
+        state = _begin(task, T_flat, start.detach().expand(*batch, robot.dof).reshape(-1, robot.dof))
+        active = (~state.converged(tolerance)).nonzero()[:, 0]
+        for _ in range(max_iterations):
+            if active.numel() == 0:
+                break
+            _iterate(robot, task, T_flat, state, active)
+            stalled = state.damping[active] > tolerances.MOST_DAMPING
+            active = active[~(state.converged(tolerance)[active] | stalled)]
+        return _finish(robot, state, tolerance, batch, task.rows)
+
+
+def _check_start(robot: Robot, T: Tensor, start: Tensor) -> None:
+    robot.check_joint_count(start.shape[-1])
+    if start.dtype != T.dtype:
+        raise PoseError(f"start holds {start.dtype} but T_base_tool {T.dtype}; give both in the same type.")
+    try:
+        np.broadcast_shapes(T.shape[:-2], start.shape[:-1])
+    except ValueError:
+        raise PoseError(
+            f"start has the batch shape {tuple(start.shape[:-1])}, which does not broadcast with "
+            f"{tuple(T.shape[:-2])} of T_base_tool; give one start for each pose, or one for all."
+        ) from None
+    bad = ~torch.isfinite(start).all(-1)
+    if bad.any():
+        raise PoseError(
+            f"start at index {tuple(bad.nonzero()[0].tolist())} has joint values that are no finite numbers; "
+            "give a start for every pose, such as the nearest solution of another branch."
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class TaskMotion:
+    """The pose errors of an arm in the axes that count, by their weights.
+
+    Attributes:
+        motion: where the tool is and how it moves.
+        axes: which axes of the tool count.
+        weights: of them in least squares.
+    """
+
+    motion: Motion
+    axes: TaskAxes
+    weights: Float[Tensor, " 6"]
+
+    @property
+    def rows(self) -> int:
+        """How many axes count."""
+        return int(self.weights.count_nonzero())
+
+    def errors(
+        self, T: Float[Tensor, "poses 4 4"], q: Float[Tensor, "poses dof"]
+    ) -> tuple[Float[Tensor, "poses 6"], Float[Tensor, "poses 6 dof"]]:
+        """Error from the wanted poses at joint values, and its Jacobian."""
+        reached, J = self.motion(q)
+        if self.axes.whole:
+            return pose_error(T, reached), J.clone()
+        error, turn = task_error(self.axes, T, reached)
+        return self.weights * error, self.weights[:, None] * (turn @ J)
+
+
+def _begin(task: TaskMotion, T: Float[Tensor, "poses 4 4"], q: Float[Tensor, "poses dof"]) -> _Iterate:
+    error, J = task.errors(T, q)
+    damping = torch.full_like(q[:, 0], tolerances.FIRST_DAMPING)
+    return _Iterate(q.clone(), error, J, damping, torch.ones_like(damping, dtype=torch.int64))
+
+
+def _iterate(
+    robot: Robot,
+    task: TaskMotion,
+    T: Float[Tensor, "poses 4 4"],
+    state: _Iterate,
+    active: Int64[Tensor, " active"],
+) -> None:
+    """Try one step for the active poses and keep those that bring the tool nearer."""
+    old = _scaled(robot, state.error[active])
+    trial = state.q[active] + damped_step(robot, state.J[active], old, state.damping[active], task.rows)
+    error, J = task.errors(T[active], trial)
+    better = _scaled(robot, error).square().sum(-1) < old.square().sum(-1)
+    state.iterations[active] += 1
+    factor = torch.where(better, tolerances.DAMPING_DOWN, tolerances.DAMPING_UP).to(state.damping)
+    state.damping[active] = (state.damping[active] * factor).clamp(min=tolerances.LEAST_DAMPING)
+    kept = active[better]
+    state.q[kept], state.error[kept], state.J[kept] = trial[better], error[better], J[better]
+
+
+def _scaled(robot: Robot, error: Float[Tensor, "poses 6"]) -> Float[Tensor, "poses 6"]:
+    return error / error.new_tensor([characteristic_length(robot)] * 3 + [1.0] * 3)
+
+
+def damped_step(
+    robot: Robot,
+    J: Float[Tensor, "poses 6 dof"],
+    scaled_error: Float[Tensor, "poses 6"],
+    damping: Float[Tensor, " poses"],
+    rows: int = 6,
+) -> Float[Tensor, "poses dof"]:
+    """The damped least-squares step [rad or m], from the smaller of the two forms of the normal equations.
+
+    Args:
+        robot: the robot.
+        J: joint Jacobian.
+        scaled_error: pose error with translation in characteristic lengths.
+        damping: factor of the squared error in the damping; rounding sets a floor under the product.
+        rows: how many rows of the Jacobian count; the others are 0.
+    """
+    A = dimensionless_jacobian(robot, J).contiguous()
+    small = A.mT @ A if robot.dof < rows else A @ A.mT
+    floor = 4 * torch.finfo(A.dtype).eps * small.diagonal(dim1=-2, dim2=-1).sum(-1)
+    weight = damping * scaled_error.square().sum(-1) + floor
+    small = small + weight[:, None, None] * torch.eye(small.shape[-1], dtype=A.dtype, device=A.device)
+    error = scaled_error[..., None]
+    factor, _ = torch.linalg.cholesky_ex(small)
+    if robot.dof < rows:
+        step = torch.cholesky_solve(A.mT @ error, factor)[..., 0]
+    else:
+        step = (A.mT @ torch.cholesky_solve(error, factor))[..., 0]
+    lengths = [1.0 if revolute else characteristic_length(robot) for revolute in robot.revolute]
+    return step * step.new_tensor(lengths)
+
+
+def _finish(
+    robot: Robot, state: _Iterate, tolerance: float, batch: tuple[int, ...], rows: int
+) -> NumericSolution:
+    q, inside = wrap_into_limits(robot, state.q)
+    singular_tolerance = tolerances.SINGULAR_TOLERANCE if q.dtype == torch.float64 else 3e-3
+    singular = smallest_singular_value(robot, state.J, rows) < singular_tolerance
+    status = torch.where(singular, int(Status.SINGULAR), int(Status.REACHED))
+    status = torch.where(inside, status, int(Status.OUTSIDE_JOINT_LIMITS))
+    converged = state.converged(tolerance)
+    status = torch.where(converged, status, int(Status.NOT_CONVERGED))
+    position, rotation = state.residuals()
+    return NumericSolution(
+        q=torch.where(converged[:, None], q, state.q).reshape(*batch, robot.dof),
+        status=status.reshape(batch),
+        position_residual=position.reshape(batch),
+        rotation_residual=rotation.reshape(batch),
+        iterations=state.iterations.reshape(batch),
+    )

@@ -1,0 +1,49 @@
+"""Pose errors and Jacobians in the axes that a task asks for; see `kinematics.task_axes.TaskAxes`."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from pisigma.robot.kinematics.task_axes import TaskAxes
+from pisigma.robot.se3 import pose_error
+
+
+def task_error(
+    axes: TaskAxes, T: Float[Tensor, "poses 4 4"], reached: Float[Tensor, "poses 4 4"]
+) -> tuple[Float[Tensor, "poses 6"], Float[Tensor, "poses 6 6"]]:
+    """Errors of poses in all axes of the tool, and the matrices that take Jacobians of poses to those of the errors.
+
+    For a rotation D from the tool reached to the wanted one, and an axis k of it, the swing of the axis is
+    `atan2(|k × Dk|, k · Dk)` about `k × Dk`, and the twist about it `atan2(D_ji - D_ij, D_ii + D_jj)` with i, j, k
+    cyclic, which changes by `(k + Dk) · ω / (1 + k · Dk)`. Of rotation vectors and swings the derivatives are those of
+    small ones, as everywhere in Gauss-Newton steps here.
+
+    Args:
+        axes: what the task asks for.
+        T: wanted T_base_tool [m].
+        reached: T_base_tool reached [m].
+
+    Returns:
+        Errors [m, rad], in the order of `AXES`, and the matrices.
+    """
+    zero = torch.zeros_like(T[:, :3, :3])
+    turn, D = reached[:, :3, :3].mT, reached[:, :3, :3].mT @ T[:, :3, :3]
+    rotation, k = turn, axes.pivot
+    error = pose_error(T, reached)
+    error = torch.cat(
+        [(T[:, :3, :3].mT @ error[:, :3, None])[..., 0], (turn @ error[:, 3:, None])[..., 0]], -1
+    )
+    if k >= 0:
+        i, j = (k + 1) % 3, (k + 2) % 3
+        sine = torch.hypot(D[:, i, k], D[:, j, k])
+        straight = torch.where(D[:, k, k] > 0, 1.0, 0.0).to(D)
+        safe = torch.where(sine > 1e-12, sine, 1.0)
+        factor = torch.where(sine > 1e-12, torch.atan2(sine, D[:, k, k]) / safe, straight)
+        error[:, 3 + i], error[:, 3 + j] = -factor * D[:, j, k], factor * D[:, i, k]
+        error[:, 3 + k] = torch.atan2(D[:, j, i] - D[:, i, j], D[:, i, i] + D[:, j, j])
+        direction = D[:, :, k] / (1 + D[:, k, k]).clamp(min=0.05)[:, None]
+        direction[:, k] = 1.0
+        rotation = turn.clone()
+        rotation[:, k] = (direction[:, None] @ turn)[:, 0]
+    matrix = torch.cat([torch.cat([T[:, :3, :3].mT, zero], -1), torch.cat([zero, rotation], -1)], -2)
+    return error, matrix

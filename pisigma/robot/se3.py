@@ -1,0 +1,251 @@
+"""Rotations and rigid transforms, batched: leading dimensions are batch everywhere.
+
+Angles are in rad, lengths in m. `T_a_b` maps coordinates in b to coordinates in a.
+"""
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from pisigma.files.errors import PoseError
+
+
+def rotation_from_rpy(rpy: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
+    """Rotation `RotZ(roll) · RotY(pitch) · RotX(yaw)`, the order of the three papers.
+
+    Args:
+        rpy: roll, pitch, yaw [rad].
+    """
+    cos, sin = torch.cos(rpy), torch.sin(rpy)
+    cz, cy, cx = cos.unbind(-1)
+    sz, sy, sx = sin.unbind(-1)
+    cz_sy, sz_sy = cz * sy, sz * sy
+    first = (cz * cy, cz_sy * sx - sz * cx, cz_sy * cx + sz * sx)
+    second = (sz * cy, sz_sy * sx + cz * cx, sz_sy * cx - cz * sx)
+    entries = torch.stack([*first, *second, -sy, cy * sx, cy * cx], -1)
+    return entries.view(*rpy.shape[:-1], 3, 3)
+
+
+def rpy_from_rotation(R: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3"]:
+    """Roll, pitch, yaw [rad] of a rotation; at pitch = ±90 deg yaw is taken as 0.
+
+    Inverse of `rotation_from_rpy` for pitch within ±90 deg.
+    """
+    regular = R[..., 0, 0].square() + R[..., 1, 0].square() > 1e-24
+    cosine, sine = _where_regular(regular, R[..., 0, 0], R[..., 1, 0])
+    horizontal = torch.where(regular, torch.hypot(cosine, sine), torch.zeros_like(sine))
+    pitch = torch.atan2(-R[..., 2, 0], horizontal)
+    upright, leaning = _where_regular(~regular, R[..., 1, 1], -R[..., 0, 1])
+    roll = torch.where(regular, torch.atan2(sine, cosine), torch.atan2(leaning, upright))
+    cosine, sine = _where_regular(regular, R[..., 2, 2], R[..., 2, 1])
+    yaw = torch.where(regular, torch.atan2(sine, cosine), torch.zeros_like(roll))
+    return torch.stack([roll, pitch, yaw], -1)
+
+
+def _where_regular(
+    regular: Bool[Tensor, "*batch"], cosine: Float[Tensor, "*batch"], sine: Float[Tensor, "*batch"]
+) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch"]]:
+    """Cosine and sine where regular, else 1 and 0, so that the gradient of their angle is finite."""
+    return torch.where(regular, cosine, torch.ones_like(cosine)), torch.where(
+        regular, sine, torch.zeros_like(sine)
+    )
+
+
+def rotation_from_quaternion(quaternion: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 3 3"]:
+    """Rotation of a quaternion (x, y, z, w), which is normalised first."""
+    x, y, z, w = (quaternion / quaternion.norm(dim=-1, keepdim=True)).unbind(-1)
+    rows = [
+        torch.stack([1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)], -1),
+        torch.stack([2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)], -1),
+        torch.stack([2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)], -1),
+    ]
+    return torch.stack(rows, -2)
+
+
+def quaternion_from_rotation(R: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 4"]:
+    """Quaternion (x, y, z, w) of a rotation, w >= 0; inverse of `rotation_from_quaternion`.
+
+    The outer product 4·q·q^T is linear in R (Shepperd 1978, J. Guidance and Control 1(3)); its row with the
+    largest diagonal entry is q up to length and sign, without cancellation for any angle.
+    """
+    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = (row.unbind(-1) for row in R.unbind(-2))
+    rows = [
+        torch.stack([1 + xx - yy - zz, xy + yx, xz + zx, zy - yz], -1),
+        torch.stack([xy + yx, 1 - xx + yy - zz, yz + zy, xz - zx], -1),
+        torch.stack([xz + zx, yz + zy, 1 - xx - yy + zz, yx - xy], -1),
+        torch.stack([zy - yz, xz - zx, yx - xy, 1 + xx + yy + zz], -1),
+    ]
+    outer = torch.stack(rows, -2)
+    largest = outer.diagonal(dim1=-2, dim2=-1).argmax(-1)
+    q = torch.take_along_dim(outer, largest[..., None, None], -2)[..., 0, :]
+    sign = torch.where(q[..., 3:] < 0, -1.0, 1.0).to(q)
+    length = (q * q).sum(-1, keepdim=True).sqrt()
+    return sign * q / length
+
+
+def rotation_from_vector(vector: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
+    """Rotation of a rotation vector [rad] (Rodrigues), with finite gradients at zero."""
+    square = (vector * vector).sum(-1)
+    small = square < 1e-8
+    safe = torch.where(small, torch.ones_like(square), square)
+    angle = safe.sqrt()
+    first = torch.where(small, 1 - square / 6, torch.sin(angle) / angle)
+    second = torch.where(small, 0.5 - square / 24, (1 - torch.cos(angle)) / safe)
+    K = skew(vector)
+    eye = torch.eye(3, dtype=vector.dtype, device=vector.device)
+    return eye + first[..., None, None] * K + second[..., None, None] * (K @ K)
+
+
+def rotation_vector(R: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3"]:
+    """Rotation vector [rad] of a rotation: axis times angle in [0, pi].
+
+    Near the identity the factor of the vector part of `R - R^T` is a series; near pi the axis comes from `R +
+    R^T`. Gradients are finite everywhere.
+    """
+    twice_sine_axis = torch.stack(
+        [R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]], -1
+    )
+    cosine = (R[..., 0, 0] + R[..., 1, 1] + R[..., 2, 2] - 1) / 2
+    sine_square = (twice_sine_axis * twice_sine_axis).sum(-1) / 4
+    positive = sine_square > 0
+    sine = torch.where(positive, sine_square, torch.ones_like(sine_square)).sqrt()
+    angle = torch.atan2(torch.where(positive, sine, torch.zeros_like(sine)), cosine)
+    factor = torch.where(sine_square > 1e-8, angle / (2 * sine), 0.5 + sine_square / 12)
+    ordinary = factor[..., None] * twice_sine_axis
+    near_pi = (cosine < -0.99)[..., None]
+    return torch.where(near_pi, _rotation_vector_near_pi(R, twice_sine_axis, angle), ordinary)
+
+
+def _rotation_vector_near_pi(
+    R: Float[Tensor, "*batch 3 3"], twice_sine_axis: Float[Tensor, "*batch 3"], angle: Float[Tensor, "*batch"]
+) -> Float[Tensor, "*batch 3"]:
+    """Axis from the symmetric part: its largest column is `axis · axis_k (1 - cos)`; sign from `R - R^T`."""
+    symmetric = (R + R.mT) / 2 + torch.eye(3, dtype=R.dtype, device=R.device)
+    trace = R[..., 0, 0] + R[..., 1, 1] + R[..., 2, 2]
+    # (R + R^T)/2 = cos·I + (1 - cos)·n n^T, so the sum above less (1 + cos)·I is (1 - cos)·n n^T.
+    cosine = (trace - 1) / 2
+    outer = symmetric - (1 + cosine)[..., None, None] * torch.eye(3, dtype=R.dtype, device=R.device)
+    largest = outer.diagonal(dim1=-2, dim2=-1).argmax(-1)
+    column = torch.take_along_dim(outer, largest[..., None, None], -1)[..., 0]
+    column = torch.where((column * column).sum(-1, keepdim=True) > 0, column, torch.ones_like(column))
+    axis: Tensor = column / torch.linalg.vector_norm(column, dim=-1, keepdim=True)
+    sign = torch.where((axis * twice_sine_axis).sum(-1) < 0, -1.0, 1.0).to(R.dtype)
+    return (sign * angle)[..., None] * axis
+
+
+def skew(vector: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
+    """Matrix of the cross product: `skew(a) @ b = a × b`."""
+    x, y, z = vector.unbind(-1)
+    zero = torch.zeros_like(x)
+    rows = [torch.stack([zero, -z, y], -1), torch.stack([z, zero, -x], -1), torch.stack([-y, x, zero], -1)]
+    return torch.stack(rows, -2)
+
+
+def transform(
+    rotation: Float[Tensor, "*batch 3 3"], translation: Float[Tensor, "*batch 3"]
+) -> Float[Tensor, "*batch 4 4"]:
+    """Homogeneous transform of a rotation and a translation [m]; both broadcast."""
+    batch = np.broadcast_shapes(rotation.shape[:-2], translation.shape[:-1])
+    upper = torch.cat([rotation.expand(*batch, 3, 3), translation.expand(*batch, 3)[..., None]], -1)
+    last_row = torch.eye(4, dtype=upper.dtype, device=upper.device)[3:].expand(*batch, 1, 4)
+    return torch.cat([upper, last_row], -2)
+
+
+def transform_from_xyzrpy(xyzrpy: Float[Tensor, "*batch 6"]) -> Float[Tensor, "*batch 4 4"]:
+    """`Trans(x, y, z) · RotZ(roll) · RotY(pitch) · RotX(yaw)`; x, y, z [m], roll, pitch, yaw [rad]."""
+    return transform(rotation_from_rpy(xyzrpy[..., 3:]), xyzrpy[..., :3])
+
+
+def xyzrpy_from_transform(T: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch 6"]:
+    """x, y, z [m] and roll, pitch, yaw [rad] of a transform; inverse of `transform_from_xyzrpy`."""
+    return torch.cat([T[..., :3, 3], rpy_from_rotation(T[..., :3, :3])], -1)
+
+
+def invert(T: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch 4 4"]:
+    """Inverse of rigid transforms, by transposition."""
+    R_inverse = T[..., :3, :3].mT
+    return transform(R_inverse, -(R_inverse @ T[..., :3, 3:])[..., 0])
+
+
+def pose_error(
+    T_a_wanted: Float[Tensor, "*batch 4 4"], T_a_actual: Float[Tensor, "*batch 4 4"]
+) -> Float[Tensor, "*batch 6"]:
+    """What moves the actual pose onto the wanted one, in frame a.
+
+    Returns:
+        Translation wanted - actual [m] and the rotation vector of `R_wanted · R_actual^T` [rad].
+    """
+    translation = T_a_wanted[..., :3, 3] - T_a_actual[..., :3, 3]
+    rotation = T_a_wanted[..., :3, :3] @ T_a_actual[..., :3, :3].mT
+    return torch.cat([translation, rotation_vector(rotation)], -1)
+
+
+def wrap_to_pi(angle: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+    """The same angle [rad] in (-pi, pi]; an angle that is there already keeps every digit."""
+    wrapped = torch.remainder(angle + torch.pi, 2 * torch.pi) - torch.pi
+    wrapped = torch.where(wrapped <= -torch.pi, torch.full_like(wrapped, torch.pi), wrapped)
+    return torch.where((angle > -torch.pi) & (angle <= torch.pi), angle, wrapped)
+
+
+def check_transforms(T: Tensor, name: str, tolerance: float = 1e-6) -> None:
+    """Refuse matrices that are no rigid transforms.
+
+    Args:
+        T: the matrices; anything but a float tensor `(*batch, 4, 4)` is refused too.
+        name: what complaints call them.
+        tolerance: largest deviation of `R^T R` from the identity and of the last row from (0, 0, 0, 1).
+
+    Raises:
+        PoseError: the shape or type is wrong, an entry is not finite, a rotation is not orthonormal or
+            left-handed, or the last row is wrong; the message gives the index of the first such matrix.
+    """
+    if T.ndim < 2 or T.shape[-2:] != (4, 4):
+        raise PoseError(
+            f"{name} has the shape {tuple(T.shape)}; give homogeneous transforms of shape (*batch, 4, 4)."
+        )
+    if not T.is_floating_point():
+        raise PoseError(f"{name} holds {T.dtype}; give float64 or float32, lengths in metres.")
+    for bad, what in transform_faults(T, tolerance):
+        if bad.any():
+            index = tuple(bad.nonzero()[0].tolist())
+            place = f" at index {index if len(index) > 1 else index[0]}" if index else ""
+            raise PoseError(f"{name}{place} {what}.")
+
+
+def transform_faults(
+    T: Float[Tensor, "*batch 4 4"], tolerance: float
+) -> tuple[tuple[Bool[Tensor, "*batch"], str], ...]:
+    """For everything that may be wrong with a rigid transform, which matrices are wrong in that way, and a word on it.
+
+    Args:
+        T: the matrices.
+        tolerance: see `check_transforms`.
+    """
+    eye = torch.eye(4, dtype=T.dtype, device=T.device)
+    finite = torch.isfinite(T).all(-1).all(-1)
+    R = torch.where(finite[..., None, None], T, eye)[..., :3, :3]
+    skewness = (R.mT @ R - eye[:3, :3]).abs().amax((-1, -2))
+    last_row = (T[..., 3, :] - eye[3]).abs().amax(-1)
+    return (
+        (~finite, "has entries that are not finite numbers; give 16 finite numbers"),
+        (last_row > tolerance, "does not end with the row 0 0 0 1; give a homogeneous transform"),
+        (
+            skewness > tolerance,
+            "has a rotation part that is not orthonormal; normalise it or check its source",
+        ),
+        (
+            torch.linalg.det(R) < 0,
+            "has a left-handed rotation part (determinant -1); a reflection is no pose, check its axes",
+        ),
+    )
+
+
+def nearest_rotation(M: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3 3"]:
+    """The rotation nearest to a matrix, in the Frobenius norm (orthogonal Procrustes, Kabsch's sign).
+
+    It is worked out on the host: there are few such matrices, and what costs is the number of operations.
+    """
+    U, _, Vh = np.linalg.svd(M.cpu().numpy())
+    U[..., 2] *= np.sign(np.linalg.det(U @ Vh))[..., None]
+    return torch.from_numpy(U @ Vh).to(M)

@@ -1,0 +1,77 @@
+"""Whether another robot of the catalogue was measured."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import torch
+
+from pisigma.calibration.geometric.calibrator import GeometricCalibrator
+from pisigma.files.errors import IdentificationError
+from pisigma.measurement.dataset import Measurements
+from pisigma.robot.description import Robot
+from pisigma.robot.robot_file import catalogue
+from pisigma.validation.checks.check import AbstractCheck, CheckedCalibration
+from pisigma.validation.held_out.calibration_validation import errors_under
+from pisigma.validation.held_out.diagnostic import Diagnostic
+from pisigma.validation.held_out.trained_calibrations import base_and_tool
+
+SUSPICIOUS = 0.01
+"""Share of the reach; arms are built to a third of that and better."""
+NEARER = 1 / 3
+"""Share of the errors that another robot must leave at most. An arm as drawn explains its own measurements to a
+thousandth of its reach, so that of two different robots one is nearer by more."""
+FEWEST_ROWS = 6
+"""Of fewer, base and tool alone bring another robot near the rows."""
+ROWS = 200
+"""Rows that are enough to tell robots apart."""
+
+
+class OtherRobotCheck(AbstractCheck):
+    """Where the robot as drawn is far off, fits base and tool of the other robots of the catalogue."""
+
+    def diagnose(self, checked: CheckedCalibration) -> Iterator[Diagnostic]:
+        """See `AbstractCheck.diagnose`."""
+        robot = checked.robot
+        as_drawn = None if checked.figures is None else checked.figures.nominal
+        stated = None if as_drawn is None else as_drawn.rms_mm
+        if stated is None or stated <= SUSPICIOUS * robot.reach * 1e3:
+            return
+        others = {
+            name: size for name in catalogue() if (size := _rms_mm(checked, Robot.load(name))) is not None
+        }
+        name = min(others, key=lambda other: others[other], default=None)
+        if name is not None and others[name] < NEARER * stated:
+            yield Diagnostic(
+                kind="other_robot",
+                severity="implausible",
+                sentence=f"Robot '{name}' of the catalogue is far nearer to these rows: with base and tool fitted, its "
+                f"errors are {others[name]:.3g} mm RMS, those of robot '{robot.name}' {stated:.3g} mm; check which "
+                "robot was measured.",
+            )
+
+
+def other_robot_diagnostics(robot: Robot, rows: Measurements) -> tuple[Diagnostic, ...]:
+    """Say of rows alone, before a calibration, whether another robot was measured; of few rows nothing is said."""
+    calibrator = GeometricCalibrator(robot)
+    if rows.rows < FEWEST_ROWS:
+        return ()
+    try:
+        as_drawn = base_and_tool(calibrator).fit(rows)
+    except IdentificationError:
+        return ()
+    checked = CheckedCalibration(calibrator, rows, {"nominal": as_drawn, "geometric": as_drawn})
+    return tuple(OtherRobotCheck().diagnose(checked))
+
+
+def _rms_mm(checked: CheckedCalibration, other: Robot) -> float | None:
+    """RMS error of another robot as drawn [mm]; None of one with other joints, or that cannot be fitted."""
+    if other.name == checked.robot.name or other.revolute != checked.robot.revolute:
+        return None
+    count = checked.rows.rows
+    chosen = torch.linspace(0, count - 1, min(count, ROWS)).round().long()
+    rows = checked.rows.select(chosen)
+    try:
+        fitted = base_and_tool(replace(checked.calibrator, robot=other)).fit(rows)
+    except IdentificationError:
+        return None
+    return errors_under(fitted, rows).figures.rms_mm

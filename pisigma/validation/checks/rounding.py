@@ -1,0 +1,151 @@
+"""Whether joint values or positions were rounded so coarsely that their errors come from it."""
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float64
+
+from pisigma.calibration.geometric.result import CalibrationResult
+from pisigma.measurement.dataset import Measurements
+from pisigma.robot.description import Robot
+from pisigma.validation.checks.check import AbstractCheck, CheckedCalibration
+from pisigma.validation.held_out.diagnostic import Diagnostic
+from pisigma.validation.setup_faults.cause import joints_text, length_text
+from pisigma.validation.setup_faults.ordered_rows import OrderedRows
+
+STEPS = tuple(factor * 10.0**power for power in (1, 0, -1, -2, -3) for factor in (5, 2, 1))
+"""[deg or mm] That values may be rounded to, the coarsest first."""
+ON_LATTICE = 1e-4
+"""Rounded values are so near to a multiple of the step, in steps."""
+FEWEST_ROWS = 12
+SHARE = 0.25
+"""Of the squared errors that rounding has to make."""
+MOST = 1.7
+"""More would be left of rows that were rounded; series of the joints' errors take up a part of it."""
+LIKELY = math.log(100.0)
+"""Log likelihood ratio from which on errors are those of rounding."""
+SIZES = np.geomspace(1e-3, 1e3, 61)
+"""Sizes of the other errors that are tried, over the noise."""
+
+
+@dataclass(frozen=True)
+class Rounding:
+    """Rounded values of rows.
+
+    Attributes:
+        steps: of every joint [rad or m]; 0 where it is not rounded.
+        error: RMS of the position errors that the rounding of the joints makes [m].
+        share: of the squared errors of the rows that these are.
+    """
+
+    steps: tuple[float, ...]
+    error: float
+    share: float
+
+
+class RoundingCheck(AbstractCheck):
+    """Compares the errors that rounding makes with those of the rows.
+
+    Joints that were sent to whole degrees have rounded values without an error. So the errors must be those of rounded
+    joint values by their directions, too: large where a joint moves the tool far.
+    """
+
+    def diagnose(self, checked: CheckedCalibration) -> Iterator[Diagnostic]:
+        """See `AbstractCheck.diagnose`."""
+        rounding = joint_rounding(checked.geometric, checked.rows)
+        if rounding is not None:
+            yield Diagnostic(
+                kind="rounding",
+                severity="warning",
+                sentence=f"The joint values are rounded to {_steps_text(checked.robot, rounding.steps)}: this alone "
+                f"makes position errors of {length_text(rounding.error)} RMS, {rounding.share:.0%} of the squared "
+                "errors of the rows; log them with more decimals.",
+            )
+        step = (
+            _common_step(checked.rows.position.cpu().numpy() * 1e3)
+            if checked.rows.position is not None
+            else 0.0
+        )
+        errors = checked.errors["geometric"].get("position")
+        if step and errors is not None:
+            made, rms = (
+                step * 1e-3 / 2,
+                float(errors.square().sum(1).nanmean().sqrt()),
+            )  # sqrt(3) step / sqrt(12)
+            if made**2 > SHARE * rms**2:
+                yield Diagnostic(
+                    kind="rounding",
+                    severity="warning",
+                    sentence=f"The positions are rounded to {step:g} mm: this alone makes errors of "
+                    f"{length_text(made)} RMS, where the rows leave {length_text(rms)}; write them with more decimals.",
+                )
+
+
+def joint_rounding(result: CalibrationResult, measurements: Measurements) -> Rounding | None:
+    """Find joint values that are rounded and make a part of the errors; None where there are none.
+
+    With the derivative `J` of a row's values, rounding to steps `s` gives its residuals the covariance
+    `J diag(s²/12) J^T` besides that of the other errors, `σ² I`. The likelihood with rounding is compared with that
+    without, either with the σ that makes it largest.
+
+    Args:
+        result: a geometric calibration.
+        measurements: with which was calibrated.
+    """
+    q = measurements.q.cpu().numpy()
+    coupling = result.robot.coupling
+    steps = np.zeros(q.shape[1])
+    if coupling is None:
+        unit = np.where(result.robot.revolute, math.degrees(1), 1e3)
+        steps = np.array([_common_step(column[:, None]) for column in (q * unit).T]) / unit
+    rows = OrderedRows.of(result) if steps.any() else None
+    if rows is None or len(rows.residual) < FEWEST_ROWS:
+        return None
+    made = rows.by_joints * steps / math.sqrt(12)
+    left = rows.left * math.sqrt(rows.values / max(rows.values - rows.used, 1.0))
+    share = float(np.square(made).sum() / max(np.square(left).sum(), 1e-300))
+    if not SHARE < share < MOST or _gain(left, made) < LIKELY:
+        return None
+    position = (made * rows.noise[:, None])[:, :3]
+    error = math.sqrt(np.square(position).sum() / len(position))
+    return Rounding(tuple(steps.tolist()), error, min(share, 1.0))
+
+
+def _gain(
+    residual: Float64[np.ndarray, "rows values"], made: Float64[np.ndarray, "rows values dof"]
+) -> float:
+    """Logarithm of the likelihood with rounding over that without."""
+    covariance = made @ made.transpose(0, 2, 1)
+    sizes, axes = np.linalg.eigh(covariance)
+    along = np.square(np.einsum("nvk,nv->nk", axes, residual))
+
+    def likelihood(share: float) -> float:
+        variances = share * sizes + np.square(SIZES)[:, None, None]
+        return float((-np.log(variances) - along / variances).sum((1, 2)).max() / 2)
+
+    return likelihood(1.0) - likelihood(0.0)
+
+
+def _common_step(values: Float64[np.ndarray, "rows columns"]) -> float:
+    """Give the coarsest step that all values are multiples of; 0 where there is none."""
+    values = values[np.isfinite(values).all(1)]
+    if len(values) < FEWEST_ROWS or np.ptp(values, 0).min() <= 0:
+        return 0.0
+    for step in STEPS:
+        counts = values / step
+        if np.abs(counts - np.round(counts)).max() < ON_LATTICE:
+            return step
+    return 0.0
+
+
+def _steps_text(robot: Robot, steps: Sequence[float]) -> str:
+    """Write steps with their joints."""
+    texts = []
+    for step in dict.fromkeys(step for step in steps if step):
+        joints = tuple(joint for joint, one in enumerate(steps) if one == step)
+        revolute = robot.revolute[joints[0]]
+        size = f"{math.degrees(step):.3g} deg" if revolute else f"{step * 1e3:.3g} mm"
+        texts.append(f"{size} ({joints_text(joints)})")
+    return " and ".join(texts)

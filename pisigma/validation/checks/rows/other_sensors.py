@@ -1,0 +1,209 @@
+"""Rows without positions, such as balls in sockets, and stated distances of sockets, against a model."""
+
+import math
+from collections.abc import Collection, Iterator, Sequence
+from contextlib import suppress
+from dataclasses import replace
+
+import torch
+from jaxtyping import Float64
+from torch import Tensor
+
+from pisigma.files.errors import IdentificationError
+from pisigma.measurement.dataset import Measurements
+from pisigma.model.calibrated_model import CalibratedModel
+from pisigma.model.row_poses import poses_of_rows
+from pisigma.robot.se3 import transform
+from pisigma.validation.checks.rows.row_check import FEWEST_ROWS, LARGE_SHARE, Move, fitted_or_new
+from pisigma.validation.held_out.diagnostic import Diagnostic
+from pisigma.validation.held_out.frames.fitted_frames import FrameKind, with_names_of
+from pisigma.validation.held_out.frames.row_errors import errors_of_rows
+from pisigma.validation.held_out.model_comparison import ModelComparison, ModelFigures
+from pisigma.validation.setup_faults.cause import Cause, length_text
+from pisigma.validation.setup_faults.explanations import PLAUSIBLE_SHARE
+from pisigma.validation.setup_faults.hypothesis import COLLAPSED
+from pisigma.validation.setup_faults.joint_faults import joint_causes, signs_and_exchanges
+from pisigma.validation.setup_faults.setup_fault import SetupFault
+from pisigma.validation.setup_faults.setup_faults import unexplained
+
+FAR, STRETCHED = 3.0, 0.01
+"""A stated distance is missed by more than so many times the RMS of the rows' errors, and this share of it."""
+
+ROUNDS, SETTLED, STEP, LARGEST_STEP = 8, 0.9, 1e-6, 0.3
+"""Of a fit of what has moved: rounds, which end where less is gained, and steps in rad or m."""
+
+
+def missed_distances(comparison: ModelComparison, figures: ModelFigures) -> Iterator[Diagnostic]:
+    """Say which stated distances of sockets a model misses by more than its rows disagree.
+
+    Args:
+        comparison: of models on the rows of the sockets.
+        figures: of one of them.
+    """
+    distances = () if comparison.socket_distance is None else comparison.socket_distance.each
+    rms = figures.position.statistics["rms"]
+    for one in distances:
+        error = one.errors_mm[figures.name]
+        if abs(error) > FAR * rms + STRETCHED * one.stated_mm:
+            yield Diagnostic(
+                kind="socket_distance",
+                severity="implausible",
+                sentence=f"{figures.name}: the sockets {' and '.join(one.sockets)} are {one.stated_mm + error:.6g} mm "
+                f"apart by their rows, not {one.stated_mm:.6g} mm as stated, while the rows of every socket agree to "
+                f"{rms:.3g} mm RMS; check the distance, the names of the sockets and the scale of the robot.",
+            )
+
+
+def diagnosed_lengths(
+    model: CalibratedModel,
+    rows: Measurements,
+    fitted: Collection[FrameKind],
+    may_move: Collection[Move],
+) -> tuple[tuple[Diagnostic, ...], tuple[SetupFault, ...]]:
+    """Say what is wrong with rows without positions whose errors are larger than those of wear.
+
+    Tried are a reversed sign of every joint, an exchange of two neighbours, the zero of every joint and another tool,
+    one at a time.
+
+    Args:
+        model: the model.
+        rows: without positions; not judged are those of an anchor that has too few of them, and where touches or stated
+            points say where a base stood that may stand anywhere now.
+        fitted: what stands elsewhere for certain.
+        may_move: what else may have moved, without being a fault.
+
+    Returns:
+        What makes the rows implausible, and the setup fault that explains them, which may be a move.
+    """
+    kinds = fitted_or_new(model, rows, fitted)
+    free = {"tool"} & {*kinds}
+    moves = free | ({*may_move} - {"frame"})
+    if ("base" in kinds or "frame" in may_move) and (rows.touch is not None or rows.anchor_place is not None):
+        return (), ()
+    known, reach = with_names_of(model, rows, kinds), model.robot.reach
+    with suppress(IdentificationError):
+        errors = _errors(model, known)
+        if int(torch.isfinite(errors).all(-1).sum()) < FEWEST_ROWS or not _rms(errors) > LARGE_SHARE * reach:
+            return (), ()
+        fault = _fault(model, known, free)
+        faults = () if fault is None else (fault,)
+        left = _fitted(model, known, _numbers(rows.dof, moves))[0]
+        if left <= min(COLLAPSED * _rms(errors), PLAUSIBLE_SHARE * reach):
+            return (), faults
+        if fault is not None and not moves.issuperset(fault.kinds):
+            return (Diagnostic(kind="setup_fault", severity="implausible", sentence=fault.sentence),), faults
+        if left > PLAUSIBLE_SHARE * reach:
+            why = Diagnostic(kind="implausible_errors", severity="implausible", sentence=unexplained(model))
+            return (why,), faults
+        return (), faults
+    return (), ()
+
+
+def _fault(model: CalibratedModel, rows: Measurements, free: Collection[str]) -> SetupFault | None:
+    """The one thing that makes the errors collapse best; None where nothing does."""
+    before, dof = _rms(_errors(model, rows)), rows.dof
+    maps = signs_and_exchanges(dof)
+    found = [
+        (_rms(_errors(model, replace(rows, q=q))), joint_causes(maps, number, model.robot)[0])
+        for number, q in enumerate(maps.of(rows.q))
+    ]
+    found.append(_moved_most(model, rows, free))
+    after, cause = min(found, key=lambda one: one[0])
+    if not after <= COLLAPSED * before:
+        return None
+    nowhere = float("nan")
+    return SetupFault(
+        (cause.kind,),
+        cause.clause,
+        cause.advice,
+        before,
+        after,
+        nowhere,
+        nowhere,
+        nowhere,
+        joints=cause.joints,
+    )
+
+
+def _moved_most(model: CalibratedModel, rows: Measurements, free: Collection[str]) -> tuple[float, Cause]:
+    """The zero of one joint, or the tool, that leaves least when it is moved, and what it leaves [m].
+
+    Chosen by errors that are linear in what moves, as where the model is.
+    """
+    dof, fitted = rows.dof, _numbers(rows.dof, free)
+    error = _errors(model, rows)
+    columns = _columns(model, rows, torch.zeros(dof + 3, dtype=torch.float64), range(dof + 3), error)
+    tried = [[joint] for joint in range(dof)] + ([_numbers(dof, {"tool"})] if "tool" not in free else [])
+    b = torch.nan_to_num(error).flatten()
+
+    def left(numbers: list[int]) -> float:
+        J = columns[:, [*fitted, *numbers]]
+        return float((b - J @ torch.linalg.lstsq(J, b, driver="gelsd").solution).norm())
+
+    best = min(tried, key=left)
+    after, x = _fitted(model, rows, [*fitted, *best])
+    if len(best) > 1:
+        clause = f"the tool is {length_text(float(x[best].norm()))} away from where it was"
+        return after, Cause("tool", clause, "check what is mounted, or recalibrate the model", 3.0)
+    (joint,) = best
+    moved = float(x[joint])
+    amount = f"{math.degrees(moved):.3g} deg" if model.robot.revolute[joint] else length_text(moved)
+    clause = f"the zero of joint {joint + 1} is {amount} off"
+    return after, Cause("joint_zero", clause, "recalibrate the model, or check the zero", 1.0, (joint,))
+
+
+def _numbers(dof: int, moves: Collection[str]) -> list[int]:
+    """What is free where some things may have moved: zeros of joints, and 3 numbers of the tool."""
+    kinds = (("joint_zero", range(dof)), ("tool", range(dof, dof + 3)))
+    return [number for kind, numbers in kinds if kind in moves for number in numbers]
+
+
+def _fitted(
+    model: CalibratedModel, rows: Measurements, free: Sequence[int]
+) -> tuple[float, Float64[Tensor, " numbers"]]:
+    """Root mean square of the errors [m] that are left with some numbers fitted, as if none were, and the numbers."""
+    x = torch.zeros(rows.dof + 3, dtype=torch.float64)
+    least, best = float("inf"), x
+    for _ in range(ROUNDS if free else 1):
+        error = _errors(model, rows, x)
+        here = _rms(error)
+        if not here < SETTLED * least:
+            break
+        least, best = here, x
+        if free:
+            J = _columns(model, rows, x, free, error)
+            step = torch.linalg.lstsq(J, -torch.nan_to_num(error).flatten(), driver="gelsd").solution
+            x = x.index_add(0, torch.tensor(free), step.clamp(-LARGEST_STEP, LARGEST_STEP))
+    values = int((torch.nan_to_num(error) != 0).sum())
+    return least * (values / max(values - len(free), 1)) ** 0.5, best
+
+
+def _columns(
+    model: CalibratedModel,
+    rows: Measurements,
+    x: Float64[Tensor, " numbers"],
+    free: Sequence[int],
+    error: Float64[Tensor, "rows 3"],
+) -> Float64[Tensor, "values free"]:
+    """Derivatives of all errors by some numbers."""
+    eye = STEP * torch.eye(len(x), dtype=torch.float64)
+    columns = [((_errors(model, rows, x + eye[number]) - error) / STEP).flatten() for number in free]
+    return torch.nan_to_num(torch.stack(columns, -1))
+
+
+def _errors(
+    model: CalibratedModel, rows: Measurements, x: Float64[Tensor, " numbers"] | None = None
+) -> Float64[Tensor, "rows 3"]:
+    """Errors, where wanted with zeros [rad or m] and tool [m] moved."""
+    if x is None:
+        return errors_of_rows(poses_of_rows(model, rows), rows).position
+    zeros, tool = torch.split(x, [rows.dof, 3])
+    T = poses_of_rows(model, replace(rows, q=rows.q + zeros))
+    T = T @ transform(torch.eye(3, dtype=T.dtype), tool)
+    return errors_of_rows(T, rows).position
+
+
+def _rms(errors: Float64[Tensor, "rows 3"]) -> float:
+    """Root mean square of lengths, of the rows that have one."""
+    there = torch.isfinite(errors).all(-1)
+    return float(errors[there].square().sum(-1).mean().sqrt())

@@ -1,0 +1,159 @@
+"""What every check of rows against a model has in common."""
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Final, Literal
+
+import torch
+from jaxtyping import Float64
+from torch import Tensor
+
+from pisigma.measurement.dataset import Measurements
+from pisigma.model.accuracy import deviation_of_rows
+from pisigma.model.calibrated_model import CalibratedModel
+from pisigma.model.row_poses import poses_of_rows
+from pisigma.validation.held_out.diagnostic import Diagnostic
+from pisigma.validation.held_out.frames.fitted_frames import FrameKind, fit_frames, with_names_of
+from pisigma.validation.held_out.frames.frame_fits import LEVER_SHARE, MeasuredPoses
+from pisigma.validation.setup_faults.setup_fault import SetupFault
+from pisigma.validation.setup_faults.setup_faults import find_setup_faults, judged_values
+
+Move = Literal["frame", "tool", "joint_zero"]
+"""What may have moved since a model was made: kinds of causes of setup faults."""
+MOVES: Final[frozenset[Move]] = frozenset({"frame", "tool", "joint_zero"})
+LARGE_SHARE = 2e-3
+"""Share of the reach beyond which errors are those of a mistake or a motion, and not of wear."""
+FEWEST_ROWS = 5
+"""Fewer rows with positions say nothing of a mistake."""
+
+
+@dataclass(frozen=True, eq=False)
+class RowsUnderModel:
+    """Rows with positions, and what a model says of them.
+
+    Attributes:
+        model: the model.
+        rows: the rows.
+        fitted: what stands elsewhere for certain, so that it is fitted to the rows.
+        may_move: what else may have moved without being a fault.
+        nominal: the nominal robot with the base and tool that suit it best; only shows what its errors fall to.
+    """
+
+    model: CalibratedModel
+    rows: Measurements
+    fitted: tuple[FrameKind, ...]
+    may_move: frozenset[Move]
+    nominal: CalibratedModel | None = None
+
+    @staticmethod
+    def of(
+        model: CalibratedModel,
+        rows: Measurements,
+        fitted: Collection[FrameKind],
+        may_move: Collection[Move],
+        nominal: CalibratedModel | None = None,
+    ) -> "RowsUnderModel | None":
+        """Take the rows that have positions where the model predicts any; None where these are too few.
+
+        Frames and targets that the model does not have are fitted.
+        """
+        if rows.position is None:
+            return None
+        kinds = fitted_or_new(model, rows, fitted)
+        some = judged_values(model, rows)
+        T = poses_of_rows(model, with_names_of(model, some, kinds))
+        there = torch.isfinite(rows.position).all(-1) & torch.isfinite(T).flatten(1).all(-1)
+        if int(there.sum()) < FEWEST_ROWS:
+            return None
+        some = replace(some.select(there), pair=None, distance=None)
+        return RowsUnderModel(model, some, kinds, frozenset(may_move), nominal)
+
+    @cached_property
+    def known(self) -> Measurements:
+        """The rows with the names of the model for what is fitted."""
+        return with_names_of(self.model, self.rows, self.fitted)
+
+    @cached_property
+    def drawn(self) -> Float64[Tensor, "rows 4 4"]:
+        """Predicted poses before anything is fitted."""
+        return poses_of_rows(self.model, self.known)
+
+    @cached_property
+    def predicted(self) -> Float64[Tensor, "rows 4 4"]:
+        """Predicted poses, with what is fitted."""
+        return fit_frames(self.drawn, self.measured, self.rows, self.fitted)[0] if self.fitted else self.drawn
+
+    @cached_property
+    def measured(self) -> MeasuredPoses:
+        """The measured poses."""
+        return MeasuredPoses.of(self.rows, LEVER_SHARE * self.model.robot.reach)
+
+    @cached_property
+    def errors(self) -> Float64[Tensor, " rows"]:
+        """Lengths of the errors of the positions [m]."""
+        return self.lengths(self.predicted)
+
+    def lengths(self, T: Float64[Tensor, "rows 4 4"]) -> Float64[Tensor, " rows"]:
+        """Lengths of the errors of the positions of predicted poses [m]."""
+        result: Tensor = (self.measured.position - T[:, :3, 3]).norm(dim=-1)
+        return result
+
+    @cached_property
+    def usual(self) -> Float64[Tensor, " rows"]:
+        """Standard deviation of the length of every row's error by the model's posterior and noise [m]; NaN without."""
+        deviation = deviation_of_rows(self.model, self.known).square().sum(-1)
+        known = self.model.uncertainty
+        noise = torch.as_tensor(math.nan if known is None else known.noise.get("position", 0.0))
+        if self.rows.sigma_position is not None:
+            noise = noise * torch.nan_to_num(self.rows.sigma_position, nan=1.0)
+        result: Tensor = (deviation + 3 * noise.square()).sqrt()
+        return result
+
+    @cached_property
+    def large(self) -> bool:
+        """Whether the errors of positions and orientations are too large to be those of wear."""
+        error = float(self.measured.squares(self.predicted).mean().sqrt())
+        return error > LARGE_SHARE * self.model.robot.reach
+
+    @cached_property
+    def setup_faults(self) -> tuple[SetupFault, ...]:
+        """What explains the errors of all rows alike, of any size."""
+        return find_setup_faults(self.model, self.nominal, self.rows, self.fitted)
+
+    @cached_property
+    def moved_frames(self) -> tuple[SetupFault, ...]:
+        """Frames and tools that have moved by any size."""
+        return find_setup_faults(self.model, self.nominal, self.rows, self.fitted, frames_only=True)
+
+    def is_move(self, fault: SetupFault) -> bool:
+        """Whether a fault is only something that may have moved: frames, tools, and the zero of a single joint."""
+        return self.may_move.issuperset(fault.kinds) and len(set(fault.joints)) <= 1
+
+
+class AbstractRowCheck(ABC):
+    """Looks for one kind of fault in rows, by what a model says of them."""
+
+    @abstractmethod
+    def diagnose(self, judged: RowsUnderModel) -> Iterator[Diagnostic]:
+        """Say what is wrong; nothing where nothing is."""
+
+
+def fitted_or_new(
+    model: CalibratedModel, rows: Measurements, fitted: Collection[FrameKind]
+) -> tuple[FrameKind, ...]:
+    """Add to what is fitted whether rows have frames or targets that a model does not."""
+    new: tuple[FrameKind, ...] = (
+        *(("base",) if _unknown(rows.frame, model.bases) else ()),
+        *(("tool",) if _unknown(rows.target, model.tools) else ()),
+    )
+    return tuple(dict.fromkeys((*fitted, *new)))
+
+
+def _unknown(names: tuple[str, ...], known: Collection[str]) -> bool:
+    """Whether rows have a frame or target that a model does not, see `pisigma.model.row_poses.known_names`."""
+    if not set(known) - {""}:
+        return len(set(names)) > 1
+    return not set(names) <= set(known) and not (len(known) == 1 and not any(names))

@@ -1,0 +1,32 @@
+"""Whether stated temperatures can be those of a robot in degrees Celsius."""
+
+from collections.abc import Iterator
+
+import torch
+
+from pisigma.validation.checks.check import AbstractCheck, CheckedCalibration
+from pisigma.validation.held_out.diagnostic import Diagnostic
+
+HOT = 60.0
+"""[deg C] Robots are allowed to work at up to 45 deg C, and their housings warm up by less than 15; a room of 20 deg C
+has 68 deg F."""
+
+
+class TemperatureCheck(AbstractCheck):
+    """Warns of temperatures that look like degrees Fahrenheit."""
+
+    def diagnose(self, checked: CheckedCalibration) -> Iterator[Diagnostic]:
+        """See `AbstractCheck.diagnose`."""
+        rows = checked.rows
+        if rows.temperature is None:
+            return
+        hot = (rows.temperature > HOT).nonzero()[:, 0].tolist()
+        if hot:
+            most = int(torch.nan_to_num(rows.temperature, nan=-torch.inf).argmax())
+            yield Diagnostic(
+                kind="temperature",
+                severity="warning",
+                sentence=f"{rows.place(most)}: {float(rows.temperature[most]):.4g} deg C is hot for a robot "
+                f"({len(hot)} of {rows.rows} rows are above {HOT:g} deg C); check whether these are degrees "
+                "Fahrenheit, deg C = (deg F - 32) / 1.8.",
+            )

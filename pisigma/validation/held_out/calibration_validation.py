@@ -1,0 +1,384 @@
+"""Calibrations judged on held-out rows: nominal, geometric and hybrid side by side."""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import Protocol, runtime_checkable
+
+import torch
+from jaxtyping import Float64, Int64
+from torch import Tensor
+
+from pisigma.calibration.geometric.calibrator import GeometricCalibrator
+from pisigma.calibration.hybrid.result import HybridResult
+from pisigma.files.errors import IdentificationError
+from pisigma.files.progress import Progress, silent, stage
+from pisigma.measurement.dataset import Measurements
+from pisigma.measurement.sensors.registry import SENSORS
+from pisigma.measurement.sensors.socket import PairOfSockets
+from pisigma.measurement.splits import TrainTest, with_fewer
+from pisigma.validation.held_out.pose_statistics import PoseErrors, error_statistics
+from pisigma.validation.held_out.predicted_spread import PredictedSpread, predicted_spread
+from pisigma.validation.held_out.side_by_side import in_processes, side_by_side
+from pisigma.validation.held_out.trained_calibrations import (
+    Calibrator,
+    DistanceErrors,
+    Result,
+    distance_figures,
+    geometric_of,
+    judgeable,
+    left_out_of_folds,
+    trained,
+    with_frames,
+    without_missing,
+)
+from pisigma.validation.held_out.validation_figures import LearningPoint, ValidationFigures
+
+FEW_ROWS = 500
+"""Folds of up to so many rows are calibrated side by side; more need their memory for themselves."""
+
+
+@dataclass(frozen=True, eq=False)
+class CalibrationValidation:
+    """Errors of held-out rows, each under calibrations without it.
+
+    In rows that were never held out they are NaN.
+
+    Attributes:
+        folds: number of folds; 1 where rows were held out once, 0 for rows that were kept apart from the start.
+        models: by name: "nominal" (the nominal arm, base and tool fitted to the training rows), "geometric" and
+            "hybrid" where it was asked for, which chooses its features on the training rows alone.
+        spread: errors of positions beside what the hybrid predicts of them; None without one.
+        distances: errors of stated distances of sockets that were left out.
+        frames_fitted: how many frames were held out whole; where the base stands in them was fitted to the
+            held-out rows themselves, under either arm.
+        sockets_held_out: how many sockets were held out whole; their errors are from where their rows put the
+            ball on average.
+        not_judged: how many held-out rows have a target or an anchor that the rows calibrated with lack.
+        again: the same for other folds, whose errors count in the figures too.
+    """
+
+    folds: int
+    models: Mapping[str, PoseErrors]
+    spread: PredictedSpread | None = None
+    distances: DistanceErrors = field(default_factory=DistanceErrors)
+    frames_fitted: int = 0
+    sockets_held_out: int = 0
+    not_judged: int = 0
+    again: tuple["CalibrationValidation", ...] = ()
+
+    @property
+    def repeats(self) -> tuple["CalibrationValidation", ...]:
+        """One validation for every repeat."""
+        return (replace(self, again=()), *self.again)
+
+    @property
+    def all_errors(self) -> dict[str, PoseErrors]:
+        """By model, errors of all rows in all repeats, one repeat after the other."""
+        return {
+            name: PoseErrors.joined([repeat.models[name] for repeat in self.repeats]) for name in self.models
+        }
+
+    @property
+    def all_spread(self) -> PredictedSpread | None:
+        """What a hybrid predicts of these errors."""
+        spreads = [repeat.spread for repeat in self.repeats if repeat.spread is not None]
+        return PredictedSpread.joined(spreads) if spreads else None
+
+    def figures(self, simulations: Sequence[TrainTest] = ()) -> ValidationFigures:
+        """The figures in mm and deg of all repeats.
+
+        Args:
+            simulations: training and test rows of each of several simulations; their RMS errors are listed one by one.
+        """
+        last = list(self.models.values())[-1]
+        figures: dict[str, object] = {"folds": self.folds} if self.folds else {}
+        figures["rows"] = int(torch.isfinite(last.position).sum())
+        if self.again:
+            figures["repeats"] = len(self.repeats)
+            figures["rms_mm_of_repeats"] = {
+                name: tuple(_rms_mm(one.models[name].position) for one in self.repeats)
+                for name in self.models
+            }
+        figures |= {name: errors.figures for name, errors in self.all_errors.items()}
+        if self.all_spread is not None:
+            figures |= self.all_spread.in_file_units()
+        if (distances := distance_figures([one.distances for one in self.repeats])) is not None:
+            figures["socket_distance"] = distances.model_dump(exclude_unset=True)
+        counts = {"frames_fitted": self.frames_fitted, "sockets_held_out": self.sockets_held_out}
+        counts["rows_not_judged"] = max(repeat.not_judged for repeat in self.repeats)
+        figures |= {name: count for name, count in counts.items() if count}
+        if simulations:
+            rms = {
+                name: tuple(_rms_mm(errors.position[test]) for _, test in simulations)
+                for name, errors in self.models.items()
+            }
+            figures["rms_mm_of_simulations"] = rms
+            figures["mean_rms_mm"] = {name: sum(values) / len(values) for name, values in rms.items()}
+        return ValidationFigures.model_validate(figures)
+
+
+@dataclass(frozen=True, eq=False)
+class JudgedFold:
+    """What is kept of one fold: errors of its held-out rows under all models.
+
+    Attributes:
+        test: numbers of these rows.
+        errors: by model.
+        distances: of stated distances of sockets that it did without.
+        spread: errors of positions beside what a hybrid predicts of them.
+        frames: held out whole.
+        sockets: held out whole.
+        left_out: held-out rows that could not be judged.
+    """
+
+    test: Int64[Tensor, " rows"]
+    errors: Mapping[str, PoseErrors]
+    distances: DistanceErrors
+    spread: PredictedSpread | None
+    frames: int = 0
+    sockets: int = 0
+    left_out: int = 0
+
+
+def _joined(measurements: Measurements, judged: Sequence[JudgedFold], folds: int) -> CalibrationValidation:
+    """Everything together, in the order of the rows."""
+    units = {SENSORS[kind].unit for kind in measurements.kinds if kind in SENSORS}
+    turned = measurements.rotation is not None or "rad" in units
+    errors = {name: PoseErrors.none(measurements.rows, turned) for name in judged[0].errors}
+    spread = None
+    for fold in judged:
+        for name, of_fold in fold.errors.items():
+            errors[name].put(fold.test, of_fold)
+        if fold.spread is not None:
+            spread = spread or PredictedSpread.none(measurements.rows)
+            spread.error[fold.test], spread.sigma[fold.test] = fold.spread.error, fold.spread.sigma
+    distances = DistanceErrors.joined([fold.distances for fold in judged])
+    frames, sockets, left_out = (
+        sum(getattr(fold, count) for fold in judged) for count in ("frames", "sockets", "left_out")
+    )
+    return CalibrationValidation(folds, errors, spread, distances, frames, sockets, left_out)
+
+
+def validate(
+    calibrator: Calibrator,
+    measurements: Measurements,
+    splits: Sequence[TrainTest],
+    progress: Progress = lambda what: None,
+    jobs: int | None = None,
+) -> CalibrationValidation:
+    """Calibrate on the training rows of every split and judge on its test rows.
+
+    Args:
+        calibrator: the calibration; "nominal" is the geometric one with no parameter of the arm free and no row
+            downweighted. Whatever it chooses, it chooses on the training rows.
+        measurements: the rows.
+        splits: from `k_folds` or `holdout`.
+        progress: called with the fold that is being judged, and what is being tried; not from other processes.
+        jobs: processes that judge the splits side by side, with one thread each; None for threads of this one.
+
+    Raises:
+        IdentificationError: the training rows of a split do not determine what is asked for, or no test row has a
+            target or anchor that its training rows have too.
+    """
+    judged = judged_folds(calibrator, measurements, [splits], progress, jobs)
+    return joined_repeats(measurements, [splits], judged)
+
+
+def judged_folds(
+    calibrator: Calibrator,
+    measurements: Measurements,
+    repeats: Sequence[Sequence[TrainTest]],
+    progress: Progress = lambda what: None,
+    jobs: int | None = None,
+) -> Iterator[JudgedFold]:
+    """Judge every fold of every repeat in turn, in threads or in processes; see `fold_tasks` and `validate`."""
+    if jobs is not None:
+        return in_processes(fold_tasks(calibrator, measurements, repeats, silent), jobs)
+    return side_by_side(fold_tasks(calibrator, measurements, repeats, progress), measurements.rows > FEW_ROWS)
+
+
+def fold_tasks(
+    calibrator: Calibrator,
+    measurements: Measurements,
+    repeats: Sequence[Sequence[TrainTest]],
+    progress: Progress,
+) -> list[Callable[[], JudgedFold]]:
+    """Give what judges every fold of every repeat.
+
+    Args:
+        calibrator: see `validate`.
+        measurements: the rows.
+        repeats: training and test rows of every fold, per repeat; see `pisigma.measurement.splits.repeats`.
+        progress: called with the fold that is being judged, and what is being tried.
+    """
+    tasks: list[Callable[[], JudgedFold]] = []
+    for number, splits in enumerate(repeats, 1):
+        of_repeat = progress
+        if len(repeats) > 1:
+            of_repeat = stage(progress, f"repeat {number} of {len(repeats)}", ", ")
+        left_out = left_out_of_folds(geometric_of(calibrator).socket_distances, measurements, splits)
+        for fold, (split, without) in enumerate(zip(splits, left_out, strict=True), 1):
+            name = f"fold {fold} of {len(splits)}"
+            tasks.append(partial(_judged_fold, calibrator, measurements, name, split, without, of_repeat))
+    return tasks
+
+
+def joined_repeats(
+    measurements: Measurements, repeats: Sequence[Sequence[TrainTest]], judged: Iterator[JudgedFold]
+) -> CalibrationValidation:
+    """Put the judged folds of all repeats together, in the order of `fold_tasks`."""
+    first, *again = [_joined(measurements, [next(judged) for _ in splits], len(splits)) for splits in repeats]
+    return replace(first, again=tuple(again))
+
+
+def _judged_fold(
+    calibrator: Calibrator,
+    measurements: Measurements,
+    fold: str,
+    split: TrainTest,
+    distances: Mapping[PairOfSockets, float],
+    progress: Progress,
+) -> JudgedFold:
+    """Calibrate on the training rows of one split, without some distances, and judge on these and its test rows."""
+    progress(fold)
+    train, test = split
+    training = measurements.select(train)
+    judged_rows = test[judgeable(measurements, test, training)]
+    held_out = measurements.select(judged_rows)
+    chosen = without_missing(calibrator, training, measurements, distances)
+    try:
+        results = trained(chosen, training, stage(progress, fold))
+    except IdentificationError as problem:
+        raise IdentificationError(
+            f"{fold}, calibrated with {training.rows} of the {measurements.rows} rows: {problem} All rows at once "
+            "may do: leave out the cross-validation, or ask for more folds."
+        ) from None
+    everything = measurements.select(torch.cat([train, judged_rows]))
+    judged = _judge(geometric_of(calibrator), results, held_out, distances, everything)
+    return replace(
+        judged,
+        test=judged_rows,
+        frames=len(set(held_out.frame) - set(training.frame)),
+        sockets=len(_sockets(held_out) - _sockets(training)),
+        left_out=len(test) - len(judged_rows),
+    )
+
+
+def learning_curve(
+    calibrator: Calibrator,
+    measurements: Measurements,
+    splits: Sequence[TrainTest],
+    sizes: Sequence[int],
+    seed: int,
+    progress: Progress = lambda what: None,
+    whole: CalibrationValidation | None = None,
+    jobs: int | None = None,
+) -> tuple[LearningPoint, ...]:
+    """Calibrate with fewer and fewer of the training rows of every split, and judge on all its test rows.
+
+    Args:
+        calibrator: see `validate`.
+        measurements: the rows.
+        splits: training and test rows.
+        sizes: numbers of training rows.
+        seed: decides which rows are drawn; smaller draws are subsets of larger ones.
+        progress: called with what is being done.
+        whole: what all training rows gave, as the last point of the curve; None for none.
+        jobs: see `validate`.
+
+    Returns:
+        The figures of the points, fewest rows first.
+
+    Raises:
+        MeasurementError: a split has fewer training rows than are wanted.
+        IdentificationError: so few rows do not determine what is asked for.
+    """
+    points = []
+    for rows in sorted(sizes):
+        fewer = with_fewer(measurements, splits, rows, seed)
+        of_rows = stage(progress, f"{rows} training rows")
+        points.append((rows, validate(calibrator, measurements, fewer, of_rows, jobs)))
+    if whole is not None:
+        points.append((min(len(train) for train, _ in splits), whole))
+    figures = ((rows, validation.figures().model_dump(exclude_unset=True)) for rows, validation in points)
+    return tuple(
+        LearningPoint.model_validate({**values, "rows": rows, "held_out": values["rows"]})
+        for rows, values in figures
+    )
+
+
+def judge(
+    calibrator: Calibrator, result: Result, training: Measurements, test: Measurements
+) -> CalibrationValidation:
+    """Judge a calibration on rows that were kept apart.
+
+    Args:
+        calibrator: what calibrated, for the "nominal" figures; see `validate`.
+        result: what it gave.
+        training: the rows that it was fitted to.
+        test: other rows.
+
+    Raises:
+        IdentificationError: a test row has a frame or target that was not calibrated.
+    """
+    results = trained(calibrator, training, result=result)
+    return _joined(test, [_judge(None, results, test, {}, test)], 0)
+
+
+def _judge(
+    calibrator: GeometricCalibrator | None,
+    results: Mapping[str, Result],
+    held_out: Measurements,
+    distances: Mapping[PairOfSockets, float],
+    rows: Measurements,
+) -> JudgedFold:
+    """Judge all models on held-out rows, with frames that they lack fitted by a calibrator, if there is one.
+
+    Distances of sockets that they were made without are judged on all rows.
+    """
+    if calibrator is not None:
+        results = {name: with_frames(calibrator, fitted, held_out) for name, fitted in results.items()}
+    errors = {name: errors_under(result, held_out) for name, result in results.items()}
+    hybrid = results.get("hybrid")
+    spread = predicted_spread(hybrid, held_out) if isinstance(hybrid, HybridResult) else None
+    poses = {name: result.predicted_poses(rows) for name, result in results.items() if distances}
+    apart = DistanceErrors.of(poses, distances, rows)
+    return JudgedFold(torch.arange(held_out.rows), errors, apart, spread)
+
+
+@runtime_checkable
+class PredictsErrors(Protocol):
+    """A calibration of any kind."""
+
+    def errors_of(self, measurements: Measurements) -> Mapping[str, Float64[Tensor, "rows components"]]:
+        """Measured - predicted values by sensor [m or rad]; see `CalibrationResult.errors_of`."""
+
+
+def errors_under(result: PredictsErrors, measurements: Measurements) -> PoseErrors:
+    """Errors of any rows under a calibration, whatever sensor measured them.
+
+    Returns:
+        As "position" the length of the error of whatever length a row has: of a position or a ball in a socket the
+        distance, of a touch, a wire or a pair the difference [m]. As "rotation" the same of whatever angle it has.
+
+    Raises:
+        IdentificationError: a row has a frame, target or anchor that was not calibrated.
+    """
+    lengths = torch.full((measurements.rows,), torch.nan, dtype=torch.float64)
+    rotation: Tensor | None = None
+    for sensor, errors in result.errors_of(measurements).items():
+        size = torch.as_tensor(errors).norm(dim=-1)
+        if SENSORS[sensor].unit == "rad":
+            rotation = size if rotation is None else torch.where(torch.isfinite(size), size, rotation)
+        else:
+            lengths = torch.where(torch.isfinite(size), size, lengths)
+    return PoseErrors(lengths, rotation)
+
+
+def _sockets(rows: Measurements) -> set[str]:
+    return set(rows.socket or ()) - {""}
+
+
+def _rms_mm(errors: Float64[Tensor, " rows"]) -> float:
+    return error_statistics(errors)["rms"] * 1e3

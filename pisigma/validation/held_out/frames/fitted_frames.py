@@ -1,0 +1,219 @@
+"""Errors of measured rows whose frames or targets are fitted to the rows themselves, with honest degrees of freedom."""
+
+from collections.abc import Callable, Collection
+from dataclasses import replace
+from typing import Literal
+
+import torch
+from jaxtyping import Float64, Int64
+from torch import Tensor
+
+from pisigma.files.errors import MeasurementError
+from pisigma.measurement.dataset import Measurements
+from pisigma.measurement.groups import groups_to_keep_whole, numbers_of_names
+from pisigma.model.calibrated_model import CalibratedModel
+from pisigma.model.row_poses import poses_of_rows
+from pisigma.validation.held_out.calibration_summary import has_orientation
+from pisigma.validation.held_out.frames.frame_fits import (
+    FIRST_DAMPING,
+    LEVER_SHARE,
+    SETTLED,
+    STEPS,
+    MeasuredPoses,
+    best_base,
+    best_tool,
+    frame_columns,
+    moved_frame,
+)
+from pisigma.validation.held_out.frames.row_errors import errors_of_rows
+from pisigma.validation.held_out.pose_statistics import ErrorVectors
+
+FrameKind = Literal["base", "tool"]
+"""What can be fitted: the base in every frame of the rows, the tool of every target."""
+
+FEWEST = 6
+"""Different joint vectors that a frame or a target needs at least: 18 values for the 9 numbers of base and tool."""
+DETERMINED = 1e-9
+"""Singular values below this share of the largest are of directions that the rows do not determine."""
+
+
+def fitted_kinds(fit_frame: bool, fit_tool: bool) -> tuple[FrameKind, ...]:
+    """List what two options say is fitted."""
+    kinds: tuple[tuple[FrameKind, bool], ...] = (("base", fit_frame), ("tool", fit_tool))
+    return tuple(kind for kind, fitted in kinds if fitted)
+
+
+def with_names_of(model: CalibratedModel, rows: Measurements, fitted: Collection[FrameKind]) -> Measurements:
+    """Name the frames and the targets that are fitted as the model does, which holds any: they do not matter."""
+    if "base" in fitted:
+        rows = replace(rows, frame=(next(iter(model.bases), ""),) * rows.rows)
+    if "tool" in fitted:
+        rows = replace(rows, target=(next(iter(model.tools), ""),) * rows.rows)
+    return rows
+
+
+def fitted_remark(rows: Measurements, fitted: Collection[FrameKind]) -> tuple[str, ...]:
+    """Say what a user should know of errors in fitted frames; nothing where none is fitted."""
+    if not fitted:
+        return ()
+    turned = rows.rotation is not None
+    numbers = {
+        "frame": 6 * len(set(rows.frame)) * ("base" in fitted),
+        "tool": (6 if turned else 3) * len(set(rows.target)) * ("tool" in fitted),
+    }
+    what = " and ".join(f"the {name} ({count} numbers)" for name, count in numbers.items() if count)
+    values = len(set(groups_to_keep_whole(rows).tolist())) * (6 if turned else 3)
+    return (
+        f"These rows determine {what} too, for every model, so an error of the robot's {' or '.join(fitted)} does not "
+        f"show. The errors are enlarged for that: their squares are divided by {values - sum(numbers.values())} "
+        f"degrees of freedom, {values} values less {sum(numbers.values())} fitted numbers.",
+    )
+
+
+def errors_in_fitted_frames(
+    model: CalibratedModel, measurements: Measurements, fitted: Collection[FrameKind]
+) -> ErrorVectors:
+    """Compute errors under a model, with frames or targets fitted as after a sensor or a reflector was moved.
+
+    What is fitted to n values makes their errors too small. So they are multiplied by `sqrt(n / (n - p))`, where p is
+    the trace of the hat matrix over these values, the number of parameters where there is one kind of them (Draper and
+    Smith 1998, Applied Regression Analysis, section 8.1). Rows with equal joint values count once in n.
+
+    Args:
+        model: of any kind; the frames or targets that it holds do not matter where they are fitted.
+        measurements: rows with positions, and with orientations or without.
+        fitted: what is fitted; nothing for the errors in the model's own frames.
+
+    Returns:
+        Measured minus predicted, see `errors_of_rows`; NaN where nothing was measured or predicted, and where
+        something is fitted in rows without a position.
+
+    Raises:
+        MeasurementError: a frame or a target has fewer than `FEWEST` different joint vectors, no positions were
+            measured that something could be fitted to, or the model lacks a frame or target that is not fitted.
+        IdentificationError: an anchor has too few rows to say where it is.
+    """
+    T = poses_of_rows(model, with_names_of(model, measurements, fitted))
+    if not fitted:
+        return errors_of_rows(T, measurements)
+    if measurements.position is None:
+        raise MeasurementError(
+            f"{measurements.source}: expected positions to fit the {' and the '.join(fitted)} to, got "
+            f"{' and '.join(sorted(measurements.kinds)) or 'none'}; leave the fit out (balls in sockets, and distances "
+            "from anchors at unknown points, do not depend on where the base stands)."
+        )
+    usable = torch.isfinite(measurements.position).all(-1) & torch.isfinite(T).flatten(1).all(-1)
+    rows = measurements.select(usable.nonzero()[:, 0])
+    _check_configurations(model, measurements, rows, fitted)
+    known = rows if has_orientation(model) or "tool" in fitted else replace(rows, rotation=None)
+    measured = MeasuredPoses.of(known, LEVER_SHARE * model.robot.reach)
+    fit, columns = fit_frames(T[usable], measured, rows, fitted)
+    T = T.index_put((usable.nonzero()[:, 0],), fit)
+    U, size, _ = torch.linalg.svd(columns.flatten(0, 1), full_matrices=False)
+    leverage = U[:, size > DETERMINED * size.max()].square().sum(-1).view(-1, 2, 3).sum((0, 2)).tolist()
+    errors = ErrorVectors.between(measurements, T)
+    turned = rows.select(measured.has_rotation.nonzero()[:, 0])
+    return ErrorVectors(
+        errors.position * _enlargement(rows, leverage[0]),
+        None if errors.rotation is None else errors.rotation * _enlargement(turned, leverage[1]),
+    )
+
+
+def _enlargement(rows: Measurements, fitted: float) -> float:
+    """Factor on errors for so many fitted numbers."""
+    values = 3 * len(set(groups_to_keep_whole(rows).tolist()))
+    return float((values / (values - fitted)) ** 0.5) if fitted else 1.0
+
+
+def _check_configurations(
+    model: CalibratedModel, measurements: Measurements, rows: Measurements, fitted: Collection[FrameKind]
+) -> None:
+    """Make sure that every frame and every target that is fitted has enough rows."""
+    names = {
+        "base": ("frame", measurements.frame, rows.frame),
+        "tool": ("target", measurements.target, rows.target),
+    }
+    for kind in fitted:
+        what, wanted, there = names[kind]
+        for name in dict.fromkeys(wanted):
+            of_name = torch.tensor(
+                [index for index, other in enumerate(there) if other == name], dtype=torch.int64
+            )
+            count = len(set(groups_to_keep_whole(rows.select(of_name)).tolist()))
+            if count < FEWEST:
+                raise MeasurementError(
+                    f"{measurements.source}: {what} '{name}' holds {count} different joint vectors whose positions "
+                    f"the model '{model.name}' predicts, and fitting it takes {FEWEST} or more; measure more poses."
+                )
+
+
+def fit_frames(
+    T: Float64[Tensor, "rows 4 4"], measured: MeasuredPoses, rows: Measurements, fitted: Collection[FrameKind]
+) -> tuple[Float64[Tensor, "rows 4 4"], Float64[Tensor, "rows 6 numbers"]]:
+    """Fit bases and tools of rows to their measured poses.
+
+    Either kind alone is fitted in closed form; both together go on from there by Levenberg and Marquardt's method.
+
+    Args:
+        T: predicted poses, with any bases and tools.
+        measured: of the rows.
+        rows: with the names of frames and targets.
+        fitted: what is fitted.
+
+    Returns:
+        The poses, and the derivatives of their values by all fitted numbers, see `frame_columns`.
+    """
+    frame, target = numbers_of_names(rows.frame), numbers_of_names(rows.target)
+    bases, tools = (torch.eye(4).to(T).repeat(int(number.max()) + 1, 1, 1) for number in (frame, target))
+    if "base" in fitted:
+        bases = _each(best_base, T, measured, frame)
+    if "tool" in fitted:
+        tools = _each(best_tool, bases[frame] @ T, measured, target)
+    columns, error = _columns(T, measured, (bases, frame), (tools, target), fitted)
+    damping = FIRST_DAMPING
+    for _ in range(STEPS if len(fitted) > 1 else 0):
+        A = columns.flatten(0, 1)
+        normal = A.mT @ A
+        damped = normal + torch.diag(damping * normal.diagonal() + 1e-12 * len(T))
+        steps = torch.linalg.solve(damped, A.mT @ error.flatten()).view(-1, 6)
+        moved = moved_frame(bases, steps[: len(bases)]), moved_frame(tools, steps[len(bases) :])
+        tried = _columns(T, measured, (moved[0], frame), (moved[1], target), fitted)
+        gain = float(error.square().sum() - tried[1].square().sum())
+        if gain > 0:
+            settled = gain <= SETTLED * float(error.square().sum())
+            (bases, tools), (columns, error), damping = moved, tried, damping / 10
+            if settled:
+                break
+        else:
+            damping *= 10
+    return bases[frame] @ T @ tools[target], columns
+
+
+def _each(
+    fit: Callable[[Tensor, MeasuredPoses], Tensor],
+    T: Tensor,
+    measured: MeasuredPoses,
+    number: Int64[Tensor, " rows"],
+) -> Float64[Tensor, "frames 4 4"]:
+    """Fit the transform of every frame or target in closed form."""
+    chosen = [number == k for k in range(int(number.max()) + 1)]
+    return torch.stack([fit(T[rows], measured.select(rows)) for rows in chosen])
+
+
+def _columns(
+    T: Float64[Tensor, "rows 4 4"],
+    measured: MeasuredPoses,
+    bases: tuple[Tensor, Int64[Tensor, " rows"]],
+    tools: tuple[Tensor, Int64[Tensor, " rows"]],
+    fitted: Collection[FrameKind],
+) -> tuple[Float64[Tensor, "rows 6 numbers"], Float64[Tensor, "rows 6"]]:
+    """Derivatives of all values by the numbers of the fitted bases and tools, and the errors; see `frame_columns`."""
+    J, error = frame_columns(T, measured, bases[0][bases[1]], tools[0][tools[1]])
+    blocks = []
+    for kind, (frames, number), part in zip(
+        ("base", "tool"), (bases, tools), torch.split(J, 6, -1), strict=True
+    ):
+        if kind in fitted:
+            of_row = torch.nn.functional.one_hot(number, len(frames)).to(part)
+            blocks.append((of_row[:, None, :, None] * part[:, :, None, :]).flatten(2))
+    return torch.cat(blocks, -1), error

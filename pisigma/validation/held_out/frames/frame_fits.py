@@ -1,0 +1,284 @@
+"""Rigid transforms before and behind predicted poses that explain measured ones best, in closed form."""
+
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Bool, Float64
+from torch import Tensor
+
+from pisigma.measurement.dataset import Measurements
+from pisigma.robot.se3 import nearest_rotation, rotation_from_vector, rotation_vector, skew, transform
+
+LEVER_SHARE = 0.2
+"""A rotation error counts like a position error at this share of the reach."""
+ALTERNATIONS = 10
+"""Projections onto the rotations by which a guess of base and tool is polished."""
+STEPS = 20
+AFFINE_NUMBERS = 13
+"""Unknowns of every coordinate of an affine base and tool: so many positions or fewer do not determine them."""
+SETTLED = 1e-6
+"""The search for base and tool ends when a step lowers the cost by less than this share."""
+FIRST_DAMPING = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class MeasuredPoses:
+    """Measured positions and rotations, ready for comparison with predicted poses.
+
+    Attributes:
+        position: measured positions [m].
+        rotation: measured rotations; the identity where none was measured.
+        has_rotation: which rows hold a rotation.
+        lever: a rotation error counts like a position error at this distance [m].
+    """
+
+    position: Float64[Tensor, "*#batch rows 3"]
+    rotation: Float64[Tensor, "*#batch rows 3 3"]
+    has_rotation: Bool[Tensor, " rows"]
+    lever: float
+
+    @staticmethod
+    def of(measurements: Measurements, lever: float) -> "MeasuredPoses":
+        """Take the poses of measurements; every row has a position."""
+        assert measurements.position is not None
+        eye = torch.eye(3, dtype=torch.float64)
+        if measurements.rotation is None:
+            none = torch.zeros(measurements.rows, dtype=torch.bool)
+            return MeasuredPoses(measurements.position, eye.expand(measurements.rows, 3, 3), none, lever)
+        has_rotation = torch.isfinite(measurements.rotation).flatten(1).all(-1)
+        rotation = torch.where(has_rotation[:, None, None], measurements.rotation, eye)
+        return MeasuredPoses(measurements.position, rotation, has_rotation, lever)
+
+    def select(self, rows: Tensor) -> "MeasuredPoses":
+        """Select the rows of a mask or an index."""
+        return MeasuredPoses(self.position[rows], self.rotation[rows], self.has_rotation[rows], self.lever)
+
+    def scaled(self, factor: float) -> "MeasuredPoses":
+        """Multiply the positions by a factor."""
+        return replace(self, position=self.position * factor)
+
+    @property
+    def values(self) -> int:
+        """Number of independent numbers that were measured."""
+        return 3 * len(self.position) + 3 * int(self.has_rotation.sum())
+
+    @property
+    def spread(self) -> float:
+        """Root mean square distance [m] from the mean pose, as `squares` measures it."""
+        off = (self.position - self.position.mean(0)).square().sum(-1).mean()
+        R = self.rotation[self.has_rotation]
+        turn = (3 - R.mean(0).square().sum()) / 2 if len(R) else torch.zeros(())
+        return float((off + self.lever**2 * turn * self.has_rotation.double().mean()).sqrt())
+
+    def squares(self, T: Float64[Tensor, "*batch rows 4 4"]) -> Float64[Tensor, "*batch rows"]:
+        """Compute squared errors `|dp|² + lever² |dR|² / 2` [m²] of poses; |dR|²/2 is about the angle squared."""
+        off = (self.position - T[..., :3, 3]).square().sum(-1)
+        turn = (self.rotation - T[..., :3, :3]).square().sum((-2, -1)) / 2
+        return off + self.lever**2 * torch.where(self.has_rotation, turn, 0.0)
+
+
+def best_base(
+    T: Float64[Tensor, "*batch rows 4 4"], measured: MeasuredPoses
+) -> Float64[Tensor, "*batch 4 4"]:
+    """Find the transform X for which `X T` are nearest to measured poses (weighted orthogonal Procrustes)."""
+    middle, wanted = T[..., :3, 3].mean(-2, keepdim=True), measured.position.mean(0)
+    M = (measured.position - wanted).mT @ (T[..., :3, 3] - middle)
+    if bool(measured.has_rotation.any()):
+        weight = measured.has_rotation.to(T)[:, None, None]
+        M = M + measured.lever**2 / 2 * (weight * measured.rotation @ T[..., :3, :3].mT).sum(-3)
+    R = nearest_rotation(M)
+    return transform(R, wanted - (R @ middle.mT)[..., 0])
+
+
+def best_tool(
+    T: Float64[Tensor, "*batch rows 4 4"], measured: MeasuredPoses
+) -> Float64[Tensor, "*batch 4 4"]:
+    """Find the transform X for which `T X` are nearest to measured poses; it turns nothing without rotations."""
+    R = T[..., :3, :3]
+    offset = (R.mT @ (measured.position - T[..., :3, 3])[..., None])[..., 0].mean(-2)
+    if not bool(measured.has_rotation.any()):
+        return transform(torch.eye(3).to(T), offset)
+    weight = measured.has_rotation.to(T)[:, None, None]
+    return transform(nearest_rotation((weight * R.mT @ measured.rotation).sum(-3)), offset)
+
+
+def affine_error(
+    T: Float64[Tensor, "*#batch rows 4 4"], measured: MeasuredPoses
+) -> Float64[Tensor, "*#batch"]:
+    """Compute the mean squared error [m²] per row that the best affine base and tool leave: rigid ones leave no less.
+
+    Every coordinate of `R_base (R t + p) + p_base` is linear in 13 unknowns where nothing is held to be a rotation, and
+    `|R_measured - R_base R R_tool|² / 2` is at least 3 less three times the largest singular value of the mean of
+    `R_measured ⊗ R` (Shah 2013, J. Mechanisms Robotics 5(3)). So thousands of hypotheses are compared in closed form.
+    The lengths are divided by the degrees of freedom that are left.
+
+    Args:
+        T: predicted poses.
+        measured: more than 13 measured poses.
+    """
+    rows = T.shape[-3]
+    A, solution = _affine_solution(T, measured.position)
+    residual = measured.position - A @ solution
+    error: Tensor = residual.square().sum((-2, -1)) / max(rows - A.shape[-1], 0.0)
+    if not bool(measured.has_rotation.any()):
+        return error
+    K = _rotation_products(T, measured) / measured.has_rotation.sum()
+    turns: Tensor = 3 * (1 - torch.linalg.matrix_norm(K, 2)).clamp(min=0.0)
+    return error + measured.lever**2 * turns
+
+
+def best_base_and_tool(
+    T: Float64[Tensor, "*batch rows 4 4"], measured: MeasuredPoses
+) -> tuple[Float64[Tensor, "*batch 4 4"], Float64[Tensor, "*batch 4 4"]]:
+    """Find transforms X, Y for which `X T Y` are nearest to measured poses; Y turns nothing without rotations.
+
+    The initial guess is what `affine_error` fits, its matrices replaced by the nearest rotations; then Levenberg and
+    Marquardt's method on all batches at once.
+
+    Args:
+        T: predicted poses.
+        measured: what was measured there.
+    """
+    base, tool = _affine_base_and_tool(T, measured)
+    damping = torch.full_like(T[..., 0, 0, 0], FIRST_DAMPING)
+    cost = measured.squares(base[..., None, :, :] @ T @ tool[..., None, :, :]).sum(-1)
+    for _ in range(STEPS):
+        step = base_and_tool_step(T, measured, base, tool, damping)
+        nearer, behind = moved_base_and_tool(base, tool, step)
+        tried = measured.squares(nearer[..., None, :, :] @ T @ behind[..., None, :, :]).sum(-1)
+        better = tried < cost
+        settled = bool(((cost - tried).abs() <= SETTLED * cost).all())
+        base = torch.where(better[..., None, None], nearer, base)
+        tool = torch.where(better[..., None, None], behind, tool)
+        cost, damping = torch.minimum(cost, tried), torch.where(better, damping / 10, damping * 10)
+        if settled:
+            break
+    return base, tool
+
+
+def moved_base_and_tool(
+    base: Float64[Tensor, "*batch 4 4"],
+    tool: Float64[Tensor, "*batch 4 4"],
+    step: Float64[Tensor, "*batch 12"],
+) -> tuple[Float64[Tensor, "*batch 4 4"], Float64[Tensor, "*batch 4 4"]]:
+    """Shift and turn base and tool by a step of `base_and_tool_step`."""
+    return moved_frame(base, step[..., :6]), moved_frame(tool, step[..., 6:])
+
+
+def moved_frame(
+    frame: Float64[Tensor, "*batch 4 4"], step: Float64[Tensor, "*batch 6"]
+) -> Float64[Tensor, "*batch 4 4"]:
+    """Shift [m] and turn [rad] a frame, about its origin."""
+    return transform(
+        rotation_from_vector(step[..., 3:]) @ frame[..., :3, :3], frame[..., :3, 3] + step[..., :3]
+    )
+
+
+def _rotation_products(
+    T: Float64[Tensor, "*#batch rows 4 4"], measured: MeasuredPoses
+) -> Float64[Tensor, "*#batch 9 9"]:
+    """Sum `vec(R_measured) vec(R)^T`, reordered so that it maps `vec(R_tool^T)` to `vec(R_base)`."""
+    weight = measured.has_rotation.to(T)[..., None]
+    M = (weight * measured.rotation.flatten(-2)).mT @ T[..., :3, :3].flatten(-2)
+    batch = M.shape[:-2]
+    K: Tensor = M.reshape(*batch, 3, 3, 3, 3).transpose(-3, -2).reshape(*batch, 9, 9)
+    return K
+
+
+def _affine_solution(
+    T: Float64[Tensor, "*batch rows 4 4"], position: Float64[Tensor, "*#batch rows 3"]
+) -> tuple[Float64[Tensor, "*batch rows 13"], Float64[Tensor, "*batch 13 3"]]:
+    """Solve `position = A X` for the regressors `A = (vec(R), p, 1)`; returns both."""
+    A = torch.cat([T[..., :3, :3].flatten(-2), T[..., :3, 3], torch.ones_like(T[..., :1, 0])], -1)
+    size = A.square().sum(-2, keepdim=True).sqrt().clamp(min=1e-12)
+    scaled = A / size
+    normal = scaled.mT @ scaled + 1e-12 * torch.eye(A.shape[-1]).to(A)
+    return A, torch.linalg.solve(normal, scaled.mT @ position) / size.mT
+
+
+def _nearest_rotations(columns: Float64[Tensor, "*batch 9 1"]) -> Float64[Tensor, "*batch 3 3"]:
+    """Give the rotations nearest to matrices that are written as columns."""
+    return nearest_rotation(columns.reshape(*columns.shape[:-2], 3, 3))
+
+
+def _affine_base_and_tool(
+    T: Float64[Tensor, "*batch rows 4 4"], measured: MeasuredPoses
+) -> tuple[Float64[Tensor, "*batch 4 4"], Float64[Tensor, "*batch 4 4"]]:
+    """Guess base and tool in closed form; see `affine_error`."""
+    R, p, position = T[..., :3, :3], T[..., :3, 3], measured.position
+    R_tool = torch.eye(3).to(T).expand(*T.shape[:-3], 3, 3)
+    if bool(measured.has_rotation.any()):
+        K = _rotation_products(T, measured)[..., None, :, :]
+        leading = torch.linalg.svd(K)[2][..., 0, :]
+        Z = _nearest_rotations(torch.cat([leading, -leading], -2)[..., None])
+        for _ in range(ALTERNATIONS):
+            bases = _nearest_rotations(K @ Z.flatten(-2)[..., None])
+            Z = _nearest_rotations(K.mT @ bases.flatten(-2)[..., None])
+        agreement = (bases.flatten(-2) * (K @ Z.flatten(-2)[..., None])[..., 0]).sum(-1)
+        best = agreement.argmax(-1)[..., None, None, None]
+        R_base = bases.take_along_dim(best, -3)[..., 0, :, :]
+        R_tool = Z.take_along_dim(best, -3)[..., 0, :, :].mT
+    elif T.shape[-3] > AFFINE_NUMBERS:
+        R_base = nearest_rotation(_affine_solution(T, position)[1][..., 9:12, :].mT)
+    else:
+        R_base = best_base(T, measured)[..., :3, :3]
+    eye = torch.eye(3).to(T).expand(R.shape)
+    J = torch.cat([eye, R_base[..., None, :, :] @ R], -1).flatten(-3, -2)
+    wanted = (position - p @ R_base.mT).flatten(-2)[..., None]
+    ridge = 1e-9 * T.shape[-3] * torch.eye(6).to(T)
+    shift = torch.linalg.solve(J.mT @ J + ridge, J.mT @ wanted)[..., 0]
+    return transform(R_base, shift[..., :3]), transform(R_tool, shift[..., 3:])
+
+
+def frame_columns(
+    T: Float64[Tensor, "*batch rows 4 4"],
+    measured: MeasuredPoses,
+    base: Float64[Tensor, "*batch #rows 4 4"],
+    tool: Float64[Tensor, "*batch #rows 4 4"],
+) -> tuple[Float64[Tensor, "*batch rows 6 12"], Float64[Tensor, "*batch rows 6"]]:
+    """Derivatives of poses `base T tool` by shift [m] and turn [rad] of the base, then of the tool; and the errors.
+
+    The base turns about its origin, in the measuring frame. The six values of a row are those of its position [m] and,
+    times the lever, of its rotation vector; the latter are 0 where no rotation was measured.
+    """
+    R_base, R_flange = base[..., :3, :3], base[..., :3, :3] @ T[..., :3, :3]
+    arm = (R_base @ (T[..., :3, 3:] + T[..., :3, :3] @ tool[..., :3, 3:]))[..., 0]
+    eye, none = torch.eye(3).to(T).expand(R_flange.shape), torch.zeros_like(R_flange)
+    weight = measured.lever * measured.has_rotation.to(T)[..., None]
+    turn = rotation_vector(measured.rotation @ (R_flange @ tool[..., :3, :3]).mT)
+    J = torch.cat([eye, -skew(arm), R_flange, none], -1)
+    J = torch.cat([J, weight[..., None] * torch.cat([none, eye, none, R_flange], -1)], -2)
+    return J, torch.cat([measured.position - arm - base[..., :3, 3], weight * turn], -1)
+
+
+def base_and_tool_step(
+    T: Float64[Tensor, "*batch rows 4 4"],
+    measured: MeasuredPoses,
+    base: Float64[Tensor, "*batch 4 4"],
+    tool: Float64[Tensor, "*batch 4 4"],
+    damping: Float64[Tensor, "*batch"],
+    free: Float64[Tensor, "*batch rows 6"] | None = None,
+) -> Float64[Tensor, "*batch 12"]:
+    """Compute a damped step: shift [m] and turn [rad] of the base, in the measuring frame, then those of the tool.
+
+    Args:
+        T: predicted poses.
+        measured: what was measured there.
+        base: before them, as it is now.
+        tool: behind them, as it is now.
+        damping: Marquardt's, relative to the normal matrix.
+        free: shift [m] and turn [rad] of every row's pose by a value of its own, which is eliminated (variable
+            projection, Golub and Pereyra 1973); None where there is none.
+    """
+    J, error = frame_columns(T, measured, base[..., None, :, :], tool[..., None, :, :])
+    residual = error[..., None]
+    if free is not None:
+        weight = measured.lever * measured.has_rotation.to(T)[..., None]
+        along = torch.cat([free[..., :3], weight * free[..., 3:]], -1)[..., None]
+        along = along / along.norm(dim=-2, keepdim=True).clamp(min=1e-12)
+        J, residual = J - along @ (along.mT @ J), residual - along @ (along.mT @ residual)
+    J, residual = J.flatten(-3, -2), residual.flatten(-3, -2)
+    normal = J.mT @ J
+    scale = normal.diagonal(dim1=-2, dim2=-1) * damping[..., None] + 1e-12 * T.shape[-3]
+    step: Tensor = torch.linalg.solve(normal + torch.diag_embed(scale), J.mT @ residual)
+    return step[..., 0]

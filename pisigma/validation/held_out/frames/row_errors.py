@@ -1,0 +1,93 @@
+"""Errors of measured rows, whatever measured them."""
+
+from dataclasses import replace
+
+import torch
+from jaxtyping import Bool, Float64
+from torch import Tensor
+
+from pisigma.measurement.dataset import Measurements
+from pisigma.measurement.sensors.registry import SENSORS, measured_errors, unknown_groups
+from pisigma.validation.held_out.pose_statistics import ErrorVectors
+
+
+def errors_of_rows(T: Float64[Tensor, "rows 4 4"], measurements: Measurements) -> ErrorVectors:
+    """Compute the errors of rows against predicted poses of the targets.
+
+    Sockets, and anchors at unknown points, are where their rows fit best, and the errors are enlarged for that; see
+    `measured_errors`.
+
+    Args:
+        T: predicted, in the frame of every row.
+        measurements: the rows.
+
+    Returns:
+        As positions the errors of positions, and in rows without one those of whatever length was measured: of a ball
+        in a socket along the axes of the frame, of a wire, a touch or a pair the difference as the first component. NaN
+        where nothing was measured or predicted.
+
+    Raises:
+        IdentificationError: an anchor has too few rows to say where it is.
+    """
+    if measurements.position is not None:
+        errors = ErrorVectors.between(measurements, T)
+    else:
+        nowhere = torch.full((measurements.rows, 3), torch.nan, dtype=torch.float64)
+        poses = replace(measurements, position=nowhere)
+        errors = ErrorVectors.between(poses, T)
+    rows = (
+        _whole_pairs(measurements, torch.isfinite(T).flatten(1).all(-1)) & other_lengths(measurements)
+    ).nonzero()[:, 0]
+    if not len(rows):
+        return errors
+    some = replace(
+        measurements, position=None, sigma_position=None, rotation=None, sigma_rotation=None
+    ).select(rows)
+    position = errors.position.clone()
+    for name, error in measured_errors(T[rows], some, None).items():
+        if SENSORS[name].unit == "m":
+            there = torch.isfinite(error).all(-1)
+            position[rows[there]] = torch.nn.functional.pad(error, (0, 3 - error.shape[1]))[there]
+    return replace(errors, position=position)
+
+
+def other_lengths(measurements: Measurements) -> Bool[Tensor, " rows"]:
+    """Say which rows have no position, but a length of another sensor."""
+    kinds = [kind for kind in measurements.kinds if kind in SENSORS and SENSORS[kind].unit == "m"]
+    there = torch.zeros(measurements.rows, dtype=torch.bool)
+    for kind in kinds:
+        there |= measurements.measured(kind)
+    return there & ~has_position(measurements)
+
+
+def has_position(measurements: Measurements) -> Bool[Tensor, " rows"]:
+    """Say which rows have a position."""
+    if measurements.position is None:
+        return torch.zeros(measurements.rows, dtype=torch.bool)
+    return torch.isfinite(measurements.position).all(-1)
+
+
+def places_remark(measurements: Measurements) -> tuple[str, ...]:
+    """Say what a user should know of errors of rows that find out where a sensor stands."""
+    rows = other_lengths(measurements).nonzero()[:, 0]
+    groups = unknown_groups(measurements.select(rows))
+    if not groups:
+        return ()
+    what = " and ".join(f"{len(group.owners)} {group.name}s" for group in groups)
+    return (
+        f"Where {what} are, the rows say themselves, for every model: an error is how far a row is off what the others "
+        "of its socket or anchor agree on, enlarged for the numbers that were fitted to them. Where the robot's base "
+        "stands does not matter for that.",
+    )
+
+
+def _whole_pairs(measurements: Measurements, rows: Bool[Tensor, " rows"]) -> Bool[Tensor, " rows"]:
+    """Leave out both rows of pairs that one is left out of."""
+    broken = {
+        name
+        for name, there in zip(measurements.pair or (), rows.tolist(), strict=False)
+        if name and not there
+    }
+    if not broken:
+        return rows
+    return rows & torch.tensor([name not in broken for name in measurements.pair or ()])

@@ -1,0 +1,322 @@
+"""Any number of models on the same measured rows: their errors, confidence intervals and differences."""
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float64, Int64
+from torch import Tensor
+
+from pisigma.files.errors import MeasurementError
+from pisigma.measurement.dataset import Measurements
+from pisigma.measurement.groups import groups_to_keep_whole
+from pisigma.measurement.sensors.socket import PairOfSockets
+from pisigma.model.calibrated_model import CalibratedModel
+from pisigma.model.row_poses import poses_of_rows
+from pisigma.robot.kinematics.forward import forward_kinematics
+from pisigma.validation.held_out.bootstrap import STATISTICS, Bootstrap, Intervals, statistics
+from pisigma.validation.held_out.frames.fitted_frames import FrameKind, errors_in_fitted_frames
+from pisigma.validation.held_out.frames.row_errors import has_position, other_lengths
+from pisigma.validation.held_out.pose_statistics import axis_statistics, error_statistics
+from pisigma.validation.held_out.rank_tests import SignedRank, signed_rank
+from pisigma.validation.held_out.trained_calibrations import DistanceErrors, distance_figures
+from pisigma.validation.held_out.validation_figures import SocketDistances
+
+Interval = tuple[float, float]
+"""Lower and upper end."""
+
+NOTHING_TO_JUDGE = "expected positions, balls in sockets, wires, pairs or touches, got none; give x, y and z."
+UNITS = {"position": ("mm", 1e3), "orientation": ("deg", float(np.rad2deg(1.0)))}
+"""Of every quantity the unit of tables and files, and what an SI value is multiplied by."""
+
+
+@dataclass(frozen=True)
+class Difference:
+    """Errors of a model minus those of the first model on the same rows; below 0 where the model is better.
+
+    Attributes:
+        statistics: by name ("mean", "rms", "p95") the difference [mm or deg].
+        intervals: by name its confidence interval; None where there is one configuration only.
+        test: Wilcoxon's test of the configurations' mean differences.
+        better_share: share of the configurations in which the model's mean error is smaller.
+    """
+
+    statistics: Mapping[str, float]
+    intervals: Mapping[str, Interval | None]
+    test: SignedRank
+    better_share: float
+
+    def to_json(self, unit: str) -> dict[str, object]:
+        """Return the figures as plain values, the unit in their names."""
+        values: dict[str, object] = {f"{name}_{unit}": value for name, value in self.statistics.items()}
+        values |= {f"{name}_{unit}_interval": interval for name, interval in self.intervals.items()}
+        return values | {"better_share": self.better_share, "wilcoxon": asdict(self.test)}
+
+
+@dataclass(frozen=True)
+class QuantityErrors:
+    """Errors of one quantity under one model, in the unit of tables and files.
+
+    Attributes:
+        unit: "mm" of positions, "deg" of orientations.
+        statistics: by name ("rms", "mean", "p95", "max") of the errors' sizes.
+        intervals: confidence intervals of "mean", "rms" and "p95"; None where there is one configuration only.
+        axes: by axis of the frame "mean" of the signed errors and "rms", "p95", "max" of their sizes; empty where no
+            row has the position too.
+        inside: `statistics` of the rows inside the model's domain; empty where there are none or it knows no domain.
+        outside: the same of the rows outside it.
+        difference: to the first model; None of the first.
+    """
+
+    unit: str
+    statistics: Mapping[str, float]
+    intervals: Mapping[str, Interval | None]
+    axes: Mapping[str, Mapping[str, float]]
+    inside: Mapping[str, float]
+    outside: Mapping[str, float]
+    difference: Difference | None
+
+
+@dataclass(frozen=True)
+class ModelFigures:
+    """Everything that is said of one of the compared models.
+
+    Attributes:
+        name: what the model is called.
+        rows_not_predicted: rows with a measured length for which this model predicts nothing.
+        position: errors of positions, and of the lengths of other sensors in rows without one.
+        orientation: errors of orientations; None where none was measured.
+        rows_inside: compared rows inside the model's domain; None where it knows no domain.
+        rows_outside: the same outside it.
+    """
+
+    name: str
+    rows_not_predicted: int
+    position: QuantityErrors
+    orientation: QuantityErrors | None
+    rows_inside: int | None
+    rows_outside: int | None
+
+    @property
+    def quantities(self) -> dict[str, QuantityErrors]:
+        """Errors of "position" and, where measured, of "orientation"."""
+        both = {"position": self.position, "orientation": self.orientation}
+        return {name: errors for name, errors in both.items() if errors is not None}
+
+    @property
+    def statistics_in_file_units(self) -> dict[str, float]:
+        """Statistics of all quantities, such as "rms_mm" and "max_deg"."""
+        return _with_units(list(self.quantities.values()), "statistics")
+
+    def to_json(self) -> dict[str, object]:
+        """Return the figures as plain values; names end with the unit."""
+        errors = list(self.quantities.values())
+        values: dict[str, object] = {"name": self.name, "rows_not_predicted": self.rows_not_predicted}
+        values |= self.statistics_in_file_units
+        values["intervals"] = _with_units(errors, "intervals")
+        values["axes"] = {
+            axis: {f"{name}_{one.unit}": value for one in errors for name, value in one.axes[axis].items()}
+            for axis in self.position.axes
+        }
+        for where, rows in (("inside", self.rows_inside), ("outside", self.rows_outside)):
+            if rows is not None:
+                values[f"{where}_domain"] = {"rows": rows, **_with_units(errors, where)} if rows else None
+        if self.position.difference is not None:
+            values["difference_to_first"] = {
+                quantity: one.difference.to_json(one.unit)
+                for quantity, one in self.quantities.items()
+                if one.difference is not None
+            }
+        return values
+
+
+@dataclass(frozen=True)
+class ModelComparison:
+    """Models on the same rows.
+
+    Attributes:
+        models: in the order in which they were given.
+        rows: rows that are compared.
+        rows_without_position: rows that hold no position, and no other length that could be judged.
+        configurations: number of different configurations of these rows.
+        bootstrap: how the intervals were computed.
+        socket_distance: errors of stated distances of sockets; None where none is stated.
+    """
+
+    models: tuple[ModelFigures, ...]
+    rows: int
+    rows_without_position: int
+    configurations: int
+    bootstrap: Bootstrap
+    socket_distance: SocketDistances | None = None
+
+    def to_json(self) -> dict[str, object]:
+        """Return the comparison as plain values."""
+        distances = (
+            {} if self.socket_distance is None else self.socket_distance.model_dump(exclude_unset=True)
+        )
+        return {
+            "rows_compared": self.rows,
+            "rows_without_position": self.rows_without_position,
+            "configurations": self.configurations,
+            "bootstrap": asdict(self.bootstrap),
+            "models": [model.to_json() for model in self.models],
+            **({"socket_distance": distances} if distances else {}),
+        }
+
+
+@torch.no_grad()
+def compare_models(
+    models: Mapping[str, CalibratedModel],
+    measurements: Measurements,
+    bootstrap: Bootstrap | None = None,
+    fitted: Collection[FrameKind] = (),
+    socket_distances: Mapping[PairOfSockets, float] = MappingProxyType({}),
+) -> ModelComparison:
+    """Judge models on measurements; rows for which one of them predicts nothing count for none.
+
+    Args:
+        models: by name, one or more.
+        measurements: the rows, in the frames that the models were fitted in.
+        bootstrap: how confidence intervals are computed. None: `Bootstrap()`.
+        fitted: frames or targets that are fitted to the rows, for every model; see `errors_in_fitted_frames`.
+        socket_distances: stated distances of sockets of the rows [m].
+
+    Raises:
+        MeasurementError: no lengths were measured, or in a frame or of a target that a model does not know, or no
+            row is predicted by all models, or a frame or target that is fitted has too few rows.
+        PoseError: the joint values do not fit a model's robot.
+    """
+    bootstrap = bootstrap or Bootstrap()
+    vectors = {name: errors_in_fitted_frames(model, measurements, fitted) for name, model in models.items()}
+    measured, others = has_position(measurements), other_lengths(measurements)
+    if not bool((measured | others).any()):
+        raise MeasurementError(f"{measurements.source}: {NOTHING_TO_JUDGE}")
+    predicted = {name: torch.isfinite(errors.position).all(-1) for name, errors in vectors.items()}
+    common = torch.stack(list(predicted.values())).all(0)
+    if not common.any():
+        raise MeasurementError(
+            f"{measurements.source}: there is no row with a measured length that {', '.join(models)} predict; give "
+            "rows nearer to what was calibrated with, and two or more of every socket."
+        )
+    measured = measured | (others & torch.stack(list(predicted.values())).any(0))
+    domains = [inside_domain(model, measurements) for model in models.values()]
+    group = groups_to_keep_whole(measurements)
+    positions = _quantity(
+        "position", [errors.position for errors in vectors.values()], common, domains, group, bootstrap
+    )
+    orientations: Sequence[QuantityErrors | None] = [None] * len(models)
+    turns = [errors.rotation for errors in vectors.values() if errors.rotation is not None]
+    if turns and bool(torch.isfinite(turns[0][common]).any()):
+        orientations = _quantity("orientation", turns, common, domains, group, bootstrap)
+    figures = [
+        ModelFigures(
+            name=name,
+            rows_not_predicted=int((measured & ~predicted[name]).sum()),
+            position=position,
+            orientation=orientation,
+            rows_inside=None if inside is None else int((common & inside).sum()),
+            rows_outside=None if inside is None else int((common & ~inside).sum()),
+        )
+        for name, position, orientation, inside in zip(models, positions, orientations, domains, strict=True)
+    ]
+    if bool((common & others).any()):
+        figures = [replace(one, position=replace(one.position, axes={})) for one in figures]
+    unmeasured, configurations = int((~measured).sum()), len(set(group[common].tolist()))
+    distances = _distances(models, measurements.select(common.nonzero()[:, 0]), socket_distances)
+    return ModelComparison(
+        tuple(figures), int(common.sum()), unmeasured, configurations, bootstrap, distances
+    )
+
+
+def _distances(
+    models: Mapping[str, CalibratedModel], rows: Measurements, stated: Mapping[PairOfSockets, float]
+) -> SocketDistances | None:
+    """Figures of stated distances of sockets, each where its rows put the ball."""
+    poses = {name: poses_of_rows(model, rows) for name, model in models.items() if stated}
+    return distance_figures([DistanceErrors.of(poses, stated, rows)])
+
+
+def inside_domain(model: CalibratedModel, measurements: Measurements) -> Bool[Tensor, " rows"] | None:
+    """Say which rows are inside a model's domain: where its correction was learned.
+
+    Returns:
+        None where the model knows no domain, as geometric calibrations do not.
+    """
+    if model.hybrid is not None:
+        return model.hybrid.coverage.contains(measurements.q)
+    if model.network is None or model.domain is None:
+        return None
+    with torch.no_grad():
+        q = model.nominal_joints(measurements.q)
+        finite = torch.isfinite(q).all(-1)
+        at = torch.where(finite[:, None], q, 0.0)
+        scaled = model.network.scaled_inputs(forward_kinematics(model.robot, at), at)
+        return finite & model.domain.contains(scaled)
+
+
+def _quantity(
+    quantity: str,
+    vectors: Sequence[Float64[Tensor, "rows 3"]],
+    common: Bool[Tensor, " rows"],
+    domains: Sequence[Bool[Tensor, " rows"] | None],
+    group: Int64[Tensor, " rows"],
+    bootstrap: Bootstrap,
+) -> list[QuantityErrors]:
+    """Compute the figures of one quantity of all models on those of the common rows that have it under all."""
+    unit, factor = UNITS[quantity]
+    stacked = torch.stack(list(vectors)) * factor
+    there = common & torch.isfinite(stacked).all(-1).all(0)
+    sizes = stacked.norm(dim=-1)[:, there].numpy()
+    index = torch.unique(group[there], return_inverse=True)[1].numpy()
+    intervals = bootstrap.intervals(sizes, index)
+    differences = _differences(sizes, index, intervals)
+    figures = []
+    for number, (errors, inside) in enumerate(zip(stacked[:, there], domains, strict=True)):
+        within = None if inside is None else inside[there]
+        figures.append(
+            QuantityErrors(
+                unit=unit,
+                statistics=error_statistics(errors.norm(dim=-1)),
+                intervals=_by_name(intervals.value[:, number]),
+                axes={axis: axis_statistics(along) for axis, along in zip("xyz", errors.T, strict=True)},
+                inside=_some(errors, within),
+                outside=_some(errors, None if within is None else ~within),
+                difference=differences[number] if number else None,
+            )
+        )
+    return figures
+
+
+def _differences(
+    sizes: Float64[np.ndarray, "models rows"], group: Int64[np.ndarray, " rows"], intervals: Intervals
+) -> list[Difference]:
+    """Compare every model with the first, the first with itself too."""
+    values = statistics(sizes)
+    means = np.stack([np.bincount(group, row) for row in sizes]) / np.bincount(group)
+    return [
+        Difference(
+            statistics=dict(zip(STATISTICS, (values[:, model] - values[:, 0]).tolist(), strict=True)),
+            intervals=_by_name(intervals.difference[:, model]),
+            test=signed_rank(mean - means[0]),
+            better_share=float((mean < means[0]).mean()),
+        )
+        for model, mean in enumerate(means)
+    ]
+
+
+def _by_name(ends: Float64[np.ndarray, "statistics 2"]) -> dict[str, Interval | None]:
+    pairs = [None if np.isnan(low) else (float(low), float(high)) for low, high in ends]
+    return dict(zip(STATISTICS, pairs, strict=True))
+
+
+def _some(errors: Float64[Tensor, "rows 3"], rows: Bool[Tensor, " rows"] | None) -> dict[str, float]:
+    """Compute the statistics of some rows; nothing where there are none."""
+    return {} if rows is None or not bool(rows.any()) else error_statistics(errors[rows].norm(dim=-1))
+
+
+def _with_units(errors: Sequence[QuantityErrors], name: str) -> dict[str, Any]:
+    return {f"{key}_{one.unit}": value for one in errors for key, value in getattr(one, name).items()}

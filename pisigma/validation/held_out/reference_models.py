@@ -1,0 +1,84 @@
+"""What a model is compared with: the robot as drawn, and the geometric calibration under a hybrid."""
+
+from dataclasses import replace
+
+import torch
+
+from pisigma.calibration.geometric.calibrator import GeometricCalibrator
+from pisigma.files.errors import IdentificationError, ModelError
+from pisigma.measurement.dataset import Measurements
+from pisigma.model.calibrated_model import CalibratedModel
+from pisigma.model.row_poses import poses_of_rows
+from pisigma.validation.held_out.trained_calibrations import base_and_tool
+
+
+def nominal_model(model: CalibratedModel, turned: bool) -> CalibratedModel:
+    """The robot as drawn, with the base and tool that suit it best.
+
+    Base and tool of an identified geometry go with that geometry and would make the drawn arm look worse than it is.
+    So they are fitted anew, to where the model says that the targets were at the joint values that it keeps of its
+    training rows; what the model is judged on plays no part. A model with nominal geometry has them already.
+
+    Args:
+        model: a model of any kind.
+        turned: whether orientations will be judged; then they are fitted too.
+
+    Raises:
+        ModelError: the model does not keep enough joint values to fit base and tool.
+    """
+    if model.calibrated is None:
+        return replace(model, network=None, domain=None)
+    try:
+        fitted = base_and_tool(GeometricCalibrator(model.robot)).fit(_predicted(model, turned))
+    except IdentificationError as problem:
+        raise ModelError(
+            f"model {model.name}: base and tool of the robot as drawn cannot be fitted to the {len(model.starts)} "
+            f"joint values that it keeps ({' '.join(str(problem).rstrip('.').split())}); compare models by name."
+        ) from problem
+    robot = model.robot.with_geometry(base=fitted.robot.base, tool=fitted.robot.tool)
+    return replace(
+        geometric_model(model),
+        robot=robot,
+        calibrated=robot,
+        bases=dict(fitted.bases),
+        tools=dict(fitted.tools),
+    )
+
+
+def geometric_model(model: CalibratedModel) -> CalibratedModel:
+    """The geometric calibration that a hybrid builds upon; of another identified geometry the model itself.
+
+    Raises:
+        ModelError: the model has no identified geometry.
+    """
+    if model.calibrated is None:
+        raise ModelError(
+            f"model {model.name} ({model.kind}) has no identified geometry; calibrate with `pisigma calibrate`."
+        )
+    return replace(
+        model,
+        kind="geometric_calibration",
+        network=None,
+        domain=None,
+        hybrid=None,
+        hybrid_bases={},
+        hybrid_tools={},
+        uncertainty=None,
+    )
+
+
+def _predicted(model: CalibratedModel, turned: bool) -> Measurements:
+    """Predicted rows at the kept joint values: every frame with the first target, every target in the first frame."""
+    frames, targets = tuple(model.bases) or ("",), tuple(model.tools) or ("",)
+    pairs = [(frame, targets[0]) for frame in frames] + [(frames[0], target) for target in targets[1:]]
+    count = len(model.starts)
+    rows = Measurements(
+        q=model.starts.repeat(len(pairs), 1),
+        frame=tuple(frame for frame, _ in pairs for _ in range(count)),
+        target=tuple(target for _, target in pairs for _ in range(count)),
+        source=model.name,
+    )
+    with torch.no_grad():
+        T = poses_of_rows(model, rows)
+    rotation = T[:, :3, :3].contiguous() if turned else None
+    return replace(rows, position=T[:, :3, 3].contiguous(), rotation=rotation)

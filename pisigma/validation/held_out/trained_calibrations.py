@@ -1,0 +1,298 @@
+"""Calibrations that are judged side by side, trained on the same rows, and what of the others they can predict."""
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import torch
+from jaxtyping import Float64
+from torch import Tensor
+
+from pisigma.calibration.geometric.calibrator import GeometricCalibrator
+from pisigma.calibration.geometric.result import CalibrationResult
+from pisigma.calibration.hybrid.calibrator import HybridCalibrator
+from pisigma.calibration.hybrid.result import HybridResult
+from pisigma.estimation.loss import SquaredLoss
+from pisigma.files.errors import IdentificationError
+from pisigma.files.progress import Progress
+from pisigma.measurement.dataset import Measurements
+from pisigma.measurement.sensors.socket import PairOfSockets, SocketSensor
+from pisigma.measurement.splits import TrainTest
+from pisigma.robot.description import Robot
+from pisigma.validation.held_out.validation_figures import (
+    MODELS,
+    DistanceFigures,
+    SocketDistances,
+    StatedDistance,
+)
+
+Calibrator = GeometricCalibrator | HybridCalibrator
+Result = CalibrationResult | HybridResult
+
+
+def geometric_of(calibrator: Calibrator) -> GeometricCalibrator:
+    """The geometric calibrator, or the one that a hybrid builds upon."""
+    return calibrator.geometric if isinstance(calibrator, HybridCalibrator) else calibrator
+
+
+def geometric_result(result: Result) -> CalibrationResult:
+    """The geometric calibration, or the one that a hybrid builds upon."""
+    return result.geometric if isinstance(result, HybridResult) else result
+
+
+def fit(calibrator: Calibrator, rows: Measurements, progress: Progress) -> Result:
+    """Calibrate; see the calibrators' `fit`.
+
+    Args:
+        calibrator: of either kind.
+        rows: to calibrate with.
+        progress: called with what a hybrid tries.
+    """
+    return (
+        calibrator.fit(rows, progress) if isinstance(calibrator, HybridCalibrator) else calibrator.fit(rows)
+    )
+
+
+def trained(
+    calibrator: Calibrator,
+    rows: Measurements,
+    progress: Progress = lambda what: None,
+    result: Result | None = None,
+) -> dict[str, Result]:
+    """Give the calibrations of some rows that are compared, by name.
+
+    Args:
+        calibrator: of either kind.
+        rows: to calibrate with.
+        progress: called with what is being tried.
+        result: what the calibrator gave for these rows; None to calibrate.
+
+    Returns:
+        "nominal": the arm as drawn, base and tool fitted and every row counted in full; "geometric"; and "hybrid"
+        of a hybrid calibrator.
+
+    Raises:
+        IdentificationError: the rows do not determine what is asked for.
+    """
+    nominal = base_and_tool(geometric_of(calibrator)).fit(rows)
+    result = fit(calibrator, rows, progress) if result is None else result
+    results: dict[str, Result] = {"nominal": nominal, "geometric": geometric_result(result)}
+    return results | ({"hybrid": result} if isinstance(result, HybridResult) else {})
+
+
+def base_and_tool(calibrator: GeometricCalibrator) -> GeometricCalibrator:
+    """Give the calibrator of the arm as drawn: only base and tool are fitted, and every row counts in full."""
+    return replace(calibrator, free=(), loss=SquaredLoss())
+
+
+def without_missing(
+    calibrator: Calibrator,
+    rows: Measurements,
+    of: Measurements,
+    left_out: Collection[PairOfSockets] = (),
+) -> Calibrator:
+    """Give the calibrator without stated frames and socket distances that some of the rows lack.
+
+    Args:
+        calibrator: for all rows.
+        rows: those that it will be fitted to.
+        of: all rows; what these lack too stays, so that the calibrator refuses it.
+        left_out: socket distances that it is to do without, too.
+    """
+    if isinstance(calibrator, HybridCalibrator):
+        geometric = without_missing(calibrator.geometric, rows, of, left_out)
+        assert isinstance(geometric, GeometricCalibrator)
+        return replace(calibrator, robot=geometric)
+    no_frame = set(of.frame) - set(rows.frame)
+    no_socket = (set(of.socket or ()) - set(rows.socket or ())) - {""}
+    return replace(
+        calibrator,
+        frames={name: base for name, base in calibrator.frames.items() if name not in no_frame},
+        socket_distances={
+            pair: distance
+            for pair, distance in calibrator.socket_distances.items()
+            if not no_socket & set(pair) and pair not in left_out
+        },
+    )
+
+
+def with_frames(calibrator: GeometricCalibrator, result: Result, rows: Measurements) -> Result:
+    """Fit the bases of frames that a calibration lacks to the rows of these frames, and nothing else.
+
+    Args:
+        calibrator: what gave the geometric calibration.
+        result: the calibration; of a hybrid, the bases of either arm are fitted.
+        rows: held-out rows, some of them in frames that were not calibrated.
+
+    Returns:
+        The calibration with these bases too.
+
+    Raises:
+        IdentificationError: there are several targets, or the rows do not determine where the base is in their frame.
+    """
+    geometric = geometric_result(result)
+    missing = set(rows.frame) - set(geometric.bases)
+    if not missing:
+        return result
+    if len(geometric.tools) > 1:
+        raise IdentificationError(
+            f"frame '{min(missing)}' is held out, which needs a single target, but there are "
+            f"{', '.join(sorted(geometric.tools))}; split by joints or by time."
+        )
+    chosen = torch.tensor([name in missing for name in rows.frame]).nonzero()[:, 0]
+    missed = rows.select(chosen)
+    bases = geometric.bases | _bases(calibrator, geometric.robot, missed)
+    if not isinstance(result, HybridResult):
+        return replace(result, bases=bases)
+    learned = result.learned
+    if learned is not None:
+        with torch.no_grad():
+            moved = replace(missed, q=missed.q + learned.correction.of_rows(missed))
+        learned_bases = learned.geometry.bases | _bases(calibrator, learned.geometry.robot, moved)
+        learned = replace(learned, geometry=replace(learned.geometry, bases=learned_bases))
+    return replace(result, geometric=replace(geometric, bases=bases), learned=learned)
+
+
+def _bases(
+    calibrator: GeometricCalibrator, robot: Robot, rows: Measurements
+) -> dict[str, Float64[np.ndarray, " 6"]]:
+    """Where an arm stands in the frames of some rows; every row counts in full."""
+    frames = set(rows.frame)
+    only_bases = replace(
+        calibrator,
+        robot=robot,
+        free=(),
+        base="free",
+        tool="fixed",
+        loss=SquaredLoss(),
+        frames={name: base for name, base in calibrator.frames.items() if name in frames},
+        socket_distances={},
+    )
+    return only_bases.fit(rows).bases
+
+
+def judgeable(measurements: Measurements, test: Tensor, training: Measurements) -> Tensor:
+    """Say which test rows have a target, and an anchor or its place, that the training rows have too.
+
+    Args:
+        measurements: all rows.
+        test: numbers of the test rows.
+        training: the training rows.
+
+    Returns:
+        One bool per test row.
+
+    Raises:
+        IdentificationError: none has.
+    """
+    targets, anchors = set(training.target), {*(training.anchor or ()), ""}
+    names = measurements.anchor or ("",) * measurements.rows
+    place = measurements.anchor_place
+    placed = torch.zeros(len(test), dtype=torch.bool) if place is None else place[test].isfinite().all(-1)
+    rows = test.tolist()
+    rows_judged = [
+        measurements.target[row] in targets and (names[row] in anchors or is_placed)
+        for row, is_placed in zip(rows, placed.tolist(), strict=True)
+    ]
+    if not any(rows_judged):
+        raise IdentificationError(
+            f"{measurements.place(rows[0])}: neither this row nor any other that is held out with it has a target and "
+            "an anchor that other rows have; measure more poses with each, or leave out the cross-validation."
+        )
+    return torch.tensor(rows_judged, device=test.device)
+
+
+@dataclass(frozen=True, eq=False)
+class DistanceErrors:
+    """Errors of stated distances.
+
+    Attributes:
+        stated: by the names of two sockets [m].
+        errors: by model, predicted minus stated, in the same order [m].
+    """
+
+    stated: Mapping[PairOfSockets, float] = field(default_factory=dict)
+    errors: Mapping[str, Float64[Tensor, " pairs"]] = field(default_factory=dict)
+
+    @staticmethod
+    def of(
+        poses: Mapping[str, Float64[Tensor, "rows 4 4"]],
+        stated: Mapping[PairOfSockets, float],
+        rows: Measurements,
+    ) -> "DistanceErrors":
+        """Under several calibrations; a socket is where its rows put the ball.
+
+        Args:
+            poses: where calibrations without these distances have the target in every row, by name.
+            stated: the distances.
+            rows: of their sockets, and others.
+        """
+        errors, sockets = {}, tuple({one for pair in stated for one in pair})
+        for model, T in poses.items():
+            centre = {name: SocketSensor.uncalibrated(rows, name, T.detach().cpu(), ()) for name in sockets}
+            errors[model] = torch.tensor(
+                [float((centre[a] - centre[b]).norm()) - distance for (a, b), distance in stated.items()],
+                dtype=torch.float64,
+            )
+        return DistanceErrors(stated, errors)
+
+    @staticmethod
+    def joined(parts: "Sequence[DistanceErrors]") -> "DistanceErrors":
+        """Those of several folds."""
+        there = [part for part in parts if part.stated]
+        stated = {pair: distance for part in there for pair, distance in part.stated.items()}
+        names = there[0].errors if there else ()
+        return DistanceErrors(
+            stated, {name: torch.cat([part.errors[name] for part in there]) for name in names}
+        )
+
+
+def left_out_of_folds(
+    stated: Mapping[PairOfSockets, float], measurements: Measurements, splits: Sequence[TrainTest]
+) -> tuple[dict[PairOfSockets, float], ...]:
+    """Assign every stated distance to one fold, whose calibration does without it.
+
+    That is the fold without rows of one of the sockets, or else, of several folds, each in turn, as long as one
+    distance is left there: without any, a calibration does not determine the scale. One of a socket that no row has is
+    none's, so that the calibrations refuse it.
+    """
+    names = measurements.socket or ()
+    known = [{names[row] for row in train.tolist()} if names else set() for train, _ in splits]
+    folds: tuple[dict[PairOfSockets, float], ...] = tuple({} for _ in splits)
+    for number, (pair, distance) in enumerate(stated.items()):
+        if not set(pair) <= set(names):
+            continue
+        lacking = [fold for fold, sockets in enumerate(known) if not set(pair) <= sockets]
+        fold = lacking[0] if lacking else number % len(splits)
+        left = [one for one in stated if set(one) <= known[fold] and one != pair and one not in folds[fold]]
+        if lacking or (left and len(splits) > 1):
+            folds[fold][pair] = distance
+    return folds
+
+
+def distance_figures(repeats: Sequence[DistanceErrors]) -> SocketDistances | None:
+    """Figures of several repeats in mm; None where no distance was judged."""
+    repeats = [one for one in repeats if one.stated]
+    if not repeats:
+        return None
+    of_each: dict[PairOfSockets, dict[str, list[float]]] = {}
+    for one in repeats:
+        for number, pair in enumerate(one.stated):
+            for name, errors in one.errors.items():
+                of_each.setdefault(pair, {}).setdefault(name, []).append(float(errors[number]) * 1e3)
+    stated = {pair: distance * 1e3 for one in repeats for pair, distance in one.stated.items()}
+    sizes = {
+        name: DistanceFigures(mean_mm=float(errors.mean()) * 1e3, max_mm=float(errors.max()) * 1e3)
+        for name in repeats[0].errors
+        if name in MODELS
+        for errors in [torch.cat([one.errors[name] for one in repeats]).abs()]
+    }
+    each = tuple(
+        StatedDistance(
+            sockets=pair,
+            stated_mm=stated[pair],
+            errors_mm={name: sum(values) / len(values) for name, values in errors.items()},
+        )
+        for pair, errors in sorted(of_each.items())
+    )
+    return SocketDistances.model_validate({"count": len(each), **sizes, "each": each})

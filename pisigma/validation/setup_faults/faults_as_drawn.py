@@ -1,0 +1,210 @@
+"""Setup faults that show with the robot as drawn, base and tool being fitted under every hypothesis."""
+
+import math
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+
+import numpy as np
+import torch
+from jaxtyping import Float64, Int64
+from torch import Tensor
+
+from pisigma.calibration.geometric.calibrator import GeometricCalibrator
+from pisigma.files.errors import IdentificationError
+from pisigma.measurement.dataset import Measurements
+from pisigma.measurement.groups import numbers_of_names
+from pisigma.robot.description import Robot
+from pisigma.robot.kinematics.forward import forward_kinematics
+from pisigma.robot.kinematics.parameter_jacobian import identification_jacobian
+from pisigma.robot.robot_class import HOBBY
+from pisigma.validation.held_out.frames.frame_fits import LEVER_SHARE, MeasuredPoses
+from pisigma.validation.setup_faults.arm import PredictingArm
+from pisigma.validation.setup_faults.cause import Cause
+from pisigma.validation.setup_faults.explanations import (
+    AS_GOOD,
+    hypotheses,
+    in_frames,
+    largest_explained,
+    simplest,
+)
+from pisigma.validation.setup_faults.free_joint import freed_joints
+from pisigma.validation.setup_faults.hypothesis import Hypothesis
+from pisigma.validation.setup_faults.row_faults import MARGIN, explains_nothing, shifted_rows
+from pisigma.validation.setup_faults.setup_fault import SetupFault, fault_of
+from pisigma.validation.setup_faults.target_faults import better_labellings, fit_targets
+
+MOST_ROWS = 1_000
+"""Rows that explanations are tried on, spread over all of them."""
+MOST_ROWS_AS_DRAWN = 150
+"""The same of the robot as drawn, where base and tool are fitted to them under every hypothesis."""
+FEWEST_ROWS_AS_DRAWN = 24
+"""Base and tool, as 39 unknowns of an affine fit, leave too few of the values of fewer rows."""
+LARGEST_ZERO = 3 * HOBBY.largest.joint_offset
+"""[rad] Zeros of joints are not further off."""
+LARGEST_SLIDE = 3 * HOBBY.largest.length
+"""[m] The same of joints that slide."""
+USUAL = 1e-3
+"""Usual prior standard deviation of geometric errors [m and rad]."""
+
+
+def find_faults_as_drawn(robot: Robot, measurements: Measurements) -> tuple[SetupFault, ...]:
+    """Find what makes the errors of the robot as drawn collapse to a quarter or less, the simplest first.
+
+    Base and tool are fitted to the rows as they are and under every hypothesis: those of `find_setup_faults`, rows
+    shifted from one row on, several targets under one name, and a joint whose logged values are not those that it
+    had. They are tried where the errors are larger than geometric errors of the usual prior (1 mm, 1 mrad) make those
+    of the robot as drawn. There a true explanation leaves these usual errors, a tenth or less of what faults make.
+
+    Args:
+        robot: as drawn.
+        measurements: rows; those with positions in the frame and of the target that most are of are judged.
+
+    Returns:
+        Nothing where the errors are usual, or where nothing explains them.
+    """
+    rows = largest_group(measurements)
+    if rows.rows < FEWEST_ROWS_AS_DRAWN:
+        return ()
+    chosen = spread(torch.arange(MARGIN, rows.rows - MARGIN), MOST_ROWS_AS_DRAWN)
+    some, arm = rows.select(chosen), PredictingArm(robot)
+    measured = MeasuredPoses.of(some, LEVER_SHARE * robot.reach)
+    raw = Hypothesis(some.q, arm.poses(some), measured)
+    here, usual = next(in_frames(arm, some, raw)), usual_error(robot, some.q)
+    if len(set(measurements.target)) > 1:
+        named = _named_otherwise(robot, measurements, usual)
+        if named or not here.error > usual:
+            return named
+    if not here.error > usual:
+        return ()
+    most = largest_explained(here, robot.reach)
+    tried = [
+        *hypotheses(arm, some, raw, most),
+        *_with_joints(arm, shifted_rows(arm, rows, chosen, measured), most),
+    ]
+    faults = simplest(tried, most)
+    if not faults and not are_unrelated(robot, rows):
+        freed = ((q, measured, cause) for q, cause in freed_joints(arm, some, measured))
+        faults = simplest(_with_joints(arm, freed, most, values=1) + _labelled(robot, some, measured), most)
+    if faults:
+        faults = _better_than_zeros(faults, _error_with_zeros(robot, some, measured), usual)
+    return tuple(fault_of(here, other, float("nan")) for other in faults)
+
+
+def _better_than_zeros(faults: Sequence[Hypothesis], error: float, usual: float) -> list[Hypothesis]:
+    """Keep the faults that explain the rows better than other zeros of all joints do, which a calibration finds.
+
+    Zeros of single joints are kept too where they leave no more than usual errors.
+
+    Args:
+        faults: that were found.
+        error: what is left with other zeros [m].
+        usual: errors of a healthy robot as drawn [m].
+    """
+    return [
+        fault
+        for fault in faults
+        if AS_GOOD * fault.error < error
+        or (all(cause.kind == "joint_zero" for cause in fault.causes) and fault.error <= max(usual, error))
+    ]
+
+
+def _error_with_zeros(robot: Robot, rows: Measurements, measured: MeasuredPoses) -> float:
+    """Root mean square of the errors [m] with the zeros of all joints fitted; infinite where they move too far."""
+    try:
+        fitted = GeometricCalibrator(robot, free="joint_offsets", prior=None).fit(rows).robot
+    except IdentificationError:
+        return math.inf
+    moved = (fitted.dh - robot.dh)[:, :2]
+    if np.abs(moved[:, 0]).max() > LARGEST_ZERO or np.abs(moved[:, 1]).max() > LARGEST_SLIDE:
+        return math.inf
+    arm = PredictingArm(robot.with_geometry(dh=fitted.dh))
+    here = next(in_frames(arm, rows, Hypothesis(rows.q, arm.poses(rows), measured)))
+    return replace(here, fitted=here.fitted + robot.dof).error
+
+
+def _named_otherwise(robot: Robot, measurements: Measurements, usual: float) -> tuple[SetupFault, ...]:
+    """Find better names for the targets of the frame that most rows are of, where errors are larger than usual [m]."""
+    rows = largest_group(measurements, by_target=False)
+    rows = rows.select(spread(torch.arange(rows.rows), MOST_ROWS))
+    measured, T = MeasuredPoses.of(rows, LEVER_SHARE * robot.reach), forward_kinematics(robot, rows.q)
+    here = Hypothesis(rows.q, fit_targets(T, measured, numbers_of_names(rows.target))[1], measured)
+    if not here.error > usual:
+        return ()
+    most = largest_explained(here, robot.reach)
+    return tuple(
+        fault_of(here, other, float("nan")) for other in simplest(_labelled(robot, rows, measured), most)
+    )
+
+
+def _labelled(robot: Robot, rows: Measurements, measured: MeasuredPoses) -> list[Hypothesis]:
+    """Make hypotheses of other names of targets."""
+    return [
+        Hypothesis(rows.q, one.T, measured, (one.cause,), 3 * one.targets)
+        for one in better_labellings(robot, rows, measured)
+    ]
+
+
+def _with_joints(
+    arm: PredictingArm,
+    tried: Iterable[tuple[Float64[Tensor, "rows dof"], MeasuredPoses, Cause]],
+    most: float,
+    values: int = 0,
+) -> list[Hypothesis]:
+    """Make hypotheses of joint values of the robot as drawn, of which every row has some values of its own."""
+    return [
+        other
+        for q, measured, cause in tried
+        for rows in [Measurements(q=q)]
+        for other in in_frames(
+            arm, rows, Hypothesis(q, arm.poses(rows), measured, (cause,), values * len(q)), most
+        )
+    ]
+
+
+def are_unrelated(robot: Robot, measurements: Measurements) -> bool:
+    """Say whether positions have nothing to do with the joint values of their rows, as where one side was sorted."""
+    rows = largest_group(measurements)
+    if rows.rows < FEWEST_ROWS_AS_DRAWN:
+        return False
+    rows = rows.select(spread(torch.arange(rows.rows), MOST_ROWS_AS_DRAWN))
+    assert rows.position is not None
+    spread_out = float((rows.position - rows.position.mean(0)).square().sum(1).mean().sqrt())
+    return spread_out > usual_error(robot, rows.q) and explains_nothing(
+        forward_kinematics(robot, rows.q), rows.position
+    )
+
+
+def usual_error(robot: Robot, q: Float64[Tensor, "rows dof"]) -> float:
+    """Compute the root mean square of the position errors [m] that geometric errors of 1 mm and 1 mrad make.
+
+    Their covariance is `J P J^T` for the derivative `J` of the position by the parameters of all rows and the prior
+    covariance `P`; that base and tool take a part of it is left out.
+    """
+    J = identification_jacobian(robot, q)[1][:, :3, : 5 * len(robot.rows)]
+    return USUAL * float(J.square().sum((1, 2)).mean().sqrt())
+
+
+def measured_rows(measurements: Measurements) -> Int64[Tensor, " rows"]:
+    """List the rows with a position."""
+    assert measurements.position is not None
+    return torch.isfinite(measurements.position).all(-1).nonzero()[:, 0]
+
+
+def largest_group(measurements: Measurements, by_target: bool = True) -> Measurements:
+    """Select the rows with positions of the frame (and target) that most are of; none where none was measured."""
+    if measurements.position is None:
+        return measurements.select(torch.arange(0))
+    rows = measured_rows(measurements)
+    names = [
+        (measurements.frame[row], measurements.target[row] if by_target else "") for row in rows.tolist()
+    ]
+    most = Counter(names).most_common(1)[:1]
+    group = measurements.select(rows[torch.tensor([name == most[0][0] for name in names], dtype=torch.bool)])
+    return replace(group, pair=None, distance=None)
+
+
+def spread(rows: Int64[Tensor, " rows"], most: int) -> Int64[Tensor, " chosen"]:
+    """Choose some of the rows, spread over them."""
+    count = min(len(rows), most)
+    return rows[torch.linspace(0, len(rows) - 1, count).round().long()]

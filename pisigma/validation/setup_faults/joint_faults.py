@@ -1,0 +1,316 @@
+"""Setup faults of joint columns: order, sign, unit and zero, as maps of logged joint values that are tried on rows."""
+
+import itertools
+import math
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from jaxtyping import Float64, Int64
+from torch import Tensor
+
+from pisigma.measurement.dataset import Measurements
+from pisigma.robot.description import Robot
+from pisigma.robot.se3 import wrap_to_pi
+from pisigma.validation.held_out.frames.frame_fits import MeasuredPoses
+from pisigma.validation.setup_faults.arm import PredictingArm
+from pisigma.validation.setup_faults.cause import Cause, joints_text
+
+QUARTER = math.pi / 2
+GRADIANS = 0.9
+"""Degrees in a gradian."""
+ALMOST = math.radians(0.5)
+"""A zero this near to a quarter turn is meant to be there [rad]."""
+MOST_ORDERS = 5040
+"""Of seven joints; with more only two of them are exchanged."""
+MOST_ZEROS = 4**7
+SCREEN_ROWS = 32
+"""Rows that every map is tried on."""
+NOTICED = 2e-5
+"""Errors below this count as none [m]."""
+PROMISING = 0.5
+"""Share of the errors that is left, at most, where a map is looked at again."""
+KEPT = 3
+"""Maps of each kind that are looked at again, at most."""
+NEAR_BEST = 4.0
+"""Maps whose errors are larger than the best by this factor are not."""
+STEPS = 36
+"""A zero is searched on a grid of so many values to either side, which then is made finer."""
+FINER = 7
+"""Times that the grid is made finer."""
+
+
+@dataclass(frozen=True, eq=False)
+class JointMaps:
+    """Maps `q -> matrix · q + offset` of logged joint values to those that the robot had, one per hypothesis.
+
+    Attributes:
+        matrix: what every joint has of each logged column.
+        offset: of each joint [rad or m].
+    """
+
+    matrix: Float64[Tensor, "maps dof dof"]
+    offset: Float64[Tensor, "maps dof"]
+
+    @staticmethod
+    def unchanged(count: int, dof: int) -> "JointMaps":
+        """Return maps that change nothing."""
+        eye = torch.eye(dof, dtype=torch.float64)
+        return JointMaps(eye.repeat(count, 1, 1), torch.zeros(count, dof, dtype=torch.float64))
+
+    @staticmethod
+    def scaled(factors: Float64[Tensor, "maps dof"]) -> "JointMaps":
+        """Multiply the joints by factors."""
+        return JointMaps(torch.diag_embed(factors), torch.zeros_like(factors))
+
+    def of(self, q: Float64[Tensor, "rows dof"]) -> Float64[Tensor, "maps rows dof"]:
+        """Map joint values [rad or m]."""
+        return q @ self.matrix.mT + self.offset[:, None]
+
+    def select(self, index: Int64[Tensor, " chosen"]) -> "JointMaps":
+        """Select some of the maps."""
+        return JointMaps(self.matrix[index], self.offset[index])
+
+
+def signs_and_exchanges(dof: int) -> JointMaps:
+    """List a reversed sign of every joint, and an exchange of two neighbours."""
+    signs = JointMaps.scaled(1 - 2 * torch.eye(dof, dtype=torch.float64))
+    order = torch.arange(dof).repeat(dof - 1, 1)
+    pairs = torch.stack([torch.arange(dof - 1), torch.arange(1, dof)], 1)
+    order = order.scatter(1, pairs, pairs.flip(1))
+    eye = torch.eye(dof, dtype=torch.float64)
+    return JointMaps(
+        torch.cat([signs.matrix, eye[order]]),
+        torch.cat([signs.offset, torch.zeros(dof - 1, dof, dtype=torch.float64)]),
+    )
+
+
+def reversed_signs(dof: int) -> JointMaps:
+    """List all ways to reverse signs."""
+    choices = list(itertools.product((1.0, -1.0), repeat=dof))[1:]
+    return JointMaps.scaled(torch.tensor(choices, dtype=torch.float64))
+
+
+def other_orders(dof: int) -> JointMaps:
+    """List all orders of the joints; of more than seven the exchanges of two."""
+    orders = torch.arange(dof).repeat(math.comb(dof, 2), 1)
+    pairs = torch.combinations(torch.arange(dof))
+    orders = orders.scatter(1, pairs, pairs.flip(1))
+    if math.factorial(dof) <= MOST_ORDERS:
+        orders = torch.tensor(list(itertools.permutations(range(dof)))[1:], dtype=torch.int64).reshape(
+            -1, dof
+        )
+    return JointMaps(torch.eye(dof, dtype=torch.float64)[orders], torch.zeros(len(orders), dof).double())
+
+
+def coupled_joints(dof: int) -> JointMaps:
+    """List all pairs of joints of which one is counted together with the other, as after a belt or from the horizon."""
+    pairs = torch.tensor(list(itertools.permutations(range(dof), 2)), dtype=torch.int64).reshape(-1, 2)
+    pairs, sign = pairs.repeat(2, 1), torch.tensor([1.0, -1.0]).double().repeat_interleave(len(pairs))
+    maps = JointMaps.unchanged(len(pairs), dof)
+    return replace(maps, matrix=maps.matrix.index_put((torch.arange(len(pairs)), *pairs.T), sign))
+
+
+def other_units(robot: Robot) -> JointMaps:
+    """List degrees for radians and the reverse in any joints that turn, mm for m in those that slide, and gradians."""
+    turning = [1.0 if turns else 0.0 for turns in robot.revolute]
+    rows = [[GRADIANS ** (sign * turns) for turns in turning] for sign in (1, -1) if any(turning)]
+    for revolute, per_unit in ((True, math.degrees(1)), (False, 1e3)):
+        joints = [i for i, turns in enumerate(robot.revolute) if turns == revolute]
+        for count in range(1, len(joints) + 1):
+            for some in itertools.combinations(joints, count):
+                rows += [
+                    [factor if i in some else 1.0 for i in range(robot.dof)]
+                    for factor in (per_unit, 1 / per_unit)
+                ]
+    return JointMaps.scaled(torch.tensor(rows, dtype=torch.float64).reshape(len(rows), robot.dof))
+
+
+def quarter_turned_zeros(robot: Robot, inner: bool = False) -> JointMaps:
+    """List zeros moved by quarter turns of any joints that turn; of one joint at a time where these are too many.
+
+    Args:
+        robot: with the joints.
+        inner: leave out the first and the last joint, whose zeros a base and a tool that are fitted take up.
+    """
+    turning = [i for i, revolute in enumerate(robot.revolute) if revolute]
+    turning = [i for i in turning if not inner or 0 < i < robot.dof - 1]
+    if 4 ** len(turning) <= MOST_ZEROS:
+        choices = np.array(list(itertools.product((0, 1, 2, -1), repeat=len(turning)))[1:])
+    else:
+        choices = np.concatenate([k * np.eye(len(turning)) for k in (1, 2, -1)])
+    offset = np.zeros((len(choices), robot.dof))
+    offset[:, turning] = choices * QUARTER
+    return replace(JointMaps.unchanged(len(choices), robot.dof), offset=torch.from_numpy(offset))
+
+
+def moved_zeros(joints: Int64[Tensor, " maps"], by: Float64[Tensor, " maps"], dof: int) -> JointMaps:
+    """Move the zero of one joint by so much [rad or m] in each map."""
+    maps = JointMaps.unchanged(len(joints), dof)
+    return replace(maps, offset=maps.offset.index_put((torch.arange(len(joints)), joints), by))
+
+
+def joint_causes(maps: JointMaps, number: int, robot: Robot) -> tuple[Cause, ...]:
+    """Say what a map takes to be wrong with the joint columns."""
+    matrix, offset = maps.matrix[number], maps.offset[number].tolist()
+    order = matrix.abs().argmax(1).tolist()
+    factor = [row[column] for row, column in zip(matrix.tolist(), order, strict=True)]
+    if int((matrix != 0).sum()) > robot.dof:
+        return (_coupling_cause(matrix.tolist(), robot),)
+    causes = []
+    moved = tuple(i for i, column in enumerate(order) if column != i)
+    advice = "check the order of the joint columns"
+    if len(moved) == 2:
+        clause = f"the columns of {joints_text(moved)} are swapped"
+        causes.append(Cause("joint_order", clause, advice, 1.0, moved))
+    elif moved:
+        columns = ", ".join(f"q{column + 1}" for column in order)
+        clause = f"the joint columns stand in another order (joints 1 to {robot.dof} are in {columns})"
+        causes.append(Cause("joint_order", clause, advice, 2.0, moved))
+    if negative := tuple(i for i, value in enumerate(factor) if value < 0):
+        signs = "the sign of {} is reversed" if len(negative) == 1 else "the signs of {} are reversed"
+        clause = signs.format(joints_text(negative))
+        advice = "check the directions of the joints"
+        causes.append(Cause("joint_sign", clause, advice, float(len(negative)), negative))
+    causes.extend(_unit_causes(factor, robot))
+    if zeros := tuple(i for i, value in enumerate(offset) if value):
+        causes.append(_zero_cause(zeros, offset, robot))
+    return tuple(causes)
+
+
+def _coupling_cause(matrix: list[list[float]], robot: Robot) -> Cause:
+    joint, other, share = next(
+        (i, j, share) for i, row in enumerate(matrix) for j, share in enumerate(row) if i != j and share
+    )
+    logged = f"q{joint + 1} {'+' if share < 0 else '-'} q{other + 1}"
+    clause = (
+        f"{joints_text(tuple(sorted((joint, other))))} are coupled: joint {joint + 1} is logged as {logged}"
+    )
+    advice = (
+        "state the coupling in the robot file, or log the angles between the links"
+        if robot.coupling is None
+        else "log what the controller shows, or correct the coupling that the robot file states"
+    )
+    return Cause("joint_coupling", clause, advice, 1.0, (joint, other))
+
+
+def _unit_causes(factor: list[float], robot: Robot) -> list[Cause]:
+    causes = []
+    for revolute, small, large in ((True, "degrees", "radians"), (False, "millimetres", "metres")):
+        joints = [i for i, turns in enumerate(robot.revolute) if turns == revolute]
+        for too_large in (True, False):
+            wrong = tuple(i for i in joints if abs(factor[i]) != 1 and (abs(factor[i]) < 1) == too_large)
+            if wrong:
+                named, are = (large, small) if too_large else (small, large)
+                if GRADIANS <= abs(factor[wrong[0]]) <= 1 / GRADIANS:
+                    named, are = ("degrees", "gradians") if too_large else ("gradians", "degrees")
+                clause = f"the values of {joints_text(wrong)} are {are} that are named {named}"
+                size = 1.0 if list(wrong) == joints else len(wrong) + 0.5
+                causes.append(
+                    Cause("joint_unit", clause, "correct the unit in the column names", size, wrong)
+                )
+    return causes
+
+
+def _zero_cause(joints: tuple[int, ...], offset: list[float], robot: Robot) -> Cause:
+    clauses = []
+    size = 0.0
+    for i in joints:
+        turns = robot.revolute[i]
+        by = f"{math.degrees(offset[i]):.4g} deg" if turns else f"{offset[i] * 1e3:.4g} mm"
+        clauses.append(f"joint {i + 1} has moved by {by}")
+        size += 1.25 if turns and is_quarter(offset[i]) else 1.5
+    advice = "check the zeros of the joints"
+    if joints == (0,):
+        advice += " (a measuring frame that is turned about or shifted along the first axis looks the same)"
+    elif joints == (robot.dof - 1,):
+        advice += " (a tool that is turned about or shifted along the last axis looks the same)"
+    return Cause("joint_zero", " and ".join(clauses), advice, size, joints, max(map(abs, offset)))
+
+
+def is_quarter(angle: float) -> bool:
+    """Say whether an angle [rad] is a multiple of a quarter turn."""
+    return abs(math.remainder(angle, QUARTER)) < 1e-12
+
+
+def likely_maps(arm: PredictingArm, measurements: Measurements, measured: MeasuredPoses) -> JointMaps:
+    """Find maps of joint values that may explain what was measured, to be tried with the whole model.
+
+    Thousands of maps are tried on a few rows with the geometry alone; see `PredictingArm.screened_errors`.
+
+    Args:
+        arm: with which is predicted.
+        measurements: rows with positions.
+        measured: their poses.
+    """
+    rows, robot = _screened_rows(measurements), arm.robot
+    some, few = measurements.select(rows), measured.select(rows)
+
+    def errors_of(maps: JointMaps) -> Float64[Tensor, "modes maps"]:
+        return arm.screened_errors(some, maps.of(some.q), few)
+
+    kinds = (
+        other_units(robot),
+        reversed_signs(robot.dof),
+        other_orders(robot.dof),
+        coupled_joints(robot.dof),
+        quarter_turned_zeros(robot, inner=arm.model is None),
+    )
+    tried = [(maps, errors_of(maps)) for maps in kinds]
+    unchanged = errors_of(JointMaps.unchanged(1, robot.dof))[:, 0].tolist()
+    likely: list[JointMaps] = []
+    for mode in range(len(unchanged)):
+        zeros = _best_zeros(robot, lambda maps, mode=mode: errors_of(maps)[mode])  # type: ignore[misc]
+        candidates = [(maps, errors[mode]) for maps, errors in (*tried, (zeros, errors_of(zeros)))]
+        least = min(float(errors.min()) for _, errors in candidates if len(errors))
+        limit = min(PROMISING**2 * unchanged[mode], max(NEAR_BEST**2 * least, NOTICED**2))
+        for maps, errors in candidates:
+            best = errors.argsort()[:KEPT]
+            likely.append(maps.select(best[errors[best] <= limit]))
+    return _distinct(likely)
+
+
+def _screened_rows(measurements: Measurements) -> Int64[Tensor, " chosen"]:
+    """Choose rows of the frame and target that most rows are of, spread over them."""
+    names = list(zip(measurements.frame, measurements.target, strict=True))
+    most = Counter(names).most_common(1)[0][0]
+    rows = torch.tensor([name == most for name in names]).nonzero()[:, 0]
+    count = min(len(rows), SCREEN_ROWS)
+    return rows[torch.linspace(0, len(rows) - 1, count).round().long()]
+
+
+def _best_zeros(robot: Robot, errors_of: Callable[[JointMaps], Float64[Tensor, " maps"]]) -> JointMaps:
+    """Find per joint the zero that explains most, moved by any amount; by a quarter turn where it is almost one."""
+    dof = robot.dof
+    width = torch.tensor(
+        [torch.pi if turns else robot.reach for turns in robot.revolute], dtype=torch.float64
+    )
+    by = torch.zeros(dof, dtype=torch.float64)
+    joints = torch.arange(dof).repeat_interleave(2 * STEPS + 1)
+    grid = torch.linspace(-1, 1, 2 * STEPS + 1, dtype=torch.float64)
+    for _ in range(FINER):
+        tried = by[:, None] + width[:, None] * grid
+        errors = errors_of(moved_zeros(joints, tried.flatten(), dof)).reshape(tried.shape)
+        by = tried.gather(1, errors.argmin(1, keepdim=True))[:, 0]
+        width = width * 2 / STEPS
+    near = (by / QUARTER).round() * QUARTER
+    near = torch.where(near < -1.5 * QUARTER, -near, near)
+    turning = torch.tensor(robot.revolute)
+    by = torch.where(turning & (wrap_to_pi(by - near).abs() < ALMOST) & (near != 0), near, by)
+    return moved_zeros(torch.arange(dof), by, dof)
+
+
+def _distinct(likely: list[JointMaps]) -> JointMaps:
+    """Join all maps that change something, each once."""
+    joined = JointMaps(
+        torch.cat([maps.matrix for maps in likely]), torch.cat([maps.offset for maps in likely])
+    )
+    values = torch.cat([joined.matrix.flatten(1), joined.offset], 1)
+    unchanged = (*torch.eye(joined.offset.shape[1]).flatten().tolist(), *[0.0] * joined.offset.shape[1])
+    first: dict[tuple[float, ...], int] = {}
+    for number, row in enumerate(map(tuple, values.tolist())):
+        if row != unchanged:
+            first.setdefault(row, number)
+    return joined.select(torch.tensor(list(first.values()), dtype=torch.int64))

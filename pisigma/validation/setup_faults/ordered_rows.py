@@ -1,0 +1,152 @@
+"""Residuals of a calibration in the order in which the rows were measured, with their derivatives."""
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+import torch
+from jaxtyping import Float64, Int64
+
+from pisigma.calibration.geometric.initial_guess.initial_guess import chosen_rows
+from pisigma.calibration.geometric.problem.noise import ALWAYS_GOOD, UNDETERMINED, renumbered, view_of
+from pisigma.calibration.geometric.problem.problem import CalibrationProblem
+from pisigma.calibration.geometric.result import CalibrationResult
+from pisigma.calibration.hybrid.result import HybridResult
+from pisigma.joint_correction.fourier_series import FourierSeries
+
+MOST_ROWS = 4_000
+"""So many rows are looked at, drawn from all of them."""
+SENSORS = ("position", "rotation")
+"""Whose values frame and tool shift whatever else is unknown."""
+HARMONICS, JOINT_ERROR = 3, 3e-4
+"""Series of the joint values, with the standard deviation of its weights [rad], that the parameters are joined by: in
+rows that were measured in the order of a joint's values, slow errors of its gear look like a slow motion."""
+OF_A_POSE = 6
+"""Values that a configuration says at most, however many targets and repeats there are: the pose of the tool."""
+
+
+@dataclass(frozen=True, eq=False)
+class OrderedRows:
+    """Residuals of a calibration in the order of the file, with their derivatives, all over the noise.
+
+    Attributes:
+        result: the geometric calibration.
+        problem: of the rows.
+        number: of every row in the measurements.
+        residual: three values a sensor, 0 where nothing was measured.
+        derivative: by all parameters.
+        values: how many values were measured.
+        noise: of every column of values [m or rad], or the factor on what the rows state.
+    """
+
+    result: CalibrationResult
+    problem: CalibrationProblem
+    number: Int64[np.ndarray, " rows"]
+    residual: Float64[np.ndarray, "rows values"]
+    derivative: Float64[np.ndarray, "rows values parameters"]
+    values: int
+    noise: Float64[np.ndarray, " values"]
+
+    @staticmethod
+    def of(result: CalibrationResult | HybridResult) -> "OrderedRows | None":
+        """Of a calibration; None where it has no positions or orientations with noise."""
+        learned = result.learned if isinstance(result, HybridResult) else None
+        geometric = result.geometric if isinstance(result, HybridResult) else result
+        solved = geometric.solved
+        data, view, rows = solved.measurements, view_of(solved.refined), solved.setup.rows.cpu()
+        errors = None if learned is None else result.errors_of(data)
+        present = [sensor.present for sensor in solved.problem.sensors if sensor.name in SENSORS]
+        if not present:
+            return None
+        measured = torch.stack(present).any(0).nonzero()[:, 0].cpu()
+        some = measured[chosen_rows(len(measured), MOST_ROWS)]
+        line = np.zeros(data.rows) if data.origin else np.array(data.line)  # files stand one behind the other
+        some = some[np.lexsort((rows[some].numpy(), line[rows[some]]))]
+        problem = replace(solved.problem, pairs=0).select(some)
+        whole, every = slice(0, len(some)), torch.arange(len(problem.space.parameters))
+        motion = problem.motion(solved.refined.point, whole, every)
+        unknowns = problem.space.sensor_unknowns(solved.refined.point)
+        R = solved.setup.anchors.bases[:, :3, :3][problem.frame]
+        residuals, derivatives, values, noise = [], [], 0, []
+        for k, sensor in enumerate(problem.sensors):
+            sigma = float(view.noise[k]) if learned is None else learned.noise[sensor.name]
+            if sensor.name not in SENSORS or sigma <= ALWAYS_GOOD:
+                continue
+            residual = view.sums[k].residual[:, some]
+            if errors is not None:
+                residual = (R.mT @ errors[sensor.name][rows[some], :, None])[..., 0].t()
+            root = sensor.present / (sigma if sensor.sigma is None else sigma * sensor.sigma)
+            J = problem.derivative(sensor, motion, unknowns, whole, every)
+            residuals.append(torch.where(sensor.present, residual * root, 0.0).t().cpu().numpy())
+            derivatives.append((J * root).permute(2, 1, 0).cpu().numpy())
+            values += int(sensor.present.sum()) * sensor.components
+            noise += [sigma] * sensor.components
+        if not residuals:
+            return None
+        flat = (np.concatenate(residuals, 1), np.concatenate(derivatives, 1))
+        return OrderedRows(geometric, problem, rows[some].numpy(), *flat, values, np.array(noise))
+
+    @cached_property
+    def by_joints(self) -> Float64[np.ndarray, "rows values dof"]:
+        """Derivative by the joint values."""
+        robot = self.problem.space.robot
+        theta_or_d = 5 * np.array(robot.joint_rows) + ~np.array(robot.revolute)
+        derivative: np.ndarray = self.derivative[:, :, theta_or_d] * robot.directions
+        return derivative
+
+    @cached_property
+    def X(self) -> Float64[np.ndarray, "rows values unknowns"]:
+        """Derivative by the parameters of the calibration, and by weights of a series for the joints' errors."""
+        robot = self.problem.space.robot
+        series = FourierSeries(robot, HARMONICS).columns(self.problem.state).cpu().numpy()
+        by_weights = self.by_joints[..., None] * series[:, None]
+        by_weights = by_weights.reshape(*self.residual.shape, -1)
+        return np.concatenate([self.derivative[:, :, self.problem.active.cpu().numpy()], by_weights], 2)
+
+    @cached_property
+    def precision(self) -> Float64[np.ndarray, " unknowns"]:
+        """1 / variance of the parameters by the prior, and of the weights."""
+        robot = self.problem.space.robot
+        active = self.problem.precision[self.problem.active]
+        precision = view_of(self.result.solved.refined).scaled(active, self.problem.prior_group).cpu().numpy()
+        size = JOINT_ERROR * np.where(robot.revolute, 1.0, robot.reach)
+        weights: np.ndarray = np.repeat(size**-2, (self.X.shape[2] - len(precision)) // robot.dof)
+        return np.concatenate([precision, weights])
+
+    @cached_property
+    def covariance(self) -> Float64[np.ndarray, "unknowns unknowns"]:
+        """Of the parameters, every row counting in full."""
+        flat = self.X.reshape(-1, self.X.shape[2])
+        return inverse_of(flat.T @ flat + np.diag(self.precision))
+
+    @cached_property
+    def left(self) -> Float64[np.ndarray, "rows values"]:
+        """What the series of the joints' errors leaves of the residuals."""
+        X, r = self.X.reshape(-1, self.X.shape[2]), self.residual.ravel()
+        left: np.ndarray = r - X @ (self.covariance @ (X.T @ r))
+        return left.reshape(self.residual.shape)
+
+    @cached_property
+    def used(self) -> float:
+        """Number of values that the calibration used up."""
+        return float((self.X * (self.X @ self.covariance)).sum())
+
+    @cached_property
+    def configuration(self) -> Int64[np.ndarray, " rows"] | None:
+        """Number of every row's joint values and frame, or target too; None where all rows differ."""
+        group = self.problem.pose if self.problem.configuration is None else self.problem.configuration
+        return None if group is None else renumbered(group).cpu().numpy()
+
+    @property
+    def independent(self) -> float:
+        """Values left after the calibration, those of one configuration counting as a pose at most."""
+        count = len(self.residual) if self.configuration is None else int(self.configuration.max()) + 1
+        return min(self.values, OF_A_POSE * count) - self.used
+
+
+def inverse_of(normal: Float64[np.ndarray, "unknowns unknowns"]) -> Float64[np.ndarray, "unknowns unknowns"]:
+    """Invert a normal matrix with column scaling; directions that it does not hold get no variance."""
+    scale = 1 / np.sqrt(np.maximum(normal.diagonal(), 1e-300))
+    scales = scale * scale[:, None]
+    inverse: np.ndarray = np.linalg.pinv(normal * scales, rcond=UNDETERMINED, hermitian=True) * scales
+    return inverse

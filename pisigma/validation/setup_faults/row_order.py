@@ -1,0 +1,377 @@
+"""Whether frame or tool moved while the rows were measured: residuals, tested against the order of the rows."""
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Literal
+
+import numpy as np
+import torch
+from jaxtyping import Float64, Int64
+from numpy.polynomial.legendre import legvander
+
+from pisigma.calibration.geometric.result import CalibrationResult
+from pisigma.calibration.hybrid.result import HybridResult
+from pisigma.estimation.loss import HampelLoss
+from pisigma.validation.setup_faults.ordered_rows import OrderedRows, inverse_of
+
+FEWEST_ROWS = 3
+"""Measured before and after a motion, at least."""
+MOST_USED = 0.8
+"""Share of the values that parameters and motions may use up, or the fit follows the noise, whose size it finds."""
+DEGREES = (1, 3, 6)
+"""Of the polynomials in the share of the rows that were measured which slow motions follow."""
+AS_LIKELY = 0.5
+"""Share of the largest log Bayes factor from which on a motion where a frame begins explains the residuals as well."""
+CAP = 3.0
+"""Residuals longer than so many times their upper quartile count as so long while the row of a motion is sought."""
+ROUNDS = 6
+"""Of reweighting at most."""
+SETTLED = 1e-2
+"""Weights and the noise have settled that change by less."""
+_LOSS = HampelLoss()
+_Moved = Literal["frame", "target", "tool"]
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """A rigid motion of a frame or of a tool while the rows were measured.
+
+    Attributes:
+        moved: "frame", "target" (one of several on the tool) or "tool".
+        name: of the frame or the target.
+        rows: numbers of its rows in the measurements, in the order of the file.
+        first: index in `rows` of the first row that moved; None where it moves slowly all the time.
+        shift: mean shift of the measured points after the motion [m], in their frame, or of a tool in that of the
+            flange; of a slow motion the largest one since the first row.
+        turn: angle by which frame or tool are turned [rad]; of a slow motion likewise.
+        log_bayes_factor: logarithm of the odds of the motion against none, if both were as likely before.
+        factor: how many times as large as without the motion the errors of the rows are.
+        begins_frame: whether a target or the tool has moved just where rows of another frame begin.
+    """
+
+    moved: _Moved
+    name: str
+    rows: Int64[np.ndarray, " rows"]
+    first: int | None
+    shift: Float64[np.ndarray, " 3"]
+    turn: float
+    log_bayes_factor: float
+    factor: float
+    begins_frame: bool = False
+
+
+def find_motion(result: CalibrationResult | HybridResult) -> Motion | None:
+    """Find the motion of frame or tool that explains the residuals of a calibration best, likely or not.
+
+    A frame or a tool that is moved from row k on shifts the values of these rows by `Z_i m` with six numbers m. The
+    residuals r of the calibration, linear in its parameters and in a short series of the joint values, x, say how
+    likely that is: `r = X x + Z_k m + e`. How much of them is explained has a closed form for every k, from sums over
+    the rows behind it; far-off residuals are cut off for that. The best k is then fitted with far-off rows counting
+    less. Slow motions `Σ P_d(t) m_d`, polynomials of the share t of the rows that were measured, are fitted likewise.
+
+    The Bayes factor is that of Zellner's g-prior for m with unit information (Liang et al. 2008, JASA 103, 410-423,
+    eq. 6), over the number of rows k that were tried. What neighbours in the order of the rows have in common, because
+    the geometry does not explain everything and they were measured along a path, or repeat a pose, is no independent
+    value: their number is divided by the sum of the autocorrelations (Geyer 1992, Statistical Science 7, 473-483) or by
+    the design effect of repeated poses (Kish 1965), whichever is larger; and by how many times fewer principal
+    components than values the residuals of a row have, `values · tr(C²) / tr(C)²` with their covariance C.
+
+    Returns:
+        None where no position or orientation was measured, or there are too few rows.
+    """
+    rows = OrderedRows.of(result)
+    if rows is None:
+        return None
+    search = _Search(rows)
+    fits = [search.fit(candidate) for candidate in search.candidates()]
+    # Which one it is: as if values were independent, as what a wrong candidate leaves is correlated.
+    odds = [search.log_bayes_factor(fit, 1.0) for fit in fits]
+    if not fits:
+        return None
+    best = int(np.argmax(odds))
+    motion, chosen = search.motion(fits[best]), fits[best].candidate
+    starts = search.frame_starts(chosen)
+    alike = (search.log_bayes_factor(search.reweighted(one), 1.0) > AS_LIKELY * odds[best] for one in starts)
+    return replace(motion, begins_frame=any(alike))
+
+
+@dataclass(frozen=True, eq=False)
+class _Candidate:
+    """What may have moved.
+
+    Attributes:
+        moved: see `Motion`.
+        number: of the frame or the target.
+        index: of its rows, in the order of the file.
+        full: derivative by its motion.
+        course: share of every motion that a row has made: 0 or 1 where it moved at once.
+        first: see `Motion`.
+    """
+
+    moved: _Moved
+    number: int
+    index: Int64[np.ndarray, " own"]
+    full: Float64[np.ndarray, "own values motion"]
+    course: Float64[np.ndarray, "own courses"]
+    first: int | None = None
+
+    @cached_property
+    def columns(self) -> Float64[np.ndarray, "own values motions"]:
+        """Derivative by all its motions."""
+        return np.concatenate([self.full * course[:, None, None] for course in self.course.T], 2)
+
+    @property
+    def tried(self) -> int:
+        """How many candidates it was chosen from."""
+        return 1 if self.first is None else len(self.index) - 2 * FEWEST_ROWS
+
+    def from_row(self, first: int) -> "_Candidate":
+        """The same moved from a row on."""
+        return replace(self, first=first, course=(np.arange(len(self.index)) >= first)[:, None] * 1.0)
+
+
+@dataclass(frozen=True, eq=False)
+class _Fit:
+    """A candidate fitted together with the parameters of the calibration, far-off rows counting less.
+
+    Attributes:
+        candidate: what was fitted.
+        motion: its motions.
+        after: residuals that are left.
+        scale: standard deviation of one of them, per sensor.
+        effective: how many unknowns the values determine, the motions among them.
+    """
+
+    candidate: _Candidate
+    motion: Float64[np.ndarray, " motions"]
+    after: Float64[np.ndarray, "rows values"]
+    scale: tuple[float, ...]
+    effective: float
+
+    @property
+    def shifts(self) -> Float64[np.ndarray, "own values"]:
+        """What the motion makes of the rows' values."""
+        shifts: np.ndarray = self.candidate.columns @ self.motion
+        return shifts
+
+    @property
+    def weights(self) -> Float64[np.ndarray, "rows values"]:
+        """How much every value counts."""
+        return _by_sensor(self.after, self.scale, _LOSS.weight)
+
+    def costs(self, residual: Float64[np.ndarray, "rows values"]) -> Float64[np.ndarray, " rows"]:
+        """What every row costs with some residuals."""
+        cost: np.ndarray = _by_sensor(residual, self.scale, _LOSS.cost).sum(1) / 3
+        return cost
+
+
+@dataclass(frozen=True, eq=False)
+class _Search:
+    """Fits motions to the residuals of a calibration.
+
+    Attributes:
+        rows: the residuals.
+    """
+
+    rows: OrderedRows
+
+    def candidates(self) -> Iterator[_Candidate]:
+        """Everything that may have moved: at once, from the row on that explains most, or slowly."""
+        lengths = np.linalg.norm(self.rows.residual, axis=1)
+        longest = CAP * np.quantile(lengths, 0.75)
+        cut = self.rows.residual * np.minimum(1.0, longest / np.maximum(lengths, 1e-300))[:, None]
+        for candidate in self._rigid():
+            count = len(candidate.index)
+            if count > 2 * FEWEST_ROWS:
+                yield candidate.from_row(self._best_step(cut, candidate))
+                time = (2 * np.arange(count) + 1) / count - 1
+                for degree in DEGREES:
+                    yield replace(candidate, course=legvander(time, degree)[:, 1:])
+
+    def frame_starts(self, candidate: _Candidate) -> Iterator[_Candidate]:
+        """The same motion at once of a target or the tool, where rows of another frame begin."""
+        frame = self.rows.problem.frame.cpu().numpy()[candidate.index]
+        changes = np.flatnonzero(np.diff(frame)) + 1
+        if candidate.moved != "frame" and len(changes) < len(self.rows.problem.space.frames):
+            yield from (candidate.from_row(int(first)) for first in changes)
+
+    def _rigid(self) -> Iterator[_Candidate]:
+        """Frames, targets where there are several, and the tool with all of them."""
+        space = self.rows.problem.space
+        tool: _Moved = "target" if len(space.targets) > 1 else "tool"
+        kinds: tuple[tuple[_Moved, torch.Tensor, tuple[str, ...]], ...] = (
+            ("frame", self.rows.problem.frame, space.frames),
+            (tool, self.rows.problem.target, space.targets),
+        )
+        for kind, groups, names in kinds:
+            group = groups.cpu().numpy()
+            first = space.of("base" if kind == "frame" else "tool").start
+            columns = first + 6 * group[:, None] + np.arange(6)
+            Z = np.take_along_axis(self.rows.derivative, columns[:, None], 2)
+            turning = kind == "frame" or self.rows.residual.shape[1] > 3
+            for number in range(len(names)):
+                index = np.flatnonzero(group == number)
+                own = Z[index] if turning else Z[index][:, :, :3]
+                yield _Candidate(kind, number, index, own, np.ones((len(index), 1)))
+        if len(space.targets) > 1:
+            arms = space.split(self.rows.result.solved.refined.point)[2][:, :3].cpu().numpy()[group]
+            lever = np.cross(np.eye(3)[:, None], arms)  # e_k × p, (3, rows, 3)
+            turned = np.einsum("nvx,knx->nvk", Z[:, :, :3], lever)
+            both = np.concatenate([Z[:, :, :3], turned], 2)
+            yield _Candidate("tool", 0, np.arange(len(group)), both, np.ones((len(group), 1)))
+
+    def _best_step(self, residual: Float64[np.ndarray, "rows values"], candidate: _Candidate) -> int:
+        """The row from which on a motion explains most of the residuals, in closed form for all rows."""
+        index, Z, X = candidate.index, candidate.full, self.rows.X[candidate.index]
+
+        def behind(terms: np.ndarray) -> np.ndarray:
+            """Sums over the rows from every row on."""
+            sums: np.ndarray = terms[::-1].cumsum(0)[::-1]
+            return sums
+
+        ZX, ZZ = behind(np.einsum("nvm,nva->nma", Z, X)), behind(np.einsum("nvm,nvk->nmk", Z, Z))
+        pull = np.einsum("nva,nv->a", self.rows.X, residual)
+        gain = behind(np.einsum("nvm,nv->nm", Z, residual[index])) - ZX @ self.rows.covariance @ pull
+        scale = 1 / np.sqrt(np.maximum(ZZ[0].diagonal(), 1e-300))
+        information = (ZZ - ZX @ self.rows.covariance @ ZX.transpose(0, 2, 1)) * scale * scale[:, None]
+        solution = np.linalg.solve(information + 1e-6 * np.eye(len(scale)), (scale * gain)[..., None])
+        explained = (scale * gain * solution[..., 0]).sum(1)
+        return FEWEST_ROWS + int(explained[FEWEST_ROWS : len(index) - FEWEST_ROWS].argmax())
+
+    def fit(self, candidate: _Candidate) -> _Fit:
+        """Fit a candidate together with the parameters; where it moved at once, the row is sought once more."""
+        fit = self.reweighted(candidate)
+        if candidate.first is None:
+            return fit
+        still = fit.after.copy()
+        still[candidate.index] += fit.shifts
+        moved = still.copy()
+        size = candidate.full.shape[2]
+        moved[candidate.index] -= candidate.full @ fit.motion[:size]
+        gain = (fit.costs(still) - fit.costs(moved))[candidate.index][::-1].cumsum()[::-1]
+        first = FEWEST_ROWS + int(gain[FEWEST_ROWS : len(gain) - FEWEST_ROWS].argmax())
+        return fit if first == candidate.first else self.reweighted(candidate.from_row(first))
+
+    @cached_property
+    def still(self) -> _Fit:
+        """The same without a motion."""
+        nothing = np.zeros((len(self.rows.residual), self.rows.residual.shape[1], 0))
+        index = np.arange(len(self.rows.residual))
+        return self.reweighted(_Candidate("frame", 0, index, nothing, np.zeros((len(index), 1))))
+
+    def reweighted(self, candidate: _Candidate) -> _Fit:
+        """Iteratively reweighted least squares, from rows of full weight on."""
+        size, motions = self.rows.X.shape[2], candidate.columns.shape[2]
+        A = np.concatenate([self.rows.X, np.zeros((*self.rows.X.shape[:2], motions))], 2)
+        A[candidate.index, :, size:] = candidate.columns
+        A = A.reshape(-1, size + motions)
+        held = np.diag(np.concatenate([self.rows.precision, np.zeros(motions)]))
+        left = max(1 - (self.rows.used + motions) / self.rows.values, 1e-2)
+        weight, scale = np.ones_like(self.rows.residual), np.ones(self.rows.residual.shape[1] // 3)
+        for _ in range(ROUNDS):
+            weighted = A * (weight / np.repeat(scale, 3) ** 2).reshape(-1, 1)
+            normal = weighted.T @ A
+            covariance = inverse_of(normal + held)
+            x = covariance @ (weighted.T @ self.rows.residual.ravel())
+            after = self.rows.residual - (A @ x).reshape(self.rows.residual.shape)
+            old, scale = scale, np.array([_scale(part) for part in _sensors(after)]) / left**0.5
+            effective = float(np.einsum("ij,ji->", covariance, normal))
+            fit = _Fit(candidate, x[size:], after, tuple(scale.tolist()), effective)
+            before, weight = weight, fit.weights
+            if np.abs(weight - before).max() < SETTLED and np.abs(scale / old - 1).max() < SETTLED:
+                break
+        return fit
+
+    def log_bayes_factor(self, fit: _Fit, values_of_one: float) -> float:
+        """Logarithm of the odds of a candidate against no motion, where so many values say as much as one.
+
+        Where motions and parameters use up nearly all values, nothing is left that contradicts them: no odds.
+        """
+        if fit.effective > MOST_USED * self.rows.values:
+            return -math.inf
+        values = max(min((self.rows.values - self.rows.used) / values_of_one, self.rows.independent), 1.0)
+        before = min(float(fit.costs(residual).sum()) for residual in (self.rows.residual, self.still.after))
+        left = float(fit.costs(fit.after).sum()) / max(before, 1e-300)
+        gain = (values - len(fit.motion)) * math.log1p(values) - values * math.log1p(values * min(left, 1.0))
+        return gain / 2 - math.log(fit.candidate.tried)
+
+    def values_of_one(self, fit: _Fit) -> float:
+        """How many values say as much as one that is independent, by what a candidate leaves."""
+        left = fit.after * np.sqrt(fit.weights)
+        own = left[fit.candidate.index]
+        total = max(float((own**2).sum()), 1e-150)
+        together: float = own.shape[1] * float(np.square(own.T @ own).sum()) / total**2
+        alike = 1.0
+        for lag in range(1, len(own) // 2, 2):
+            two = sum(float((own[near:] * own[:-near]).sum()) for near in (lag, lag + 1)) / total
+            if two < 0:
+                break
+            alike += 2 * two
+        repeated, configuration = 1.0, self.rows.configuration
+        if configuration is not None:
+            count = np.bincount(configuration)
+            means = np.stack([np.bincount(configuration, column) for column in left.T]) ** 2 / count
+            repeated = float(means.sum()) / len(count) / float(np.square(left).sum()) * len(left)
+        return together * float(max(alike, repeated, 1.0))
+
+    def motion(self, fit: _Fit) -> Motion:
+        """Say what a fit means, in metres and radians."""
+        candidate = fit.candidate
+        weight = fit.weights[candidate.index]
+        left = (weight * fit.after[candidate.index] ** 2).sum(0) / np.maximum(weight.sum(0), 1e-300)
+        parts = zip(_sensors(fit.shifts.var(0)[None]), _sensors(left[None]), strict=True)
+        factor = max(math.sqrt(1 + added.sum() / max(rest.sum(), 1e-300)) for added, rest in parts)
+        course = candidate.course - candidate.course[0]
+        whole = course @ fit.motion.reshape(-1, candidate.full.shape[2])  # what every row has made of it
+        largest = whole[np.linalg.norm(candidate.full[:, :3] @ whole[..., None], axis=(1, 2)).argmax()]
+        shift, turn = largest[:3], largest[:2:-1]  # about x, y, z, stored as roll, pitch, yaw
+        names = self.rows.problem.space.targets
+        if candidate.moved == "frame":
+            names = self.rows.problem.space.frames
+            anchor = self.rows.result.solved.setup.anchors.bases[candidate.number].cpu().numpy()
+            center = self._center(self.rows.number[candidate.index[candidate.first or 0 :]])
+            lever = anchor[:3, :3].T @ (center - anchor[:3, 3])
+            shift = anchor[:3, :3] @ (shift + np.cross(turn, lever))
+        return Motion(
+            candidate.moved,
+            names[candidate.number],
+            self.rows.number[candidate.index],
+            candidate.first,
+            shift,
+            float(np.linalg.norm(turn)),
+            self.log_bayes_factor(fit, self.values_of_one(fit)),
+            factor,
+        )
+
+    def _center(self, rows: Int64[np.ndarray, " chosen"]) -> Float64[np.ndarray, " 3"]:
+        """Mean of the measured positions of some rows [m]; 0 where there are none."""
+        position = self.rows.result.solved.measurements.position
+        if position is None:
+            return np.zeros(3)
+        center: np.ndarray = np.nan_to_num(position[rows].nanmean(0).cpu().numpy())
+        return center
+
+
+def _sensors(values: Float64[np.ndarray, "rows values"]) -> Sequence[Float64[np.ndarray, "rows 3"]]:
+    """The values of every sensor."""
+    return np.split(values, values.shape[1] // 3, 1)
+
+
+def _scale(residual: Float64[np.ndarray, "rows 3"]) -> float:
+    """Standard deviation of one value, by the median of the rows that were measured."""
+    lengths = np.linalg.norm(residual, axis=1)
+    if not lengths.any():
+        return 1.0
+    return max(float(_LOSS.scale(torch.from_numpy(lengths[lengths > 0]), 3, 0.0)), 1e-6)
+
+
+def _by_sensor(
+    values: Float64[np.ndarray, "rows values"],
+    scale: Sequence[float],
+    function: Callable[[torch.Tensor, int], torch.Tensor],
+) -> Float64[np.ndarray, "rows values"]:
+    """A function of the length of every sensor's values over its scale, once for each of them."""
+    lengths = [np.linalg.norm(part, axis=1) / one for part, one in zip(_sensors(values), scale, strict=True)]
+    return np.repeat(np.stack([function(torch.from_numpy(one), 3).numpy() for one in lengths], 1), 3, axis=1)

@@ -1,0 +1,96 @@
+"""A setup fault, as it is reported."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from pisigma.validation.setup_faults.cause import length_text
+from pisigma.validation.setup_faults.hypothesis import COLLAPSED, Hypothesis
+
+
+@dataclass(frozen=True)
+class SetupFault:
+    """An explanation under which the errors collapse.
+
+    Attributes:
+        kinds: those that it is about, see `Cause.kind`.
+        clause: what is wrong, such as "the sign of joint 3 is reversed".
+        advice: what to check.
+        before: root mean square of the position errors [m].
+        after: what it falls to [m].
+        after_nominal: what that of the nominal robot falls to [m]; NaN where the explanation is about the correction.
+        before_rotation: as `before`, of the rotation errors [rad]; NaN where none was measured.
+        after_rotation: what it falls to [rad].
+        moved: how far the zeros of joints have moved at most [rad or m]; infinite where it is about something else.
+        joints: those that it is about, from 0.
+    """
+
+    kinds: tuple[str, ...]
+    clause: str
+    advice: str
+    before: float
+    after: float
+    after_nominal: float
+    before_rotation: float
+    after_rotation: float
+    moved: float = math.inf
+    joints: tuple[int, ...] = ()
+
+    @property
+    def explains_orientation(self) -> bool:
+        """Whether the rotation errors are among what it explains."""
+        return self.after_rotation <= COLLAPSED * self.before_rotation
+
+    @property
+    def sentence(self) -> str:
+        """What is wrong, what the errors fall to without it, and what to check."""
+        clause = self.clause[:1].upper() + self.clause[1:]
+        if not np.isfinite(self.after):
+            return f"{clause}; {self.advice}."
+        fall = f"from {length_text(self.before)} to {length_text(self.after)} RMS"
+        if np.isfinite(self.before_rotation):
+            degrees = np.rad2deg([self.before_rotation, self.after_rotation])
+            fall += f" and from {degrees[0]:.3g} deg to {degrees[1]:.3g} deg"
+        if np.isfinite(self.after_nominal):
+            fall += f" (those of the nominal robot to {length_text(self.after_nominal)})"
+        return f"{clause}: with this set right, the errors fall {fall}; {self.advice}."
+
+    def to_json(self) -> dict[str, object]:
+        """Return kinds, sentence and figures in mm and, where measured, in deg."""
+        figures = {
+            "before_rms_mm": self.before * 1e3,
+            "after_rms_mm": self.after * 1e3,
+            "after_nominal_rms_mm": self.after_nominal * 1e3,
+            "before_rms_deg": float(np.rad2deg(self.before_rotation)),
+            "after_rms_deg": float(np.rad2deg(self.after_rotation)),
+        }
+        measured = {name: value for name, value in figures.items() if np.isfinite(value)}
+        return {"kinds": list(self.kinds), "sentence": self.sentence, **measured}
+
+
+def either(faults: Sequence[SetupFault]) -> SetupFault:
+    """Join faults that explain the errors about equally well, the best first, as alternatives."""
+    clauses = dict.fromkeys(fault.clause for fault in faults)
+    advice = dict.fromkeys(fault.advice for fault in faults)
+    return replace(
+        faults[0], clause=", or ".join(clauses), advice="; ".join(advice), moved=max(f.moved for f in faults)
+    )
+
+
+def fault_of(here: Hypothesis, other: Hypothesis, after_nominal: float) -> SetupFault:
+    """Report a hypothesis with what the errors are here, and what they and those of the nominal robot [m] fall to."""
+    (before, before_rotation), (after, after_rotation) = here.rms(), other.rms()
+    return SetupFault(
+        kinds=tuple(cause.kind for cause in other.causes),
+        clause=" and ".join(cause.clause for cause in other.causes),
+        advice="; ".join(cause.advice for cause in other.causes),
+        before=before,
+        after=after,
+        after_nominal=after_nominal,
+        before_rotation=before_rotation,
+        after_rotation=after_rotation,
+        moved=max(cause.moved for cause in other.causes),
+        joints=tuple(joint for cause in other.causes for joint in cause.joints),
+    )

@@ -1,0 +1,153 @@
+"""The robot of a recipe and its rows: simulated, or read from a file."""
+
+import os
+from dataclasses import dataclass
+from typing import TypeVar
+
+import torch
+
+from pisigma.files.errors import RecipeError
+from pisigma.files.yaml_file import Section
+from pisigma.measurement.camera.corner_file import read_rows
+from pisigma.measurement.dataset import Measurements, join
+from pisigma.measurement.splits import TrainTest, k_folds
+from pisigma.robot.description import Robot
+from pisigma.simulation.camera.image_folder import write_images
+from pisigma.simulation.camera.simulated_images import SimulatedImages
+from pisigma.simulation.measure import SimulatedPoses
+from pisigma.simulation.true_robot import TrueRobot
+from pisigma.workflow.recipes.recipe import GeometricRecipe, HybridRecipe, MeasuredData, Recipe, SimulatedData
+
+Seeded = TypeVar("Seeded", bound=Section)
+
+
+@dataclass(frozen=True, eq=False)
+class RecipeData:
+    """What a recipe is trained and judged on.
+
+    Attributes:
+        robot: as drawn.
+        training: rows to train on.
+        test: rows that a file of measurements marks as test; None without such rows.
+        simulations: training and held-out rows of every repeat of a simulation, those of the model first; none for
+            measured data.
+        folds: how measured rows are split for a cross-validation; None for simulated ones.
+    """
+
+    robot: Robot
+    training: Measurements
+    test: Measurements | None = None
+    simulations: tuple[tuple[Measurements, Measurements], ...] = ()
+    folds: MeasuredData | None = None
+
+    @property
+    def held_out(self) -> Measurements | None:
+        """Rows of the simulation that the training never sees; None for measured data."""
+        return self.simulations[0][1] if self.simulations else None
+
+    def splits(self) -> tuple[Measurements, tuple[TrainTest, ...]]:
+        """Rows to judge on, and which of them are training and held-out rows of every fold, or of every simulation.
+
+        Raises:
+            MeasurementError: there are fewer different joint vectors than folds.
+        """
+        if self.folds is not None:
+            return self.training, k_folds(self.training, self.folds.folds, self.folds.seed)
+        every = [rows for pair in self.simulations for rows in pair]
+        joined = join(every)
+        numbers = iter(torch.split(torch.arange(joined.rows), [rows.rows for rows in every]))
+        return joined, tuple(zip(numbers, numbers, strict=True))
+
+
+def load_data(recipe: Recipe, data: Measurements | str | os.PathLike[str] | None = None) -> RecipeData:
+    """Simulate the rows of a recipe, or take the measured ones.
+
+    Args:
+        recipe: the recipe.
+        data: for measured data: these, or a CSV file of them.
+
+    Raises:
+        RecipeError: a simulated recipe got data, or a measured one none.
+        RobotError: the robot of the recipe cannot be used.
+        MeasurementError: the file cannot be used.
+    """
+    if isinstance(recipe, GeometricRecipe) or isinstance(recipe.data, SimulatedData):
+        if data is not None:
+            raise RecipeError(
+                f"recipe '{recipe.name}' simulates its data and has no use for --data; leave it out."
+            )
+        return simulate(recipe, recipe.repeats if isinstance(recipe, HybridRecipe) else 1)
+    if data is None:
+        raise RecipeError(f"recipe '{recipe.name}' is for measured data; give the file with --data FILE.csv.")
+    robot = Robot.load(recipe.robot)
+    return RecipeData(robot, *read_rows(data, robot).split_sets(), folds=recipe.data)
+
+
+def simulate(recipe: Recipe, repeats: int = 1) -> RecipeData:
+    """Measure training and held-out rows of a recipe on its true robot.
+
+    Args:
+        recipe: for simulated data.
+        repeats: how often, with other seeds each time.
+
+    Raises:
+        RecipeError: the recipe is for measured data.
+        RobotError: the robot of the recipe cannot be used.
+    """
+    robot, stated, simulations = Robot.load(recipe.robot), simulated_data(recipe), []
+    for repeat in range(repeats):
+        data = repeated(stated, repeat)
+        true = TrueRobot(robot, data.errors)
+        simulations.append((data.training.measure(true), data.held_out.measure(true)))
+    return RecipeData(robot, simulations[0][0], simulations=tuple(simulations))
+
+
+def write_recipe_images(recipe: Recipe, folder: str | os.PathLike[str]) -> int:
+    """Render the images that a recipe calibrates with; see `write_images`.
+
+    Raises:
+        RecipeError: the recipe simulates no images.
+        RobotError: the robot of the recipe cannot be used.
+        OutputError: the folder exists, or cannot be written.
+    """
+    data = simulated_data(recipe)
+    if not isinstance(data.training, SimulatedImages):
+        raise RecipeError(
+            f"recipe '{recipe.name}' simulates no images but a tracker; write its measurements with --out."
+        )
+    return write_images(data.training, TrueRobot(Robot.load(recipe.robot), data.errors), folder)
+
+
+def simulated_data(recipe: Recipe) -> SimulatedData:
+    """What a recipe simulates; a geometric one states it beside its other settings.
+
+    Raises:
+        RecipeError: the recipe is for measured data.
+    """
+    if isinstance(recipe, GeometricRecipe):
+        errors, training, held_out = recipe.errors, recipe.measurements, recipe.held_out
+        return SimulatedData(kind="simulated", errors=errors, training=training, held_out=held_out)
+    if not isinstance(recipe.data, SimulatedData):
+        raise RecipeError(f"recipe '{recipe.name}' is for measured data and simulates nothing; use another.")
+    return recipe.data
+
+
+def repeated(data: SimulatedData, repeat: int) -> SimulatedData:
+    """A simulation with everything that is random drawn anew: all its seeds higher by the number of the repeat."""
+    return data.model_copy(
+        update={
+            "errors": tuple(_reseeded(source, repeat) for source in data.errors),
+            "training": _measured_anew(data.training, repeat),
+            "held_out": _measured_anew(data.held_out, repeat),
+        }
+    )
+
+
+def _measured_anew(section: SimulatedPoses, repeat: int) -> SimulatedPoses:
+    noise = None if section.noise is None else _reseeded(section.noise, repeat)
+    return section.model_copy(update={"poses": _reseeded(section.poses, repeat), "noise": noise})
+
+
+def _reseeded(section: Seeded, repeat: int) -> Seeded:
+    seed = getattr(section, "seed", None)
+    return section if seed is None else section.model_copy(update={"seed": seed + repeat})

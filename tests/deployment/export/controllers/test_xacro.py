@@ -1,0 +1,54 @@
+"""The xacro overlay: a URDF whose origins are properties, read back to the robot that was written."""
+
+import pytest
+from testing.closeness import assert_close
+from testing.identified import off_by
+from testing.models import joints_around
+
+from pisigma.deployment.export.controllers.xacro import with_properties
+from pisigma.files.errors import RobotError
+from pisigma.robot import Robot
+from pisigma.robot.kinematics.forward import forward_kinematics
+from pisigma.robot.urdf_template import CALIBRATED_FRAME, CALIBRATED_TOOL, robot_into_urdf
+from pisigma.robot.writing import robot_to_urdf
+
+
+@pytest.fixture
+def drawn(tmp_path):
+    """A URDF file."""
+    path = tmp_path / "arm.urdf"
+    path.write_text(
+        robot_to_urdf(Robot.load("ur10")).replace("</robot>", '<gazebo reference="link_1"/></robot>')
+    )
+    return path
+
+
+def test_the_same_robot_comes_back(drawn, tmp_path):
+    nominal = Robot.load(drawn)
+    calibrated = off_by(nominal)
+    urdf = robot_into_urdf(calibrated, nominal, drawn, comments=("said",))
+    overlay = tmp_path / "arm.urdf.xacro"
+    overlay.write_text(with_properties(urdf))
+    text = overlay.read_text()
+    assert '<xacro:property name="theta_2_xyz" value="' in text
+    assert 'xyz="${theta_2_xyz}"' in text
+    assert '<gazebo reference="link_1"/>' in text
+    held = Robot.load(overlay, base=CALIBRATED_FRAME, tip=CALIBRATED_TOOL)
+    q = joints_around("ur10", 100, spread=3.0)
+    assert_close(forward_kinematics(held, q), forward_kinematics(calibrated, q), atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("before", "after"),
+    [
+        ("${theta_2_xyz}", "${theta_2_xyz * 2}"),
+        ("${theta_2_xyz}", "$(arg x)"),
+        ('name="theta_2_xyz"', 'name="other"'),
+    ],
+)
+def test_anything_else_of_xacro_is_refused(before, after, drawn, tmp_path):
+    nominal = Robot.load(drawn)
+    overlay = tmp_path / "arm.xacro"
+    overlay.write_text(with_properties(robot_into_urdf(nominal, nominal, drawn)).replace(before, after))
+    with pytest.raises(RobotError, match="is xacro, which is not read; expand it first"):
+        Robot.load(overlay, tip=CALIBRATED_TOOL)

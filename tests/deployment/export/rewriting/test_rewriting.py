@@ -1,0 +1,208 @@
+"""Programs whose targets are rewritten: the real tool comes where the program says, along straight lines too."""
+
+import json
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from testing.closeness import assert_close
+from testing.rewritten_programs import (
+    FRAME,
+    LANGUAGES,
+    TOLERANCE_MM,
+    TOOL,
+    program,
+    really,
+    scanned,
+    six,
+    wanted_poses,
+)
+
+from pisigma.deployment.export.export_format import Exported, ExportRequest
+from pisigma.deployment.export.programs.text import millimetres_and_euler
+from pisigma.deployment.export.registry import export_model
+from pisigma.files.errors import OutputError
+from pisigma.model.folder.model_folder import load_model
+
+
+@pytest.mark.parametrize("language", LANGUAGES, ids=lambda language: language.suffix)
+def test_the_real_tool_comes_where_the_program_says(language, arm, tmp_path):
+    request = program(language, arm, tmp_path)
+    exported = export_model("targets", request)
+    wanted = wanted_poses(load_model(arm).robot)
+    before, after = scanned(request.program, request.frames), scanned(request.out, request.frames)
+    names = [round(float(t.pose.T[0, 3]), 6) for t in before.targets]
+    kept = 2 if language.suffix == ".ls" else 3  # P[3] is used with an offset too
+    assert len(before.targets) == kept + 1
+    assert exported.facts["statuses"] == {"reached": kept, "unreachable": 1}
+    order = [min(range(4), key=lambda i: abs(float(wanted[i, 0, 3]) - x)) for x in names]
+    assert sorted(order) == [0, 1, *([2] if kept == 3 else []), 3]
+    commanded = {}
+    for target in after.targets:
+        nearest = min(range(4), key=lambda i: float((wanted[i] - target.pose.T)[:3, 3].norm()))
+        if float((wanted[nearest] - target.pose.T)[:3, 3].norm()) < 4e-3:
+            commanded[nearest] = target.pose.T
+    for index in set(order) - {3}:
+        assert float((commanded[index] - wanted[index])[:3, 3].norm()) > 1e-4
+        real = really(arm, commanded[index][None], wanted[index][None])
+        assert_close(real[0, :3, 3], wanted[index, :3, 3], atol=1e-8)
+        assert_close(real[0, :3, :3], wanted[index, :3, :3], atol=1e-7)
+    assert_close(commanded[3], wanted[3], atol=1e-8)  # it keeps its line
+    line = next(
+        i for i, text in enumerate(request.program.read_text().splitlines(), 1) if "9" in text and i > 5
+    )
+    assert line
+    assert str(exported.shortfall).startswith(f"{request.program}, line ")
+    assert "unreachable, so the line is as it was" in str(exported.shortfall)
+
+
+@pytest.mark.parametrize("language", LANGUAGES, ids=lambda language: language.suffix)
+def test_straight_moves_stay_straight(language, arm, tmp_path):
+    """Between way points a controller moves on the line between commanded poses; so does the real tool, nearly."""
+    request = program(language, arm, tmp_path)
+    exported = export_model("targets", request)
+    after = scanned(request.out, request.frames)
+    moves = [move for move in after.moves if move.start is not None]
+    wanted = wanted_poses(load_model(arm).robot)
+    assert exported.facts["way_points"] >= 1
+    ends = [float((move.end.pose.T - wanted[1])[:3, 3].norm()) < 4e-3 for move in moves]
+    moves = moves[: ends.index(True) + 1]
+    assert len(moves) > 1
+    share = torch.linspace(0, 1, 9, dtype=torch.float64)[:, None, None]
+    worst, line = 0.0, wanted[1, :3, 3] - wanted[0, :3, 3]
+    for move in moves:
+        T = move.start.pose.T + share * (move.end.pose.T - move.start.pose.T)
+        u, _, v = torch.linalg.svd(T[:, :3, :3])
+        T[:, :3, :3] = u @ v
+        real = really(arm, T, T)[:, :3, 3] - wanted[0, :3, 3]
+        off = real - (real @ line / (line @ line))[:, None] * line
+        worst = max(worst, float(off.norm(dim=-1).max()) * 1e3)
+    assert worst < 1.5 * TOLERANCE_MM
+
+
+@pytest.mark.parametrize("language", LANGUAGES, ids=lambda language: language.suffix)
+def test_all_else_stays_and_is_named(language, arm, tmp_path):
+    request = program(language, arm, tmp_path)
+    exported = export_model("targets", request)
+    text, old = request.out.read_text(), request.program.read_text()
+    assert all(piece in text for piece in language.kept)
+    removed = [
+        line[1:] for line in exported.facts["diff"].splitlines() if line.startswith("-") and line[:3] != "---"
+    ]
+    unnumbered = [re.sub(r"^:", "", line) for line in removed]
+    assert all(any(line.endswith(rest) for line in old.splitlines()) for rest in unnumbered)
+    reasons = {entry["line"]: entry["reason"] for entry in exported.facts["left_alone"]}
+    computed = next(
+        i for i, line in enumerate(old.splitlines(), 1) if re.search(r"pose_add|LIN_REL|Offs\(|PR\[1\]", line)
+    )
+    assert re.search("computed|bench_2", reasons[computed])
+    assert exported.facts["joint_lines"]
+    assert exported.facts["largest_shift_mm"] > 0.1
+    assert any("TEST IT AT LOW SPEED" in sentence for sentence in exported.doubts)
+    (branch,) = exported.facts["branches"]
+    assert any(f"corrected for the branch {branch}." in sentence for sentence in exported.doubts)
+    if language.suffix == ".ls":
+        lines = re.findall(r"(?m)^ *(\d+):", text)
+        assert lines == [str(i) for i in range(1, len(lines) + 1)]
+        assert f"LINE_COUNT = {len(lines)};" in text
+        assert reasons[13] == "Offset moves the target"
+
+
+@pytest.mark.parametrize("language", LANGUAGES, ids=lambda language: language.suffix)
+def test_frames_that_are_not_stated_leave_their_targets(language, arm, tmp_path):
+    request = program(language, arm, tmp_path)
+    pattern = r"(?m)^.*(set_tcp|\$BASE|tooldata).*\n"
+    request.program.write_text(re.sub(pattern, "", request.program.read_text(), count=1), newline="")
+    with pytest.raises(OutputError, match=r"holds no pose that can be rewritten \(line \d+: .* not stated"):
+        export_model("targets", replace(request, frames=None))
+    assert not request.out.exists()
+
+
+def test_a_pose_within_a_branch_of_the_program_begins_nowhere(arm, tmp_path):
+    request = program(LANGUAGES[0], arm, tmp_path)
+    text = request.program.read_text().replace("  set_digital_out(1, True)\n", "  if x > 1:\n  end\n")
+    request.program.write_text(text)
+    exported = export_model("targets", request)
+    reasons = [entry["reason"] for entry in exported.facts["left_alone"]]
+    assert sum("begins is not stated" in reason for reason in reasons) == 1
+
+
+def test_a_pose_of_several_tools_stays(arm, tmp_path):
+    request = program(LANGUAGES[0], arm, tmp_path)
+    other = "end\n".join(request.program.read_text().rsplit("end\n", 1)).replace(
+        "  movel(pose_add",
+        "  set_tcp(p[0, 0, 0, 0, 0, 0])\n  movel(pose_trans(bench, over))\n  movel(pose_add",
+    )
+    request.program.write_text(other)
+    exported = export_model("targets", request)
+    assert any("several frames or tools" in entry["reason"] for entry in exported.facts["left_alone"])
+    assert exported.facts["targets"] == 3
+
+
+@pytest.mark.parametrize(
+    ("options", "complaint"),
+    [
+        ({"program": Path("cell.txt")}, "a program ends in .script, .src, .dat, .mod, .ls"),
+        ({"out": Path("new.src")}, "--out ends as the program does"),
+        ({"targets": "joints"}, "--targets goes with --poses"),
+        ({"tolerance_mm": 0.0}, "--tolerance-mm 0: a length above 0 was wanted"),
+        ({"poses": Path("poses.csv")}, "both name poses"),
+        ({"program": None}, "needs the poses to make them for"),
+        ({"program": None, "poses": Path("x.csv")}, "--frames and --tolerance-mm go with --program"),
+        ({"program": Path("none.script")}, "none.script: cannot be read"),
+    ],
+)
+def test_what_is_refused(options, complaint, arm, tmp_path):
+    request = replace(program(LANGUAGES[0], arm, tmp_path), **options)
+    with pytest.raises(OutputError, match=complaint):
+        export_model("targets", request)
+
+
+def test_the_facts_are_plain(arm, tmp_path):
+    exported = export_model("targets", program(LANGUAGES[0], arm, tmp_path))
+    assert isinstance(exported, Exported)
+    assert json.loads(json.dumps(dict(exported.facts)))["unreached"] == [
+        {"line": 11, "status": "unreachable"}
+    ]
+
+
+@pytest.mark.parametrize("language", LANGUAGES, ids=lambda language: language.suffix)
+def test_line_ends_stay(language, arm, tmp_path):
+    request = program(language, arm, tmp_path)
+    export_model("targets", request)
+    plain = request.out.read_bytes()
+    request.program.write_bytes(request.program.read_bytes().replace(b"\n", b"\r\n"))
+    export_model("targets", request)
+    assert request.out.read_bytes() == plain.replace(b"\n", b"\r\n")
+
+
+DATA = """DEFDAT CELL
+DECL E6POS XP1={{{P0},S 2,T 35,E1 0.0,E2 0.0}}
+DECL FDAT FP1={{TOOL_NO 4,BASE_NO 3,IPO_FRAME #BASE,POINT2[] " ",TQ_STATE FALSE}}
+DECL E6POS XP2={{{P1},S 2,T 35,E1 0.0,E2 0.0}}
+DECL FDAT FP2={{TOOL_NO 4,BASE_NO 3,IPO_FRAME #TCP,POINT2[] " ",TQ_STATE FALSE}}
+DECL E6POS XP3={{{P2},S 2,T 35}}
+DECL E6AXIS XP4={{A1 0,A2 0,A3 0,A4 0,A5 0,A6 0}}
+ENDDAT
+"""
+
+
+def test_points_of_inline_forms(arm, tmp_path):
+    """Their frames are numbers; a fixed tool, and a point without frames, are left alone."""
+    T = wanted_poses(load_model(arm).robot)
+    program_file, out = tmp_path / "cell.dat", tmp_path / "new.dat"
+    program_file.write_text(DATA.format(**{f"P{i}": six(T[i]) for i in range(3)}))
+    columns = ("x_mm", "y_mm", "z_mm", "roll_deg", "pitch_deg", "yaw_deg")
+    frame, tool = (dict(zip(columns, millimetres_and_euler(F).tolist(), strict=True)) for F in (FRAME, TOOL))
+    frames = tmp_path / "frames.yaml"
+    frames.write_text(json.dumps({"frames": {"BASE_DATA[3]": frame}, "tools": {"TOOL_DATA[4]": tool}}))
+    exported = export_model("targets", ExportRequest(arm, out, program=program_file, frames=frames))
+    (target,) = scanned(out, frames).targets
+    real = really(arm, target.pose.T[None], T[:1])
+    assert_close(real[0, :3, 3], T[0, :3, 3], atol=1e-8)
+    assert [entry["line"] for entry in exported.facts["left_alone"]] == [4, 6]
+    assert out.read_text().splitlines()[2:] == program_file.read_text().splitlines()[2:]
+    with pytest.raises(OutputError, match="is written with --program only"):
+        export_model("targets", ExportRequest(arm, out, poses=tmp_path / "poses.csv"))

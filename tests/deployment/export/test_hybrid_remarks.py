@@ -1,0 +1,16 @@
+"""Files of geometry say that the joint correction of a hybrid model is not in them."""
+
+from testing.hybrid import hybrid_of
+
+from pisigma.deployment.export.geometry import offset_remarks, remarks
+from pisigma.model.geometric_model import model_of_hybrid
+
+
+def test_what_a_hybrid_has_learned_is_said_to_be_missing():
+    arm = hybrid_of(name="rb5")
+    model = model_of_hybrid("hybrid", arm.true.nominal, arm.result, arm.measurements)
+    assert model.hybrid is not None
+    for said in (remarks(model), offset_remarks(model)):
+        assert any(
+            "learned joint correction of the model is not in this file" in sentence for sentence in said
+        )

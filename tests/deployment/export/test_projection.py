@@ -1,0 +1,53 @@
+"""Models projected on few parameters: the best there are, by least squares."""
+
+import numpy as np
+import pytest
+import torch
+from testing.closeness import assert_close
+from testing.models import joints_around
+
+from pisigma.deployment.export.projection import (
+    ProjectionProblem,
+    joint_offsets,
+    solve_projection,
+    whole_geometry,
+)
+from pisigma.robot import Robot
+from pisigma.robot.kinematics.forward import forward_kinematics
+
+
+def test_the_fit_is_the_best_there_is():
+    """No small change of the free numbers makes the sum of squares smaller."""
+    nominal, random = Robot.load("ur10"), np.random.default_rng(0)
+    true = nominal.with_geometry(nominal.dh + random.normal(0, 2e-3, nominal.dh.shape))
+    q = joints_around("ur10", 200, spread=0.8)
+    problem = ProjectionProblem(nominal, q, forward_kinematics(true, q), joint_offsets(nominal))
+    fitted, seen = solve_projection(problem)
+    assert seen == (False, True, True, True, True, False)
+    missing, J = problem.residual(fitted)
+    free = torch.tensor([*seen, *[True] * 12])
+    slope = (J[:, free].T @ missing) / (J[:, free].norm(dim=0) * missing.norm())
+    assert slope.abs().max() < 1e-6
+    assert missing.norm() < problem.residual(nominal)[0].norm() / 1.5
+
+
+@pytest.mark.parametrize("free", [joint_offsets, whole_geometry])
+def test_the_derivative_is_that_of_finite_differences(free):
+    robot, q = Robot.load("kiro3"), joints_around("kiro3", 4)
+    problem = ProjectionProblem(robot, q, forward_kinematics(robot, q), free(robot))
+    _, J = problem.residual(robot)
+    for i in range(J.shape[1]):
+        step = torch.zeros(J.shape[1], dtype=torch.float64)
+        step[i] = 1e-6
+        there, back = (problem.residual(problem.moved(robot, s * step))[0] for s in (1, -1))
+        assert_close((back - there) / 2e-6, J[:, i], atol=1e-8)
+
+
+def test_the_whole_geometry_reaches_any_other():
+    nominal, random = Robot.load("ur10"), np.random.default_rng(0)
+    true = nominal.with_geometry(nominal.dh + random.normal(0, 2e-3, nominal.dh.shape))
+    q = joints_around("ur10", 200, spread=0.8)
+    T = forward_kinematics(true, q)
+    fitted, observable = solve_projection(ProjectionProblem(nominal, q, T, whole_geometry(nominal)))
+    assert sum(observable) == 18  # 4 n + 6 of an arm with n joints, of which base and tool have 12
+    assert_close(forward_kinematics(fitted, q), T, atol=1e-8)

@@ -1,0 +1,75 @@
+"""When the server stays awake for the next request."""
+
+import pytest
+
+from pisigma.deployment.serve import polling
+from pisigma.deployment.serve.polling import REST, TAKEN_AWAY, Polling
+
+DURATION = 0.02
+
+
+class _Sockets:
+    """A clock, and sockets where a request comes at the stated look; each look takes a while."""
+
+    def __init__(self):
+        self.now, self.look, self.looks, self.request_at = 100.0, TAKEN_AWAY / 5, 0, None
+
+    def monotonic(self):
+        return self.now
+
+    def select(self, timeout):
+        assert timeout == 0
+        self.looks += 1
+        self.now += self.look
+        return ["request"] if self.looks == self.request_at else []
+
+
+@pytest.fixture
+def sockets(monkeypatch):
+    sockets = _Sockets()
+    monkeypatch.setattr(polling, "time", sockets)
+    return sockets
+
+
+def _after_two_requests(sockets, apart=0.0, duration=DURATION):
+    polling = Polling(sockets, duration)
+    polling.went_on()
+    sockets.now += apart
+    polling.went_on()
+    return polling
+
+
+def test_the_next_of_frequent_requests_finds_the_server_awake(sockets):
+    sockets.request_at = 3
+    assert _after_two_requests(sockets).ready() == ["request"]
+    assert sockets.looks == 3
+
+
+def test_the_server_sleeps_when_no_request_comes_in_time(sockets):
+    begun = sockets.now
+    assert _after_two_requests(sockets).ready() == []
+    assert DURATION <= sockets.now - begun < 1.1 * DURATION
+
+
+@pytest.mark.parametrize(("apart", "duration"), [(2 * DURATION, DURATION), (0.0, 0.0)])
+def test_after_rare_requests_or_without_a_duration_the_server_sleeps_at_once(sockets, apart, duration):
+    assert _after_two_requests(sockets, apart, duration).ready() == []
+    assert sockets.looks == 0
+
+
+def test_one_request_alone_keeps_nobody_awake(sockets):
+    polling = Polling(sockets, DURATION)
+    polling.went_on()
+    assert polling.ready() == []
+    assert sockets.looks == 0
+
+
+def test_the_server_rests_where_others_want_the_processor(sockets):
+    sockets.look = 2 * TAKEN_AWAY
+    busy = _after_two_requests(sockets)
+    for looks, pause in ((1, 0.0), (1, 0.6), (2, 0.6)):
+        sockets.now += pause * REST * sockets.look
+        busy.went_on()
+        busy.went_on()
+        assert busy.ready() == []
+        assert sockets.looks == looks

@@ -1,0 +1,59 @@
+"""Models of one robot, brought together; models of different robots, refused."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from testing.closeness import assert_close
+from testing.compared import model_of
+from testing.models import hand_made_model
+
+from pisigma.files.errors import ModelError
+from pisigma.lifetime.comparison.displacement import Displacement
+from pisigma.lifetime.comparison.model_pair import ModelPair
+from pisigma.robot.kinematics.forward import forward_kinematics
+
+
+def test_a_base_and_a_tool_that_were_moved_make_no_difference_to_fitted_frames():
+    model = hand_made_model("ur10", scale=0.0)
+    base, tool = np.array([[0.4, -0.3, 0.2, 0.5, 0.1, -0.2], [0.1, 0.0, 0.2, 0.3, 0.0, 0.1]])
+    moved = replace(model, name="moved", robot=model.robot.with_geometry(base=base, tool=tool))
+    by = ModelPair.of(model, moved, "fitted").displacement(model.starts)
+    assert_close(by, torch.zeros_like(by), atol=1e-7)
+    assert (
+        float(ModelPair.of(model, moved, "fixed").displacement(model.starts)[:, :3].norm(dim=1).min()) > 0.1
+    )
+
+
+def test_corrections_of_networks_are_compared():
+    first, second = hand_made_model("kiro3", scale=0.0), hand_made_model("kiro3", scale=0.002)
+    pair = ModelPair.of(first, second, "fixed")
+    q = pair.points
+    T = forward_kinematics(second.robot, second.nominal_joints(q))
+    expected = T[:, :3, 3] - forward_kinematics(first.robot, q)[:, :3, 3]
+    assert_close(pair.displacement(q)[:, :3], expected, atol=1e-12)
+    displacement = Displacement.at(pair, pair.workspace, "the workspace")
+    assert len(displacement.q) + displacement.not_predicted == 3000
+
+
+@pytest.mark.parametrize(
+    ("other", "what"), [("kiro3", "joints"), ("ur5e", "is drawn as"), ("rb5", "their rows are")]
+)
+def test_different_robots_are_refused(other, what):
+    others = model_of(50) if other == "rb5" else hand_made_model("kiro3")
+    if other == "ur5e":
+        robot = hand_made_model("ur10").robot
+        others = replace(
+            hand_made_model("ur10"), robot=robot.with_geometry(dh=robot.dh * [1, 0.7, 0.7, 1, 1])
+        )
+    with pytest.raises(ModelError, match=f"are of different robots: .*{what}"):
+        ModelPair.of(hand_made_model("ur10"), others, "fitted")
+
+
+def test_fixed_frames_need_a_common_name():
+    model = hand_made_model("ur10", scale=0.0)
+    first, second = (replace(model, bases={name: model.robot.base}) for name in ("wall", "floor"))
+    with pytest.raises(ModelError, match=r"no frame in common \(wall and floor\)"):
+        ModelPair.of(first, second, "fixed")
+    assert ModelPair.of(first, second, "fitted").owner == (("wall", ""), ("floor", ""))

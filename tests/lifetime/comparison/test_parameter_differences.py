@@ -1,0 +1,78 @@
+"""Which parameters of two models differ: right ones, and no others by chance."""
+
+import itertools
+import math
+from dataclasses import replace
+
+import pytest
+from testing.closeness import assert_close
+from testing.compared import COLLISION, after_collision, model_of
+
+from pisigma.lifetime.comparison.model_pair import ModelPair
+from pisigma.lifetime.comparison.parameter_differences import parameter_differences
+from pisigma.lifetime.recalibration.moved import NORMAL_95
+from pisigma.validation.held_out.reference_models import nominal_model
+
+
+@pytest.mark.parametrize("forth", [True, False])
+def test_exactly_the_joint_that_moved_differs_beside_a_base_that_moved(forth):
+    models = model_of(50), after_collision()
+    differences = parameter_differences(ModelPair.of(*models[:: 1 if forth else -1], "fitted"))
+    (joint,) = (one.shift for one in differences.differing)
+    assert joint.what == "joint 3"
+    assert_close(joint.shift, 0.1 if forth else -0.1, atol=0.005)
+    assert joint.interval[0] < (0.1 if forth else -0.1) < joint.interval[1]
+    assert differences.remainder is not None
+    assert not differences.remainder.significant
+    base = [one for one in differences.frames if one.what == "base"]
+    assert_close(base[0].shift, math.hypot(300, 200, 100), atol=0.2)
+    tool = [one for one in differences.frames if one.what == "tool"]
+    assert_close(tool[0].shift, 0.0, atol=0.1)
+
+
+def test_fixed_frames_find_the_same_joint():
+    models = model_of(50), model_of(61, COLLISION)
+    differences = parameter_differences(ModelPair.of(*models, "fixed"))
+    assert [one.shift.what for one in differences.differing] == ["joint 3"]
+    assert differences.frames == ()
+
+
+def test_models_of_disjoint_rows_differ_by_chance_only():
+    """Six pairs at a simultaneous level of 1 %; of single shifts at most about 5 % lie outside their 95 % intervals."""
+    models = [model_of(seed) for seed in (50, 51, 52, 53)]
+    outside = tested = 0
+    for pair in itertools.combinations(models, 2):
+        differences = parameter_differences(ModelPair.of(*pair, "fitted"))
+        assert differences.differing == ()
+        assert differences.remainder is not None
+        assert not differences.remainder.significant
+        for one in differences.parameters:
+            if one.shift is not None and one.deviation is not None:
+                tested += 1
+                outside += abs(one.shift) > NORMAL_95 * one.deviation
+    assert tested > 100
+    assert outside <= 0.08 * tested
+
+
+def test_what_moves_the_tool_as_base_and_tool_do_has_no_shift():
+    parameters = parameter_differences(ModelPair.of(model_of(50), model_of(51), "fitted")).parameters
+    by_name = {one.name: one for one in parameters}
+    for name in ("theta_1", "d_1", "theta_6", "d_6", "a_6", "alpha_6"):
+        assert by_name[name].shift is None
+    assert by_name["d_2"].alike == ("d_3", "d_4")  # along parallel axes
+
+
+def test_a_robot_as_drawn_is_exactly_known():
+    model = model_of(50)
+    differences = parameter_differences(ModelPair.of(model, nominal_model(model, True), "fitted"))
+    assert differences.differing
+    assert all(one.deviations[1] == 0.0 for one in differences.parameters)
+
+
+def test_a_model_without_posterior_is_put_beside_without_a_test():
+    first = model_of(50)
+    differences = parameter_differences(
+        ModelPair.of(first, replace(model_of(51), uncertainty=None), "fitted")
+    )
+    assert differences.remainder is None
+    assert all(one.p is None and one.deviations[1] is None for one in differences.parameters)

@@ -1,0 +1,132 @@
+"""What robots of one type have in common, and how far it carries ten poses of another one."""
+
+import numpy as np
+import pytest
+import torch
+from scipy.stats import chi2
+from testing.fleet_robots import DRAWN, common_errors, rows_of
+from testing.models import no_type_checker
+
+from pisigma.files.errors import FleetError
+from pisigma.lifetime.fleet.likeness import Likeness
+from pisigma.lifetime.fleet.prior import (
+    Population,
+    RobotEvidence,
+    expectation_maximisation,
+    fleet_prior,
+    without_odd,
+)
+from pisigma.lifetime.fleet.prior_summary import summarise_prior
+from pisigma.workflow.calibrate import CalibrationSettings, calibrate
+from pisigma.workflow.recalibrate import recalibrate
+
+ROBOTS = 8
+
+
+@pytest.fixture(scope="module")
+def prior():
+    """Of eight robots, of which the last is of another type."""
+    with no_type_checker():
+        return fleet_prior("fleet", DRAWN, [rows_of(k, 40, k, odd=k == ROBOTS - 1) for k in range(ROBOTS)])
+
+
+def rms(errors):
+    return float(errors["position"].square().sum(1).mean().sqrt())
+
+
+def test_the_odd_robot_is_named_and_does_not_count(prior):
+    assert prior.odd == (ROBOTS - 1,)
+    summary = summarise_prior(prior, [f"r{k}" for k in range(ROBOTS)])
+    assert (summary.robots, summary.odd) == (ROBOTS - 1, ("r7",))
+    assert "r7" in summary.warnings[0]
+
+
+def test_shared_errors_are_estimated(prior):
+    """Of parameters that the rows determine by themselves."""
+    mean = dict(zip(prior.names, prior.population.mean.tolist(), strict=False))
+    true = dict(zip(prior.names, common_errors().flatten().tolist(), strict=True))
+    for name in ("a_2", "a_3", "alpha_2", "alpha_3", "theta_3", "d_5"):
+        assert abs(mean[name] - true[name]) < 4e-4, name
+
+
+def test_ten_poses_with_the_prior_are_far_better_than_without(prior):
+    few, test = rows_of(50, 10, 1), rows_of(50, 300, 2, noise=0.0)
+    with no_type_checker():
+        begun = recalibrate(prior.model, few)
+        without = calibrate(DRAWN, few, CalibrationSettings(folds=0)).result
+    assert begun.gate.kept != "scratch"
+    assert begun.moved == ()
+    assert "like the fleet" in begun.summary.changed
+    assert rms(begun.adaptation.errors_of(test)) < 0.6 * rms(without.errors_of(test))
+
+
+def test_a_robot_of_another_type_is_unlike_the_fleet_and_not_bent_to_it(prior):
+    few = rows_of(60, 10, 3, odd=True)
+    with no_type_checker():
+        assert Likeness.of(prior.model, few).odd
+        assert not Likeness.of(prior.model, rows_of(61, 20, 4)).odd
+        begun = recalibrate(prior.model, few)
+        without = calibrate(DRAWN, few, CalibrationSettings(folds=0))
+        fewer = recalibrate(prior.model, few.select(torch.arange(8)))
+    assert begun.gate.kept == "scratch"
+    assert "too few to predict" in begun.gate.sentence
+    assert np.array_equal(begun.model.calibrated.dh, without.model.calibrated.dh)
+    assert fewer.gate.kept != "scratch"
+    assert "unlike the fleet" in fewer.summary.changed
+
+
+def test_expectation_maximisation_finds_a_population():
+    """Many robots, each of which sees its errors nearly exactly."""
+    g = torch.Generator().manual_seed(0)
+    mean, deviation = torch.tensor([1.0, -2.0]).double(), torch.tensor([0.5, 0.1]).double()
+    x = mean + deviation * torch.randn(4000, 2, generator=g, dtype=torch.float64)
+    evidence = [RobotEvidence(1e8 * torch.eye(2).double(), 1e8 * one, {}) for one in x]
+    start = Population(torch.zeros(2).double(), torch.eye(2).double(), 1)
+    found = expectation_maximisation(evidence, start, torch.ones(2).double())
+    assert (found.mean - mean).abs().max() < 0.03
+    assert (found.covariance.diagonal().sqrt() / deviation - 1).abs().max() < 0.05
+
+
+def test_what_few_robots_say_of_another_one_allows_for_their_number():
+    """One more than five is beyond their 95 % point in 19 %, as their scatter is uncertain, too; else in 31 %."""
+    g = torch.Generator().manual_seed(0)
+    beyond = []
+    for _ in range(200):
+        x = torch.randn(6, 2, generator=g, dtype=torch.float64)
+        robots = [RobotEvidence(1e8 * torch.eye(2).double(), 1e8 * one, {}) for one in x]
+        off = x[:5] - x[:5].mean(0)
+        population = Population(x[:5].mean(0), off.square().mean(0).diag(), 0).of_another(5)
+        square, count = population.surprise(robots[5])
+        beyond.append(chi2.sf(square, count) < 0.05)
+    assert sum(beyond) < 0.2 * len(beyond)
+
+
+def test_a_robot_without_information_does_not_count():
+    g = torch.Generator().manual_seed(0)
+    x = 0.3 * torch.randn(50, 2, generator=g, dtype=torch.float64)
+    evidence = [RobotEvidence(1e6 * torch.eye(2).double(), 1e6 * one, {}) for one in x]
+    nothing = RobotEvidence(torch.zeros(2, 2).double(), torch.zeros(2).double(), {})
+    start = Population(torch.zeros(2).double(), torch.eye(2).double(), 1)
+    few, many = (
+        expectation_maximisation(those, start, torch.ones(2).double())
+        for those in (evidence, [*evidence, nothing])
+    )
+    assert (few.mean - many.mean).abs().max() < 1e-4
+    assert (few.covariance - many.covariance).abs().max() < 0.02
+
+
+@pytest.mark.parametrize("odd", [0, 1, 6])
+def test_odd_robots_that_are_alike_do_not_hide_each_other(odd):
+    g = torch.Generator().manual_seed(odd)
+    x = torch.tensor([1.0, -2.0, 0.5]).double() + 0.2 * torch.randn(20, 3, generator=g, dtype=torch.float64)
+    x[20 - odd :] += 3.0
+    evidence = [RobotEvidence(1e4 * torch.eye(3).double(), 1e4 * one, {}) for one in x]
+    start = Population(torch.zeros(3).double(), 9 * torch.eye(3).double(), 2)
+    population, found = without_odd(evidence, start, 9 * torch.ones(3).double())
+    assert found == tuple(range(20 - odd, 20))
+    assert (population.covariance.diagonal().sqrt() < 0.5).all()
+
+
+def test_few_robots_are_refused():
+    with pytest.raises(FleetError, match="5 robots or more"):
+        fleet_prior("fleet", DRAWN, [rows_of(0, 20, 0)] * 4)

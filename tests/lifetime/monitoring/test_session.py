@@ -1,0 +1,98 @@
+"""One session against a model: the joint that moved, an instrument elsewhere, and what cannot be observed."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from testing.aged import model_before, rows_later
+from testing.closeness import assert_close
+
+from pisigma.lifetime.monitoring.session import judge_session
+from pisigma.model.model_posterior import ModelPosterior
+
+ELSEWHERE = (0.3, -0.2, 0.1, 0.5, 0.2, -0.3)
+
+
+def moved_joint(joint, degrees=0.05):
+    return tuple(math.radians(degrees) * (k == joint) for k in range(1, 7))
+
+
+def judged(rows, stated=None):
+    model = model_before()
+    return judge_session(model, ModelPosterior.of(model), rows, stated)
+
+
+@pytest.mark.parametrize("joint", [1, 2, 3, 4, 5])
+def test_the_joint_that_moved_is_named_from_five_poses(joint):
+    degrees = 0.05 if joint < 4 else 0.5  # nearer to the reflector
+    session, zeros = judged(rows_later(5, 20 + joint, moved_joint(joint, degrees)))
+    assert session.verdict == "moved"
+    assert [one.moved.what for one in session.moved] == [f"joint {joint}"]
+    low, high = session.moved[0].moved.interval
+    assert low < degrees < high
+    assert session.moved[0].probability > 0.9
+    assert session.unchanged < 0.01
+    assert abs(float(zeros.shift[joint - 1]) - math.radians(degrees)) < 4 * float(zeros.deviation[joint - 1])
+
+
+def test_false_alarms_are_rare():
+    sessions = [judged(rows_later(5, 100 + seed))[0] for seed in range(10)]
+    assert [one.verdict for one in sessions] == ["unchanged"] * 10
+    assert not any(one.recalibrate for one in sessions)
+
+
+def test_recalibrating_pays_after_a_collision():
+    session, _ = judged(rows_later(10, 3, moved_joint(3, 0.25)))
+    assert session.recalibrate
+    assert session.rms_after < 0.2 * session.rms
+    assert_close(session.gain, session.rms - session.rms_after, rtol=1e-12)
+    assert not judged(rows_later(10, 3))[0].recalibrate
+
+
+@pytest.mark.parametrize("joint", [0, 3])
+def test_a_wrong_row_is_named_and_not_taken_for_a_motion(joint):
+    rows = rows_later(10, 3, moved_joint(joint, 0.25))
+    wrong = rows.position.clone()
+    wrong[4, 1] += 0.005
+    session, _ = judged(replace(rows, position=wrong))
+    assert session.outliers == (rows.place(4),)
+    assert [one.moved.what for one in session.moved] == (["joint 3"] if joint else [])
+    assert_close(session.rms, judged(rows.select(torch.tensor([0, 1, 2, 3, 5, 6, 7, 8, 9])))[0].rms, rtol=0.1)
+
+
+def test_two_joints_that_moved_are_both_named():
+    both = tuple(a + b for a, b in zip(moved_joint(2, 0.2), moved_joint(5, -0.3), strict=True))
+    session, _ = judged(rows_later(12, 4, both))
+    assert {one.moved.what for one in session.moved} == {"joint 2", "joint 5"}
+
+
+@pytest.mark.parametrize("joint", [0, 3])
+def test_an_instrument_elsewhere_is_told_from_a_joint(joint):
+    session, _ = judged(rows_later(12, 5, moved_joint(joint, 0.1), ELSEWHERE))
+    expected = ["joint 3"] if joint else []
+    assert [one.moved.what for one in session.moved] == [*expected, "base", "base"]
+    assert session.recalibrate == bool(joint)
+    assert "base" in session.standing
+    assert not session.observable[0]
+    assert "Joint 1 cannot be told from the base" in session.unobservable[0]
+
+
+def test_a_small_motion_of_the_base_is_not_taken_for_a_joint():
+    session, _ = judged(rows_later(10, 6, base=(3e-4, -2e-4, 4e-4, 0.0, 0.0, 0.0)))
+    assert {one.moved.what for one in session.moved} == {"base"}
+    assert not session.recalibrate
+
+
+def test_what_stands_elsewhere_can_be_stated():
+    session, _ = judged(rows_later(12, 5), frozenset({("base", "")}))
+    assert session.standing == ("base",)
+    assert all(one.moved.what == "base" for one in session.moved)
+
+
+def test_scores_are_as_large_as_expected_where_nothing_changes():
+    zeros = [judged(rows_later(10, 200 + seed))[1] for seed in range(12)]
+    scores = torch.stack(
+        [one.shift / (one.influence @ one.influence.mT + one.own).diagonal().sqrt() for one in zeros]
+    )
+    assert 0.4 < float(scores[:, :5].square().mean().sqrt()) < 1.6

@@ -1,0 +1,117 @@
+"""Sessions over the months: drifts with time and temperature, and when a limit is passed."""
+
+import math
+
+import pytest
+import torch
+from testing.closeness import assert_close
+
+from pisigma.lifetime.monitoring.history import Record
+from pisigma.lifetime.monitoring.session import JointZeros, Session
+from pisigma.lifetime.monitoring.trends import charts_of, forecast_of, jumps_of, trends_of
+
+REVOLUTE = (True, False)
+DEVIATION = 4e-5
+
+
+def records(months, per_month=0.0, per_kelvin=0.0, rms=lambda month: 1e-4, warm=lambda month: None):
+    noise = torch.randn(months, 2, generator=torch.Generator().manual_seed(4), dtype=torch.float64)
+    made = []
+    for month in range(months):
+        temperature = warm(month)
+        shift = DEVIATION * noise[month]
+        shift[0] += math.radians(per_month) * month + math.radians(per_kelvin) * (temperature or 0.0)
+        session = Session(10, 0.9, (), (), rms(month), rms(month), 1.0, 1.0, 30, (), (True, month != 1))
+        zeros = JointZeros(
+            shift,
+            torch.full((2,), DEVIATION).double(),
+            torch.zeros(2, 3).double(),
+            DEVIATION**2 * torch.eye(2).double(),
+        )
+        made.append(
+            Record(f"{month}.csv", f"2026-{month + 1:02d}-01", str(month), temperature, session, zeros)
+        )
+    return made
+
+
+def test_a_drift_is_charted_and_measured():
+    drifting = records(8, per_month=0.01)
+    joint, other, error = charts_of(REVOLUTE, drifting)
+    assert (joint.what, joint.unit, other.unit, error.unit) == ("joint 1", "deg", "mm", "mm")
+    assert joint.alarm is not None
+    assert joint.alarm <= 4
+    assert other.alarm is error.alarm is None
+    assert bool(other.values[1].isnan())
+    clear = [one for one in trends_of(REVOLUTE, drifting) if one.clear]
+    assert [(one.what, one.over) for one in clear] == [("joint 1", "month")]
+    low, high = clear[0].interval
+    assert low < 0.01 < high
+    assert "joint 1 drifts by 0.01" in clear[0].sentence
+
+
+def test_a_jump_is_no_drift():
+    made = records(10)
+    for record in made[6:]:
+        record.zeros.shift[0] += math.radians(0.05)
+    (jump,) = jumps_of(REVOLUTE, made)
+    assert (jump.what, jump.before, jump.after) == ("joint 1", "2026-06-01", "2026-07-01")
+    assert_close(jump.size, 0.05, atol=0.005)
+    assert not [one for one in trends_of(REVOLUTE, made) if one.clear]
+    assert jumps_of(REVOLUTE, records(8, per_month=0.01)) == jumps_of(REVOLUTE, records(8)) == ()
+
+
+@pytest.mark.parametrize(
+    ("off", "changes"),
+    [
+        ({4: 0.05}, [("2026-05-01", True, 0.05)]),
+        ({9: 0.05}, [("2026-10-01", False, 0.05)]),
+        ({3: 0.05, 4: 0.05, 5: 0.05}, [("2026-04-01", False, 0.05), ("2026-07-01", False, -0.05)]),
+        (
+            {3: 0.05, 4: 0.05, 5: 0.05, 6: 0.05, 7: 0.1, 8: 0.1, 9: 0.1},
+            [("2026-04-01", False, 0.05), ("2026-08-01", False, 0.05)],
+        ),
+    ],
+    ids=["one session", "last session", "three sessions", "twice"],
+)
+@pytest.mark.parametrize("per_month", [0.0, 0.01])
+def test_changes_of_any_kind_are_told_from_a_drift(off, changes, per_month):
+    made = records(10, per_month=per_month)
+    for month, size in off.items():
+        made[month].zeros.shift[0] += math.radians(size)
+    found = jumps_of(REVOLUTE, made)
+    assert [(one.what, one.after, one.alone) for one in found] == [("joint 1", *one[:2]) for one in changes]
+    for one, (_, _, size) in zip(found, changes, strict=True):
+        assert_close(one.size, size, atol=0.012)
+    clear = [one for one in trends_of(REVOLUTE, made) if one.clear]
+    assert len(clear) == (per_month > 0)
+
+
+def test_a_jump_of_the_error_passes_no_limit_by_itself():
+    made = records(10, rms=lambda month: 1e-4 * (1 + 0.1 * math.sin(9 * month)) + 4e-4 * (month >= 7))
+    assert forecast_of(made, 1.0).date is None
+
+
+def test_warming_is_no_drift_in_time():
+    warmed = records(10, per_kelvin=0.002, warm=lambda month: 20.0 + 8.0 * math.sin(month))
+    clear = [one for one in trends_of(REVOLUTE, warmed) if one.clear]
+    assert [(one.what, one.over) for one in clear] == [("joint 1", "kelvin")]
+    assert_close(clear[0].slope, 0.002, rtol=0.3)
+
+
+def test_few_sessions_say_nothing_of_a_drift():
+    assert trends_of(REVOLUTE, records(3, per_month=0.1)) == ()
+
+
+@pytest.mark.parametrize(
+    ("slope", "limit", "passed", "date"),
+    [(0.0, 0.5, False, None), (2e-5, 0.5, False, "2026-1"), (2e-5, 0.2, True, None)],
+)
+def test_a_limit_is_forecast(slope, limit, passed, date):
+    forecast = forecast_of(records(10, rms=lambda month: 3e-4 + slope * month), limit)
+    if date is None:
+        assert forecast.date is None
+    else:
+        assert forecast.date.startswith(date)
+        assert forecast.earliest <= forecast.date
+    assert forecast.passed is passed
+    assert forecast.sentence.endswith(".")

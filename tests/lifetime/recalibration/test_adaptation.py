@@ -1,0 +1,100 @@
+"""A model adapted to new rows: after a collision, with a moved instrument, and row after row as with all at once."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from testing.aged import model_before, rows_later
+from testing.closeness import assert_close
+from testing.linearised import with_directions
+from testing.models import hand_made_model
+
+from pisigma.files.errors import ModelError
+from pisigma.lifetime.recalibration.adaptation import Adaptation, adapt
+from pisigma.lifetime.recalibration.elsewhere import owners_elsewhere
+from pisigma.lifetime.recalibration.moved import moved_by, what_moved
+from pisigma.lifetime.recalibration.recalibrated_model import recalibrated_model
+from pisigma.lifetime.recalibration.recalibration_problem import recalibration_problem
+from pisigma.model.model_posterior import ModelPosterior
+from pisigma.model.row_poses import poses_of_rows
+
+COLLISION = (0.0, 0.0, math.radians(0.25), 0.0, 0.0, 0.0)
+SHIFTED = (0.3, -0.2, 0.1, 0.5, 0.2, -0.3)
+
+
+def adapted(model, rows, elsewhere=frozenset()) -> Adaptation:
+    posterior = ModelPosterior.of(model)
+    return adapt(recalibration_problem(model, posterior, rows, elsewhere), posterior.noise)
+
+
+def rms(errors: torch.Tensor) -> float:
+    return float(errors.square().sum(1).mean().sqrt())
+
+
+def rms_of(model, rows) -> float:
+    return rms(rows.position - poses_of_rows(model, rows)[:, :3, 3])
+
+
+def with_turned_joint_3(adaptation: Adaptation) -> Adaptation:
+    """The same of a robot whose joint 3 counts the other way round, as about an axis 0 0 -1 of a URDF file."""
+    design = adaptation.problem.design
+    robot = with_directions(design.problem.space.robot, (1, 1, -1, 1, 1, 1))
+    problem = replace(design.problem, space=replace(design.problem.space, robot=robot))
+    return replace(adaptation, problem=replace(adaptation.problem, design=replace(design, problem=problem)))
+
+
+def test_a_collision_is_found_and_repaired():
+    model = model_before()
+    before = rms_of(model, rows_later(300, 50, noise=0.0))
+    adaptation = adapted(model, rows_later(10, 2, COLLISION))
+    after = rms(adaptation.errors_of(rows_later(300, 50, COLLISION, noise=0.0))["position"])
+    assert after < 1.15 * before
+    moved = moved_by(adaptation)
+    assert [one.what for one in moved] == ["joint 3"]
+    low, high = moved[0].interval
+    assert low < 0.25 < high
+    assert high - low < 0.05
+    assert what_moved(moved).startswith("Joint 3 moved by 0.2")
+    (turned,) = moved_by(with_turned_joint_3(adaptation))
+    assert_close(turned.shift, -moved[0].shift)
+
+
+def test_nothing_moved_is_said_where_nothing_moved():
+    adaptation = adapted(model_before(), rows_later(10, 2))
+    assert what_moved(moved_by(adaptation)) == "Nothing moved beyond its uncertainty."
+
+
+@pytest.mark.parametrize("moved", [(0.0,) * 6, COLLISION])
+def test_an_instrument_elsewhere_is_found(moved):
+    model, rows = model_before(), rows_later(12, 2, moved, SHIFTED)
+    posterior = ModelPosterior.of(model)
+    assert owners_elsewhere(model, posterior, rows, posterior.noise) == {("base", "")}
+    assert not owners_elsewhere(model, posterior, rows_later(12, 2, moved), posterior.noise)
+    adaptation = adapted(model, rows, {("base", "")})
+    errors = adaptation.errors_of(rows_later(300, 50, moved, SHIFTED, noise=0.0))["position"]
+    assert rms(errors) < 1.5 * rms_of(model, rows_later(300, 50, noise=0.0))
+    whats = [one.what for one in moved_by(adaptation)]
+    assert whats == [*(["joint 3"] if any(moved) else []), "base", "base"]
+
+
+def test_row_after_row_is_as_all_at_once():
+    model = chain = model_before()
+    everything = rows_later(30, 11)
+    for k in range(3):
+        part = everything.select(torch.arange(10 * k, 10 * k + 10))
+        chain = recalibrated_model(chain, adapted(chain, part), part)
+    at_once = recalibrated_model(model, adapted(model, everything), everything)
+    test = rows_later(300, 50, noise=0.0)
+    assert_close(rms_of(chain, test), rms_of(at_once, test), rtol=0.05)
+    assert rms_of(chain, test) < rms_of(model, test)
+    deviations = [
+        one.uncertainty.deviation(test, test.q).norm(dim=1).mean() for one in (chain, at_once, model)
+    ]
+    assert_close(deviations[0], deviations[1], rtol=0.1)
+    assert deviations[1] < deviations[2]
+
+
+def test_a_model_without_a_posterior_is_refused():
+    with pytest.raises(ModelError, match=r"holds no posterior.*pisigma calibrate ROBOT DATA --out DIR"):
+        ModelPosterior.of(hand_made_model("kiro3"))

@@ -1,0 +1,74 @@
+"""Which candidate is kept: by the errors of left-out rows."""
+
+import math
+
+import pytest
+import torch
+from testing.aged import model_before, rows_later
+from testing.closeness import assert_close
+
+from pisigma.calibration.hybrid.calibrator import HybridCalibrator
+from pisigma.lifetime.recalibration.adaptation import adapt
+from pisigma.lifetime.recalibration.candidates import ABOUT_AS_GOOD, Gate, _decided, gate
+from pisigma.lifetime.recalibration.recalibration_problem import recalibration_problem
+from pisigma.model.model_posterior import ModelPosterior
+
+
+def decided(**errors: list[float]) -> Gate:
+    return _decided({name: torch.tensor(values).double() for name, values in errors.items()})
+
+
+def test_the_recalibrated_model_is_kept_where_it_is_about_as_good():
+    near = [0.99, 1.01] * 10
+    scaled = {factor: [factor * error for error in near] for factor in (1.04, 1.06, 0.9)}
+    assert decided(recalibrated=scaled[1.04], old=near, scratch=near).kept == "recalibrated"
+    assert decided(recalibrated=scaled[1.06], old=near, scratch=scaled[1.04]).kept == "old"
+    assert decided(recalibrated=scaled[1.06], old=near, scratch=scaled[0.9]).kept == "scratch"
+    by_chance = [0.5, 1.5] * 10
+    judged = decided(recalibrated=by_chance, old=[2.0] * 20, scratch=near)
+    assert judged.kept == "recalibrated"
+    assert judged.rms["scratch"] < judged.rms["recalibrated"]
+
+
+def test_a_row_that_is_off_by_far_does_not_save_a_candidate_that_is_worse_everywhere():
+    hopeless = [30.0] * 9 + [5_000.0]
+    assert decided(recalibrated=hopeless, old=[31.0] * 10, scratch=[0.9, 1.1] * 5).kept == "scratch"
+
+
+def test_a_candidate_that_is_far_better_is_kept_however_its_rows_are_distributed():
+    by_metres = [40.0, 1e-3, 0.3, 4.0, 6.0, 9.0]
+    by_luck = [2e-3, 0.2, 3e-3, 0.5, 4e-4, 0.3]
+    assert decided(recalibrated=by_metres, old=by_metres, scratch=by_luck).kept == "scratch"
+
+
+def test_a_candidate_that_cannot_be_fitted_is_not_kept():
+    judged = decided(recalibrated=[2.0, 2.1] * 5, old=[1.0, 1.1] * 5, scratch=[math.inf, 0.9] * 5)
+    assert (judged.kept, judged.rms["scratch"]) == ("old", None)
+    assert "scratch" not in judged.sentence
+
+
+def test_a_row_that_every_candidate_misses_does_not_count():
+    judged = decided(recalibrated=[1.0, 1.0, 1.0, 90.0], old=[1.2] * 3 + [80.0], scratch=[3.0] * 3 + [50.0])
+    assert (judged.kept, judged.rows) == ("recalibrated", 3)
+    assert_close(judged.rms["recalibrated"], 1.0)
+
+
+def test_without_left_out_rows_the_recalibrated_model_is_kept():
+    judged = decided(recalibrated=[math.nan] * 2, old=[math.nan] * 2, scratch=[math.nan] * 2)
+    assert (judged.kept, judged.rows) == ("recalibrated", 0)
+    assert judged.sentence == "The recalibrated model is kept: the rows are too few to leave any out."
+
+
+@pytest.mark.parametrize("count", [5, 10])
+def test_left_out_rows_decide(count):
+    model, rows = model_before(), rows_later(count, 2, (0.0, 0.0, math.radians(0.25), 0.0, 0.0, 0.0))
+    posterior = ModelPosterior.of(model)
+    problem = recalibration_problem(model, posterior, rows, frozenset())
+    whole = adapt(problem, posterior.noise)
+    calibrator = HybridCalibrator(posterior.space.robot)
+    judged = gate(model, whole, frozenset(), rows, calibrator, lambda what: None)
+    assert (judged.kept, judged.rows) == ("recalibrated", count)
+    kept, old = judged.rms["recalibrated"], judged.rms["old"]
+    assert kept is not None
+    assert old is not None
+    assert ABOUT_AS_GOOD * kept < old

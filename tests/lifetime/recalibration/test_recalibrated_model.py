@@ -1,0 +1,76 @@
+"""The model after new rows: it is the same after it was written and read, and knows more than before."""
+
+import math
+
+import pytest
+import torch
+from testing.aged import model_before, rows_later
+from testing.closeness import assert_close
+
+from pisigma.lifetime.recalibration.adaptation import adapt
+from pisigma.lifetime.recalibration.recalibrated_model import recalibrated_model
+from pisigma.lifetime.recalibration.recalibration_problem import recalibration_problem
+from pisigma.model.folder.model_folder import load_model, save_model
+from pisigma.model.model_posterior import ModelPosterior
+from pisigma.model.row_poses import poses_of_rows
+from pisigma.robot.se3 import invert, transform_from_xyzrpy
+
+ELSEWHERE = (0.3, -0.2, 0.1, 0.5, 0.2, -0.3)
+
+
+def recalibrated(rows, elsewhere=frozenset(), arm=True):
+    model = model_before()
+    posterior = ModelPosterior.of(model)
+    problem = recalibration_problem(model, posterior, rows, elsewhere)
+    adaptation = adapt(problem if arm else problem.without_arm(), posterior.noise)
+    return recalibrated_model(model, adaptation, rows), adaptation
+
+
+def frame(values) -> torch.Tensor:
+    return transform_from_xyzrpy(torch.tensor(list(values)).double())
+
+
+def test_it_is_the_same_after_writing_and_reading(tmp_path):
+    rows, test = rows_later(10, 2, (0.0, 0.0, math.radians(0.25), 0.0, 0.0, 0.0)), rows_later(20, 50)
+    model, adaptation = recalibrated(rows)
+    save_model(model, tmp_path)
+    loaded = load_model(tmp_path)
+    assert_close(poses_of_rows(loaded, test), poses_of_rows(model, test))
+    errors = adaptation.errors_of(test)["position"]
+    assert_close(test.position - poses_of_rows(model, test)[:, :3, 3], errors, atol=1e-12)
+    assert_close(loaded.uncertainty.root, model.uncertainty.root)
+    assert loaded.uncertainty.noise == model.uncertainty.noise
+    again = ModelPosterior.of(loaded)
+    assert_close(again.weights, ModelPosterior.of(model).weights, atol=1e-12)
+    at = adaptation.arm.geometry.robot.dh - model_before().hybrid.robot.dh
+    assert_close(loaded.calibrated.dh - model_before().calibrated.dh, at, atol=1e-12)
+
+
+def test_frames_elsewhere_take_the_geometric_calibration_along():
+    rows = rows_later(12, 2, base=ELSEWHERE)
+    model, _ = recalibrated(rows, {("base", "")}, arm=False)
+    before = model_before()
+    moved = [
+        frame(new[""]) @ invert(frame(old[""]))
+        for new, old in ((model.bases, before.bases), (model.hybrid_bases, before.hybrid_bases))
+    ]
+    assert_close(moved[0], moved[1], atol=1e-12)
+    assert_close(moved[0], frame(ELSEWHERE), atol=1e-3)
+    assert_close(model.hybrid.robot.dh, before.hybrid.robot.dh)
+    assert_close(model.robot.base, model.bases[""])
+    known = len(before.uncertainty.space.parameters)
+    assert_close(
+        (model.uncertainty.root[known:] @ model.uncertainty.root[known:].t()).diagonal(),
+        (before.uncertainty.root[known:] @ before.uncertainty.root[known:].t()).diagonal(),
+        rtol=1e-5,
+    )
+
+
+@pytest.mark.parametrize("name", ["hall", ""])
+def test_a_new_frame_stands_beside_the_old_ones(name):
+    rows = rows_later(12, 2)
+    two = type(rows)(q=rows.q, position=rows.position, frame=(name,) * 6 + ("wall",) * 6)
+    model, _ = recalibrated(two)
+    assert list(model.bases) == list(dict.fromkeys(["", name, "wall"]))
+    again = ModelPosterior.of(model)
+    assert again.space.frames == tuple(model.bases)

@@ -1,0 +1,44 @@
+"""The unknowns of a recalibration: those of the model and of the rows, in the order in which sensors number them."""
+
+import torch
+from testing.aged import model_before, rows_later
+from testing.closeness import assert_close
+
+from pisigma.calibration.geometric.problem.parameters import ParameterSpace
+from pisigma.lifetime.recalibration.recalibration_problem import _joined_space, recalibration_problem
+from pisigma.measurement.dataset import Measurements
+from pisigma.measurement.sensors.sensor import UnknownGroup
+from pisigma.measurement.sensors.socket import SOCKET_COLUMNS
+from pisigma.model.model_posterior import ModelPosterior
+from pisigma.robot import Robot
+
+
+def test_owners_stand_in_the_order_of_the_rows():
+    robot = Robot.load("kiro3")
+    before = ParameterSpace(
+        robot, ("wall",), ("",), (UnknownGroup("socket", SOCKET_COLUMNS, ("a", "b"), ("wall",) * 2),)
+    )
+    rows = Measurements(
+        q=torch.zeros(2, robot.dof).double(), socket=("c", "b"), frame=("floor",) * 2, target=("ball",) * 2
+    )
+    space = _joined_space(before, rows)
+    assert (space.frames, space.targets) == (("wall", "floor"), ("", "ball"))
+    (group,) = space.unknowns
+    assert (group.owners, group.frames) == (("c", "b", "a"), ("floor", "floor", "wall"))
+
+
+def test_the_prior_is_the_posterior_of_the_model():
+    model, rows = model_before(), rows_later(10, 2)
+    posterior = ModelPosterior.of(model)
+    problem = recalibration_problem(model, posterior, rows, frozenset())
+    parameters = len(posterior.space.parameters)
+    back = torch.cat([problem.change @ problem.root[:parameters], problem.root[parameters:]])
+    assert_close(back, posterior.root, atol=1e-12)
+    elsewhere = recalibration_problem(model, posterior, rows, {("base", "")})
+    base = elsewhere.design.problem.space.of("base")
+    assert not elsewhere.root[base.start : base.stop].any()
+    assert [group.what for group in elsewhere.groups if group.stands] == ["base"]
+    still = problem.without_arm()
+    assert still.root.shape[1] == 0
+    assert still.groups == ()
+    assert_close(still.standing, problem.root)

@@ -1,0 +1,53 @@
+"""Configurations that were measured wrongly, beside a joint that has moved and unknowns that could explain anything."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from testing.closeness import assert_close
+
+from pisigma.calibration.hybrid.evidence import SensorCount
+from pisigma.lifetime.recalibration.drift import DriftGroup, DriftSearch, LinearValues
+from pisigma.lifetime.recalibration.wrong_rows import Explained, with_wrong_rows
+
+NOISE, MOVED, CONFIGURATIONS = 1e-4, 4e-3, 12
+
+
+def explained(off: float, seed: int = 0) -> Explained[DriftSearch]:
+    """Three values of every configuration, of which one is off; as many unknowns as values, and a joint that moved."""
+    rng, count = np.random.default_rng(seed), 3 * CONFIGURATIONS
+    X = torch.from_numpy(rng.normal(size=(count, count + 1)))
+    y = MOVED * X[:, 0] + NOISE * torch.from_numpy(rng.normal(size=count))
+    y[15:18] += off * torch.tensor([0.6, 0.8, 0.0]).double()
+    noise = torch.tensor([NOISE]).double()
+    configuration = torch.arange(CONFIGURATIONS).repeat_interleave(3)
+    counts = (SensorCount(float(count), stated=False, exact=False),)
+    groups = [DriftGroup("joint 1", torch.tensor([0]), torch.ones(1).double())]
+    groups += [DriftGroup("correction", torch.arange(1, count + 1), torch.ones(count).double())]
+
+    values = LinearValues(X, y, torch.zeros(count, dtype=torch.int64), configuration, counts)
+
+    def explain(wrong) -> Explained[DriftSearch]:
+        there = replace(values, wrong=wrong)
+        search = DriftSearch(there, 1e-6 * X, groups, noise, noise)
+        search.estimate()
+        return Explained(search, there, search.log_evidence, search.covariance, search.deviation)
+
+    return with_wrong_rows(explain({}), explain)
+
+
+@pytest.mark.parametrize("off", [0.005, 0.5])
+def test_a_wrong_configuration_beside_a_drift_is_found(off):
+    result = explained(off)
+    assert list(result.values.wrong) == [5]
+    assert [group.what for group in result.what.drift.groups if group.size] == ["joint 1"]
+    assert_close(result.what.shift(0)[0], torch.tensor([MOVED]), rtol=0.05)
+    expected = result.what.drift.noise * torch.ones(36).double()
+    assert_close(result.deviation[:15], expected[:15])
+    assert float(result.deviation[15]) > 10 * NOISE
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_no_configuration_is_wrong_where_none_is(seed):
+    assert not explained(0.0, seed).values.wrong

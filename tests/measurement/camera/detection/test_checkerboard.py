@@ -1,0 +1,57 @@
+"""Corners of checkerboards in drawn images: where they are, how they are numbered, and why there are none."""
+
+import numpy as np
+import pytest
+from testing.board_images import CAMERA, draw_board, view
+from testing.closeness import assert_close
+
+from pisigma.measurement.camera.board import Board
+from pisigma.measurement.camera.detection.checkerboard import detect_checkerboard
+from pisigma.measurement.camera.detection.detected_board import DetectedBoard, EdgeProfiles, NoBoard
+
+BOARD = Board("board", 4, 5, 0.03)
+
+
+@pytest.mark.parametrize("roll", [0.0, 1.5, 3.0, -1.7])
+def test_corners_are_found_and_numbered_however_the_camera_is_turned(roll: float) -> None:
+    R, t = view(BOARD, 0.35, (roll, 0.4, -0.3))
+    detected = detect_checkerboard(draw_board(BOARD, R, t), BOARD)
+    assert isinstance(detected, DetectedBoard)
+    assert detected.corners.tolist() == list(range(20))
+    true = CAMERA.project(BOARD.corners @ R.T + t)[0]
+    assert_close(detected.pixels, true, atol=0.08)
+    assert_close(np.sqrt(np.square(detected.pixels - true).mean()), 0.0, atol=0.03)
+
+
+def test_a_symmetric_board_is_numbered_from_the_upper_left() -> None:
+    board = Board("board", 4, 4, 0.03)
+    R, t = view(board, 0.35, (3.0, 0.3, 0.0))
+    detected = detect_checkerboard(draw_board(board, R, t), board)
+    assert isinstance(detected, DetectedBoard)
+    true = CAMERA.project(board.corners @ R.T + t)[0]
+    assert_close(detected.pixels, true[::-1], atol=0.1)
+
+
+def test_why_there_is_no_board() -> None:
+    image = draw_board(BOARD, *view(BOARD, 0.35, (0.0, 0.3, 0.0)))
+    image[:, :280] = 120
+    piece, nothing = detect_checkerboard(image, BOARD), detect_checkerboard(np.zeros_like(image), BOARD)
+    assert isinstance(piece, NoBoard)
+    assert isinstance(nothing, NoBoard)
+    assert piece.reason == "only a piece of 4 x 3 corners is found of a board of 4 x 5 corners"
+    assert nothing.reason == "no board of 4 x 5 corners is found in it"
+
+
+def test_edges_without_contrast_have_no_blur_and_stay() -> None:
+    ends = np.array([[[100.0, 100.0], [150.0, 110.0]]])
+    profiles = EdgeProfiles.of(np.full((400, 640), 90, dtype=np.uint8), ends, 0.2)
+    assert np.isnan(profiles.blur)
+    assert_close(profiles.points, profiles.at)
+
+
+@pytest.mark.parametrize("blur", [1.0, 2.5])
+def test_the_blur_of_edges(blur: float) -> None:
+    R, t = view(BOARD, 0.3, (0.4, 0.3, 0.0))
+    ends = CAMERA.project(BOARD.corners @ R.T + t)[0][BOARD.edges]
+    profiles = EdgeProfiles.of(draw_board(BOARD, R, t, blur=blur), ends, BOARD.clearance)
+    assert_close(profiles.blur, np.hypot(blur, 0.5), rtol=0.05)

@@ -1,0 +1,175 @@
+"""Files of corners, of several cameras and beside rows of other sensors, as measurements."""
+
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from testing.camera_cell import BOARD, CAMERA, camera_cell, corner_lines
+from testing.closeness import assert_close
+
+from pisigma.files.errors import MeasurementError
+from pisigma.measurement.camera.board import Board
+from pisigma.measurement.camera.camera import Camera
+from pisigma.measurement.camera.corner_file import CameraFiles, read_rows
+from pisigma.measurement.camera.image_rows import Repeatability
+from pisigma.measurement.dataset import Measurements
+from pisigma.measurement.sensors.intrinsics import boards, without_stated
+from pisigma.robot.kinematics.forward import forward_kinematics
+from pisigma.simulation.camera.images import ImageNoise
+
+EXACT = ImageNoise(0.0, Repeatability(0.0, 0.0))
+BESIDE, HAND = replace(CAMERA, name="beside", is_fixed=True), replace(BOARD, name="hand")
+
+
+def camera_files(
+    folder: Path, cameras: tuple[Camera, ...] = (CAMERA,), boards: tuple[Board, ...] = (BOARD,)
+) -> CameraFiles:
+    """Write the files of cameras and boards."""
+    paths: tuple[list[str], list[str]] = ([], [])
+    for camera in cameras:
+        paths[0].append(str(folder / f"{camera.name}.yaml"))
+        Path(paths[0][-1]).write_text(yaml.safe_dump(asdict(camera)))
+    for board in boards:
+        paths[1].append(str(folder / f"{board.name}.yaml"))
+        stated = {"name": board.name, "rows": board.rows, "columns": board.columns}
+        Path(paths[1][-1]).write_text(yaml.safe_dump(stated | {"square_mm": board.square * 1e3}))
+    return CameraFiles(tuple(paths[0]), tuple(paths[1]))
+
+
+def with_columns(lines: list[str], **columns: str) -> list[str]:
+    """Lines with further columns, of which all rows hold the same."""
+    names, cells = ",".join(columns), ",".join(columns.values())
+    return [f"{lines[0]},{names}", *(f"{line},{cells}" for line in lines[1:])]
+
+
+@pytest.mark.parametrize("is_fixed", [False, True], ids=["flange", "fixed"])
+def test_exact_corners_give_the_poses_of_the_target(tmp_path: Path, is_fixed: bool) -> None:
+    cell = camera_cell(8, 0, EXACT, is_fixed)
+    path = tmp_path / "corners.csv"
+    path.write_text("\n".join(corner_lines(cell.images)) + "\n")
+    rows = read_rows(path, cell.nominal, replace(camera_files(tmp_path), is_fixed=is_fixed))
+    assert (rows.frame[0], rows.target[0]) == (("wrist", "board") if is_fixed else ("board", "wrist"))
+    assert_close(rows.T, forward_kinematics(cell.true, cell.images.q), atol=1e-7)
+    assert rows.place(1) == f"{path}, line {2 + len(cell.images.corners[0])} (image '0001')"
+    rows.write_csv(tmp_path / "rows.csv", cell.nominal)
+    again = Measurements.read_csv(tmp_path / "rows.csv", cell.nominal)
+    assert again.kinds == {"pose", "corner"}
+    assert again.image == rows.image
+
+
+def test_a_model_that_names_neither_frame_nor_target_takes_images(tmp_path: Path) -> None:
+    cell = camera_cell(3, 0, EXACT)
+    (tmp_path / "corners.csv").write_text("\n".join(corner_lines(cell.images)) + "\n")
+    rows = read_rows(tmp_path / "corners.csv", cell.nominal, camera_files(tmp_path))
+    renamed = replace(rows, frame=("",) * 3, target=("",) * 3)
+    assert boards(rows) == boards(renamed) == ("board",) * 3
+    assert without_stated(renamed, {}).rows == 3
+
+
+def test_several_cameras_and_other_sensors_in_one_file(tmp_path: Path) -> None:
+    wrist, fixed = camera_cell(3, 0, EXACT), camera_cell(2, 0, EXACT, True)
+    lines = with_columns(corner_lines(wrist.images), camera="wrist", board="board", set="train", x_mm="")
+    other = with_columns(corner_lines(fixed.images), camera="beside", board="hand", set="test", x_mm="")
+    joints = ",".join("10" for _ in range(6))
+    lines = [line + "," for line in [*lines, *other[1:]]]
+    lines = [lines[0] + "y_mm,z_mm", *(f"{line}," for line in lines[1:]), f",,,,{joints},,,train,100,200,300"]
+    path = tmp_path / "corners.csv"
+    path.write_text("\n".join(lines) + "\n")
+    rows = read_rows(path, wrist.nominal, camera_files(tmp_path, (CAMERA, BESIDE), (BOARD, HAND)))
+    assert rows.frame == ("board",) * 3 + ("beside",) * 2 + ("",)
+    assert rows.target == ("wrist",) * 3 + ("hand",) * 2 + ("",)
+    assert rows.split == ("train",) * 3 + ("test",) * 2 + ("train",)
+    assert_close(rows.T[:3], forward_kinematics(wrist.true, wrist.images.q), atol=1e-7)
+    assert_close(rows.T[3:5], forward_kinematics(fixed.true, fixed.images.q), atol=1e-7)
+    assert rows.position is not None
+    assert_close(rows.position[5].numpy(), np.array([0.1, 0.2, 0.3]), atol=1e-15)
+    assert rows.image == ("0000", "0001", "0002", "0000", "0001", "")
+
+
+def test_rows_of_several_files_keep_their_names(tmp_path: Path) -> None:
+    cell = camera_cell(3, 0, EXACT)
+    corners, tracker = tmp_path / "corners.csv", tmp_path / "tracker.csv"
+    corners.write_text("\n".join(corner_lines(cell.images)) + "\n")
+    Measurements(cell.images.q[:2], cell.images.q[:2, :3]).write_csv(tracker, cell.nominal)
+    rows = read_rows([corners, tracker], cell.nominal, camera_files(tmp_path))
+    assert rows.file_names == "corners.csv + tracker.csv"
+    assert rows.select(rows.measured("position")).place(1) == f"{tracker}, line 3"
+
+
+def test_corners_count_by_their_deviations(tmp_path: Path) -> None:
+    cell = camera_cell(2, 0, EXACT)
+    lines = with_columns(corner_lines(cell.images), sigma_px="0.5")
+    worse = lines[10].split(",")
+    lines[10] = ",".join([*worse[:2], str(float(worse[2]) + 1.0), *worse[3:-1], "500"])
+    path = tmp_path / "corners.csv"
+    path.write_text("\n".join(lines) + "\n")
+    rows = read_rows(path, cell.nominal, camera_files(tmp_path))
+    assert_close(rows.T, forward_kinematics(cell.true, cell.images.q), atol=1e-7)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (
+            lambda lines: [lines[0].replace("u_px", "u"), *lines[1:]],
+            "there is no column 'u_px'; did you mean 'v_px'",
+        ),
+        (lambda lines: lines[:1], "the file ends after its header"),
+        (lambda lines: lines[:5], "line 2: image '0000' has 4 corners, but 6 or more were wanted"),
+        (lambda lines: [*lines, lines[1]], "image '0000' has a corner twice"),
+        (
+            lambda lines: [*lines, lines[1].replace("0000,0", "0000,54", 1)],
+            "number from 0 to 53 was wanted.*got 54",
+        ),
+        (
+            lambda lines: [*lines[:54], lines[54].rpartition(",")[0] + ",1.5"],
+            "image '0000' has rows of different joint values",
+        ),
+        (
+            lambda lines: [*lines[:9], lines[9].replace(",", ",x", 2), *lines[10:]],
+            "line 10, column 'corner'.*'x8'",
+        ),
+        (
+            lambda lines: [*lines[:9], lines[9].replace(",8,", ",8,nan", 1), *lines[10:]],
+            "line 10, column 'u_px': a number was wanted, got 'nan",
+        ),
+        (
+            lambda lines: [*lines[:9], lines[9].replace(",8,", ",8,9", 1), *lines[10:]],
+            "line 10: the corner at u = 9.* is outside of the 1920 x 1200 px of camera 'wrist'",
+        ),
+        (lambda lines: [*lines, "0000,3"], "2 fields, but the header has 10; complete the row"),
+        (lambda lines: with_columns(lines, sigma_px="0"), "column 'sigma_px': a standard deviation above 0"),
+        (
+            lambda lines: with_columns(lines, camera="wirst"),
+            "line 2, column 'camera': the name of a camera was wanted, got 'wirst'; did you mean 'wrist'",
+        ),
+    ],
+)
+def test_faulty_files_are_named(tmp_path: Path, change, message: str) -> None:
+    path = tmp_path / "corners.csv"
+    path.write_text("\n".join(change(corner_lines(camera_cell(8, 0, EXACT).images))) + "\n")
+    with pytest.raises(MeasurementError, match=message):
+        read_rows(path, camera_cell(8, 0, EXACT).nominal, camera_files(tmp_path))
+
+
+def test_what_is_stated_of_cameras_has_to_fit_the_files(tmp_path: Path) -> None:
+    cell = camera_cell(8, 0, EXACT)
+    path = tmp_path / "corners.csv"
+    path.write_text("\n".join(corner_lines(cell.images)) + "\n")
+    two = camera_files(tmp_path, (CAMERA, BESIDE))
+    with pytest.raises(MeasurementError, match="there is no column 'camera'"):
+        read_rows(path, cell.nominal, two)
+    with pytest.raises(
+        MeasurementError, match=r"these are corners .*state what they mean with --camera .* read\.$"
+    ):
+        read_rows(path, cell.nominal)
+    with pytest.raises(MeasurementError, match="another camera is called 'wrist', too"):
+        read_rows(path, cell.nominal, replace(two, cameras=two.cameras[:1] * 2))
+    large = camera_files(tmp_path, (replace(CAMERA, width=7680, height=4800),))
+    with pytest.raises(MeasurementError, match=r"all corners lie within .* px, a quarter of the 7680 x 4800"):
+        read_rows(path, cell.nominal, large)
+    Measurements(cell.images.q, cell.images.q[:, :3]).write_csv(tmp_path / "tracker.csv", cell.nominal)
+    with pytest.raises(MeasurementError, match="corners of images were wanted, as a camera is stated"):
+        read_rows(tmp_path / "tracker.csv", cell.nominal, camera_files(tmp_path))

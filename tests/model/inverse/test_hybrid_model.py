@@ -1,0 +1,333 @@
+"""Models of hybrid calibrations: predictions, their folder, and folders that cannot be true."""
+
+import hashlib
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import yaml
+from safetensors.torch import load_file, save_file
+from testing.closeness import assert_close
+from testing.hybrid import hybrid_of, joints_in
+
+from pisigma.calibration.hybrid.covariance_root import CovarianceRoot
+from pisigma.files.errors import MeasurementError, ModelError, PoseError
+from pisigma.measurement.dataset import Measurements
+from pisigma.model.accuracy import deviation_of_rows, parameter_posterior, position_accuracy
+from pisigma.model.folder.model_folder import load_model, save_model
+from pisigma.model.geometric_model import model_of_hybrid
+from pisigma.model.hybrid_motion import hybrid_motion, hybrid_poses
+from pisigma.model.row_poses import nominal_poses_of_rows, poses_of_rows
+from pisigma.robot.kinematics.forward import forward_kinematics
+from pisigma.robot.kinematics.jacobian import joint_jacobian
+from pisigma.robot.se3 import pose_error
+
+pytestmark = pytest.mark.usefixtures("without_type_checker")
+
+SET_UPS = {
+    "additive": {"name": "rb5"},
+    "products": {"name": "rb5", "products": True, "frames": True},
+    "half": {"name": "kiro4", "share": 0.5},
+    "joints": {"name": "ur5", "features": ("joints",)},
+    "slide": {"name": "kiro3"},
+    "payload": {"name": "rb5", "features": ("gravity", "conditions", "series"), "payloads": (0.0, 20.0)},
+}
+
+
+def model_of(set_up: str):
+    arm = hybrid_of(**SET_UPS[set_up])
+    return arm, model_of_hybrid("hybrid", arm.true.nominal, arm.result, arm.measurements, ("recipe", "ab"))
+
+
+@pytest.fixture(scope="module", params=SET_UPS)
+def hybrid(request):
+    """What was simulated, and the model of its calibration."""
+    return model_of(request.param)
+
+
+def everywhere(arm, rows: int = 300) -> torch.Tensor:
+    return joints_in(arm.true.nominal, rows, seed=7)
+
+
+def test_the_set_ups_are_what_their_names_say():
+    assert model_of("additive")[1].hybrid.correction.orders == ()
+    assert set(model_of("products")[1].hybrid.correction.orders) == {2}
+    assert [f.name for f in model_of("joints")[1].hybrid.correction.features] == ["joints"]
+    assert "conditions" in [f.name for f in model_of("payload")[1].hybrid.correction.features]
+    arm, model = model_of("half")
+    inside = model.hybrid.coverage.contains(everywhere(arm))
+    assert 0 < int(inside.sum()) < len(inside)
+
+
+def test_the_model_predicts_what_the_calibration_does(hybrid):
+    arm, model = hybrid
+    assert (model.kind, model.provenance.recipe) == ("hybrid_calibration", "recipe")
+    q = everywhere(arm)
+    assert_close(model.forward(q), arm.result.arm().forward(q), atol=1e-12)
+    assert_close(
+        poses_of_rows(model, arm.measurements), arm.result.predicted_poses(arm.measurements), atol=1e-12
+    )
+    errors = arm.measurements.position - poses_of_rows(model, arm.measurements)[:, :3, 3]
+    nominal = arm.measurements.position - nominal_poses_of_rows(model, arm.measurements)[:, :3, 3]
+    assert float(errors.square().mean()) < 0.2 * float(nominal.square().mean())
+
+
+def test_frames_and_targets_are_told_apart():
+    arm, model = model_of("products")
+    assert list(model.bases) == list(model.hybrid_bases) == ["wall", "floor"]
+    q = everywhere(arm, 4)
+    names = {"frame": ("wall", "floor") * 2, "target": ("A", "A", "B", "B")}
+    rows = Measurements(q=q, **names)
+    assert_close(poses_of_rows(model, rows), arm.result.predicted_poses(rows), atol=1e-12)
+    assert_close(poses_of_rows(model, rows)[0], model.forward(q)[0], atol=1e-12)
+    with pytest.raises(MeasurementError, match="was not fitted to frame 'ceiling'"):
+        poses_of_rows(model, replace(rows, frame=("ceiling",) * 4))
+
+
+def test_deviations_are_those_of_the_calibration(hybrid):
+    arm, model = hybrid
+    own = replace(arm.measurements, q=everywhere(arm, len(arm.measurements.q)), position=None)
+    expected = arm.result.deviation(own)
+    assert_close(deviation_of_rows(model, own), expected, atol=1e-12, rtol=1e-5)
+    rows = [i for i in range(own.rows) if (own.frame[i], own.target[i]) == (own.frame[0], own.target[0])]
+    found = position_accuracy(model, own.q[rows].reshape(1, len(rows), -1))
+    expected = arm.result.deviation(replace(own, payload=None))  # under the usual conditions
+    assert_close(found[0], expected[rows].norm(dim=-1), atol=1e-12, rtol=1e-5)
+
+
+def test_without_a_name_the_only_frame_is_meant():
+    arm, model = model_of("additive")
+    rows = Measurements(q=everywhere(arm, 3), frame=("anything",) * 3)
+    assert_close(deviation_of_rows(model, rows), deviation_of_rows(model, replace(rows, frame=())))
+    assert_close(poses_of_rows(model, rows), model.forward(rows.q), atol=1e-12)
+
+
+def test_the_accuracy_of_nothing_is_nan():
+    arm, model = model_of("additive")
+    q = everywhere(arm, 3)
+    q[1, 2] = torch.nan
+    found = position_accuracy(model, q)
+    assert found.isnan().tolist() == [False, True, False]
+    assert bool(position_accuracy(replace(model, uncertainty=None), q).isnan().all())
+    assert position_accuracy(model, q[:0]).shape == (0,)
+
+
+def test_beyond_the_measured_joints_the_correction_holds_and_is_less_certain():
+    arm, model = model_of("half")
+    q = everywhere(arm)
+    inside, moved = model.hybrid.coverage.contains(q), q + model.hybrid.correction(q)
+    assert_close(model.forward(q), forward_kinematics(model.hybrid.robot, moved), atol=1e-15)
+    predicted = position_accuracy(model, q)
+    assert float(predicted[~inside].median()) > 1.2 * float(predicted[inside].median())
+
+
+def test_a_folder_gives_the_same_predictions_to_the_last_bit(hybrid, tmp_path):
+    arm, model = hybrid
+    save_model(model, tmp_path)
+    loaded = load_model(tmp_path)
+    q = everywhere(arm)
+    assert torch.equal(loaded.forward(q), model.forward(q))
+    assert torch.equal(poses_of_rows(loaded, arm.measurements), poses_of_rows(model, arm.measurements))
+    assert torch.equal(
+        deviation_of_rows(loaded, arm.measurements), deviation_of_rows(model, arm.measurements)
+    )
+    posterior, kept = parameter_posterior(model), parameter_posterior(loaded)
+    assert (kept.names, kept.weights) == (posterior.names, posterior.weights)
+    assert torch.equal(kept.mean, posterior.mean)
+    assert torch.equal(kept.root, posterior.root)
+    assert np.array_equal(loaded.robot.dh, model.robot.dh)
+    assert np.array_equal(loaded.robot.limits, model.robot.limits)
+    assert loaded.branches == model.branches
+    assert loaded.provenance == model.provenance
+    assert not any(parameter.requires_grad for parameter in loaded.hybrid.correction.parameters())
+    again = tmp_path / "again"
+    again.mkdir()
+    save_model(loaded, again)
+    assert (again / "model.yaml").read_bytes() == (tmp_path / "model.yaml").read_bytes()
+    assert (again / "model.safetensors").read_bytes() == (tmp_path / "model.safetensors").read_bytes()
+
+
+def test_without_a_correction_it_is_the_geometric_model(tmp_path):
+    arm, _ = model_of("additive")
+    known = arm.result.uncertainty
+    size = len(known.space.parameters)
+    bare = replace(known, features=(), covariance_root=CovarianceRoot(known.root[:size]))
+    result = replace(arm.result, learned=None, uncertainty=bare)
+    model = model_of_hybrid("geometric", arm.true.nominal, result, arm.measurements)
+    assert (model.kind, model.hybrid) == ("geometric_calibration", None)
+    save_model(model, tmp_path)
+    loaded = load_model(tmp_path)
+    q = everywhere(arm)
+    assert torch.equal(loaded.forward(q), forward_kinematics(arm.result.geometric.robot, q))
+    assert torch.equal(position_accuracy(loaded, q), position_accuracy(model, q))
+    assert_close(
+        deviation_of_rows(model, arm.measurements), result.deviation(arm.measurements), rtol=1e-3, atol=0
+    )
+
+
+@pytest.mark.parametrize("batch", [(), (0,), (1,), (3, 1, 2), (5000,)], ids=str)
+def test_poses_of_batches(batch):
+    arm, model = model_of("additive")
+    q = everywhere(arm, int(np.prod(batch))).reshape(*batch, 6)
+    T = hybrid_poses(model.hybrid, q)
+    assert T.shape == (*batch, 4, 4)
+    assert_close(T, model.hybrid.forward(q), atol=1e-14)
+    with pytest.raises(PoseError, match="has 6 joints"):
+        hybrid_poses(model.hybrid, q[..., :5])
+
+
+@pytest.mark.parametrize("set_up", ["additive", "products", "half", "slide"])
+def test_the_jacobian_agrees_with_differences(set_up):
+    arm, model = model_of(set_up)
+    inside = (arm.measurements.q[:40] + arm.measurements.q[40:80]) / 2  # not at the ends of what was measured
+    q = torch.cat([everywhere(arm, 60), inside])
+    T, J = hybrid_motion(model.hybrid, q)
+    assert_close(T, model.forward(q), atol=1e-13)
+    step = 1e-6 * torch.eye(q.shape[1], dtype=torch.float64)
+    for joint in range(q.shape[1]):
+        ahead, behind = (model.forward(q + sign * step[joint]) for sign in (1, -1))
+        assert_close(J[..., joint], pose_error(ahead, behind) / 2e-6, atol=2e-6)
+    cheap = hybrid_motion(model.hybrid, q, exact=False)[1]
+    assert 1e-5 < float((cheap - J).abs().max()) < 0.05
+    assert float((joint_jacobian(model.calibrated, q)[1] - J).abs().max()) > 1e-5
+
+
+@pytest.fixture
+def folder(tmp_path) -> Path:
+    save_model(model_of("products")[1], tmp_path)
+    return tmp_path
+
+
+def edit(folder: Path, change) -> None:
+    """Change the description and sign it again, as a foreign program might."""
+    text = (folder / "model.yaml").read_text()
+    document = yaml.load(text[: text.index("\nsha256: ") + 1], Loader=yaml.CSafeLoader)
+    change(document)
+    body = yaml.dump(document, Dumper=yaml.CSafeDumper, sort_keys=False)
+    (folder / "model.yaml").write_text(f"{body}sha256: {hashlib.sha256(body.encode()).hexdigest()}\n")
+
+
+def edit_tensors(folder: Path, change) -> None:
+    """Change the weights and note their new hash."""
+    path = folder / "model.safetensors"
+    tensors = load_file(path)
+    change(tensors)
+    save_file({name: value.contiguous() for name, value in tensors.items()}, path)
+    digest = hashlib.sha256(path.read_bytes()).hexdigest()
+    edit(folder, lambda document: document.update(weights_sha256=digest))
+
+
+def refused(folder: Path) -> str:
+    """The complaint: one sentence that names the folder."""
+    with pytest.raises(ModelError) as caught:
+        load_model(folder)
+    sentence = str(caught.value)
+    assert "\n" not in sentence
+    assert sentence.startswith(str(folder))
+    assert len(sentence) < 600
+    return sentence
+
+
+def test_an_unchanged_folder_survives_the_editing_of_these_tests(folder):
+    edit_tensors(folder, lambda tensors: None)
+    assert load_model(folder).kind == "hybrid_calibration"
+
+
+@pytest.mark.parametrize("name", ["model.yaml", "model.safetensors"])
+@pytest.mark.parametrize("share", [0.3, 0.97, 0.9999])
+def test_truncated_files(folder, name, share):
+    content = (folder / name).read_bytes()
+    (folder / name).write_bytes(content[: int(share * len(content))])
+    assert "truncated" in refused(folder)
+
+
+def _learned(**values):
+    return lambda document: document["learned"].update(values)
+
+
+def _known(**values):
+    return lambda document: document["uncertainty"].update(values)
+
+
+@pytest.mark.parametrize(
+    ("change", "complaint"),
+    [
+        (lambda document: document.update(format=99), "format 99 is newer"),
+        (_learned(features=[{"name": "seris", "harmonics": 3}]), "features"),
+        (_learned(features=[{"name": "series", "harmonics": 3}]), "uncertainty is of the features"),
+        (_learned(features=[{"name": "series", "harmonics": 3}] * 2), "uncertainty is of the features"),
+        (_learned(features=[{"name": "series", "harmonics": 10**9}]), "100000"),
+        (_learned(features=[{"name": "series", "harmonics": 4, "gravity": [0, 0, 1]}]), "gravity"),
+        (_learned(features=[{"name": "gravity", "gravity": [0.0, 0.0, 0.0]}]), "needs a direction"),
+        (_learned(features=[]), "uncertainty is of the features"),
+        (_learned(orders=[2, 2]), "of shape"),
+        (_learned(orders=[1]), "orders"),
+        (_learned(orders=[]), "of shape"),
+        (_learned(fade_rad=0.1), "unknown key 'fade_rad'"),
+        (lambda document: document["learned"]["bases"].pop("floor"), "other frames or targets"),
+        (lambda document: document["bases"].pop("floor"), "other frames or targets"),
+        (_learned(tools={}), "other frames or targets"),
+        (lambda document: document.pop("learned"), "is unknown"),
+        (lambda document: document.pop("uncertainty"), "'uncertainty.root' is unknown"),
+        (lambda document: document.update(calibrated=None), "needs the calibrated robot"),
+        (_known(free=[0, 1]), "of shape"),
+        (lambda document: document["uncertainty"]["free"].reverse(), "rising numbers"),
+        (lambda document: document["uncertainty"]["free"].__setitem__(-1, 9999), "rising numbers"),
+        (lambda document: document["uncertainty"]["features"].pop(0), "uncertainty is of the features"),
+        (lambda document: document["uncertainty"]["features"].remove("products"), "of shape"),
+        (_known(features=3), "features"),
+        (_known(unknowns=[{"name": "socket"}]), "unknowns"),
+        (_known(prior_scale=-1.0), "prior_scale"),
+        (_known(values={"socket": {"A": [0.0, "far"]}}), "values"),
+        (
+            lambda document: document["robot"]["rows"][0].update(d_mm=1.0),
+            "not the geometry in the description",
+        ),
+        (
+            lambda document: document["robot"]["rows"][0].update(limits_deg=[-10.0, 10.0]),
+            "not the limits in the description",
+        ),
+        (lambda document: document["robot"]["rows"][0].pop("limits_deg"), "of shape"),
+    ],
+)
+def test_descriptions_that_do_not_fit(folder, change, complaint):
+    edit(folder, change)
+    assert complaint in refused(folder)
+
+
+def _put(name: str, value: torch.Tensor):
+    return lambda tensors: tensors.update({name: value})
+
+
+@pytest.mark.parametrize(
+    ("change", "complaint"),
+    [
+        (lambda tensors: tensors.pop("learned.dh"), "'learned.dh' is missing"),
+        (lambda tensors: tensors.pop("coverage.half"), "'coverage.half' is missing"),
+        (lambda tensors: tensors.pop("correction.linear.0"), "'correction.linear.0' is missing"),
+        (_put("correction.linear.9", torch.zeros(1).double()), "'correction.linear.9' is unknown"),
+        (_put("correction.weight", torch.zeros(6, 3, 12).double()), "'correction.weight' of shape"),
+        (
+            lambda tensors: tensors.update({"correction.bias": tensors["correction.bias"].float()}),
+            "'correction.bias' in float64 was wanted",
+        ),
+        (_put("coverage.joint", torch.zeros(6).double()), "'coverage.joint' in int64 was wanted"),
+        (_put("coverage.joint", torch.zeros(6, dtype=torch.int64)), "a stretch"),
+        (_put("coverage.middle", torch.zeros(99).double()), "joint, middle or half is missing"),
+        (lambda tensors: tensors["coverage.half"].fill_(-1.0), "at least no length"),
+        (lambda tensors: tensors["coverage.half"].fill_(torch.nan), "not finite"),
+        (lambda tensors: tensors["correction.weight"].view(-1)[3:4].fill_(torch.inf), "not finite"),
+        (lambda tensors: tensors["drawn.dh"].add_(1e-6), "'drawn.dh' is not the geometry"),
+        (lambda tensors: tensors["calibrated.base"].add_(1e-6), "'calibrated.base' is not the geometry"),
+        (lambda tensors: tensors["drawn.limits"].add_(1e-6), "not the limits"),
+        (
+            lambda tensors: tensors.update({"uncertainty.root": tensors["uncertainty.root"].float()}),
+            "'uncertainty.root' in float64 was wanted",
+        ),
+    ],
+)
+def test_tensors_that_do_not_fit(folder, change, complaint):
+    edit_tensors(folder, change)
+    assert complaint in refused(folder)

@@ -1,0 +1,259 @@
+"""One call for arrays, without torch, and for tensors; and one for models without kernels."""
+
+import shutil
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import torch
+from testing.closeness import assert_close
+from testing.models import hand_made_model, joints_around, no_type_checker
+
+import pisigma
+from pisigma.files.errors import ModelError, PoseError
+from pisigma.files.model_files import COMPILED, DESCRIPTION, WEIGHTS, ready_hash
+from pisigma.model.calibrated_model import CalibratedModel
+from pisigma.model.folder.model_folder import save_model
+from pisigma.model.inverse.corrected_ik import CorrectedIK, load
+from pisigma.model.inverse.solution import Solution
+from pisigma.robot import Robot
+from pisigma.robot.kinematics.status import Status
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A model folder of a UR10 with errors in all parameters."""
+    nominal, rng = Robot.load("ur10"), np.random.default_rng(4)
+    model = CalibratedModel(
+        name="cell",
+        kind="geometric_calibration",
+        robot=nominal,
+        network=None,
+        domain=None,
+        branches=(),
+        starts=joints_around("ur10", 50, spread=0.6),
+        calibrated=nominal.with_geometry(nominal.dh + 5e-4 * rng.normal(size=nominal.dh.shape)),
+    )
+    path = tmp_path_factory.mktemp("models") / "cell"
+    path.mkdir()
+    with no_type_checker():
+        save_model(model, path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def ik(folder):
+    return load(folder)
+
+
+@pytest.fixture(scope="module")
+def poses(ik):
+    with no_type_checker():
+        return ik.model.forward(joints_around("ur10", 3, 4, spread=0.5))
+
+
+def call(ik, *arguments, **options):
+    with no_type_checker():
+        return ik(*arguments, **options)
+
+
+@pytest.mark.parametrize("batch", [(), (4,), (3, 4), (0,)])
+def test_both_routes_give_the_same_in_their_own_kind(ik, poses, batch):
+    T = {(): poses[0, 0], (4,): poses[1], (3, 4): poses, (0,): poses[0, :0]}[batch]
+    arrays, tensors = call(ik, T.numpy()), call(ik, T)
+    assert type(arrays) is type(tensors) is Solution
+    assert isinstance(arrays.q, np.ndarray)
+    assert isinstance(tensors.q, torch.Tensor)
+    assert arrays.q.shape == tuple(tensors.q.shape) == (*batch, 6)
+    for name in ("q", "q_nominal", "correction"):
+        assert_close(getattr(arrays, name), getattr(tensors, name), atol=1e-9)
+    for name in ("status", "branch"):
+        assert_close(np.asarray(getattr(arrays, name)), getattr(tensors, name))
+    for name in ("position_residual", "rotation_residual"):
+        assert np.shape(getattr(arrays, name)) == batch
+        assert_close(np.asarray(getattr(arrays, name)), np.zeros(batch), atol=1e-9)
+        assert_close(getattr(tensors, name), np.zeros(batch), atol=1e-9)
+    assert arrays.sentences == tensors.sentences
+    assert arrays.branches == tensors.branches == ik.branches
+    assert np.isnan(arrays.accuracy).all()  # nothing is known of it
+    assert np.shape(arrays.accuracy) == batch
+
+
+def test_lists_are_arrays(ik, poses):
+    assert_close(call(ik, poses[0, 0].tolist()).q, call(ik, poses[0, 0].numpy()).q)
+    assert_close(call(ik, poses.tolist()).q, call(ik, poses.numpy()).q)
+
+
+def test_near_of_any_batch(ik, poses):
+    q = call(ik, poses.numpy()).q
+    for near in (q[0, 0], q[0], q, q[:, :1]):
+        beside = np.broadcast_to(near, q.shape)
+        expected = call(ik, poses, near=torch.from_numpy(beside.copy())).q
+        assert_close(call(ik, poses.numpy(), near=near).q, expected, atol=1e-9)
+    with pytest.raises(PoseError, match="does not broadcast"):
+        call(ik, poses.numpy(), near=q[:2])
+    with pytest.raises(PoseError, match="near"):
+        call(ik, poses[0, 0].numpy(), near=[0.0, 1.0])
+
+
+def test_all_branches(ik, poses):
+    with no_type_checker():
+        arrays, tensors = ik.all_branches(poses.numpy()), ik.all_branches(poses)
+    assert arrays.q.shape == (3, 4, len(ik.branches), 6)
+    assert_close(arrays.status, tensors.status)
+    reached = np.isfinite(arrays.q).all(-1)
+    assert reached.any()
+    assert_close(arrays.q[reached], tensors.q.numpy()[reached], atol=1e-9)
+
+
+def spoil(T, rows):
+    bad = T.copy()
+    bad[rows[0]], bad[rows[1]], bad[rows[2]][3, 0] = np.nan, 2 * T[0], 0.5
+    bad[rows[3], :3, 0] *= -1
+    return bad
+
+
+@pytest.mark.parametrize("kind", [np.asarray, torch.from_numpy])
+def test_without_raising(ik, poses, kind):
+    T = poses.reshape(-1, 4, 4).numpy()
+    rows = [1, 4, 6, 9]
+    found = call(ik, kind(spoil(T, rows)), throw=False)
+    bad = np.isin(np.arange(len(T)), rows)
+    assert_close(np.asarray(found.status == Status.INVALID_POSE), bad)
+    assert np.isnan(np.asarray(found.q)[bad]).all()
+    assert_close(np.asarray(found.q)[~bad], call(ik, T).q[~bad], atol=1e-9)
+    assert "no pose" in found.sentences[1]
+    with pytest.raises(PoseError, match="index 1 has entries that are not finite"):
+        call(ik, kind(spoil(T, rows)))
+    near = np.asarray(call(ik, T).q).copy()
+    near[2, 3] = np.nan
+    found = call(ik, kind(T), near=kind(near), throw=False)
+    assert np.flatnonzero(np.asarray(found.status) == Status.INVALID_POSE).tolist() == [2]
+    with pytest.raises(PoseError, match="shape"):
+        call(ik, kind(np.zeros((3, 3))), throw=False)
+    with pytest.raises(PoseError, match="no branch 'up'"):
+        call(ik, kind(T), branch="up", throw=False)
+
+
+@pytest.mark.parametrize("kind", [np.asarray, torch.from_numpy])
+def test_present_joint_values_in_degrees_are_noticed(ik, poses, kind):
+    T = poses.reshape(-1, 4, 4).numpy()
+    near = np.asarray(call(ik, T).q).copy()
+    turned = near + np.clip(-np.sign(near), -1, 1) * 2 * np.pi  # on other turns, which is no mistake
+    assert_close(call(ik, kind(T), near=kind(turned)).position_residual, 0.0, atol=1e-10)
+    near[5] = np.degrees(near[5])
+    far = np.flatnonzero(np.abs(near[5]) > 4 * np.pi)[0]
+    sentence = rf"near holds {near[5, far]:g} for joint theta_{far + 1}, .* give joint values in radians"
+    for values in (near, near[5]):
+        with pytest.raises(PoseError, match=sentence):
+            call(ik, kind(T), near=kind(values))
+    with pytest.raises(PoseError, match=sentence):
+        call(ik, kind(T[5]), near=kind(near[5]))
+    found = call(ik, kind(T), near=kind(near), throw=False)
+    assert np.flatnonzero(np.asarray(found.status) == Status.INVALID_POSE).tolist() == [5]
+    one = call(ik, kind(T[5]), near=kind(near[5]), throw=False)
+    assert int(one.status) == Status.INVALID_POSE
+    assert np.isnan(np.asarray(one.q)).all()
+    with pytest.raises(PoseError, match=sentence), no_type_checker():
+        ik.path(T, near=near[5])
+
+
+def test_present_joint_values_in_millimetres_are_noticed():
+    with no_type_checker():
+        scara = CorrectedIK(hand_made_model("kiro3"))
+    with pytest.raises(PoseError, match=r"near holds -120 for joint d_3, more than 1 m beyond .* 0 m;"):
+        call(scara, np.eye(4), near=[0.3, 0.8, -120.0, 0.4])
+
+
+def test_no_numbers(ik, poses):
+    T = poses.reshape(-1, 4, 4).numpy()
+    for wanted in (T, T[0]):
+        with pytest.raises(PoseError, match="near is no array of numbers"):
+            call(ik, wanted, near=["left"] * 6)
+        found = call(ik, wanted, near=["left"] * 6, throw=False)
+        assert (np.asarray(found.status) == Status.INVALID_POSE).all()
+    with pytest.raises(PoseError, match="no array of numbers"):
+        call(ik, [["a"] * 4] * 4)
+    with pytest.raises(PoseError, match=r"shape \(2, 3\)"):
+        call(ik, np.zeros((2, 3)))
+
+
+def test_a_robot_program_needs_no_torch(folder, tmp_path):
+    """From a folder to joint values, the way a control program goes."""
+    np.save(tmp_path / "q.npy", [0.1, -1.0, 1.2, -0.4, 1.1, 0.3])
+    program = f"""
+import sys
+import numpy as np
+import pisigma
+ik = pisigma.load({str(folder)!r})
+T = np.eye(4)
+T[:3, :3] = [[1, 0, 0], [0, -1, 0], [0, 0, -1]]
+T[:3, 3] = 0.6, 0.2, 0.5
+found = ik(T)
+assert found.status == pisigma.Status.REACHED, found.sentences
+again = ik(T, near=found.q)
+assert abs(again.q - found.q).max() < 1e-9
+assert ik(T[None], throw=False).q.shape == (1, 6)
+print(sorted(name for name in ("torch", "lightning", "matplotlib", "scipy") if name in sys.modules))
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout == "[]\n"
+
+
+def test_what_stands_ready_belongs_to_the_model(folder, tmp_path, poses):
+    copy = tmp_path / "copy"
+    shutil.copytree(folder, copy)
+    assert "compiled" in vars(load(copy))  # read, not made
+    expected = load(copy).model.robot.dh
+    text = (copy / DESCRIPTION).read_text()
+    (copy / DESCRIPTION).write_text(text + "\n")
+    with pytest.raises(ModelError, match=DESCRIPTION):
+        load(copy)  # what stands ready is stale, so the folder itself is read, and it was changed
+    (copy / DESCRIPTION).write_text(text)
+    (copy / COMPILED).write_bytes((copy / COMPILED).read_bytes()[:-100])
+    made = load(copy)
+    assert "compiled" not in vars(made)
+    assert_close(made.model.robot.dh, expected)
+    assert_close(call(made, poses.numpy()).q, call(load(folder), poses.numpy()).q, atol=1e-12)
+    (copy / COMPILED).unlink()
+    assert_close(call(load(copy), poses.numpy()).q, call(load(folder), poses.numpy()).q, atol=1e-12)
+    (copy / WEIGHTS).unlink()
+    assert ready_hash(copy) is None
+    with pytest.raises(ModelError, match=f"{WEIGHTS} is missing"):
+        load(copy)
+
+
+def test_a_folder_that_changes_behind_the_back(folder, tmp_path):
+    copy = tmp_path / "copy"
+    shutil.copytree(folder, copy)
+    ready = load(copy)
+    (copy / DESCRIPTION).write_text((copy / DESCRIPTION).read_text() + "\n")
+    with pytest.raises(ModelError, match="was changed after it was loaded"):
+        _ = ready.model
+
+
+def test_of_a_model_in_memory(poses, ik):
+    made = CorrectedIK(ik.model)
+    assert (made.name, made.branches, made.joints) == (ik.name, ik.branches, ik.joints)
+    assert made.order == ik.order
+    assert made.closed_form == ik.closed_form
+    assert_close(made.limits, ik.limits)
+    assert_close(made.revolute, ik.revolute)
+    assert_close(call(made, poses.numpy()).q, call(ik, poses.numpy()).q, atol=1e-12)
+
+
+def test_a_network_model_by_both_routes():
+    with no_type_checker():
+        made = CorrectedIK(hand_made_model("kiro4"))
+        T = made.model.forward(joints_around("kiro4", 30, spread=0.1))
+    arrays, tensors = call(made, T.numpy()), call(made, T)
+    assert_close(arrays.q, tensors.q, atol=1e-9)
+    assert_close(arrays.status, tensors.status)
+    assert_close(arrays.domain_measure, tensors.domain_measure, rtol=1e-9)
+
+
+def test_names_that_everyone_finds():
+    assert pisigma.load is load
+    assert pisigma.CorrectedIK is CorrectedIK

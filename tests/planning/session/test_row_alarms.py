@@ -1,0 +1,61 @@
+"""What is said of rows that cannot be right."""
+
+import torch
+from testing.measured_plans import NOISE, measured_plan, with_offset
+
+from pisigma.measurement.dataset import Measurements, join
+from pisigma.measurement.fields import LeftOut
+from pisigma.planning.session.row_alarms import contradicted, other_joint_values, stale_readings, unreadable
+from pisigma.planning.session.row_judgement import judge_rows
+
+PLAN = measured_plan()
+ROBOT = PLAN.stored.arm.robot
+NAMES = [f"pose {number} of the plan" for number in range(1, 25)]
+
+
+def test_a_row_that_cannot_be_read_is_to_be_measured_again():
+    alarm = unreadable(LeftOut(7, "column 'x_mm': 'abc' is no finite number; write one such as -12.5"))
+    assert alarm.sentence.startswith("line 7, column 'x_mm': 'abc'")
+    assert (alarm.kind, alarm.repeat, alarm.counts) == ("unreadable", True, False)
+
+
+def test_a_frozen_sensor_and_a_row_written_twice():
+    rows = PLAN.rows(4)
+    frozen = Measurements(q=PLAN.stored.q[4:5], position=rows.position[2:3], line=(6,))
+    (alarm,) = stale_readings(join([rows, frozen]), 4)
+    assert alarm.kind == "frozen"
+    assert "exactly that of line 4" in alarm.sentence
+    assert alarm.repeat
+    again = Measurements(q=rows.q[2:3], position=rows.position[2:3], line=(6,))
+    (alarm,) = stale_readings(join([rows, again]), 4)
+    assert (alarm.kind, alarm.repeat, alarm.counts) == ("duplicate", False, False)
+    balls = Measurements(q=rows.q[[0, 1, 0]], socket=("a", "a", "a"), line=(2, 3, 4))
+    (alarm,) = stale_readings(balls, 1)
+    assert (alarm.kind, alarm.line) == ("duplicate", 4)
+
+
+def test_joint_values_beside_the_plan_are_a_remark():
+    q = PLAN.stored.q[:3].clone()
+    q[1, 2] += torch.deg2rad(torch.tensor(1.2))
+    q[2, 0] += 1.0
+    near, far = other_joint_values(ROBOT, PLAN.measure(q), 0, PLAN.stored.q, NAMES)
+    assert "is 1.20 deg from its value in pose 2 of the plan" in near.sentence
+    assert "no pose of the plan" in far.sentence
+    assert near.counts
+    assert not near.repeat
+    (alarm,) = other_joint_values(ROBOT, PLAN.measure(q[:1].deg2rad()), 0, PLAN.stored.q, NAMES)
+    assert "those of pose 1 of the plan if they are radians that are named degrees" in alarm.sentence
+
+
+def test_how_far_a_row_is_off_and_whose_point_it_is():
+    rows = PLAN.rows(15)
+    wrong = with_offset(rows, 14, (0.003, -0.004, 0.0))
+    trusted = torch.arange(15) < 14
+    alarm = contradicted(wrong, judge_rows(ROBOT, wrong, NOISE, trusted), 14, PLAN.stored.q, NAMES)
+    assert alarm.kind == "off"
+    assert alarm.sentence.startswith("line 16: the measured value is ")
+    other = PLAN.measure(PLAN.stored.q[20:21]).position
+    swapped = Measurements(q=rows.q, position=torch.cat([rows.position[:14], other]), line=rows.line)
+    alarm = contradicted(swapped, judge_rows(ROBOT, swapped, NOISE, trusted), 14, PLAN.stored.q, NAMES)
+    assert alarm.kind == "swapped"
+    assert "the point of pose 21 of the plan" in alarm.sentence

@@ -1,0 +1,58 @@
+"""Which rows count."""
+
+import numpy as np
+import torch
+from testing.measured_plans import NOISE, measured_plan, with_offset
+
+from pisigma.measurement.dataset import Measurements
+from pisigma.planning.session.row_judgement import judge_rows
+
+PLAN = measured_plan()
+ROBOT = PLAN.stored.arm.robot
+
+
+def counting(rows: Measurements, trusted: int) -> list[int]:
+    """Rows that count after so many were right."""
+    mask = torch.arange(rows.rows) < trusted
+    return judge_rows(ROBOT, rows, NOISE, mask).counts.nonzero()[:, 0].tolist()
+
+
+def swapped(rows: Measurements, one: int, other: int) -> Measurements:
+    order = list(range(rows.rows))
+    order[one], order[other] = other, one
+    assert rows.position is not None
+    return Measurements(q=rows.q, position=rows.position[order], line=rows.line)
+
+
+def test_right_rows_count():
+    for count in (2, 14):
+        assert counting(PLAN.rows(count), count - 1) == list(range(count))
+
+
+def test_rows_of_a_robot_that_does_not_repeat_well_count():
+    rows = PLAN.rows(16)
+    assert rows.position is not None
+    noise = torch.from_numpy(np.random.default_rng(1).normal(size=(16, 3))) * 2e-4
+    rows = Measurements(q=rows.q, position=rows.position + noise)
+    assert counting(rows, 15) == list(range(16))
+
+
+def test_a_new_row_that_is_5_mm_off_does_not_count():
+    rows = with_offset(PLAN.rows(15), 14, (0.003, -0.004, 0.0))
+    assert counting(rows, 14) == list(range(14))
+
+
+def test_a_swapped_point_among_the_first_is_told_from_the_right_ones():
+    rows = swapped(PLAN.rows(20), 1, 19).select(torch.arange(6))
+    assert counting(rows, 5) == [0, 2, 3, 4, 5]
+
+
+def test_a_row_that_was_taken_for_wrong_counts_again():
+    rows = PLAN.rows(15)
+    mask = (torch.arange(15) < 14) & (torch.arange(15) != 4)
+    assert judge_rows(ROBOT, rows, NOISE, mask).counts.all()
+
+
+def test_a_trusted_row_that_others_contradict_counts_no_more():
+    rows = with_offset(PLAN.rows(16), 3, (0.0, 0.004, 0.003))
+    assert counting(rows, 15) == [row for row in range(16) if row != 3]

@@ -1,0 +1,62 @@
+"""Rows that are each predicted from the others."""
+
+import numpy as np
+import pytest
+import torch
+from testing.closeness import assert_close
+from testing.measured_plans import NOISE, measured_plan, with_offset
+
+from pisigma.files.errors import IdentificationError
+from pisigma.measurement.dataset import Measurements
+from pisigma.planning.session.row_model import RowModel
+
+PLAN = measured_plan()
+ROWS = PLAN.rows(14)
+EVERY = torch.ones(14, dtype=torch.bool)
+
+
+def left_out(rows, kept=EVERY):
+    return RowModel.of(PLAN.stored.arm.robot, rows, NOISE, kept).left_out()
+
+
+@pytest.fixture(scope="module")
+def of_right_rows():
+    return left_out(ROWS)
+
+
+def test_right_rows_are_no_surprise(of_right_rows):
+    assert float(of_right_rows.chance.min()) > 5e-3
+    assert 1.0 <= of_right_rows.scale < 1.5
+    assert float(of_right_rows.length.max()) < 3e-3
+    assert bool(of_right_rows.angle.isnan().all())
+    assert_close(of_right_rows.position.norm(dim=1), of_right_rows.length, rtol=1e-12)
+
+
+def test_a_row_is_predicted_alike_whether_it_is_left_out_or_was_never_there(of_right_rows):
+    kept = torch.arange(14) != 6
+    without = left_out(ROWS, kept)
+    assert_close(without.position[6], of_right_rows.position[6], atol=2e-5)
+
+
+def test_the_prediction_does_not_depend_on_a_row_that_is_not_kept():
+    kept = torch.arange(14) != 6
+    away = with_offset(ROWS, 6, (0.3, -0.5, 0.2))
+    there, here = left_out(away, kept), left_out(ROWS, kept)
+    assert_close(there.position[6] - here.position[6], [0.3, -0.5, 0.2], atol=1e-5)
+    assert_close(there.position[kept], here.position[kept], atol=1e-6)
+    assert float(there.chance[6]) < 1e-12
+
+
+def test_three_positions_say_nothing_of_each_other():
+    assert bool(left_out(ROWS.select(torch.arange(3)), EVERY[:3]).chance.isnan().all())
+
+
+def test_two_positions_are_too_few():
+    with pytest.raises(IdentificationError, match="measure more"):
+        left_out(ROWS.select(torch.arange(2)), EVERY[:2])
+
+
+def test_a_robot_that_errs_more_than_its_class_has_its_scale():
+    assert ROWS.position is not None
+    noise = torch.from_numpy(np.random.default_rng(0).normal(size=(14, 3))) * 5e-3
+    assert left_out(Measurements(q=ROWS.q, position=ROWS.position + noise)).scale > 3

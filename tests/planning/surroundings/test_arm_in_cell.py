@@ -1,0 +1,112 @@
+"""Which poses and motions a cell allows, against points on the links."""
+
+import numpy as np
+import pytest
+import torch
+from testing.cells import CELL, is_collision_free, is_visible
+from testing.closeness import assert_close
+
+from pisigma.planning.surroundings.arm_in_cell import ArmInCell
+from pisigma.planning.surroundings.cell import Cell, LinkSection
+from pisigma.planning.surroundings.motion import Motions, is_free, way_points
+from pisigma.robot import Robot
+
+ARM = ArmInCell.of(Robot.load("fanuc_r2000"), CELL)
+RADIUS = np.array([*(0.05 * 3.534 for _ in range(3)), *(0.035 * 3.534 for _ in range(3)), 0.025])
+LIMITS = ARM.limits.clamp(-np.pi, np.pi)
+DRAWS = torch.rand(300, 6, dtype=torch.float64, generator=torch.Generator().manual_seed(5))
+Q = LIMITS[:, 0] + (LIMITS[:, 1] - LIMITS[:, 0]) * DRAWS
+FAULTS = ARM.faults(Q)
+
+
+def test_capsules_are_as_thick_as_the_documentation_says():
+    assert_close(ARM.capsules.radius.unique(), np.unique(RADIUS), rtol=1e-3)
+
+
+def test_every_allowed_pose_is_free_and_visible():
+    allowed = Q[FAULTS.allowed].numpy()
+    assert 15 < len(allowed) < 150
+    assert all(is_collision_free(ARM.robot, CELL, q, RADIUS) for q in allowed)
+    assert all(is_visible(ARM.robot, CELL, q, RADIUS) for q in allowed)
+
+
+def test_what_is_refused_is_refused_for_a_reason():
+    """Points lie a little farther apart than the lines they stand on, hence the few that only lines refuse."""
+    refused = Q[~FAULTS.allowed][:60].numpy()
+    wrongly = [
+        is_collision_free(ARM.robot, CELL, q, RADIUS) and is_visible(ARM.robot, CELL, q, RADIUS)
+        for q in refused
+    ]
+    assert sum(wrongly) <= 0.1 * len(refused)
+
+
+def test_every_reason_is_named():
+    everything = " ".join(FAULTS.counts())
+    for word in ("links", "floor", "'table'", "hides", "turned away"):
+        assert word in everything
+    outside = ARM.faults(torch.tensor([[4.0, 0, 0, 0, 0, 0]], dtype=torch.float64))
+    assert "outside its limits" in str(outside.sentence(0))
+    assert FAULTS.sentence(int(FAULTS.allowed.nonzero()[0])) is None
+
+
+@pytest.mark.parametrize(
+    ("links", "named"),
+    [
+        ({}, None),
+        ({"radius_mm": 60.0}, None),
+        ({"radius_mm": 900.0}, "link theta_1 and link theta_4"),
+        ({"radii_mm": {"theta_4": 1700.0}}, "link theta_1 and link theta_4"),
+    ],
+)
+def test_links_that_are_too_thick_to_be_kept_apart_are_named(links: dict[str, object], named: str | None):
+    arm = ArmInCell.of(Robot.load("ur10"), Cell(links=LinkSection.model_validate(links)))
+    assert len(arm.too_thick) == (named is not None)
+    assert named is None or named in arm.too_thick[0]
+
+
+def test_a_motion_is_free_where_all_poses_on_it_are():
+    q = Q[ARM.gap(Q) >= 0]
+    start, end = q[:20], q[20:40]
+    free = is_free(ARM, start, end)
+    assert 0 < int(free.sum()) < len(free)
+    steps = torch.linspace(0, 1, 100, dtype=torch.float64)[:, None, None]
+    least = ARM.gap((start + steps * (end - start)).reshape(-1, 6)).reshape(100, -1).min(0).values
+    assert bool((least[free] > -ARM.cell.clearance / 2).all())
+    assert bool((least[~free] < 0).all())
+
+
+def test_way_points_lead_round_what_blocks_a_motion():
+    q = Q[ARM.gap(Q) >= 0]
+    blocked = (~is_free(ARM, q[:20], q[20:40])).nonzero()[:, 0].tolist()
+    start, end = q[blocked[0]], q[20 + blocked[0]]
+    points = way_points(ARM, start, end, q)
+    assert points is not None
+    path = torch.cat([start[None], points, end[None]])
+    assert bool(is_free(ARM, path[:-1], path[1:]).all())
+    assert way_points(ARM, start, end, q[:0]) is None
+
+
+def test_motions_that_were_looked_at_are_known_both_ways():
+    q = Q[ARM.gap(Q) >= 0]
+    motions, free = Motions(ARM, q), is_free(ARM, q[:20], q[20:40])
+    assert motions.are_free(q[:20], q[20:40]).tolist() == free.tolist()
+    assert motions.are_free(q[20:40], q[:20]).tolist() == free.tolist()
+    assert motions.are_free(q[:30], q[10:40]).tolist() == is_free(ARM, q[:30], q[10:40]).tolist()
+    first = (~free).nonzero()[0]
+    points = motions.points_between(q[first][0], q[20 + first][0])
+    assert points is not None
+    assert motions.points_between(q[first][0], q[20 + first][0]) is points
+
+
+def test_a_measured_pose_is_free_of_self_collision():
+    """Poses that touch by the drawing are allowed where they were measured, and so are those with more room."""
+    arm = ArmInCell.of(Robot.load("ur5"))
+    limits = torch.from_numpy(np.clip(arm.robot.limits, -np.pi, np.pi))
+    draws = torch.rand(400, arm.robot.dof, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    q = limits[:, 0] + (limits[:, 1] - limits[:, 0]) * draws
+    touching = (~arm.faults(q).allowed).nonzero()[:, 0]
+    measured = q[touching[:5]]
+    with_measured = arm.with_measured(measured)
+    assert len(touching) > 10
+    assert with_measured.faults(measured).allowed.all()
+    assert with_measured.faults(q).allowed.sum() < len(q)

@@ -1,0 +1,88 @@
+"""Robots as the meshes of their URDF files."""
+
+import numpy as np
+import pytest
+import torch
+from testing.closeness import assert_close
+
+from pisigma.files.errors import RobotError
+from pisigma.reporting.viewing.mesh_body import MeshBody
+from pisigma.robot.description import Robot
+from pisigma.robot.kinematics.forward import forward_kinematics
+
+trimesh = pytest.importorskip("trimesh", reason="the extra view is not installed")
+
+URDF = """<robot name="arm">
+<link name="base"><visual><origin xyz="0 0 0.1"/>
+<geometry><cylinder radius="0.1" length="0.2"/></geometry></visual></link>
+<joint name="j1" type="revolute"><origin xyz="0 0 0.2"/><parent link="base"/><child link="l1"/><axis xyz="0 0 1"/>
+<limit lower="-3" upper="3"/></joint>
+<link name="l1"><visual><geometry><mesh filename="package://arm/meshes/link.stl"/></geometry></visual></link>
+<joint name="j2" type="prismatic"><origin xyz="0 0 0.5" rpy="1.5 0.2 0"/><parent link="l1"/><child link="l2"/>
+<axis xyz="0 0 -1"/><limit lower="-3" upper="3"/></joint>
+<link name="l2"><visual><origin xyz="0 0 1" rpy="0 1.57079632679 0"/><geometry>
+<mesh filename="../meshes/link.stl" scale="2 1 1"/></geometry></visual></link>
+<joint name="j3" type="continuous"><origin xyz="0.3 0 0"/><parent link="l2"/><child link="tip"/>
+<axis xyz="0 1 0"/></joint>
+<link name="tip"><visual><geometry><sphere radius="0.04"/></geometry></visual>
+<visual><geometry><box size="0.1 0.1 0.1"/></geometry></visual></link></robot>"""
+
+
+@pytest.fixture
+def urdf(tmp_path):
+    """A URDF file of a package, with one mesh of 0.1 m x 0.2 m x 0.3 m."""
+    (tmp_path / "arm" / "urdf").mkdir(parents=True)
+    (tmp_path / "arm" / "meshes").mkdir()
+    trimesh.creation.box((0.1, 0.2, 0.3)).export(tmp_path / "arm" / "meshes" / "link.stl")
+    path = tmp_path / "arm" / "urdf" / "arm.urdf"
+    path.write_text(URDF)
+    return path
+
+
+def test_links_move_with_their_joints(urdf):
+    robot = Robot.load(urdf)
+    q = np.array([0.4, -0.2, 1.1])
+    frames = MeshBody(robot, urdf).frames(dict(zip(("j1", "j2", "j3"), q, strict=True)))
+    assert_close(frames["tip"], forward_kinematics(robot, torch.from_numpy(q)), atol=1e-12)
+    assert_close(frames["base"], np.eye(4))
+
+
+def test_meshes_stand_in_their_links(urdf):
+    links = MeshBody(Robot.load(urdf), urdf).links
+    assert set(links) == {"base", "l1", "l2", "tip"}
+    sizes = {name: np.ptp(surface.points, axis=0) for name, surface in links.items()}
+    assert_close(sizes["base"], [0.2, 0.2, 0.2], atol=1e-3)
+    assert_close(sizes["l1"], [0.1, 0.2, 0.3], atol=1e-6)
+    assert_close(sizes["l2"], [0.3, 0.2, 0.2], atol=1e-6)  # twice as long along x, then x becomes -z
+    assert_close(links["l2"].points.mean(0), [0.0, 0.0, 1.0], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (
+            ("meshes/link.stl", "meshes/absent.stl"),
+            "the mesh 'package://arm/meshes/absent.stl' is not at hand",
+        ),
+        (("../meshes/link.stl", "arm.urdf"), "line 9: this <visual> cannot be drawn"),
+        (('radius="0.04"', 'radius="wide"'), "line 13: this <visual> cannot be drawn"),
+        (('<box size="0.1 0.1 0.1"/>', ""), "line 14: this <visual> cannot be drawn"),
+    ],
+)
+def test_what_cannot_be_drawn_is_refused(urdf, change, message):
+    robot = Robot.load(urdf)
+    urdf.write_text(URDF.replace(*change, 1))
+    with pytest.raises(RobotError, match=message):
+        MeshBody(robot, urdf)
+
+
+def test_a_file_of_another_robot_is_refused(urdf):
+    with pytest.raises(RobotError, match="its joints are j1, j2, j3, but those of robot 'ur5' are"):
+        MeshBody(Robot.load("ur5"), urdf)
+
+
+def test_a_file_without_meshes_is_refused(urdf):
+    robot = Robot.load(urdf)
+    urdf.write_text(URDF.replace("visual>", "collision>"))
+    with pytest.raises(RobotError, match="no link has a <visual>"):
+        MeshBody(robot, urdf)

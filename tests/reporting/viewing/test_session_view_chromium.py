@@ -1,0 +1,119 @@
+"""The page of a measuring session in headless Chromium: it shows every row, without errors, from this machine only."""
+
+import re
+from contextlib import contextmanager
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from testing.closeness import assert_close
+from testing.models import no_type_checker
+from testing.report import HOSTILE
+from testing.sessions import arm_beside_tracker, session_state
+
+from pisigma.files.errors import OutputError
+from pisigma.planning.session.state import Advice, Alarm
+
+pytest.importorskip("viser", reason="the extra view is not installed")
+
+from pisigma.reporting.viewing.session_view import SessionView, first_view, top_of_scale
+
+
+@pytest.fixture(scope="module")
+def view():
+    """A page that is served while a module is tested; viser's annotations are not checked."""
+    with no_type_checker(), SessionView(arm_beside_tracker(), limit=1.5e-4, port=0) as view:
+        yield view
+
+
+@contextmanager
+def opened(browser, view):
+    """The page, and what went wrong on it while it was open."""
+    page = browser.new_page(viewport={"width": 480, "height": 270})
+    page.set_default_timeout(
+        90_000
+    )  # without a graphics card a busy machine takes long for the first picture
+    faults = []
+    page.on("console", lambda message: faults.append(message.text) if message.type == "error" else None)
+    page.on("pageerror", lambda error: faults.append(str(error)))
+    page.on("dialog", lambda dialog: (faults.append("a dialog"), dialog.dismiss()))
+    allowed = (view.url, f"blob:{view.url}", "data:")
+    page.on(
+        "request",
+        lambda asked: None if asked.url.startswith(allowed) else faults.append(f"loads {asked.url}"),
+    )
+    try:
+        page.goto(view.url)
+        yield page
+        assert faults == []
+    finally:
+        page.close()
+
+
+def text_with(page, rows):
+    """The text of the page once it shows so many rows."""
+    page.wait_for_selector(f"[data-rows='{rows}']")
+    return re.sub(r"\s+", " ", page.inner_text("body"))
+
+
+def test_rows_appear_as_they_come(browser, view):
+    arm = arm_beside_tracker()
+    view.show(session_state(arm, 5))
+    with opened(browser, view) as page:
+        first = text_with(page, 5)
+        assert "Next: pose 6 of 30 (check)" in first
+        assert "RMS 0." not in first
+        page.wait_for_selector("canvas")
+        view.show(replace(session_state(arm, 20, wrong=19), base=np.eye(4)))
+        shown = text_with(page, 20)
+        for sentence in (
+            "20 rows (3 of them check), 1 of them not counted",
+            "predicted: RMS 0.224 mm, 95 % below 0.380 mm",
+            "cross-validated: RMS 0.268 mm",
+            "line 21: the position is off by 5 mm",
+            "theta_6",
+            "Coverage of the joints",
+        ):
+            assert sentence in shown
+        view.show(session_state(arm, 30))
+        assert "Next" not in text_with(page, 30)
+        assert page.inner_text("[data-action=stop]").strip() == "Stop: the limit is reached."
+        alarm = Alarm(3, "unreadable", HOSTILE, False)
+        view.show(replace(session_state(arm, 9), advice=Advice("repeat", HOSTILE), alarms=(alarm,)))
+        text_with(page, 9)
+        assert "</script><script>alert(1)</script>" in page.inner_text("[data-action=repeat]")
+
+
+def test_nothing_is_printed_where_results_stand(capfd):
+    with no_type_checker(), SessionView(arm_beside_tracker(), port=0) as view:
+        assert view.url.startswith("http://127.0.0.1:")
+    assert capfd.readouterr().out == ""
+
+
+@pytest.mark.parametrize("host", ["192.0.2.1", "no such host"])
+def test_an_address_of_another_machine_is_refused(host):
+    with no_type_checker(), pytest.raises(OutputError, match=f"cannot be served at '{host}'"):
+        SessionView(arm_beside_tracker(), host=host)
+
+
+def test_a_page_beside_another_takes_the_next_port():
+    with no_type_checker(), SessionView(arm_beside_tracker(), port=0) as first:
+        port = int(first.url.rpartition(":")[2])
+        with SessionView(arm_beside_tracker(), port=port) as second:
+            assert int(second.url.rpartition(":")[2]) > port
+
+
+def test_scales_end_beyond_the_rows_that_count():
+    state = session_state(arm_beside_tracker(), 20, wrong=19)
+    assert_close(top_of_scale(state.rows), 5e-4, rtol=1e-12)
+    assert_close(top_of_scale(session_state(arm_beside_tracker(), 3).rows), 1e-3)
+
+
+def test_the_first_view_holds_robot_and_tracker():
+    arm = arm_beside_tracker()
+    position, middle = first_view(arm)
+    tracker = arm.cell.tracker.position.numpy()
+    for point in (tracker, 0 * tracker):
+        toward = (point - position) / (((point - position) ** 2).sum()) ** 0.5
+        ahead = (middle - position) / (((middle - position) ** 2).sum()) ** 0.5
+        assert toward @ ahead > 0.85

@@ -1,0 +1,307 @@
+"""Compiled inverse kinematics: it reaches the poses, agrees with torch, and says what is wrong."""
+
+import subprocess
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from testing.closeness import assert_close
+from testing.models import hand_made_model, no_type_checker, with_limits
+
+from pisigma.calibration.hybrid.arm import HybridArm
+from pisigma.files.errors import ModelError, PoseError
+from pisigma.joint_correction.joint_correction import JointCorrection
+from pisigma.joint_correction.shared_features import NominalPose
+from pisigma.model.compiled_model import describe, save_compiled
+from pisigma.model.inverse.compiled_ik import CompiledIK
+from pisigma.model.inverse.reference import ReferenceIK
+from pisigma.robot.kinematics.closed_form import closed_form_solver
+from pisigma.robot.kinematics.status import Status
+from pisigma.robot.kinematics.task_error import task_error
+
+NAMES = ["kiro3", "kiro4", "ur5", "rb5", "panda"]
+
+
+def _torch_solutions(model, T, near=None, branch=None):
+    with no_type_checker():
+        return ReferenceIK(model)(T, near=near, branch=branch)
+
+
+def _both(name, arms, rows=40, near=False, **kind):
+    """Joint values, poses, the compiled solution and that of torch."""
+    model = arms.calibrated(name, **kind)
+    q = arms.draw_joints(model.robot, rows, seed=7, share=kind.get("covered", 1.0) * 1.05)
+    T = model.forward(q)
+    beside = q + 0.02 * torch.sin(17 * q) if near else None
+    found = arms.compiled(name, **kind).solve_batch(T.numpy(), None if beside is None else beside.numpy())
+    return q, T, found, _torch_solutions(model, T, beside)
+
+
+def _left(kernels, model, q, T):
+    """Errors from the poses in the axes of the tool that count, which are all six but for a SCARA."""
+    error, _ = task_error(kernels.axes, T, model.forward(torch.from_numpy(q)))
+    return error[:, ~torch.tensor(kernels.axes.free)]
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("near", [False, True])
+@pytest.mark.parametrize(("hybrid", "covered"), [(True, 1.0), (True, 0.5), (False, 1.0)])
+def test_solutions_are_those_of_torch(name, near, hybrid, covered, arms):
+    _, _, found, expected = _both(name, arms, near=near, hybrid=hybrid, covered=covered)
+    reached = (found.status != Status.UNREACHABLE) & (expected.status.numpy() != Status.UNREACHABLE)
+    same = reached & (found.branch == expected.branch.numpy())
+    assert same.mean() > 0.95 * (expected.status != Status.UNREACHABLE).double().mean()
+    free = same & (found.status == expected.status.numpy()) & (found.status != Status.SINGULAR)
+    assert free.mean() > 0.9 * same.mean()
+    difference = np.abs(found.q - expected.q.numpy())[free].max(-1)
+    part = (
+        0.95 if name != "panda" else 0.5
+    )  # of many solutions a redundant arm's depends on every step that led there
+    assert np.quantile(difference, part) < 1e-9
+    both = free & np.isfinite(found.q_nominal).all(-1) & np.isfinite(expected.q_nominal.numpy()).all(-1)
+    if both.any():
+        assert np.quantile(np.abs(found.q_nominal - expected.q_nominal.numpy())[both].max(-1), part) < 1e-6
+    assert both.any() or name == "kiro3"  # whose nominal arm does not tilt
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("covered", [1.0, 0.5])
+def test_what_is_called_reached_is_reached(name, covered, arms):
+    model, kernels = arms.calibrated(name, covered=covered), arms.compiled(name, covered=covered)
+    q = arms.draw_joints(model.robot, 2000, seed=8, share=covered)
+    T = model.forward(q)
+    found = kernels.solve_batch(T.numpy(), near=q.numpy() + 0.01)
+    reached = found.status != Status.UNREACHABLE
+    assert reached.mean() >= (0.999 if name != "panda" else 0.99)
+    assert_close(_left(kernels, model, found.q[reached], T[reached]), 0.0, atol=1e-10)
+    assert found.position_residual[reached].max() < 1e-10
+    assert found.rotation_residual[reached].max() < 1e-10
+    assert np.isnan(found.q[~reached]).all()
+    assert (np.abs(found.q - q.numpy()).max(-1) < 1e-6).mean() > 0.99 or model.robot.dof > 6
+
+
+@pytest.mark.parametrize("name", ["kiro3", "kiro4", "ur5"])  # one for every closed form
+def test_every_branch_is_that_of_torch(name, arms):
+    model, kernels = arms.calibrated(name), arms.compiled(name)
+    T = model.forward(arms.draw_joints(model.robot, 8, seed=9))
+    for branch in kernels.branches:
+        found, expected = (
+            kernels.solve_batch(T.numpy(), branch=branch),
+            _torch_solutions(model, T, branch=branch),
+        )
+        reached = (found.status != Status.UNREACHABLE) & (expected.status.numpy() != Status.UNREACHABLE)
+        assert reached.sum() >= (expected.status != Status.UNREACHABLE).sum() - 1
+        assert (found.branch == kernels.branches.index(branch)).all()
+        if not reached.any():
+            assert name == "kiro3"  # four joints reach a pose on the branch that it was made on only
+            continue
+        difference = np.abs(found.q - expected.q.numpy())[reached].max(-1)
+        assert np.median(difference) < 1e-11
+        assert np.sort(difference)[:-1].max() < 1e-7
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_batches_equal_single_poses_on_any_number_of_threads(name, arms):
+    model, kernels = arms.calibrated(name), arms.compiled(name)
+    q = arms.draw_joints(model.robot, 5000, seed=10)
+    T = model.forward(q).numpy()
+    found = kernels.solve_batch(T, threads=2)
+    again = kernels.solve_batch(T, threads=1)
+    assert np.array_equal(found.q, again.q, equal_nan=True)
+    for i in range(0, 5000, 500):
+        single = kernels.solve(T[i])
+        assert np.array_equal(single.q, found.q[i], equal_nan=True)
+        assert (single.status, single.branch) == (found.status[i], found.branch[i])
+    assert kernels.solve_batch(T[:0]).q.shape == (0, model.robot.dof)
+
+
+def test_poses_at_half_a_turn_and_no_orientation_error_are_no_special_case(arms):
+    model, kernels = arms.calibrated("ur5"), arms.compiled("ur5")
+    q = arms.draw_joints(model.robot, 50, seed=11)
+    flipped = model.forward(q) @ torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
+    found = kernels.solve_batch(flipped.numpy(), near=q.numpy())
+    reached = found.status != Status.UNREACHABLE
+    assert reached.any()
+    assert_close(model.forward(torch.from_numpy(found.q[reached])), flipped[reached], atol=1e-10)
+
+
+@pytest.mark.parametrize("name", ["kiro3", "kiro4", "ur5", "rb5", "fanuc_r2000"])
+def test_poses_that_only_the_calibrated_arm_reaches_are_solved(name, arms):
+    """They lie near singular poses: no nominal branch reaches them, and one of them comes near."""
+    model = arms.calibrated(name)
+    T = model.forward(arms.draw_joints(model.robot, 200 if name == "kiro3" else 10_000, seed=21))
+    nominal = torch.isfinite(closed_form_solver(model.robot).solve(T).q).all(-1).any(-1)
+    T = T[~nominal].numpy()
+    assert len(T) >= 20
+    found = arms.compiled(name).solve_batch(T)
+    reached = found.status != Status.UNREACHABLE
+    assert reached.mean() > 0.95
+    left = _left(arms.compiled(name), model, found.q[reached], torch.from_numpy(T[reached]))
+    assert_close(left, 0.0, atol=1e-10)
+
+
+def test_statuses_say_what_became_of_a_pose(arms):
+    model, kernels = arms.calibrated("ur5", covered=0.5), arms.compiled("ur5", covered=0.5)
+    far = np.eye(4)
+    far[:3, 3] = 9.0
+    assert kernels.solve(far).status == Status.UNREACHABLE
+    assert np.isnan(kernels.solve(far).q).all()
+    q = torch.full((1, 6), 0.8, dtype=torch.float64)
+    q[0, 0] = 3.0
+    outside = kernels.solve(model.forward(q)[0].numpy(), near=q[0].numpy())
+    assert outside.status == Status.OUTSIDE_DOMAIN
+    assert_close(outside.domain_measure, 1 + model.hybrid.coverage.beyond(q).max(), atol=1e-12)
+    assert outside.domain_measure > 1
+    stretched = torch.tensor([0.3, -0.7, 0.0, 0.5, 0.6, 0.2], dtype=torch.float64)
+    geometric = arms.calibrated("ur5", hybrid=False)
+    nominal = replace(geometric, calibrated=None)
+    T = nominal.forward(stretched[None])[0].numpy()
+    assert CompiledIK.of(nominal).solve(T, near=stretched.numpy()).status == Status.SINGULAR
+
+
+def test_limits_bind_what_is_commanded(arms):
+    model = arms.calibrated("ur5", hybrid=False)
+    q = torch.tensor([0.3, -0.7, 1.0, 0.5, 0.6, 0.2], dtype=torch.float64)
+    T = model.forward(q[None])[0].numpy()
+    turned = q.clone()
+    turned[5] -= 2 * np.pi
+    for lower, upper, status, value in (
+        (-1.0, 1.0, Status.REACHED, 0.2),
+        (6.0, 7.0, Status.REACHED, 0.2 + 2 * np.pi),
+        (1.0, 2.0, Status.OUTSIDE_JOINT_LIMITS, 0.2),
+    ):
+        robots = [with_limits(robot, 5, lower, upper) for robot in (model.robot, model.calibrated)]
+        kernels = CompiledIK.of(replace(model, robot=robots[0], calibrated=robots[1]))
+        branch = kernels.branches[arms.compiled("ur5", hybrid=False).solve(T, near=q.numpy()).branch]
+        found = kernels.solve(T, near=q.numpy(), branch=branch)
+        assert found.status == status
+        assert_close(found.q[5], value, atol=1e-9)
+        assert len(found.sentences) == 1
+    near = arms.compiled("ur5", hybrid=False).solve(T, near=turned.numpy())
+    assert_close(near.q, turned, atol=1e-9)
+
+
+def test_a_correction_that_is_another_on_the_next_turn_is_solved_there(arms):
+    model, kernels = arms.calibrated("ur5", joints=True), arms.compiled("ur5", joints=True)
+    q = arms.draw_joints(model.robot, 50, seed=12)
+    q[:, 5] += torch.where(q[:, 5] > 0, -2 * torch.pi, 2 * torch.pi)
+    T = model.forward(q)
+    found = kernels.solve_batch(T.numpy(), near=q.numpy())
+    reached = found.status != Status.UNREACHABLE
+    assert reached.mean() > 0.9
+    assert_close(model.forward(torch.from_numpy(found.q[reached])), T[reached], atol=1e-10)
+    assert (np.abs(found.q - q.numpy())[reached].max(-1) < 1e-6).mean() > 0.9
+
+
+GOOD = np.eye(4)
+HOSTILE = {
+    "nan": (np.where(np.eye(4) == 0, np.nan, 1.0), "entries that are not finite"),
+    "infinite": (GOOD + np.inf, "entries that are not finite"),
+    "scaled": (np.diag([2.0, 2.0, 2.0, 1.0]), "not orthonormal"),
+    "mirrored": (np.diag([1.0, 1.0, -1.0, 1.0]), "left-handed"),
+    "last row": (2 * np.eye(4), "does not end with the row"),
+    "shape": (np.eye(3), r"shape \(3, 3\)"),
+    "text": ([["a"] * 4] * 4, "no array of numbers"),
+    "ragged": ([[1.0], [1.0, 2.0]], "no array of numbers"),
+}
+
+
+@pytest.mark.parametrize("case", HOSTILE)
+def test_what_is_no_pose_is_refused_in_one_sentence(case, arms):
+    kernels, (T, words) = arms.compiled("ur5"), HOSTILE[case]
+    with pytest.raises(PoseError, match=words) as caught:
+        kernels.solve(T)
+    assert "\n" not in str(caught.value)
+    if case not in ("text", "ragged", "shape"):
+        with pytest.raises(PoseError, match="at index 3 ") as caught:
+            kernels.solve_batch(np.stack([GOOD, GOOD, GOOD, T, GOOD]))
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"near": np.zeros(5)}, r"near has the shape \(5,\)"),
+        ({"near": np.full(6, np.nan)}, "no finite numbers"),
+        ({"near": "here"}, "near is no array"),
+        ({"branch": "front/elbow_up/no_flop"}, "did you mean 'front/elbow_up/no_flip'"),
+    ],
+)
+def test_what_does_not_fit_is_refused(options, words, arms):
+    with pytest.raises(PoseError, match=words):
+        arms.compiled("ur5").solve(GOOD, **options)
+    with pytest.raises(PoseError, match=words):
+        arms.compiled("ur5").solve_batch(GOOD[None], **options)
+
+
+def test_batches_refuse_what_is_no_batch(arms):
+    kernels = arms.compiled("ur5")
+    with pytest.raises(PoseError, match=r"shape \(3, 4\)"):
+        kernels.solve_batch(GOOD[:3])
+    with pytest.raises(PoseError, match="threads=0"):
+        kernels.solve_batch(GOOD[None], threads=0)
+    with pytest.raises(PoseError, match="no array of numbers"):
+        kernels.solve_batch([["a"] * 4] * 4)
+
+
+def test_models_without_compiled_form_are_refused(arms):
+    model = arms.calibrated("ur5")
+    with pytest.raises(ModelError, match="corrects nominal joint values"):
+        describe(replace(hand_made_model("ur10"), calibrated=model.calibrated))
+    correction = JointCorrection(model.robot, [NominalPose(model.robot)])
+    arm = HybridArm(model.calibrated, correction, model.hybrid.coverage)
+    with pytest.raises(ModelError, match="feature 'pose'"):
+        describe(replace(model, hybrid=arm))
+    panda = arms.calibrated("panda")
+    with pytest.raises(ModelError, match="no closed-form inverse"):
+        describe(replace(panda, starts=panda.starts[:0]))
+    with pytest.raises(ModelError, match=r"starts\.q has the shape"):
+        CompiledIK.of(replace(panda, starts=panda.starts.repeat(2, 1)))
+
+
+@pytest.mark.parametrize("name", ["ur5", "panda"])
+def test_a_file_gives_the_same_back_without_torch(name, arms, tmp_path):
+    model, kernels = arms.calibrated(name), arms.compiled(name)
+    T = model.forward(arms.draw_joints(model.robot, 1, seed=13))[0].numpy()
+    file = tmp_path / "compiled.npz"
+    save_compiled(model, file)
+    np.save(tmp_path / "T.npy", T)
+    script = (
+        "import sys\nimport numpy as np\n"
+        "from pisigma.model.inverse.compiled_ik import CompiledIK\n"
+        f"found = CompiledIK.load({str(file)!r}).solve(np.load({str(tmp_path / 'T.npy')!r}))\n"
+        "heavy = ('torch', 'lightning', 'jaxtyping', 'matplotlib', 'pydantic', 'numba')\n"
+        "assert not [name for name in heavy if name in sys.modules]\n"
+        "print(found.q.tolist())\n"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert_close(np.array(eval(done.stdout)), kernels.solve(T).q, atol=1e-12)
+    save_compiled(model, file, belongs_to="5ca1ab1e")
+    loaded = CompiledIK.load(file)
+    assert (loaded.belongs_to, kernels.belongs_to) == ("5ca1ab1e", "")
+    assert (loaded.branches, loaded.joints, loaded.name) == (kernels.branches, kernels.joints, kernels.name)
+
+
+def test_files_that_are_no_models_are_refused(arms, tmp_path):
+    file = tmp_path / "compiled.npz"
+    save_compiled(arms.calibrated("ur5"), file)
+    content = file.read_bytes()
+    with pytest.raises(ModelError, match="cannot be read"):
+        CompiledIK.load(tmp_path / "missing.npz")
+    for wrong in (b"", b"nothing", content[: len(content) // 2], content[:3000] + b"x" + content[3001:]):
+        file.write_bytes(wrong)
+        with pytest.raises(ModelError, match="again"):
+            CompiledIK.load(file)
+    with np.load(
+        tmp_path / "other.npz" if (tmp_path / "other.npz").exists() else _foreign(tmp_path)
+    ) as foreign:
+        assert foreign.files
+    with pytest.raises(ModelError, match="no compiled model of format 6"):
+        CompiledIK.load(tmp_path / "other.npz")
+
+
+def _foreign(folder):
+    np.savez(folder / "other.npz", q=np.zeros(3))
+    return folder / "other.npz"

@@ -1,0 +1,178 @@
+"""A frame or a tool that moves while rows are measured is found with its row; healthy measurements are left alone."""
+
+import math
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from testing.checked import checked
+from testing.closeness import assert_close
+from testing.simulated_arm import SimulatedArm, simulate
+
+from pisigma.calibration.geometric.calibrator import GeometricCalibrator
+from pisigma.measurement.dataset import Measurements
+from pisigma.measurement.new_frames import with_new_frames
+from pisigma.robot import Robot
+from pisigma.robot.kinematics.forward import forward_kinematics
+from pisigma.robot.se3 import rotation_from_vector
+from pisigma.validation.checks.row_order import RowOrderCheck
+from pisigma.validation.held_out.diagnostic import Diagnostic
+from pisigma.validation.setup_faults.row_order import find_motion
+
+DATA = Path(os.environ.get("PISIGMA_DATA", "../shared/data"))
+SHIFT = torch.tensor([0.004, -0.003, 0.0], dtype=torch.float64)
+TURN = rotation_from_vector(torch.tensor([0.0, math.radians(1.0), 0.0], dtype=torch.float64))
+FIRST_LINE = 2
+
+
+def arm(turned: bool = False, rows: int = 80) -> SimulatedArm:
+    """Measurements as if they came from a file."""
+    made = simulate("ur5", seed=1, rows=rows, noise=5e-5, turn_noise=1e-4 if turned else None)
+    lines = tuple(range(FIRST_LINE, FIRST_LINE + rows))
+    return replace(made, measurements=replace(made.measurements, line=lines, source="tracker.csv"))
+
+
+def frame_moved(rows: Measurements, first: int) -> Measurements:
+    """The frame shifts by 5 mm and turns by 1 deg about the middle of its points."""
+    assert rows.position is not None
+    position = rows.position.clone()
+    middle = position[first:].mean(0)
+    position[first:] = (position[first:] - middle) @ TURN.T + middle + SHIFT
+    if rows.rotation is None:
+        return replace(rows, position=position)
+    rotation = rows.rotation.clone()
+    rotation[first:] = TURN @ rotation[first:]
+    return replace(rows, position=position, rotation=rotation)
+
+
+def tool_moved(simulated: SimulatedArm, first: int) -> Measurements:
+    """The target is 10 mm elsewhere on the tool."""
+    rows = simulated.measurements
+    assert rows.position is not None
+    R = forward_kinematics(simulated.true, rows.q)[:, :3, :3]
+    position = rows.position.clone()
+    position[first:] += 2 * R[first:] @ SHIFT
+    return replace(rows, position=position)
+
+
+def drifting(rows: Measurements, share: torch.Tensor) -> Measurements:
+    assert rows.position is not None
+    return replace(rows, position=rows.position + share[:, None] * SHIFT)
+
+
+def said(robot: Robot, rows: Measurements) -> list[Diagnostic]:
+    return list(RowOrderCheck().diagnose(checked(GeometricCalibrator(robot), rows)))
+
+
+@pytest.mark.parametrize("turned", [False, True])
+@pytest.mark.parametrize("first", [16, 40])
+def test_a_frame_that_moved_is_found_with_its_row_and_amount(turned: bool, first: int) -> None:
+    simulated = arm(turned)
+    rows = frame_moved(simulated.measurements, first)
+    (diagnostic,) = said(simulated.nominal, rows)
+    assert diagnostic.severity == "implausible"
+    assert (
+        f"tracker.csv, line {first + FIRST_LINE}: from this row on the measuring frame" in diagnostic.sentence
+    )
+    assert f"--new-frame-at {first + FIRST_LINE}" in diagnostic.sentence
+    motion = find_motion(GeometricCalibrator(simulated.nominal).fit(rows))
+    assert motion is not None
+    assert motion.first == first
+    assert_close(motion.shift, SHIFT, atol=2e-4)
+    assert_close(np.rad2deg(motion.turn), 1.0, atol=0.03)
+    apart = with_new_frames(rows, [first + FIRST_LINE])
+    assert said(simulated.nominal, apart) == []
+    found = GeometricCalibrator(simulated.nominal).fit(apart).noise[0].sigma
+    assert_close(found, 5e-5, rtol=0.2)
+
+
+def test_a_tool_that_moved_is_told_from_a_frame() -> None:
+    simulated = arm()
+    (diagnostic,) = said(simulated.nominal, tool_moved(simulated, 40))
+    assert diagnostic.severity == "implausible"
+    assert "line 42: from this row on the tool has moved by 9.99 mm" in diagnostic.sentence
+    assert "column 'target'" in diagnostic.sentence
+
+
+@pytest.mark.parametrize("wave", [False, True])
+def test_a_slow_drift_is_found(wave: bool) -> None:
+    simulated = arm()
+    time = torch.linspace(0, 1, 80, dtype=torch.float64)
+    (diagnostic,) = said(
+        simulated.nominal, drifting(simulated.measurements, (4 * time).sin() if wave else time)
+    )
+    assert diagnostic.severity == "implausible"
+    assert "tracker.csv: the measuring frame moves slowly" in diagnostic.sentence
+
+
+def test_a_small_motion_is_a_warning() -> None:
+    simulated = arm(rows=200)
+    behind = (torch.arange(200) >= 100).double()
+    (diagnostic,) = said(simulated.nominal, drifting(simulated.measurements, 0.02 * behind))
+    assert diagnostic.severity == "warning"
+    assert "line 102: from this row on" in diagnostic.sentence
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("rows", [15, 60])
+@pytest.mark.parametrize("wrong", [0.0, 0.1])
+def test_healthy_rows_in_any_order_are_left_alone(seed: int, rows: int, wrong: float) -> None:
+    simulated = simulate("ur5", seed=seed, rows=rows, noise=5e-5, wrong=wrong)
+    assert said(simulated.nominal, simulated.measurements) == []
+    in_order = simulated.measurements.select(simulated.measurements.q[:, seed].argsort())
+    assert said(simulated.nominal, in_order) == []
+
+
+@pytest.mark.parametrize(("seed", "rows"), [(2, 20), (7, 20), (10, 20), (3, 24), (6, 24), (7, 24)])
+def test_few_rows_of_an_arm_with_gears_are_left_alone(seed: int, rows: int) -> None:
+    """What motions and parameters could follow to the noise, as they are nearly as many as the values."""
+    simulated = simulate("ur5", seed=seed, rows=rows)
+    drawn, q = np.random.default_rng(seed), simulated.measurements.q
+    size, phase = (
+        torch.from_numpy(made) for made in (drawn.normal(0, 2.6e-4, (3, 6)), drawn.uniform(0, 6.28, (3, 6)))
+    )
+    gears = sum(size[k] * torch.sin(harmonic * q + phase[k]) for k, harmonic in enumerate((1, 2, 7)))
+    position = forward_kinematics(simulated.true, q + gears)[:, :3, 3]
+    measured = Measurements(q, position + torch.from_numpy(drawn.normal(0, 3.6e-5, (rows, 3))))
+    assert said(simulated.nominal, measured) == []
+
+
+def test_exact_rows_and_few_rows_show_nothing() -> None:
+    exact, few = simulate("ur5", rows=40), simulate("ur5", rows=14, noise=5e-5)
+    assert find_motion(GeometricCalibrator(exact.nominal).fit(exact.measurements)) is None
+    offsets = GeometricCalibrator(few.nominal, free="joint_offsets")
+    assert find_motion(offsets.fit(few.measurements.select(torch.arange(6)))) is None
+
+
+@pytest.mark.parametrize(
+    ("name", "file"),
+    [("ur5", "ur5/grid.csv"), ("fanuc_r2000", "fanuc_r2000/positions.csv"), ("ur10", "ur10/series_b.csv")],
+)
+def test_measured_robots_show_no_motion_in_any_order(name: str, file: str) -> None:
+    if not (DATA / file).is_file():
+        pytest.skip(f"{DATA / file} is not there; set PISIGMA_DATA to the folder of measured robots.")
+    robot = Robot.load(name)
+    rows = Measurements.read_csv(DATA / file, robot)
+    every = rows.select(torch.arange(0, rows.rows, max(rows.rows // 500, 1)))
+    for data in (every, every.select(every.q[:, 1].argsort()), every.select(every.q[:, 4].argsort())):
+        assert [one for one in said(robot, data) if one.severity == "implausible"] == []
+    assert said(robot, every) == []
+
+
+@pytest.mark.parametrize(
+    ("shift", "frames", "reported"), [(8e-5, 1, True), (8e-5, 2, False), (4e-3, 2, True)]
+)
+def test_what_two_frames_leave_unexplained_is_no_motion_of_the_tool(shift, frames, reported):
+    """Where a frame begins a tool moves only if that makes the errors far larger."""
+    simulated = simulate("ur5", seed=1, rows=160, noise=5e-5)
+    rows = replace(simulated.measurements, line=tuple(range(2, 162)), source="tracker.csv")
+    R = forward_kinematics(simulated.true, rows.q)[80:, :3, :3]
+    position = rows.position.clone()
+    position[80:] += R @ torch.tensor([shift, 0.0, 0.0], dtype=torch.float64)
+    rows = replace(rows, position=position)
+    if frames == 2:
+        rows = with_new_frames(rows, (82,))
+    assert bool(said(simulated.nominal, rows)) == reported

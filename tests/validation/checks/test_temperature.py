@@ -1,0 +1,24 @@
+"""Temperatures in degrees Fahrenheit are warned of."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from testing.checked import checked
+from testing.simulated_arm import simulate
+
+from pisigma.calibration.geometric.calibrator import GeometricCalibrator
+from pisigma.validation.checks.temperature import TemperatureCheck
+
+
+@pytest.mark.parametrize(("hottest", "sentences"), [(35.0, 0), (70.0, 1)])
+def test_hot_rows_are_warned_of(hottest: float, sentences: int) -> None:
+    simulated = simulate("ur5", rows=30, noise=5e-5)
+    temperature = torch.linspace(20, hottest, 30, dtype=torch.float64)
+    temperature[0] = torch.nan
+    rows = replace(simulated.measurements, temperature=temperature)
+    said = list(TemperatureCheck().diagnose(checked(GeometricCalibrator(simulated.nominal), rows)))
+    assert len(said) == sentences
+    for diagnostic in said:
+        assert diagnostic.severity == "warning"
+        assert "memory, row 29: 70 deg C is hot for a robot (6 of 30 rows" in diagnostic.sentence

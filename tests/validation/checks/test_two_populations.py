@@ -1,0 +1,104 @@
+"""Two populations of residuals are told from one, whatever its shape."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from testing.checked import checked
+from testing.closeness import assert_close
+from testing.outside_arm import ARMS, OutsideArm, either
+from testing.simulated_arm import simulate
+
+from pisigma.calibration.geometric.calibrator import GeometricCalibrator
+from pisigma.measurement.dataset import Measurements
+from pisigma.robot.description import Robot
+from pisigma.validation.checks.two_populations import TwoPopulationsCheck, two_populations
+from pisigma.validation.held_out.diagnostic import Diagnostic
+
+
+@pytest.mark.parametrize("components", [1, 3])
+def test_one_population_is_one(components):
+    rng = np.random.default_rng(0)
+    residuals = rng.normal(size=(200, components)) * 10.0 ** -np.arange(components)
+    assert not two_populations(residuals).apart
+    assert not two_populations(np.zeros((30, components))).apart
+
+
+def test_errors_of_a_gear_along_one_axis_are_one_population():
+    rng = np.random.default_rng(0)
+    residuals = 0.1 * rng.normal(size=(200, 3))
+    residuals[:, 2] += np.sin(rng.uniform(0, 7, 200))
+    assert not two_populations(residuals).apart
+
+
+@pytest.mark.parametrize("same", [True, False])
+def test_wrong_rows_are_told_from_right_ones(same):
+    rng = np.random.default_rng(0)
+    residuals = 0.1 * rng.normal(size=(200, 3))
+    residuals[:80] += [3.0, 0, 0] if same else 1.7 * rng.normal(size=(80, 3))
+    mixture = two_populations(residuals)
+    assert mixture.apart
+    assert_close(mixture.share, 0.4, atol=0.02)
+    assert_close(mixture.scatter, 0.1, rtol=0.15)
+    assert_close(mixture.off, 1.7, rtol=0.15)
+
+
+def populations(robot: Robot, rows: Measurements) -> list[Diagnostic]:
+    return list(TwoPopulationsCheck().diagnose(checked(GeometricCalibrator(robot), rows)))
+
+
+@pytest.mark.parametrize("name", ARMS)
+@pytest.mark.parametrize("alternating", [True, False])
+def test_two_arms_in_one_file_are_told_apart(name, alternating):
+    arm, other = OutsideArm(name, 3), OutsideArm(name, 103)
+    of_other = np.arange(100) % 2 == 1 if alternating else np.random.default_rng(1).random(100) < 0.4
+    (found,) = populations(arm.robot, either(arm.measured(), other.measured(), of_other))
+    assert (found.kind, found.severity) == ("two_populations", "implausible")
+    named = np.array([f"rows.csv, line {line}" in found.rows for line in range(2, 102)])
+    assert max(np.mean(named == of_other), np.mean(named != of_other)) > 0.95
+    assert not alternating or "every second row" in found.sentence
+
+
+@pytest.mark.parametrize("name", ARMS)
+@pytest.mark.parametrize(("size", "severity"), [(5e-3, "implausible"), (1e-3, "warning")])
+def test_rows_of_another_target_are_told_apart(name, size, severity):
+    arm = OutsideArm(name, 4)
+    moved = np.random.default_rng(2).random(100) < 1 / 3
+    shift = size / 3**0.5 * np.array([1.0, -1.0, 1.0])
+    (found,) = populations(arm.robot, either(arm.measured(), arm.measured(tool=shift), moved))
+    assert found.severity == severity
+    assert "another target" in found.sentence
+    assert np.mean([f"rows.csv, line {line}" in found.rows for line in range(2, 102)] == moved) > 0.95
+
+
+@pytest.mark.parametrize("name", ARMS)
+@pytest.mark.parametrize("rows", [30, 100])
+@pytest.mark.parametrize("seed", range(5, 8))
+def test_an_arm_with_gears_and_sag_is_one_population(name, rows, seed):
+    arm = OutsideArm(name, seed, rows, seed)
+    assert populations(arm.robot, arm.measured()) == []
+
+
+@pytest.mark.parametrize(("name", "rows", "seed"), [("irb120", 36, 10), ("arm7", 40, 6), ("arm7", 40, 8)])
+def test_what_two_populations_use_up_tells_nothing(name, rows, seed):
+    arm = OutsideArm(name, seed, rows, seed + 50)
+    assert populations(arm.robot, arm.measured()) == []
+
+
+def test_few_rows_in_another_frame_are_told_apart():
+    arm = OutsideArm("irb120", 3, 44, 3)
+    rows = arm.measured()
+    moved = torch.arange(44) % 5 < 2
+    shifted = replace(rows, position=rows.position + 1.5e-3 / 3**0.5 * moved[:, None].double())
+    (found,) = populations(arm.robot, shifted)
+    assert "another frame" in found.sentence
+    assert len(found.rows) == int(moved.sum())
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_poses_in_two_frames_are_no_two_populations(seed):
+    """Thirty poses have hardly more values than two arms and two frames have unknowns."""
+    arm = simulate("ur5", seed, 30, noise=3e-5, turn_noise=1e-4, length=3e-4, angle=5e-4)
+    frame = tuple(["before"] * 15 + ["after"] * 15)
+    assert populations(arm.nominal, replace(arm.measurements, frame=frame)) == []

@@ -1,0 +1,46 @@
+"""Errors that no calibrated robot has are implausible whatever they come from; those of healthy arms are not."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from testing.checked import checked
+from testing.outside_arm import ARMS, OutsideArm
+
+from pisigma.calibration.geometric.calibrator import GeometricCalibrator
+from pisigma.measurement.dataset import Measurements
+from pisigma.robot import Robot
+from pisigma.validation.checks.joint_zero import JointZeroCheck
+from pisigma.validation.checks.unexplained import UnexplainedCheck
+
+
+@pytest.mark.parametrize("name", ARMS)
+def test_errors_of_unknown_cause_are_implausible(name):
+    arm = OutsideArm(name, 3)
+    off = np.random.default_rng(0).normal(0, 3e-3, arm.q.shape) * arm.robot.reach
+    rows = arm.measured(logged=arm.q + off)
+    check = checked(GeometricCalibrator(arm.robot), rows)
+    assert [one.severity for one in UnexplainedCheck().diagnose(check)] == ["implausible"]
+    stated = replace(rows, sigma_position=torch.full((100,), 5e-3 * arm.robot.reach, dtype=torch.float64))
+    assert list(UnexplainedCheck().diagnose(checked(GeometricCalibrator(arm.robot), stated))) == []
+
+
+@pytest.mark.parametrize("name", ARMS)
+@pytest.mark.parametrize("rows", [25, 100])
+def test_healthy_arms_are_plausible(name, rows):
+    arm = OutsideArm(name, 6, rows)
+    check = checked(GeometricCalibrator(arm.robot), arm.measured())
+    assert [*UnexplainedCheck().diagnose(check), *JointZeroCheck().diagnose(check)] == []
+
+
+@pytest.mark.parametrize(("degrees", "joints"), [(0.0, []), (1.0, [2]), (-1.0, [2])])
+def test_a_joint_whose_zero_is_off_is_named_where_base_and_tool_hide_it(shared_data, degrees, joints):
+    robot = Robot.load("ur5")
+    rows = Measurements.read_csv(shared_data / "ur5/grid.csv", robot)
+    rows = rows.select(torch.arange(0, rows.rows, 10))
+    q = rows.q.clone()
+    q[:, 1] += np.deg2rad(degrees)
+    found = list(JointZeroCheck().diagnose(checked(GeometricCalibrator(robot), replace(rows, q=q))))
+    assert [one.severity for one in found] == ["warning"] * len(joints)
+    assert all(f"joint {joint} " in one.sentence for joint, one in zip(joints, found, strict=True))

@@ -1,0 +1,96 @@
+"""Bootstrap intervals: whole configurations are drawn, and an interval holds the truth as often as it says."""
+
+import numpy as np
+import pytest
+from testing.closeness import assert_close
+
+from pisigma.files.errors import MeasurementError
+from pisigma.validation.held_out import bootstrap as module
+from pisigma.validation.held_out.bootstrap import STATISTICS, Bootstrap, statistics
+
+ROWS = 40
+
+
+def grouped(seed: int, groups: int, models: int = 2) -> tuple[np.ndarray, np.ndarray]:
+    """Errors of 40 rows in groups of different sizes, in any order."""
+    rng = np.random.default_rng(seed)
+    group = np.concatenate([np.arange(groups), rng.integers(0, groups, ROWS - groups)])
+    errors = rng.gamma(2.0, 1e-4, (models, ROWS)) + 1e-4 * group
+    return errors, rng.permutation(group)
+
+
+def test_statistics_are_numpys():
+    errors, _ = grouped(0, 8)
+    found = dict(zip(STATISTICS, statistics(errors), strict=True))
+    for model, values in enumerate(errors):
+        assert_close(found["mean"][model], values.mean(), rtol=1e-12)
+        assert_close(found["rms"][model], np.sqrt((values**2).mean()), rtol=1e-12)
+        assert_close(found["p95"][model], np.quantile(values, 0.95), rtol=1e-12)
+
+
+@pytest.mark.parametrize("groups", [2, 9, ROWS])
+def test_intervals_are_those_of_resamples_drawn_by_hand(groups: int):
+    """Whole groups, as many as there are, with replacement; models and differences on the same resamples."""
+    errors, group = grouped(3, groups)
+    rng, resamples = np.random.default_rng(5), []
+    for drawn in rng.integers(0, groups, (800, groups)):
+        rows = np.concatenate([np.flatnonzero(group == index) for index in drawn])
+        resamples.append(statistics(errors[:, rows]))
+    values = np.stack(resamples, -1)
+    found = Bootstrap(resamples=800, seed=5, confidence=0.9).intervals(errors, group)
+    spread = values.std(-1).max()
+    for intervals, own in ((found.value, values), (found.difference, values - values[:, :1])):
+        expected = np.moveaxis(np.quantile(own, [0.05, 0.95], axis=-1), 0, -1)
+        assert_close(intervals, expected, atol=0.4 * spread)
+    assert_close(found.difference[:, 0], 0.0)
+
+
+def test_the_seed_decides_and_nothing_else(monkeypatch):
+    errors, group = grouped(1, 9)
+    state = np.random.get_state()[1].copy()  # noqa: NPY002
+    first, again, other = (Bootstrap(50, seed).intervals(errors, group).value for seed in (5, 5, 6))
+    assert np.array_equal(first, again)
+    assert not np.array_equal(first, other)
+    assert np.array_equal(np.random.get_state()[1], state)  # noqa: NPY002
+    alone = Bootstrap(50, 5).intervals(errors[:1], group).value
+    assert_close(alone, first[:, :1], rtol=1e-12)  # whatever stands beside it
+    monkeypatch.setattr(module, "_BATCH", 1)
+    assert_close(Bootstrap(50, 5).intervals(errors, group).value, first, rtol=1e-12)
+
+
+def test_repeats_of_a_configuration_make_no_interval_narrower():
+    """Thirty copies of every row say nothing new; drawn as rows they would narrow it by √30."""
+    errors, group = np.random.default_rng(0).uniform(size=(1, 25)), np.arange(25)
+    bootstrap = Bootstrap(400, seed=0)
+    once = bootstrap.intervals(errors, group).value
+    often = bootstrap.intervals(errors.repeat(30, 1), group.repeat(30)).value
+    assert_close(often[:2], once[:2], rtol=1e-12)
+    as_rows = bootstrap.intervals(errors.repeat(30, 1), np.arange(750)).value
+    assert np.diff(as_rows[0, 0]) < np.diff(once[0, 0]) / 4
+
+
+def test_an_interval_holds_the_truth_as_often_as_it_says():
+    """60 sets of 60 configurations with 2 rows each; 95 % of the intervals shall hold the true mean and RMS."""
+    rng = np.random.default_rng(0)
+    truth = np.array([2.0, np.sqrt(6.0)])  # of a gamma distribution of shape 2
+    held = np.zeros(2)
+    for _ in range(60):
+        errors = rng.gamma(2.0, 1.0, (1, 60)).repeat(2, 1)
+        low, high = Bootstrap(150, seed=1).intervals(errors, np.arange(60).repeat(2)).value[:2, 0].T
+        held += (low <= truth) & (truth <= high)
+    assert np.all((held >= 51) & (held <= 60))
+
+
+def test_a_single_configuration_has_no_interval():
+    found = Bootstrap(10).intervals(np.ones((1, 5)), np.zeros(5, dtype=np.int64))
+    assert np.isnan(found.value).all()
+    assert np.isnan(found.difference).all()
+
+
+@pytest.mark.parametrize(
+    ("resamples", "seed", "confidence"),
+    [(1, 0, 0.95), (100, 0, 0.0), (100, 0, 1.0), (100, -1, 0.95), (10**10, 0, 0.95)],
+)
+def test_refuses_settings_that_give_no_interval(resamples: int, seed: int, confidence: float):
+    with pytest.raises(MeasurementError, match="2 resamples or more and a confidence between 0 and 1"):
+        Bootstrap(resamples, seed, confidence)

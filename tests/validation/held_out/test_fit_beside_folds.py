@@ -1,0 +1,23 @@
+"""A calibration of all rows beside those of its folds, here and in processes."""
+
+import torch
+from testing.simulated_arm import simulate
+
+from pisigma.calibration.hybrid.calibrator import HybridCalibrator
+from pisigma.files.progress import silent
+from pisigma.measurement.splits import k_folds
+from pisigma.validation.held_out.calibration_validation import joined_repeats
+from pisigma.validation.held_out.fit_beside_folds import fit_beside_folds
+
+
+def test_processes_give_the_same_to_the_bit() -> None:
+    arm = simulate("kiro4", rows=24, noise=5e-5)
+    rows, calibrator = arm.measurements, HybridCalibrator(arm.nominal)
+    repeats = [k_folds(rows, 3, 0)]
+    (here, judged), (there, judged_there) = (
+        fit_beside_folds(calibrator, rows, rows, repeats, silent, jobs) for jobs in (None, 1)
+    )
+    assert torch.equal(here.errors_of(rows)["position"], there.errors_of(rows)["position"])
+    validation = joined_repeats(rows, repeats, judged_there)
+    for name, errors in joined_repeats(rows, repeats, judged).models.items():
+        assert torch.equal(errors.position, validation.models[name].position), name

@@ -1,0 +1,99 @@
+"""Held-out rows in a model folder: written, read, and refused where they were changed."""
+
+import csv
+import io
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from testing.closeness import assert_close
+from testing.models import hand_made_model
+from testing.report import bare_summary
+
+from pisigma.files.errors import ModelError
+from pisigma.files.model_files import HELD_OUT_CSV
+from pisigma.measurement.dataset import Measurements
+from pisigma.model.calibrated_model import CalibratedModel
+from pisigma.validation.held_out.calibration_validation import CalibrationValidation
+from pisigma.validation.held_out.held_out_rows import HeldOutRows, read_held_out
+from pisigma.validation.held_out.pose_statistics import PoseErrors
+from pisigma.validation.held_out.predicted_spread import PredictedSpread
+
+ROWS = 20
+
+
+def _validation(rows: int, turned: bool, spread: bool) -> CalibrationValidation:
+    rng = np.random.default_rng(3)
+    models = {}
+    for name in ("nominal", "geometric", "hybrid"):
+        position = torch.from_numpy(rng.uniform(1e-5, 1e-3, rows))
+        position[-1] = torch.nan
+        models[name] = PoseErrors(position, torch.from_numpy(rng.uniform(0, 1e-3, rows)) if turned else None)
+    error = torch.from_numpy(rng.normal(0, 1e-4, (rows, 3)))
+    found = PredictedSpread(error, error.abs()) if spread else None
+    return CalibrationValidation(5, models, found)
+
+
+def _kept(
+    model: CalibratedModel, validation: CalibrationValidation, measured: Measurements
+) -> tuple[str, CalibratedModel]:
+    """The file of held-out rows, and the model whose metrics hold its hash."""
+    held_out = HeldOutRows.of(validation, measured)
+    text = held_out.to_csv(model.robot)
+    metrics = bare_summary(held_out_rows=held_out.hashes(text)).to_json()
+    return text, replace(model, kind="geometric_calibration", metrics=metrics)
+
+
+@pytest.fixture
+def measured() -> Measurements:
+    q = hand_made_model("kiro3").starts[:ROWS]
+    names = tuple(("wall", 'a "b", <i>', "", "line\nbreak")[k % 4] for k in range(ROWS))
+    return Measurements(q=q, position=torch.rand(ROWS, 3).double(), frame=names, target=names[::-1])
+
+
+@pytest.mark.parametrize("turned", [False, True])
+@pytest.mark.parametrize("spread", [False, True])
+def test_rows_come_back(measured, tmp_path, turned, spread):
+    model = hand_made_model("kiro3")
+    validation = _validation(ROWS, turned, spread)
+    text, keeping = _kept(model, validation, measured)
+    (tmp_path / HELD_OUT_CSV).write_text(text, encoding="utf-8", newline="\n")
+    found = read_held_out(tmp_path, keeping)
+    assert found is not None
+    assert found.data_sha256 == measured.content_hash()
+    assert (found.frame, found.target) == (measured.frame, measured.target)
+    assert_close(found.q, measured.q, atol=1e-14)
+    assert list(found.models) == list(validation.models)
+    for name, errors in validation.models.items():
+        known = torch.isfinite(errors.position)
+        assert torch.equal(torch.isfinite(found.models[name].position), known)
+        assert_close(found.models[name].position[known], errors.position[known], rtol=1e-6)
+        assert (found.models[name].rotation is not None) == turned
+        if turned:
+            assert_close(found.models[name].rotation, errors.rotation, rtol=1e-6)
+    if spread:
+        assert_close(found.residual, validation.spread.error, rtol=1e-6)
+    else:
+        assert bool(torch.isnan(found.residual).all())
+
+
+def test_columns_bear_their_units(measured):
+    text, _ = _kept(hand_made_model("kiro3"), _validation(ROWS, True, True), measured)
+    head = next(csv.reader(io.StringIO(text)))
+    assert head[:6] == ["q1_deg", "q2_deg", "q3_mm", "q4_deg", "frame", "target"]
+    assert head[6:8] == ["nominal_mm", "nominal_deg"]
+    assert head[-3:] == ["residual_x_mm", "residual_y_mm", "residual_z_mm"]
+
+
+def test_without_a_section_there_are_none(tmp_path):
+    assert read_held_out(tmp_path, hand_made_model("kiro3")) is None
+
+
+def test_a_changed_or_missing_file_is_refused(measured, tmp_path):
+    text, model = _kept(hand_made_model("kiro3"), _validation(ROWS, False, False), measured)
+    with pytest.raises(ModelError, match="cannot be read"):
+        read_held_out(tmp_path, model)
+    (tmp_path / HELD_OUT_CSV).write_text(text.replace("wall", "hall", 1), encoding="utf-8")
+    with pytest.raises(ModelError, match="was changed"):
+        read_held_out(tmp_path, model)

@@ -1,0 +1,80 @@
+"""Setup faults of a simulated robot show with the robot as drawn, and healthy rows show none."""
+
+import numpy as np
+import pytest
+import torch
+from hostile.mistakes import POSES, POSITIONS
+from scipy.spatial.transform import Rotation
+from testing.closeness import assert_close
+from testing.simulated_arm import simulate
+
+from pisigma.robot.kinematics.forward import forward_kinematics
+from pisigma.validation.held_out.frames.frame_fits import MeasuredPoses, affine_error, best_base_and_tool
+from pisigma.validation.setup_faults.faults_as_drawn import are_unrelated, find_faults_as_drawn, usual_error
+from pisigma.validation.setup_faults.pose_faults import other_conventions
+
+pytestmark = pytest.mark.usefixtures("without_type_checker")
+MISTAKES = {mistake.name: mistake for mistake in (*POSITIONS, *POSES)}
+
+
+@pytest.fixture(scope="module")
+def arm():
+    """A UR5 with errors of the usual size, and 60 poses of it."""
+    return simulate("ur5", rows=60, noise=5e-5, turn_noise=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("name", "kind"),
+    [
+        ("sign of q4", "joint_sign"),
+        ("q3 logged as q3 +1 q2", "joint_coupling"),
+        ("gradians named degrees", "joint_unit"),
+        ("joint 5 logged constant", "joint_values"),
+        ("a row lost half-way", "rows"),
+        ("inches named mm", "position_unit"),
+        ("sign of y, not of rotations", "handedness"),
+        ("quaternion conjugated", "rotation"),
+    ],
+)
+def test_faults_are_named(arm, name, kind):
+    (fault,) = find_faults_as_drawn(arm.nominal, MISTAKES[name].change(arm.measurements, arm.nominal))
+    assert fault.kinds == (kind,)
+    assert fault.after < 3 * usual_error(arm.nominal, arm.measurements.q) < fault.before
+    assert fault.explains_orientation == (kind not in ("position_unit",))
+
+
+def test_healthy_and_unrelated_rows_have_no_fault(arm):
+    rows = arm.measurements
+    assert find_faults_as_drawn(arm.nominal, rows) == ()
+    assert not are_unrelated(arm.nominal, rows)
+    mixed = MISTAKES["rows in another order"].change(rows, arm.nominal)
+    assert find_faults_as_drawn(arm.nominal, mixed) == ()
+    assert are_unrelated(arm.nominal, mixed)
+
+
+def test_no_rigid_base_and_tool_leave_less_than_affine_ones(arm):
+    measured = MeasuredPoses.of(arm.measurements, 0.2)
+    T = forward_kinematics(arm.nominal, arm.measurements.q)
+    base, tool = best_base_and_tool(T, measured)
+    rigid = measured.squares(base @ T @ tool).mean()
+    assert (1 - 13 / len(T)) * affine_error(T, measured) < rigid
+    batch = torch.stack([T, T.flip(0)])
+    assert_close(affine_error(batch, measured)[0], affine_error(T, measured), atol=1e-12)
+    assert_close(best_base_and_tool(batch, measured)[0][0], base, atol=1e-6)
+
+
+def test_conventions_give_the_rotations_back(arm):
+    """What a file holds in another convention is among what is tried."""
+    R = Rotation.from_matrix(arm.measurements.rotation.numpy())
+    written = {
+        "scalar part first": Rotation.from_quat(np.roll(R.as_quat(), 1, 1)),
+        "inverse": R.inv(),
+        "RotX(roll) · RotY(pitch) · RotZ(yaw)": Rotation.from_euler("ZYX", R.as_euler("XYZ")),
+        "signs of angles are reversed: roll, -pitch, yaw": Rotation.from_euler(
+            "ZYX", R.as_euler("ZYX") * [1, -1, 1]
+        ),
+    }
+    for words, read in written.items():
+        tried = other_conventions(torch.from_numpy(read.as_matrix()))
+        meant = next(rotation for rotation, clause, _ in tried if words in clause)
+        assert_close(meant, arm.measurements.rotation, atol=1e-12)

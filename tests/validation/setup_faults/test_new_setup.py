@@ -1,0 +1,55 @@
+"""Rows of two setups in one file are recognised with the robot as drawn."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from testing.closeness import assert_close
+from testing.simulated_arm import simulate
+
+from pisigma.calibration.geometric.calibrator import GeometricCalibrator
+from pisigma.files.errors import IdentificationError
+from pisigma.measurement.dataset import Measurements
+from pisigma.measurement.new_frames import with_new_frames
+from pisigma.robot import Robot
+from pisigma.robot.se3 import transform_from_xyzrpy
+from pisigma.validation.setup_faults.new_setup import new_setup
+from pisigma.workflow.calibrate import CalibrationSettings, calibrate
+
+ELSEWHERE = transform_from_xyzrpy(torch.tensor([0.3, -0.2, 0.1, 0.5, 0.1, -0.2], dtype=torch.float64))
+ROWS = 60
+
+
+def two_setups(first: int, wrong: float = 0.0) -> tuple[Robot, Measurements]:
+    """A robot, and measurements of it as if they came from a file."""
+    arm = simulate("ur5", rows=ROWS, noise=5e-5, wrong=wrong)
+    assert arm.measurements.position is not None
+    position = arm.measurements.position.clone()
+    position[first:] = position[first:] @ ELSEWHERE[:3, :3].T + ELSEWHERE[:3, 3]
+    lines = tuple(range(2, 2 + ROWS))
+    return arm.nominal, replace(arm.measurements, position=position, line=lines, source="tracker.csv")
+
+
+@pytest.mark.parametrize("first", [15, 30, 45])
+@pytest.mark.parametrize("wrong", [0.0, 0.05])
+def test_the_row_is_named_from_which_on_the_instrument_stands_elsewhere(first: int, wrong: float) -> None:
+    sentence = new_setup(*two_setups(first, wrong))
+    assert sentence is not None
+    assert sentence.startswith(f"tracker.csv, line {first + 2}: from this row on the instrument or the tool")
+
+
+def test_a_refusal_names_the_line_and_a_new_frame_there_helps() -> None:
+    robot, rows = two_setups(30)
+    settings = CalibrationSettings(model="geometric", folds=0)
+    with pytest.raises(IdentificationError, match="--new-frame-at 32"):
+        calibrate(robot, rows, settings)
+    apart = with_new_frames(rows, [32])
+    assert_close(GeometricCalibrator(robot).fit(apart).noise[0].sigma, 5e-5, rtol=0.3)
+
+
+def test_rows_that_fit_nothing_are_no_new_setup() -> None:
+    arm = simulate("ur5", rows=ROWS, noise=5e-5)
+    assert arm.measurements.position is not None
+    assert new_setup(arm.nominal, arm.measurements) is None
+    shuffled = arm.measurements.position[torch.randperm(ROWS, generator=torch.Generator().manual_seed(0))]
+    assert new_setup(arm.nominal, replace(arm.measurements, position=shuffled)) is None

@@ -1,0 +1,228 @@
+"""Setup faults are recognised by name, and never on good data."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from testing.calibrated_ur5 import NOISE, calibrated_ur5, measured
+from testing.closeness import assert_close
+from testing.hybrid import hybrid_of, joints_in
+from testing.models import no_type_checker
+
+from pisigma.measurement.dataset import Measurements
+from pisigma.model.geometric_model import model_of_hybrid
+from pisigma.model.row_poses import nominal_poses_of_rows, poses_of_rows
+from pisigma.robot.se3 import transform_from_xyzrpy
+from pisigma.validation.held_out.reference_models import nominal_model
+from pisigma.validation.setup_faults.setup_faults import find_setup_faults
+
+pytestmark = pytest.mark.usefixtures("without_type_checker")
+
+ROWS = 50
+FRAME = transform_from_xyzrpy(torch.tensor([0.3, -0.2, 0.1, 0.5, 0.2, -0.3], dtype=torch.float64))
+TOOL = transform_from_xyzrpy(torch.tensor([0.03, -0.02, 0.05, 0.2, 0.1, 0.0], dtype=torch.float64))
+
+
+@pytest.fixture(scope="module")
+def geometric():
+    """The geometric calibration of a simulated UR5, and new measurements of it: positions, and poses."""
+    model, q, T = calibrated_ur5(ROWS)
+    with no_type_checker():
+        return model, measured(q, T, False), measured(q, T, True)
+
+
+@pytest.fixture(scope="module")
+def hybrid():
+    """The hybrid calibration of a simulated kiro4, and new positions of it."""
+    arm = hybrid_of("kiro4", share=0.5)
+    with no_type_checker():
+        model = model_of_hybrid("kiro4", arm.true.nominal, arm.result, arm.measurements)
+        q = joints_in(arm.true.nominal, ROWS, seed=5, share=0.5)
+        return model, measured(q, arm.true.forward(q), False)
+
+
+def joints(rows: Measurements, factor=1.0, offset=0.0, order=None) -> Measurements:
+    """The rows with other joint values in the log."""
+    q = rows.q if order is None else rows.q[:, order]
+    return replace(rows, q=q * torch.as_tensor(factor) + torch.as_tensor(offset).double())
+
+
+def moved(rows: Measurements, T_measured, X, Y) -> Measurements:
+    """The rows as seen from another frame X, and of another tool Y."""
+    T = X @ T_measured @ Y
+    noise = (rows.position - T_measured[:, :3, 3]) @ X[:3, :3].T
+    rotation = None if rows.rotation is None else T[:, :3, :3]
+    return replace(rows, position=T[:, :3, 3] + noise, rotation=rotation)
+
+
+EYE = torch.eye(4, dtype=torch.float64)
+QUARTER = torch.pi / 2
+FAULTS = {
+    "frame": (
+        lambda rows, T: moved(rows, T, FRAME, EYE),
+        ("frame",),
+        "the base has moved by about 680 mm and 36.6 deg against the model",
+    ),
+    "tool": (
+        lambda rows, T: moved(rows, T, EYE, TOOL),
+        ("tool",),
+        "the tool has moved by about 61.6 mm against the model",
+    ),
+    "frame and tool": (
+        lambda rows, T: moved(rows, T, FRAME, TOOL),
+        ("frame", "tool"),
+        "and the tool has moved",
+    ),
+    "mm named m": (
+        lambda rows, T: replace(rows, position=rows.position * 1e3),
+        ("position_unit",),
+        "x, y and z are millimetres that are named metres",
+    ),
+    "m named mm": (
+        lambda rows, T: replace(rows, position=rows.position / 1e3),
+        ("position_unit",),
+        "x, y and z are metres that are named millimetres",
+    ),
+    "degrees named radians": (
+        lambda rows, T: joints(rows, 180 / torch.pi),
+        ("joint_unit",),
+        "the values of joints 1 to 6 are degrees that are named radians",
+    ),
+    "radians named degrees": (
+        lambda rows, T: joints(rows, torch.pi / 180),
+        ("joint_unit",),
+        "the values of joints 1 to 6 are radians that are named degrees",
+    ),
+    "two exchanged": (
+        lambda rows, T: joints(rows, order=[0, 2, 1, 3, 4, 5]),
+        ("joint_order",),
+        "the columns of joints 2 and 3 are swapped",
+    ),
+    "another order": (
+        lambda rows, T: joints(rows, order=[2, 0, 1, 3, 4, 5]),
+        ("joint_order",),
+        "joints 1 to 6 are in q2, q3, q1, q4, q5, q6",
+    ),
+    "a sign": (
+        lambda rows, T: joints(rows, [1, 1, -1.0, 1, 1, 1]),
+        ("joint_sign",),
+        "the sign of joint 3 is reversed",
+    ),
+    "two signs": (
+        lambda rows, T: joints(rows, [1, -1.0, 1, -1, 1, 1]),
+        ("joint_sign",),
+        "the signs of joints 2 and 4 are reversed",
+    ),
+    "a quarter turn": (
+        lambda rows, T: joints(rows, offset=[0, QUARTER, 0, 0, 0, 0]),
+        ("joint_zero",),
+        "joint 2 has moved by -90 deg",
+    ),
+    "half a turn": (
+        lambda rows, T: joints(rows, offset=[0, 0, torch.pi, 0, 0, 0]),
+        ("joint_zero",),
+        "joint 3 has moved by 180 deg",
+    ),
+    "two quarter turns": (
+        lambda rows, T: joints(rows, offset=[0, -QUARTER, 0, QUARTER, 0, 0]),
+        ("joint_zero",),
+        "joint 2 has moved by 90 deg and joint 4 has moved by -90 deg",
+    ),
+    "any zero": (
+        lambda rows, T: joints(rows, offset=[0, 0, 0.2, 0, 0, 0]),
+        ("joint_zero",),
+        "joint 3 has moved by -11.46 deg",
+    ),
+    "a sign, from elsewhere": (
+        lambda rows, T: joints(moved(rows, T, FRAME, EYE), [1, 1, -1.0, 1, 1, 1]),
+        ("joint_sign", "frame"),
+        "the sign of joint 3 is reversed and the base has moved",
+    ),
+}
+"""By name: how good measurements are spoilt, what is to be recognised, and words of the sentence."""
+
+
+@pytest.mark.parametrize("name", FAULTS)
+def test_faults_are_recognised(geometric, name):
+    model, rows, _ = geometric
+    spoil, kinds, words = FAULTS[name]
+    (setup_fault,) = find_setup_faults(
+        model, nominal_model(model, False), spoil(rows, poses_of_rows(model, rows))
+    )
+    assert setup_fault.kinds == kinds
+    assert words in setup_fault.clause
+    assert setup_fault.before > 20 * setup_fault.after
+    assert_close(setup_fault.after, NOISE * 3**0.5, rtol=0.3)
+    assert setup_fault.after_nominal > 3 * setup_fault.after
+
+
+@pytest.mark.parametrize("name", ["frame and tool", "degrees named radians", "two exchanged", "a sign"])
+def test_faults_are_recognised_in_poses(geometric, name):
+    model, _, rows = geometric
+    spoil, kinds, words = FAULTS[name]
+    (setup_fault,) = find_setup_faults(model, model, spoil(rows, poses_of_rows(model, rows)))
+    assert setup_fault.kinds == kinds
+    assert words in setup_fault.clause
+    assert setup_fault.after_rotation < 1e-3 < setup_fault.before_rotation
+    assert {"before_rms_deg", "after_rms_deg"} <= set(setup_fault.to_json())
+
+
+def test_a_zero_that_only_orientations_tell(geometric):
+    model, _, rows = geometric
+    (setup_fault,) = find_setup_faults(model, model, joints(rows, offset=[0, 0, 0, 0, 0, torch.pi]))
+    assert setup_fault.kinds == ("joint_zero",)
+    assert setup_fault.clause == "joint 6 has moved by 180 deg"
+
+
+@pytest.mark.parametrize("name", ["tool", "a sign, from elsewhere"])
+def test_faults_are_recognised_by_a_hybrid(hybrid, name):
+    model, rows = hybrid
+    spoil, kinds, _ = FAULTS[name]
+    spoilt = spoil(rows, poses_of_rows(model, rows))
+    assert kinds in [fault.kinds for fault in find_setup_faults(model, nominal_model(model, False), spoilt)]
+
+
+def test_good_data_have_no_fault(geometric, hybrid):
+    for model, rows in (geometric[:2], geometric[::2], hybrid):
+        assert find_setup_faults(model, model, rows) == ()
+
+
+@pytest.mark.parametrize("fixture", ["geometric", "hybrid"])
+def test_the_nominal_robot_is_recognised(request, fixture):
+    model, rows = request.getfixturevalue(fixture)[:2]
+    rows = measured(rows.q, nominal_poses_of_rows(model, rows), False)
+    (setup_fault,) = find_setup_faults(model, nominal_model(model, False), rows)
+    assert setup_fault.kinds == ("correction",)
+    assert "fit the nominal robot at the joint values of the file" in setup_fault.sentence
+    assert "after_nominal_rms_mm" not in setup_fault.to_json()
+
+
+def test_corrected_values_in_the_log_of_uncorrected_moves(geometric):
+    """The log holds what corrects a pose, the robot was sent to the nominal joint values."""
+    model, rows, _ = geometric
+    T_nominal = nominal_poses_of_rows(model, rows)
+    logged = rows.q.clone()
+    for _ in range(4):  # the joint values at which the model is where the nominal robot is at rows.q
+        T = poses_of_rows(model, replace(rows, q=logged))
+        logged = logged + pose_steps(model, rows, logged, T, T_nominal)
+    off = (poses_of_rows(model, replace(rows, q=logged)) - T_nominal).abs().amax((1, 2))
+    regular = (off < 1e-6) & (
+        (logged - rows.q).abs().amax(1) < 0.02
+    )  # near singular poses corrections are large
+    assert int(regular.sum()) > ROWS / 2
+    T = poses_of_rows(model, rows)
+    (setup_fault,) = find_setup_faults(model, model, measured(logged[regular], T[regular], False))
+    assert setup_fault.kinds == ("correction",)
+    assert "ran without the correction that the joint values of the file hold" in setup_fault.sentence
+
+
+def pose_steps(model, rows, q, T, T_wanted):
+    """Newton steps of the joint values towards poses, by differences."""
+    step = 1e-6
+    columns = []
+    for joint in range(q.shape[1]):
+        other = q.clone()
+        other[:, joint] += step
+        columns.append(((poses_of_rows(model, replace(rows, q=other)) - T) / step)[:, :3].flatten(1))
+    J = torch.stack(columns, -1)
+    return torch.linalg.lstsq(J, (T_wanted - T)[:, :3].flatten(1)[..., None]).solution[..., 0]
