@@ -73,7 +73,7 @@ def _wait(child: int, until: float) -> int:
 def main() -> None:
     """Run them, print a table, and how each bad one is seen again."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--count", type=int, default=1500)
+    parser.add_argument("--count", type=int, default=2000)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--kind", choices=sorted(KINDS))
     parser.add_argument("--number", type=int, help="run this one only, and print all that it said")

@@ -9,7 +9,7 @@ from hostile.kinds import KINDS, make, shares
 from hostile.outcome import attempt
 from testing.models import no_type_checker
 
-COUNT, SEED = 1500, 0
+COUNT, SEED = 200, 0
 MOST_MEMORY = 10**6
 """[kB] The memory of the tests may grow by no more."""
 
