@@ -21,9 +21,9 @@ from pisigma.calibration.geometric.problem.setup import identified_geometry
 from pisigma.calibration.geometric.result import SolvedCalibration
 from pisigma.calibration.hybrid.calibrator import HybridCalibrator
 from pisigma.calibration.hybrid.design import Design
-from pisigma.calibration.hybrid.evidence import GaussianPrior
 from pisigma.calibration.hybrid.refinement import Refined, linearised, refined_at
 from pisigma.calibration.hybrid.regression import regression
+from pisigma.estimation.prior import GaussianPrior
 from pisigma.joint_correction.feature import AbstractFeature
 from pisigma.joint_correction.input_products import InputProducts
 from pisigma.measurement.dataset import Measurements

@@ -8,9 +8,9 @@ from torch import Tensor
 
 from pisigma.calibration.geometric.problem.setup import IdentifiedGeometry
 from pisigma.calibration.geometric.result import CalibrationResult
-from pisigma.calibration.hybrid.covariance_root import CovarianceRoot
 from pisigma.calibration.hybrid.result import HybridResult
 from pisigma.calibration.hybrid.uncertainty import PositionUncertainty
+from pisigma.estimation.covariance_root import CovarianceRoot
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel, Provenance
 from pisigma.model.stored_starts import nearest_branch, spread_rows

@@ -13,10 +13,10 @@ from pisigma.calibration.geometric.problem.parameters import ParameterSpace
 from pisigma.calibration.geometric.problem.prior_sizes import PriorGroup, prior_group_of
 from pisigma.calibration.geometric.problem.setup import IdentifiedGeometry
 from pisigma.calibration.hybrid.calibrator import HybridCalibrator
-from pisigma.calibration.hybrid.covariance_root import CovarianceRoot
 from pisigma.calibration.hybrid.gravity import USUAL, in_first_row
 from pisigma.calibration.hybrid.result import HybridResult
 from pisigma.calibration.hybrid.uncertainty import PositionUncertainty
+from pisigma.estimation.covariance_root import CovarianceRoot
 from pisigma.files.errors import IdentificationError, ImplausibleError, MeasurementError
 from pisigma.joint_correction.feature import AbstractFeature
 from pisigma.joint_correction.fourier_series import FourierSeries

@@ -13,9 +13,9 @@ from testing.simulated_arm import draw_joints, simulate
 import pisigma
 from pisigma.calibration.geometric.calibrator import GeometricCalibrator
 from pisigma.calibration.geometric.problem.setup import IdentifiedGeometry
-from pisigma.calibration.hybrid.covariance_root import CovarianceRoot
 from pisigma.calibration.hybrid.result import HybridResult
 from pisigma.calibration.hybrid.uncertainty import PositionUncertainty
+from pisigma.estimation.covariance_root import CovarianceRoot
 from pisigma.files.errors import ModelError
 from pisigma.model.accuracy import parameter_posterior
 from pisigma.model.folder.model_folder import load_model, save_model

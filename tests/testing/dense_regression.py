@@ -7,19 +7,16 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from pisigma.calibration.hybrid.covariance_root import CovarianceRoot
 from pisigma.calibration.hybrid.design import Design, Rows
-from pisigma.calibration.hybrid.evidence import (
-    AbstractRegression,
-    GaussianPrior,
-    LeftOut,
-    Posterior,
-    SensorCount,
-)
+from pisigma.calibration.hybrid.design_regression import AbstractDesignRegression
+from pisigma.estimation.covariance_root import CovarianceRoot
+from pisigma.estimation.left_out import LeftOut
+from pisigma.estimation.prior import GaussianPrior
+from pisigma.estimation.regression import Posterior, SensorCount
 
 
 @dataclass(frozen=True, eq=False)
-class DenseRegression(AbstractRegression):
+class DenseRegression(AbstractDesignRegression):
     """All values and their columns.
 
     Attributes:

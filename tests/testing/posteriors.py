@@ -6,18 +6,20 @@ import numpy as np
 from testing.closeness import assert_close
 from torch import Tensor
 
-from pisigma.calibration.hybrid.evidence import AbstractRegression, GaussianPrior, Posterior
+from pisigma.calibration.hybrid.design_regression import AbstractDesignRegression
+from pisigma.estimation.prior import GaussianPrior
+from pisigma.estimation.regression import Posterior
 
 
-def covariance(fit: AbstractRegression, posterior: Posterior) -> Tensor:
+def covariance(fit: AbstractDesignRegression, posterior: Posterior) -> Tensor:
     """Covariance of the unknowns, from its root."""
     root = fit.covariance_root(posterior).dense
     return root @ root.t()
 
 
 def assert_same_posterior(
-    found: AbstractRegression,
-    expected: AbstractRegression,
+    found: AbstractDesignRegression,
+    expected: AbstractDesignRegression,
     prior: GaussianPrior,
     noise: tuple[float, ...],
     exactness: float,

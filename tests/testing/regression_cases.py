@@ -11,7 +11,8 @@ from testing.sensors import mixed_data, true_robot
 from torch import Tensor
 
 from pisigma.calibration.hybrid.design import Design, Rows
-from pisigma.calibration.hybrid.evidence import GaussianPrior, LeftOut
+from pisigma.estimation.left_out import LeftOut
+from pisigma.estimation.prior import GaussianPrior
 from pisigma.joint_correction.feature import AbstractFeature
 from pisigma.joint_correction.fourier_series import FourierSeries
 from pisigma.joint_correction.gravity_torques import GravityTorques

@@ -19,7 +19,6 @@ from pisigma.calibration.geometric.result import SolvedCalibration
 from pisigma.calibration.hybrid.arm import JointCoverage
 from pisigma.calibration.hybrid.delivery import Delivered, delivered
 from pisigma.calibration.hybrid.design import Design, Rows, weigh
-from pisigma.calibration.hybrid.evidence import SMALLEST_NOISE
 from pisigma.calibration.hybrid.gravity import USUAL, gravity_by_evidence, gravity_sentence, in_first_row
 from pisigma.calibration.hybrid.mini_batches import (
     MANY_ROWS,
@@ -34,6 +33,7 @@ from pisigma.calibration.hybrid.search import FIRST_MODEL_SIZES, Choice, Fitted,
 from pisigma.calibration.hybrid.sensor_values import sensor_values
 from pisigma.calibration.hybrid.spectrum import lines, odds_against_a_line
 from pisigma.calibration.hybrid.uncertainty import position_uncertainty
+from pisigma.estimation.regression import SMALLEST_NOISE
 from pisigma.files.errors import IdentificationError, nearest_choice
 from pisigma.joint_correction.feature import AbstractFeature, FeatureOptions
 from pisigma.joint_correction.fourier_series import USUAL_HARMONICS

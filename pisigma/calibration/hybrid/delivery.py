@@ -6,11 +6,11 @@ from dataclasses import dataclass, replace
 from pisigma.calibration.geometric.problem.noise import view_of
 from pisigma.calibration.geometric.result import SolvedCalibration
 from pisigma.calibration.hybrid.design import Design
-from pisigma.calibration.hybrid.evidence import Posterior
 from pisigma.calibration.hybrid.left_out_rows import Comparison, SensorErrors, left_out_rows
 from pisigma.calibration.hybrid.refinement import Refined, linearised, refine
 from pisigma.calibration.hybrid.regression import regression
 from pisigma.calibration.hybrid.search import CLEAR_GAIN, ROUGHLY, Choice, Fitted
+from pisigma.estimation.regression import Posterior
 from pisigma.joint_correction.feature import AbstractFeature
 from pisigma.measurement.groups import groups_of_equal_joints
 

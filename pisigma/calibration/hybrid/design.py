@@ -10,9 +10,10 @@ from torch import Tensor
 
 from pisigma.calibration.geometric.problem.prior_sizes import PriorGroup
 from pisigma.calibration.geometric.problem.problem import CalibrationProblem
-from pisigma.calibration.hybrid.evidence import FIRST_SIZE, GaussianPrior, SensorCount
 from pisigma.calibration.hybrid.sensor_values import SensorValues
 from pisigma.estimation.loss import SquaredLoss
+from pisigma.estimation.prior import FIRST_SIZE, GaussianPrior
+from pisigma.estimation.regression import SensorCount
 from pisigma.files.errors import IdentificationError
 from pisigma.joint_correction.feature import AbstractFeature
 from pisigma.measurement.conditions import JointState

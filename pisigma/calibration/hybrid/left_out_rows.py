@@ -8,10 +8,11 @@ from jaxtyping import Bool, Float64, Int64
 from torch import Tensor
 
 from pisigma.calibration.hybrid.design import Design, Rows, weigh
-from pisigma.calibration.hybrid.evidence import Posterior, standard_errors
 from pisigma.calibration.hybrid.refinement import MOST_ROUNDS, SETTLED, in_chunks, network
 from pisigma.calibration.hybrid.regression import regression
 from pisigma.calibration.hybrid.sensor_values import SensorValues, sensor_values
+from pisigma.estimation.left_out import standard_errors
+from pisigma.estimation.regression import Posterior
 
 TOLERANCE = 1.005
 """Errors count as worse from this ratio of their RMS: a smaller difference is no difference to anybody."""

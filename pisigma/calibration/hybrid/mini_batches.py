@@ -15,9 +15,9 @@ from torch import Tensor
 from pisigma.calibration.geometric.problem.problem import CalibrationProblem
 from pisigma.calibration.geometric.result import SolvedCalibration
 from pisigma.calibration.hybrid.design import Design
-from pisigma.calibration.hybrid.evidence import Posterior
 from pisigma.calibration.hybrid.refinement import Refined, network, refined_at
 from pisigma.calibration.hybrid.sensor_values import sensor_values
+from pisigma.estimation.regression import Posterior
 from pisigma.files.yaml_file import Section
 from pisigma.measurement.conditions import JointState
 

@@ -1,95 +1,37 @@
 """Regression by normal equations: for many values and fewer unknowns."""
 
-import ctypes
-import math
-import sys
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float64, Int64
 from torch import Tensor
 
-from pisigma.calibration.hybrid.covariance_root import CovarianceRoot
 from pisigma.calibration.hybrid.design import Design, Rows, chunks
-from pisigma.calibration.hybrid.evidence import (
-    AbstractRegression,
-    GaussianPrior,
-    LeftOut,
-    Posterior,
-    SensorCount,
-)
+from pisigma.calibration.hybrid.design_regression import AbstractDesignRegression
 from pisigma.calibration.hybrid.sensor_values import SensorValues
-from pisigma.files.errors import IdentificationError
+from pisigma.estimation.cholesky import BLOCK, blocks, return_free_memory
+from pisigma.estimation.left_out import LeftOut
+from pisigma.estimation.primal_regression import PrimalRegression, Solved
+from pisigma.estimation.prior import GaussianPrior
+from pisigma.estimation.regression import Posterior, SensorCount
 from pisigma.joint_correction.feature import AbstractFeature
 
-BLOCK = 192
-"""Triangular matrices are worked on in blocks of so many rows: small ones leave less of what is 0 in the products,
-large ones are multiplied faster."""
 NARROW = 64
 """Rows of which all columns are in memory at a time where only products with some of them are made."""
-MANY_UNKNOWNS = 1_000
-"""Matrices of more are large enough to make room for."""
 
 
 @dataclass(frozen=True, eq=False)
-class Solved:
-    """The normal equations, divided by the noise's variance, with a prior: `D (Σ X^T X + precision) D = L L^T`.
-
-    Attributes:
-        prior: of the unknowns.
-        noise: per sensor.
-        scale: the diagonal of D.
-        inverse: L^-1, a lower triangle, so that the covariance is `D L^-T L^-1 D`.
-        log_det: logarithm of the determinant of `Σ X^T X + precision`.
-        x: the most probable values.
-    """
-
-    prior: GaussianPrior
-    noise: tuple[float, ...]
-    scale: Float64[Tensor, " unknowns"]
-    inverse: Float64[Tensor, "unknowns unknowns"]
-    log_det: float
-    x: Float64[Tensor, " unknowns"]
-
-    @property
-    def variance(self) -> Float64[Tensor, " unknowns"]:
-        """Diagonal of the covariance."""
-        deviation: Tensor = self.scale * torch.linalg.vector_norm(self.inverse, dim=0)
-        return deviation.square()
-
-    def trace(self, matrix: Float64[Tensor, "unknowns unknowns"]) -> float:
-        """Trace of the product of a symmetric matrix and the covariance, of which one block is made at a time."""
-        trace = 0.0
-        for rows in chunks(len(self.x), BLOCK):
-            block = self.inverse[rows.start :, rows].t() @ self.inverse[rows.start :, : rows.stop]
-            scale = self.scale[: rows.stop].clone()
-            scale[: rows.start].mul_(2)  # the blocks above the diagonal as well
-            trace += float(self.scale[rows] @ (block.mul_(matrix[rows, : rows.stop]) @ scale))
-        return trace
-
-
-@dataclass(frozen=True, eq=False)
-class NormalEquations(AbstractRegression):
-    """Normal equations of every sensor, before division by its noise's variance.
+class NormalEquations(PrimalRegression, AbstractDesignRegression):
+    """The normal equations of linearised rows for the unknowns of a design.
 
     Attributes:
         design: the unknowns.
         rows: linearised values.
-        normal: `Σ X^T X` per sensor, rows already weighted.
-        descent: `Σ X^T y`.
-        square: `Σ y^T y`.
-        sensors: how many values there are.
-        latest: what was solved last, which the evidence, left-out values and the covariance are all made from.
     """
 
     design: Design
     rows: Rows
-    normal: Float64[Tensor, "sensors unknowns unknowns"]
-    descent: Float64[Tensor, "sensors unknowns"]
-    square: tuple[float, ...]
-    sensors: tuple[SensorCount, ...]
-    latest: list[Solved] = field(default_factory=list, init=False)
 
     @staticmethod
     def of(design: Design, rows: Rows) -> "NormalEquations":
@@ -99,18 +41,18 @@ class NormalEquations(AbstractRegression):
         joints `X_j^T X_i = f_j^T diag(J_j^T J_i) f_i`: the components of a value are summed before the products.
         """
         size = design.unknowns
-        _return_free_memory(size)
+        return_free_memory(size)
         normal = design.problem.q.new_empty((len(rows.values), size, size))
         descent, square = normal.new_empty((len(rows.values), size)), []
         for k, sensor in enumerate(rows.values):
             square.append(_add_sums(design, sensor, normal[k], descent[k]))
-        return NormalEquations(design, rows, normal, descent, tuple(square), rows.sensors)
+        return NormalEquations(normal, descent, tuple(square), rows.sensors, design, rows)
 
     def select(self, design: Design) -> "NormalEquations":
         """See `AbstractRegression.select`."""
         if design.unknowns == self.design.unknowns and design.features == self.design.features:
             return self
-        _return_free_memory(design.unknowns)
+        return_free_memory(design.unknowns)
         columns = self.design.indices(design.features)
         normal = self.normal.new_empty((len(self.normal), len(columns), len(columns)))
         for whole, part in zip(self.normal, normal, strict=True):
@@ -123,7 +65,7 @@ class NormalEquations(AbstractRegression):
         Sums that are there already are copied.
         """
         self.latest.clear()
-        _return_free_memory(design.unknowns)
+        return_free_memory(design.unknowns)
         before = self.design.indices(design.features[:-1])
         first, new = len(before), slice(len(before), None)
         normal = self.normal.new_empty((len(self.normal), design.unknowns, design.unknowns))
@@ -155,12 +97,12 @@ class NormalEquations(AbstractRegression):
 
     def left_out(self, posterior: Posterior, folds: Sequence[Int64[Tensor, " _groups"]]) -> LeftOut:
         """See `AbstractRegression.left_out`."""
-        solved = self._solved(posterior.prior, posterior.noise)
+        solved = self.solved_with(posterior.prior, posterior.noise)
         return LeftOut.joined([self._left_out(groups, solved) for groups in folds])
 
     def _left_out(self, groups: Int64[Tensor, " groups"], solved: Solved) -> LeftOut:
         """Leave out one fold."""
-        _return_free_memory(len(solved.x))
+        return_free_memory(len(solved.x))
         test, x = self.rows.held_out(groups).values, solved.x
         whitened = x.new_empty((sum(sensor.residual.numel() for sensor in test), len(x)))
         r, number, first = [], [], 0
@@ -174,26 +116,10 @@ class NormalEquations(AbstractRegression):
             first += len(r[-1])
             del columns
         M = torch.eye(first, dtype=x.dtype, device=x.device)
-        for rows in chunks(len(x), BLOCK):
+        for rows in blocks(len(x), BLOCK):
             S = solved.inverse[rows, : rows.stop] @ whitened[:, : rows.stop].t()
             M.addmm_(S.t(), S, alpha=-1)
         return LeftOut.of(M, torch.cat(r), torch.cat(number), self.sensors)
-
-    def solve(self, prior: GaussianPrior, noise: tuple[float, ...]) -> Posterior:
-        """Solve `(Σ_s N_s / noise_s² + precision) x = Σ_s b_s / noise_s²` by Cholesky with column scaling."""
-        precision = prior.precision
-        solved = self._solved(prior, noise)
-        x, held = solved.x, precision * solved.variance
-        pairs = zip(self.normal[1:], noise[1:], strict=True)
-        used = [solved.trace(N) / sigma**2 for N, sigma in pairs]
-        used.insert(0, float((1 - held).sum()) - sum(used))  # the prior holds what the values do not
-        misfit = self._misfits(x)
-        log_prior = float(precision[precision > 0].log().sum())
-        fit = sum(total / sigma**2 for total, sigma in zip(misfit, noise, strict=True))
-        evidence = fit + float((x.square() * precision).sum()) + solved.log_det - log_prior
-        evidence = -0.5 * (evidence + log_noise(self.sensors, noise))
-        square, determined = prior.of_groups(x.square() * prior.base), prior.of_groups(1 - held)
-        return Posterior(x, evidence, prior, noise, square, determined, misfit, tuple(used))
 
     def first_sizes(
         self, posterior: Posterior, design: Design, features: AbstractFeature
@@ -205,15 +131,14 @@ class NormalEquations(AbstractRegression):
         """
         columns = self.design.indices((*design.features, features))
         old, new = columns[: design.unknowns], columns[design.unknowns :]
-        solved = self.select(design)._solved(posterior.prior, posterior.noise)
+        solved = self.select(design).solved_with(posterior.prior, posterior.noise)
         normal = sum(N[new] * sigma**-2 for N, sigma in zip(self.normal, posterior.noise, strict=True))
         descent = sum(b * sigma**-2 for b, sigma in zip(self.descent, posterior.noise, strict=True))
         square = sum(total / sigma**2 for total, sigma in zip(self.square, posterior.noise, strict=True))
         cross = normal[:, old]
         root = solved.inverse @ (cross * solved.scale).t()
         rest = square - float(descent[old] @ solved.x)
-        alone = replace(
-            self,
+        alone = PrimalRegression(
             normal=(normal[:, new] - root.t() @ root)[None],
             descent=(descent[new] - cross @ solved.x)[None],
             square=(rest,),
@@ -226,101 +151,6 @@ class NormalEquations(AbstractRegression):
         )
         best = alone.maximise_evidence(prior, (1.0,))
         return best.log_evidence + rest / 2, best.prior.sizes
-
-    def covariance_root(self, posterior: Posterior) -> CovarianceRoot:
-        """See `AbstractRegression.covariance_root`; with the names of `Solved` it is `D L^-T`."""
-        solved = self._solved(posterior.prior, posterior.noise)
-        self.latest.clear()
-        return CovarianceRoot(solved.inverse.t().mul_(solved.scale[:, None]))
-
-    def _solved(self, prior: GaussianPrior, noise: tuple[float, ...]) -> Solved:
-        """What was solved last, or else solve now."""
-
-        def normal() -> Tensor:
-            torch.mul(self.normal[0], noise[0] ** -2, out=memory)
-            for N, sigma in zip(self.normal[1:], noise[1:], strict=True):
-                memory.add_(N, alpha=sigma**-2)
-            memory.diagonal().add_(prior.precision)
-            return memory
-
-        if not self.latest or self.latest[0].prior is not prior or self.latest[0].noise != noise:
-            _return_free_memory(len(prior.base))
-            memory = self.latest.pop().inverse.mT if self.latest else torch.empty_like(self.normal[0])
-            descent = torch.zeros_like(self.descent[0])
-            for b, sigma in zip(self.descent, noise, strict=True):
-                descent.add_(b, alpha=sigma**-2)
-            scale, factor = factored(normal)
-            log_det = log_determinant(scale, factor)
-            inner = torch.linalg.solve_triangular(factor, (scale * descent)[:, None], upper=False)
-            x = scale * torch.linalg.solve_triangular(factor.mT, inner, upper=True)[:, 0]
-            _invert_triangle(factor)
-            self.latest.append(Solved(prior, noise, scale, factor, log_det, x))
-        return self.latest[0]
-
-    def _misfits(self, x: Float64[Tensor, " unknowns"]) -> tuple[float, ...]:
-        """`Σ (y - X x)²` per sensor."""
-        cross = (self.descent @ x).tolist()
-        inner = [float(x @ (N @ x)) for N in self.normal]
-        return tuple(
-            max(total - 2 * a + b, 0.0) for total, a, b in zip(self.square, cross, inner, strict=True)
-        )
-
-
-def log_noise(sensors: Sequence[SensorCount], noise: Sequence[float]) -> float:
-    """`Σ log noise²` over all values."""
-    pairs = zip(sensors, noise, strict=True)
-    return sum(2 * sensor.values * math.log(sigma) for sensor, sigma in pairs)
-
-
-def factored(matrix: Callable[[], Float64[Tensor, "unknowns unknowns"]]) -> tuple[Tensor, Tensor]:
-    """Column scale, and Cholesky factor of a scaled symmetric matrix.
-
-    Args:
-        matrix: makes it, stored row by row; its upper triangle is read. As the factor takes its memory, it is made
-            again where that fails.
-
-    Raises:
-        IdentificationError: the matrix is not finite.
-    """
-    jitter = 1e-14
-    while True:
-        scaled = matrix()
-        scale = scaled.diagonal().clamp(min=1e-300).rsqrt()
-        scaled.mul_(scale).mul_(scale[:, None]).diagonal().fill_(1 + jitter)
-        by_column, status = scaled.mT, torch.empty((), dtype=torch.int32, device=scaled.device)
-        factor, failed = torch.linalg.cholesky_ex(by_column, out=(by_column, status))
-        if not failed:
-            return scale, factor
-        if not bool(torch.isfinite(matrix()).all()):
-            raise IdentificationError(
-                "the normal equations are not finite; look for values without limit in the measurements."
-            )
-        jitter *= 10
-
-
-def log_determinant(scale: Tensor, factor: Tensor) -> float:
-    """Of a matrix from what `factored` gives."""
-    return 2 * float(factor.diagonal().log().sum()) - 2 * float(scale.log().sum())
-
-
-def inverted(scale: Tensor, factor: Tensor) -> Float64[Tensor, "unknowns unknowns"]:
-    """Inverse of a matrix from what `factored` gives, in the place of the factor."""
-    inverse: Tensor = torch.cholesky_inverse(factor, out=factor).mT  # symmetric, and so stored row by row
-    return inverse.mul_(scale).mul_(scale[:, None])
-
-
-def _invert_triangle(factor: Tensor) -> None:
-    """Put its inverse in the place of a lower triangular matrix: block by block, so that most of it are products."""
-    blocks = chunks(len(factor), BLOCK)
-    for number, rows in enumerate(blocks):
-        diagonal = factor[rows, rows]
-        identity = torch.eye(len(diagonal), dtype=factor.dtype, device=factor.device)
-        inverse = torch.linalg.solve_triangular(diagonal, identity, upper=False)
-        before = factor[rows, : rows.start].clone()
-        for columns in blocks[:number]:
-            inner = factor[columns.start : rows.start, columns]
-            factor[rows, columns] = -inverse @ (before[:, columns.start :] @ inner)
-        diagonal.copy_(inverse)
 
 
 def _add_sums(design: Design, sensor: SensorValues, N: Tensor, b: Tensor) -> float:
@@ -380,15 +210,3 @@ def _places(design: Design, dof: int, count: int) -> Int64[Tensor, " weights"]:
         places.append(own[chosen.used])
         first += chosen.count
     return torch.cat(places)
-
-
-def _return_free_memory(unknowns: int) -> None:
-    """Give free memory back to the system where the C library offers that (`malloc_trim` of glibc); else do nothing.
-
-    After fits of thousands of unknowns more than 100 MB are free in pieces between what is in use, and the matrices of
-    the next fit would come on top of them.
-    """
-    if unknowns > MANY_UNKNOWNS and sys.platform == "linux":
-        trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
-        if trim is not None:
-            trim(0)

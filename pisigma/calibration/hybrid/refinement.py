@@ -12,10 +12,12 @@ from pisigma.calibration.geometric.problem.problem import CalibrationProblem
 from pisigma.calibration.geometric.problem.setup import IdentifiedGeometry, identified_geometry
 from pisigma.calibration.geometric.result import SolvedCalibration
 from pisigma.calibration.hybrid.design import Design, Rows, chunks, weigh
-from pisigma.calibration.hybrid.evidence import AbstractRegression, LeftOut, Posterior
+from pisigma.calibration.hybrid.design_regression import AbstractDesignRegression
 from pisigma.calibration.hybrid.regression import regression
 from pisigma.calibration.hybrid.search import Choice
 from pisigma.calibration.hybrid.sensor_values import Shift, sensor_values
+from pisigma.estimation.left_out import LeftOut
+from pisigma.estimation.regression import Posterior
 from pisigma.joint_correction.input_products import InputProducts
 from pisigma.joint_correction.joint_correction import JointCorrection
 from pisigma.measurement.dataset import Measurements
@@ -46,7 +48,7 @@ class Refined:
     rows: Rows
     design: Design
     posterior: Posterior
-    regression: AbstractRegression
+    regression: AbstractDesignRegression
     point: Float64[Tensor, " parameters"]
     correction: JointCorrection
     rounds: int
@@ -93,7 +95,7 @@ def refined_at(design: Design, posterior: Posterior, group: Int64[Tensor, " rows
 
 
 def _refined(
-    rows: Rows, design: Design, posterior: Posterior, fit: AbstractRegression, rounds: int
+    rows: Rows, design: Design, posterior: Posterior, fit: AbstractDesignRegression, rounds: int
 ) -> Refined:
     problem = design.problem
     point = problem.nominal.index_add(0, problem.active, posterior.x[: design.active])

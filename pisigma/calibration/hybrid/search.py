@@ -9,8 +9,10 @@ import torch
 from torch import Tensor
 
 from pisigma.calibration.hybrid.design import FOLDS, FOLDS_OF_FEW, MOST_GROUPS, Design, Rows
-from pisigma.calibration.hybrid.evidence import AbstractRegression, LeftOut, Posterior
+from pisigma.calibration.hybrid.design_regression import AbstractDesignRegression
 from pisigma.calibration.hybrid.regression import extended, regression
+from pisigma.estimation.left_out import LeftOut
+from pisigma.estimation.regression import Posterior
 from pisigma.joint_correction.feature import AbstractFeature
 
 LEVEL = 1.03
@@ -114,7 +116,7 @@ class Choice:
     geometry: Fitted
     best: Fitted
     trials: tuple[Trial, ...]
-    regression: AbstractRegression | None = None
+    regression: AbstractDesignRegression | None = None
 
 
 class Search:

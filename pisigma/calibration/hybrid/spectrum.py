@@ -7,7 +7,7 @@ from jaxtyping import Bool, Complex128, Float64
 from torch import Tensor
 
 from pisigma.calibration.hybrid.design import Design, Rows
-from pisigma.calibration.hybrid.evidence import Posterior
+from pisigma.estimation.regression import Posterior
 from pisigma.joint_correction.feature import turning_rate
 
 HIGHEST = 3_000

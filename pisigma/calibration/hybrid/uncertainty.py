@@ -1,6 +1,5 @@
 """Standard deviations of predicted positions, from the posterior of parameters and weights."""
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
@@ -10,10 +9,12 @@ from torch import Tensor
 
 from pisigma.calibration.geometric.problem.parameters import ParameterSpace
 from pisigma.calibration.geometric.problem.setup import IdentifiedGeometry
-from pisigma.calibration.hybrid.covariance_root import CovarianceRoot
 from pisigma.calibration.hybrid.design import FOLDS, FOLDS_OF_FEW, MOST_GROUPS, Design, Rows
-from pisigma.calibration.hybrid.evidence import AbstractRegression, LeftOut, Posterior
+from pisigma.calibration.hybrid.design_regression import AbstractDesignRegression
 from pisigma.calibration.hybrid.sensor_values import joint_columns, weight_columns
+from pisigma.estimation.covariance_root import CovarianceRoot
+from pisigma.estimation.left_out import LeftOut, left_out_scale
+from pisigma.estimation.regression import Posterior, root_of_sizes
 from pisigma.joint_correction.feature import AbstractFeature
 from pisigma.measurement.conditions import JointState
 from pisigma.measurement.dataset import Measurements
@@ -30,10 +31,6 @@ with all of them, so that its errors say little of theirs."""
 FOLD_UPDATES, FEWER_UPDATES, SOME_GROUPS = 3, 1, 150
 """Updates of noise and prior sizes then, and of more than so many groups: with one update 0.9 % fewer of 30 rows lie in
 the predicted 95 %, 0.4 % of 100 rows and 0.3 % of 300 rows; a fit of these takes four fifths of the time with it."""
-LEAST_EFFECTIVE = 0.5
-"""Prior sizes of groups of which the data determine fewer unknowns do not matter."""
-LARGEST_SCALE = 1e4
-"""Largest factor on variances."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,43 +115,10 @@ class PositionUncertainty:
         return torch.cat([joints[..., :0], *blocks], -1)
 
 
-def root_of_sizes(posterior: Posterior, root: CovarianceRoot) -> Float64[Tensor, "unknowns groups"]:
-    """What the uncertainty of the prior's sizes adds to a root of the covariance C of the unknowns.
-
-    With `dx / d log s_g = 2 C Λ_g x` for the unknowns of group g and `var(log s_g) = 1 / (2 n_g)`, where n_g of
-    them are determined by the data (first order; Kass and Steffey 1989, J. Amer. Statist. Assoc. 84(407), 717-726).
-    """
-    prior, x = posterior.prior, posterior.x
-    groups = torch.zeros(len(x), len(prior.sizes), dtype=x.dtype, device=x.device)
-    groups[torch.arange(len(x)), prior.group] = 1.0
-    certain = posterior.determined > LEAST_EFFECTIVE
-    moved = 2 * root.covariance_times((groups * (prior.precision * x)[:, None])[:, certain])
-    return moved * (2 * posterior.determined[certain]).rsqrt()
-
-
-def left_out_scale(errors: LeftOut) -> float:
-    """Factor on the unknowns' covariance with which left-out values are missed by as much as predicted; 1 or more.
-
-    With errors e and predicted deviations s in units of the noise, it solves `mean(e² / (1 + f (s² - 1))) = 1`.
-    What the model cannot express makes it larger than 1.
-    """
-    square, extra = errors.error.square(), errors.spread.square() - 1
-    low, high = 0.0, math.log(LARGEST_SCALE)
-    if float((square / (1 + extra)).mean()) <= 1:
-        return 1.0
-    for _ in range(60):
-        middle = (low + high) / 2
-        if float((square / (1 + math.exp(middle) * extra)).mean()) > 1:
-            low = middle
-        else:
-            high = middle
-    return math.exp(high)
-
-
 def position_uncertainty(
     rows: Rows,
     design: Design,
-    fit: AbstractRegression,
+    fit: AbstractDesignRegression,
     posterior: Posterior,
     geometry: IdentifiedGeometry,
     left_out: LeftOut | None = None,

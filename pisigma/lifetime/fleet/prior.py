@@ -12,8 +12,8 @@ from torch import Tensor
 from pisigma.calibration.geometric.problem.parameters import ParameterSpace
 from pisigma.calibration.geometric.problem.setup import IdentifiedGeometry
 from pisigma.calibration.hybrid.arm import HybridArm, JointCoverage
-from pisigma.calibration.hybrid.covariance_root import CovarianceRoot
 from pisigma.calibration.hybrid.uncertainty import PositionUncertainty
+from pisigma.estimation.covariance_root import CovarianceRoot
 from pisigma.files.errors import FleetError
 from pisigma.joint_correction.feature import AbstractFeature
 from pisigma.joint_correction.joint_correction import JointCorrection

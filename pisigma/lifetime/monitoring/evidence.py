@@ -9,14 +9,14 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
-from pisigma.lifetime.recalibration.drift import (
+from pisigma.estimation.cholesky import covariance_factor
+from pisigma.estimation.drift import (
     NOISE_FACTORS,
     NOISE_SPREAD,
     SIZES,
     DriftGroup,
     LinearValues,
     coordinates,
-    covariance_factor,
     fewest_columns,
     gains,
 )
@@ -76,7 +76,7 @@ class SessionEvidence:
     of the posterior's root, so that geometry, frames and correction are as uncertain as the model knows them, and B
     those by what stands anywhere, such as the base of a tracker that was carried away. A hypothesis adds `s² Z Z^T` for
     its unknowns; its evidence is the mean over sizes s and noise factors f, each in closed form (see
-    `pisigma.lifetime.recalibration.drift.DriftSearch`). Bayes factors times prior odds give the probabilities (Kass
+    `pisigma.estimation.drift.DriftSearch`). Bayes factors times prior odds give the probabilities (Kass
     and Raftery 1995, Bayes factors, J. Am. Stat. Assoc. 90(430)).
     """
 

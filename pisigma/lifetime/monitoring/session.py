@@ -11,19 +11,19 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from pisigma.calibration.hybrid.refinement import linearised
+from pisigma.estimation.drift import Drift, DriftGroup, LinearValues
+from pisigma.estimation.posterior_update import PosteriorUpdate
+from pisigma.estimation.wrong_rows import Explained, with_wrong_rows
 from pisigma.files.errors import IdentificationError
 from pisigma.lifetime.monitoring.evidence import CORRECTION, Explanation, Motion, SessionEvidence
 from pisigma.lifetime.recalibration.adaptation import AdaptedArm, linear_values, noise_of_sensors
-from pisigma.lifetime.recalibration.drift import Drift, DriftGroup, LinearValues
 from pisigma.lifetime.recalibration.elsewhere import FAR
 from pisigma.lifetime.recalibration.moved import Moved, moved_of_group
-from pisigma.lifetime.recalibration.posterior_update import PosteriorUpdate
 from pisigma.lifetime.recalibration.recalibration_problem import (
     Owner,
     RecalibrationProblem,
     recalibration_problem,
 )
-from pisigma.lifetime.recalibration.wrong_rows import Explained, with_wrong_rows
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.groups import held_out_groups
 from pisigma.model.calibrated_model import CalibratedModel

@@ -13,11 +13,11 @@ from pisigma.calibration.geometric.prediction import predicted_poses
 from pisigma.calibration.geometric.problem.setup import IdentifiedGeometry, identified_geometry
 from pisigma.calibration.hybrid.design import Rows
 from pisigma.calibration.hybrid.refinement import linearised, network
+from pisigma.estimation.drift import Drift, DriftGroup, DriftSearch, LinearValues
+from pisigma.estimation.posterior_update import PosteriorUpdate
+from pisigma.estimation.wrong_rows import Explained, with_wrong_rows
 from pisigma.joint_correction.joint_correction import JointCorrection
-from pisigma.lifetime.recalibration.drift import Drift, DriftGroup, DriftSearch, LinearValues
-from pisigma.lifetime.recalibration.posterior_update import PosteriorUpdate
 from pisigma.lifetime.recalibration.recalibration_problem import RecalibrationProblem
-from pisigma.lifetime.recalibration.wrong_rows import Explained, with_wrong_rows
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.groups import held_out_groups
 from pisigma.measurement.sensors.registry import measured_errors

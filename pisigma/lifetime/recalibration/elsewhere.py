@@ -4,9 +4,9 @@ from collections.abc import Mapping, Set
 from contextlib import suppress
 
 from pisigma.calibration.geometric.initial_guess.initial_guess import chosen_rows
+from pisigma.estimation.drift import WORTH
 from pisigma.files.errors import IdentificationError
 from pisigma.lifetime.recalibration.adaptation import adapt
-from pisigma.lifetime.recalibration.drift import WORTH
 from pisigma.lifetime.recalibration.recalibration_problem import Owner, recalibration_problem
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel

@@ -9,8 +9,8 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from pisigma.calibration.geometric.problem.setup import IdentifiedGeometry
+from pisigma.estimation.drift import DriftGroup
 from pisigma.lifetime.recalibration.adaptation import Adaptation
-from pisigma.lifetime.recalibration.drift import DriftGroup
 from pisigma.lifetime.recalibration.recalibration_problem import RecalibrationProblem, frame_stretch
 from pisigma.measurement.sensors.sensor import SHOWN_UNITS, ShownUnit
 from pisigma.robot.se3 import rotation_vector, transform_from_xyzrpy

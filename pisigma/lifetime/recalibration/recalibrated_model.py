@@ -8,8 +8,8 @@ import torch
 
 from pisigma.calibration.geometric.problem.setup import IdentifiedGeometry
 from pisigma.calibration.hybrid.arm import HybridArm
-from pisigma.calibration.hybrid.covariance_root import CovarianceRoot
 from pisigma.calibration.hybrid.uncertainty import PositionUncertainty
+from pisigma.estimation.covariance_root import CovarianceRoot
 from pisigma.lifetime.recalibration.adaptation import Adaptation
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel, Provenance

@@ -19,8 +19,8 @@ from pisigma.calibration.geometric.problem.setup import (
     usable_rows,
 )
 from pisigma.calibration.hybrid.design import Design
+from pisigma.estimation.drift import DriftGroup, LinearValues
 from pisigma.estimation.loss import HampelLoss
-from pisigma.lifetime.recalibration.drift import DriftGroup, LinearValues
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.groups import groups_to_keep_whole
 from pisigma.measurement.sensors.intrinsics import without_stated

@@ -17,8 +17,8 @@ from torch import Tensor
 from pisigma.calibration.geometric.problem.parameters import ParameterSpace
 from pisigma.calibration.geometric.problem.setup import IdentifiedGeometry
 from pisigma.calibration.hybrid.arm import HybridArm, JointCoverage
-from pisigma.calibration.hybrid.covariance_root import CovarianceRoot
 from pisigma.calibration.hybrid.uncertainty import PositionUncertainty
+from pisigma.estimation.covariance_root import CovarianceRoot
 from pisigma.joint_correction.feature import AbstractFeature, turning_rate
 from pisigma.joint_correction.input_products import InputProducts
 from pisigma.joint_correction.joint_correction import JointCorrection

@@ -9,9 +9,9 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from pisigma.calibration.geometric.result import CalibrationResult
-from pisigma.calibration.hybrid.covariance_root import CovarianceRoot
 from pisigma.calibration.hybrid.result import HybridResult
 from pisigma.calibration.hybrid.uncertainty import PositionUncertainty
+from pisigma.estimation.covariance_root import CovarianceRoot
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.sensors.corner import position_deviations
 from pisigma.measurement.sensors.intrinsics import NOISE_COLUMN

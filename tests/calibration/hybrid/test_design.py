@@ -9,7 +9,7 @@ from testing.linearised import LinearisedArm, drawn_joints, linearised, tracker_
 from testing.regression_cases import all_kinds
 
 from pisigma.calibration.hybrid.design import Design
-from pisigma.calibration.hybrid.evidence import FIRST_SIZE
+from pisigma.estimation.prior import FIRST_SIZE
 from pisigma.joint_correction.feature import AbstractFeature
 from pisigma.joint_correction.fourier_series import FourierSeries
 from pisigma.joint_correction.gravity_torques import GravityTorques

@@ -8,9 +8,11 @@ from testing.closeness import assert_close
 from testing.regression_cases import CASES, few_values, poses
 from torch import Tensor
 
-from pisigma.calibration.hybrid.evidence import AbstractRegression, LeftOut, SensorCount
+from pisigma.calibration.hybrid.design_regression import AbstractDesignRegression
 from pisigma.calibration.hybrid.normal_equations import NormalEquations
 from pisigma.calibration.hybrid.value_covariance import ValueCovariance
+from pisigma.estimation.left_out import LeftOut
+from pisigma.estimation.regression import SensorCount
 
 FORMS = {"normal equations": NormalEquations, "value covariance": ValueCovariance}
 
@@ -20,7 +22,7 @@ FORMS = {"normal equations": NormalEquations, "value covariance": ValueCovarianc
 def test_closed_form_equals_fitting_without_every_group(name: str, form: str) -> None:
     """Where nothing else says where sockets of a placement or an anchor are, that is fitted to the left-out rows."""
     case = CASES[name]()
-    fit: AbstractRegression = FORMS[form].of(case.design, case.rows)
+    fit: AbstractDesignRegression = FORMS[form].of(case.design, case.rows)
     found = fit.left_out(fit.solve(case.prior, case.noise), case.folds)
     expected = case.refitted
     assert found.sensor.tolist() == expected.sensor.tolist()
@@ -34,7 +36,7 @@ def test_several_groups_can_be_left_out_together(form: str) -> None:
     case = poses()
     folds = case.rows.folds(4, 1000)
     assert sorted(torch.cat(folds).tolist()) == list(range(case.rows.groups))
-    fit: AbstractRegression = FORMS[form].of(case.design, case.rows)
+    fit: AbstractDesignRegression = FORMS[form].of(case.design, case.rows)
     found = fit.left_out(fit.solve(case.prior, case.noise), folds)
     expected = case.dense.left_out(case.dense.solve(case.prior, case.noise), folds)
     assert_close(found.error, expected.error, atol=1e-6)
@@ -45,7 +47,7 @@ def test_several_groups_can_be_left_out_together(form: str) -> None:
 def test_sizes_and_noise_can_be_estimated_anew_for_every_fold(form: str) -> None:
     case = poses()
     folds = case.rows.folds(3, 1000)
-    fit: AbstractRegression = FORMS[form].of(case.design, case.rows)
+    fit: AbstractDesignRegression = FORMS[form].of(case.design, case.rows)
     found = fit.left_out_anew(fit.solve(case.prior, case.noise), folds, 3)
     expected = case.dense.left_out_anew(case.dense.solve(case.prior, case.noise), folds, 3)
     assert_close(found.error, expected.error, atol=1e-4)
@@ -61,7 +63,7 @@ def test_the_noise_of_a_sensor_stands_of_which_a_fold_takes_all_values(form: str
     number = [values.name for values in case.rows.values].index("distance")
     wire = case.rows.group[case.rows.values[number].row].unique()
     assert len(wire) == 1
-    fit: AbstractRegression = FORMS[form].of(case.design, case.rows)
+    fit: AbstractDesignRegression = FORMS[form].of(case.design, case.rows)
     posterior = fit.solve(case.prior, case.noise)
     rest = fit.without(wire).maximise_evidence(posterior.prior, posterior.noise, 2)
     assert rest.noise[number] == case.noise[number]

@@ -14,17 +14,12 @@ from torch import Tensor
 
 from pisigma.calibration.geometric.prediction import predicted_poses
 from pisigma.calibration.geometric.problem.setup import identified_geometry
-from pisigma.calibration.hybrid.evidence import GaussianPrior, LeftOut
 from pisigma.calibration.hybrid.normal_equations import NormalEquations
 from pisigma.calibration.hybrid.search import Fitted
-from pisigma.calibration.hybrid.uncertainty import (
-    LARGEST_SCALE,
-    LEAST_EFFECTIVE,
-    PositionUncertainty,
-    left_out_scale,
-    position_uncertainty,
-    root_of_sizes,
-)
+from pisigma.calibration.hybrid.uncertainty import PositionUncertainty, position_uncertainty
+from pisigma.estimation.left_out import LARGEST_SCALE, LeftOut, left_out_scale
+from pisigma.estimation.prior import GaussianPrior
+from pisigma.estimation.regression import LEAST_EFFECTIVE, root_of_sizes
 from pisigma.joint_correction.fourier_series import FourierSeries
 from pisigma.joint_correction.gravity_torques import GravityTorques
 from pisigma.joint_correction.joint_correction import JointCorrection

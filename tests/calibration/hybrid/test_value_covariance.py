@@ -89,7 +89,7 @@ def test_noise_that_is_small_beside_the_values_is_left_to_normal_equations() -> 
     noise = tuple(1e-4 * sigma for sigma in case.noise)
     prior = replace(case.prior, sizes=case.prior.sizes * 10)
     dual, normal = ValueCovariance.of(case.design, case.rows), NormalEquations.of(case.design, case.rows)
-    here, there = dual.solve(prior, noise), dual.normal_equations.solve(prior, noise)
+    here, there = dual.solve(prior, noise), dual.primal.solve(prior, noise)
     assert torch.equal(here.x, there.x)
     assert here.log_evidence == there.log_evidence
     expected = normal.solve(prior, noise)

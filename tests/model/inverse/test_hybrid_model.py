@@ -12,7 +12,7 @@ from safetensors.torch import load_file, save_file
 from testing.closeness import assert_close
 from testing.hybrid import hybrid_of, joints_in
 
-from pisigma.calibration.hybrid.covariance_root import CovarianceRoot
+from pisigma.estimation.covariance_root import CovarianceRoot
 from pisigma.files.errors import MeasurementError, ModelError, PoseError
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.accuracy import deviation_of_rows, parameter_posterior, position_accuracy

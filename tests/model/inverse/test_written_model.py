@@ -17,8 +17,8 @@ from testing.same_model import differences
 
 from pisigma.calibration.geometric.problem.parameters import ParameterSpace
 from pisigma.calibration.geometric.problem.setup import IdentifiedGeometry
-from pisigma.calibration.hybrid.covariance_root import CovarianceRoot
 from pisigma.calibration.hybrid.uncertainty import PositionUncertainty
+from pisigma.estimation.covariance_root import CovarianceRoot
 from pisigma.files.errors import ModelError
 from pisigma.joint_correction import registry
 from pisigma.joint_correction.backlash import Backlash

@@ -7,9 +7,9 @@ import pytest
 import torch
 from testing.closeness import assert_close
 
-from pisigma.calibration.hybrid.evidence import SensorCount
-from pisigma.lifetime.recalibration.drift import DriftGroup, DriftSearch, LinearValues
-from pisigma.lifetime.recalibration.wrong_rows import Explained, with_wrong_rows
+from pisigma.estimation.drift import DriftGroup, DriftSearch, LinearValues
+from pisigma.estimation.regression import SensorCount
+from pisigma.estimation.wrong_rows import Explained, with_wrong_rows
 
 NOISE, MOVED, CONFIGURATIONS = 1e-4, 4e-3, 12
 

@@ -8,7 +8,8 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
-from pisigma.lifetime.recalibration.drift import LinearValues, covariance_factor, gains
+from pisigma.estimation.cholesky import covariance_factor
+from pisigma.estimation.drift import LinearValues, gains
 
 FACTORS = torch.logspace(0.5, 4.5, 17, dtype=torch.float64)
 """Factors on the noise of a wrong configuration that are tried."""

@@ -8,7 +8,8 @@ import torch
 from jaxtyping import Bool, Float64, Int64
 from torch import Tensor
 
-from pisigma.calibration.hybrid.evidence import SensorCount
+from pisigma.estimation.cholesky import covariance_factor
+from pisigma.estimation.regression import SensorCount
 
 SIZES = torch.logspace(-6, -0.5, 56, dtype=torch.float64)
 """Sizes that are tried: 1 µm to 0.3 m, 0.0001 to 18 deg; of corrections, shares of ten times their usual size."""
@@ -264,14 +265,3 @@ def fewest_columns(Z: Float64[Tensor, "values members"]) -> Float64[Tensor, "val
         return Z
     columns: Tensor = torch.linalg.qr(Z.t(), mode="r").R.t()
     return columns
-
-
-def covariance_factor(V: Float64[Tensor, "values values"]) -> Float64[Tensor, "values values"]:
-    """Cholesky factor of a covariance of values; rounding of far larger variances is made up for."""
-    jitter = 0.0
-    while True:
-        factor: Tensor
-        factor, failed = torch.linalg.cholesky_ex(V + jitter * V.diagonal().diag())
-        if not failed:
-            return factor
-        jitter = max(10 * jitter, 1e-14)

@@ -5,9 +5,9 @@ import pytest
 import torch
 from testing.closeness import assert_close
 
-from pisigma.calibration.hybrid.evidence import SensorCount
-from pisigma.lifetime.recalibration.drift import Drift, DriftGroup, LinearValues
-from pisigma.lifetime.recalibration.posterior_update import MOST_DIRECTIONS, PosteriorUpdate
+from pisigma.estimation.drift import Drift, DriftGroup, LinearValues
+from pisigma.estimation.posterior_update import MOST_DIRECTIONS, PosteriorUpdate
+from pisigma.estimation.regression import SensorCount
 
 UNKNOWNS, DIRECTIONS, NOISE = 30, 32, 0.3
 

@@ -7,8 +7,8 @@ import pytest
 import torch
 from testing.closeness import assert_close
 
-from pisigma.calibration.hybrid.evidence import SensorCount
-from pisigma.lifetime.recalibration.drift import SIZES, WORTH, Drift, DriftGroup, DriftSearch, LinearValues
+from pisigma.estimation.drift import SIZES, WORTH, Drift, DriftGroup, DriftSearch, LinearValues
+from pisigma.estimation.regression import SensorCount
 
 NOISE, MOVED = 1e-4, 4e-3
 

@@ -4,7 +4,7 @@ import torch
 from testing.closeness import assert_close
 from torch import Tensor
 
-from pisigma.calibration.hybrid.covariance_root import CovarianceRoot, FewValues
+from pisigma.estimation.covariance_root import CovarianceRoot, FewValues
 
 PARAMETERS, WEIGHTS, VALUES = 3, 12, 5
 

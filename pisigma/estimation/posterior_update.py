@@ -4,8 +4,8 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
-from pisigma.calibration.hybrid.normal_equations import factored
-from pisigma.lifetime.recalibration.drift import Drift, LinearValues
+from pisigma.estimation.cholesky import factored
+from pisigma.estimation.drift import Drift, LinearValues
 
 MOST_DIRECTIONS = 1.2
 """Directions of a root that is kept, by the number of unknowns."""

@@ -1,0 +1,106 @@
+"""Values that were left out of a linear fit and predicted by the others."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float64, Int64
+from torch import Tensor
+
+from pisigma.estimation.regression import SensorCount
+
+SINGULAR = 1e-6
+"""Share of a left-out value's variance below which no other value says anything of it."""
+LARGEST_SCALE = 1e4
+"""Largest factor on variances."""
+
+
+@dataclass(frozen=True, eq=False)
+class LeftOut:
+    """Errors of values that were left out, in standard deviations of the noise.
+
+    Attributes:
+        error: measured minus predicted.
+        spread: its predicted standard deviation, parameters and noise.
+        sensor: number of every value's sensor.
+    """
+
+    error: Float64[Tensor, " values"]
+    spread: Float64[Tensor, " values"]
+    sensor: Int64[Tensor, " values"]
+
+    @staticmethod
+    def of(
+        M: Float64[Tensor, "values values"],
+        residual: Float64[Tensor, " values"],
+        sensor: Int64[Tensor, " values"],
+        counts: Sequence[SensorCount],
+    ) -> "LeftOut":
+        """Of the values of a fold, from a fit to all values: errors `M^-1 r` of the covariance `M^-1`.
+
+        Where only these values determine an unknown, such as where a socket is, M is singular; that unknown counts as
+        fitted to them, and the errors are scaled by what that takes away (Cook and Weisberg 1982, section 2.2).
+
+        Args:
+            M: block of `I - X C X^T` of the values, whitened.
+            residual: r, whitened.
+            sensor: number of every value's sensor.
+            counts: of the sensors.
+        """
+        factor, failed = torch.linalg.cholesky_ex(M)
+        if len(M) and (failed or float(factor.diagonal().min()) ** 2 < SINGULAR):
+            values, vectors = torch.linalg.eigh(M)
+            certain = values > SINGULAR
+            inverse = (vectors * torch.where(certain, 1 / values, 0.0)) @ vectors.t()
+            residual = residual * (len(M) / max(int(certain.sum()), 1)) ** 0.5
+        else:
+            inverse = torch.cholesky_inverse(factor)
+        repetition = residual.new_tensor([one.repetition for one in counts])[sensor]
+        spread = 1 + repetition * (inverse.diagonal() - 1).clamp(min=0)
+        return LeftOut((inverse @ residual) * repetition.sqrt(), spread.sqrt(), sensor)
+
+    @staticmethod
+    def joined(parts: "Sequence[LeftOut]") -> "LeftOut":
+        """One after the other."""
+        names = ("error", "spread", "sensor")
+        return LeftOut(*(torch.cat([getattr(part, name) for part in parts]) for name in names))
+
+    def rms(self, noise: Sequence[float], unit: Sequence[float]) -> float:
+        """Root mean square in other standard deviations than those of the noise, such as that of another model."""
+        return float(self._squares(noise, unit).mean().sqrt())
+
+    def gain(self, noise: Sequence[float], before: "LeftOut", noise_before: Sequence[float]) -> float:
+        """By how many standard errors the squares of the same values are smaller than another fit's."""
+        return standard_errors(
+            before._squares(noise_before, noise_before) - self._squares(noise, noise_before)
+        )
+
+    def _squares(self, noise: Sequence[float], unit: Sequence[float]) -> Float64[Tensor, " values"]:
+        scale = self.error.new_tensor(noise) / self.error.new_tensor(unit)
+        return (self.error * scale[self.sensor]).square()
+
+
+def standard_errors(values: Float64[Tensor, " values"]) -> float:
+    """The sum of independent values over its standard error; 0 where all are the same."""
+    scatter = (values.square().sum() - values.sum().square() / max(len(values), 1)).clamp(min=0).sqrt()
+    return float(values.sum() / scatter) if float(scatter) > 0 else 0.0
+
+
+def left_out_scale(errors: LeftOut) -> float:
+    """Factor on the unknowns' covariance with which left-out values are missed by as much as predicted; 1 or more.
+
+    With errors e and predicted deviations s in units of the noise, it solves `mean(e² / (1 + f (s² - 1))) = 1`.
+    What the model cannot express makes it larger than 1.
+    """
+    square, extra = errors.error.square(), errors.spread.square() - 1
+    low, high = 0.0, math.log(LARGEST_SCALE)
+    if float((square / (1 + extra)).mean()) <= 1:
+        return 1.0
+    for _ in range(60):
+        middle = (low + high) / 2
+        if float((square / (1 + math.exp(middle) * extra)).mean()) > 1:
+            low = middle
+        else:
+            high = middle
+    return math.exp(high)

@@ -1,0 +1,137 @@
+"""Bayesian linear regression by normal equations: for many values and fewer unknowns."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import torch
+from jaxtyping import Float64
+from torch import Tensor
+
+from pisigma.estimation.cholesky import (
+    BLOCK,
+    blocks,
+    factored,
+    invert_triangle,
+    log_determinant,
+    return_free_memory,
+)
+from pisigma.estimation.covariance_root import CovarianceRoot
+from pisigma.estimation.prior import GaussianPrior
+from pisigma.estimation.regression import AbstractRegression, Posterior, SensorCount
+
+
+@dataclass(frozen=True, eq=False)
+class Solved:
+    """The normal equations, divided by the noise's variance, with a prior: `D (Σ X^T X + precision) D = L L^T`.
+
+    Attributes:
+        prior: of the unknowns.
+        noise: per sensor.
+        scale: the diagonal of D.
+        inverse: L^-1, a lower triangle, so that the covariance is `D L^-T L^-1 D`.
+        log_det: logarithm of the determinant of `Σ X^T X + precision`.
+        x: the most probable values.
+    """
+
+    prior: GaussianPrior
+    noise: tuple[float, ...]
+    scale: Float64[Tensor, " unknowns"]
+    inverse: Float64[Tensor, "unknowns unknowns"]
+    log_det: float
+    x: Float64[Tensor, " unknowns"]
+
+    @property
+    def variance(self) -> Float64[Tensor, " unknowns"]:
+        """Diagonal of the covariance."""
+        deviation: Tensor = self.scale * torch.linalg.vector_norm(self.inverse, dim=0)
+        return deviation.square()
+
+    def trace(self, matrix: Float64[Tensor, "unknowns unknowns"]) -> float:
+        """Trace of the product of a symmetric matrix and the covariance, of which one block is made at a time."""
+        trace = 0.0
+        for rows in blocks(len(self.x), BLOCK):
+            block = self.inverse[rows.start :, rows].t() @ self.inverse[rows.start :, : rows.stop]
+            scale = self.scale[: rows.stop].clone()
+            scale[: rows.start].mul_(2)  # the blocks above the diagonal as well
+            trace += float(self.scale[rows] @ (block.mul_(matrix[rows, : rows.stop]) @ scale))
+        return trace
+
+
+@dataclass(frozen=True, eq=False)
+class PrimalRegression(AbstractRegression):
+    """Normal equations of every sensor, before division by its noise's variance.
+
+    Attributes:
+        normal: `Σ X^T X` per sensor, rows already weighted.
+        descent: `Σ X^T y`.
+        square: `Σ y^T y`.
+        sensors: how many values there are.
+        latest: what was solved last, which the evidence, left-out values and the covariance are all made from.
+    """
+
+    normal: Float64[Tensor, "sensors unknowns unknowns"]
+    descent: Float64[Tensor, "sensors unknowns"]
+    square: tuple[float, ...]
+    sensors: tuple[SensorCount, ...]
+    latest: list[Solved] = field(default_factory=list, init=False)
+
+    def solve(self, prior: GaussianPrior, noise: tuple[float, ...]) -> Posterior:
+        """Solve `(Σ_s N_s / noise_s² + precision) x = Σ_s b_s / noise_s²` by Cholesky with column scaling."""
+        precision = prior.precision
+        solved = self.solved_with(prior, noise)
+        x, held = solved.x, precision * solved.variance
+        pairs = zip(self.normal[1:], noise[1:], strict=True)
+        used = [solved.trace(N) / sigma**2 for N, sigma in pairs]
+        used.insert(0, float((1 - held).sum()) - sum(used))  # the prior holds what the values do not
+        misfit = self._misfits(x)
+        log_prior = float(precision[precision > 0].log().sum())
+        fit = sum(total / sigma**2 for total, sigma in zip(misfit, noise, strict=True))
+        evidence = fit + float((x.square() * precision).sum()) + solved.log_det - log_prior
+        evidence = -0.5 * (evidence + log_noise(self.sensors, noise))
+        square, determined = prior.of_groups(x.square() * prior.base), prior.of_groups(1 - held)
+        return Posterior(x, evidence, prior, noise, square, determined, misfit, tuple(used))
+
+    def covariance_root(self, posterior: Posterior) -> CovarianceRoot:
+        """See `AbstractRegression.covariance_root`; with the names of `Solved` it is `D L^-T`."""
+        solved = self.solved_with(posterior.prior, posterior.noise)
+        self.latest.clear()
+        return CovarianceRoot(solved.inverse.t().mul_(solved.scale[:, None]))
+
+    def solved_with(self, prior: GaussianPrior, noise: tuple[float, ...]) -> Solved:
+        """What was solved last, or else solve now."""
+
+        def normal() -> Tensor:
+            torch.mul(self.normal[0], noise[0] ** -2, out=memory)
+            for N, sigma in zip(self.normal[1:], noise[1:], strict=True):
+                memory.add_(N, alpha=sigma**-2)
+            memory.diagonal().add_(prior.precision)
+            return memory
+
+        if not self.latest or self.latest[0].prior is not prior or self.latest[0].noise != noise:
+            return_free_memory(len(prior.base))
+            memory = self.latest.pop().inverse.mT if self.latest else torch.empty_like(self.normal[0])
+            descent = torch.zeros_like(self.descent[0])
+            for b, sigma in zip(self.descent, noise, strict=True):
+                descent.add_(b, alpha=sigma**-2)
+            scale, factor = factored(normal)
+            log_det = log_determinant(scale, factor)
+            inner = torch.linalg.solve_triangular(factor, (scale * descent)[:, None], upper=False)
+            x = scale * torch.linalg.solve_triangular(factor.mT, inner, upper=True)[:, 0]
+            invert_triangle(factor)
+            self.latest.append(Solved(prior, noise, scale, factor, log_det, x))
+        return self.latest[0]
+
+    def _misfits(self, x: Float64[Tensor, " unknowns"]) -> tuple[float, ...]:
+        """`Σ (y - X x)²` per sensor."""
+        cross = (self.descent @ x).tolist()
+        inner = [float(x @ (N @ x)) for N in self.normal]
+        return tuple(
+            max(total - 2 * a + b, 0.0) for total, a, b in zip(self.square, cross, inner, strict=True)
+        )
+
+
+def log_noise(sensors: Sequence[SensorCount], noise: Sequence[float]) -> float:
+    """`Σ log noise²` over all values."""
+    pairs = zip(sensors, noise, strict=True)
+    return sum(2 * sensor.values * math.log(sigma) for sensor, sigma in pairs)
