@@ -18,7 +18,8 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
 from testing.fleet_robots import DRAWN, GEARS, NOISE, common_errors, common_gears, rows_of
 
-from pisigma.lifetime.fleet.prior import FleetPrior, Population, fleet_prior, mean_robot
+from pisigma.estimation.population import Population
+from pisigma.lifetime.fleet.prior import FleetPrior, fleet_prior, mean_robot
 from pisigma.lifetime.recalibration.adaptation import Adaptation, adapt
 from pisigma.lifetime.recalibration.recalibration_problem import owners_in, recalibration_problem
 from pisigma.measurement.dataset import Measurements

@@ -1,1 +1,1 @@
-"""The linear-Gaussian core of every estimate, and the losses of least squares."""
+"""The linear-Gaussian core: priors, evidence, posterior and its update, left-out and contradicting values; losses."""

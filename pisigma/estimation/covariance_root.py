@@ -43,6 +43,20 @@ class FewValues:
         return result
 
 
+def after_values(
+    along: Float64[Tensor, "*batch directions"], B: Float64[Tensor, "values directions"]
+) -> Float64[Tensor, "*batch directions"]:
+    """`A R'` with R' the root after values are measured, whatever they are: `A R L^-T` with `L L^T = 1 + B^T B`.
+
+    Args:
+        along: `A R` with the root R before.
+        B: derivatives of the values along the directions of R, over their noise.
+    """
+    lower = torch.linalg.cholesky(torch.eye(B.shape[1]).to(B) + B.t() @ B)
+    after: Tensor = torch.linalg.solve_triangular(lower, along.flatten(0, -2).t(), upper=False).t()
+    return after.reshape(along.shape)
+
+
 @dataclass(frozen=True, eq=False)
 class CovarianceRoot:
     """R: some directions of all unknowns, and beside them those of the weights alone that few values leave.

@@ -35,6 +35,7 @@ class DriftGroup:
         size: 0 where it has not drifted.
         stands: whether the size is stated rather than estimated, as that of a base which stands elsewhere.
         worth: [nats] by so much its drift has to raise the log evidence.
+        single: whether it is one motion, rather than many ways to err otherwise than before.
     """
 
     what: str
@@ -43,6 +44,7 @@ class DriftGroup:
     size: float = 0.0
     stands: bool = False
     worth: float = WORTH
+    single: bool = True
 
     @property
     def deviation(self) -> Float64[Tensor, " members"]:

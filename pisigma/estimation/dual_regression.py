@@ -13,6 +13,8 @@ from pisigma.estimation.primal_regression import PrimalRegression, log_noise
 from pisigma.estimation.prior import GaussianPrior
 from pisigma.estimation.regression import AbstractRegression, Posterior, SensorCount
 
+DETERMINED = 1e-9
+"""Share of the precision of a value, or of the best determined unknown, below which others say nothing of it."""
 LARGEST_RATIO = 1e6
 """Sum of the values' variances by the prior over that of the noise up to which traces of P are right to 1e-4."""
 
@@ -148,6 +150,29 @@ class DualRegression(AbstractRegression):
         """Sums of the values of every sensor, those that are alike counted less."""
         sums = torch.zeros(len(self.sensors)).to(values).index_add(0, self.sensor, values)
         return tuple(sums.tolist())
+
+
+def beside_unknown(
+    V: Float64[Tensor, "values values"], G: Float64[Tensor, "values unknowns"]
+) -> tuple[Tensor, Tensor, int]:
+    """What values with the covariance V say beside unknowns of which nothing is known before.
+
+    Args:
+        V: covariance.
+        G: derivatives by the unknowns, some of which the values may not determine.
+
+    Returns:
+        `P = V^-1 - V^-1 G (G^T V^-1 G)^-1 G^T V^-1`; the unknowns by the values, `(G^T V^-1 G)^-1 G^T V^-1`; and how
+        many of them the values determine.
+    """
+    inverse = torch.cholesky_inverse(torch.linalg.cholesky(V))
+    along = inverse @ G
+    scale = G.square().sum(0).clamp(min=1e-300).rsqrt()
+    strength, axes = torch.linalg.eigh(G.t() @ along * scale * scale[:, None])
+    certain = strength > DETERMINED * strength[-1:]
+    axes = scale[:, None] * axes[:, certain]
+    solution = axes / strength[certain] @ axes.t() @ along.t()
+    return inverse - along @ solution, solution, int(certain.sum())
 
 
 def gram(X: Tensor, prior: GaussianPrior, group: int, active: int) -> Tensor:

@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Float64, Int64
 from torch import Tensor
 
+from pisigma.estimation.covariance_root import after_values
 from pisigma.planning.knowledge import Knowledge
 
 RANDOM_CHOICES = 5
@@ -67,25 +68,16 @@ def curve(
     orders = [torch.randperm(len(B), generator=generator) for _ in range(RANDOM_CHOICES)]
     points = []
     for count in counts:
-        after = _after(B[chosen[:count]], D)
-        random = torch.stack([_after(B[order[:count]], D).square().sum() for order in orders])
+        after = after_values(D, B[chosen[:count]].flatten(0, 1))
+        random = torch.stack(
+            [after_values(D, B[order[:count]].flatten(0, 1)).square().sum() for order in orders]
+        )
         points.append(
             ExpectedAccuracy(
                 count, rms_of(after), p95_of(after, seed), float((random.mean() / len(D)).sqrt())
             )
         )
     return tuple(points)
-
-
-def _after(
-    B: Float64[Tensor, "poses values directions"], D: Float64[Tensor, "tasks 3 directions"]
-) -> Float64[Tensor, "tasks 3 directions"]:
-    """D after poses were measured: `D L^-T` with `L L^T = 1 + B^T B`."""
-    rows = B.flatten(0, 1)
-    lower = torch.linalg.cholesky(torch.eye(B.shape[2]).to(B) + rows.t() @ rows)
-    after = torch.linalg.solve_triangular(lower, D.flatten(0, 1).t(), upper=False)
-    reshaped: Tensor = after.t().reshape(D.shape)
-    return reshaped
 
 
 def rms_of(D: Float64[Tensor, "tasks 3 directions"]) -> float:

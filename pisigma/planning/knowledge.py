@@ -16,7 +16,7 @@ from pisigma.calibration.hybrid.calibrator import HybridCalibrator
 from pisigma.calibration.hybrid.gravity import USUAL, in_first_row
 from pisigma.calibration.hybrid.result import HybridResult
 from pisigma.calibration.hybrid.uncertainty import PositionUncertainty
-from pisigma.estimation.covariance_root import CovarianceRoot
+from pisigma.estimation.covariance_root import CovarianceRoot, after_values
 from pisigma.files.errors import IdentificationError, ImplausibleError, MeasurementError
 from pisigma.joint_correction.feature import AbstractFeature
 from pisigma.joint_correction.fourier_series import FourierSeries
@@ -154,9 +154,7 @@ class Knowledge:
         Args:
             q: commanded joint values [rad or m].
         """
-        B = self.measured(q).flatten(0, 1)
-        lower = torch.linalg.cholesky(torch.eye(B.shape[1]).to(B) + B.t() @ B)
-        root = torch.linalg.solve_triangular(lower, self.uncertainty.root.t(), upper=False).t()
+        root = after_values(self.uncertainty.root, self.measured(q).flatten(0, 1))
         return replace(self, uncertainty=replace(self.uncertainty, covariance_root=CovarianceRoot(root)))
 
     def moved(self, q: Float64[Tensor, "*batch dof"]) -> Float64[Tensor, "*batch dof"]:

@@ -5,7 +5,8 @@ from dataclasses import dataclass
 import torch
 from scipy.stats import chi2
 
-from pisigma.lifetime.fleet.prior import ODD, Population, class_population, evidence_of, of_arm
+from pisigma.estimation.population import ODD, Population
+from pisigma.lifetime.fleet.prior import class_population, evidence_of, of_arm
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.model_posterior import ModelPosterior

@@ -12,10 +12,11 @@ from torch import Tensor
 
 from pisigma.calibration.hybrid.refinement import linearised
 from pisigma.estimation.drift import Drift, DriftGroup, LinearValues
+from pisigma.estimation.hypotheses import Explanation, Motion, SessionEvidence
 from pisigma.estimation.posterior_update import PosteriorUpdate
 from pisigma.estimation.wrong_rows import Explained, with_wrong_rows
 from pisigma.files.errors import IdentificationError
-from pisigma.lifetime.monitoring.evidence import CORRECTION, Explanation, Motion, SessionEvidence
+from pisigma.lifetime.monitoring.hypotheses import hypotheses
 from pisigma.lifetime.recalibration.adaptation import AdaptedArm, linear_values, noise_of_sensors
 from pisigma.lifetime.recalibration.elsewhere import FAR
 from pisigma.lifetime.recalibration.moved import Moved, moved_of_group
@@ -273,7 +274,8 @@ def _explained(
     problem: RecalibrationProblem, noise: Float64[Tensor, " sensors"], values: LinearValues
 ) -> _Solved:
     """The most probable explanation of a session's values, wrong rows among them."""
-    every = SessionEvidence(problem, values, noise)
+    standing = [one for one in problem.groups if one.stands]
+    every = SessionEvidence(values, problem.root, standing, hypotheses(problem), noise)
 
     def explain(wrong: Mapping[int, float]) -> Explained[_Solved]:
         evidence = every.with_wrong(wrong)
@@ -306,7 +308,7 @@ def _judged(solved: _Solved, elsewhere: dict[Owner, float]) -> Session:
     before = solved.arm_with(frames)
     (rms, angle), (rms_after, angle_after) = (_rms(arm, rows) for arm in (before, solved.arm_with(motions)))
     count = len(solved.values.y)
-    determined = sum(len(group.index) for group in of_arm if group.what != CORRECTION)
+    determined = sum(len(group.index) for group in of_arm if group.single)
     optimism = math.sqrt(count / max(count - determined, 1))  # the rows themselves determined what moved
     return Session(
         rows=every.rows,

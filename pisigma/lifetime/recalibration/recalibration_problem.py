@@ -250,7 +250,7 @@ def _groups(
     if len(posterior.weights):
         index = torch.arange(parameters, len(root))
         scale = LARGEST_CORRECTION * posterior.usual_weights
-        groups.append(DriftGroup("correction", index, scale, worth=WORTH_OF_CORRECTION))
+        groups.append(DriftGroup("correction", index, scale, worth=WORTH_OF_CORRECTION, single=False))
     return tuple(group for group in groups if len(group.index))
 
 

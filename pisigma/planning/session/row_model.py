@@ -20,6 +20,7 @@ from pisigma.calibration.geometric.problem.setup import (
 from pisigma.calibration.hybrid.design import Design
 from pisigma.calibration.hybrid.gravity import USUAL, in_first_row
 from pisigma.calibration.hybrid.sensor_values import SensorValues, sensor_values
+from pisigma.estimation.dual_regression import DETERMINED, beside_unknown
 from pisigma.joint_correction.fourier_series import FourierSeries
 from pisigma.joint_correction.gravity_torques import GravityTorques
 from pisigma.measurement.dataset import Measurements
@@ -42,8 +43,6 @@ USUAL_NOISE = {"m": 5e-5, "rad": 2e-4}
 CLASS_VALUES = 20
 """The class counts like so many measured values when the size of this robot's errors is estimated."""
 LINEARISATIONS = 2
-DETERMINED = 1e-9
-"""Share of a value's precision that the other rows leave; below it they say nothing of the value."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -209,17 +208,10 @@ class RowModel:
         Z, G = X[:, ~free] * self._size[~free], X[:, free]
         V = Z @ Z.t()
         V.diagonal().add_(self.sigma[kept].square())
-        inverse = torch.cholesky_inverse(torch.linalg.cholesky(V))
-        along = inverse @ G
-        scale = G.square().sum(0).clamp(min=1e-300).rsqrt()
-        strength, axes = torch.linalg.eigh(G.t() @ along * scale * scale[:, None])
-        certain = strength > DETERMINED * strength[-1:]
-        axes = scale[:, None] * axes[:, certain]
-        covariance = axes / strength[certain] @ axes.t()
-        P = inverse - along @ covariance @ along.t()
+        P, solution, determined = beside_unknown(V, G)
         x = torch.zeros_like(self._size)
-        x[free], x[~free] = covariance @ (along.t() @ r), self._size[~free] * (Z.t() @ (P @ r))
-        return P, x, int(certain.sum())
+        x[free], x[~free] = solution @ r, self._size[~free] * (Z.t() @ (P @ r))
+        return P, x, determined
 
     @cached_property
     def _columns(self) -> Float64[Tensor, "values unknowns"]:

@@ -9,10 +9,11 @@ from typing import Any
 
 import numpy as np
 
+from pisigma.estimation.population import FEWEST_ROBOTS
 from pisigma.files.errors import FleetError, MeasurementError, RobotError
 from pisigma.files.progress import Progress
 from pisigma.lifetime.fleet.members import Member, read_fleet
-from pisigma.lifetime.fleet.prior import FEWEST_ROBOTS, FleetPrior, fleet_prior
+from pisigma.lifetime.fleet.prior import FleetPrior, fleet_prior
 from pisigma.lifetime.fleet.prior_summary import FleetPriorSummary, summarise_prior
 from pisigma.measurement.camera.corner_file import read_rows
 from pisigma.measurement.dataset import Measurements

@@ -7,15 +7,10 @@ from scipy.stats import chi2
 from testing.fleet_robots import DRAWN, common_errors, rows_of
 from testing.models import no_type_checker
 
+from pisigma.estimation.population import Population, expectation_maximisation, without_odd
 from pisigma.files.errors import FleetError
 from pisigma.lifetime.fleet.likeness import Likeness
-from pisigma.lifetime.fleet.prior import (
-    Population,
-    RobotEvidence,
-    expectation_maximisation,
-    fleet_prior,
-    without_odd,
-)
+from pisigma.lifetime.fleet.prior import RobotEvidence, fleet_prior
 from pisigma.lifetime.fleet.prior_summary import summarise_prior
 from pisigma.workflow.calibrate import CalibrationSettings, calibrate
 from pisigma.workflow.recalibrate import recalibrate

@@ -20,10 +20,7 @@ from pisigma.estimation.drift import (
     fewest_columns,
     gains,
 )
-from pisigma.lifetime.recalibration.recalibration_problem import RecalibrationProblem
 
-WORTH = math.log(100)
-"""[nats] Prior odds of 1 to 100 that a thing moved since the calibration, against that nothing did."""
 TRIED = SIZES[SIZES >= 1e-4]
 """Sizes of a motion, all equally probable: 0.1 mm to 0.3 m, 0.006 to 18 deg."""
 CERTAIN = 0.01
@@ -31,8 +28,6 @@ CERTAIN = 0.01
 NAMED = 0.8
 """Probability from which on a motion is said to have happened."""
 MOST_MOVED = 3
-CORRECTION = "correction"
-"""The hypothesis that the joints err otherwise than before in many ways, which no single motion explains."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,26 +77,29 @@ class SessionEvidence:
 
     def __init__(
         self,
-        problem: RecalibrationProblem,
         values: LinearValues,
+        root: Float64[Tensor, "unknowns directions"],
+        standing: Sequence[DriftGroup],
+        hypotheses: Sequence[DriftGroup],
         usual_noise: Float64[Tensor, " sensors"],
     ) -> None:
         """Work out the covariance of the values where nothing moved.
 
         Args:
-            problem: of the session.
-            values: its rows.
+            values: rows of the session.
+            root: of the covariance of the unknowns by the model's posterior.
+            standing: what stands anywhere.
+            hypotheses: what can have moved by itself, each with its prior odds.
             usual_noise: that of the calibration, per sensor.
         """
         self.values, self._usual_noise = values, usual_noise
-        self.known = values.X @ problem.root
-        standing = [values.X[:, one.index] * one.deviation for one in problem.groups if one.stands]
+        self.known = values.X @ root
         self._K = self.known @ self.known.t()
-        for B in standing:
+        for B in (values.X[:, one.index] * one.deviation for one in standing):
             self._K += B @ B.t()
         self._sigma = values.deviation(usual_noise)
         self._scaled = ~values.exact
-        self._groups = hypotheses(problem)
+        self._groups = tuple(hypotheses)
         self._Z = [fewest_columns(values.X[:, one.index] * one.scale) for one in self._groups]
 
     def with_wrong(self, wrong: Mapping[int, float]) -> "SessionEvidence":
@@ -127,7 +125,7 @@ class SessionEvidence:
             compared = self._compare(motions)
             unchanged = unchanged if motions else compared.unchanged
             clear, best = compared.unchanged < CERTAIN, compared.candidates[0]
-            named = best.probability >= NAMED and best.group.what != CORRECTION
+            named = best.probability >= NAMED and best.group.single
             if not (clear and named) or len(motions) == MOST_MOVED:
                 candidates = compared.candidates if clear and not motions else ()
                 return replace(compared, unchanged=unchanged, candidates=candidates)
@@ -241,23 +239,3 @@ class SessionEvidence:
         covariance = torch.linalg.inv(normal) * deviation * deviation[:, None]
         back = torch.linalg.solve_triangular(factor.t(), W, upper=True)
         return covariance / deviation @ back.t(), covariance
-
-
-def hypotheses(problem: RecalibrationProblem) -> tuple[DriftGroup, ...]:
-    """Everything that can have moved by itself: joints, bases, tools, single lengths and angles; or the correction.
-
-    Zeros of joints slip more often than arms are bent: all lengths together have a tenth of the odds of a joint, and so
-    have all angles.
-    """
-    parameters = problem.design.problem.space.parameters
-    single: list[DriftGroup] = []
-    for group in problem.groups:
-        if group.stands:
-            continue
-        if group.what not in ("lengths", "angles"):
-            single.append(replace(group, worth=WORTH))
-            continue
-        for index, scale in zip(group.index, group.scale, strict=True):
-            worth = WORTH + math.log(10 * len(group.index))
-            single.append(DriftGroup(parameters[int(index)].name, index[None], scale[None], worth=worth))
-    return tuple(single)
