@@ -44,7 +44,7 @@ def test_report_judges_the_others(tmp_path):
     assert done.diagnostics == ()
     assert done.content.rows.measurements.rows == 23
     assert float(done.content.rows.after.position.max()) < 2e-3
-    assert sum("rows.csv, line 7" in one for one in done.content.rows.remarks) == 1
+    assert sum("rows.csv, line 7" in one for one in done.content.remarks) == 1
 
 
 def test_recalibrate_judges_the_others():

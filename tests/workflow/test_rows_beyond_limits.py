@@ -58,7 +58,7 @@ def other(model: Path) -> Path:
         lambda m, r: verify(m, r).warnings,
         lambda m, r: evaluate(m, r).warnings,
         lambda m, r: compare(m, other(m), r).warnings,
-        lambda m, r: report(m, r).content.rows.remarks,
+        lambda m, r: report(m, r).content.remarks,
     ],
     ids=["verify", "evaluate", "compare", "report"],
 )

@@ -6,12 +6,11 @@ from dataclasses import dataclass
 
 import torch
 
-from pisigma.measurement.groups import groups_of_equal_joints
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.reporting.calibration_tables import cross_validation_text
-from pisigma.reporting.page.judged_rows import JudgedRows, means_by_name
 from pisigma.reporting.rendering import sentences
 from pisigma.validation.held_out.calibration_summary import CalibrationSummary
+from pisigma.validation.held_out.judged_rows import JudgedRows
 from pisigma.validation.held_out.pose_statistics import PoseErrors, error_statistics
 from pisigma.validation.held_out.training_summary import BeforeAfter, TrainingSummary
 from pisigma.validation.held_out.validation_figures import ErrorFigures
@@ -28,8 +27,6 @@ LABELS = {
 _JOINT_ROWS = (("held_out", True), ("training", False))
 MOSTLY = 0.8
 """Share of the squared error from which on scatter is what limits."""
-LEAST_REPEATS = 10
-"""Degrees of freedom from which on repeated rows show the scatter."""
 
 
 @dataclass(frozen=True)
@@ -199,7 +196,7 @@ def limit_of(
         return Limit(
             "the full model that it stands for", sentence or "Ask the full model for its own accuracy."
         )
-    noise, source = _repeated(rows), "rows that were measured more than once"
+    noise, source = None if rows is None else rows.scatter, "rows that were measured more than once"
     if noise is None:
         noise, source = _identified_noise(summary), "the noise that the calibration identified"
     error = accuracy.figure("rms") if accuracy is not None and accuracy.unit == "mm" else 0.0
@@ -212,24 +209,6 @@ def limit_of(
     (clause,) = sentences("report.txt.j2", "limit_clause", noise, share, mostly)
     (sentence,) = sentences("report.txt.j2", "limit", noise, share, mostly, error, source, rest)
     return Limit(clause, sentence, noise, share, source if noise is not None else "")
-
-
-def _repeated(rows: JudgedRows | None) -> float | None:
-    """Pool the scatter of positions at equal joint values: its RMS length [mm]; None with too few of them."""
-    if rows is None:
-        return None
-    finite = torch.isfinite(rows.residual).all(-1)
-    if int(finite.sum()) <= LEAST_REPEATS:
-        return None
-    measurements = rows.measurements.select(finite)
-    group = groups_of_equal_joints(measurements.q).tolist()
-    names = list(zip(group, measurements.frame, measurements.target, strict=True))
-    freedom = len(names) - len(set(names))
-    if freedom < LEAST_REPEATS:
-        return None
-    values = rows.residual[finite]
-    mean, _ = means_by_name(values, names)
-    return math.sqrt(float((values - mean).square().sum()) / freedom) * 1e3
 
 
 def _identified_noise(summary: CalibrationSummary | None) -> float | None:

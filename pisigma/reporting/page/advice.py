@@ -13,9 +13,9 @@ from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.stated_conditions import condition_warnings
 from pisigma.reporting.calibration_tables import warning_lines
 from pisigma.reporting.page.accuracy import MOSTLY, Accuracy, Limit
-from pisigma.reporting.page.judged_rows import JudgedRows
 from pisigma.reporting.rendering import sentences
 from pisigma.validation.held_out.calibration_summary import CalibrationSummary
+from pisigma.validation.held_out.judged_rows import JudgedRows
 
 _say = functools.partial(sentences, "report.txt.j2")
 

@@ -1,7 +1,7 @@
 """Everything that a report says, as figures and sentences, before it is drawn and laid out."""
 
 import math
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -24,11 +24,11 @@ from pisigma.reporting.page.corrections import (
 )
 from pisigma.reporting.page.dependence import Dependence, NameErrors, by_name, dependences
 from pisigma.reporting.page.error_map import ErrorMap, map_of_rows, map_of_workspace
-from pisigma.reporting.page.judged_rows import JudgedRows, rows_of_file, rows_of_folder
 from pisigma.reporting.page.verdict import Verdict, verdict_of
 from pisigma.reporting.rendering import sentences
 from pisigma.validation.held_out.calibration_summary import CalibrationSummary
 from pisigma.validation.held_out.held_out_rows import read_held_out
+from pisigma.validation.held_out.judged_rows import JudgedRows, rows_of_file, rows_of_folder
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,6 +42,7 @@ class ReportContent:
         accuracies: the first one is that of the verdict.
         limit: what limits the accuracy.
         rows: judged rows, or None.
+        remarks: what a reader should know of these rows, a sentence each.
         map: points in space.
         dependences: errors over joint values, order, payload and temperature.
         frames: errors per frame, and a sentence; empty where there is one.
@@ -63,6 +64,7 @@ class ReportContent:
     accuracies: tuple[Accuracy, ...]
     limit: Limit
     rows: JudgedRows | None
+    remarks: tuple[str, ...]
     map: ErrorMap
     dependences: tuple[Dependence, ...]
     frames: tuple[tuple[NameErrors, ...], str]
@@ -102,7 +104,7 @@ class ReportContent:
             ],
             "rows": None
             if rows is None
-            else {"count": rows.measurements.rows, "origin": rows.origin, "remarks": list(rows.remarks)},
+            else {"count": rows.measurements.rows, "origin": rows.origin, "remarks": list(self.remarks)},
             "residuals": [{"over": one.title, "says": one.sentence} for one in self.dependences],
             "frames": [asdict(one) for one in self.frames[0]],
             "targets": [asdict(one) for one in self.targets[0]],
@@ -136,12 +138,10 @@ def report_content(
         ModelError: files of the folder are missing or were changed.
     """
     summary, held_out = CalibrationSummary.read(model), read_held_out(folder, model)
-    rows = None
+    rows = None if held_out is None else rows_of_folder(model, held_out)
     if measurements is not None:
         rows = rows_of_file(model, measurements, held_out)
-        rows = replace(rows, remarks=(*doubts, *rows.remarks))
-    elif held_out is not None:
-        rows = rows_of_folder(model, held_out)
+    remarks = () if rows is None else (*doubts, *sentences("report.txt.j2", "remarks_on_rows", rows))
     figures, joints = accuracies(model, summary, rows), judged_joints(model)
     limit = limit_of(model, summary, figures[0] if figures else None, rows)
     return ReportContent(
@@ -151,6 +151,7 @@ def report_content(
         accuracies=figures,
         limit=limit,
         rows=rows,
+        remarks=remarks,
         map=map_of_workspace(model) if rows is None else map_of_rows(model, rows),
         dependences=() if rows is None else dependences(rows, model.robot),
         frames=((), "") if rows is None else by_name(rows, rows.measurements.frame),

@@ -10,9 +10,9 @@ from jaxtyping import Float64, Int64
 
 from pisigma.measurement.conditions import CONDITIONS, conditions_of
 from pisigma.measurement.groups import groups_of_equal_joints, numbers_of_names
-from pisigma.reporting.page.judged_rows import JudgedRows
 from pisigma.reporting.rendering import sentences
 from pisigma.robot.description import Robot
+from pisigma.validation.held_out.judged_rows import JudgedRows
 from pisigma.validation.held_out.rank_tests import SIGNIFICANT, groups_differ, rank_correlation
 
 _say = functools.partial(sentences, "report.txt.j2")

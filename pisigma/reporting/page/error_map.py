@@ -10,8 +10,8 @@ from torch import Tensor
 
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel
-from pisigma.reporting.page.judged_rows import JudgedRows, inside, place_of, predicted_at
 from pisigma.robot.kinematics.forward import forward_kinematics
+from pisigma.validation.held_out.judged_rows import JudgedRows, inside, place_of, predicted_at
 
 MOST_POINTS = 20_000
 """Of more rows so many are shown, the largest errors among them."""

@@ -10,8 +10,8 @@ from jaxtyping import Float64
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.reporting.page.accuracy import Accuracy, JudgedJoint, Limit
 from pisigma.reporting.page.dependence import LEAST_ROWS, error_lengths, root_mean_square
-from pisigma.reporting.page.judged_rows import JudgedRows
 from pisigma.reporting.rendering import sentences
+from pisigma.validation.held_out.judged_rows import JudgedRows
 from pisigma.validation.held_out.rank_tests import SIGNIFICANT, groups_differ
 
 CELLS = 4

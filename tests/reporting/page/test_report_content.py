@@ -19,8 +19,8 @@ from pisigma.reporting.page.accuracy import limit_of
 from pisigma.reporting.page.advice import measured_stretches
 from pisigma.reporting.page.content import report_content
 from pisigma.reporting.page.corrections import correction_curves
-from pisigma.reporting.page.judged_rows import MOST_PREDICTED, predicted_at
 from pisigma.validation.held_out.calibration_summary import CalibrationSummary
+from pisigma.validation.held_out.judged_rows import MOST_PREDICTED, predicted_at
 from pisigma.validation.held_out.validation_figures import ErrorFigures
 
 pytestmark = pytest.mark.usefixtures("without_type_checker")
@@ -77,7 +77,7 @@ def test_joint_values_of_the_calibration_measured_again_are_said(hybrid, tmp_pat
     again = replace(arm.measurements, position=arm.measurements.position + 1e-5)
     content = report_content(model, tmp_path, again)
     assert content.rows.origin == "other"
-    assert any("200 of 200 rows have joint values" in line for line in content.rows.remarks)
+    assert any("200 of 200 rows have joint values" in line for line in content.remarks)
 
 
 def test_a_folder_that_keeps_held_out_rows_shows_them(hybrid, tmp_path):
@@ -106,7 +106,7 @@ def test_rows_marked_as_train_are_left_out(hybrid, tmp_path):
     rows = replace(measured(arm, 40, seed=9), split=("train",) * 10 + ("test",) * 30)
     content = report_content(model, tmp_path, rows)
     assert content.rows.measurements.rows == 30
-    assert any("10 rows that the file marks as 'train'" in line for line in content.rows.remarks)
+    assert any("10 rows that the file marks as 'train'" in line for line in content.remarks)
 
 
 def test_frames_and_targets_are_told_apart(tmp_path):
@@ -132,7 +132,7 @@ def test_sockets_are_judged_from_where_they_are_on_average(hybrid, tmp_path):
     expected = torch.cat([ball[:4].mean(0) - ball[:4], ball[4:8].mean(0) - ball[4:8]])
     assert_close(content.rows.residual[:8], expected, atol=1e-12)
     assert bool(torch.isnan(content.rows.residual[8]).all())
-    said = " ".join(content.rows.remarks)
+    said = " ".join(content.remarks)
     assert "1 of 9 rows have no position error" in said
     assert "that all rows of a socket share does not show" in said
 
@@ -228,7 +228,7 @@ def test_scatter_above_the_error_is_no_share_of_it(hybrid, tmp_path):
 
 def test_accuracy_is_predicted_at_many_rows_at_most(hybrid, monkeypatch):
     arm, model = hybrid
-    monkeypatch.setattr("pisigma.reporting.page.judged_rows.MOST_PREDICTED", 20)
+    monkeypatch.setattr("pisigma.validation.held_out.judged_rows.MOST_PREDICTED", 20)
     found = predicted_at(model, arm.measurements)
     assert int(torch.isfinite(found).sum()) == 20
     assert MOST_PREDICTED > 20

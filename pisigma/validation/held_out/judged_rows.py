@@ -1,9 +1,10 @@
-"""What a report holds of every row: where it is, and how far off before and after the calibration."""
+"""Where every judged row is, and how far off before and after the calibration."""
 
-import functools
+import math
 from collections.abc import Hashable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import torch
 from jaxtyping import Bool, Float64
@@ -12,20 +13,19 @@ from torch import Tensor
 from pisigma.files.errors import MeasurementError, ModelError
 from pisigma.measurement.copies import copy_warnings
 from pisigma.measurement.dataset import Measurements
-from pisigma.measurement.groups import numbers_of_names
+from pisigma.measurement.groups import groups_of_equal_joints, numbers_of_names
 from pisigma.model.accuracy import deviation_of_rows
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.row_poses import nominal_poses_of_rows, poses_of_rows
 from pisigma.model.training_rows import known_rows, training_row_warnings
-from pisigma.reporting.rendering import sentences
 from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.robot.se3 import invert, transform_from_xyzrpy
 from pisigma.validation.held_out.held_out_rows import HeldOutRows
 from pisigma.validation.held_out.pose_statistics import PoseErrors
 from pisigma.validation.held_out.reference_models import nominal_model
 
-_say = functools.partial(sentences, "report.txt.j2")
-
+LEAST_REPEATS = 10
+"""Degrees of freedom from which on repeated rows show the scatter."""
 MOST_PREDICTED = 4_000
 """The accuracy is predicted at so many rows at most, evenly over them: each costs a millisecond."""
 
@@ -44,7 +44,12 @@ class JudgedRows:
         residual_origin: the same for the residuals as `origin` for the lengths.
         predicted: standard deviation of the predicted position [m]; NaN where there is none.
         inside: whether every joint value was measured when the model was made.
-        remarks: what a reader should know of these rows, a sentence each.
+        left_out: so many rows of the file are marked as rows to calibrate with, and are not among these.
+        again: which rows stand there twice, or are those that the model was made of, a sentence each.
+        nominal: what "nominal" has for base and tool: "fitted" to the model's own poses, or as "given" to the model
+            where nothing was calibrated, or those of the "model", which keeps too few poses; None of held-out rows.
+        unknown: so many rows have no position error that can be known.
+        repeats: of the cross-validation; errors are of the first one.
     """
 
     origin: str
@@ -55,7 +60,11 @@ class JudgedRows:
     residual_origin: str
     predicted: Float64[Tensor, " rows"]
     inside: Bool[Tensor, " rows"]
-    remarks: tuple[str, ...] = ()
+    left_out: int = 0
+    again: tuple[str, ...] = ()
+    nominal: Literal["fitted", "given", "model"] | None = None
+    unknown: int = 0
+    repeats: int = 1
 
     @property
     def before(self) -> PoseErrors:
@@ -66,6 +75,22 @@ class JudgedRows:
     def after(self) -> PoseErrors:
         """Errors of the model."""
         return list(self.models.values())[-1]
+
+    @property
+    def scatter(self) -> float | None:
+        """Pooled scatter of positions at equal joint values: its RMS length [mm]; None with too few of them."""
+        finite = torch.isfinite(self.residual).all(-1)
+        if int(finite.sum()) <= LEAST_REPEATS:
+            return None
+        measurements = self.measurements.select(finite)
+        group = groups_of_equal_joints(measurements.q).tolist()
+        names = list(zip(group, measurements.frame, measurements.target, strict=True))
+        freedom = len(names) - len(set(names))
+        if freedom < LEAST_REPEATS:
+            return None
+        values = self.residual[finite]
+        mean, _ = _means_by_name(values, names)
+        return math.sqrt(float((values - mean).square().sum()) / freedom) * 1e3
 
 
 def rows_of_file(
@@ -88,8 +113,8 @@ def rows_of_file(
         residual, origin = held_out.residual, "held_out"
         if not bool(torch.isfinite(residual).any()):
             residual, origin = _errors(poses_of_rows(model, rows), rows)[1], "training"
-        remarks = (*_say("rows_left_out", left_out), *_repeats(model))
-        return _judged(model, rows, held_out.models, residual, ("held_out", origin), remarks)
+        judged = _judged(model, rows, held_out.models, residual, ("held_out", origin))
+        return replace(judged, left_out=left_out, repeats=_repeats(model))
     known, again = known_rows(model, rows), tuple[str, ...]()
     origin = "training" if digest == model.provenance.data_sha256 or bool(known.all()) else "other"
     if origin == "other":
@@ -107,10 +132,13 @@ def rows_of_file(
         models["geometric"] = _errors(poses_of_rows(replace(model, hybrid=None), rows), rows)[0]
     identified = "corrected" if model.calibrated is None else "geometric"
     models["hybrid" if model.hybrid is not None else identified] = errors
-    again = (*copy_warnings(rows.left_out), *again)
-    unknown = int((~torch.isfinite(errors.position)).sum())
-    remarks = _say("remarks_on_rows", rows, left_out, again, model, own_frames, unknown)
-    return _judged(model, rows, models, residual, (origin, origin), remarks)
+    return replace(
+        _judged(model, rows, models, residual, (origin, origin)),
+        left_out=left_out,
+        again=(*copy_warnings(rows.left_out), *again),
+        nominal="model" if not own_frames else "given" if model.calibrated is None else "fitted",
+        unknown=int((~torch.isfinite(errors.position)).sum()),
+    )
 
 
 def rows_of_folder(model: CalibratedModel, held_out: HeldOutRows) -> JudgedRows:
@@ -119,7 +147,8 @@ def rows_of_folder(model: CalibratedModel, held_out: HeldOutRows) -> JudgedRows:
         q=held_out.q, frame=held_out.frame, target=held_out.target, source=model.provenance.data_source
     )
     origins = ("held_out", "held_out")
-    return _judged(model, rows, held_out.models, held_out.residual, origins, _repeats(model))
+    judged = _judged(model, rows, held_out.models, held_out.residual, origins)
+    return replace(judged, repeats=_repeats(model))
 
 
 def place_of(model: CalibratedModel, q: Float64[Tensor, "rows dof"]) -> Float64[Tensor, "rows 3"]:
@@ -153,7 +182,6 @@ def _judged(
     models: Mapping[str, PoseErrors],
     residual: Float64[Tensor, "rows 3"],
     origins: tuple[str, str],
-    remarks: tuple[str, ...],
 ) -> JudgedRows:
     return JudgedRows(
         origin=origins[0],
@@ -164,7 +192,6 @@ def _judged(
         residual_origin=origins[1],
         predicted=predicted_at(model, rows),
         inside=inside(model, rows.q),
-        remarks=remarks,
     )
 
 
@@ -174,10 +201,10 @@ def _test_rows(measurements: Measurements) -> Measurements:
     return measurements if not test.any() or bool(test.all()) else measurements.select(test)
 
 
-def _repeats(model: CalibratedModel) -> tuple[str, ...]:
-    """Say where the errors that are kept of every row are those of one repeat among several."""
-    repeats = model.metrics.get("cross_validation", {}).get("repeats", 1)
-    return () if repeats == 1 else _say("rows_of_folds", repeats)
+def _repeats(model: CalibratedModel) -> int:
+    """Repeats of the cross-validation; the errors that are kept of every row are those of the first one."""
+    repeats: int = model.metrics.get("cross_validation", {}).get("repeats", 1)
+    return repeats
 
 
 def _nominal_poses(model: CalibratedModel, rows: Measurements) -> tuple[Float64[Tensor, "rows 4 4"], bool]:
@@ -207,11 +234,11 @@ def _errors(
 
 def _from_socket(rows: Measurements, ball: Float64[Tensor, "rows 3"]) -> Float64[Tensor, "rows 3"]:
     """Compute the mean position of every row's socket minus the row's ball; NaN in sockets of a single row."""
-    mean, count = means_by_name(ball, list(zip(rows.frame, rows.socket or (), strict=True)))
+    mean, count = _means_by_name(ball, list(zip(rows.frame, rows.socket or (), strict=True)))
     return torch.where((count > 1)[:, None], mean - ball, torch.nan)
 
 
-def means_by_name(
+def _means_by_name(
     values: Float64[Tensor, "rows 3"], names: Sequence[Hashable]
 ) -> tuple[Float64[Tensor, "rows 3"], Float64[Tensor, " rows"]]:
     """Compute for every row the mean of the values of its name, and how many rows have this name."""
