@@ -15,7 +15,6 @@ from pisigma.cli.arguments import (
     complete_robot,
     socket_distances,
 )
-from pisigma.cli.camera_options import takes_corners
 from pisigma.cli.lifetime.recalibrate import recalibrate_into
 from pisigma.cli.output import (
     command_line,
@@ -26,10 +25,11 @@ from pisigma.cli.output import (
     progress_of,
     saved,
 )
+from pisigma.cli.settings_options import takes_settings
 from pisigma.files.errors import IdentificationError
+from pisigma.measurement.camera.camera_files import CameraFiles
 
 if TYPE_CHECKING:
-    from pisigma.measurement.camera.corner_file import CameraFiles
     from pisigma.validation.held_out.calibration_summary import CalibrationSummary
     from pisigma.workflow.calibrate import CalibrationSettings
 
@@ -131,7 +131,7 @@ Prior = Annotated[
 Verbose = Annotated[bool, typer.Option("--verbose", help="Print all parameters.")]
 
 
-@takes_corners
+@takes_settings
 def calibrate(
     context: typer.Context,
     robot: RobotName,
@@ -154,7 +154,7 @@ def calibrate(
     gravity: Gravity = None,
     new_frame_at: NewFrameAt = None,
     socket_distance: SocketDistance = None,
-    cameras: "CameraFiles | None" = None,
+    cameras: CameraFiles | None = None,
     base: Base = None,
     tip: Tip = None,
     prior: Prior = None,
@@ -256,7 +256,7 @@ def _print_parameters(summary: "CalibrationSummary", verbose: bool) -> None:
     print_lines((f"- {line}" for line in undetermined_lines(summary)), indent="  ")
 
 
-def _settings(options: Mapping[str, Any], cameras: "CameraFiles | None") -> "CalibrationSettings":
+def _settings(options: Mapping[str, Any], cameras: CameraFiles | None) -> "CalibrationSettings":
     """Settings by the options of the command."""
     from pisigma.workflow.calibrate import CalibrationSettings
 

@@ -5,13 +5,13 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from pisigma.cli.arguments import AsJson, SocketDistance, socket_distances
-from pisigma.cli.camera_options import takes_corners
 from pisigma.cli.output import print_json, print_lines
+from pisigma.cli.settings_options import takes_settings
 from pisigma.cli.verify import FitFrame, FitTool, print_comparison
 from pisigma.files.errors import AcceptanceError
+from pisigma.measurement.camera.camera_files import CameraFiles
 
 if TYPE_CHECKING:
-    from pisigma.measurement.camera.corner_file import CameraFiles
     from pisigma.workflow.evaluate import Evaluation
 
 Paths = Annotated[
@@ -47,7 +47,7 @@ Hashes = Annotated[
 Seed = Annotated[int, typer.Option(help="Seed of the resamples.")]
 
 
-@takes_corners
+@takes_settings
 def evaluate(
     paths: Paths,
     max_mean_mm: MaxMean = None,
@@ -57,7 +57,7 @@ def evaluate(
     fit_frame: FitFrame = False,
     fit_tool: FitTool = False,
     socket_distance: SocketDistance = None,
-    cameras: "CameraFiles | None" = None,
+    cameras: CameraFiles | None = None,
     resamples: Resamples = 2000,
     seed: Seed = 0,
     sha256: Hashes = None,

@@ -6,12 +6,12 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from pisigma.cli.arguments import AsJson, ModelFolder, SocketDistance, socket_distances
-from pisigma.cli.camera_options import takes_corners
 from pisigma.cli.output import print_json, print_line, print_lines, print_table, progress_of, screen_width
+from pisigma.cli.settings_options import takes_settings
 from pisigma.files.errors import AcceptanceError
+from pisigma.measurement.camera.camera_files import CameraFiles
 
 if TYPE_CHECKING:
-    from pisigma.measurement.camera.corner_file import CameraFiles
     from pisigma.validation.held_out.model_comparison import ModelComparison
     from pisigma.workflow.verify import Verification
 
@@ -40,14 +40,14 @@ Data = Annotated[
 ]
 
 
-@takes_corners
+@takes_settings
 def verify(
     model: ModelFolder,
     data: Data,
     fit_frame: FitFrame = False,
     fit_tool: FitTool = False,
     socket_distance: SocketDistance = None,
-    cameras: "CameraFiles | None" = None,
+    cameras: CameraFiles | None = None,
     sha256: Hash = None,
     as_json: AsJson = False,
 ) -> None:

@@ -6,8 +6,7 @@ from dataclasses import dataclass
 from pisigma.files.errors import PlanningError
 from pisigma.measurement.camera.board import Board
 from pisigma.measurement.camera.camera import Camera
-from pisigma.measurement.camera.corner_file import CameraFiles
-from pisigma.measurement.camera.image_rows import Repeatability
+from pisigma.measurement.camera.camera_files import CameraFiles, Repeatability
 from pisigma.planning.board_sight import BoardSight
 
 FINEST_PX, COARSEST_PX = 1e-3, 100.0

@@ -17,7 +17,8 @@ from pisigma.files.errors import IdentificationError, MeasurementError, nearest_
 from pisigma.files.model_files import HELD_OUT_CSV
 from pisigma.files.progress import Progress
 from pisigma.joint_correction.registry import features_from_outside
-from pisigma.measurement.camera.corner_file import CameraFiles, MeasurementFiles, read_rows
+from pisigma.measurement.camera.camera_files import CameraFiles
+from pisigma.measurement.camera.corner_file import MeasurementFiles, read_rows
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.groups import groups_to_keep_whole
 from pisigma.measurement.joint_range import row_warnings, with_limits_of_rows

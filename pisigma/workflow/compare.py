@@ -18,7 +18,8 @@ from pisigma.lifetime.comparison.parameter_differences import (
     ParameterDifferences,
     parameter_differences,
 )
-from pisigma.measurement.camera.corner_file import CameraFiles, MeasurementFiles, read_rows
+from pisigma.measurement.camera.camera_files import CameraFiles
+from pisigma.measurement.camera.corner_file import MeasurementFiles, read_rows
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.joint_range import row_warnings
 from pisigma.model.calibrated_model import CalibratedModel

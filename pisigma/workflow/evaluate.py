@@ -10,7 +10,8 @@ from pathlib import Path
 import torch
 
 from pisigma.files.errors import MeasurementError, ModelError
-from pisigma.measurement.camera.corner_file import CameraFiles, MeasurementFiles, read_rows
+from pisigma.measurement.camera.camera_files import CameraFiles
+from pisigma.measurement.camera.corner_file import MeasurementFiles, read_rows
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.joint_range import row_warnings
 from pisigma.measurement.sensors.socket import matching_sockets

@@ -29,7 +29,8 @@ from pisigma.lifetime.monitoring.trends import (
 )
 from pisigma.lifetime.recalibration.motion import session_diagnostics
 from pisigma.lifetime.recalibration.recalibration_problem import owners_in
-from pisigma.measurement.camera.corner_file import CameraFiles, read_rows
+from pisigma.measurement.camera.camera_files import CameraFiles
+from pisigma.measurement.camera.corner_file import read_rows
 from pisigma.measurement.copies import RowValues
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.dates import WANTED, date_in_name, is_date

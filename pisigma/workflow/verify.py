@@ -10,7 +10,8 @@ import numpy as np
 
 from pisigma.lifetime.monitoring.session import Session
 from pisigma.lifetime.recalibration.motion import judged_motion, motion_sentence, motion_warnings
-from pisigma.measurement.camera.corner_file import CameraFiles, MeasurementFiles, read_rows
+from pisigma.measurement.camera.camera_files import CameraFiles
+from pisigma.measurement.camera.corner_file import MeasurementFiles, read_rows
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.joint_range import row_warnings
 from pisigma.measurement.sensors.socket import matching_sockets

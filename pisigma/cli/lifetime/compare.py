@@ -6,12 +6,12 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from pisigma.cli.arguments import AsJson, complete_model
-from pisigma.cli.camera_options import takes_corners
 from pisigma.cli.output import print_json, print_lines, print_table, progress_of, screen_width
+from pisigma.cli.settings_options import takes_settings
 from pisigma.files.errors import AcceptanceError
+from pisigma.measurement.camera.camera_files import CameraFiles
 
 if TYPE_CHECKING:
-    from pisigma.measurement.camera.corner_file import CameraFiles
     from pisigma.workflow.compare import ComparedModels
 
 First = Annotated[
@@ -44,12 +44,12 @@ Level = Annotated[
 Page = Annotated[Path | None, typer.Option(help="HTML page to write, with a map of the workspace.")]
 
 
-@takes_corners
+@takes_settings
 def compare(
     first: First,
     second: Second,
     rows: Rows = None,
-    cameras: "CameraFiles | None" = None,
+    cameras: CameraFiles | None = None,
     program: Program = None,
     fixed_frames: FixedFrames = False,
     level: Level = 0.01,

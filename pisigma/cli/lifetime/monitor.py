@@ -6,13 +6,13 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from pisigma.cli.arguments import AsJson, ModelFolder
-from pisigma.cli.camera_options import takes_corners
 from pisigma.cli.endings import NOT_ACCEPTED
 from pisigma.cli.lifetime.recalibrate import Moved, stated_to_move
 from pisigma.cli.output import print_json, print_lines, print_table, progress_of
+from pisigma.cli.settings_options import takes_settings
+from pisigma.measurement.camera.camera_files import CameraFiles
 
 if TYPE_CHECKING:
-    from pisigma.measurement.camera.corner_file import CameraFiles
     from pisigma.workflow.monitor import Monitoring
 
 Sessions = Annotated[
@@ -35,7 +35,7 @@ Page = Annotated[Path | None, typer.Option(help="HTML page to write, with charts
 NoHistory = Annotated[bool, typer.Option("--no-history", help="Neither read nor write MODEL.history.sqlite.")]
 
 
-@takes_corners
+@takes_settings
 def monitor(
     model: ModelFolder,
     sessions: Sessions,
@@ -44,7 +44,7 @@ def monitor(
     limit_mm: LimitMm = None,
     page: Page = None,
     no_history: NoHistory = False,
-    cameras: "CameraFiles | None" = None,
+    cameras: CameraFiles | None = None,
     as_json: AsJson = False,
 ) -> None:
     """Say of every session whether the robot is unchanged or what moved, and follow it over the months.

@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from pisigma.cli.arguments import AcceptImplausible, AsJson, ModelFolder, Overwrite
-from pisigma.cli.camera_options import takes_corners
 from pisigma.cli.output import command_line, print_json, print_lines, print_table, progress_of, saved
+from pisigma.cli.settings_options import takes_settings
 from pisigma.files.errors import AcceptanceError
+from pisigma.measurement.camera.camera_files import CameraFiles
 
 if TYPE_CHECKING:
-    from pisigma.measurement.camera.corner_file import CameraFiles
     from pisigma.robot.description import Robot
     from pisigma.workflow.recalibrate import Recalibration
 
@@ -31,7 +31,7 @@ Moved = Annotated[
 DryRun = Annotated[bool, typer.Option("--dry-run", help="Say what would be kept, and write nothing.")]
 
 
-@takes_corners
+@takes_settings
 def recalibrate(
     context: typer.Context,
     model: ModelFolder,
@@ -39,7 +39,7 @@ def recalibrate(
     out: Out = None,
     moved: Moved = None,
     dry_run: DryRun = False,
-    cameras: "CameraFiles | None" = None,
+    cameras: CameraFiles | None = None,
     accept_implausible: AcceptImplausible = False,
     overwrite: Overwrite = False,
     as_json: AsJson = False,
@@ -67,7 +67,7 @@ def recalibrate_into(
     accept_implausible: bool,
     overwrite: bool,
     as_json: bool,
-    cameras: "CameraFiles | None",
+    cameras: CameraFiles | None,
     moved: tuple[str, ...] | None = None,
     drawn: "Robot | None" = None,
 ) -> None:

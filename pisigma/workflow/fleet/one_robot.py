@@ -10,7 +10,7 @@ from pydantic import TypeAdapter, ValidationError
 from pisigma.files.errors import FleetError, OutputError, PisigmaError, nearest_choice
 from pisigma.lifetime.fleet.members import Member, SessionFile
 from pisigma.lifetime.fleet.record import REFUSED, ParameterValue, RobotRecord, SessionRecord, write_record
-from pisigma.measurement.camera.corner_file import CameraFiles
+from pisigma.measurement.camera.camera_files import CameraFiles
 from pisigma.measurement.sensors.sensor import SHOWN_UNITS
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.robot.description import Robot
