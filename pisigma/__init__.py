@@ -24,10 +24,10 @@ _NAMES = {
     "planning.plan_settings": "PlanSettings",
     "robot.description": "Robot",
     "measurement.sensors.registry": "Measurements register_sensor",
-    "workflow.calibrate": "Calibration CalibrationSettings calibrate",
+    "workflow.calibrate": "Calibration calibrate",
     "workflow.compare": "ComparedModels ComparisonSettings compare",
     "workflow.distill": "Distillation DistillationSettings distill",
-    "workflow.evaluate": "EvaluationSettings Limits evaluate",
+    "workflow.evaluate": "evaluate",
     "workflow.fleet.run": "FleetRun run_fleet",
     "workflow.fleet.prior": "estimate_fleet_prior",
     "workflow.fleet.one_robot": "FleetSettings",
@@ -38,7 +38,10 @@ _NAMES = {
     "workflow.report": "report",
     "workflow.train": "train",
     "workflow.train_networks": "TrainSettings",
-    "workflow.verify": "VerificationSettings verify",
+    "workflow.settings.calibration": "CalibrationSettings",
+    "workflow.settings.evaluation": "EvaluationSettings Limits",
+    "workflow.settings.verification": "VerificationSettings",
+    "workflow.verify": "verify",
 }
 """Public names by the modules that hold them; `__init__.pyi` tells them to type checkers. `Measurements` comes from the
 registry of sensors, and not from its own module, so that files have the columns of all sensors."""

@@ -17,7 +17,6 @@ from pisigma.robot.kernels.array_kinematics import forward_kinematics as forward
 from pisigma.robot.kernels.array_kinematics import joint_jacobian as joint_jacobian
 from pisigma.robot.kinematics.status import Status as Status
 from pisigma.workflow.calibrate import Calibration as Calibration
-from pisigma.workflow.calibrate import CalibrationSettings as CalibrationSettings
 from pisigma.workflow.calibrate import calibrate as calibrate
 from pisigma.workflow.compare import ComparedModels as ComparedModels
 from pisigma.workflow.compare import ComparisonSettings as ComparisonSettings
@@ -25,8 +24,6 @@ from pisigma.workflow.compare import compare as compare
 from pisigma.workflow.distill import Distillation as Distillation
 from pisigma.workflow.distill import DistillationSettings as DistillationSettings
 from pisigma.workflow.distill import distill as distill
-from pisigma.workflow.evaluate import EvaluationSettings as EvaluationSettings
-from pisigma.workflow.evaluate import Limits as Limits
 from pisigma.workflow.evaluate import evaluate as evaluate
 from pisigma.workflow.fleet.one_robot import FleetSettings as FleetSettings
 from pisigma.workflow.fleet.prior import estimate_fleet_prior as estimate_fleet_prior
@@ -43,9 +40,12 @@ from pisigma.workflow.recalibrate import Recalibration as Recalibration
 from pisigma.workflow.recalibrate import RecalibrationSettings as RecalibrationSettings
 from pisigma.workflow.recalibrate import recalibrate as recalibrate
 from pisigma.workflow.report import report as report
+from pisigma.workflow.settings.calibration import CalibrationSettings as CalibrationSettings
+from pisigma.workflow.settings.evaluation import EvaluationSettings as EvaluationSettings
+from pisigma.workflow.settings.evaluation import Limits as Limits
+from pisigma.workflow.settings.verification import VerificationSettings as VerificationSettings
 from pisigma.workflow.train import train as train
 from pisigma.workflow.train_networks import TrainSettings as TrainSettings
-from pisigma.workflow.verify import VerificationSettings as VerificationSettings
 from pisigma.workflow.verify import verify as verify
 
 __version__: str

@@ -25,7 +25,7 @@ class Option:
         name: of the option, such as "--class"; None for that of the setting.
         kind: type of what is stated, where it is not that of the setting.
         read: makes the setting of what is stated.
-        unit: that is stated, one of `UNITS`.
+        unit: that is stated, one of `UNITS`; `read` turns it into that of the setting where there is one.
         least: that can be stated.
         most: that can be stated.
         metavar: what stands for the value in the help.
@@ -37,8 +37,8 @@ class Option:
     kind: Any = None
     read: Callable[[Any], Any] | None = None
     unit: str | None = None
-    least: float | None = None
-    most: float | None = None
+    least: float | int | None = None
+    most: float | int | None = None
     metavar: str | None = None
     default: Any = None
     hidden: bool = False
@@ -53,6 +53,15 @@ FILE = Option(kind=Path, read=str)
 def texts(stated: Iterable[object]) -> tuple[str, ...]:
     """What is stated, as texts."""
     return tuple(map(str, stated))
+
+
+def names(stated: str) -> tuple[str, ...]:
+    """Names with commas between."""
+    return tuple(name.strip() for name in stated.split(",")) if stated else ()
+
+
+NAMES = Option(kind=str, read=names)
+"""Of settings that are several names."""
 
 
 @dataclass(frozen=True)
@@ -87,9 +96,9 @@ class Setting:
 
     def read(self, stated: Any) -> Any:
         """The setting by what a command line states."""
-        if self.option.unit is not None:
-            return stated * UNITS[self.option.unit][1]
-        return stated if self.option.read is None else self.option.read(stated)
+        if self.option.read is not None:
+            return self.option.read(stated)
+        return stated if self.option.unit is None else stated * UNITS[self.option.unit][1]
 
 
 def settings_of(group: type) -> list[Setting]:
@@ -99,16 +108,17 @@ def settings_of(group: type) -> list[Setting]:
     """
     meanings, found = attributes_of(group), []
     for one in fields(group):
-        kind, option = _resolved(one.type, vars(sys.modules[group.__module__])), Option()
+        module = vars(sys.modules[group.__module__])
+        kind, option = _resolved(one.type, module), Option()
         if get_origin(kind) is Annotated:
-            kind, option = get_args(kind)
+            kind, option = _resolved(get_args(kind)[0], module), get_args(kind)[1]
         if option.hidden:
             continue
         is_required = one.default is MISSING and one.default_factory is MISSING
         default = _stated_default(None if one.default is MISSING else one.default, option)
         kind = option.kind or _stated_as(kind)
         default = bool(default) if kind is bool else default
-        meaning = _help(meanings.get(one.name, ""), option)
+        meaning = _help(meanings.get(one.name, ""), option, get_origin(kind) is list)
         found.append(Setting(one.name, kind, default, is_required, meaning, option))
     return found
 
@@ -158,9 +168,11 @@ def _stated_default(default: Any, option: Option) -> Any:
     return None if default == () else default
 
 
-def _help(meaning: str, option: Option) -> str:
-    """What an option means: a sentence, with the option's unit; what None means is its default."""
+def _help(meaning: str, option: Option, is_repeated: bool) -> str:
+    """What an option means, in sentences and with its unit; what None means is its default."""
     if option.unit is not None:
         meaning = meaning.replace(f"[{UNITS[option.unit][0]}]", f"[{option.unit}]")
     meaning = re.sub(r"[;.]? None: ([^.]*)\.?$", r". [default: \1]", meaning)
-    return meaning[:1].upper() + meaning[1:]
+    begins_with_choice = meaning.partition(" ")[0].endswith(":")
+    sentence = meaning if begins_with_choice else meaning[:1].upper() + meaning[1:]
+    return f"{sentence} May be repeated." if is_repeated else sentence

@@ -28,10 +28,10 @@ from pisigma.model.training_rows import training_row_warnings
 from pisigma.planning.task import read_task
 from pisigma.validation.checks.rows.wrong_rows import without_wrong_rows
 from pisigma.validation.gate import check_rows
-from pisigma.validation.held_out.bootstrap import Bootstrap
 from pisigma.validation.held_out.diagnostic import Diagnostic
 from pisigma.validation.held_out.frames.fitted_frames import fitted_kinds
 from pisigma.validation.held_out.model_comparison import Difference, ModelComparison, compare_models
+from pisigma.validation.resampling import Bootstrap
 from pisigma.workflow.evaluate import (
     REFERENCES,
     labelled,

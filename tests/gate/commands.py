@@ -16,7 +16,7 @@ from pisigma.measurement.dataset import Measurements
 from pisigma.model.folder.model_folder import save_model
 from pisigma.planning.plan_settings import PlanSettings
 from pisigma.robot import Robot
-from pisigma.workflow.calibrate import CalibrationSettings, calibrate
+from pisigma.workflow.calibrate import calibrate
 from pisigma.workflow.compare import compare
 from pisigma.workflow.evaluate import evaluate
 from pisigma.workflow.fleet.one_robot import FleetSettings, work_out
@@ -25,6 +25,7 @@ from pisigma.workflow.monitor import monitor
 from pisigma.workflow.plan import plan
 from pisigma.workflow.recalibrate import recalibrate
 from pisigma.workflow.report import report
+from pisigma.workflow.settings.calibration import CalibrationSettings
 from pisigma.workflow.verify import verify
 
 ROBOT = "rb5"

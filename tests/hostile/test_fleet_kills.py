@@ -4,8 +4,8 @@ from hostile.fleet_kills import BAD, faults_of, write_plant
 from testing.models import no_type_checker
 
 from pisigma.lifetime.fleet.members import read_fleet
-from pisigma.workflow.calibrate import CalibrationSettings
 from pisigma.workflow.fleet.one_robot import FleetSettings, work_out
+from pisigma.workflow.settings.calibration import CalibrationSettings
 
 
 def test_every_bad_file_is_named_with_its_reason(tmp_path):

@@ -8,8 +8,8 @@ from testing.simulated_arm import simulate
 import pisigma
 from pisigma.files.progress import silent, stage
 from pisigma.validation.held_out import side_by_side
-from pisigma.workflow.calibrate import CalibrationSettings
 from pisigma.workflow.recipes.recipe import MeasuredData
+from pisigma.workflow.settings.calibration import CalibrationSettings
 from pisigma.workflow.train_networks import TrainSettings
 
 

@@ -82,9 +82,9 @@ def run(
     A call that was ended goes on where it was. A robot whose files are bad is named and does not stop the others; exit
     status 3 then.
     """
-    from pisigma.workflow.calibrate import CalibrationSettings
     from pisigma.workflow.fleet.one_robot import FleetSettings
     from pisigma.workflow.fleet.run import run_fleet
+    from pisigma.workflow.settings.calibration import CalibrationSettings
 
     stated: dict[str, Any] = {"task": task, "engine": engine}
     kind: Any = model

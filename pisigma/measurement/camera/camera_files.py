@@ -40,9 +40,9 @@ class CameraFiles:
 
     Attributes:
         cameras: cameras (YAML of pisigma, ROS or OpenCV) whose corners a file holds: columns image, corner, u_px, v_px
-            and joints; with boards. There may be several; the column camera then has their names.
-        boards: boards that the cameras see (YAML: rows, columns, square_mm). There may be several; the column board
-            then has their names.
+            and joints; with boards. Of several, the column camera has the names.
+        boards: boards that the cameras see (YAML: rows, columns, square_mm). Of several, the column board has the
+            names.
         is_fixed: every camera is fixed and the boards are on the flange, not the other way round; of several cameras,
             state is_fixed: true in the files of those that are.
         repeatability: of the robot.

@@ -3,7 +3,7 @@
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Any, Literal, get_args, get_type_hints
 
 from pydantic import TypeAdapter, ValidationError
 
@@ -12,17 +12,21 @@ from pisigma.lifetime.fleet.members import Member, SessionFile
 from pisigma.lifetime.fleet.record import REFUSED, ParameterValue, RobotRecord, SessionRecord, write_record
 from pisigma.measurement.camera.camera_files import CameraFiles
 from pisigma.measurement.sensors.sensor import SHOWN_UNITS
+from pisigma.measurement.splits import SplitBy
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.robot.description import Robot
+from pisigma.robot.robot_class import ClassName
 from pisigma.validation.held_out.validation_figures import AbstractValidationFigures
-from pisigma.workflow.calibrate import Calibration, CalibrationSettings, calibrate
+from pisigma.workflow.calibrate import Calibration, calibrate
 from pisigma.workflow.monitor import MonitorSettings, monitor
 from pisigma.workflow.recalibrate import Recalibration, RecalibrationSettings, recalibrate
+from pisigma.workflow.settings.calibration import CalibrationSettings, free_parameters
 
 Task = Literal["calibrate", "recalibrate", "monitor"]
 EngineName = Literal["processes", "ray"]
 OPTIONS = ("model", "free", "split", "robust", "prior_length", "prior_angle", "train_rows", "seed")
 """Settings of a calibration that a manifest may state for one robot."""
+KINDS = get_type_hints(CalibrationSettings, localns={"SplitBy": SplitBy, "ClassName": ClassName})
 UNKNOWN = SessionFile("description", "", Path())
 """Stands for the sessions of a robot whose description is wrong."""
 
@@ -88,18 +92,17 @@ class FleetSettings:
                 )
             if [one for one, _ in member.options].count(name) > 1:
                 raise FleetError(f"robot '{member.id}': option '{name}' appears twice; state it once.")
-        stated = {name: getattr(self.calibration, name) for name in self.calibration.__dataclass_fields__}
-        stated |= {name: _free(value) if name == "free" else value for name, value in member.options}
-        stated["cameras"] = member.cameras
+        stated: dict[str, Any] = {}
+        for name, value in member.options:
+            try:
+                stated[name] = TypeAdapter(KINDS[name]).validate_python(_read(name, value))
+            except ValidationError as problem:
+                what = problem.errors()[0]["msg"]
+                raise FleetError(f"robot '{member.id}': option '{name}': {what}, got '{value}'.") from None
         try:
-            settings = TypeAdapter(CalibrationSettings).validate_python(stated)
-        except ValidationError as problem:
-            where = problem.errors()[0]
-            name = ".".join(map(str, where["loc"]))
-            what = (
-                f"option '{name}': {where['msg']}, got '{where['input']}'." if name else where["ctx"]["error"]
-            )
-            raise FleetError(f"robot '{member.id}': {what}") from None
+            settings = replace(self.calibration, cameras=member.cameras, **stated)
+        except PisigmaError as problem:
+            raise FleetError(f"robot '{member.id}': {problem}") from None
         if self.prior is not None:
             settings.check_unused()
         elif self.task != "calibrate" and member.model is None and settings.model == "geometric":
@@ -278,8 +281,6 @@ def _refusal(session: SessionFile, sentence: str) -> SessionRecord:
     return SessionRecord(session.name, session.date, session.data.name, 0, REFUSED, sentence)
 
 
-def _free(value: str) -> str | tuple[str, ...]:
-    """Free parameters: a choice, or names with commas or blanks between them."""
-    if value in ("identifiable", "joint_offsets"):
-        return value
-    return tuple(value.replace(",", " ").split())
+def _read(name: str, value: str) -> str | tuple[str, ...]:
+    """An option of a manifest: free parameters have commas or blanks between them."""
+    return free_parameters(",".join(value.replace(",", " ").split())) if name == "free" else value

@@ -31,8 +31,8 @@ from pisigma.lifetime.fleet.record import (
 from pisigma.lifetime.fleet.results_table import RESULTS, write_results
 from pisigma.model.folder.model_folder import load_model
 from pisigma.model.model_posterior import check_fleet_prior
-from pisigma.workflow.calibrate import CalibrationSettings
 from pisigma.workflow.fleet.one_robot import FleetSettings, work_out
+from pisigma.workflow.settings.calibration import CalibrationSettings
 
 ROBOTS_A_CHUNK = 4
 """Calibrations that a worker gets at once: some seconds of work."""
