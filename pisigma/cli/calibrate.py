@@ -24,6 +24,7 @@ from pisigma.cli.output import (
 )
 from pisigma.cli.settings_options import takes_settings
 from pisigma.workflow.settings.calibration import CalibrationSettings
+from pisigma.workflow.settings.recalibration import RecalibrationSettings
 
 if TYPE_CHECKING:
     from pisigma.validation.held_out.calibration_summary import CalibrationSummary
@@ -78,14 +79,14 @@ def calibrate(
     from pisigma.robot.robot_file import robot_file
     from pisigma.workflow import calibrate as workflow
 
-    cameras = settings.cameras
-    stated = cameras.files if cameras else ()
-    check_folder(out, overwrite, inputs=(robot_file(robot), prior, *data, *stated))
+    seen_by = settings.cameras.files if settings.cameras else ()
+    check_folder(out, overwrite, inputs=(robot_file(robot), prior, *data, *seen_by))
     nominal = Robot.load(robot, base, tip)
     if prior is not None:
         settings.check_unused()
+        again = RecalibrationSettings(cameras=settings.cameras)
         return recalibrate_into(
-            context, prior, data, out, accept_implausible, overwrite, as_json, cameras, drawn=nominal
+            context, prior, data, again, out, accept_implausible, overwrite, as_json, drawn=nominal
         )
     with progress_of("calibrate") as progress:
         calibration = workflow.calibrate(nominal, data, settings, progress)

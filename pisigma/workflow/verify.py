@@ -35,7 +35,7 @@ from pisigma.validation.setup_faults.cause import length_text
 from pisigma.validation.setup_faults.setup_fault import SetupFault
 from pisigma.validation.setup_faults.setup_faults import is_implausible, unexplained
 from pisigma.workflow.evaluate import test_rows
-from pisigma.workflow.recalibrate import RecalibrationSettings
+from pisigma.workflow.settings.recalibration import RecalibrationSettings
 from pisigma.workflow.settings.verification import VerificationSettings
 
 FEWEST_CONFIGURATIONS = 6

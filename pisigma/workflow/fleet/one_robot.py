@@ -18,9 +18,11 @@ from pisigma.robot.description import Robot
 from pisigma.robot.robot_class import ClassName
 from pisigma.validation.held_out.validation_figures import AbstractValidationFigures
 from pisigma.workflow.calibrate import Calibration, calibrate
-from pisigma.workflow.monitor import MonitorSettings, monitor
-from pisigma.workflow.recalibrate import Recalibration, RecalibrationSettings, recalibrate
+from pisigma.workflow.monitor import monitor
+from pisigma.workflow.recalibrate import Recalibration, recalibrate
 from pisigma.workflow.settings.calibration import CalibrationSettings, free_parameters
+from pisigma.workflow.settings.monitoring import MonitorSettings
+from pisigma.workflow.settings.recalibration import RecalibrationSettings
 
 Task = Literal["calibrate", "recalibrate", "monitor"]
 EngineName = Literal["processes", "ray"]

@@ -5,7 +5,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Annotated, Literal, get_args
 
-from pisigma.files.errors import IdentificationError, MeasurementError, nearest_choice
+from pisigma.files.errors import IdentificationError, MeasurementError, check_choice
 from pisigma.files.setting import NAMES, Option, names
 from pisigma.measurement.camera.camera_files import CameraFiles
 
@@ -130,12 +130,8 @@ class CalibrationSettings:
         """Refuse settings that are no choice or exclude each other."""
         from pisigma.measurement.splits import SplitBy
 
-        if self.model not in get_args(ModelKind):
-            choices = nearest_choice(self.model, get_args(ModelKind))
-            raise IdentificationError(f"model '{self.model}' is unknown; {choices}")
-        if self.split not in get_args(SplitBy):
-            choices = nearest_choice(self.split, get_args(SplitBy))
-            raise MeasurementError(f"split '{self.split}' is unknown; {choices}")
+        check_choice(IdentificationError, "model", self.model, get_args(ModelKind))
+        check_choice(MeasurementError, "split", self.split, get_args(SplitBy))
         once = self.hold_out is not None or self.folds == 0
         if self.repeats is not None and self.repeats > 1 and once:
             raise MeasurementError(

@@ -20,7 +20,8 @@ from pisigma.robot import Robot
 from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.robot.se3 import invert, xyzrpy_from_transform
 from pisigma.simulation.camera.images import ImageNoise, simulate_images
-from pisigma.workflow.measure import MeasureSettings, MeasuringSession
+from pisigma.workflow.measure import MeasuringSession
+from pisigma.workflow.settings.measuring import MeasureSettings
 
 IMAGES, SWAPPED = 9, 7
 CORNERS = 54
