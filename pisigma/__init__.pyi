@@ -21,14 +21,11 @@ from pisigma.workflow.calibrate import calibrate as calibrate
 from pisigma.workflow.compare import ComparedModels as ComparedModels
 from pisigma.workflow.compare import compare as compare
 from pisigma.workflow.distill import Distillation as Distillation
-from pisigma.workflow.distill import DistillationSettings as DistillationSettings
 from pisigma.workflow.distill import distill as distill
 from pisigma.workflow.evaluate import evaluate as evaluate
-from pisigma.workflow.fleet.one_robot import FleetSettings as FleetSettings
 from pisigma.workflow.fleet.prior import estimate_fleet_prior as estimate_fleet_prior
 from pisigma.workflow.fleet.run import FleetRun as FleetRun
 from pisigma.workflow.fleet.run import run_fleet as run_fleet
-from pisigma.workflow.import_rows import ImportSettings as ImportSettings
 from pisigma.workflow.import_rows import import_rows as import_rows
 from pisigma.workflow.monitor import Monitoring as Monitoring
 from pisigma.workflow.monitor import monitor as monitor
@@ -39,13 +36,16 @@ from pisigma.workflow.recalibrate import recalibrate as recalibrate
 from pisigma.workflow.report import report as report
 from pisigma.workflow.settings.calibration import CalibrationSettings as CalibrationSettings
 from pisigma.workflow.settings.comparison import ComparisonSettings as ComparisonSettings
+from pisigma.workflow.settings.distillation import DistillationSettings as DistillationSettings
 from pisigma.workflow.settings.evaluation import EvaluationSettings as EvaluationSettings
 from pisigma.workflow.settings.evaluation import Limits as Limits
+from pisigma.workflow.settings.fleet import FleetSettings as FleetSettings
+from pisigma.workflow.settings.importing import ImportSettings as ImportSettings
 from pisigma.workflow.settings.monitoring import MonitorSettings as MonitorSettings
 from pisigma.workflow.settings.recalibration import RecalibrationSettings as RecalibrationSettings
+from pisigma.workflow.settings.training import TrainSettings as TrainSettings
 from pisigma.workflow.settings.verification import VerificationSettings as VerificationSettings
 from pisigma.workflow.train import train as train
-from pisigma.workflow.train_networks import TrainSettings as TrainSettings
 from pisigma.workflow.verify import verify as verify
 
 __version__: str

@@ -10,7 +10,7 @@ from pisigma.files.progress import silent, stage
 from pisigma.validation.held_out import side_by_side
 from pisigma.workflow.recipes.recipe import MeasuredData
 from pisigma.workflow.settings.calibration import CalibrationSettings
-from pisigma.workflow.train_networks import TrainSettings
+from pisigma.workflow.settings.training import TrainSettings
 
 
 @pytest.fixture
