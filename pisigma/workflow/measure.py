@@ -19,6 +19,7 @@ from pisigma.files.progress import Progress
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.fields import LeftOut
 from pisigma.planning.plan_file import StoredPlan, read_plan
+from pisigma.planning.plan_inputs import find_candidates, with_measured
 from pisigma.planning.session.coverage import coverage
 from pisigma.planning.session.judged_rows import JudgedRows
 from pisigma.planning.session.planned_again import FurtherPoses
@@ -59,11 +60,11 @@ class MeasuringSession:
             plan: the poses, and what they were planned with.
             settings: see `MeasureSettings`.
         """
-        plan = replace(plan, arm=plan.settings.with_measured(plan.arm))
+        plan = replace(plan, arm=with_measured(plan.settings, plan.arm))
         self.plan, self.replanned = plan, False
         self._lock = threading.RLock()
         self._settings = settings
-        candidates = plan.settings.find_candidates(plan.arm)
+        candidates = find_candidates(plan.settings, plan.arm)
         subject = Subject(plan.arm.drawn) if plan.model is None else Subject.of(plan.model)
         self._against = subject.model or plan.arm.robot
         self._task = task_poses(plan.arm, plan.settings, candidates.workspace, subject.model)

@@ -70,10 +70,11 @@ def shown_in_browser(
     if page is None:
         yield lambda state: None
         return
+    from pisigma.planning.plan_inputs import sight_of
     from pisigma.reporting.viewing.session_view import SessionView
 
     limit = None if limit_mm is None else limit_mm / 1e3
-    sight = None if camera is None else camera.sight()
+    sight = None if camera is None else sight_of(camera)
     with SessionView(arm, page.body(arm.robot), limit, page.host, page.port, sight) as view:
         print_line(f"The session is shown at {view.url}", to_stderr=True)
         yield view.show
