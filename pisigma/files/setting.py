@@ -117,7 +117,6 @@ def settings_of(group: type) -> list[Setting]:
         is_required = one.default is MISSING and one.default_factory is MISSING
         default = _stated_default(None if one.default is MISSING else one.default, option)
         kind = option.kind or _stated_as(kind)
-        default = bool(default) if kind is bool else default
         meaning = _help(meanings.get(one.name, ""), option, get_origin(kind) is list)
         found.append(Setting(one.name, kind, default, is_required, meaning, option))
     return found
@@ -161,6 +160,8 @@ def _stated_as(kind: Any) -> Any:
 
 
 def _stated_default(default: Any, option: Option) -> Any:
+    if isinstance(default, bool) or option.kind is bool:
+        return default is True and option.kind is None
     if option.unit is not None and default is not None:
         return float(f"{default / UNITS[option.unit][1]:.6g}")
     if option.default is not None or (option.kind is not None and not isinstance(default, str)):
