@@ -35,4 +35,4 @@ class DistillationSettings:
     def __post_init__(self) -> None:
         """Refuse a seed that is none."""
         if not 0 <= self.seed < 2**63:
-            raise RecipeError(f"seed {self.seed}: a whole number from 0 to 2^63 - 1 was wanted.")
+            raise RecipeError(f"--seed {self.seed}: a whole number from 0 to 2^63 - 1 was wanted.")
