@@ -25,8 +25,8 @@ from pisigma.calibration.geometric.problem.motion import MotionMemory
 from pisigma.calibration.geometric.problem.parameters import Prior
 from pisigma.measurement.camera.board import Board
 from pisigma.measurement.camera.camera import INTRINSICS, USUAL_DEVIATIONS, Camera
-from pisigma.measurement.camera.image_rows import Images, Repeatability, image_measurements
-from pisigma.measurement.camera.solved_images import IntrinsicsChoice
+from pisigma.measurement.camera.camera_files import IntrinsicsChoice, Repeatability
+from pisigma.measurement.camera.image_rows import Images, image_measurements
 from pisigma.measurement.dataset import Measurements
 from pisigma.robot import Robot
 from pisigma.robot.kinematics.closed_form.registry import closed_form_solver

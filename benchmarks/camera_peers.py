@@ -35,7 +35,8 @@ from scipy.sparse import csr_matrix, lil_matrix
 from pisigma.calibration.geometric.calibrator import GeometricCalibrator
 from pisigma.calibration.geometric.initial_guess.base_and_tool import fit_base_and_tool
 from pisigma.measurement.camera.camera import USUAL_DEVIATIONS, Camera
-from pisigma.measurement.camera.image_rows import Repeatability, image_measurements
+from pisigma.measurement.camera.camera_files import Repeatability
+from pisigma.measurement.camera.image_rows import image_measurements
 from pisigma.robot import Robot
 from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.robot.se3 import invert, rotation_from_vector

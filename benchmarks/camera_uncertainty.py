@@ -18,8 +18,8 @@ from torch import Tensor
 
 from pisigma.calibration.geometric.calibrator import GeometricCalibrator
 from pisigma.calibration.hybrid.calibrator import HybridCalibrator
+from pisigma.measurement.camera.camera_files import IntrinsicsChoice
 from pisigma.measurement.camera.image_rows import image_measurements
-from pisigma.measurement.camera.solved_images import IntrinsicsChoice
 from pisigma.measurement.dataset import Measurements, join
 from pisigma.model.accuracy import deviation_of_rows
 from pisigma.model.geometric_model import model_of_hybrid

@@ -29,7 +29,8 @@ from pisigma.planning.choice import choose
 from pisigma.planning.knowledge import Instrument, Knowledge
 from pisigma.robot import Robot
 from pisigma.robot.se3 import rotation_from_vector
-from pisigma.workflow.calibrate import CalibrationSettings, calibrate
+from pisigma.workflow.calibrate import calibrate
+from pisigma.workflow.settings.calibration import CalibrationSettings
 
 sys.path.insert(0, os.environ.get("PISIGMA_SIMULATED", "../shared/simulated"))
 import sim  # type: ignore[import-not-found]

@@ -26,8 +26,9 @@ from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.model_posterior import ModelPosterior
 from pisigma.planning.knowledge import Knowledge
-from pisigma.workflow.calibrate import CalibrationSettings, calibrate
+from pisigma.workflow.calibrate import calibrate
 from pisigma.workflow.recalibrate import recalibrate
+from pisigma.workflow.settings.calibration import CalibrationSettings
 
 FLEETS = ((2e-4, 1.0), (1e-4, 1.0), (5e-5, 1.0), (2e-5, 1.0), (2e-5, 0.1), (2e-5, 0.01), (1e-5, 0.0))
 """Individual errors [m or rad], and the share of the variance of harmonics that is individual; the first is usual."""

@@ -21,8 +21,9 @@ from pisigma.planning.plan_settings import PlanSettings
 from pisigma.planning.session.row_judgement import judge_rows
 from pisigma.planning.surroundings.arm_in_cell import ArmInCell
 from pisigma.validation.held_out.few_rows import fit_where_it_helps
-from pisigma.workflow.measure import MeasureSettings, MeasuringSession
+from pisigma.workflow.measure import MeasuringSession
 from pisigma.workflow.plan import plan
+from pisigma.workflow.settings.measuring import MeasureSettings
 
 ROWS, JUDGED = 40, 6
 LIMIT_MM, ACCEPTED_MM = 0.15, 0.17

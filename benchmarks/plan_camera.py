@@ -29,6 +29,7 @@ from pisigma.planning.camera_settings import CameraSettings
 from pisigma.planning.choice import Criterion, choose
 from pisigma.planning.expected_accuracy import rms_of
 from pisigma.planning.knowledge import Knowledge
+from pisigma.planning.plan_inputs import find_candidates, instrument_of, views_of
 from pisigma.planning.plan_settings import PlanSettings
 from pisigma.planning.surroundings.arm_in_cell import ArmInCell
 from pisigma.planning.surroundings.cell import Cell
@@ -76,8 +77,8 @@ class Bench:
             settings = PlanSettings(
                 sensor="camera", camera=CameraSettings(*map(str, files)), candidates=candidates
             )
-            arm, instrument = ArmInCell.of(Robot.load("ur5"), CELL), settings.instrument()
-            drawn, views = settings.find_candidates(arm), settings.views(arm)
+            arm, instrument = ArmInCell.of(Robot.load("ur5"), CELL), instrument_of(settings)
+            drawn, views = find_candidates(settings, arm), views_of(settings, arm)
         assert views is not None
         base = xyzrpy_from_transform(invert(views.T_cell_frame)).numpy()
         robot = arm.robot.with_geometry(base=base)

@@ -32,7 +32,8 @@ from pisigma.planning.plan_settings import PlanSettings
 from pisigma.robot import Robot
 from pisigma.validation.held_out.trained_calibrations import fit
 from pisigma.workflow.plan import plan
-from pisigma.workflow.recalibrate import Recalibration, RecalibrationSettings, recalibrate
+from pisigma.workflow.recalibrate import Recalibration, recalibrate
+from pisigma.workflow.settings.recalibration import RecalibrationSettings
 
 DATA = Path(os.environ.get("PISIGMA_DATA", "../shared/data"))
 SIMULATED = Path(os.environ.get("PISIGMA_SIMULATED", "../shared/simulated"))

@@ -245,6 +245,13 @@ def test_the_keys_of_recipes_are_those_of_the_models() -> None:
     assert tables.page_with(text, tables.tables()) == text, "run: python docs/hooks/recipe_tables.py"
 
 
+def test_the_settings_are_those_of_the_commands(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(DOCS / "hooks")
+    tables = _hook("setting_tables")
+    text = _text(DOCS / "reference" / "settings.md")
+    assert tables.page_with(text, tables.tables()) == text, "run: python docs/hooks/setting_tables.py"
+
+
 def test_every_status_and_every_robot_is_named() -> None:
     statuses = re.findall(
         r"^\| `([A-Z_]+)` \|", _text(DOCS / "how-to" / "corrected-ik.md"), flags=re.MULTILINE

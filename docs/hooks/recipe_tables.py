@@ -13,6 +13,7 @@ from typing import Any
 from pydantic import BaseModel
 from pydantic_core import PydanticUndefined
 
+from pisigma.files.setting import attributes_of
 from pisigma.files.yaml_file import OneOf
 from pisigma.workflow.recipes.recipe import GeometricRecipe, HybridRecipe, InverseRecipe
 
@@ -66,7 +67,7 @@ def _closed(annotation: Any) -> Any:
 
 
 def _table(section: type[BaseModel]) -> str:
-    doc = _documentation(section)
+    doc = attributes_of(section)
     lines = [f"### {_name(section)}", "", _cell(_summary(section)), ""]
     lines += ["| key | value | default | meaning |", "|---|---|---|---|"]
     for name, field in section.model_fields.items():
@@ -89,20 +90,6 @@ def _name(section: type[BaseModel]) -> str:
 def _summary(section: type[BaseModel]) -> str:
     text = (section.__doc__ or "").strip()
     return re.split(r"\n\s*(?:Attributes|Source):", text)[0].replace("``", "`")
-
-
-def _documentation(section: type[BaseModel]) -> dict[str, str]:
-    """What the docstring says of every attribute."""
-    lines = (section.__doc__ or "").partition("Attributes:")[2].splitlines()
-    found: dict[str, str] = {}
-    last = ""
-    for line in lines:
-        if match := re.match(r"^ {8}(\w+): (.*)$", line):
-            last = match[1]
-            found[last] = match[2]
-        elif last and line.startswith(" " * 12):
-            found[last] += f" {line.strip()}"
-    return found
 
 
 def _type(annotation: Any) -> str:

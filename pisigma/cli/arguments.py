@@ -1,12 +1,9 @@
 """Arguments and options that several commands share, and what shells complete in them."""
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
 import typer
-
-from pisigma.files.errors import IdentificationError
 
 
 def complete_robot(incomplete: str) -> list[str]:
@@ -58,37 +55,3 @@ AcceptImplausible = Annotated[
     ),
 ]
 """The option of commands that check a model before they write it."""
-
-SocketDistance = Annotated[
-    list[str] | None,
-    typer.Option(
-        help="Known distance of two sockets as A,B,MM; */0,*/1,50 states that of every placement. Repeat it for more."
-    ),
-]
-
-
-def socket_distances(stated: Sequence[str] | None) -> dict[tuple[str, str], float]:
-    """Known distances of two sockets each [m], from "A,B,MM"."""
-    distances: dict[tuple[str, str], float] = {}
-    for one in stated or ():
-        sockets, distance = _socket_distance(one)
-        if sockets in distances:
-            raise IdentificationError(
-                f"expected one distance of the sockets {' and '.join(sockets)}, got a second one in '{one}'; remove "
-                "one of them."
-            )
-        distances[sockets] = distance
-    return distances
-
-
-def _socket_distance(stated: str) -> tuple[tuple[str, str], float]:
-    words = [word.strip() for word in stated.split(",")]
-    try:
-        distance = float(words[2])
-    except (IndexError, ValueError):
-        distance = 0.0
-    if len(words) != 3 or not 0 < distance < float("inf"):
-        raise IdentificationError(
-            f"expected a known socket distance as A,B,MM, such as */0,*/1,50, got '{stated}'."
-        )
-    return (words[0], words[1]), distance / 1e3

@@ -1,8 +1,7 @@
 """`pisigma calibrate`: geometric or hybrid calibration of measured data."""
 
-from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -10,12 +9,9 @@ from pisigma.cli.arguments import (
     AcceptImplausible,
     AsJson,
     Overwrite,
-    SocketDistance,
     complete_model,
     complete_robot,
-    socket_distances,
 )
-from pisigma.cli.camera_options import takes_corners
 from pisigma.cli.lifetime.recalibrate import recalibrate_into
 from pisigma.cli.output import (
     command_line,
@@ -26,12 +22,12 @@ from pisigma.cli.output import (
     progress_of,
     saved,
 )
-from pisigma.files.errors import IdentificationError
+from pisigma.cli.settings_options import takes_settings
+from pisigma.workflow.settings.calibration import CalibrationSettings
+from pisigma.workflow.settings.recalibration import RecalibrationSettings
 
 if TYPE_CHECKING:
-    from pisigma.measurement.camera.corner_file import CameraFiles
     from pisigma.validation.held_out.calibration_summary import CalibrationSummary
-    from pisigma.workflow.calibrate import CalibrationSettings
 
 RobotName = Annotated[
     str,
@@ -43,79 +39,6 @@ Data = Annotated[
     list[Path], typer.Argument(metavar="DATA...", help="Measurements (CSV), in one file or several.")
 ]
 Out = Annotated[Path, typer.Option(help="Model folder to write.")]
-Model = Annotated[
-    str,
-    typer.Option(help="hybrid: geometry and, where the data are for it, a joint correction; or geometric."),
-]
-Folds = Annotated[
-    int | None,
-    typer.Option(min=0, help="Folds of the cross-validation; 0 for none. [default: 5, or one per placement]"),
-]
-HoldOut = Annotated[float | None, typer.Option(help="Share of the rows to hold out once, instead of folds.")]
-Split = Annotated[
-    str, typer.Option(help="How rows are split: joints (at random), interleaved, time, space or placement.")
-]
-Repeats = Annotated[
-    int | None,
-    typer.Option(
-        min=1,
-        help="Repeats of the cross-validation. [default: 200 / number of different joint values, 1 to 10]",
-    ),
-]
-Jobs = Annotated[
-    int | None,
-    typer.Option(
-        help="Processes that calibrate with all rows and with those of each fold side by side, with one thread each. "
-        "[default: threads]"
-    ),
-]
-Seed = Annotated[int, typer.Option(help="Seed of the split, and of drawing training rows.")]
-TrainRows = Annotated[
-    int | None,
-    typer.Option(
-        help="Number of rows, drawn at random, to calibrate with, in the cross-validation too. [default: all]"
-    ),
-]
-Free = Annotated[
-    str, typer.Option(help="Free parameters: identifiable, joint_offsets, or names such as a_2,theta_3.")
-]
-PriorMm = Annotated[
-    float, typer.Option(help="Prior standard deviation of length errors [mm]; 0 for no prior.")
-]
-PriorMrad = Annotated[
-    float, typer.Option(help="Prior standard deviation of angle errors [mrad]; 0 for no prior.")
-]
-RobotClassName = Annotated[
-    str | None,
-    typer.Option(
-        "--class",
-        help="How large errors of the geometry can be: industrial, cobot or hobby (also of old and surgical arms). "
-        "[default: as the maker and the data say]",
-    ),
-]
-Robust = Annotated[bool, typer.Option(help="Let rows that are far off count less.")]
-Features = Annotated[
-    str | None,
-    typer.Option(
-        help="Features of the joint correction that are tried, such as gravity,lines,series. [default: all that fit, "
-        "and those of plug-ins]"
-    ),
-]
-Gravity = Annotated[
-    str | None,
-    typer.Option(
-        help="Direction in which things fall, in the robot's base frame, such as 0,0,-1. [default: the axis that the "
-        "data show]"
-    ),
-]
-NewFrameAt = Annotated[
-    list[int] | None,
-    typer.Option(
-        metavar="LINE",
-        help="Line of DATA from which on the rows are in a frame of their own, as the instrument was moved; may be "
-        "repeated.",
-    ),
-]
 Base = Annotated[str | None, typer.Option(help="Of a URDF file: link that is the base. [default: its root]")]
 Tip = Annotated[
     str | None, typer.Option(help="Of a URDF file: link that is the tool. [default: its only leaf]")
@@ -131,30 +54,13 @@ Prior = Annotated[
 Verbose = Annotated[bool, typer.Option("--verbose", help="Print all parameters.")]
 
 
-@takes_corners
+@takes_settings
 def calibrate(
     context: typer.Context,
     robot: RobotName,
     data: Data,
     out: Out,
-    model: Model = "hybrid",
-    folds: Folds = None,
-    hold_out: HoldOut = None,
-    split: Split = "joints",
-    repeats: Repeats = None,
-    jobs: Jobs = None,
-    seed: Seed = 0,
-    train_rows: TrainRows = None,
-    free: Free = "identifiable",
-    prior_mm: PriorMm = 1.0,
-    prior_mrad: PriorMrad = 1.0,
-    robot_class: RobotClassName = None,
-    robust: Robust = True,
-    features: Features = None,
-    gravity: Gravity = None,
-    new_frame_at: NewFrameAt = None,
-    socket_distance: SocketDistance = None,
-    cameras: "CameraFiles | None" = None,
+    settings: CalibrationSettings,
     base: Base = None,
     tip: Tip = None,
     prior: Prior = None,
@@ -173,13 +79,14 @@ def calibrate(
     from pisigma.robot.robot_file import robot_file
     from pisigma.workflow import calibrate as workflow
 
-    stated = cameras.files if cameras else ()
-    check_folder(out, overwrite, inputs=(robot_file(robot), prior, *data, *stated))
-    settings, nominal = _settings(context.params, cameras), Robot.load(robot, base, tip)
+    seen_by = settings.cameras.files if settings.cameras else ()
+    check_folder(out, overwrite, inputs=(robot_file(robot), prior, *data, *seen_by))
+    nominal = Robot.load(robot, base, tip)
     if prior is not None:
         settings.check_unused()
+        again = RecalibrationSettings(cameras=settings.cameras)
         return recalibrate_into(
-            context, prior, data, out, accept_implausible, overwrite, as_json, cameras, drawn=nominal
+            context, prior, data, again, out, accept_implausible, overwrite, as_json, drawn=nominal
         )
     with progress_of("calibrate") as progress:
         calibration = workflow.calibrate(nominal, data, settings, progress)
@@ -254,57 +161,3 @@ def _print_parameters(summary: "CalibrationSummary", verbose: bool) -> None:
     print_table(title, *parameter_table(estimated))
     print_line("What these data cannot determine:")
     print_lines((f"- {line}" for line in undetermined_lines(summary)), indent="  ")
-
-
-def _settings(options: Mapping[str, Any], cameras: "CameraFiles | None") -> "CalibrationSettings":
-    """Settings by the options of the command."""
-    from pisigma.workflow.calibrate import CalibrationSettings
-
-    same = (
-        "model",
-        "folds",
-        "hold_out",
-        "split",
-        "repeats",
-        "jobs",
-        "seed",
-        "train_rows",
-        "robot_class",
-        "robust",
-    )
-    return CalibrationSettings(
-        free=_free(options["free"]),
-        prior_length=options["prior_mm"] / 1e3,
-        prior_angle=options["prior_mrad"] / 1e3,
-        features=None if options["features"] is None else _names(options["features"]),
-        gravity=_gravity(options["gravity"]),
-        new_frame_at=tuple(options["new_frame_at"] or ()),
-        socket_distances=socket_distances(options["socket_distance"]),
-        cameras=cameras,
-        **{name: options[name] for name in same},
-    )
-
-
-def _free(stated: str) -> Any:
-    """Free parameters as the settings have them."""
-    if stated in ("identifiable", "joint_offsets"):
-        return stated
-    return _names(stated)
-
-
-def _names(stated: str) -> tuple[str, ...]:
-    """Names with commas between."""
-    return tuple(name.strip() for name in stated.split(","))
-
-
-def _gravity(stated: str | None) -> Any:
-    """Direction of gravity, from "X,Y,Z"."""
-    try:
-        direction = None if stated is None else tuple(map(float, stated.split(",")))
-    except ValueError:
-        direction = ()
-    if direction is not None and len(direction) != 3:
-        raise IdentificationError(
-            f"the direction of gravity as X,Y,Z was wanted, such as 0,0,-1, got '{stated}'."
-        )
-    return direction

@@ -1,6 +1,7 @@
 """`pisigma distill`: a calibrated model as a small network on nominal joint values."""
 
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -8,7 +9,9 @@ import typer
 
 from pisigma.cli.arguments import AsJson, ModelFolder, Overwrite
 from pisigma.cli.output import command_line, print_json, print_lines, print_table, progress_of
+from pisigma.cli.settings_options import takes_settings
 from pisigma.files.errors import PoseError, RecipeError
+from pisigma.workflow.settings.distillation import DistillationSettings
 
 if TYPE_CHECKING:
     from pisigma.workflow.distill import Distillation
@@ -32,7 +35,6 @@ Joints = Annotated[
         "so that the rows have to fill it."
     ),
 ]
-Poses = Annotated[int, typer.Option(help="Number of poses to fit to.")]
 Orders = Annotated[
     str | None,
     typer.Option(help="Orders of the product units, such as 1,2,3. [default: several sizes are tried]"),
@@ -43,19 +45,18 @@ Harmonics = Annotated[
         help="With --orders: cycles a turn up to which the value of a joint is an input. [default: 1]"
     ),
 ]
-Seed = Annotated[int, typer.Option(help="Seed of poses and starts.")]
 
 
+@takes_settings
 def distill(
     context: typer.Context,
     model: ModelFolder,
     out: Out,
+    settings: DistillationSettings,
     region: RegionMm = None,
     joints: Joints = None,
-    poses: Poses = 5000,
     orders: Orders = None,
     harmonics: Harmonics = None,
-    seed: Seed = 0,
     overwrite: Overwrite = False,
     as_json: AsJson = False,
 ) -> None:
@@ -67,10 +68,8 @@ def distill(
     from pisigma.workflow import distill as workflow
 
     check_folder(out, overwrite, inputs=(model, joints))
-    if not 0 <= seed < 2**63:
-        raise RecipeError(f"--seed {seed}: a whole number from 0 to 2^63 - 1 was wanted.")
     size = _size(orders, harmonics)
-    settings = workflow.DistillationSettings(_region(model, region, joints), poses, size, seed)
+    settings = replace(settings, region=_region(model, region, joints), size=size)
     with progress_of("distillation") as progress:
         distillation = workflow.distill(model, settings, progress)
     distillation.save(out, command=command_line(context, ("out", "joints")), overwrite=overwrite)

@@ -4,14 +4,14 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from pisigma.cli.arguments import AsJson, SocketDistance, socket_distances
-from pisigma.cli.camera_options import takes_corners
+from pisigma.cli.arguments import AsJson
 from pisigma.cli.output import print_json, print_lines
-from pisigma.cli.verify import FitFrame, FitTool, print_comparison
+from pisigma.cli.settings_options import takes_settings
+from pisigma.cli.verify import print_comparison
 from pisigma.files.errors import AcceptanceError
+from pisigma.workflow.settings.evaluation import EvaluationSettings
 
 if TYPE_CHECKING:
-    from pisigma.measurement.camera.corner_file import CameraFiles
     from pisigma.workflow.evaluate import Evaluation
 
 Paths = Annotated[
@@ -23,19 +23,6 @@ Paths = Annotated[
         "single model is compared with nominal.",
     ),
 ]
-MaxMean = Annotated[
-    float | None, typer.Option(help="Accept only where the mean position error is at most this.")
-]
-MaxP95 = Annotated[
-    float | None, typer.Option(help="Accept only where 95 % of the position errors are at most this.")
-]
-Largest = Annotated[float | None, typer.Option(help="Accept only where no position error is larger.")]
-MaxMeanDeg = Annotated[
-    float | None, typer.Option(help="Accept only where the mean orientation error is at most this.")
-]
-Resamples = Annotated[
-    int, typer.Option(min=2, help="Resamples of the configurations, for confidence intervals.")
-]
 Hashes = Annotated[
     list[str] | None,
     typer.Option(
@@ -44,22 +31,12 @@ Hashes = Annotated[
         "folder, in their order.",
     ),
 ]
-Seed = Annotated[int, typer.Option(help="Seed of the resamples.")]
 
 
-@takes_corners
+@takes_settings
 def evaluate(
     paths: Paths,
-    max_mean_mm: MaxMean = None,
-    max_p95_mm: MaxP95 = None,
-    max_mm: Largest = None,
-    max_mean_deg: MaxMeanDeg = None,
-    fit_frame: FitFrame = False,
-    fit_tool: FitTool = False,
-    socket_distance: SocketDistance = None,
-    cameras: "CameraFiles | None" = None,
-    resamples: Resamples = 2000,
-    seed: Seed = 0,
+    settings: EvaluationSettings,
     sha256: Hashes = None,
     as_json: AsJson = False,
 ) -> None:
@@ -71,7 +48,6 @@ def evaluate(
     Balls in sockets, wires and pairs are judged by how well the rows of each agree, and by stated distances.
     """
     from pisigma.files.model_files import check_model_hash
-    from pisigma.validation.held_out.bootstrap import Bootstrap
     from pisigma.workflow import evaluate as workflow
 
     if len(paths) < 2:
@@ -84,10 +60,6 @@ def evaluate(
         )
     for folder, wanted in zip(folders, sha256 or (), strict=False):
         check_model_hash(folder, wanted)
-    limits = workflow.Limits(max_mean_mm, max_p95_mm, max_mm, max_mean_deg)
-    settings = workflow.EvaluationSettings(
-        limits, fit_frame, fit_tool, Bootstrap(resamples, seed), cameras, socket_distances(socket_distance)
-    )
     evaluation = workflow.evaluate(paths[:-1], paths[-1], settings)
     if as_json:
         print_json(evaluation.to_json())

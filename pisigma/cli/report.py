@@ -1,20 +1,18 @@
 """`pisigma report`: one page by which a calibration is accepted."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 from pisigma.cli.arguments import AsJson, ModelFolder
-from pisigma.cli.camera_options import takes_corners
 from pisigma.cli.output import print_json, print_lines, progress_of
+from pisigma.cli.settings_options import takes_settings
 from pisigma.files.errors import AcceptanceError
-
-if TYPE_CHECKING:
-    from pisigma.measurement.camera.corner_file import CameraFiles
+from pisigma.measurement.camera.camera_files import CameraFiles
 
 
-@takes_corners
+@takes_settings
 def report(
     model: ModelFolder,
     data: Annotated[
@@ -27,7 +25,7 @@ def report(
     figures: Annotated[
         Path | None, typer.Option(help="Folder for the figures as PNG and SVG files; made where missing.")
     ] = None,
-    cameras: "CameraFiles | None" = None,
+    cameras: CameraFiles | None = None,
     as_json: AsJson = False,
 ) -> None:
     """Write a report as one HTML page: how accurate, where worst, what limits it, what to measure next.

@@ -13,37 +13,25 @@ import typer
 from pisigma.cli.arguments import AcceptImplausible, AsJson, Overwrite
 from pisigma.cli.calibrate import print_calibration
 from pisigma.cli.output import print_json, print_line, print_lines, print_table, progress_of, saved
+from pisigma.cli.settings_options import takes_settings
 from pisigma.files.errors import printable
+from pisigma.workflow.settings.training import TrainSettings
 
 if TYPE_CHECKING:
     from pisigma.validation.held_out.calibration_summary import CalibrationSummary
     from pisigma.validation.held_out.training_summary import TrainingSummary
 
-Jobs = Annotated[
-    int | None,
-    typer.Option(
-        help="Processes that judge folds and simulations side by side, with one thread each. [default: threads]"
-    ),
-]
 
-
+@takes_settings
 def train(
     recipe: Annotated[Path, typer.Argument(help="Recipe (YAML), such as training/kiro3.yaml.")],
+    settings: TrainSettings,
     data: Annotated[
         Path | None, typer.Option(help="Measured data (CSV), for recipes that ask for them.")
     ] = None,
     out: Annotated[
         Path | None, typer.Option(help="Model folder to write. [default: runs/NAME, or the next free name]")
     ] = None,
-    resume: Annotated[
-        bool,
-        typer.Option("--resume", help="Go on from where an interrupted training of this folder stopped."),
-    ] = False,
-    logs: Annotated[
-        Path | None,
-        typer.Option(help="Folder for metrics.csv of every epoch, and TensorBoard's events if it is there."),
-    ] = None,
-    jobs: Jobs = None,
     accept_implausible: AcceptImplausible = False,
     overwrite: Overwrite = False,
     as_json: AsJson = False,
@@ -59,16 +47,15 @@ def train(
     from pisigma.workflow.recipes.reader import read_recipe
     from pisigma.workflow.train import InverseTraining
     from pisigma.workflow.train import train as train_recipe
-    from pisigma.workflow.train_networks import TrainSettings
 
     read = read_recipe(recipe)
     folder = out or _next_free(read.name)
     inputs = (recipe, data, robot_file(read.robot))
     check_folder(folder, overwrite, inputs)
-    if logs is not None:
-        check_apart(logs / "metrics.csv", inputs, "--logs")
+    if settings.logs is not None:
+        check_apart(settings.logs / "metrics.csv", inputs, "--logs")
     checkpoints = folder.parent / f".{folder.name}.training"
-    settings = TrainSettings(checkpoints, resume, show_progress=True, logs=logs, jobs=jobs)
+    settings = replace(settings, checkpoints=checkpoints, show_progress=True)
     with progress_of("training") as progress:
         training = train_recipe(recipe, data, settings, progress)
     command = ["pisigma", "train", recipe.as_posix(), *(["--data", data.name] if data else [])]

@@ -5,29 +5,16 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from pisigma.cli.arguments import AsJson, ModelFolder, SocketDistance, socket_distances
-from pisigma.cli.camera_options import takes_corners
+from pisigma.cli.arguments import AsJson, ModelFolder
 from pisigma.cli.output import print_json, print_line, print_lines, print_table, progress_of, screen_width
+from pisigma.cli.settings_options import takes_settings
 from pisigma.files.errors import AcceptanceError
+from pisigma.workflow.settings.verification import VerificationSettings
 
 if TYPE_CHECKING:
-    from pisigma.measurement.camera.corner_file import CameraFiles
     from pisigma.validation.held_out.model_comparison import ModelComparison
     from pisigma.workflow.verify import Verification
 
-FitFrame = Annotated[
-    bool,
-    typer.Option(
-        "--fit-frame", help="The sensor was moved since: fit its frame to these rows, 6 poses or more."
-    ),
-]
-FitTool = Annotated[
-    bool,
-    typer.Option(
-        "--fit-tool",
-        help="Another reflector was mounted since: fit its place to these rows, 6 poses or more.",
-    ),
-]
 Hash = Annotated[
     str | None,
     typer.Option(
@@ -40,14 +27,11 @@ Data = Annotated[
 ]
 
 
-@takes_corners
+@takes_settings
 def verify(
     model: ModelFolder,
     data: Data,
-    fit_frame: FitFrame = False,
-    fit_tool: FitTool = False,
-    socket_distance: SocketDistance = None,
-    cameras: "CameraFiles | None" = None,
+    settings: VerificationSettings,
     sha256: Hash = None,
     as_json: AsJson = False,
 ) -> None:
@@ -65,9 +49,6 @@ def verify(
     if sha256 is not None:
         check_model_hash(model, sha256)
     with progress_of(f"verifying {model}"):
-        settings = workflow.VerificationSettings(
-            fit_frame, fit_tool, cameras=cameras, socket_distances=socket_distances(socket_distance)
-        )
         verification = workflow.verify(model, data, settings)
     if as_json:
         print_json(verification.to_json())

@@ -7,7 +7,7 @@ defect of ours.
 
 import difflib
 import re
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 
 LONGEST_WORD = 200
 """Letters of a word of a file or a command line that a message quotes."""
@@ -139,6 +139,16 @@ def missing_extra(problem: ImportError) -> MissingExtraError | None:
         f"this needs the package {package}, which is not installed; install it with "
         f'`pip install "pisigma[{EXTRAS[package]}]"`.'
     )
+
+
+def check_choice(error: type[PisigmaError], name: str, value: str, choices: Collection[str]) -> None:
+    """Refuse what is no choice.
+
+    Raises:
+        PisigmaError: of the class `error`, with the nearest choice.
+    """
+    if value not in choices:
+        raise error(f"{name} '{value}' is unknown; {nearest_choice(str(value), choices)}")
 
 
 def nearest_choice(given: str, choices: Iterable[str]) -> str:

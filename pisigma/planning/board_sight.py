@@ -8,7 +8,7 @@ from torch import Tensor
 
 from pisigma.measurement.camera.board import Board
 from pisigma.measurement.camera.camera import Camera
-from pisigma.measurement.camera.image_rows import Repeatability
+from pisigma.measurement.camera.camera_files import Repeatability
 from pisigma.robot.se3 import invert, skew
 
 

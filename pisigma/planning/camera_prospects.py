@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float64, Int64
 from torch import Tensor
 
-from pisigma.measurement.camera.image_rows import Repeatability
+from pisigma.measurement.camera.camera_files import Repeatability
 from pisigma.planning.board_views import BoardViews
 from pisigma.planning.candidates import Candidates
 from pisigma.planning.choice import choose

@@ -2,13 +2,11 @@
 
 import math
 from dataclasses import dataclass
+from typing import Annotated
 
 from pisigma.files.errors import PlanningError
-from pisigma.measurement.camera.board import Board
-from pisigma.measurement.camera.camera import Camera
-from pisigma.measurement.camera.corner_file import CameraFiles
-from pisigma.measurement.camera.image_rows import Repeatability
-from pisigma.planning.board_sight import BoardSight
+from pisigma.files.setting import FILE, Option
+from pisigma.measurement.camera.camera_files import CameraFiles, Repeatability
 
 FINEST_PX, COARSEST_PX = 1e-3, 100.0
 """Of the noise of a corner."""
@@ -19,20 +17,20 @@ class CameraSettings:
     """Which camera sees which board.
 
     Attributes:
-        camera: file of the camera.
-        board: file of the board.
-        is_fixed: whether the camera stands beside the robot and the board is on the flange; else the other way round.
-        sigma_px: standard deviation of u and v of a corner [px].
-        repeatability_mm: of the robot: standard deviation of each coordinate of a position [mm].
-        repeatability_deg: of the robot: standard deviation of a turn about each axis [deg].
+        camera: of the sensor camera: its YAML (of pisigma, ROS or OpenCV).
+        board: of the sensor camera: the board that it sees (YAML).
+        is_fixed: the camera is fixed and the board is on the flange, not the other way round.
+        sigma_px: of a camera: standard deviation of u and v of a corner [px].
+        repeatability_mm: of images: standard deviation with which a position repeats, per axis [mm].
+        repeatability_deg: of images: standard deviation with which a direction repeats, per axis [deg].
 
     Raises:
         PlanningError: a number is none that it can be.
     """
 
-    camera: str
-    board: str
-    is_fixed: bool = False
+    camera: Annotated[str, FILE]
+    board: Annotated[str, FILE]
+    is_fixed: Annotated[bool, Option("--fixed-camera")] = False
     sigma_px: float = 0.3
     repeatability_mm: float = 0.02
     repeatability_deg: float = 0.01
@@ -54,13 +52,3 @@ class CameraSettings:
     def files(self) -> CameraFiles:
         """What reads the corners that are measured."""
         return CameraFiles((self.camera,), (self.board,), self.is_fixed, self.repeatability)
-
-    def sight(self) -> BoardSight:
-        """Read the files of camera and board.
-
-        Raises:
-            MeasurementError: a file cannot be used; the message says which and where.
-        """
-        camera, board = Camera.load(self.camera), Board.load(self.board)
-        is_fixed = self.is_fixed or camera.is_fixed
-        return BoardSight(camera, board, is_fixed, self.sigma_px, self.repeatability)

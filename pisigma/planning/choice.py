@@ -2,15 +2,14 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
 
 import torch
 from jaxtyping import Float64, Int64
 from torch import Tensor
 
 from pisigma.files.errors import PlanningError
+from pisigma.planning.plan_settings import Criterion
 
-Criterion = Literal["D", "I"]
 LEAST_VARIANCE = 1e-10
 """Share of the task's variance that directions which are left out may hold together: where a base may stand anywhere
 within a metre, errors of a tenth of a millimetre, which a plan is for, are 1e-8 of it."""

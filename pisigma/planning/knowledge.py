@@ -1,7 +1,6 @@
 """What is known of a robot before the next pose is measured: the normal distribution of all its unknowns."""
 
 from dataclasses import dataclass, replace
-from typing import Literal
 
 import numpy as np
 import torch
@@ -26,12 +25,12 @@ from pisigma.measurement.conditions import JointState
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.planning.board_sight import BoardSight
+from pisigma.planning.plan_settings import SensorKind
 from pisigma.robot.description import Robot
 from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.robot.robot_class import RobotClass
 from pisigma.robot.se3 import rotation_vector, skew
 
-SensorKind = Literal["position", "pose", "distance", "camera"]
 WIDE = (*(1.0,) * 6, *(0.1,) * 3, *(1.0,) * 3)
 """[m, rad, m, rad] Where base and tool may be before anything is measured: so wide that it does not matter."""
 

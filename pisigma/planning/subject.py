@@ -16,6 +16,7 @@ from pisigma.model.folder.model_folder import load_model
 from pisigma.model.model_source import HoldsModel
 from pisigma.planning.board_views import BoardViews
 from pisigma.planning.knowledge import Knowledge
+from pisigma.planning.plan_inputs import instrument_of, read_planned_rows, views_of
 from pisigma.planning.plan_settings import PlanSettings
 from pisigma.planning.surroundings.arm_in_cell import ArmInCell
 from pisigma.planning.surroundings.cell import Cell
@@ -97,7 +98,7 @@ class Subject:
             MeasurementError: the rows that were measured cannot be used.
             PlanningError: the settings do not go together.
         """
-        views = settings.views(arm)
+        views = views_of(settings, arm)
         if views is not None:
             knowledge = self._seen_by_camera(arm, settings, views)
         else:
@@ -106,12 +107,12 @@ class Subject:
             if self.model is not None:
                 T = self._from_cell()
                 anchor = None if anchor is None else T[:3, :3] @ anchor + T[:3, 3]
-                knowledge = Knowledge.of_model(self.model, settings.instrument(anchor))
+                knowledge = Knowledge.of_model(self.model, instrument_of(settings, anchor))
             else:
-                knowledge = Knowledge.of_robot(arm.robot, settings.instrument(anchor))
+                knowledge = Knowledge.of_robot(arm.robot, instrument_of(settings, anchor))
         if settings.measured is None:
             return knowledge
-        rows = settings.read_rows(settings.measured, arm.robot).split_sets()[0]
+        rows = read_planned_rows(settings, settings.measured, arm.robot).split_sets()[0]
         return knowledge.after(rows) if self.model is None else knowledge.informed(rows.q)
 
     def _seen_by_camera(self, arm: ArmInCell, settings: PlanSettings, views: BoardViews) -> Knowledge:
@@ -119,7 +120,7 @@ class Subject:
 
         A model that was calibrated with other ones, or with another sensor, says nothing of where they are.
         """
-        instrument, drawn = settings.instrument(), torch.tensor(arm.drawn.base)
+        instrument, drawn = instrument_of(settings), torch.tensor(arm.drawn.base)
         base = xyzrpy_from_transform(invert(views.T_cell_frame) @ transform_from_xyzrpy(drawn)).numpy()
         tool = arm.robot.tool
         if self.model is None:

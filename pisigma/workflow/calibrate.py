@@ -1,34 +1,31 @@
 """Calibrate a robot from measurements: typed settings in, a typed result out that writes itself as a model folder."""
 
-import math
 import os
 import time
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Literal, get_args
 
 from pisigma.calibration.geometric.calibrator import GeometricCalibrator
 from pisigma.calibration.geometric.problem.parameters import Prior
 from pisigma.calibration.hybrid.calibrator import HybridCalibrator
 from pisigma.calibration.hybrid.result import HybridResult
 from pisigma.estimation.loss import HampelLoss, SquaredLoss
-from pisigma.files.errors import IdentificationError, MeasurementError, nearest_choice
+from pisigma.files.errors import IdentificationError, MeasurementError
 from pisigma.files.model_files import HELD_OUT_CSV
 from pisigma.files.progress import Progress
 from pisigma.joint_correction.registry import features_from_outside
-from pisigma.measurement.camera.corner_file import CameraFiles, MeasurementFiles, read_rows
+from pisigma.measurement.camera.corner_file import MeasurementFiles, read_rows
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.groups import groups_to_keep_whole
 from pisigma.measurement.joint_range import row_warnings, with_limits_of_rows
 from pisigma.measurement.new_frames import with_new_frames
 from pisigma.measurement.sensors.socket import matching_sockets
-from pisigma.measurement.splits import SplitBy, TrainTest, draw_rows, holdout, repeats, with_fewer
+from pisigma.measurement.splits import TrainTest, draw_rows, holdout, repeats, with_fewer
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.geometric_model import model_of_calibration, model_of_hybrid
 from pisigma.reporting.cards import CardTexts, write_calibration_card
 from pisigma.robot.description import Robot
-from pisigma.robot.robot_class import ClassName
 from pisigma.validation.checks.check import CheckedCalibration
 from pisigma.validation.checks.registry import diagnostics_of
 from pisigma.validation.checks.scale import scale_figures
@@ -40,175 +37,15 @@ from pisigma.validation.held_out.held_out_rows import HeldOutRows
 from pisigma.validation.held_out.predicted_spread import predicted_at_other_poses
 from pisigma.validation.held_out.trained_calibrations import Calibrator, Result, geometric_of, trained
 from pisigma.workflow.result import AbstractModelResult
+from pisigma.workflow.settings.calibration import CalibrationSettings, ModelKind
 
 FOLDS = 5
 """Of a cross-validation that is not by placement."""
-
-LARGEST_REPEATS = 1000
 
 ONLY_GEOMETRY = (
     "The geometry alone was calibrated, and nothing was cross-validated: errors that a fault of the setup or of the "
     "file explains are not for a joint correction to learn."
 )
-
-ModelKind = Literal["hybrid", "geometric"]
-
-
-@dataclass(frozen=True)
-class CalibrationSettings:
-    """How a robot is calibrated, and how the calibration is validated.
-
-    Attributes:
-        model: "hybrid": geometry and, where the data are for it, a joint correction; or "geometric".
-        folds: of the cross-validation, 0 for none; None for 5, or one per placement.
-        hold_out: share of the rows that are held out once, instead of folds.
-        split: how rows are split: see `pisigma.measurement.splits.SplitBy`.
-        repeats: of the cross-validation; None for 1 to 10, the more the fewer different joint values there are.
-        jobs: processes that calibrate with all rows and with those of folds side by side, with one thread each; None
-            for threads of this one.
-        seed: of the split, and of drawing training rows.
-        train_rows: number of rows, drawn at random, to calibrate with, in the cross-validation too; None for all.
-        free: "identifiable", "joint_offsets", or names of parameters.
-        prior_length: prior standard deviation of length errors [m]; 0 for no prior.
-        prior_angle: prior standard deviation of angle errors [rad]; 0 for no prior.
-        robot_class: how large errors of the geometry can be: "industrial", "cobot" or "hobby"; None: as the maker and
-            the data say.
-        robust: whether rows that are far off count less.
-        features: of the joint correction, by name, that are tried; None for the usual ones and those of
-            plug-ins.
-        gravity: direction in which things fall, in the frame of the robot's base; None for the axis of the base that
-            the data show.
-        new_frame_at: lines of the file of measurements at which new frames begin, because the instrument was moved.
-        socket_distances: by the names of two sockets their known distance [m]. A * in both names stands for the same
-            text, so that ("*/0", "*/1") means a/0 and a/1, b/0 and b/1 and so on.
-        cameras: what the pixels mean where files of measurements hold corners of boards in images.
-
-    Raises:
-        IdentificationError: the model is no choice, has no use for gravity, or only one of the two prior standard
-            deviations is 0.
-        MeasurementError: the split is no choice, or settings of the validation exclude each other.
-    """
-
-    model: ModelKind = "hybrid"
-    folds: int | None = None
-    hold_out: float | None = None
-    split: SplitBy = "joints"
-    repeats: int | None = None
-    jobs: int | None = None
-    seed: int = 0
-    train_rows: int | None = None
-    free: Literal["identifiable", "joint_offsets"] | tuple[str, ...] = "identifiable"
-    prior_length: float = 1e-3
-    prior_angle: float = 1e-3
-    robot_class: ClassName | None = None
-    robust: bool = True
-    features: tuple[str, ...] | None = None
-    gravity: tuple[float, float, float] | None = None
-    new_frame_at: tuple[int, ...] = ()
-    socket_distances: Mapping[tuple[str, str], float] = field(default_factory=dict)
-    cameras: CameraFiles | None = None
-
-    def __post_init__(self) -> None:
-        """Refuse settings that are no choice or exclude each other."""
-        if self.model not in get_args(ModelKind):
-            choices = nearest_choice(self.model, get_args(ModelKind))
-            raise IdentificationError(f"model '{self.model}' is unknown; {choices}")
-        if self.split not in get_args(SplitBy):
-            choices = nearest_choice(self.split, get_args(SplitBy))
-            raise MeasurementError(f"split '{self.split}' is unknown; {choices}")
-        once = self.hold_out is not None or self.folds == 0
-        if self.repeats is not None and self.repeats > 1 and once:
-            raise MeasurementError(
-                f"repeats {self.repeats}: only folds can be repeated; leave out hold-out, and folds 0."
-            )
-        if self.hold_out is not None and self.folds is not None:
-            raise MeasurementError(
-                f"folds {self.folds} and hold-out {self.hold_out:g} exclude each other; leave one out."
-            )
-        if not 0 <= self.seed < 2**63 or (self.repeats or 0) > LARGEST_REPEATS:
-            raise MeasurementError(
-                f"a seed from 0 to 2^63 - 1 and at most {LARGEST_REPEATS:,} repeats were wanted, got {self.seed} and "
-                f"{self.repeats or 'the usual'}."
-            )
-        if self.jobs is not None and self.jobs < 1:
-            raise MeasurementError(f"jobs: 1 or more were wanted, got {self.jobs}.")
-        for name in ("features", "gravity"):
-            if (value := getattr(self, name)) is not None and self.model != "hybrid":
-                raise IdentificationError(
-                    f"{name} {value}: a geometric calibration has no use for it; leave it out, or take the hybrid."
-                )
-        prior = (self.prior_length, self.prior_angle)
-        if not all(map(math.isfinite, prior)) or min(prior) < 0 or (prior[0] == 0) != (prior[1] == 0):
-            raise IdentificationError(
-                f"the prior's standard deviations were wanted above 0, or both 0 for none, got {prior[0] * 1e3:g} mm "
-                f"and {prior[1] * 1e3:g} mrad."
-            )
-
-    def check_unused(self) -> None:
-        """Refuse what says how to calibrate or to validate: with the prior of a fleet it would not count.
-
-        Raises:
-            IdentificationError: something is stated besides cameras and jobs.
-        """
-        usual = CalibrationSettings(cameras=self.cameras, jobs=self.jobs)
-        stated = [name for name in self.__dataclass_fields__ if getattr(self, name) != getattr(usual, name)]
-        if stated:
-            raise IdentificationError(
-                f"{', '.join(name.replace('_', ' ') for name in stated)}: a calibration that begins with the prior of "
-                "a fleet is a hybrid of all its parameters, and every row is left out in turn; leave this out, or "
-                "the prior."
-            )
-
-    def calibrator(self, robot: Robot, sockets: Iterable[str] = ()) -> Calibrator:
-        """Give the calibrator of a robot.
-
-        Args:
-            robot: as drawn.
-            sockets: names of the sockets in the data, for `socket_distances`.
-
-        Raises:
-            IdentificationError: a setting does not fit the robot, or the data have no such sockets.
-        """
-        length, angle = self.prior_length, self.prior_angle
-        geometric = GeometricCalibrator(
-            robot,
-            free=self.free,
-            prior=Prior(theta=angle, d=length, a=length, alpha=angle, beta=angle) if length else None,
-            loss=HampelLoss() if self.robust else SquaredLoss(),
-            robot_class=self.robot_class,
-            socket_distances=matching_sockets(self.socket_distances, sockets),
-        )
-        if self.model != "hybrid":
-            return geometric
-        features = (*features_from_outside(), *HybridCalibrator.features)
-        return HybridCalibrator(
-            geometric, features=features if self.features is None else self.features, gravity=self.gravity
-        )
-
-    def splits(self, measurements: Measurements) -> Sequence[Sequence[TrainTest]]:
-        """Give training and test rows of every fold, per repeat; nothing without a validation.
-
-        Raises:
-            MeasurementError: the measurements cannot be split like that.
-        """
-        if self.hold_out is not None:
-            splits: Sequence[Sequence[TrainTest]] = [
-                [holdout(measurements, self.hold_out, self.seed, self.split)]
-            ]
-        elif self.folds == 0:
-            return []
-        else:
-            folds = FOLDS if self.folds is None and self.split != "placement" else self.folds
-            if folds is not self.folds and len(set(groups_to_keep_whole(measurements).tolist())) < FOLDS:
-                raise MeasurementError(
-                    f"{measurements.source}: {FOLDS} different poses or more were wanted, so that each can be left out "
-                    "once to judge the others; measure more, about 50 for a good calibration, or leave that out "
-                    "(--folds 0)."
-                )
-            splits = repeats(measurements, folds, self.seed, self.split, self.repeats)
-        if self.train_rows is None:
-            return splits
-        return [with_fewer(measurements, folds, self.train_rows, self.seed) for folds in splits]
 
 
 @dataclass(frozen=True, eq=False)
@@ -281,11 +118,11 @@ def calibrate(
     measurements = with_new_frames(measurements, settings.new_frame_at)
     beyond, nominal = row_warnings(nominal, measurements), with_limits_of_rows(nominal, measurements)
     training, test_rows = measurements.split_sets()
-    splits = settings.splits(training)
+    splits = splits_of(settings, training)
     rows = training
     if settings.train_rows is not None:
         rows = training.select(draw_rows(training, settings.train_rows, settings.seed))
-    calibrator = settings.calibrator(nominal, training.socket or ())
+    calibrator = calibrator_of(settings, nominal, training.socket or ())
     faulty = any(one.severity == "implausible" for one in setup_diagnostics(nominal, rows))
     if faulty:
         calibrator, splits = geometric_of(calibrator), []
@@ -388,3 +225,59 @@ def _description(model: ModelKind, nominal: Robot) -> str:
         f"Hybrid calibration of robot {nominal.name} ({nominal.maker}): DH and Hayati parameters, base and tool, and "
         "with them, where the data are for it, a Pi-Sigma network that corrects the joint values."
     )
+
+
+def calibrator_of(settings: CalibrationSettings, robot: Robot, sockets: Iterable[str] = ()) -> Calibrator:
+    """Give the calibrator of a robot.
+
+    Args:
+        settings: see `CalibrationSettings`.
+        robot: as drawn.
+        sockets: names of the sockets in the data, for `socket_distances`.
+
+    Raises:
+        IdentificationError: a setting does not fit the robot, or the data have no such sockets.
+    """
+    length, angle = settings.prior_length, settings.prior_angle
+    geometric = GeometricCalibrator(
+        robot,
+        free=settings.free,
+        prior=Prior(theta=angle, d=length, a=length, alpha=angle, beta=angle) if length else None,
+        loss=HampelLoss() if settings.robust else SquaredLoss(),
+        robot_class=settings.robot_class,
+        socket_distances=matching_sockets(settings.socket_distances, sockets),
+    )
+    if settings.model != "hybrid":
+        return geometric
+    features = (*features_from_outside(), *HybridCalibrator.features)
+    return HybridCalibrator(
+        geometric,
+        features=features if settings.features is None else settings.features,
+        gravity=settings.gravity,
+    )
+
+
+def splits_of(settings: CalibrationSettings, measurements: Measurements) -> Sequence[Sequence[TrainTest]]:
+    """Give training and test rows of every fold, per repeat; nothing without a validation.
+
+    Raises:
+        MeasurementError: the measurements cannot be split like that.
+    """
+    if settings.hold_out is not None:
+        splits: Sequence[Sequence[TrainTest]] = [
+            [holdout(measurements, settings.hold_out, settings.seed, settings.split)]
+        ]
+    elif settings.folds == 0:
+        return []
+    else:
+        folds = FOLDS if settings.folds is None and settings.split != "placement" else settings.folds
+        if folds is not settings.folds and len(set(groups_to_keep_whole(measurements).tolist())) < FOLDS:
+            raise MeasurementError(
+                f"{measurements.source}: {FOLDS} different poses or more were wanted, so that each can be left out "
+                "once to judge the others; measure more, about 50 for a good calibration, or leave that out "
+                "(--folds 0)."
+            )
+        splits = repeats(measurements, folds, settings.seed, settings.split, settings.repeats)
+    if settings.train_rows is None:
+        return splits
+    return [with_fewer(measurements, folds, settings.train_rows, settings.seed) for folds in splits]

@@ -3,22 +3,20 @@
 import os
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
-from pisigma.files.errors import IdentificationError, nearest_choice
 from pisigma.files.model_files import model_hash
 from pisigma.files.output_file import check_page, write_whole
 from pisigma.lifetime.comparison.displacement import Displacement
-from pisigma.lifetime.comparison.model_pair import FrameChoice, ModelPair
+from pisigma.lifetime.comparison.model_pair import ModelPair
 from pisigma.lifetime.comparison.parameter_differences import (
-    LEVEL,
     ParameterDifference,
     ParameterDifferences,
     parameter_differences,
 )
-from pisigma.measurement.camera.corner_file import CameraFiles, MeasurementFiles, read_rows
+from pisigma.measurement.camera.corner_file import MeasurementFiles, read_rows
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.joint_range import row_warnings
 from pisigma.model.calibrated_model import CalibratedModel
@@ -27,7 +25,6 @@ from pisigma.model.training_rows import training_row_warnings
 from pisigma.planning.task import read_task
 from pisigma.validation.checks.rows.wrong_rows import without_wrong_rows
 from pisigma.validation.gate import check_rows
-from pisigma.validation.held_out.bootstrap import Bootstrap
 from pisigma.validation.held_out.diagnostic import Diagnostic
 from pisigma.validation.held_out.frames.fitted_frames import fitted_kinds
 from pisigma.validation.held_out.model_comparison import Difference, ModelComparison, compare_models
@@ -38,39 +35,7 @@ from pisigma.workflow.evaluate import (
     test_rows,
     with_references,
 )
-
-
-@dataclass(frozen=True)
-class ComparisonSettings:
-    """How two models are compared.
-
-    Attributes:
-        frames: "fitted" where base or tool may stand elsewhere for the second model: they are fitted so that the arms
-            agree best, and compared apart. "fixed" where both models were measured in the same frame with the same
-            tool.
-        level: probability that any parameter at all is called different by chance.
-        bootstrap: how confidence intervals of errors on rows are computed.
-        cameras: what the pixels mean where the rows are corners of boards in images.
-
-    Raises:
-        IdentificationError: the level is no probability, or the frames are treated otherwise.
-    """
-
-    frames: FrameChoice = "fitted"
-    level: float = LEVEL
-    bootstrap: Bootstrap = field(default_factory=Bootstrap)
-    cameras: CameraFiles | None = None
-
-    def __post_init__(self) -> None:
-        """Refuse what is no choice, and a level that no test has."""
-        if self.frames not in get_args(FrameChoice):
-            raise IdentificationError(
-                f"frames: '{self.frames}' is no choice; {nearest_choice(self.frames, get_args(FrameChoice))}"
-            )
-        if not 0.0 < self.level < 1.0:
-            raise IdentificationError(
-                f"level: a probability between 0 and 1 was wanted, got {self.level:g}; 0.01 is usual."
-            )
+from pisigma.workflow.settings.comparison import ComparisonSettings
 
 
 @dataclass(frozen=True, eq=False)

@@ -41,11 +41,11 @@ from pisigma.validation.held_out.distillation_summary import (
 )
 from pisigma.validation.held_out.pose_statistics import PoseErrors
 from pisigma.validation.held_out.validation_figures import ErrorFigures
-from pisigma.workflow.distilled_network import Size, choose_network, sizes_for
+from pisigma.workflow.distilled_network import choose_network, sizes_for
 from pisigma.workflow.result import AbstractModelResult
+from pisigma.workflow.settings.distillation import DistillationSettings
 from pisigma.workflow.solved_poses import SINGULAR_BELOW, Region, SolvedPoses, draw_solved_poses
 
-POSES = 5_000
 CHOICE_SHARE, HELD_OUT_SHARE = 0.2, 0.4
 """Poses that sizes are chosen by, and poses that the chosen one is judged by, beside one that is fitted to."""
 
@@ -58,25 +58,6 @@ FEWEST = 100
 
 _FEW_ROWS = 20
 """Rows per joint from which a region is taken as filled."""
-
-
-@dataclass(frozen=True)
-class DistillationSettings:
-    """How a model is distilled.
-
-    Attributes:
-        region: where poses are drawn; None for around the joint values that the model was measured at.
-        poses: number of poses to fit to; others are drawn besides for choosing and judging.
-        size: the only one to fit; None tries those of `sizes_for`.
-        seed: of poses and starts.
-        epochs: largest number of iterations for a joint.
-    """
-
-    region: Region | None = None
-    poses: int = POSES
-    size: Size | None = None
-    seed: int = 0
-    epochs: int = 80
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,16 +1,15 @@
 """Evaluate models on measurements that they were not trained on, and accept them or not."""
 
-import math
 import os
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import torch
 
 from pisigma.files.errors import MeasurementError, ModelError
-from pisigma.measurement.camera.corner_file import CameraFiles, MeasurementFiles, read_rows
+from pisigma.measurement.camera.corner_file import MeasurementFiles, read_rows
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.joint_range import row_warnings
 from pisigma.measurement.sensors.socket import matching_sockets
@@ -19,110 +18,21 @@ from pisigma.model.folder.model_folder import load_model
 from pisigma.model.model_source import HoldsModel, ModelSource, model_or_folder
 from pisigma.model.stated_conditions import condition_warnings
 from pisigma.model.training_rows import training_row_warnings
-from pisigma.reporting.tables import figure_text
 from pisigma.validation.checks.rows.other_sensors import missed_distances
 from pisigma.validation.checks.rows.wrong_rows import without_wrong_rows
 from pisigma.validation.gate import check_rows
-from pisigma.validation.held_out.bootstrap import Bootstrap
 from pisigma.validation.held_out.diagnostic import Diagnostic
-from pisigma.validation.held_out.frames.fitted_frames import FrameKind, fitted_kinds, fitted_remark
+from pisigma.validation.held_out.frames.fitted_frames import FrameKind, fitted_remark
 from pisigma.validation.held_out.frames.row_errors import places_remark
 from pisigma.validation.held_out.model_comparison import ModelComparison, ModelFigures, compare_models
 from pisigma.validation.held_out.predicted_spread import image_remark
 from pisigma.validation.held_out.reference_models import geometric_model, nominal_model
 from pisigma.validation.setup_faults.setup_faults import is_implausible, unexplained
+from pisigma.workflow.settings.evaluation import EvaluationSettings
 
 REFERENCES = ("nominal", "geometric")
 """Names of what a model is compared with: the robot as drawn, and the geometry under a hybrid. Neither has to meet
 limits."""
-
-_LIMITED = {
-    "mean_mm": ("max-mean-mm", "mean position error"),
-    "p95_mm": ("max-p95-mm", "95 % quantile of the position error"),
-    "max_mm": ("max-mm", "largest position error"),
-    "mean_deg": ("max-mean-deg", "mean orientation error"),
-}
-
-
-@dataclass(frozen=True)
-class Limits:
-    """Largest errors that are accepted; None where there is no limit.
-
-    Attributes:
-        mean_mm: of the mean position error.
-        p95_mm: of the position error that 95 % of the rows stay below.
-        max_mm: of the largest position error.
-        mean_deg: of the mean orientation error.
-    """
-
-    mean_mm: float | None = None
-    p95_mm: float | None = None
-    max_mm: float | None = None
-    mean_deg: float | None = None
-
-    def __post_init__(self) -> None:
-        """Refuse limits that no figure could be held against."""
-        for name, limit in self.stated.items():
-            if not (limit > 0 and math.isfinite(limit)):
-                raise MeasurementError(f"--{_LIMITED[name][0]} {limit:g}: a limit above 0 was wanted.")
-
-    @property
-    def stated(self) -> dict[str, float]:
-        """The limits that there are, by name."""
-        return {name: limit for name, limit in asdict(self).items() if limit is not None}
-
-    def missed_by(self, model: ModelFigures) -> list[str]:
-        """Say which limits a model misses, in sentences without their ends; nothing where it meets all.
-
-        A model that predicts nothing for a row meets no limit.
-
-        Raises:
-            MeasurementError: there is a limit on the orientation, but none was measured.
-        """
-        sentences = []
-        for key, limit in self.stated.items():
-            option, what = _LIMITED[key]
-            statistic, unit = key.split("_")
-            errors = model.position if unit == "mm" else model.orientation
-            if errors is None:
-                raise MeasurementError(
-                    f"--{option} {limit:g}: no orientations were measured; leave the limit out or give poses."
-                )
-            value = errors.statistics[statistic]
-            if not value <= limit:
-                text = figure_text(value) if figure_text(value) != figure_text(limit) else value
-                sentences.append(
-                    f"the {what} of {model.name} is {text} {unit}, --{option} allows {limit:g} {unit}"
-                )
-        if self.stated and model.rows_not_predicted:
-            sentences.append(f"{model.name} predicts nothing for {model.rows_not_predicted} of the rows")
-        return sentences
-
-
-@dataclass(frozen=True)
-class EvaluationSettings:
-    """How models are evaluated.
-
-    Attributes:
-        limits: that every model, but no reference, has to meet.
-        fit_frame: fit the frames of the rows to them, as after the sensor was moved.
-        fit_tool: fit the targets of the rows to them, as after another reflector was mounted.
-        bootstrap: how confidence intervals are computed.
-        cameras: what the pixels mean where files of measurements hold corners of boards in images.
-        socket_distances: stated distances of sockets [m], see `pisigma.workflow.calibrate.CalibrationSettings`.
-    """
-
-    limits: Limits = field(default_factory=Limits)
-    fit_frame: bool = False
-    fit_tool: bool = False
-    bootstrap: Bootstrap = field(default_factory=Bootstrap)
-    cameras: CameraFiles | None = None
-    socket_distances: Mapping[tuple[str, str], float] = field(default_factory=dict)
-
-    @property
-    def fitted(self) -> tuple[FrameKind, ...]:
-        """What is fitted to the rows."""
-        return fitted_kinds(self.fit_frame, self.fit_tool)
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,7 @@
 """Import what instruments and controllers export as measurements."""
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,38 +13,13 @@ from pisigma.measurement.foreign.accounting import FileAccount, LeftOutRow, Plac
 from pisigma.measurement.foreign.conversion import ConvertedRows, convert
 from pisigma.measurement.foreign.doubts import doubts
 from pisigma.measurement.foreign.export_file import read_export
-from pisigma.measurement.foreign.joining import WITHIN, JoinBy, JoinedRows, append_rows, join_rows
+from pisigma.measurement.foreign.joining import JoinedRows, append_rows, join_rows
 from pisigma.measurement.foreign.mapping import FileMapping, map_columns
 from pisigma.measurement.foreign.measurement_table import MeasurementTable, measurement_table
-from pisigma.measurement.foreign.number_format import Decimal
 from pisigma.measurement.foreign.quantities import LEFT_OUT
 from pisigma.measurement.foreign.saved_map import check_used, map_for, save_map
 from pisigma.measurement.foreign.units import parse_units
-
-
-@dataclass(frozen=True)
-class ImportSettings:
-    """How exports are read.
-
-    Attributes:
-        maps: by headings of columns, or their numbers from "1" on, what they are: a column of measurement files
-            ("q1_deg"), such a quantity in another unit ("x_in") or in that which the file states ("x"), a value of a
-            rotation ("ur_rx_rad"), "point", "time", or "-" for a column that is not wanted. Of several the one that
-            fits a file counts.
-        units: such as "mm,deg", of the columns for which the file states none.
-        rotation: encoding of the rotations by its maker (`ROTATIONS`), "none" to leave them out, or None to tell it by
-            the headings.
-        decimal: sign before decimals; None to tell it by the cells.
-        join: how rows with and without joint values are put together; None to put the files behind each other.
-        within: largest difference of time stamps [s] that are joined.
-    """
-
-    maps: Sequence[Mapping[str, str]] = ()
-    units: str = ""
-    rotation: str | None = None
-    decimal: Decimal | None = None
-    join: JoinBy | None = None
-    within: float = WITHIN
+from pisigma.workflow.settings.importing import ImportSettings
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,11 +1,10 @@
 """Measure with a plan: rows in as they come; what is wrong with them, the next pose, and when to stop out."""
 
 import contextlib
-import math
 import os
 import threading
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import count as counting_from
 from pathlib import Path
 
@@ -15,12 +14,12 @@ from jaxtyping import Bool, Int64
 from torch import Tensor
 
 from pisigma.deployment.export.programs.planned import planned_program
-from pisigma.files.errors import PlanningError
 from pisigma.files.output_file import write_whole
 from pisigma.files.progress import Progress
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.fields import LeftOut
 from pisigma.planning.plan_file import StoredPlan, read_plan
+from pisigma.planning.plan_inputs import find_candidates, with_measured
 from pisigma.planning.session.coverage import coverage
 from pisigma.planning.session.judged_rows import JudgedRows
 from pisigma.planning.session.planned_again import FurtherPoses
@@ -32,6 +31,7 @@ from pisigma.planning.session.stopping import advice
 from pisigma.planning.subject import Subject
 from pisigma.planning.task import task_poses
 from pisigma.robot.se3 import transform_from_xyzrpy
+from pisigma.workflow.settings.measuring import MeasureSettings
 
 STEP = 5
 """Poses between two points of the curve."""
@@ -39,37 +39,6 @@ STEP = 5
 
 class OutdatedError(Exception):
     """Rows came that a calculation does not know."""
-
-
-@dataclass(frozen=True)
-class MeasureSettings:
-    """When a session stops, and how often it is judged.
-
-    Attributes:
-        limit_mm: 95 % of the tool's position errors over the task are to stay below [mm]; None for no limit.
-        least_gain_mm: the session ends where the next 10 poses would lower that by less [mm].
-        every: the accuracy is worked out, and the rest planned again, after so many rows.
-        replan: whether what is left is planned again.
-
-    Raises:
-        PlanningError: a setting is no number that it can be.
-    """
-
-    limit_mm: float | None = None
-    least_gain_mm: float = 0.005
-    every: int = 3
-    replan: bool = True
-
-    def __post_init__(self) -> None:
-        """Refuse settings that are none."""
-        if self.limit_mm is not None and not 0 < self.limit_mm < math.inf:
-            raise PlanningError(f"limit: a length above 0 was wanted, got {self.limit_mm:g} mm.")
-        if not 0 <= self.least_gain_mm < math.inf:
-            raise PlanningError(
-                f"least gain: a length of 0 or more was wanted, got {self.least_gain_mm:g} mm."
-            )
-        if self.every < 1:
-            raise PlanningError(f"every: 1 row or more was wanted, got {self.every}.")
 
 
 class MeasuringSession:
@@ -91,11 +60,11 @@ class MeasuringSession:
             plan: the poses, and what they were planned with.
             settings: see `MeasureSettings`.
         """
-        plan = replace(plan, arm=plan.settings.with_measured(plan.arm))
+        plan = replace(plan, arm=with_measured(plan.settings, plan.arm))
         self.plan, self.replanned = plan, False
         self._lock = threading.RLock()
         self._settings = settings
-        candidates = plan.settings.find_candidates(plan.arm)
+        candidates = find_candidates(plan.settings, plan.arm)
         subject = Subject(plan.arm.drawn) if plan.model is None else Subject.of(plan.model)
         self._against = subject.model or plan.arm.robot
         self._task = task_poses(plan.arm, plan.settings, candidates.workspace, subject.model)

@@ -10,7 +10,7 @@ from typing import Any
 
 import torch
 
-from pisigma.files.errors import IdentificationError, MeasurementError, ModelError
+from pisigma.files.errors import MeasurementError, ModelError
 from pisigma.files.model_files import model_hash
 from pisigma.files.output_file import check_page, write_whole
 from pisigma.files.progress import Progress
@@ -29,7 +29,8 @@ from pisigma.lifetime.monitoring.trends import (
 )
 from pisigma.lifetime.recalibration.motion import session_diagnostics
 from pisigma.lifetime.recalibration.recalibration_problem import owners_in
-from pisigma.measurement.camera.corner_file import CameraFiles, read_rows
+from pisigma.measurement.camera.camera_files import CameraFiles
+from pisigma.measurement.camera.corner_file import read_rows
 from pisigma.measurement.copies import RowValues
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.dates import WANTED, date_in_name, is_date
@@ -41,45 +42,12 @@ from pisigma.model.model_source import HoldsModel, ModelSource, model_or_folder
 from pisigma.model.stated_conditions import condition_warnings
 from pisigma.validation.gate import check_rows
 from pisigma.validation.held_out.diagnostic import Diagnostic
-from pisigma.workflow.recalibrate import RecalibrationSettings
+from pisigma.workflow.recalibrate import may_move, right_rows
+from pisigma.workflow.settings.monitoring import MonitorSettings
+from pisigma.workflow.settings.recalibration import RecalibrationSettings
 
 FEWEST_ROWS = 5
 """Rows of a session below which it says little."""
-
-
-@dataclass(frozen=True)
-class MonitorSettings:
-    """How sessions are judged.
-
-    Attributes:
-        dates: of the files, one each, as ISO 8601 writes them; () to take them from the column `date`, else from the
-            name of the file, else from its time of change.
-        moved: which of "base" and "tool" stand elsewhere than when the model was made; None to find it by evidence.
-        limit_mm: RMS error that is forecast; None for no forecast.
-        history: whether the sessions are kept beside the model folder, and those kept before count.
-        cameras: what the pixels mean where files hold corners of boards in images.
-
-    Raises:
-        IdentificationError: something else is named in `moved`, or the limit is no length.
-        MeasurementError: a date is none.
-    """
-
-    dates: tuple[str, ...] = ()
-    moved: tuple[str, ...] | None = None
-    limit_mm: float | None = None
-    history: bool = True
-    cameras: CameraFiles | None = None
-
-    def __post_init__(self) -> None:
-        """Refuse what makes no sense."""
-        RecalibrationSettings(self.moved)
-        for date in self.dates:
-            if not is_date(date):
-                raise MeasurementError(f"dates: expected {WANTED}, got '{date}'; correct it.")
-        if self.limit_mm is not None and not self.limit_mm > 0:
-            raise IdentificationError(
-                f"limit_mm: a length above 0 was wanted, got {self.limit_mm:g}; give the RMS error to stay below."
-            )
 
 
 @dataclass(frozen=True)
@@ -260,7 +228,7 @@ def monitor(
     for date, day in _by_day(rows, settings.dates):
         progress(f"{Path(day.source).name}, {date}")
         warnings += row_warnings(loaded.robot, day)
-        right = RecalibrationSettings(settings.moved).right_rows(loaded, posterior.renamed(day))
+        right = right_rows(RecalibrationSettings(settings.moved), loaded, posterior.renamed(day))
         warnings += right.warnings
         day, again = new_rows(loaded, right.rows, date, earlier, judged)
         warnings += again
@@ -346,7 +314,7 @@ def _record(
     """Judge a session."""
     stated = RecalibrationSettings(settings.moved)
     file = Path(rows.source).name
-    if implausible := check_rows(rows, model, stated.fitted, stated.may_move).implausible:
+    if implausible := check_rows(rows, model, stated.fitted, may_move(stated)).implausible:
         return UntrustedSession(file, date, implausible)
     elsewhere = None if settings.moved is None else owners_in(rows, settings.moved)
     session, zeros = judge_session(model, posterior, rows, elsewhere)

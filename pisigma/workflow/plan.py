@@ -29,6 +29,7 @@ from pisigma.planning.choice import choose
 from pisigma.planning.expected_accuracy import ExpectedAccuracy, RemainingError, curve, remaining_errors
 from pisigma.planning.knowledge import Knowledge
 from pisigma.planning.plan_file import StoredPlan, yaml_of
+from pisigma.planning.plan_inputs import find_candidates, read_planned_rows, views_of, with_measured
 from pisigma.planning.plan_settings import PlanSettings
 from pisigma.planning.subject import Subject
 from pisigma.planning.surroundings.arm_in_cell import ArmInCell
@@ -189,9 +190,9 @@ def plan(
     subject = subject if isinstance(subject, Subject) else Subject.of(subject)
     if cell is not None and not isinstance(cell, Cell):
         cell = read_cell(cell, subject.robot)
-    arm = settings.with_measured(subject.arm(cell))
+    arm = with_measured(settings, subject.arm(cell))
     progress("candidates")
-    candidates = settings.find_candidates(arm)
+    candidates = find_candidates(settings, arm)
     candidates.check_count(settings.count + settings.check)
     progress("what is known")
     repeated = _check_measured(subject.model, settings, arm.robot)
@@ -237,7 +238,7 @@ class _Problem:
     @cached_property
     def views(self) -> BoardViews | None:
         """From where the camera has to see its board; None without a camera."""
-        return self.settings.views(self.arm)
+        return views_of(self.settings, self.arm)
 
     @cached_property
     def measured(self) -> Float64[Tensor, "candidates values directions"]:
@@ -355,7 +356,7 @@ def _check_measured(model: CalibratedModel | None, settings: PlanSettings, robot
     """
     if settings.measured is None:
         return ()
-    rows = settings.read_rows(settings.measured, robot).split_sets()[0]
+    rows = read_planned_rows(settings, settings.measured, robot).split_sets()[0]
     against = robot if model is None else model
     if implausible := check_rows(rows, against, may_move=MOVES).implausible:
         raise MeasurementError(f"{settings.measured}: {implausible[0].sentence}")

@@ -2,7 +2,6 @@
 
 import datetime
 import math
-import shlex
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -14,7 +13,7 @@ import torch
 
 from pisigma.calibration.hybrid.calibrator import HybridCalibrator
 from pisigma.calibration.hybrid.result import HybridResult
-from pisigma.files.errors import IdentificationError, ModelError, nearest_choice
+from pisigma.files.errors import IdentificationError, ModelError
 from pisigma.files.model_files import model_hash
 from pisigma.files.progress import Progress, stage
 from pisigma.lifetime.recalibration.adaptation import Adaptation, adapt
@@ -30,7 +29,7 @@ from pisigma.lifetime.recalibration.summary import (
     RecalibrationSummary,
     WrongRowFigures,
 )
-from pisigma.measurement.camera.corner_file import CameraFiles, MeasurementFiles, read_rows
+from pisigma.measurement.camera.corner_file import MeasurementFiles, read_rows
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.joint_range import row_warnings
 from pisigma.model.calibrated_model import CalibratedModel
@@ -49,10 +48,11 @@ from pisigma.validation.gate import check_rows
 from pisigma.validation.held_out.calibration_validation import errors_under
 from pisigma.validation.held_out.distillation_summary import ParentFigures
 from pisigma.validation.held_out.few_rows import fit_where_it_helps
-from pisigma.validation.held_out.frames.fitted_frames import FrameKind, fitted_kinds
+from pisigma.validation.held_out.frames.fitted_frames import fitted_kinds
 from pisigma.validation.held_out.trained_calibrations import fit
 from pisigma.validation.setup_faults.explanations import PLAUSIBLE_SHARE
 from pisigma.workflow.result import AbstractModelResult
+from pisigma.workflow.settings.recalibration import RecalibrationSettings
 
 if TYPE_CHECKING:
     from pisigma.lifetime.fleet.likeness import Likeness
@@ -61,53 +61,6 @@ FEW_ROWS = 5
 """Different poses below which nothing can be said of left-out rows."""
 UNBELIEVABLE = "What has moved cannot be said: the recalibrated model does not predict left-out rows."
 NOT_TRUSTED = "What has moved cannot be said: these rows must not be trusted."
-
-
-@dataclass(frozen=True)
-class RecalibrationSettings:
-    """How a model is recalibrated.
-
-    Attributes:
-        moved: which of "base" and "tool" stand elsewhere than when the model was made; None to find it by evidence.
-        cameras: what the pixels mean where files of rows hold corners of boards in images.
-
-    Raises:
-        IdentificationError: something else is named.
-    """
-
-    moved: tuple[str, ...] | None = None
-    cameras: CameraFiles | None = None
-
-    def command(self, model: str, data: str) -> str:
-        """The line that recalibrates a model with a file in this way."""
-        stated = [] if self.moved is None else ["--moved", ",".join(self.moved)]
-        stated += self.cameras.options if self.cameras else []
-        return shlex.join(["pisigma", "recalibrate", model, data, *stated, "--out", "DIR"])
-
-    @property
-    def fitted(self) -> tuple[FrameKind, ...]:
-        """What is stated to stand elsewhere."""
-        return fitted_kinds("base" in (self.moved or ()), "tool" in (self.moved or ()))
-
-    @property
-    def may_move(self) -> frozenset[Move]:
-        """What may have moved without being stated: a joint, and base and tool where nothing is stated of them."""
-        return MOVES if self.moved is None else frozenset({"joint_zero"})
-
-    def right_rows(self, model: CalibratedModel, rows: Measurements) -> WithoutWrongRows:
-        """The rows without single ones that are wrong, wherever base and tool may stand by now."""
-        right = without_wrong_rows([model], rows, self.fitted)
-        if right.warnings or self.moved is not None:
-            return right
-        return without_wrong_rows([model], rows, fitted_kinds(fit_frame=True, fit_tool=True))
-
-    def __post_init__(self) -> None:
-        """Refuse what cannot stand elsewhere."""
-        for name in self.moved or ():
-            if name not in ("base", "tool"):
-                raise IdentificationError(
-                    f"moved: '{name}' is no choice; {nearest_choice(name, ('base', 'tool'))}"
-                )
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,8 +133,8 @@ def recalibrate(
     measurements = read_rows(data, drawn, settings.cameras)
     rows, again = without_known_rows(parent, posterior.renamed(measurements.split_sets()[0]))
     progress("checking the rows")
-    right = WithoutWrongRows(rows) if parent.kind == FLEET_PRIOR else settings.right_rows(parent, rows)
-    verdict = check_rows(right.rows, parent, settings.fitted, settings.may_move)
+    right = WithoutWrongRows(rows) if parent.kind == FLEET_PRIOR else right_rows(settings, parent, rows)
+    verdict = check_rows(right.rows, parent, settings.fitted, may_move(settings))
     progress("what has moved")
     elsewhere = _elsewhere(parent, posterior, rows, settings)
     every = rows
@@ -356,3 +309,18 @@ def _warnings(model: CalibratedModel, judged: Gate, rows: Measurements) -> tuple
             f"candidates; measure {2 * FEW_ROWS} poses or more."
         )
     return tuple(warnings)
+
+
+def may_move(settings: RecalibrationSettings) -> frozenset[Move]:
+    """What may have moved without being stated: a joint, and base and tool where nothing is stated of them."""
+    return MOVES if settings.moved is None else frozenset({"joint_zero"})
+
+
+def right_rows(
+    settings: RecalibrationSettings, model: CalibratedModel, rows: Measurements
+) -> WithoutWrongRows:
+    """The rows without single ones that are wrong, wherever base and tool may stand by now."""
+    right = without_wrong_rows([model], rows, settings.fitted)
+    if right.warnings or settings.moved is not None:
+        return right
+    return without_wrong_rows([model], rows, fitted_kinds(fit_frame=True, fit_tool=True))

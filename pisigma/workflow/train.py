@@ -26,7 +26,8 @@ from pisigma.workflow.recipes.data import RecipeData, load_data
 from pisigma.workflow.recipes.reader import read_recipe, recipe_hash
 from pisigma.workflow.recipes.recipe import GeometricRecipe, HybridRecipe, InverseRecipe, Recipe
 from pisigma.workflow.result import AbstractModelResult
-from pisigma.workflow.train_networks import DEFAULTS, TrainSettings, cross_validate, train_networks
+from pisigma.workflow.settings.training import TrainSettings
+from pisigma.workflow.train_networks import cross_validate, train_networks
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,7 +75,7 @@ Training = InverseTraining | Calibration
 def train(
     recipe: Recipe | str | os.PathLike[str],
     data: Measurements | str | os.PathLike[str] | None = None,
-    settings: TrainSettings = DEFAULTS,
+    settings: TrainSettings = TrainSettings(),
     progress: Progress = lambda what: None,
 ) -> Training:
     """Train the model of a recipe, and judge it on rows that it did not see.

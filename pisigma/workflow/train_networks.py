@@ -1,7 +1,7 @@
 """Train and cross-validate the networks of a recipe of inverse calibration."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -24,45 +24,13 @@ from pisigma.validation.held_out.side_by_side import in_processes
 from pisigma.validation.held_out.training_summary import ComparisonFigures, JointErrors, TrainingRun
 from pisigma.workflow.recipes.data import RecipeData
 from pisigma.workflow.recipes.recipe import InverseRecipe, SimulatedData
-
-
-@dataclass(frozen=True)
-class TrainSettings:
-    """How a training is run, apart from what it computes.
-
-    Attributes:
-        checkpoints: folder for checkpoints of networks, and of a hybrid on mini-batches; None keeps none. It is not
-            removed when the training is done.
-        resume: go on from the checkpoint there.
-        show_progress: draw the bar of networks on stderr, if that is a terminal.
-        logs: folder for Lightning's logs of networks: `metrics.csv`, and TensorBoard's events where it is installed.
-        jobs: processes that judge folds and simulations side by side, with one thread each; None for threads of this
-            one.
-
-    Raises:
-        RecipeError: there are no jobs.
-    """
-
-    checkpoints: Path | None = None
-    resume: bool = False
-    show_progress: bool = False
-    logs: Path | None = None
-    jobs: int | None = None
-
-    def __post_init__(self) -> None:
-        """Refuse to work nowhere."""
-        if self.jobs is not None and self.jobs < 1:
-            raise RecipeError(f"jobs: 1 or more were wanted, got {self.jobs}.")
-
-
-DEFAULTS = TrainSettings()
-"""No checkpoints, no bar, no logs, no other processes."""
+from pisigma.workflow.settings.training import TrainSettings
 
 
 def train_networks(
     recipe: InverseRecipe,
     data: RecipeData,
-    settings: TrainSettings = DEFAULTS,
+    settings: TrainSettings = TrainSettings(),
     recipe_sha256: str = "",
 ) -> TrainingRun:
     """Train the networks of a recipe, without judging them.

@@ -2,15 +2,16 @@
 
 import os
 import time
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 
 from pisigma.lifetime.monitoring.session import Session
 from pisigma.lifetime.recalibration.motion import judged_motion, motion_sentence, motion_warnings
-from pisigma.measurement.camera.corner_file import CameraFiles, MeasurementFiles, read_rows
+from pisigma.measurement.camera.camera_files import CameraFiles
+from pisigma.measurement.camera.corner_file import MeasurementFiles, read_rows
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.joint_range import row_warnings
 from pisigma.measurement.sensors.socket import matching_sockets
@@ -23,18 +24,19 @@ from pisigma.robot.row import Row
 from pisigma.validation.checks.rows.other_sensors import missed_distances
 from pisigma.validation.checks.rows.wrong_rows import without_wrong_rows
 from pisigma.validation.gate import check_rows
-from pisigma.validation.held_out.bootstrap import Bootstrap
 from pisigma.validation.held_out.diagnostic import Diagnostic
-from pisigma.validation.held_out.frames.fitted_frames import FrameKind, fitted_kinds, fitted_remark
+from pisigma.validation.held_out.frames.fitted_frames import FrameKind, fitted_remark
 from pisigma.validation.held_out.frames.row_errors import places_remark
 from pisigma.validation.held_out.model_comparison import Difference, ModelComparison, compare_models
 from pisigma.validation.held_out.predicted_spread import image_remark
 from pisigma.validation.held_out.reference_models import geometric_model, nominal_model
+from pisigma.validation.resampling import Bootstrap
 from pisigma.validation.setup_faults.cause import length_text
 from pisigma.validation.setup_faults.setup_fault import SetupFault
 from pisigma.validation.setup_faults.setup_faults import is_implausible, unexplained
 from pisigma.workflow.evaluate import test_rows
-from pisigma.workflow.recalibrate import RecalibrationSettings
+from pisigma.workflow.settings.recalibration import RecalibrationSettings
+from pisigma.workflow.settings.verification import VerificationSettings
 
 FEWEST_CONFIGURATIONS = 6
 """With fewer different joint values nothing is concluded."""
@@ -60,30 +62,6 @@ _BEGIN: dict[Verdict, str] = {
     "undecided": "These measurements do not show whether the corrected model or the nominal robot is nearer",
     "implausible": f"{NOTHING_SHOWN}, as their errors are too large to be those of a calibration",
 }
-
-
-@dataclass(frozen=True)
-class VerificationSettings:
-    """How a model is verified.
-
-    Attributes:
-        fit_frame: fit the frames to the rows, as after the sensor was moved; then any frame will do.
-        fit_tool: fit the targets to the rows, as after another reflector was mounted; then any target will do.
-        seed: of the resamples for confidence intervals.
-        cameras: what the pixels mean where the file holds corners of boards in images.
-        socket_distances: stated distances of sockets [m], see `pisigma.workflow.calibrate.CalibrationSettings`.
-    """
-
-    fit_frame: bool = False
-    fit_tool: bool = False
-    seed: int = 0
-    cameras: CameraFiles | None = None
-    socket_distances: Mapping[tuple[str, str], float] = field(default_factory=dict)
-
-    @property
-    def fitted(self) -> tuple[FrameKind, ...]:
-        """What is fitted to the rows."""
-        return fitted_kinds(self.fit_frame, self.fit_tool)
 
 
 @dataclass(frozen=True)

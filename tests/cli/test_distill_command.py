@@ -52,7 +52,7 @@ def test_the_report_says_what_was_lost(distilled):
     assert report["poses"]["held_out"] == 80
     assert [size["orders"] for size in report["sizes"]] == [[1, 2]]
     card = (out / "README.md").read_text()
-    assert "`pisigma distill geometric --out small --poses 200 --orders 1,2 --seed 3`" in card
+    assert "`pisigma distill geometric --out small --poses 200 --seed 3 --orders 1,2`" in card
     assert report["parent"]["sha256"] in card
     for sentence in report["limitations"]:
         assert sentence in card

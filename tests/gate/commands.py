@@ -16,15 +16,17 @@ from pisigma.measurement.dataset import Measurements
 from pisigma.model.folder.model_folder import save_model
 from pisigma.planning.plan_settings import PlanSettings
 from pisigma.robot import Robot
-from pisigma.workflow.calibrate import CalibrationSettings, calibrate
+from pisigma.workflow.calibrate import calibrate
 from pisigma.workflow.compare import compare
 from pisigma.workflow.evaluate import evaluate
-from pisigma.workflow.fleet.one_robot import FleetSettings, work_out
+from pisigma.workflow.fleet.one_robot import settings_for, work_out
 from pisigma.workflow.measure import MeasuringSession
 from pisigma.workflow.monitor import monitor
 from pisigma.workflow.plan import plan
 from pisigma.workflow.recalibrate import recalibrate
 from pisigma.workflow.report import report
+from pisigma.workflow.settings.calibration import CalibrationSettings
+from pisigma.workflow.settings.fleet import FleetSettings
 from pisigma.workflow.verify import verify
 
 ROBOT = "rb5"
@@ -103,7 +105,9 @@ def _fleet(rows: Measurements, folder: Path) -> Answer:
         "one", ROBOT, (SessionFile("s1", "", folder / "session.csv"),), model=model_folder(folder)
     )
     settings = FleetSettings(task="recalibrate")
-    record = work_out(member, settings, folder / "fleet", {"one": "k"}, {"one": settings.of(member)})
+    record = work_out(
+        member, settings, folder / "fleet", {"one": "k"}, {"one": settings_for(settings, member)}
+    )
     last = record.sessions[-1]
     return _of(last.verdict != REFUSED, last.sentence)
 

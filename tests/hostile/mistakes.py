@@ -25,7 +25,8 @@ from pisigma.files.errors import PisigmaError
 from pisigma.measurement.dataset import Measurements
 from pisigma.robot.description import Robot
 from pisigma.robot.kinematics.forward import forward_kinematics
-from pisigma.workflow.calibrate import CalibrationSettings, calibrate
+from pisigma.workflow.calibrate import calibrate
+from pisigma.workflow.settings.calibration import CalibrationSettings
 
 Change = Callable[[Measurements, Robot], Measurements]
 

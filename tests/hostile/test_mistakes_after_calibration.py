@@ -8,8 +8,8 @@ import torch
 from hostile.mistakes import POSES, SETS, clean_rows
 
 from pisigma.workflow import calibrate
-from pisigma.workflow.calibrate import CalibrationSettings
 from pisigma.workflow.evaluate import evaluate
+from pisigma.workflow.settings.calibration import CalibrationSettings
 from pisigma.workflow.verify import verify
 
 pytestmark = pytest.mark.usefixtures("without_type_checker")

@@ -9,7 +9,7 @@ from pisigma.lifetime.fleet.members import read_fleet
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.dates import date_in_name, is_date
 from pisigma.robot import Robot
-from pisigma.workflow.monitor import MonitorSettings
+from pisigma.workflow.settings.monitoring import MonitorSettings
 
 SLIPS = ("0206-11-22", "1969-12-31", "2206-11-22", "9999-12-31")
 

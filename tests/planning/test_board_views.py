@@ -13,6 +13,7 @@ from pisigma.measurement.camera.board import Board
 from pisigma.measurement.camera.camera import Camera
 from pisigma.model.stored_starts import nearest_branch
 from pisigma.planning.candidates import Candidates
+from pisigma.planning.plan_inputs import find_candidates, views_of
 from pisigma.planning.plan_settings import PlanSettings
 from pisigma.planning.surroundings.arm_in_cell import ArmInCell
 from pisigma.planning.surroundings.cell import Cell, LensSection, ViewSection
@@ -28,7 +29,7 @@ def settings(tmp_path_factory: pytest.TempPathFactory) -> PlanSettings:
 
 @pytest.fixture(scope="module")
 def drawn(settings: PlanSettings) -> Candidates:
-    return settings.find_candidates(arm_before_board())
+    return find_candidates(settings, arm_before_board())
 
 
 def test_every_candidate_sees_the_board(settings: PlanSettings, drawn: Candidates):
@@ -42,7 +43,7 @@ def test_every_candidate_sees_the_board(settings: PlanSettings, drawn: Candidate
 
 def test_views_are_of_all_angles_distances_and_branches(settings: PlanSettings, drawn: Candidates):
     arm = arm_before_board()
-    views = settings.views(arm)
+    views = views_of(settings, arm)
     assert views is not None
     oblique = views.obliqueness(arm, drawn.q).rad2deg()
     assert float(oblique.min()) < 10
@@ -62,7 +63,7 @@ def test_a_board_from_behind_is_refused(settings: PlanSettings, drawn: Candidate
     assert CELL.view is not None
     over = CELL.view.model_copy(update={"frame": CELL.view.frame.model_copy(update={"yaw_deg": 0.0})})
     arm = ArmInCell.of(Robot.load("ur5"), CELL.model_copy(update={"view": over}))
-    views = settings.views(arm)
+    views = views_of(settings, arm)
     assert views is not None
     faults = views.faults(arm, drawn.q[:3])
     assert bool(faults["the camera is behind the board"].all())
@@ -72,7 +73,7 @@ def test_an_arm_without_closed_form_sees_the_board_too(settings: PlanSettings):
     robot = Robot.load("panda")
     arm = ArmInCell.of(robot, CELL)
     assert settings.camera is not None
-    candidates = PlanSettings(sensor="camera", camera=settings.camera, candidates=2).find_candidates(arm)
+    candidates = find_candidates(PlanSettings(sensor="camera", camera=settings.camera, candidates=2), arm)
     assert len(candidates.q) == 2
     assert all(sees_board(arm, settings.camera, q, arm.capsules.radius.numpy()) for q in candidates.q.numpy())
 
@@ -81,7 +82,7 @@ def test_a_fixed_camera_sees_the_board_on_the_flange(tmp_path: Path):
     view = {"frame": {"x_mm": 450, "y_mm": -100, "z_mm": 900, "yaw_deg": 180}, "near_mm": 300, "far_mm": 700}
     cell = Cell.model_validate({"floor_mm": -20, "tool": {"z_mm": 30, "yaw_deg": 180}, "view": view})
     arm, camera = ArmInCell.of(Robot.load("ur5"), cell), camera_settings(tmp_path, is_fixed=True)
-    candidates = PlanSettings(sensor="camera", camera=camera, candidates=8).find_candidates(arm)
+    candidates = find_candidates(PlanSettings(sensor="camera", camera=camera, candidates=8), arm)
     assert all(sees_board(arm, camera, q, arm.capsules.radius.numpy()) for q in candidates.q.numpy())
 
 
@@ -107,7 +108,7 @@ def test_depths_are_stated_once():
 
 def test_a_camera_needs_to_know_where_the_board_is(settings: PlanSettings):
     with pytest.raises(PlanningError, match=r"where the board is .*--cell"):
-        settings.views(ArmInCell.of(Robot.load("ur5")))
+        views_of(settings, ArmInCell.of(Robot.load("ur5")))
     with pytest.raises(PlanningError, match="a camera and of a board were wanted"):
         PlanSettings(sensor="camera")
 
@@ -116,7 +117,7 @@ def test_points_far_outside_do_not_count_as_seen(tmp_path: Path, settings: PlanS
     """A strong distortion turns back outside of the image: what it shows inside is not there."""
     assert settings.camera is not None
     arm = arm_before_board()
-    views = settings.views(arm)
+    views = views_of(settings, arm)
     assert views is not None
     wide = Camera("wide", 1920, 1200, 700.0, 700.0, 960.0, 600.0, k1=-0.3)
     T = torch.eye(4, dtype=torch.float64)[None].clone()

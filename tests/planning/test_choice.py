@@ -5,9 +5,10 @@ import torch
 from testing.closeness import assert_close
 
 from pisigma.files.errors import PlanningError
-from pisigma.planning.choice import Choice, Criterion, choose, condensed
+from pisigma.planning.choice import Choice, choose, condensed
 from pisigma.planning.expected_accuracy import curve, p95_of, remaining_errors, rms_of
 from pisigma.planning.knowledge import Knowledge
+from pisigma.planning.plan_settings import Criterion
 from pisigma.robot import Robot
 
 

@@ -10,6 +10,7 @@ from testing.closeness import assert_close
 from pisigma.files.errors import MeasurementError, PlanningError
 from pisigma.planning.candidates import draw_candidates
 from pisigma.planning.plan_file import StoredPlan, read_plan
+from pisigma.planning.plan_inputs import instrument_of
 from pisigma.planning.plan_settings import PlanSettings
 from pisigma.planning.surroundings.arm_in_cell import ArmInCell
 from pisigma.robot import Robot
@@ -96,4 +97,4 @@ def test_settings_that_are_none_are_refused(stated: dict[str, object], message: 
 
 def test_distances_are_measured_from_somewhere():
     with pytest.raises(PlanningError, match="where distances are measured from"):
-        PlanSettings(sensor="distance").instrument()
+        instrument_of(PlanSettings(sensor="distance"))

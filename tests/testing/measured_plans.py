@@ -10,6 +10,7 @@ from torch import Tensor
 
 from pisigma.measurement.dataset import Measurements
 from pisigma.planning.plan_file import StoredPlan
+from pisigma.planning.plan_inputs import find_candidates
 from pisigma.planning.plan_settings import PlanSettings
 from pisigma.planning.surroundings.arm_in_cell import ArmInCell
 from pisigma.robot.description import Robot
@@ -52,7 +53,7 @@ def measured_plan(name: str = "ur5", poses: int = 24, seed: int = 0) -> Measured
     )
     settings = PlanSettings(count=poses - CHECKS, check=CHECKS, candidates=120, sigma_mm=NOISE * 1e3)
     arm = ArmInCell.of(robot)
-    candidates = settings.find_candidates(arm)
+    candidates = find_candidates(settings, arm)
     check = torch.arange(poses) % (poses // CHECKS) == 4
     return MeasuredPlan(
         StoredPlan(

@@ -9,7 +9,8 @@ from pathlib import Path
 from testing.models import REPOSITORY, no_type_checker
 
 from pisigma.deployment.serve.models import ServedModels
-from pisigma.deployment.serve.server import Server, ServeSettings
+from pisigma.deployment.serve.server import Server
+from pisigma.deployment.serve.settings import ServeSettings
 
 CLIENTS = REPOSITORY / "docs" / "clients"
 

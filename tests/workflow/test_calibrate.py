@@ -7,11 +7,11 @@ from testing.models import no_type_checker
 from testing.simulated_arm import simulate
 
 import pisigma
-from pisigma.cli.arguments import socket_distances
 from pisigma.files.errors import IdentificationError, MeasurementError
 from pisigma.model.folder.model_folder import load_model
 from pisigma.validation.held_out.calibration_summary import CalibrationSummary
-from pisigma.workflow.calibrate import CalibrationSettings
+from pisigma.workflow.calibrate import calibrator_of
+from pisigma.workflow.settings.calibration import CalibrationSettings, socket_distances
 
 SOCKETS = ("left/0", "left/1", "right/0", "right/1", "right/0", "lonely/0", "")
 
@@ -92,7 +92,7 @@ def test_settings_at_fault(settings, complaint):
 def distances(*stated: str) -> dict[tuple[str, str], float]:
     """Known distances of the calibrator, as the command line states them."""
     settings = CalibrationSettings(model="geometric", socket_distances=socket_distances(stated))
-    return settings.calibrator(pisigma.Robot.load("panda"), SOCKETS).socket_distances
+    return calibrator_of(settings, pisigma.Robot.load("panda"), SOCKETS).socket_distances
 
 
 def test_known_distances_between_sockets():

@@ -10,7 +10,8 @@ import pisigma
 from pisigma.measurement.dataset import Measurements
 from pisigma.robot import Robot
 from pisigma.robot.kinematics.forward import forward_kinematics
-from pisigma.workflow.calibrate import CalibrationSettings, calibrate
+from pisigma.workflow.calibrate import calibrate
+from pisigma.workflow.settings.calibration import CalibrationSettings
 
 
 def test_limits_of_the_model_hold_the_rows_so_that_corrected_ik_reaches_them(tmp_path):

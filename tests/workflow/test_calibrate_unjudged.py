@@ -5,7 +5,8 @@ import torch
 from testing.simulated_arm import simulate
 
 from pisigma.validation.held_out.calibration_validation import errors_under
-from pisigma.workflow.calibrate import CalibrationSettings, calibrate
+from pisigma.workflow.calibrate import calibrate
+from pisigma.workflow.settings.calibration import CalibrationSettings
 
 
 @pytest.mark.parametrize("model", ["geometric", "hybrid"])

@@ -11,7 +11,8 @@ from testing.models import no_type_checker
 
 from pisigma.files.errors import IdentificationError
 from pisigma.measurement.dataset import Measurements
-from pisigma.workflow.compare import ComparisonSettings, compare
+from pisigma.workflow.compare import compare
+from pisigma.workflow.settings.comparison import ComparisonSettings
 
 
 @pytest.fixture(scope="module")

@@ -21,8 +21,9 @@ from pisigma.robot import Robot
 from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.robot.kinematics.status import Status
 from pisigma.validation.held_out.distillation_summary import DistillationSummary
-from pisigma.workflow.distill import DistillationSettings, distill
+from pisigma.workflow.distill import distill
 from pisigma.workflow.distilled_network import Size, sizes_for
+from pisigma.workflow.settings.distillation import DistillationSettings
 from pisigma.workflow.solved_poses import Region, draw_between, draw_solved_poses
 
 pytestmark = pytest.mark.usefixtures("without_type_checker")

@@ -9,9 +9,9 @@ from testing.calibrated_ur5 import calibrated_ur5, measured
 import pisigma
 from pisigma.files.errors import MeasurementError
 from pisigma.robot.se3 import transform_from_xyzrpy
-from pisigma.validation.held_out.bootstrap import Bootstrap
 from pisigma.validation.held_out.model_comparison import ModelFigures, QuantityErrors
-from pisigma.workflow.evaluate import EvaluationSettings, Limits
+from pisigma.validation.resampling import Bootstrap
+from pisigma.workflow.settings.evaluation import EvaluationSettings, Limits
 
 
 def errors(unit: str, **statistics: float) -> QuantityErrors:

@@ -7,7 +7,8 @@ from testing.models import no_type_checker
 from pisigma.files.errors import MeasurementError, OutputError
 from pisigma.measurement.growing_file import GrowingFile
 from pisigma.workflow.follow import follow, rest_file
-from pisigma.workflow.measure import MeasureSettings, MeasuringSession
+from pisigma.workflow.measure import MeasuringSession
+from pisigma.workflow.settings.measuring import MeasureSettings
 
 PLAN = measured_plan("kiro3", poses=9)
 ROBOT = PLAN.stored.arm.robot

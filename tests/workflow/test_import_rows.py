@@ -8,7 +8,8 @@ from testing.models import REPOSITORY
 
 import pisigma
 from pisigma.files.errors import MeasurementError, OutputError
-from pisigma.workflow.import_rows import ImportSettings, import_rows, propose_import
+from pisigma.workflow.import_rows import import_rows, propose_import
+from pisigma.workflow.settings.importing import ImportSettings
 
 EXPORTS = (
     Path(os.environ.get("PISIGMA_DATA", REPOSITORY / ".." / "shared" / "data")).resolve().parent / "exports"

@@ -8,9 +8,9 @@ from testing.simulated_arm import simulate
 import pisigma
 from pisigma.files.progress import silent, stage
 from pisigma.validation.held_out import side_by_side
-from pisigma.workflow.calibrate import CalibrationSettings
 from pisigma.workflow.recipes.recipe import MeasuredData
-from pisigma.workflow.train_networks import TrainSettings
+from pisigma.workflow.settings.calibration import CalibrationSettings
+from pisigma.workflow.settings.training import TrainSettings
 
 
 @pytest.fixture

@@ -13,7 +13,8 @@ from pisigma.files.errors import PlanningError
 from pisigma.measurement.fields import LeftOut
 from pisigma.planning.plan_file import read_plan
 from pisigma.planning.session import reached
-from pisigma.workflow.measure import MeasureSettings, MeasuringSession
+from pisigma.workflow.measure import MeasuringSession
+from pisigma.workflow.settings.measuring import MeasureSettings
 
 PLAN = measured_plan("kiro3")
 

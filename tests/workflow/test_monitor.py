@@ -11,7 +11,8 @@ from testing.hybrid import hybrid_of
 from pisigma.files.errors import IdentificationError, MeasurementError
 from pisigma.measurement.dataset import join
 from pisigma.model.folder.model_folder import save_model
-from pisigma.workflow.monitor import MonitorSettings, monitor
+from pisigma.workflow.monitor import monitor
+from pisigma.workflow.settings.monitoring import MonitorSettings
 
 COLLISION = (0.0, 0.0, 0.00436, 0.0, 0.0, 0.0)
 

@@ -15,8 +15,10 @@ from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.row_poses import poses_of_rows
 from pisigma.validation.gate import check_rows
 from pisigma.validation.held_out.frames.row_errors import errors_of_rows
-from pisigma.workflow.evaluate import EvaluationSettings, evaluate
-from pisigma.workflow.verify import VerificationSettings, verify
+from pisigma.workflow.evaluate import evaluate
+from pisigma.workflow.settings.evaluation import EvaluationSettings
+from pisigma.workflow.settings.verification import VerificationSettings
+from pisigma.workflow.verify import verify
 
 
 @cache

@@ -19,7 +19,8 @@ from pisigma.model.row_poses import poses_of_rows
 from pisigma.robot import Robot
 from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.robot.se3 import transform_from_xyzrpy
-from pisigma.workflow.recalibrate import Recalibration, RecalibrationSettings, recalibrate
+from pisigma.workflow.recalibrate import Recalibration, recalibrate
+from pisigma.workflow.settings.recalibration import RecalibrationSettings
 
 COLLISION = (0.0, 0.0, math.radians(0.25), 0.0, 0.0, 0.0)
 

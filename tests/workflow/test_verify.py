@@ -17,7 +17,8 @@ from pisigma.model.geometric_model import model_of_calibration, model_of_hybrid
 from pisigma.model.row_poses import nominal_poses_of_rows
 from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.robot.se3 import transform_from_xyzrpy
-from pisigma.workflow.verify import VerificationSettings, read_for_verification, verify
+from pisigma.workflow.settings.verification import VerificationSettings
+from pisigma.workflow.verify import read_for_verification, verify
 
 pytestmark = pytest.mark.usefixtures("without_type_checker")
 

@@ -15,8 +15,8 @@ from pisigma.measurement.dataset import Measurements
 from pisigma.workflow.recipes.data import simulate
 from pisigma.workflow.recipes.reader import read_recipe
 from pisigma.workflow.recipes.recipe import GeometricRecipe
+from pisigma.workflow.settings.training import TrainSettings
 from pisigma.workflow.train import InverseTraining, Training, train
-from pisigma.workflow.train_networks import TrainSettings
 from published import read_published
 from stored_results import RESULTS, result_text
 from training_course import report_course

@@ -1,6 +1,7 @@
 """`pisigma fleet run` and `pisigma fleet status`: many robots with one command."""
 
 import datetime
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -9,7 +10,10 @@ import typer
 from pisigma.cli.arguments import AsJson, Overwrite
 from pisigma.cli.endings import NOT_ACCEPTED, tell_problems
 from pisigma.cli.output import command_line, print_json, print_lines, print_table, progress_of
+from pisigma.cli.settings_options import takes_settings
 from pisigma.files.errors import FleetError
+from pisigma.workflow.settings.calibration import CalibrationSettings
+from pisigma.workflow.settings.fleet import FleetSettings
 
 if TYPE_CHECKING:
     from pisigma.lifetime.fleet.status import FleetStatus
@@ -32,25 +36,7 @@ Out = Annotated[Path, typer.Option(help="Folder of the fleet; one that is there 
 RobotName = Annotated[
     str | None, typer.Option(metavar="ROBOT", help="Catalogue name or robot file of robots that state none.")
 ]
-Task = Annotated[
-    str,
-    typer.Option(
-        help="calibrate: every session; recalibrate: the first is calibrated, the later ones bring its model up to "
-        "date; monitor: they are compared with it."
-    ),
-]
-Validate = Annotated[
-    bool,
-    typer.Option("--validate", help="Cross-validate every calibration and draw the figures of its card."),
-]
-PriorFolder = Annotated[
-    Path | None,
-    typer.Option("--prior", help="Model folder of `pisigma fleet prior` that calibrations begin with."),
-]
 Model = Annotated[str, typer.Option(help="hybrid or geometric.")]
-EngineName = Annotated[str, typer.Option(help="processes: of this machine; or ray.")]
-Jobs = Annotated[int | None, typer.Option(help="Processes that work side by side. [default: one per core]")]
-Address = Annotated[str | None, typer.Option(help="Of a Ray cluster. [default: Ray on this machine]")]
 PriorOut = Annotated[Path, typer.Option("--out", help="Model folder to write.")]
 Folder = Annotated[Path, typer.Argument(metavar="DIR", help="Folder that `pisigma fleet run` wrote.")]
 Page = Annotated[Path | None, typer.Option(help="HTML page to write, with filters by state and name.")]
@@ -64,17 +50,13 @@ fleet = typer.Typer(name="fleet", help="Calibrate, recalibrate or monitor many r
 
 @fleet.command()
 @tell_problems
+@takes_settings
 def run(
     source: Source,
     out: Out,
+    settings: FleetSettings,
     robot: RobotName = None,
-    task: Task = "calibrate",
-    validate: Validate = False,
     model: Model = "hybrid",
-    prior: PriorFolder = None,
-    engine: EngineName = "processes",
-    jobs: Jobs = None,
-    address: Address = None,
     as_json: AsJson = False,
 ) -> None:
     """Work out all robots of a fleet: a model folder each, and one table of all results.
@@ -82,16 +64,10 @@ def run(
     A call that was ended goes on where it was. A robot whose files are bad is named and does not stop the others; exit
     status 3 then.
     """
-    from pisigma.workflow.calibrate import CalibrationSettings
-    from pisigma.workflow.fleet.one_robot import FleetSettings
     from pisigma.workflow.fleet.run import run_fleet
 
-    stated: dict[str, Any] = {"task": task, "engine": engine}
     kind: Any = model
-    calibration = CalibrationSettings(model=kind)
-    settings = FleetSettings(
-        validate=validate, calibration=calibration, jobs=jobs, address=address, prior=prior, **stated
-    )
+    settings = replace(settings, calibration=CalibrationSettings(model=kind))
     with progress_of("fleet") as progress:
         result = run_fleet(source, out, settings, robot, progress)
     if as_json:

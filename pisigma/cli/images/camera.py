@@ -6,22 +6,21 @@ from typing import Annotated
 import typer
 
 from pisigma.cli.arguments import AsJson
-from pisigma.cli.images.detect import BoardFile, MostBlur
+from pisigma.cli.images.detect import BoardFile
 from pisigma.cli.images.result import Page, check_outputs, write_result
 from pisigma.cli.output import progress_of
+from pisigma.cli.settings_options import takes_settings
+from pisigma.workflow.settings.images import IntrinsicsSettings
 
 Images = Annotated[list[Path], typer.Argument(help="Image files of one camera, or folders of them.")]
-Name = Annotated[str, typer.Option(help="Name of the camera.")]
-FreeK3 = Annotated[bool, typer.Option("--k3", help="Identify k3, too, which is 0 else.")]
 
 
+@takes_settings
 def camera(
     images: Images,
     board: BoardFile,
     out: Annotated[Path, typer.Option(help="File of the camera to write (.yaml).")],
-    name: Name = "camera",
-    free_k3: FreeK3 = False,
-    most_blur: MostBlur = 3.0,
+    settings: IntrinsicsSettings,
     page: Page = None,
     as_json: AsJson = False,
 ) -> None:
@@ -32,7 +31,6 @@ def camera(
     check_outputs(out, (".yaml", ".yml"), "a camera", page, [*images, board])
     from pisigma.workflow.images import calibrate_camera as workflow
 
-    settings = workflow.IntrinsicsSettings(name, free_k3, most_blur)
     with progress_of("camera") as progress:
         calibrated = workflow.calibrate_camera(images, board, settings, progress)
     write_result(calibrated, out, page, as_json)

@@ -9,6 +9,8 @@ from pisigma.cli.arguments import AsJson
 from pisigma.cli.endings import fail
 from pisigma.cli.images.result import Page, check_outputs, write_result
 from pisigma.cli.output import print_json, print_lines, progress_of
+from pisigma.cli.settings_options import takes_settings
+from pisigma.workflow.settings.images import DetectionSettings
 
 Images = Annotated[list[Path] | None, typer.Argument(help="Image files, or folders of them.")]
 BoardFile = Annotated[Path, typer.Option(help="Board (YAML) that the images show.")]
@@ -24,21 +26,16 @@ Joints = Annotated[
         help="Joint values (CSV) with a column 'image', or 'time' where images are named by their time."
     ),
 ]
-Within = Annotated[float, typer.Option(help="Largest difference of time stamps that are joined [s].")]
-MostBlur = Annotated[
-    float,
-    typer.Option("--most-blur-px", min=0.0, help="Images whose edges are blurred more are left out [px]."),
-]
 
 
+@takes_settings
 def detect(
     board: BoardFile,
+    settings: DetectionSettings,
     images: Images = None,
     camera: CameraFile = None,
     out: Out = None,
     joints: Joints = None,
-    within: Within = 0.2,
-    most_blur: MostBlur = 3.0,
     page: Page = None,
     sheet: Print = None,
     as_json: AsJson = False,
@@ -55,7 +52,6 @@ def detect(
     check_outputs(out, (".csv",), "a file of corners", page, [*images, board, camera, joints])
     from pisigma.workflow.images import detect as workflow
 
-    settings = workflow.DetectionSettings(most_blur, within)
     with progress_of("detect") as progress:
         detected = workflow.detect(images, board, camera, joints, settings, progress)
     write_result(detected, out, page, as_json)

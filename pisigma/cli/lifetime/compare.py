@@ -6,12 +6,12 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from pisigma.cli.arguments import AsJson, complete_model
-from pisigma.cli.camera_options import takes_corners
 from pisigma.cli.output import print_json, print_lines, print_table, progress_of, screen_width
+from pisigma.cli.settings_options import takes_settings
 from pisigma.files.errors import AcceptanceError
+from pisigma.workflow.settings.comparison import ComparisonSettings
 
 if TYPE_CHECKING:
-    from pisigma.measurement.camera.corner_file import CameraFiles
     from pisigma.workflow.compare import ComparedModels
 
 First = Annotated[
@@ -31,28 +31,16 @@ Program = Annotated[
         help="Joint values or poses (CSV) of a program that was taught with A: what it misses under B."
     ),
 ]
-FixedFrames = Annotated[
-    bool,
-    typer.Option(
-        "--fixed-frames",
-        help="Both models were measured in the same frame with the same tool. [default: base and tool are fitted]",
-    ),
-]
-Level = Annotated[
-    float, typer.Option(help="Probability that any parameter at all is called different by chance.")
-]
 Page = Annotated[Path | None, typer.Option(help="HTML page to write, with a map of the workspace.")]
 
 
-@takes_corners
+@takes_settings
 def compare(
     first: First,
     second: Second,
+    settings: ComparisonSettings,
     rows: Rows = None,
-    cameras: "CameraFiles | None" = None,
     program: Program = None,
-    fixed_frames: FixedFrames = False,
-    level: Level = 0.01,
     page: Page = None,
     as_json: AsJson = False,
 ) -> None:
@@ -65,8 +53,8 @@ def compare(
     from pisigma.workflow import compare as workflow
 
     if page is not None:
-        check_page(page, (Path(first), Path(second), rows, program, *(cameras.files if cameras else ())))
-    settings = workflow.ComparisonSettings("fixed" if fixed_frames else "fitted", level, cameras=cameras)
+        stated = settings.cameras.files if settings.cameras else ()
+        check_page(page, (Path(first), Path(second), rows, program, *stated))
     with progress_of("compare") as progress:
         progress("both models")
         compared = workflow.compare(first, second, rows, program, settings)

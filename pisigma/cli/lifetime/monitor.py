@@ -6,13 +6,12 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from pisigma.cli.arguments import AsJson, ModelFolder
-from pisigma.cli.camera_options import takes_corners
 from pisigma.cli.endings import NOT_ACCEPTED
-from pisigma.cli.lifetime.recalibrate import Moved, stated_to_move
 from pisigma.cli.output import print_json, print_lines, print_table, progress_of
+from pisigma.cli.settings_options import takes_settings
+from pisigma.workflow.settings.monitoring import MonitorSettings
 
 if TYPE_CHECKING:
-    from pisigma.measurement.camera.corner_file import CameraFiles
     from pisigma.workflow.monitor import Monitoring
 
 Sessions = Annotated[
@@ -21,30 +20,15 @@ Sessions = Annotated[
         metavar="SESSION...", help="Measurements (CSV), one file a session; five poses or more each."
     ),
 ]
-Dates = Annotated[
-    str | None,
-    typer.Option(
-        metavar="DAY,...",
-        help="Days of the files, such as 2026-10-01,2026-11-01. [default: column date, name of the file, its change]",
-    ),
-]
-LimitMm = Annotated[
-    float | None, typer.Option(help="RMS error to stay below [mm]; says when it will be passed.")
-]
 Page = Annotated[Path | None, typer.Option(help="HTML page to write, with charts of all sessions.")]
-NoHistory = Annotated[bool, typer.Option("--no-history", help="Neither read nor write MODEL.history.sqlite.")]
 
 
-@takes_corners
+@takes_settings
 def monitor(
     model: ModelFolder,
     sessions: Sessions,
-    dates: Dates = None,
-    moved: Moved = None,
-    limit_mm: LimitMm = None,
+    settings: MonitorSettings,
     page: Page = None,
-    no_history: NoHistory = False,
-    cameras: "CameraFiles | None" = None,
     as_json: AsJson = False,
 ) -> None:
     """Say of every session whether the robot is unchanged or what moved, and follow it over the months.
@@ -56,9 +40,7 @@ def monitor(
     from pisigma.workflow import monitor as workflow
 
     if page is not None:
-        check_page(page, (model, *sessions, *(cameras.files if cameras else ())))
-    days = tuple(day.strip() for day in dates.split(",")) if dates else ()
-    settings = workflow.MonitorSettings(days, stated_to_move(moved), limit_mm, not no_history, cameras)
+        check_page(page, (model, *sessions, *(settings.cameras.files if settings.cameras else ())))
     with progress_of("monitor") as progress:
         monitoring = workflow.monitor(model, sessions, settings, progress)
         if page is not None:

@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from pisigma.cli.arguments import AcceptImplausible, AsJson, ModelFolder, Overwrite
-from pisigma.cli.camera_options import takes_corners
 from pisigma.cli.output import command_line, print_json, print_lines, print_table, progress_of, saved
+from pisigma.cli.settings_options import takes_settings
 from pisigma.files.errors import AcceptanceError
+from pisigma.workflow.settings.recalibration import RecalibrationSettings
 
 if TYPE_CHECKING:
-    from pisigma.measurement.camera.corner_file import CameraFiles
     from pisigma.robot.description import Robot
     from pisigma.workflow.recalibrate import Recalibration
 
@@ -21,25 +21,17 @@ Data = Annotated[
     typer.Argument(metavar="ROWS...", help="New measurements (CSV), ten poses or more, of any sensors."),
 ]
 Out = Annotated[Path | None, typer.Option(help="Model folder to write; needed without --dry-run.")]
-Moved = Annotated[
-    str | None,
-    typer.Option(
-        help="What stands elsewhere since the model was made: base, tool, or base,tool; '' for neither. [default: what "
-        "the rows show]"
-    ),
-]
 DryRun = Annotated[bool, typer.Option("--dry-run", help="Say what would be kept, and write nothing.")]
 
 
-@takes_corners
+@takes_settings
 def recalibrate(
     context: typer.Context,
     model: ModelFolder,
     data: Data,
+    settings: RecalibrationSettings,
     out: Out = None,
-    moved: Moved = None,
     dry_run: DryRun = False,
-    cameras: "CameraFiles | None" = None,
     accept_implausible: AcceptImplausible = False,
     overwrite: Overwrite = False,
     as_json: AsJson = False,
@@ -54,21 +46,20 @@ def recalibrate(
     if (out is None) is not dry_run:
         raise typer.BadParameter("either --out DIR or --dry-run was wanted.", param_hint="'--out'")
     if out is not None:
-        check_folder(out, overwrite, inputs=(model, *data, *(cameras.files if cameras else ())))
-    elsewhere = stated_to_move(moved)
-    recalibrate_into(context, model, data, out, accept_implausible, overwrite, as_json, cameras, elsewhere)
+        stated = settings.cameras.files if settings.cameras else ()
+        check_folder(out, overwrite, inputs=(model, *data, *stated))
+    recalibrate_into(context, model, data, settings, out, accept_implausible, overwrite, as_json)
 
 
 def recalibrate_into(
     context: typer.Context,
     model: Path,
     data: Sequence[Path],
+    settings: RecalibrationSettings,
     out: Path | None,
     accept_implausible: bool,
     overwrite: bool,
     as_json: bool,
-    cameras: "CameraFiles | None",
-    moved: tuple[str, ...] | None = None,
     drawn: "Robot | None" = None,
 ) -> None:
     """Add rows to a model, write what was kept where a folder is stated, and print it.
@@ -77,12 +68,11 @@ def recalibrate_into(
         context: of the command, for the card.
         model: folder of the model.
         data: files of the rows.
+        settings: how.
         out: folder to write; None for none.
         accept_implausible: write also what must not be trusted.
         overwrite: replace the model that the folder holds.
         as_json: print one JSON object.
-        cameras: what the pixels mean where files of rows hold corners.
-        moved: what is stated to stand elsewhere.
         drawn: the robot whose fleet the model has to be the prior of; None for any model.
 
     Raises:
@@ -90,7 +80,6 @@ def recalibrate_into(
     """
     from pisigma.workflow import recalibrate as workflow
 
-    settings = workflow.RecalibrationSettings(moved, cameras)
     with progress_of("recalibration") as progress:
         recalibration = workflow.recalibrate(model, data, settings, progress, drawn)
     if out is None:
@@ -102,11 +91,6 @@ def recalibrate_into(
         return
     with saved(recalibration, out, accept_implausible, overwrite, command=command_line(context)) as folder:
         _print(recalibration, folder, as_json)
-
-
-def stated_to_move(moved: str | None) -> tuple[str, ...] | None:
-    """Names of what stands elsewhere, from "base,tool"; None where that is not stated."""
-    return None if moved is None else tuple(name.strip() for name in moved.split(",") if name.strip())
 
 
 def _print(recalibration: "Recalibration", folder: Path | None, as_json: bool) -> None:

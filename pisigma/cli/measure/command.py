@@ -9,8 +9,10 @@ import typer
 
 from pisigma.cli.arguments import AsJson
 from pisigma.cli.endings import NOT_ACCEPTED
-from pisigma.cli.measure.session_page import PageOptions, View, ViewHost, ViewPort, ViewUrdf, shown_in_browser
+from pisigma.cli.measure.session_page import PageOptions, View, shown_in_browser
 from pisigma.cli.output import print_json, print_line, print_lines
+from pisigma.cli.settings_options import takes_settings
+from pisigma.workflow.settings.measuring import MeasureSettings
 
 if TYPE_CHECKING:
     from pisigma.workflow.follow import SessionStep
@@ -20,12 +22,6 @@ PlanFile = Annotated[
     Path, typer.Argument(metavar="PLAN", help="Poses that `pisigma plan` wrote (CSV, or the YAML beside it).")
 ]
 RowsFile = Annotated[Path, typer.Option("--rows", help="Measurements (CSV) that grow row by row.")]
-LimitMm = Annotated[
-    float | None, typer.Option(help="Stop where 95 % of the errors are expected below this [mm].")
-]
-LeastGainMm = Annotated[
-    float, typer.Option(help="Stop where the next 10 poses would lower these 95 % by less than this [mm].")
-]
 Programs = Annotated[
     list[Path] | None,
     typer.Option(
@@ -34,10 +30,6 @@ Programs = Annotated[
         "several controllers.",
     ),
 ]
-Every = Annotated[
-    int, typer.Option(help="Rows after which the accuracy is worked out and the rest planned again.")
-]
-Replan = Annotated[bool, typer.Option("--replan/--no-replan", help="Plan what is left again.")]
 RestFile = Annotated[
     Path | None,
     typer.Option(
@@ -47,20 +39,16 @@ RestFile = Annotated[
 Once = Annotated[bool, typer.Option("--once", help="Judge the rows that are there, and end.")]
 
 
+@takes_settings
 def measure(
     plan: PlanFile,
     rows: RowsFile,
-    limit_mm: LimitMm = None,
-    least_gain_mm: LeastGainMm = 0.005,
-    every: Every = 3,
-    replan: Replan = True,
+    settings: MeasureSettings,
+    page: PageOptions,
     rest: RestFile = None,
     program: Programs = None,
     once: Once = False,
     view: View = False,
-    view_host: ViewHost = "127.0.0.1",
-    view_port: ViewPort = 8080,
-    view_urdf: ViewUrdf = None,
     as_json: AsJson = False,
 ) -> None:
     """Follow the rows that are measured with a plan: wrong rows, the next pose, the accuracy so far, and when to stop.
@@ -71,17 +59,17 @@ def measure(
     """
     from pisigma.planning.session.growing_images import growing_file
     from pisigma.workflow.follow import check_programs, follow, rest_file
-    from pisigma.workflow.measure import MeasureSettings, MeasuringSession
+    from pisigma.workflow.measure import MeasuringSession
 
-    settings = MeasureSettings(limit_mm, least_gain_mm, every, replan)
     session = MeasuringSession.read(plan, settings)
     growing = growing_file(rows, session.plan.arm.robot, session.plan.settings)
     rest = rest_file(plan, rows, rest)
     check_programs(program or [], session.plan.arm.robot, (plan, rows, rest))
-    page = PageOptions(view_host, view_port, view_urdf) if view else None
     try:
         with (
-            shown_in_browser(session.plan.arm, limit_mm, page, session.plan.settings.camera) as show_page,
+            shown_in_browser(
+                session.plan.arm, settings.limit_mm, page if view else None, session.plan.settings.camera
+            ) as show_page,
             _printer(session, f"measure {plan}", as_json) as show,
         ):
             for step in follow(session, growing, once):

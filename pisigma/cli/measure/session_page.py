@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from pisigma.cli.output import print_line
+from pisigma.files.setting import Option
 
 if TYPE_CHECKING:
     from pisigma.planning.camera_settings import CameraSettings
@@ -22,14 +23,6 @@ if TYPE_CHECKING:
 View = Annotated[
     bool, typer.Option("--view", help="Show robot, rows and errors on a page in the browser too.")
 ]
-ViewHost = Annotated[str, typer.Option(help="Where the page is served; 0.0.0.0: for other machines too.")]
-ViewPort = Annotated[
-    int,
-    typer.Option(min=1, max=65535, help="Port of the page; where it is taken, the next one that is free."),
-]
-ViewUrdf = Annotated[
-    Path | None, typer.Option(help="URDF file of the robot, whose meshes the page shows instead of capsules.")
-]
 
 
 @dataclass(frozen=True)
@@ -37,14 +30,14 @@ class PageOptions:
     """How a session is shown in the browser.
 
     Attributes:
-        host: address to serve at.
-        port: to serve at.
-        urdf: file whose meshes are shown; None for capsules.
+        host: where the page is served; 0.0.0.0: for other machines too.
+        port: port of the page; where it is taken, the next one that is free.
+        urdf: URDF file of the robot, whose meshes the page shows instead of capsules.
     """
 
-    host: str
-    port: int
-    urdf: Path | None
+    host: Annotated[str, Option("--view-host")] = "127.0.0.1"
+    port: Annotated[int, Option("--view-port", least=1, most=65535)] = 8080
+    urdf: Annotated[Path | None, Option("--view-urdf")] = None
 
     def body(self, robot: "Robot") -> "MeshBody | None":
         """Load the meshes of a robot; None where capsules are shown.
@@ -77,10 +70,11 @@ def shown_in_browser(
     if page is None:
         yield lambda state: None
         return
+    from pisigma.planning.plan_inputs import sight_of
     from pisigma.reporting.viewing.session_view import SessionView
 
     limit = None if limit_mm is None else limit_mm / 1e3
-    sight = None if camera is None else camera.sight()
+    sight = None if camera is None else sight_of(camera)
     with SessionView(arm, page.body(arm.robot), limit, page.host, page.port, sight) as view:
         print_line(f"The session is shown at {view.url}", to_stderr=True)
         yield view.show

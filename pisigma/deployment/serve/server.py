@@ -11,46 +11,21 @@ import time
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
 
 from pisigma.deployment.serve.binary_frames import BinaryFrames
 from pisigma.deployment.serve.connection import Connection
 from pisigma.deployment.serve.json_lines import JsonLines
 from pisigma.deployment.serve.metrics import Metrics
 from pisigma.deployment.serve.models import ServedModels
-from pisigma.deployment.serve.polling import DURATION, Polling
+from pisigma.deployment.serve.polling import Polling
 from pisigma.deployment.serve.protocol import AbstractProtocol
+from pisigma.deployment.serve.settings import ServeSettings
 from pisigma.deployment.serve.zeromq import ZeroMq
 from pisigma.files.errors import OutputError
 
 MOST_CONNECTIONS = 512
-PATIENCE = 10.0
-"""[s] A client may take for the rest of a message, for its token, or to take an answer; then it is cut off."""
 SWITCHING = 1e-4
 """[s] A thread that works out a path holds the interpreter at most, while quick answers wait for it."""
-
-
-@dataclass(frozen=True)
-class ServeSettings:
-    """Where a server listens.
-
-    Attributes:
-        host: address of this machine; at 127.0.0.1 only programs of this machine reach it.
-        json_port: for lines of JSON; 0 for a free one.
-        binary_port: for binary frames; 0 for a free one.
-        zmq_port: for ZeroMQ; 0 for a free one, None for none.
-        token: that every client has to send first; wanted where the host is not of the loopback.
-        patience: see `PATIENCE`.
-        polling: how long after a request the server stays awake for the next one [s], see `Polling`; 0 for not at all.
-    """
-
-    host: str = "127.0.0.1"
-    json_port: int = 0
-    binary_port: int = 0
-    zmq_port: int | None = None
-    token: str | None = None
-    patience: float = PATIENCE
-    polling: float = DURATION
 
 
 class Server:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pisigma.files.errors import FleetError, nearest_choice
-from pisigma.measurement.camera.corner_file import CameraFiles
+from pisigma.measurement.camera.camera_files import CameraFiles
 from pisigma.measurement.csv.header import check_separators
 from pisigma.measurement.csv.table import Table, read_table
 from pisigma.measurement.dates import WANTED, date_in_name, is_date

@@ -1,21 +1,20 @@
 """Files of corners, in which rows of other sensors may stand, as measurements."""
 
-import math
 import os
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass, field, replace
-from typing import TypeVar, get_args
+from dataclasses import replace
+from typing import TypeVar
 
 import numpy as np
 import torch
 from jaxtyping import Float64, Int64
 
-from pisigma.files.errors import IdentificationError, MeasurementError, nearest_choice
+from pisigma.files.errors import MeasurementError, nearest_choice
 from pisigma.measurement.camera.board import Board
 from pisigma.measurement.camera.board_pose import FEWEST_CORNERS
 from pisigma.measurement.camera.camera import Camera
-from pisigma.measurement.camera.image_rows import Images, Repeatability, image_measurements
-from pisigma.measurement.camera.solved_images import IntrinsicsChoice
+from pisigma.measurement.camera.camera_files import CameraFiles
+from pisigma.measurement.camera.image_rows import Images, image_measurements
 from pisigma.measurement.copies import without_copies
 from pisigma.measurement.csv.columns import CORNERS, POSITION
 from pisigma.measurement.csv.reading import fields_of, number_column, text_column
@@ -35,109 +34,56 @@ OF_IMAGES = (*CORNERS, "sigma_px", "camera", "board")
 """Columns that only rows of corners have."""
 
 MeasurementFiles = str | os.PathLike[str] | Sequence[str | os.PathLike[str]]
-
-
 CameraOrBoard = TypeVar("CameraOrBoard", Camera, Board)
 
 
-@dataclass(frozen=True)
-class CameraFiles:
-    """What the pixels of files of corners mean.
+def read_corners(path: str | os.PathLike[str], robot: Robot, cameras: CameraFiles) -> Measurements:
+    """Read a CSV file of corners: `image`, `corner`, `u_px`, `v_px` and the joints (`q1_deg` and so on).
 
-    Attributes:
-        cameras: files of the cameras, see `Camera.load`.
-        boards: files of the boards, see `Board.load`.
-        is_fixed: whether every camera stands beside the robot and the boards are on its flange; else those that say so
-            in their files do, and the others are on the flange.
-        repeatability: of the robot.
-        intrinsics: whether those of the cameras are held, under their prior, or free; see `prior_deviations`.
+    Rows of one image have one name and the same joint values. `camera` and `board` name what an image was taken by
+    and shows, where there are several; corners count by 1 / `sigma_px`². Rows without a corner are those of other
+    sensors.
+
+    Returns:
+        One row an image, in the frame of the board with the camera as target (of a fixed camera the other way
+        round), with the weights of `CornerSensor`; and the rows of other sensors.
 
     Raises:
-        MeasurementError: no camera or no board is stated.
-        IdentificationError: the intrinsics are no choice.
+        MeasurementError: a file cannot be used, or the corners of an image are not of its board; the message names
+            the line.
     """
+    table = read_table(path)
+    if not set(CORNERS) & set(table.header):
+        return Measurements.read_csv(path, robot)
+    return corners_of(table, robot, cameras)
 
-    cameras: tuple[str, ...]
-    boards: tuple[str, ...]
-    is_fixed: bool = False
-    repeatability: Repeatability = field(default_factory=Repeatability)
-    intrinsics: IntrinsicsChoice = "prior"
 
-    def __post_init__(self) -> None:
-        """Refuse what is no choice, cameras without boards, and boards without cameras."""
-        if self.intrinsics not in get_args(IntrinsicsChoice):
-            choices = nearest_choice(self.intrinsics, get_args(IntrinsicsChoice))
-            raise IdentificationError(f"intrinsics '{self.intrinsics}' is no choice; {choices}")
-        if not self.cameras or not self.boards:
-            raise MeasurementError("--camera and --board belong together; give both.")
-
-    @property
-    def files(self) -> tuple[str, ...]:
-        """Of cameras and boards."""
-        return (*self.cameras, *self.boards)
-
-    @property
-    def options(self) -> list[str]:
-        """Options by which commands read the same."""
-        words = [word for path in self.cameras for word in ("--camera", path)]
-        words += [word for path in self.boards for word in ("--board", path)]
-        usual, stated = Repeatability(), self.repeatability
-        words += ["--fixed-camera"] if self.is_fixed else []
-        words += ["--intrinsics", self.intrinsics] if self.intrinsics != "prior" else []
-        if stated.length != usual.length:
-            words += ["--repeatability-mm", f"{stated.length * 1e3:g}"]
-        if not math.isclose(stated.angle, usual.angle, rel_tol=0.01):  # 0.01 deg to three digits
-            words += ["--repeatability-deg", f"{np.rad2deg(stated.angle):g}"]
-        return words
-
-    def read(self, path: str | os.PathLike[str], robot: Robot) -> Measurements:
-        """Read a CSV file of corners: `image`, `corner`, `u_px`, `v_px` and the joints (`q1_deg` and so on).
-
-        Rows of one image have one name and the same joint values. `camera` and `board` name what an image was taken by
-        and shows, where there are several; corners count by 1 / `sigma_px`². Rows without a corner are those of other
-        sensors.
-
-        Returns:
-            One row an image, in the frame of the board with the camera as target (of a fixed camera the other way
-            round), with the weights of `CornerSensor`; and the rows of other sensors.
-
-        Raises:
-            MeasurementError: a file cannot be used, or the corners of an image are not of its board; the message names
-                the line.
-        """
-        table = read_table(path)
-        if not set(CORNERS) & set(table.header):
-            return Measurements.read_csv(path, robot)
-        return self.of_table(table, robot)
-
-    def of_table(self, table: Table, robot: Robot) -> Measurements:
-        """Turn rows of a file of corners into measurements; see `read`."""
-        cameras, boards = (
-            _by_name(Camera.load, self.cameras, "camera"),
-            _by_name(Board.load, self.boards, "board"),
+def corners_of(table: Table, robot: Robot, files: CameraFiles) -> Measurements:
+    """Turn rows of a file of corners into measurements; see `read_corners`."""
+    cameras = _by_name(Camera.load, files.cameras, "camera")
+    boards = _by_name(Board.load, files.boards, "board")
+    is_corner = _are_corners(table)
+    rows = Measurements.from_fields(fields_of(_without_corners(table, is_corner), robot))
+    corners = _some(table, is_corner)
+    of_camera, of_board = _stated(corners, "camera", cameras), _stated(corners, "board", boards)
+    numbers = np.flatnonzero(is_corner)
+    measured = [rows.select(torch.from_numpy(np.flatnonzero(~np.array(is_corner))))]
+    for camera, board in dict.fromkeys(zip(of_camera, of_board, strict=True)):
+        chosen = [pair == (camera, board) for pair in zip(of_camera, of_board, strict=True)]
+        stated = rows.select(torch.from_numpy(numbers[chosen]))
+        images, first = _images(_some(corners, chosen), stated, cameras[camera], boards[board])
+        solved = image_measurements(
+            images,
+            cameras[camera],
+            boards[board],
+            files.is_fixed or cameras[camera].is_fixed,
+            files.repeatability,
+            files.intrinsics,
         )
-        is_corner = _are_corners(table)
-        rows = Measurements.from_fields(fields_of(_without_corners(table, is_corner), robot))
-        corners = _some(table, is_corner)
-        of_camera, of_board = _stated(corners, "camera", cameras), _stated(corners, "board", boards)
-        numbers = np.flatnonzero(is_corner)
-        measured = [rows.select(torch.from_numpy(np.flatnonzero(~np.array(is_corner))))]
-        for camera, board in dict.fromkeys(zip(of_camera, of_board, strict=True)):
-            chosen = [pair == (camera, board) for pair in zip(of_camera, of_board, strict=True)]
-            stated = rows.select(torch.from_numpy(numbers[chosen]))
-            images, first = _images(_some(corners, chosen), stated, cameras[camera], boards[board])
-            solved = image_measurements(
-                images,
-                cameras[camera],
-                boards[board],
-                self.is_fixed or cameras[camera].is_fixed,
-                self.repeatability,
-                self.intrinsics,
-            )
-            conditions = {name: getattr(stated.select(first), name) for name in CONDITIONS}
-            measured.append(replace(solved, **conditions))
-        joined = join([one for one in measured if one.rows])
-        return joined.select(torch.tensor(joined.line).argsort(stable=True))
+        conditions = {name: getattr(stated.select(first), name) for name in CONDITIONS}
+        measured.append(replace(solved, **conditions))
+    joined = join([one for one in measured if one.rows])
+    return joined.select(torch.tensor(joined.line).argsort(stable=True))
 
 
 def read_rows(
@@ -168,7 +114,7 @@ def read_rows(
     if cameras is None:
         rows = [Measurements.read_csv(path, robot) for path in paths]
     else:
-        rows = [cameras.read(path, robot) for path in paths]
+        rows = [read_corners(path, robot, cameras) for path in paths]
         if not any("corner" in one.kinds for one in rows):
             raise MeasurementError(
                 f"{rows[0].source}: corners of images were wanted, as a camera is stated, but there is none of the "

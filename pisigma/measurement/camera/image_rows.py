@@ -8,13 +8,13 @@ import torch
 from jaxtyping import Float64
 
 from pisigma.estimation.loss import AbstractLoss, HampelLoss
-from pisigma.files.errors import IdentificationError, MeasurementError
+from pisigma.files.errors import MeasurementError
 from pisigma.measurement.camera.board import Board
 from pisigma.measurement.camera.board_pose import POSE, BoardPose, solve_board_pose
 from pisigma.measurement.camera.camera import Camera
+from pisigma.measurement.camera.camera_files import IntrinsicsChoice, Repeatability
 from pisigma.measurement.camera.flatness import SHAPES, bent_corners, bent_further
 from pisigma.measurement.camera.solved_images import (
-    IntrinsicsChoice,
     SolvedImages,
     corner_noise,
     prior_deviations,
@@ -36,29 +36,6 @@ SMALLEST_BEND = 1e-6
 """[m] A board is not bent further by less."""
 LARGEST_MISS = 10.0
 """[px] Where half of the corners of an image miss their prediction by more, they are not of this board."""
-MOST_REPEATABILITY = 0.01, 0.105
-"""[m] and [rad] More is that of no robot, but of another unit."""
-
-
-@dataclass(frozen=True)
-class Repeatability:
-    """By how much the robot misses, anew in every image, the pose that its joint values mean.
-
-    Attributes:
-        length: standard deviation of each coordinate of the target's position [m].
-        angle: standard deviation of its turn about each axis [rad].
-    """
-
-    length: float = 2e-5
-    angle: float = 1.75e-4
-
-    def __post_init__(self) -> None:
-        """Refuse what is no standard deviation."""
-        if not (0 <= self.length <= MOST_REPEATABILITY[0] and 0 <= self.angle <= MOST_REPEATABILITY[1]):
-            raise IdentificationError(
-                f"repeatability: standard deviations of 0 to 10 mm and 0 to 6 deg were wanted, got "
-                f"{self.length * 1e3:g} mm and {np.rad2deg(self.angle):g} deg."
-            )
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 import torch
@@ -12,9 +11,9 @@ from pisigma.estimation.loss import AbstractLoss
 from pisigma.files.errors import MeasurementError
 from pisigma.measurement.camera.board_pose import POSE, SMALLEST_NOISE, BoardPose
 from pisigma.measurement.camera.camera import INTRINSICS, USUAL_DEVIATIONS, Camera
+from pisigma.measurement.camera.camera_files import IntrinsicsChoice
 from pisigma.measurement.sensors.intrinsics import ImageIntrinsics, intrinsics_information
 
-IntrinsicsChoice = Literal["fixed", "prior", "free"]
 ROUNDS = 20
 CLOSE = 0.1
 """[standard deviations] Intrinsics that would move by less need not be linearised at anew."""

@@ -15,7 +15,6 @@ from pisigma.measurement.foreign.quantities import KEYS, is_measured, joints_of
 from pisigma.measurement.foreign.time_stamps import date_of, day_first, has_open_date, is_clock, seconds_of
 
 JoinBy = Literal["point", "order", "time"]
-WITHIN = 0.2
 """[s] Two time stamps of one pose differ by no more, where nothing is said."""
 _MOVED = 0.05
 """[deg or mm] A joint that moves by more around a time stamp did not stand."""
@@ -40,9 +39,7 @@ class JoinedRows:
     warnings: tuple[str, ...]
 
 
-def join_rows(
-    measured: ConvertedRows, joints: ConvertedRows, by: JoinBy, within: float = WITHIN
-) -> JoinedRows:
+def join_rows(measured: ConvertedRows, joints: ConvertedRows, by: JoinBy, within: float = 0.2) -> JoinedRows:
     """Put a list of measurements and a log of joint values together.
 
     Rows of the list stay in their order; one without a partner is left out and named. Poses of the log are commanded or

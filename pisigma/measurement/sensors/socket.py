@@ -233,7 +233,7 @@ def means(values: Float64[Tensor, "rows size"], number: Int64[Tensor, " rows"], 
 def matching_sockets(
     distances: Mapping[tuple[str, str], float], sockets: Iterable[str]
 ) -> dict[tuple[str, str], float]:
-    """Distances by names of sockets in the data; see `pisigma.workflow.calibrate.CalibrationSettings`."""
+    """Distances by names of sockets in the data; see `CalibrationSettings`."""
     names = dict.fromkeys(name for name in sockets if name)
     matching: dict[tuple[str, str], float] = {}
     for (first, second), distance in distances.items():

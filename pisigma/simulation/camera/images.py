@@ -10,7 +10,8 @@ from torch import Tensor
 
 from pisigma.measurement.camera.board import Board
 from pisigma.measurement.camera.camera import Camera
-from pisigma.measurement.camera.image_rows import Images, Repeatability
+from pisigma.measurement.camera.camera_files import Repeatability
+from pisigma.measurement.camera.image_rows import Images
 from pisigma.robot.description import Robot
 from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.robot.se3 import invert, rotation_from_vector, transform

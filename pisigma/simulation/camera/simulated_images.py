@@ -13,7 +13,8 @@ from torch import Tensor
 from pisigma.files.yaml_file import Section, Seed
 from pisigma.measurement.camera.board import BoardDocument
 from pisigma.measurement.camera.camera import Camera, CameraDocument, IntrinsicsSection
-from pisigma.measurement.camera.image_rows import Repeatability, image_measurements
+from pisigma.measurement.camera.camera_files import Repeatability
+from pisigma.measurement.camera.image_rows import image_measurements
 from pisigma.measurement.dataset import Measurements
 from pisigma.simulation.camera.images import ImageNoise, draw_board_poses, simulate_images
 from pisigma.simulation.camera.rendering import Exposure, render_image

@@ -5,11 +5,10 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from pisigma.files.errors import MeasurementError
+from pisigma.validation.resampling import Bootstrap
 
 STATISTICS = ("mean", "rms", "p95")
 """Statistics that have an interval; the maximum has none, as no resample exceeds what was measured."""
-MOST_RESAMPLES = 1_000_000
 QUANTILE = 0.95
 """Of the statistic "p95"."""
 
@@ -30,65 +29,41 @@ class Intervals:
     difference: Float64[np.ndarray, "statistics models 2"]
 
 
-@dataclass(frozen=True)
-class Bootstrap:
-    """Percentile bootstrap (Efron and Tibshirani 1993, chapter 13) over groups of rows that belong together.
+def confidence_intervals(
+    bootstrap: Bootstrap, errors: Float64[np.ndarray, "models rows"], group: Int64[np.ndarray, " rows"]
+) -> Intervals:
+    """Compute the intervals of all models on the same resamples.
 
-    Rows of one configuration share most of their error, so groups and not rows are drawn, as many as there are, with
-    replacement.
-
-    Attributes:
-        resamples: number of times that groups are drawn.
-        seed: of the drawing; equal seeds draw equal groups, so that models are compared on the same resamples.
-        confidence: share of the resamples within an interval.
+    Args:
+        bootstrap: how they are computed.
+        errors: of the same rows under every model, lengths or angles [m or rad]; none is NaN.
+        group: index of every row's group, from 0; every index occurs.
     """
+    from scipy import stats
 
-    resamples: int = 2000
-    seed: int = 0
-    confidence: float = 0.95
+    groups = int(group.max()) + 1
+    if groups < 2:
+        unknown = np.full((len(STATISTICS), len(errors), 2), np.nan)
+        return Intervals(unknown, unknown)
+    order = np.argsort(group, kind="stable")
+    sizes, errors = np.bincount(group), errors[:, order]
 
-    def __post_init__(self) -> None:
-        """Refuse settings that give no interval."""
-        if not 2 <= self.resamples <= MOST_RESAMPLES or not 0 < self.confidence < 1 or self.seed < 0:
-            raise MeasurementError(
-                f"bootstrap: 2 resamples or more and a confidence between 0 and 1 were wanted, a seed from 0 and up to "
-                f"{MOST_RESAMPLES:,} resamples, got {self.resamples}, {self.confidence:g} and seed {self.seed}."
-            )
+    def of_resample(drawn: Int64[np.ndarray, " groups"]) -> np.ndarray:
+        times = np.bincount(drawn.astype(np.int64), minlength=groups)
+        values = statistics(np.repeat(errors, np.repeat(times, sizes), axis=1))
+        return np.stack([values, values - values[:, :1]])
 
-    def intervals(
-        self, errors: Float64[np.ndarray, "models rows"], group: Int64[np.ndarray, " rows"]
-    ) -> Intervals:
-        """Compute the intervals of all models on the same resamples.
-
-        Args:
-            errors: of the same rows under every model, lengths or angles [m or rad]; none is NaN.
-            group: index of every row's group, from 0; every index occurs.
-        """
-        from scipy.stats import bootstrap
-
-        groups = int(group.max()) + 1
-        if groups < 2:
-            unknown = np.full((len(STATISTICS), len(errors), 2), np.nan)
-            return Intervals(unknown, unknown)
-        order = np.argsort(group, kind="stable")
-        sizes, errors = np.bincount(group), errors[:, order]
-
-        def of_resample(drawn: Int64[np.ndarray, " groups"]) -> np.ndarray:
-            times = np.bincount(drawn.astype(np.int64), minlength=groups)
-            values = statistics(np.repeat(errors, np.repeat(times, sizes), axis=1))
-            return np.stack([values, values - values[:, :1]])
-
-        result = bootstrap(
-            (np.arange(groups),),
-            of_resample,
-            vectorized=False,
-            method="percentile",
-            n_resamples=self.resamples,
-            confidence_level=self.confidence,
-            batch=max(1, _BATCH // groups),
-            rng=np.random.default_rng(self.seed),
-        )
-        return Intervals(*np.stack([result.confidence_interval.low, result.confidence_interval.high], -1))
+    result = stats.bootstrap(
+        (np.arange(groups),),
+        of_resample,
+        vectorized=False,
+        method="percentile",
+        n_resamples=bootstrap.resamples,
+        confidence_level=bootstrap.confidence,
+        batch=max(1, _BATCH // groups),
+        rng=np.random.default_rng(bootstrap.seed),
+    )
+    return Intervals(*np.stack([result.confidence_interval.low, result.confidence_interval.high], -1))
 
 
 def statistics(errors: Float64[np.ndarray, "models rows"]) -> Float64[np.ndarray, "statistics models"]:

@@ -17,13 +17,14 @@ from pisigma.measurement.sensors.socket import PairOfSockets
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.row_poses import poses_of_rows
 from pisigma.robot.kinematics.forward import forward_kinematics
-from pisigma.validation.held_out.bootstrap import STATISTICS, Bootstrap, Intervals, statistics
+from pisigma.validation.held_out.bootstrap import STATISTICS, Intervals, confidence_intervals, statistics
 from pisigma.validation.held_out.frames.fitted_frames import FrameKind, errors_in_fitted_frames
 from pisigma.validation.held_out.frames.row_errors import has_position, other_lengths
 from pisigma.validation.held_out.pose_statistics import axis_statistics, error_statistics
 from pisigma.validation.held_out.rank_tests import SignedRank, signed_rank
 from pisigma.validation.held_out.trained_calibrations import DistanceErrors, distance_figures
 from pisigma.validation.held_out.validation_figures import SocketDistances
+from pisigma.validation.resampling import Bootstrap
 
 Interval = tuple[float, float]
 """Lower and upper end."""
@@ -272,7 +273,7 @@ def _quantity(
     there = common & torch.isfinite(stacked).all(-1).all(0)
     sizes = stacked.norm(dim=-1)[:, there].numpy()
     index = torch.unique(group[there], return_inverse=True)[1].numpy()
-    intervals = bootstrap.intervals(sizes, index)
+    intervals = confidence_intervals(bootstrap, sizes, index)
     differences = _differences(sizes, index, intervals)
     figures = []
     for number, (errors, inside) in enumerate(zip(stacked[:, there], domains, strict=True)):

@@ -1,113 +1,77 @@
 """What is done with one robot of a fleet: settings, its sessions one after the other, and its record."""
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Any, get_type_hints
 
 from pydantic import TypeAdapter, ValidationError
 
 from pisigma.files.errors import FleetError, OutputError, PisigmaError, nearest_choice
 from pisigma.lifetime.fleet.members import Member, SessionFile
 from pisigma.lifetime.fleet.record import REFUSED, ParameterValue, RobotRecord, SessionRecord, write_record
-from pisigma.measurement.camera.corner_file import CameraFiles
+from pisigma.measurement.camera.camera_files import CameraFiles
 from pisigma.measurement.sensors.sensor import SHOWN_UNITS
+from pisigma.measurement.splits import SplitBy
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.robot.description import Robot
+from pisigma.robot.robot_class import ClassName
 from pisigma.validation.held_out.validation_figures import AbstractValidationFigures
-from pisigma.workflow.calibrate import Calibration, CalibrationSettings, calibrate
-from pisigma.workflow.monitor import MonitorSettings, monitor
-from pisigma.workflow.recalibrate import Recalibration, RecalibrationSettings, recalibrate
+from pisigma.workflow.calibrate import Calibration, calibrate
+from pisigma.workflow.monitor import monitor
+from pisigma.workflow.recalibrate import Recalibration, recalibrate
+from pisigma.workflow.settings.calibration import CalibrationSettings, free_parameters
+from pisigma.workflow.settings.fleet import FleetSettings
+from pisigma.workflow.settings.monitoring import MonitorSettings
+from pisigma.workflow.settings.recalibration import RecalibrationSettings
 
-Task = Literal["calibrate", "recalibrate", "monitor"]
-EngineName = Literal["processes", "ray"]
 OPTIONS = ("model", "free", "split", "robust", "prior_length", "prior_angle", "train_rows", "seed")
 """Settings of a calibration that a manifest may state for one robot."""
+KINDS = get_type_hints(CalibrationSettings, localns={"SplitBy": SplitBy, "ClassName": ClassName})
 UNKNOWN = SessionFile("description", "", Path())
 """Stands for the sessions of a robot whose description is wrong."""
 
 
-@dataclass(frozen=True)
-class FleetSettings:
-    """What is done with every robot, and where.
-
-    Attributes:
-        task: "calibrate": every session by itself; "recalibrate": the first session is calibrated, and every later one
-            brings the model of the one before up to date; "monitor": the first is calibrated, and the later ones are
-            compared with its model. A robot with a model of its own begins with that.
-        validate: cross-validate the calibrations and draw the figures of their cards.
-        calibration: of every robot, but for what its own options say; its folds count only with `validate`.
-        engine: "processes" on this machine, or "ray".
-        jobs: processes that work side by side; None for one per core.
-        address: of a Ray cluster; None for Ray on this machine.
-        prior: folder of a model of `pisigma fleet prior` that calibrations begin with, which have no use for the
-            settings of a calibration and whose rows are left out in turn anyway.
+def settings_for(settings: FleetSettings, member: Member) -> CalibrationSettings:
+    """Settings of the calibration of one robot.
 
     Raises:
-        FleetError: something is no choice, or there are no jobs.
+        FleetError: the description of the robot is wrong, an option of it is unknown or has no such value, or the
+            task needs another model than it chooses.
+        PisigmaError: the settings make no sense together.
     """
-
-    task: Task = "calibrate"
-    validate: bool = False
-    calibration: CalibrationSettings = field(default_factory=CalibrationSettings)
-    engine: EngineName = "processes"
-    jobs: int | None = None
-    address: str | None = None
-    prior: Path | None = None
-
-    def __post_init__(self) -> None:
-        """Refuse what is no choice."""
-        for name, choices in (("task", get_args(Task)), ("engine", get_args(EngineName))):
-            if (value := getattr(self, name)) not in choices:
-                raise FleetError(f"{name} '{value}' is unknown; {nearest_choice(value, choices)}")
-        if self.jobs is not None and self.jobs < 1:
-            raise FleetError(f"jobs: 1 or more were wanted, got {self.jobs}.")
-        if self.address is not None and self.engine != "ray":
+    if member.fault:
+        raise FleetError(member.fault)
+    for name, value in member.options:
+        if not value:
             raise FleetError(
-                f"address {self.address}: only the engine ray has one; choose it, or leave it out."
+                f"robot '{member.id}': expected options as name=value; name=value, got '{name}'."
             )
-
-    def of(self, member: Member) -> CalibrationSettings:
-        """Settings of the calibration of one robot.
-
-        Raises:
-            FleetError: the description of the robot is wrong, an option of it is unknown or has no such value, or the
-                task needs another model than it chooses.
-            PisigmaError: the settings make no sense together.
-        """
-        if member.fault:
-            raise FleetError(member.fault)
-        for name, value in member.options:
-            if not value:
-                raise FleetError(
-                    f"robot '{member.id}': expected options as name=value; name=value, got '{name}'."
-                )
-            if name not in OPTIONS:
-                raise FleetError(
-                    f"robot '{member.id}': option '{name}' is unknown; {nearest_choice(name, OPTIONS)}"
-                )
-            if [one for one, _ in member.options].count(name) > 1:
-                raise FleetError(f"robot '{member.id}': option '{name}' appears twice; state it once.")
-        stated = {name: getattr(self.calibration, name) for name in self.calibration.__dataclass_fields__}
-        stated |= {name: _free(value) if name == "free" else value for name, value in member.options}
-        stated["cameras"] = member.cameras
+        if name not in OPTIONS:
+            raise FleetError(
+                f"robot '{member.id}': option '{name}' is unknown; {nearest_choice(name, OPTIONS)}"
+            )
+        if [one for one, _ in member.options].count(name) > 1:
+            raise FleetError(f"robot '{member.id}': option '{name}' appears twice; state it once.")
+    stated: dict[str, Any] = {}
+    for name, value in member.options:
         try:
-            settings = TypeAdapter(CalibrationSettings).validate_python(stated)
+            stated[name] = TypeAdapter(KINDS[name]).validate_python(_read(name, value))
         except ValidationError as problem:
-            where = problem.errors()[0]
-            name = ".".join(map(str, where["loc"]))
-            what = (
-                f"option '{name}': {where['msg']}, got '{where['input']}'." if name else where["ctx"]["error"]
-            )
-            raise FleetError(f"robot '{member.id}': {what}") from None
-        if self.prior is not None:
-            settings.check_unused()
-        elif self.task != "calibrate" and member.model is None and settings.model == "geometric":
-            raise FleetError(
-                f"robot '{member.id}': the task {self.task} adds rows to the model of the first session, which only a "
-                "hybrid can take; leave out --model geometric, or state a model folder in the column 'model'."
-            )
-        return settings if self.validate else replace(settings, folds=0, hold_out=None, repeats=None)
+            what = problem.errors()[0]["msg"]
+            raise FleetError(f"robot '{member.id}': option '{name}': {what}, got '{value}'.") from None
+    try:
+        calibration = replace(settings.calibration, cameras=member.cameras, **stated)
+    except PisigmaError as problem:
+        raise FleetError(f"robot '{member.id}': {problem}") from None
+    if settings.prior is not None:
+        calibration.check_unused()
+    elif settings.task != "calibrate" and member.model is None and calibration.model == "geometric":
+        raise FleetError(
+            f"robot '{member.id}': the task {settings.task} adds rows to the model of the first session, which only a "
+            "hybrid can take; leave out --model geometric, or state a model folder in the column 'model'."
+        )
+    return calibration if settings.validate else replace(calibration, folds=0, hold_out=None, repeats=None)
 
 
 def work_out(
@@ -278,8 +242,6 @@ def _refusal(session: SessionFile, sentence: str) -> SessionRecord:
     return SessionRecord(session.name, session.date, session.data.name, 0, REFUSED, sentence)
 
 
-def _free(value: str) -> str | tuple[str, ...]:
-    """Free parameters: a choice, or names with commas or blanks between them."""
-    if value in ("identifiable", "joint_offsets"):
-        return value
-    return tuple(value.replace(",", " ").split())
+def _read(name: str, value: str) -> str | tuple[str, ...]:
+    """An option of a manifest: free parameters have commas or blanks between them."""
+    return free_parameters(",".join(value.replace(",", " ").split())) if name == "free" else value

@@ -31,8 +31,9 @@ from pisigma.lifetime.fleet.record import (
 from pisigma.lifetime.fleet.results_table import RESULTS, write_results
 from pisigma.model.folder.model_folder import load_model
 from pisigma.model.model_posterior import check_fleet_prior
-from pisigma.workflow.calibrate import CalibrationSettings
-from pisigma.workflow.fleet.one_robot import FleetSettings, work_out
+from pisigma.workflow.fleet.one_robot import settings_for, work_out
+from pisigma.workflow.settings.calibration import CalibrationSettings
+from pisigma.workflow.settings.fleet import FleetSettings
 
 ROBOTS_A_CHUNK = 4
 """Calibrations that a worker gets at once: some seconds of work."""
@@ -145,7 +146,7 @@ def _plans(members: Sequence[Member], settings: FleetSettings) -> dict[str, Cali
     plans: dict[str, CalibrationSettings | str] = {}
     for member in members:
         try:
-            plans[member.id] = settings.of(member)
+            plans[member.id] = settings_for(settings, member)
         except PisigmaError as problem:
             plans[member.id] = str(problem)
             if len(plans) == len(members) and all(isinstance(plan, str) for plan in plans.values()):

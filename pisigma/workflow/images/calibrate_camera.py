@@ -14,7 +14,7 @@ from pisigma.measurement.camera.board import Board
 from pisigma.measurement.camera.camera import INTRINSICS
 from pisigma.measurement.camera.detection.detected_board import DetectedBoard
 from pisigma.measurement.camera.detection.detected_boards import DetectedBoards, predict_boards
-from pisigma.measurement.camera.detection.detector import MOST_BLUR, detect_boards, image_files
+from pisigma.measurement.camera.detection.detector import detect_boards, image_files
 from pisigma.measurement.camera.intrinsic_calibration import (
     BoardView,
     IntrinsicCalibration,
@@ -22,6 +22,7 @@ from pisigma.measurement.camera.intrinsic_calibration import (
 )
 from pisigma.measurement.sensors.intrinsics import CAMERA_UNITS
 from pisigma.reporting.tables import Table
+from pisigma.workflow.settings.images import IntrinsicsSettings
 
 OBLIQUE = np.deg2rad(15.0)
 """Where fewer than a third of the images are more oblique, focal length and distance go together."""
@@ -34,21 +35,6 @@ CORNERS = {
     "lower left": (slice(-CORNER, None), slice(None, CORNER)),
     "lower right": (slice(-CORNER, None), slice(-CORNER, None)),
 }
-
-
-@dataclass(frozen=True)
-class IntrinsicsSettings:
-    """How a camera is calibrated.
-
-    Attributes:
-        name: of the camera.
-        free_k3: whether k3 is identified; else it is 0.
-        most_blur: images whose edges have a larger standard deviation of blur are left out [px].
-    """
-
-    name: str = "camera"
-    free_k3: bool = False
-    most_blur: float = MOST_BLUR
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,23 +12,10 @@ from pisigma.files.output_file import check_page, write_whole
 from pisigma.measurement.camera.board import Board
 from pisigma.measurement.camera.camera import Camera
 from pisigma.measurement.camera.detection.detected_boards import DetectedBoards, predict_boards
-from pisigma.measurement.camera.detection.detector import MOST_BLUR, detect_boards, image_files
+from pisigma.measurement.camera.detection.detector import detect_boards, image_files
 from pisigma.measurement.camera.detection.joined_joints import JoinedJoints, join_joints
-from pisigma.measurement.foreign.joining import WITHIN
 from pisigma.reporting.tables import Table
-
-
-@dataclass(frozen=True)
-class DetectionSettings:
-    """How corners are detected.
-
-    Attributes:
-        most_blur: images whose edges have a larger standard deviation of blur are left out [px].
-        within: largest difference of time stamps of images and joint values [s].
-    """
-
-    most_blur: float = MOST_BLUR
-    within: float = WITHIN
+from pisigma.workflow.settings.images import DetectionSettings
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,7 +8,8 @@ from gate.table import moved, positions
 from testing.aged import model_before, rows_later
 
 from pisigma.model.folder.model_folder import save_model
-from pisigma.workflow.recalibrate import RecalibrationSettings, recalibrate
+from pisigma.workflow.recalibrate import recalibrate
+from pisigma.workflow.settings.recalibration import RecalibrationSettings
 
 
 @pytest.fixture(scope="module")

@@ -14,7 +14,7 @@ from testing.controller_clients import LANGUAGES, parse, run_urscript
 from testing.serving import CLIENTS, client, json_client, running
 
 import pisigma
-from pisigma.deployment.serve.server import ServeSettings
+from pisigma.deployment.serve.settings import ServeSettings
 from pisigma.robot.kernels.array_kinematics import transform_of
 
 POSE = [800.0, 200.0, 600.0, 12.0, -80.0, 170.0]

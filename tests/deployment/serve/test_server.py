@@ -18,7 +18,8 @@ from testing.serving import frame_client, json_client, running
 import pisigma
 from pisigma.deployment.serve import connection, json_lines
 from pisigma.deployment.serve.models import ServedModels, model_folders
-from pisigma.deployment.serve.server import Server, ServeSettings
+from pisigma.deployment.serve.server import Server
+from pisigma.deployment.serve.settings import ServeSettings
 from pisigma.files.errors import ModelError, OutputError
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.folder.model_folder import save_model

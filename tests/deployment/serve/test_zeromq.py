@@ -8,7 +8,7 @@ import pytest
 from testing.closeness import assert_close
 from testing.serving import client, json_client, running
 
-from pisigma.deployment.serve.server import ServeSettings
+from pisigma.deployment.serve.settings import ServeSettings
 from pisigma.files.errors import missing_extra
 from pisigma.robot.kernels.array_kinematics import transform_of
 

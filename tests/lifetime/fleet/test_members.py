@@ -4,7 +4,7 @@ import pytest
 
 from pisigma.files.errors import FleetError, MeasurementError
 from pisigma.lifetime.fleet.members import read_fleet
-from pisigma.workflow.fleet.one_robot import FleetSettings
+from pisigma.workflow.settings.fleet import FleetSettings
 
 
 def write(folder, text):

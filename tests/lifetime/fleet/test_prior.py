@@ -12,8 +12,9 @@ from pisigma.files.errors import FleetError
 from pisigma.lifetime.fleet.likeness import Likeness
 from pisigma.lifetime.fleet.prior import RobotEvidence, fleet_prior
 from pisigma.lifetime.fleet.prior_summary import summarise_prior
-from pisigma.workflow.calibrate import CalibrationSettings, calibrate
+from pisigma.workflow.calibrate import calibrate
 from pisigma.workflow.recalibrate import recalibrate
+from pisigma.workflow.settings.calibration import CalibrationSettings
 
 ROBOTS = 8
 

@@ -7,7 +7,8 @@ from testing.aged import model_before, rows_later
 from testing.models import hand_made_model
 
 from pisigma.lifetime.recalibration.motion import judged_motion
-from pisigma.workflow.verify import VerificationSettings, verify
+from pisigma.workflow.settings.verification import VerificationSettings
+from pisigma.workflow.verify import verify
 
 pytestmark = pytest.mark.usefixtures("without_type_checker")
 ELSEWHERE = (0.3, -0.2, 0.1, 0.5, 0.2, -0.3)

@@ -12,8 +12,8 @@ from testing.closeness import assert_close
 from pisigma.files.errors import MeasurementError
 from pisigma.measurement.camera.board import Board
 from pisigma.measurement.camera.camera import Camera
-from pisigma.measurement.camera.corner_file import CameraFiles, read_rows
-from pisigma.measurement.camera.image_rows import Repeatability
+from pisigma.measurement.camera.camera_files import CameraFiles, Repeatability
+from pisigma.measurement.camera.corner_file import read_rows
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.sensors.intrinsics import boards, without_stated
 from pisigma.robot.kinematics.forward import forward_kinematics

@@ -11,7 +11,8 @@ from testing.closeness import assert_close
 from pisigma.calibration.geometric.calibrator import GeometricCalibrator
 from pisigma.calibration.geometric.problem.parameters import Prior
 from pisigma.files.errors import IdentificationError, MeasurementError
-from pisigma.measurement.camera.image_rows import Repeatability, image_measurements
+from pisigma.measurement.camera.camera_files import Repeatability
+from pisigma.measurement.camera.image_rows import image_measurements
 from pisigma.measurement.dataset import Measurements, join
 from pisigma.robot import Robot
 from pisigma.robot.kinematics.forward import forward_kinematics

@@ -15,7 +15,8 @@ from pisigma.estimation.loss import SquaredLoss
 from pisigma.files.errors import MeasurementError
 from pisigma.measurement.camera.board_pose import BoardPose, solve_board_pose
 from pisigma.measurement.camera.camera import USUAL_DEVIATIONS, Camera
-from pisigma.measurement.camera.image_rows import Images, Repeatability, image_measurements
+from pisigma.measurement.camera.camera_files import Repeatability
+from pisigma.measurement.camera.image_rows import Images, image_measurements
 from pisigma.measurement.camera.solved_images import prior_deviations, solve_images
 from pisigma.measurement.dataset import Measurements, join
 from pisigma.measurement.sensors.intrinsics import intrinsics_information

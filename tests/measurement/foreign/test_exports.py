@@ -6,7 +6,8 @@ import pytest
 from testing.closeness import assert_close
 
 from pisigma.measurement.dataset import Measurements
-from pisigma.workflow.import_rows import ImportedRows, ImportSettings, import_rows
+from pisigma.workflow.import_rows import ImportedRows, import_rows
+from pisigma.workflow.settings.importing import ImportSettings
 
 EXPORTS = Path(__file__).parent / "exports"
 REFERENCE = EXPORTS / "reference.csv"

@@ -6,7 +6,8 @@ from pathlib import Path
 import pytest
 
 from pisigma.files.errors import MeasurementError
-from pisigma.workflow.import_rows import ImportedRows, ImportSettings, import_rows
+from pisigma.workflow.import_rows import ImportedRows, import_rows
+from pisigma.workflow.settings.importing import ImportSettings
 
 NAMES = ["J1", "J2", "J3", "J4", "J5", "J6", "X", "Y", "Z"]
 STATED = ImportSettings(units="mm,deg")

@@ -12,7 +12,8 @@ from torch import Tensor
 from pisigma.calibration.geometric.calibrator import GeometricCalibrator
 from pisigma.files.errors import MeasurementError
 from pisigma.measurement.camera.camera import USUAL_DEVIATIONS
-from pisigma.measurement.camera.image_rows import Repeatability, image_measurements
+from pisigma.measurement.camera.camera_files import Repeatability
+from pisigma.measurement.camera.image_rows import image_measurements
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.sensors.corner import position_deviations
 from pisigma.measurement.sensors.intrinsics import without_stated

@@ -13,6 +13,7 @@ from testing.models import no_type_checker
 from pisigma.measurement.camera.board import Board
 from pisigma.measurement.camera.camera import Camera
 from pisigma.planning.plan_file import StoredPlan
+from pisigma.planning.plan_inputs import find_candidates
 from pisigma.planning.plan_settings import PlanSettings
 from pisigma.planning.session.growing_images import growing_file
 from pisigma.planning.surroundings.arm_in_cell import ArmInCell
@@ -20,7 +21,8 @@ from pisigma.robot import Robot
 from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.robot.se3 import invert, xyzrpy_from_transform
 from pisigma.simulation.camera.images import ImageNoise, simulate_images
-from pisigma.workflow.measure import MeasureSettings, MeasuringSession
+from pisigma.workflow.measure import MeasuringSession
+from pisigma.workflow.settings.measuring import MeasureSettings
 
 IMAGES, SWAPPED = 9, 7
 CORNERS = 54
@@ -31,7 +33,7 @@ def plan(tmp_path_factory: pytest.TempPathFactory) -> StoredPlan:
     camera = camera_settings(tmp_path_factory.mktemp("camera"))
     settings = PlanSettings(count=IMAGES, check=0, sensor="camera", camera=camera, candidates=40)
     arm = ArmInCell.of(Robot.load("ur5"), CELL)
-    drawn = settings.find_candidates(arm)
+    drawn = find_candidates(settings, arm)
     q = drawn.q[:IMAGES]
     none = (q[:0],) * IMAGES
     return StoredPlan(

@@ -12,8 +12,8 @@ from pisigma.calibration.geometric.calibrator import GeometricCalibrator
 from pisigma.calibration.geometric.problem.parameters import Prior
 from pisigma.calibration.geometric.result import CalibrationResult
 from pisigma.measurement.camera.camera import USUAL_DEVIATIONS, Camera
-from pisigma.measurement.camera.image_rows import Repeatability, image_measurements
-from pisigma.measurement.camera.solved_images import IntrinsicsChoice
+from pisigma.measurement.camera.camera_files import IntrinsicsChoice, Repeatability
+from pisigma.measurement.camera.image_rows import image_measurements
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.stored_starts import nearest_branch
 from pisigma.robot import Robot

@@ -6,7 +6,8 @@ from testing.closeness import assert_close
 
 from pisigma.files.errors import MeasurementError
 from pisigma.validation.held_out import bootstrap as module
-from pisigma.validation.held_out.bootstrap import STATISTICS, Bootstrap, statistics
+from pisigma.validation.held_out.bootstrap import STATISTICS, confidence_intervals, statistics
+from pisigma.validation.resampling import Bootstrap
 
 ROWS = 40
 
@@ -37,7 +38,7 @@ def test_intervals_are_those_of_resamples_drawn_by_hand(groups: int):
         rows = np.concatenate([np.flatnonzero(group == index) for index in drawn])
         resamples.append(statistics(errors[:, rows]))
     values = np.stack(resamples, -1)
-    found = Bootstrap(resamples=800, seed=5, confidence=0.9).intervals(errors, group)
+    found = confidence_intervals(Bootstrap(resamples=800, seed=5, confidence=0.9), errors, group)
     spread = values.std(-1).max()
     for intervals, own in ((found.value, values), (found.difference, values - values[:, :1])):
         expected = np.moveaxis(np.quantile(own, [0.05, 0.95], axis=-1), 0, -1)
@@ -48,24 +49,26 @@ def test_intervals_are_those_of_resamples_drawn_by_hand(groups: int):
 def test_the_seed_decides_and_nothing_else(monkeypatch):
     errors, group = grouped(1, 9)
     state = np.random.get_state()[1].copy()  # noqa: NPY002
-    first, again, other = (Bootstrap(50, seed).intervals(errors, group).value for seed in (5, 5, 6))
+    first, again, other = (
+        confidence_intervals(Bootstrap(50, seed), errors, group).value for seed in (5, 5, 6)
+    )
     assert np.array_equal(first, again)
     assert not np.array_equal(first, other)
     assert np.array_equal(np.random.get_state()[1], state)  # noqa: NPY002
-    alone = Bootstrap(50, 5).intervals(errors[:1], group).value
+    alone = confidence_intervals(Bootstrap(50, 5), errors[:1], group).value
     assert_close(alone, first[:, :1], rtol=1e-12)  # whatever stands beside it
     monkeypatch.setattr(module, "_BATCH", 1)
-    assert_close(Bootstrap(50, 5).intervals(errors, group).value, first, rtol=1e-12)
+    assert_close(confidence_intervals(Bootstrap(50, 5), errors, group).value, first, rtol=1e-12)
 
 
 def test_repeats_of_a_configuration_make_no_interval_narrower():
     """Thirty copies of every row say nothing new; drawn as rows they would narrow it by √30."""
     errors, group = np.random.default_rng(0).uniform(size=(1, 25)), np.arange(25)
     bootstrap = Bootstrap(400, seed=0)
-    once = bootstrap.intervals(errors, group).value
-    often = bootstrap.intervals(errors.repeat(30, 1), group.repeat(30)).value
+    once = confidence_intervals(bootstrap, errors, group).value
+    often = confidence_intervals(bootstrap, errors.repeat(30, 1), group.repeat(30)).value
     assert_close(often[:2], once[:2], rtol=1e-12)
-    as_rows = bootstrap.intervals(errors.repeat(30, 1), np.arange(750)).value
+    as_rows = confidence_intervals(bootstrap, errors.repeat(30, 1), np.arange(750)).value
     assert np.diff(as_rows[0, 0]) < np.diff(once[0, 0]) / 4
 
 
@@ -76,13 +79,15 @@ def test_an_interval_holds_the_truth_as_often_as_it_says():
     held = np.zeros(2)
     for _ in range(60):
         errors = rng.gamma(2.0, 1.0, (1, 60)).repeat(2, 1)
-        low, high = Bootstrap(150, seed=1).intervals(errors, np.arange(60).repeat(2)).value[:2, 0].T
+        low, high = (
+            confidence_intervals(Bootstrap(150, seed=1), errors, np.arange(60).repeat(2)).value[:2, 0].T
+        )
         held += (low <= truth) & (truth <= high)
     assert np.all((held >= 51) & (held <= 60))
 
 
 def test_a_single_configuration_has_no_interval():
-    found = Bootstrap(10).intervals(np.ones((1, 5)), np.zeros(5, dtype=np.int64))
+    found = confidence_intervals(Bootstrap(10), np.ones((1, 5)), np.zeros(5, dtype=np.int64))
     assert np.isnan(found.value).all()
     assert np.isnan(found.difference).all()
 

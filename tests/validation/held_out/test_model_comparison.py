@@ -19,9 +19,9 @@ from pisigma.model.row_poses import nominal_poses_of_rows, poses_of_rows
 from pisigma.robot import Robot
 from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.robot.se3 import invert, rotation_vector, transform_from_xyzrpy
-from pisigma.validation.held_out.bootstrap import Bootstrap
 from pisigma.validation.held_out.model_comparison import compare_models, inside_domain
 from pisigma.validation.held_out.reference_models import geometric_model, nominal_model
+from pisigma.validation.resampling import Bootstrap
 
 pytestmark = pytest.mark.usefixtures("without_type_checker")
 

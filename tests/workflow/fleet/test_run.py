@@ -13,8 +13,8 @@ from pisigma.files.errors import FleetError, OutputError
 from pisigma.lifetime.fleet.record import read_records
 from pisigma.model.folder.model_folder import load_model, save_model
 from pisigma.workflow.fleet import run as workflow
-from pisigma.workflow.fleet.one_robot import FleetSettings
 from pisigma.workflow.fleet.run import run_fleet
+from pisigma.workflow.settings.fleet import FleetSettings
 
 parquet = pytest.importorskip("pyarrow.parquet", reason="Parquet comes with the extra fleet")
 

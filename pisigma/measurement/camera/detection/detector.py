@@ -22,8 +22,6 @@ from pisigma.measurement.camera.detection.detected_board import (
 from pisigma.measurement.camera.detection.detected_boards import BoardImage
 from pisigma.measurement.camera.detection.markers import detect_apriltags, detect_charuco
 
-MOST_BLUR = 3.0
-"""[px] Images whose edges are blurred more are left out unless another limit is stated."""
 DETECTORS: dict[BoardKind, Callable[[Image, Board], DetectedBoard | NoBoard]] = {
     "checkerboard": detect_checkerboard,
     "charuco": detect_charuco,
@@ -59,7 +57,7 @@ def image_files(paths: Sequence[str | os.PathLike[str]]) -> tuple[Path, ...]:
 def detect_boards(
     files: Sequence[Path],
     board: Board,
-    most_blur: float = MOST_BLUR,
+    most_blur: float = 3.0,
     progress: Callable[[str], None] = lambda name: None,
 ) -> list[BoardImage]:
     """Find the corners of a board in the images of some files; see `detect_board`.

@@ -1,0 +1,43 @@
+"""Where a server listens, and to whom."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+from pisigma.deployment.serve.polling import DURATION
+from pisigma.files.errors import OutputError
+from pisigma.files.input_file import read_input
+from pisigma.files.setting import HIDDEN, Option
+
+LAST_PORT = 65535
+PATIENCE = 10.0
+"""[s] A client may take for the rest of a message, for its token, or to take an answer; then it is cut off."""
+
+
+def token_in(file: Path) -> str:
+    """The token that a file holds."""
+    return read_input(file, OutputError).decode(errors="replace").strip()
+
+
+@dataclass(frozen=True)
+class ServeSettings:
+    """Where a server listens.
+
+    Attributes:
+        host: address to listen at; other than that of this machine only with a token.
+        json_port: port for lines of JSON; 0 for a free one.
+        binary_port: port for binary frames; 0 for a free one.
+        zmq_port: port for ZeroMQ too; 0 for a free one; needs the extra serve. None: none.
+        token: what every client has to send first; options state a file that holds it.
+        patience: see `PATIENCE`.
+        polling: time to stay awake for the next request [s], where requests come that often and no other program wants
+            the processor; 0 to sleep at once.
+    """
+
+    host: str = "127.0.0.1"
+    json_port: Annotated[int, Option("--port", least=0, most=LAST_PORT)] = 0
+    binary_port: Annotated[int, Option(least=0, most=LAST_PORT)] = 0
+    zmq_port: Annotated[int | None, Option(least=0, most=LAST_PORT)] = None
+    token: Annotated[str | None, Option("--token-file", kind=Path, read=token_in)] = None
+    patience: Annotated[float, HIDDEN] = PATIENCE
+    polling: Annotated[float, Option("--poll-ms", unit="ms", least=0, most=100)] = DURATION

@@ -1,0 +1,127 @@
+"""What a plan begins with, by its settings: instrument, candidates, rows that are measured, and views of a camera."""
+
+import os
+from typing import Any
+
+import torch
+from jaxtyping import Float64
+from torch import Tensor
+
+from pisigma.files.errors import PlanningError
+from pisigma.measurement.camera.board import Board
+from pisigma.measurement.camera.camera import Camera
+from pisigma.measurement.camera.corner_file import read_rows
+from pisigma.measurement.csv.reading import holds_measurements, read_joints
+from pisigma.measurement.dataset import Measurements
+from pisigma.planning.board_sight import BoardSight
+from pisigma.planning.board_views import BoardViews
+from pisigma.planning.camera_settings import CameraSettings
+from pisigma.planning.candidates import (
+    Candidates,
+    Workspace,
+    draw_candidates,
+    read_candidates,
+    with_workspace,
+)
+from pisigma.planning.knowledge import Instrument
+from pisigma.planning.plan_settings import PlanSettings
+from pisigma.planning.surroundings.arm_in_cell import ArmInCell
+from pisigma.robot.description import Robot
+
+REACHABLE = 1000
+"""Poses that stand for the workspace where a camera measures."""
+
+
+def instrument_of(settings: PlanSettings, anchor: Float64[Tensor, " 3"] | None = None) -> Instrument:
+    """What measures.
+
+    Args:
+        settings: what is to be planned.
+        anchor: where distances are from, in the measuring frame [m].
+
+    Raises:
+        PlanningError: distances are measured, but from nowhere.
+    """
+    if settings.camera is not None:
+        return Instrument(settings.sensor, sight=sight_of(settings.camera))
+    if settings.sensor == "distance" and anchor is None:
+        raise PlanningError(
+            "where distances are measured from was wanted; state it as the tracker of the cell (--cell)."
+        )
+    stated: dict[str, Any] = {} if settings.sigma_mm is None else {"sigma": settings.sigma_mm / 1e3}
+    stated |= {} if anchor is None else {"anchor": tuple(anchor.tolist())}
+    return Instrument(settings.sensor, **stated)
+
+
+def find_candidates(settings: PlanSettings, arm: ArmInCell) -> Candidates:
+    """Draw or read the poses to choose from.
+
+    Raises:
+        MeasurementError: their file cannot be used.
+        PlanningError: a joint that slides has no limits to draw in.
+    """
+    views, workspace = views_of(settings, arm), workspace_of(settings)
+    if settings.candidates_from is not None:
+        candidates = read_candidates(arm, settings.candidates_from, workspace, views)
+    else:
+        candidates = draw_candidates(arm, settings.candidates, settings.seed, workspace, views)
+    if views is None:
+        return candidates
+    return with_workspace(arm, candidates, draw_candidates(arm, REACHABLE, settings.seed, workspace))
+
+
+def with_measured(settings: PlanSettings, arm: ArmInCell) -> ArmInCell:
+    """The arm, for which candidates that were measured are free of self-collision.
+
+    Raises:
+        MeasurementError: the file of candidates cannot be used.
+    """
+    if settings.candidates_from is None or not holds_measurements(settings.candidates_from):
+        return arm
+    return arm.with_measured(read_joints(settings.candidates_from, arm.robot))
+
+
+def workspace_of(settings: PlanSettings) -> Workspace | None:
+    """Where the reflector is measured, or the target of a camera; None for anywhere."""
+    if settings.box_mm is None:
+        return None
+    return torch.tensor(settings.box_mm, dtype=torch.float64).reshape(2, 3) / 1e3
+
+
+def read_planned_rows(settings: PlanSettings, path: str | os.PathLike[str], robot: Robot) -> Measurements:
+    """Read measured rows, or the corners that a camera saw.
+
+    Raises:
+        MeasurementError: the file cannot be used.
+    """
+    return read_rows(path, robot, None if settings.camera is None else settings.camera.files)
+
+
+def views_of(settings: PlanSettings, arm: ArmInCell) -> BoardViews | None:
+    """From where the camera has to see its board; None without a camera.
+
+    Raises:
+        PlanningError: the cell does not say from where, or where the board is.
+    """
+    if settings.camera is None:
+        return None
+    view = arm.cell.view
+    if view is None or view.T_cell_frame is None:
+        frame, target = ("camera", "board") if settings.camera.is_fixed else ("board", "camera")
+        raise PlanningError(
+            f"where the {frame} is and from where images are sharp was wanted; state it in the cell (--cell), as "
+            "view: {frame: {x_mm: 400, z_mm: 50, yaw_deg: 180}, near_mm: 300, far_mm: 700}, and where the "
+            f"{target} is on the flange as tool."
+        )
+    return BoardViews.of(sight_of(settings.camera), view.T_cell_frame, view)
+
+
+def sight_of(camera: CameraSettings) -> BoardSight:
+    """Read the files of camera and board.
+
+    Raises:
+        MeasurementError: a file cannot be used; the message says which and where.
+    """
+    seen_by, board = Camera.load(camera.camera), Board.load(camera.board)
+    is_fixed = camera.is_fixed or seen_by.is_fixed
+    return BoardSight(seen_by, board, is_fixed, camera.sigma_px, camera.repeatability)

@@ -1,0 +1,176 @@
+"""How a robot is calibrated, and how the calibration is validated."""
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Annotated, Literal, get_args
+
+from pisigma.files.errors import IdentificationError, MeasurementError, check_choice
+from pisigma.files.setting import NAMES, Option, names
+from pisigma.measurement.camera.camera_files import CameraFiles
+
+if TYPE_CHECKING:
+    from pisigma.measurement.splits import SplitBy
+    from pisigma.robot.robot_class import ClassName
+
+LARGEST_REPEATS = 1000
+
+ModelKind = Literal["hybrid", "geometric"]
+
+
+def free_parameters(stated: str) -> str | tuple[str, ...]:
+    """Free parameters from "identifiable", "joint_offsets", or names with commas between."""
+    return stated if stated in ("identifiable", "joint_offsets") else names(stated)
+
+
+def direction(stated: str) -> tuple[float, ...]:
+    """Direction of gravity, from "X,Y,Z"."""
+    try:
+        numbers = tuple(map(float, stated.split(",")))
+    except ValueError:
+        numbers = ()
+    if len(numbers) != 3:
+        raise IdentificationError(
+            f"the direction of gravity as X,Y,Z was wanted, such as 0,0,-1, got '{stated}'."
+        )
+    return numbers
+
+
+def socket_distances(stated: Iterable[str]) -> dict[tuple[str, str], float]:
+    """Known distances of two sockets each [m], from "A,B,MM"."""
+    distances: dict[tuple[str, str], float] = {}
+    for one in stated:
+        sockets, distance = _socket_distance(one)
+        if sockets in distances:
+            raise IdentificationError(
+                f"expected one distance of the sockets {' and '.join(sockets)}, got a second one in '{one}'; remove "
+                "one of them."
+            )
+        distances[sockets] = distance
+    return distances
+
+
+def _socket_distance(stated: str) -> tuple[tuple[str, str], float]:
+    words = [word.strip() for word in stated.split(",")]
+    try:
+        distance = float(words[2])
+    except (IndexError, ValueError):
+        distance = 0.0
+    if len(words) != 3 or not 0 < distance < float("inf"):
+        raise IdentificationError(
+            f"expected a known socket distance as A,B,MM, such as */0,*/1,50, got '{stated}'."
+        )
+    return (words[0], words[1]), distance / 1e3
+
+
+SocketDistances = Annotated[
+    Mapping[tuple[str, str], float],
+    Option("--socket-distance", kind=list[str], read=socket_distances, unit="mm", metavar="A,B,MM"),
+]
+
+
+@dataclass(frozen=True)
+class CalibrationSettings:
+    """How a robot is calibrated, and how the calibration is validated.
+
+    Attributes:
+        model: hybrid: geometry and, where the data are for it, a joint correction; or geometric.
+        folds: folds of the cross-validation; 0 for none. None: 5, or one per placement.
+        hold_out: share of the rows to hold out once, instead of folds.
+        split: how rows are split: joints (at random), interleaved, time, space or placement.
+        repeats: repeats of the cross-validation. None: 200 / number of different joint values, 1 to 10.
+        jobs: processes that calibrate with all rows and with those of each fold side by side, with one thread each.
+            None: threads.
+        seed: seed of the split, and of drawing training rows.
+        train_rows: number of rows, drawn at random, to calibrate with, in the cross-validation too. None: all.
+        free: free parameters: identifiable, joint_offsets, or names such as a_2,theta_3.
+        prior_length: prior standard deviation of length errors [m]; 0 for no prior.
+        prior_angle: prior standard deviation of angle errors [rad]; 0 for no prior.
+        robot_class: how large errors of the geometry can be: industrial, cobot or hobby (also of old and surgical
+            arms). None: as the maker and the data say.
+        robust: let rows that are far off count less.
+        features: features of the joint correction that are tried, such as gravity,lines,series. None: all that fit, and
+            those of plug-ins.
+        gravity: direction in which things fall, in the robot's base frame, such as 0,0,-1. None: the axis that the data
+            show.
+        new_frame_at: lines of the measurements from which on the rows are in a frame of their own, as the instrument
+            was moved.
+        socket_distances: known distances of two sockets [m]; */0,*/1,50 states 50 mm for every placement, as * in both
+            names stands for the same text.
+        cameras: what the pixels mean where files of measurements hold corners of boards in images.
+
+    Raises:
+        IdentificationError: the model is no choice, has no use for gravity, or only one of the two prior standard
+            deviations is 0.
+        MeasurementError: the split is no choice, or settings of the validation exclude each other.
+    """
+
+    model: ModelKind = "hybrid"
+    folds: Annotated[int | None, Option(least=0)] = None
+    hold_out: float | None = None
+    split: "SplitBy" = "joints"
+    repeats: Annotated[int | None, Option(least=1)] = None
+    jobs: int | None = None
+    seed: int = 0
+    train_rows: int | None = None
+    free: Annotated[
+        Literal["identifiable", "joint_offsets"] | tuple[str, ...], Option(kind=str, read=free_parameters)
+    ] = "identifiable"
+    prior_length: Annotated[float, Option("--prior-mm", unit="mm")] = 1e-3
+    prior_angle: Annotated[float, Option("--prior-mrad", unit="mrad")] = 1e-3
+    robot_class: Annotated["ClassName | None", Option("--class", kind=str)] = None
+    robust: bool = True
+    features: Annotated[tuple[str, ...] | None, NAMES] = None
+    gravity: Annotated[tuple[float, float, float] | None, Option(kind=str, read=direction)] = None
+    new_frame_at: Annotated[tuple[int, ...], Option(metavar="LINE")] = ()
+    socket_distances: SocketDistances = field(default_factory=dict)
+    cameras: CameraFiles | None = None
+
+    def __post_init__(self) -> None:
+        """Refuse settings that are no choice or exclude each other."""
+        from pisigma.measurement.splits import SplitBy
+
+        check_choice(IdentificationError, "model", self.model, get_args(ModelKind))
+        check_choice(MeasurementError, "split", self.split, get_args(SplitBy))
+        once = self.hold_out is not None or self.folds == 0
+        if self.repeats is not None and self.repeats > 1 and once:
+            raise MeasurementError(
+                f"repeats {self.repeats}: only folds can be repeated; leave out hold-out, and folds 0."
+            )
+        if self.hold_out is not None and self.folds is not None:
+            raise MeasurementError(
+                f"folds {self.folds} and hold-out {self.hold_out:g} exclude each other; leave one out."
+            )
+        if not 0 <= self.seed < 2**63 or (self.repeats or 0) > LARGEST_REPEATS:
+            raise MeasurementError(
+                f"a seed from 0 to 2^63 - 1 and at most {LARGEST_REPEATS:,} repeats were wanted, got {self.seed} and "
+                f"{self.repeats or 'the usual'}."
+            )
+        if self.jobs is not None and self.jobs < 1:
+            raise MeasurementError(f"jobs: 1 or more were wanted, got {self.jobs}.")
+        for name in ("features", "gravity"):
+            if (value := getattr(self, name)) is not None and self.model != "hybrid":
+                raise IdentificationError(
+                    f"{name} {value}: a geometric calibration has no use for it; leave it out, or take the hybrid."
+                )
+        prior = (self.prior_length, self.prior_angle)
+        if not all(map(math.isfinite, prior)) or min(prior) < 0 or (prior[0] == 0) != (prior[1] == 0):
+            raise IdentificationError(
+                f"the prior's standard deviations were wanted above 0, or both 0 for none, got {prior[0] * 1e3:g} mm "
+                f"and {prior[1] * 1e3:g} mrad."
+            )
+
+    def check_unused(self) -> None:
+        """Refuse what says how to calibrate or to validate: with the prior of a fleet it would not count.
+
+        Raises:
+            IdentificationError: something is stated besides cameras and jobs.
+        """
+        usual = CalibrationSettings(cameras=self.cameras, jobs=self.jobs)
+        stated = [name for name in self.__dataclass_fields__ if getattr(self, name) != getattr(usual, name)]
+        if stated:
+            raise IdentificationError(
+                f"{', '.join(name.replace('_', ' ') for name in stated)}: a calibration that begins with the prior of "
+                "a fleet is a hybrid of all its parameters, and every row is left out in turn; leave this out, or "
+                "the prior."
+            )

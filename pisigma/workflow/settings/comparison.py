@@ -1,0 +1,48 @@
+"""How two models are compared."""
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Annotated, get_args
+
+from pisigma.files.errors import IdentificationError, nearest_choice
+from pisigma.files.setting import HIDDEN, Option
+from pisigma.measurement.camera.camera_files import CameraFiles
+from pisigma.validation.resampling import Bootstrap
+
+if TYPE_CHECKING:
+    from pisigma.lifetime.comparison.model_pair import FrameChoice
+
+_FRAMES = {True: "fixed", False: "fitted"}
+
+
+@dataclass(frozen=True)
+class ComparisonSettings:
+    """How two models are compared.
+
+    Attributes:
+        frames: fixed: both models were measured in the same frame with the same tool; fitted: base or tool may stand
+            elsewhere for the second model, are fitted so that the arms agree best, and compared apart.
+        level: probability that any parameter at all is called different by chance.
+        bootstrap: how confidence intervals of errors on rows are computed.
+        cameras: what the pixels mean where the rows are corners of boards in images.
+
+    Raises:
+        IdentificationError: the level is no probability, or the frames are treated otherwise.
+    """
+
+    frames: Annotated["FrameChoice", Option("--fixed-frames", kind=bool, read=_FRAMES.get)] = "fitted"
+    level: float = 0.01
+    bootstrap: Annotated[Bootstrap, HIDDEN] = field(default_factory=Bootstrap)
+    cameras: CameraFiles | None = None
+
+    def __post_init__(self) -> None:
+        """Refuse what is no choice, and a level that no test has."""
+        from pisigma.lifetime.comparison.model_pair import FrameChoice
+
+        if self.frames not in get_args(FrameChoice):
+            raise IdentificationError(
+                f"frames: '{self.frames}' is no choice; {nearest_choice(self.frames, get_args(FrameChoice))}"
+            )
+        if not 0.0 < self.level < 1.0:
+            raise IdentificationError(
+                f"level: a probability between 0 and 1 was wanted, got {self.level:g}; 0.01 is usual."
+            )

@@ -1,0 +1,108 @@
+"""How models are evaluated, and what is accepted."""
+
+import math
+from dataclasses import asdict, dataclass, field
+from typing import TYPE_CHECKING, Annotated
+
+from pisigma.files.errors import MeasurementError
+from pisigma.files.setting import Option
+from pisigma.measurement.camera.camera_files import CameraFiles
+from pisigma.validation.resampling import Bootstrap
+from pisigma.workflow.settings.calibration import SocketDistances
+
+if TYPE_CHECKING:
+    from pisigma.validation.held_out.frames.fitted_frames import FrameKind
+    from pisigma.validation.held_out.model_comparison import ModelFigures
+
+_LIMITED = {
+    "mean_mm": ("max-mean-mm", "mean position error"),
+    "p95_mm": ("max-p95-mm", "95 % quantile of the position error"),
+    "max_mm": ("max-mm", "largest position error"),
+    "mean_deg": ("max-mean-deg", "mean orientation error"),
+}
+
+
+@dataclass(frozen=True)
+class Limits:
+    """Largest errors that are accepted; None where there is no limit.
+
+    Attributes:
+        mean_mm: accept only where the mean position error is at most this [mm].
+        p95_mm: accept only where 95 % of the position errors are at most this [mm].
+        max_mm: accept only where no position error is larger [mm].
+        mean_deg: accept only where the mean orientation error is at most this [deg].
+    """
+
+    mean_mm: Annotated[float | None, Option("--max-mean-mm")] = None
+    p95_mm: Annotated[float | None, Option("--max-p95-mm")] = None
+    max_mm: float | None = None
+    mean_deg: Annotated[float | None, Option("--max-mean-deg")] = None
+
+    def __post_init__(self) -> None:
+        """Refuse limits that no figure could be held against."""
+        for name, limit in self.stated.items():
+            if not (limit > 0 and math.isfinite(limit)):
+                raise MeasurementError(f"--{_LIMITED[name][0]} {limit:g}: a limit above 0 was wanted.")
+
+    @property
+    def stated(self) -> dict[str, float]:
+        """The limits that there are, by name."""
+        return {name: limit for name, limit in asdict(self).items() if limit is not None}
+
+    def missed_by(self, model: "ModelFigures") -> list[str]:
+        """Say which limits a model misses, in sentences without their ends; nothing where it meets all.
+
+        A model that predicts nothing for a row meets no limit.
+
+        Raises:
+            MeasurementError: there is a limit on the orientation, but none was measured.
+        """
+        from pisigma.reporting.tables import figure_text
+
+        sentences = []
+        for key, limit in self.stated.items():
+            option, what = _LIMITED[key]
+            statistic, unit = key.split("_")
+            errors = model.position if unit == "mm" else model.orientation
+            if errors is None:
+                raise MeasurementError(
+                    f"--{option} {limit:g}: no orientations were measured; leave the limit out or give poses."
+                )
+            value = errors.statistics[statistic]
+            if not value <= limit:
+                text = figure_text(value) if figure_text(value) != figure_text(limit) else value
+                sentences.append(
+                    f"the {what} of {model.name} is {text} {unit}, --{option} allows {limit:g} {unit}"
+                )
+        if self.stated and model.rows_not_predicted:
+            sentences.append(f"{model.name} predicts nothing for {model.rows_not_predicted} of the rows")
+        return sentences
+
+
+@dataclass(frozen=True)
+class EvaluationSettings:
+    """How models are evaluated.
+
+    Attributes:
+        limits: that every model, but no reference, has to meet.
+        fit_frame: the sensor was moved since: fit its frame to these rows, 6 poses or more.
+        fit_tool: another reflector was mounted since: fit its place to these rows, 6 poses or more.
+        bootstrap: how confidence intervals are computed.
+        cameras: what the pixels mean where files of measurements hold corners of boards in images.
+        socket_distances: known distances of two sockets [m]; */0,*/1,50 states 50 mm for every placement, as * in both
+            names stands for the same text.
+    """
+
+    limits: Limits = field(default_factory=Limits)
+    fit_frame: bool = False
+    fit_tool: bool = False
+    bootstrap: Bootstrap = field(default_factory=Bootstrap)
+    cameras: CameraFiles | None = None
+    socket_distances: SocketDistances = field(default_factory=dict)
+
+    @property
+    def fitted(self) -> "tuple[FrameKind, ...]":
+        """What is fitted to the rows."""
+        from pisigma.validation.held_out.frames.fitted_frames import fitted_kinds
+
+        return fitted_kinds(self.fit_frame, self.fit_tool)

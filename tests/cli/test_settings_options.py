@@ -1,0 +1,87 @@
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import pytest
+import typer
+from typer.testing import CliRunner
+
+from pisigma.cli.settings_options import takes_settings
+from pisigma.files.errors import PisigmaError
+from pisigma.files.setting import FILE, Option
+
+
+@dataclass(frozen=True)
+class Lens:
+    """Lens.
+
+    Attributes:
+        file: where it is.
+        sheet: what it sees.
+        width: how wide it is [m].
+    """
+
+    file: Annotated[str, FILE]
+    sheet: Annotated[str, FILE]
+    width: Annotated[float, Option("--width-mm", unit="mm")] = 1e-3
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Settings.
+
+    Attributes:
+        count: how many.
+        is_class: of a name that Python keeps for itself.
+        bright: on where nothing is stated.
+        marks: several numbers.
+        lens: that sees.
+    """
+
+    count: Annotated[int, Option(least=1)] = 5
+    is_class: Annotated[str | None, Option("--class")] = None
+    bright: bool = True
+    marks: tuple[int, ...] = ()
+    lens: Lens | None = None
+
+
+@pytest.fixture
+def built():
+    """Give what a command line is built into."""
+    seen: list[Settings] = []
+
+    @takes_settings
+    def command(data: Path, settings: Settings, plain: bool = False) -> None:
+        seen.append(settings)
+
+    app = typer.Typer()
+    app.command()(command)
+
+    def run(*words: str) -> Settings:
+        result = CliRunner().invoke(app, ["rows.csv", *words])
+        if isinstance(result.exception, PisigmaError):
+            raise result.exception
+        assert result.exit_code == 0, result.output
+        return seen[-1]
+
+    return run
+
+
+def test_what_is_not_stated_is_as_python_has_it(built):
+    assert built() == built("--plain") == Settings()
+
+
+def test_options_are_settings(built):
+    words = ("--count", "2", "--class", "x", "--no-bright", "--marks", "1", "--marks", "2")
+    assert built(*words) == Settings(2, "x", False, (1, 2))
+    lens = built("--file", "a.yaml", "--sheet", "b.yaml", "--width-mm", "2").lens
+    assert lens == Lens("a.yaml", "b.yaml", 2e-3)
+
+
+def test_what_needs_something_else_is_refused(built):
+    with pytest.raises(PisigmaError, match="--file and --sheet belong together"):
+        built("--file", "a.yaml")
+    with pytest.raises(AssertionError, match="--width-mm: only with --file and --sheet"):
+        built("--width-mm", "2")
+    with pytest.raises(AssertionError, match="greater than or equal to 1"):
+        built("--count", "0")
