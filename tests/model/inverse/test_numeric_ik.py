@@ -63,6 +63,12 @@ def test_without_kernels_nothing_need_raise(without_kernels):
             ik(T.numpy(), **options)
 
 
+def test_an_elbow_angle_is_refused_without_kernels():
+    model = calibrated_arm("panda", shared=("pose",))
+    with pytest.raises(PoseError, match="which alone know elbow_angle; leave it out"):
+        CorrectedIK(model)(np.eye(4), elbow_angle=0.3)
+
+
 def test_gradients_without_kernels(without_kernels):
     ik, q, T = without_kernels
     wanted = T[:3].clone().requires_grad_()
