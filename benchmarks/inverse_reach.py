@@ -22,8 +22,8 @@ from pisigma.files.errors import ModelError
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.folder.model_folder import load_model
 from pisigma.model.inverse.compiled_ik import CompiledIK
-from pisigma.model.inverse.identified_arm import search
-from pisigma.model.inverse.reference import ReferenceIK
+from pisigma.model.inverse.numeric_arm import NumericArm
+from pisigma.model.inverse.numeric_ik import NumericIK
 from pisigma.robot import Robot
 from pisigma.robot.kernels.array_kinematics import transform_of
 from pisigma.robot.kinematics.status import Status
@@ -81,9 +81,9 @@ def report(name: str, model: CalibratedModel, rows: int) -> None:
     width = torch.tensor([NEAR if revolute else NEAR / 10 for revolute in model.robot.revolute])
     beside = q + width * torch.from_numpy(rng.uniform(-1, 1, q.shape))
     for label, near in (("no near", None), (f"near within {NEAR} rad", beside)):
-        found = ReferenceIK(model)(T, near=near)
+        found = NumericIK(model).solve_batch(T, near=near)
         line = figures(found.status.numpy(), found.position_residual.numpy(), found.rotation_residual.numpy())
-        print(f"{name:9s} {label:20s} reference {len(T):6d} poses, {line}", flush=True)
+        print(f"{name:9s} {label:20s} torch     {len(T):6d} poses, {line}", flush=True)
         try:
             kernels = CompiledIK.of(model)
         except ModelError:
@@ -170,11 +170,12 @@ def report_branches(rows: int, starts: int = 40) -> None:
     start = time.perf_counter()
     every = kernels.all_branches(T, threads=1)
     took = (time.perf_counter() - start) / rows * 1e6
-    begun = draw_joints(model.robot, rows * starts, rng).reshape(rows * starts, 1, 6)
-    q, _ = search(model.identified, torch.from_numpy(np.repeat(T, starts, 0)), begun, model.hybrid)
+    begun = draw_joints(model.robot, rows * starts, rng).reshape(rows * starts, 6)
+    arm = NumericArm(model.robot, model.identified, model.hybrid, kernels.axes)
+    q, reached = arm.reach(torch.from_numpy(np.repeat(T, starts, 0)), begun)
     off = np.sin((q.numpy().reshape(rows, starts, 1, 6) - every.q[:, None]) / 2)
     missed = np.nan_to_num(np.abs(off).max(-1), nan=1.0).min(-1) > 1e-4
-    searched = np.isfinite(q.numpy()).all(-1).reshape(rows, starts)
+    searched = reached.numpy().reshape(rows, starts)
     print(
         f"all branches of a UR10: {100 * (1 - (missed & searched).sum() / searched.sum()):.2f} % of {searched.sum()} "
         f"solutions found by search are among them, {took:.0f} us a pose"

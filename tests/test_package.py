@@ -55,14 +55,12 @@ def name_of(path: Path) -> str:
 
 
 @functools.cache
-def imported(path: Path, type_checking: bool = True) -> frozenset[str]:
-    """Modules that a file imports anywhere, inside functions too; and under `if TYPE_CHECKING` if wanted."""
+def imported(path: Path) -> frozenset[str]:
+    """Modules that a file imports anywhere, inside functions and for type checkers too."""
     found: set[str] = set()
     nodes: list[ast.AST] = [ast.parse(path.read_text(encoding="utf-8"))]
     while nodes:
         node = nodes.pop()
-        if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING" and not type_checking:
-            continue
         nodes += ast.iter_child_nodes(node)
         if isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names}
@@ -96,7 +94,7 @@ def test_imports_run_one_way():
 
 
 def test_no_two_files_import_each_other():
-    """There is no circle of files, whatever its length; imports inside functions count, those for types not."""
+    """There is no circle of files, whatever its length; imports inside functions and those for types count too."""
     files = {
         ".".join(("pisigma", *path.relative_to(PACKAGE).with_suffix("").parts)).removesuffix(
             ".__init__"
@@ -104,8 +102,7 @@ def test_no_two_files_import_each_other():
         for path in MODULES
     }
     graph = {
-        name_of(path): {name_of(files[module]) for module in imported(path, False) & set(files)}
-        - {name_of(path)}
+        name_of(path): {name_of(files[module]) for module in imported(path) & set(files)} - {name_of(path)}
         for path in files.values()
     }
     graphlib.TopologicalSorter(graph).prepare()  # CycleError names the circle

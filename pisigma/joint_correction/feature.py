@@ -47,7 +47,7 @@ class AbstractFeature(ABC):
     """Columns for every joint: the correction of joint j is `Σ_m weight[j, m] · columns(state)[..., j, m]`.
 
     A new feature is a subclass in a file of its own and a line in `registry.py`; `register_feature` takes one from
-    anywhere. Without `compiled` the models that use it run by the torch reference, without `add_onnx` they are not
+    anywhere. Without `compiled` the models that use it are solved in torch, without `add_onnx` they are not
     exported as ONNX.
 
     Attributes:

@@ -15,10 +15,12 @@ from pisigma.calibration.hybrid.uncertainty import PositionUncertainty
 from pisigma.measurement.copies import RowValues
 from pisigma.model.domain import Domain
 from pisigma.model.hybrid_motion import hybrid_motion, hybrid_poses
+from pisigma.model.stored_starts import middle_of_starts
 from pisigma.network.correction_network import CorrectionNetwork
 from pisigma.robot.description import Robot
 from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.robot.kinematics.jacobian import joint_jacobian
+from pisigma.robot.kinematics.joint_limits import nearest_turn
 from pisigma.robot.kinematics.tolerances import FORWARD_ACCEPTED, FORWARD_ITERATIONS, FORWARD_TOLERANCE
 
 if TYPE_CHECKING:
@@ -131,6 +133,12 @@ class CalibratedModel:
         with torch.no_grad():
             result: Tensor = self.network(T, q_nominal)
         return result
+
+    def as_trained(self, q: Float64[Tensor, "*batch dof"]) -> Float64[Tensor, "*batch dof"]:
+        """Joint values [rad or m] turned as those of the training rows, which `network` knows."""
+        if not len(self.starts):
+            return q
+        return nearest_turn(self.robot, q, middle_of_starts(self.starts), within_limits=False)
 
     def forward(self, q: Float64[Tensor, "*batch dof"]) -> Float64[Tensor, "*batch 4 4"]:
         """Pose T_base_tool that the robot takes when commanded to q [rad or m], as far as the model knows.

@@ -12,10 +12,10 @@ from torch import Tensor
 
 from pisigma.files.errors import PlanningError
 from pisigma.measurement.csv.reading import read_joints
-from pisigma.model.inverse.finishing import nearest_turn
 from pisigma.planning.board_views import BoardViews
 from pisigma.planning.surroundings.arm_in_cell import ArmInCell, Faults
 from pisigma.robot.kinematics.forward import forward_kinematics
+from pisigma.robot.kinematics.joint_limits import nearest_turn
 from pisigma.robot.se3 import wrap_to_pi
 
 MOST_DRAWS = 40

@@ -187,7 +187,7 @@ class Robot:
         """
         from pisigma.robot.serial_chain import serial_chain
 
-        return serial_chain(self)
+        return serial_chain(self.rows, self.dh, self.base, self.tool)
 
     def check_joint_count(self, count: int) -> None:
         """Refuse joint values whose last axis does not fit the joints.

@@ -1,20 +1,26 @@
 """A robot as a chain of pytorch-kinematics, for planners that are built on it."""
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
+from jaxtyping import Float64
 
+from pisigma.robot.row import Row
 from pisigma.robot.urdf_frames import Frame, frame_of, row_frame, shift, turn
 
 if TYPE_CHECKING:
     from pytorch_kinematics import SerialChain
 
-    from pisigma.robot.description import Robot
-
 BASE_FRAME, TOOL_FRAME = "base_link", "tool0"
 
 
-def serial_chain(robot: "Robot") -> "SerialChain":
+def serial_chain(
+    rows: Sequence[Row],
+    dh: Float64[np.ndarray, "rows 5"],
+    base: Float64[np.ndarray, " 6"],
+    tool: Float64[np.ndarray, " 6"],
+) -> "SerialChain":
     """Build the chain from the frame that poses are given in to the tool, in float64 on the CPU.
 
     A joint stands where its row has it after `RotZ(theta) · Trans(0, 0, d)` and moves about or along z, or against
@@ -22,8 +28,11 @@ def serial_chain(robot: "Robot") -> "SerialChain":
     in float64: a chain that is made in float32 and converted is off by 2e-8 m.
 
     Args:
-        robot: its rows are the frames of the chain, between `base_link` and `tool0`; joints are named like the rows
-            and take the same joint values [rad or m].
+        rows: the frames of the chain, between `base_link` and `tool0`; joints are named like the rows and take the
+            same joint values [rad or m].
+        dh: theta, d, a, alpha and beta of every row [rad, m].
+        base: x, y, z [m], roll, pitch, yaw [rad].
+        tool: the same.
     """
     import torch
     from pytorch_kinematics import SerialChain, Transform3d
@@ -39,8 +48,8 @@ def serial_chain(robot: "Robot") -> "SerialChain":
         return child
 
     root = frames.Frame(BASE_FRAME, frames.Link(BASE_FRAME), frames.Joint("root", dtype=double))
-    last, behind = root, frame_of(robot.base)
-    for row, (theta, d, a, alpha, beta) in zip(robot.rows, robot.dh.tolist(), strict=True):
+    last, behind = root, frame_of(base)
+    for row, (theta, d, a, alpha, beta) in zip(rows, dh.tolist(), strict=True):
         last = attach(
             last,
             f"{row.name}_link",
@@ -51,5 +60,5 @@ def serial_chain(robot: "Robot") -> "SerialChain":
             limits=(row.lower, row.upper) if np.isfinite([row.lower, row.upper]).all() else None,
         )
         behind = row_frame(0.0, 0.0, a, alpha, beta)
-    attach(last, TOOL_FRAME, behind @ frame_of(robot.tool), "tool")
+    attach(last, TOOL_FRAME, behind @ frame_of(tool), "tool")
     return SerialChain(Chain(root, dtype=double), TOOL_FRAME, dtype=double)

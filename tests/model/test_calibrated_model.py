@@ -7,8 +7,8 @@ import torch
 from testing.closeness import assert_close
 from testing.models import HOMES, hand_made_model, joints_around
 
-from pisigma.model.inverse.finishing import nearest_turn
 from pisigma.robot.kinematics.forward import forward_kinematics
+from pisigma.robot.kinematics.joint_limits import nearest_turn
 
 
 @pytest.mark.parametrize("name", HOMES)

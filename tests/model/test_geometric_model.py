@@ -21,7 +21,7 @@ from pisigma.model.accuracy import parameter_posterior
 from pisigma.model.folder.model_folder import load_model, save_model
 from pisigma.model.geometric_model import model_of_calibration, model_of_hybrid
 from pisigma.model.inverse.corrected_ik import CorrectedIK
-from pisigma.model.inverse.identified_arm import within_reach
+from pisigma.model.inverse.numeric_ik import NumericIK
 from pisigma.model.stored_starts import MAXIMUM_STARTS
 from pisigma.robot.kinematics.closed_form import closed_form_solver
 from pisigma.robot.kinematics.forward import forward_kinematics
@@ -156,14 +156,15 @@ def test_poses_farther_than_the_arm_is_long_cost_no_search(calibrated, monkeypat
         calls.append(len(T))
         return solve_numeric(robot, T, start, **options)
 
-    monkeypatch.setattr("pisigma.model.inverse.identified_arm.solve_numeric", counted)
+    for module in ("numeric_arm", "numeric_ik"):
+        monkeypatch.setattr(f"pisigma.model.inverse.{module}.solve_numeric", counted)
     T = torch.eye(4, dtype=torch.float64).repeat(3, 1, 1)
     T[:, 0, 3] = 2 * ik.model.calibrated.reach
-    assert not bool(within_reach(ik.model.calibrated, T).any())
-    for solution in (ik(T), ik.all_branches(T), ik(T, near=torch.zeros(ik.model.robot.dof))):
+    numeric, near = NumericIK(ik.model), torch.zeros(ik.model.robot.dof)
+    for solution in (numeric.solve_batch(T), numeric.all_branches(T), numeric.solve_batch(T, near=near)):
         assert bool((solution.status == Status.UNREACHABLE).all())
         assert bool(solution.q.isnan().all())
-    assert calls == []
+    assert not any(calls)
 
 
 @pytest.mark.parametrize("calibrated", CLOSED_FORM, indirect=True)

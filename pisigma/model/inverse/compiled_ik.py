@@ -5,15 +5,14 @@ import os
 import threading
 from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from pisigma.files.errors import PoseError, nearest_choice
-from pisigma.model.inverse.joint_input import FAULTS
-from pisigma.model.inverse.solution import Solution
+from pisigma.model.inverse.joint_input import FAULTS, joint_rows, numbers
+from pisigma.model.inverse.solution import AbstractInverse, Solution
 from pisigma.robot.kernels import arrays
 from pisigma.robot.kernels.array_kinematics import address_of
 from pisigma.robot.kernels.description_file import read_description
@@ -21,9 +20,8 @@ from pisigma.robot.kernels.layout import make_memory, pack
 from pisigma.robot.kernels.machine_code import IGNORED, Said, kernel_forms, load_kernels
 from pisigma.robot.kinematics.task_axes import WHOLE, TaskAxes, default_axes
 
-if TYPE_CHECKING:  # names in full, which type checkers at run time find without these imports
+if TYPE_CHECKING:  # a name in full, which type checkers at run time find without this import
     import pisigma.model.calibrated_model
-    import pisigma.model.inverse.corrected_ik
 
 CHUNK = 2_048
 """Poses that a thread takes at a time."""
@@ -98,7 +96,7 @@ class CompiledIK:
         branch: str | None = None,
         throw: bool = True,
         approach: Any = None,
-        owner: "pisigma.model.inverse.corrected_ik.CorrectedIK | None" = None,
+        owner: AbstractInverse | None = None,
         axes: TaskAxes | None = None,
     ) -> Solution:
         """Find corrected joint values for one pose.
@@ -119,7 +117,7 @@ class CompiledIK:
         Raises:
             PoseError: the matrix is no pose, a shape does not fit, or there is no such branch.
         """
-        T = self._numbers(T_base_tool, "T_base_tool", throw)
+        T = numbers(T_base_tool, "T_base_tool", throw)
         if T.shape != (4, 4):
             raise PoseError(
                 f"T_base_tool has the shape {T.shape}; give one homogeneous transform of shape (4, 4)."
@@ -166,7 +164,6 @@ class CompiledIK:
         throw: bool = True,
         approach: Any = None,
         single: bool = False,
-        owner: "pisigma.model.inverse.corrected_ik.CorrectedIK | None" = None,
         axes: TaskAxes | None = None,
     ) -> Solution:
         """Find corrected joint values for poses `(*batch, 4, 4)`, several threads at a time.
@@ -179,7 +176,6 @@ class CompiledIK:
             throw: see `solve`; with False bad rows get the status INVALID_POSE and the others are solved.
             approach: `(*batch, dof)` or `(dof,)`: see `solve`.
             single: whether the poses were rounded to float32, which widens what counts as rounding.
-            owner: see `Solution`.
             axes: see `solve`.
 
         Raises:
@@ -190,7 +186,7 @@ class CompiledIK:
         batch = T.shape[:-2]
         beside, sides = self._rows(near, batch, "near", throw), self._rows(approach, batch, "approach", True)
         out = self._solve_rows(T, beside, sides, self._branch(branch), 1, threads, throw, single, task)
-        return self._solution(out.reshape(*batch, out.shape[-1]), owner, task)
+        return self._solution(out.reshape(*batch, out.shape[-1]), task)
 
     def all_branches(
         self,
@@ -199,7 +195,6 @@ class CompiledIK:
         throw: bool = True,
         approach: Any = None,
         single: bool = False,
-        owner: "pisigma.model.inverse.corrected_ik.CorrectedIK | None" = None,
         axes: TaskAxes | None = None,
     ) -> Solution:
         """Solutions `(*batch, branches)` of poses `(*batch, 4, 4)` on every branch; for the rest see `solve_batch`.
@@ -212,7 +207,7 @@ class CompiledIK:
         several = not self.description.forms.closed_forms and not self.description.network.used
         count = SOLUTIONS if several else len(self.branches)
         out = self._solve_rows(T, self._none, sides, arrays.EVERY_BRANCH, count, threads, throw, single, task)
-        return self._solution(out.reshape(*T.shape[:-2], count, out.shape[-1]), owner, task)
+        return self._solution(out.reshape(*T.shape[:-2], count, out.shape[-1]), task)
 
     def forward(self, q: Any, arm: int | None = None, approach: Any = None) -> tuple[Any, Any, Any, Any]:
         """Where the calibrated arm goes.
@@ -246,14 +241,12 @@ class CompiledIK:
             f"the usual ones ({', '.join(self.axes.ignored) or 'none'}) cannot be ignored; calibrate a hybrid."
         )
 
-    def _solution(
-        self, out: Any, owner: "pisigma.model.inverse.corrected_ik.CorrectedIK | None", axes: TaskAxes
-    ) -> Solution:
+    def _solution(self, out: Any, axes: TaskAxes) -> Solution:
         """The solutions of poses, `(*batch, 2 · dof + 5)`."""
         dof = len(self.joints)
         position, rotation, measure, status, branch = np.moveaxis(out[..., 2 * dof :], -1, 0)
         lies, found = (branch.astype(int), self.branches, status.astype(int)), (position, rotation, measure)
-        return Solution(out[..., :dof], out[..., dof : 2 * dof], *lies, *found, owner, axes.ignored)
+        return Solution(out[..., :dof], out[..., dof : 2 * dof], *lies, *found, ignored_axes=axes.ignored)
 
     def _solve_rows(
         self,
@@ -357,42 +350,16 @@ class CompiledIK:
         return self.branches.index(name)
 
     def _poses(self, T_base_tool: Any, throw: bool) -> Any:
-        T = self._numbers(T_base_tool, "T_base_tool", throw)
+        T = numbers(T_base_tool, "T_base_tool", throw)
         if T.ndim < 2 or T.shape[-2:] != (4, 4):
             raise PoseError(
                 f"T_base_tool has the shape {T.shape}; give homogeneous transforms of shape (*batch, 4, 4)."
             )
         return T
 
-    def _numbers(self, values: Any, what: str, throw: bool) -> Any:
-        """The values as a contiguous float64 array, itself where it is one; NaN for what is none, or a complaint."""
-        try:
-            return np.ascontiguousarray(values, dtype=np.float64)
-        except (TypeError, ValueError):
-            with suppress(ValueError):  # of ragged values
-                if not throw:
-                    return np.full(np.shape(values), np.nan)
-            raise PoseError(f"{what} is no array of numbers; give real numbers, lengths in metres.") from None
-
     def _rows(self, values: Any, batch: tuple[int, ...], what: str, throw: bool) -> Any:
         """Joint values, or approaches, as `(1 or poses, dof)`; `(0, dof)` for None."""
-        if values is None:
-            return self._none
-        rows, dof = self._numbers(values, what, throw), len(self.joints)
-        if rows.shape[-1:] != (dof,):
-            raise PoseError(
-                f"{what} has the shape {rows.shape}, but the robot has {dof} joints; give a value for each of "
-                f"{', '.join(self.joints)}, once or for every pose."
-            )
-        if rows.ndim == 1:
-            return rows.reshape(1, dof)
-        try:
-            return np.ascontiguousarray(np.broadcast_to(rows, (*batch, dof))).reshape(-1, dof)
-        except ValueError:
-            raise PoseError(
-                f"{what} has the batch shape {rows.shape[:-1]}, which does not broadcast to {batch} of the poses; give "
-                "one row of joint values for each pose, or one for all."
-            ) from None
+        return self._none if values is None else joint_rows(values, batch, what, throw, self.joints)
 
 
 def _processors() -> int:

@@ -1,6 +1,5 @@
 """Corrected inverse kinematics of coupled joints: the controller's values in and out, DH values in between."""
 
-from copy import copy
 from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -10,13 +9,12 @@ import numpy as np
 from pisigma.files.errors import PoseError
 from pisigma.model.inverse.joint_input import as_array, pose_array
 from pisigma.model.inverse.passive_joints import nearest_starts, solve, solve_from
-from pisigma.model.inverse.solution import Solution
+from pisigma.model.inverse.solution import AbstractInverse, Solution
 from pisigma.robot.kernels.array_kinematics import forward_kinematics, is_tensor, joint_jacobian
 from pisigma.robot.kinematics.status import Status
 from pisigma.robot.kinematics.task_axes import TaskAxes
 
-if TYPE_CHECKING:  # names in full, which type checkers at run time find without these imports
-    import pisigma.model.inverse.corrected_ik
+if TYPE_CHECKING:  # a name in full, which type checkers at run time find without this import
     import pisigma.robot.coupling
 
 
@@ -29,13 +27,13 @@ class ControllerValues:
 
     def __init__(
         self,
-        ik: "pisigma.model.inverse.corrected_ik.CorrectedIK",
+        ik: AbstractInverse,
         coupling: "pisigma.robot.coupling.Coupling",
     ) -> None:
         """Take the inverse kinematics of DH values, and how these follow the controller's."""
         self.ik, self.coupling = ik, coupling
 
-    def for_axes(self, axes: TaskAxes) -> "ControllerValues":
+    def with_axes(self, axes: TaskAxes) -> "ControllerValues":
         """The same where other axes of the tool count.
 
         Raises:
@@ -45,9 +43,7 @@ class ControllerValues:
             raise PoseError(
                 "an arm with passive joints takes no other axes of the tool than the usual; state none."
             )
-        ik = copy(self.ik)
-        ik.axes = axes
-        return ControllerValues(ik, self.coupling)
+        return ControllerValues(self.ik.with_axes(axes), self.coupling)
 
     def solve(self, T: Any, near: Any, owner: Any, branch: str | None = None, **options: Any) -> Solution:
         """See `CorrectedIK.__call__`.

@@ -13,6 +13,7 @@ import numpy as np
 from pisigma.files.errors import ModelError, PoseError
 from pisigma.files.model_files import COMPILED, model_hash, ready_hash
 from pisigma.model.inverse.joint_input import Postures, as_array, checked_approach, pose_array
+from pisigma.model.inverse.solution import AbstractInverse, Solution
 from pisigma.robot.kernels.array_kinematics import by_torch, is_tensor
 from pisigma.robot.kinematics.task_axes import TaskAxes, task_axes
 
@@ -22,17 +23,16 @@ if TYPE_CHECKING:  # names in full, which type checkers at run time find without
     import pisigma.model.calibrated_model
     import pisigma.model.inverse.compiled_ik
     import pisigma.model.inverse.controller_values
+    import pisigma.model.inverse.numeric_ik
     import pisigma.model.inverse.path
-    import pisigma.model.inverse.reference
-    import pisigma.model.inverse.solution
 
 
-class CorrectedIK:
+class CorrectedIK(AbstractInverse):
     """The corrected inverse kinematics of a model: call it with poses.
 
     Poses go through compiled kernels on the CPU. NumPy arrays and nested lists come back as NumPy arrays, without torch
     being imported; tensors come back as tensors on their own device, with gradients (see `pose_gradients`). A model
-    without compiled form, and every one where the machine has no kernels, goes through `ReferenceIK` instead.
+    without compiled form, and every one where the machine has no kernels, goes through `NumericIK` instead.
 
     Attributes:
         name: of the model.
@@ -55,17 +55,17 @@ class CorrectedIK:
         Raises:
             ModelError: the model names branches that its robot does not have, or gives the numeric inverse no start.
         """
-        from pisigma.model.inverse.reference import NUMERIC, ReferenceIK
+        from pisigma.model.inverse.numeric_ik import NUMERIC, NumericIK
         from pisigma.model.stated_conditions import condition_warnings
 
-        route = ReferenceIK(model)
+        route = NumericIK(model)
         self.name = model.name
         self.branches, self.order = route.branches, route.order
         self.joints = tuple(joint.name for joint in model.robot.joints)
         self.limits, self.revolute = model.robot.limits, np.array(model.robot.revolute)
         self.closed_form = self.branches != (NUMERIC,)
         self.warnings = condition_warnings(model)
-        self.model, self.reference = model, route
+        self.model, self.numeric = model, route
         self._read: Callable[[], pisigma.model.calibrated_model.CalibratedModel] = lambda: model
         self.controller = None
         if model.robot.coupling is not None:
@@ -100,11 +100,11 @@ class CorrectedIK:
         return self._read()
 
     @cached_property
-    def reference(self) -> "pisigma.model.inverse.reference.ReferenceIK":
+    def numeric(self) -> "pisigma.model.inverse.numeric_ik.NumericIK":
         """The route without kernels."""
-        from pisigma.model.inverse.reference import ReferenceIK
+        from pisigma.model.inverse.numeric_ik import NumericIK
 
-        return ReferenceIK(self.model)
+        return NumericIK(self.model)
 
     @cached_property
     def compiled(self) -> "pisigma.model.inverse.compiled_ik.CompiledIK | None":
@@ -133,7 +133,7 @@ class CorrectedIK:
         tolerance_mm: float | Sequence[float] | None = None,
         tolerance_deg: float | Sequence[float] | None = None,
         elbow_angle: float | None = None,
-    ) -> "pisigma.model.inverse.solution.Solution":
+    ) -> Solution:
         """Find corrected joint values for poses.
 
         Args:
@@ -169,22 +169,15 @@ class CorrectedIK:
         if isinstance(T_base_tool, np.ndarray) and T_base_tool.shape == (4, 4) and kernels is not None:
             return kernels.solve(T_base_tool, near, branch, throw, approach, self, task.axes)
         T, single = pose_array(T_base_tool)
-        if kernels is None:
-            solution = self.reference(
-                T, near=near, branch=branch, throw=throw, approach=approach, single=single, axes=task.axes
-            )
-            return self._like(T_base_tool, solution, task.axes)
-        if T.ndim == 2 and not single:
+        if T.ndim == 2 and not single and kernels is not None:
             solution = kernels.solve(T, near, branch, throw, approach, self, task.axes)
         else:
-            solution = kernels.solve_batch(
-                T, near, branch, throw=throw, approach=approach, single=single, owner=self, axes=task.axes
+            solution = (kernels or self.numeric).solve_batch(
+                T, near=near, branch=branch, throw=throw, approach=approach, single=single, axes=task.axes
             )
         return self._like(T_base_tool, solution, task.axes)
 
-    def all_branches(
-        self, T_base_tool: Any, *, approach: Any = None
-    ) -> "pisigma.model.inverse.solution.Solution":
+    def all_branches(self, T_base_tool: Any, *, approach: Any = None) -> Solution:
         """Solutions on every branch, as `(*batch, branches)`; see `__call__` and `for_task`.
 
         A robot without closed-form inverse gets up to eight different solutions instead, such as those of an elbow to
@@ -194,10 +187,9 @@ class CorrectedIK:
         if self.controller is not None:
             return self.controller.all_branches(T_base_tool, self, approach=approach)
         T, single = pose_array(T_base_tool)
-        options = {"approach": approach, "single": single, "axes": self.axes}
-        if self.compiled is None:
-            return self._like(T_base_tool, self.reference.all_branches(T, **options), self.axes)
-        return self._like(T_base_tool, self.compiled.all_branches(T, owner=self, **options), self.axes)
+        route = self.compiled or self.numeric
+        every = route.all_branches(T, approach=approach, single=single, axes=self.axes)
+        return self._like(T_base_tool, every, self.axes)
 
     def path(
         self, T_base_tool: Any, *, near: Any = None, branch: str | None = None
@@ -301,7 +293,7 @@ class CorrectedIK:
         """Which axes of the tool count where a call does not state that."""
         if self.controller is not None:
             return self.controller.ik.axes
-        return self.reference.axes if self.compiled is None else self.compiled.axes
+        return self.numeric.axes if self.compiled is None else self.compiled.axes
 
     def for_task(
         self,
@@ -336,19 +328,24 @@ class CorrectedIK:
                 f"elbow_angle={elbow_angle:g}: only a robot of seven revolute joints has an elbow to turn; give it a "
                 "finite angle [rad], and other robots none."
             )
+        return self.with_axes(task_axes(self.axes, ignore_axes, tolerance_mm, tolerance_deg, elbow_angle))
+
+    def with_axes(self, axes: TaskAxes) -> "CorrectedIK":
+        """The same where other axes of the tool count.
+
+        Raises:
+            PoseError: the robot has passive joints, which are solved in the usual axes only.
+        """
         ik = copy(self)
-        ik.axes = task_axes(self.axes, ignore_axes, tolerance_mm, tolerance_deg, elbow_angle)
+        ik.axes = axes
         if self.controller is not None:
-            ik.controller = self.controller.for_axes(ik.axes)
+            ik.controller = self.controller.with_axes(axes)
         return ik
 
-    def _like(
-        self, poses: Any, solution: "pisigma.model.inverse.solution.Solution", axes: TaskAxes
-    ) -> "pisigma.model.inverse.solution.Solution":
+    def _like(self, poses: Any, solution: Solution, axes: TaskAxes) -> Solution:
         """The solutions of tensors as tensors, with gradients where these are wanted; other ones as arrays."""
         if not is_tensor(poses):
-            arrays = isinstance(solution.q, np.ndarray)
-            return solution if arrays else replace(solution.map(as_array), owner=self)
+            return replace(solution.map(as_array), owner=self)
         from pisigma.model.inverse.pose_gradients import as_tensors
 
         return as_tensors(solution, poses, self.model if poses.requires_grad else None, self, axes)

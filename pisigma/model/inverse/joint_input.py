@@ -1,6 +1,7 @@
 """What users give as poses and joint values, as arrays; known without torch."""
 
 from collections.abc import Sequence
+from contextlib import suppress
 from operator import le
 from typing import Any
 
@@ -47,6 +48,44 @@ def pose_array(values: Any) -> tuple[Any, bool]:
     if T.ndim < 2 or T.shape[-2:] != (4, 4):
         raise PoseError(f"T_base_tool has the shape {T.shape}; give {_POSES}.")
     return T, given.dtype == np.float32
+
+
+def numbers(values: Any, what: str, throw: bool) -> Any:
+    """The values as a contiguous float64 array, itself where it is one; NaN for what is none, or a complaint.
+
+    Raises:
+        PoseError: they are ragged, or no numbers and `throw`.
+    """
+    try:
+        return np.ascontiguousarray(values, dtype=np.float64)
+    except (TypeError, ValueError):
+        with suppress(ValueError):  # of ragged values
+            if not throw:
+                return np.full(np.shape(values), np.nan)
+        raise PoseError(f"{what} is no array of numbers; give real numbers, lengths in metres.") from None
+
+
+def joint_rows(values: Any, batch: tuple[int, ...], what: str, throw: bool, joints: Sequence[str]) -> Any:
+    """Joint values, or approaches, as `(1 or poses, dof)`.
+
+    Raises:
+        PoseError: they do not fit the joints or the poses, or see `numbers`.
+    """
+    rows, dof = numbers(values, what, throw), len(joints)
+    if rows.shape[-1:] != (dof,):
+        raise PoseError(
+            f"{what} has the shape {rows.shape}, but the robot has {dof} joints; give a value for each of "
+            f"{', '.join(joints)}, once or for every pose."
+        )
+    if rows.ndim == 1:
+        return rows.reshape(1, dof)
+    try:
+        return np.ascontiguousarray(np.broadcast_to(rows, (*batch, dof))).reshape(-1, dof)
+    except ValueError:
+        raise PoseError(
+            f"{what} has the batch shape {rows.shape[:-1]}, which does not broadcast to {batch} of the poses; give "
+            "one row of joint values for each pose, or one for all."
+        ) from None
 
 
 def checked_approach(approach: Any) -> Any:

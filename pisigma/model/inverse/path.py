@@ -3,16 +3,14 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from pisigma.files.errors import PoseError, nearest_choice
+from pisigma.model.inverse.solution import AbstractInverse
 from pisigma.robot.kinematics.status import Status
 from pisigma.robot.kinematics.tolerances import LIMIT_TOLERANCE
-
-if TYPE_CHECKING:
-    import pisigma.model.inverse.corrected_ik
 
 Array = Any
 
@@ -64,7 +62,7 @@ class JointPath:
 
 
 def follow_path(
-    ik: "pisigma.model.inverse.corrected_ik.CorrectedIK",
+    ik: AbstractInverse,
     T_base_tool: Array,
     near: Array | None = None,
     branch: str | None = None,
@@ -97,7 +95,7 @@ def follow_path(
 
 
 def _solve(
-    ik: "pisigma.model.inverse.corrected_ik.CorrectedIK",
+    ik: AbstractInverse,
     T: Array,
     near: Array | None,
     approach: Array | None = None,
@@ -119,9 +117,7 @@ def _approaches(q: Array, near: Array | None) -> Array:
     return np.where(last < 0, 0.0, np.take_along_axis(sides, np.maximum(last, 0), axis=0))
 
 
-def _guide(
-    ik: "pisigma.model.inverse.corrected_ik.CorrectedIK", T: Array, near: Array | None, branch: str | None
-) -> Array:
+def _guide(ik: AbstractInverse, T: Array, near: Array | None, branch: str | None) -> Array:
     """Joint values near which to solve all poses: of chosen branches, on chosen turns."""
     every = ik.all_branches(T)
     q, status = np.asarray(every.q), np.asarray(every.status)
@@ -142,7 +138,7 @@ def _guide(
     return rolled[before]
 
 
-def _jumps(ik: "pisigma.model.inverse.corrected_ik.CorrectedIK", T: Array, q: Array) -> Array:
+def _jumps(ik: AbstractInverse, T: Array, q: Array) -> Array:
     """Whether staying on a branch is a jump `(poses - 1, branches)`; long steps are looked at halfway."""
     step = np.abs(wrapped(np.diff(q, axis=0), ik.revolute)).max(-1)
     result = np.zeros(step.shape, dtype=bool)
@@ -153,7 +149,7 @@ def _jumps(ik: "pisigma.model.inverse.corrected_ik.CorrectedIK", T: Array, q: Ar
     return result
 
 
-def _one_by_one(ik: "pisigma.model.inverse.corrected_ik.CorrectedIK", T: Array, near: Array | None) -> Array:
+def _one_by_one(ik: AbstractInverse, T: Array, near: Array | None) -> Array:
     """Joint values of every pose from those of the pose before."""
     result, last = np.empty((len(T), len(ik.joints))), near
     for row, wanted in enumerate(T):
@@ -164,9 +160,7 @@ def _one_by_one(ik: "pisigma.model.inverse.corrected_ik.CorrectedIK", T: Array, 
     return result
 
 
-def _switches(
-    ik: "pisigma.model.inverse.corrected_ik.CorrectedIK", T: Array, q: Array, solution: Any
-) -> tuple[PathSwitch, ...]:
+def _switches(ik: AbstractInverse, T: Array, q: Array, solution: Any) -> tuple[PathSwitch, ...]:
     reached = np.isfinite(q).all(-1)
     rows = np.flatnonzero(reached)
     status, lies = np.asarray(solution.status), np.asarray(solution.branch)
@@ -185,7 +179,7 @@ def _switches(
 
 
 def _at(
-    ik: "pisigma.model.inverse.corrected_ik.CorrectedIK",
+    ik: AbstractInverse,
     index: int,
     step: Array,
     jump: bool,
@@ -213,7 +207,7 @@ def _at(
     return []
 
 
-def _amount(ik: "pisigma.model.inverse.corrected_ik.CorrectedIK", joint: int, step: float) -> str:
+def _amount(ik: AbstractInverse, joint: int, step: float) -> str:
     return f"{math.degrees(step):.1f} deg" if ik.revolute[joint] else f"{step * 1e3:.1f} mm"
 
 

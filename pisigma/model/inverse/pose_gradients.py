@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -12,8 +12,7 @@ from torch.autograd.function import once_differentiable
 
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.hybrid_motion import hybrid_motion
-from pisigma.model.inverse.finishing import as_trained
-from pisigma.model.inverse.solution import Solution
+from pisigma.model.inverse.solution import AbstractInverse, Solution
 from pisigma.robot.description import Robot
 from pisigma.robot.kinematics.jacobian import joint_jacobian
 from pisigma.robot.kinematics.numeric import Motion
@@ -23,15 +22,12 @@ from pisigma.robot.kinematics.task_error import task_error
 from pisigma.robot.kinematics.tolerances import SINGULAR_TOLERANCE
 from pisigma.robot.se3 import skew
 
-if TYPE_CHECKING:
-    import pisigma.model.inverse.corrected_ik
-
 
 def as_tensors(
     solution: Solution,
     poses: Float[Tensor, "*batch 4 4"],
     model: CalibratedModel | None,
-    owner: "pisigma.model.inverse.corrected_ik.CorrectedIK",
+    owner: AbstractInverse,
     axes: TaskAxes,
 ) -> Solution:
     """Solutions as they are handed out for tensors: like the poses, and with gradients to them.
@@ -99,7 +95,7 @@ def differentiable(
         return replace(result, q=q_nominal + result.correction, q_nominal=q_nominal)
     known = torch.isfinite(result.q).all(-1, keepdim=True)
     safe = torch.where(known, q_nominal, 0.0)
-    on_turn = safe + (as_trained(model, safe.detach()) - safe.detach())
+    on_turn = safe + (model.as_trained(safe.detach()) - safe.detach())
     correction = torch.where(known, model.network(T, on_turn), torch.nan)
     return replace(result, q=q_nominal + correction, q_nominal=q_nominal)
 

@@ -1,5 +1,6 @@
-"""What corrected inverse kinematics gives back."""
+"""What corrected inverse kinematics gives back, and what it is asked for by what is built on it."""
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -7,10 +8,75 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pisigma.model.inverse.joint_input import Postures
 from pisigma.robot.kinematics.status import Status
+from pisigma.robot.kinematics.task_axes import TaskAxes
 
-if TYPE_CHECKING:  # names in full, which type checkers at run time find without these imports
-    import pisigma.model.inverse.corrected_ik
+if TYPE_CHECKING:  # a name in full, which type checkers at run time find without this import
+    import pisigma.model.calibrated_model
+
+
+class AbstractInverse(ABC):
+    """Corrected inverse kinematics as solutions, paths and coupled joints see it; for attributes see `CorrectedIK`."""
+
+    branches: tuple[str, ...]
+    joints: tuple[str, ...]
+    order: tuple[int, ...]
+    limits: np.ndarray
+    revolute: np.ndarray
+    closed_form: bool
+
+    @property
+    @abstractmethod
+    def model(self) -> "pisigma.model.calibrated_model.CalibratedModel":
+        """What it was made from."""
+
+    @property
+    @abstractmethod
+    def compiled(self) -> object | None:
+        """Its kernels; None where it has none."""
+
+    @property
+    @abstractmethod
+    def axes(self) -> TaskAxes:
+        """Which axes of the tool count."""
+
+    @property
+    @abstractmethod
+    def postures(self) -> Postures:
+        """What `near` may be."""
+
+    @abstractmethod
+    def __call__(
+        self,
+        T_base_tool: Any,
+        *,
+        near: Any = None,
+        branch: str | None = None,
+        throw: bool = True,
+        approach: Any = None,
+    ) -> "Solution":
+        """Joint values for poses."""
+
+    @abstractmethod
+    def all_branches(self, T_base_tool: Any, *, approach: Any = None) -> "Solution":
+        """Joint values on every branch."""
+
+    @abstractmethod
+    def forward(self, q: Any, *, approach: Any = None) -> Any:
+        """Poses of the calibrated arm."""
+
+    @abstractmethod
+    def jacobian(self, q: Any) -> Any:
+        """Its Jacobian."""
+
+    @abstractmethod
+    def accuracy(self, q: Any) -> Any:
+        """Predicted standard deviation of the tool's position [m]."""
+
+    @abstractmethod
+    def with_axes(self, axes: TaskAxes) -> "AbstractInverse":
+        """The same where other axes of the tool count."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +117,7 @@ class Solution:
     position_residual: Any
     rotation_residual: Any
     domain_measure: Any
-    owner: "pisigma.model.inverse.corrected_ik.CorrectedIK | None" = None
+    owner: AbstractInverse | None = None
     ignored_axes: tuple[str, ...] = ()
 
     @property

@@ -160,7 +160,7 @@ def _intermediate_code(forms: KernelForms) -> str:
     except ImportError:
         raise ModelError(
             "the package holds no compiled inverse kinematics of its present sources; install pisigma[compile], which "
-            "makes it, or go without, which is some hundred times slower."
+            "makes it, or go without, which is some thousand times slower."
         ) from None
 
 

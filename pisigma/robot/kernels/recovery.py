@@ -64,7 +64,7 @@ def nearest_starts(description: Record, memory: Record, T: Array, most: int) -> 
 
 @kernel
 def recover(description: Record, memory: Record, branch: int, any_branch: bool) -> int:
-    """Look for joint values from other starts; see `inverse.identified_arm.IdentifiedArm.recover`.
+    """Look for joint values from other starts, as `model.inverse.numeric_ik` does: branches as near as they come.
 
     Args:
         description: the calibrated arm.
@@ -304,7 +304,7 @@ def settle(description: Record, memory: Record, has_near: bool, q: Array) -> boo
 
 @kernel
 def _approach_preferred(description: Record, memory: Record, q: Array) -> bool:
-    """Move joints to preferred values as `inverse.spare_joints` does; whether they still reach the pose."""
+    """Move joints to preferred values as `kinematics.numeric.approach_preferred`; whether they still reach the pose."""
     arms, arm = description.arms, CORRECTED if description.arms.corrected else IDENTIFIED
     reach, share, before = arms.reach[IDENTIFIED], 1.0, math.inf
     for _ in range(tolerances.ROUNDS):

@@ -51,6 +51,28 @@ def wrap_into_limits(
     ).reshape(every.shape)
 
 
+def nearest_turn(
+    robot: Robot, q: Float[Tensor, "*batch dof"], near: Float[Tensor, "... dof"], within_limits: bool
+) -> Float[Tensor, "*batch dof"]:
+    """Move revolute joints by full turns as near to given values as they can come.
+
+    Args:
+        robot: the robot.
+        q: joint values [rad or m]; NaN stays NaN.
+        near: where they shall come near to [rad or m]; broadcasts.
+        within_limits: only to turns inside the joint limits; a joint that no turn brings inside stays.
+    """
+    turns = torch.round((near - q) / (2 * torch.pi))
+    if within_limits:
+        limits = torch.from_numpy(robot.limits).to(q)
+        lowest = torch.ceil((limits[:, 0] - LIMIT_TOLERANCE - q) / (2 * torch.pi))
+        highest = torch.floor((limits[:, 1] + LIMIT_TOLERANCE - q) / (2 * torch.pi))
+        nearest = torch.maximum(torch.minimum(turns, highest), lowest)
+        turns = torch.where(lowest <= highest, nearest, torch.zeros_like(turns))
+    revolute = torch.tensor(robot.revolute, device=q.device)
+    return torch.where(revolute & (turns != 0), q + 2 * torch.pi * turns, q)
+
+
 GROSS_ANGLE = np.pi / 4
 """[rad] A value that is farther outside is of another joint, unit or zero; drawings were off by up to 14 deg."""
 GROSS_SHARE = 0.25

@@ -21,7 +21,7 @@ from pisigma.robot.kinematics.singularity import (
 )
 from pisigma.robot.kinematics.status import Status
 from pisigma.robot.kinematics.task_axes import WHOLE, TaskAxes
-from pisigma.robot.kinematics.task_error import task_error
+from pisigma.robot.kinematics.task_error import task_error, tolerated
 from pisigma.robot.se3 import check_transforms, pose_error
 
 Motion = Callable[[Tensor], tuple[Tensor, Tensor]]
@@ -262,3 +262,82 @@ def _finish(
         rotation_residual=rotation.reshape(batch),
         iterations=state.iterations.reshape(batch),
     )
+
+
+def solve_within_tolerances(
+    robot: Robot,
+    T: Float[Tensor, "poses 4 4"],
+    start: Float[Tensor, "poses dof"],
+    motion: Motion,
+    axes: TaskAxes,
+) -> tuple[Float[Tensor, "poses dof"], Bool[Tensor, " poses"]]:
+    """Joint values that miss poses by as little as possible, each axis over its tolerance, and whether within all.
+
+    It is for arms with too few joints for all axes that count. Those without tolerance are met exactly.
+
+    Args:
+        robot: the robot.
+        T: wanted T_base_tool [m].
+        start: joint values to begin with [rad or m].
+        motion: where the tool is and how it moves.
+        axes: which axes of the tool count, some of them within tolerances.
+    """
+    q = solve_numeric(robot, T, start, motion=motion, axes=axes, weights=axes.loose_weights).q
+    exact, met = [float(value == 0) for value in axes.tolerance], torch.ones_like(q[:, 0], dtype=torch.bool)
+    if any(exact):
+        last = solve_numeric(
+            robot, T, q, tolerance=tolerances.HYBRID_TOLERANCE, motion=motion, axes=axes, weights=exact
+        )
+        q, met = last.q, last.status != Status.NOT_CONVERGED
+    return q, met & tolerated(axes, task_error(axes, T, motion(q)[0])[0])
+
+
+def approach_preferred(
+    robot: Robot,
+    task: TaskMotion,
+    T: Float[Tensor, "poses 4 4"],
+    q: Float[Tensor, "poses dof"],
+    preferred: Float[Tensor, "poses dof"],
+    units: Float[Tensor, " dof"],
+) -> Float[Tensor, "poses dof"]:
+    """Move joints as near to preferred values as the pose and the limits allow.
+
+    So the kernels choose among the many joint values of an arm with joints to spare. Every step solves
+    `min |(dq - pull) / units|` where `J dq = e` holds (sequential quadratic programming). A joint that comes to a
+    limit is held there. Where that leads away from the pose, the joint values stay.
+
+    Args:
+        robot: the robot.
+        task: the arm in the axes that count.
+        T: wanted poses.
+        q: joint values that reach them [rad or m].
+        preferred: joint values to come near to [rad or m].
+        units: joint motions that count as one [rad or m].
+    """
+    length, limits = characteristic_length(robot), torch.from_numpy(robot.limits)
+    rows = T.new_tensor([1 / length] * 3 + [1.0] * 3)
+    scale, share = units.expand_as(q).clone(), torch.ones_like(q[:, :1])
+    before, best, active = torch.full_like(share, torch.inf), q.clone(), torch.ones(len(q), dtype=torch.bool)
+    for _ in range(tolerances.ROUNDS):
+        if not active.any():
+            break
+        error, J = task.errors(T, best)
+        pull = torch.where(scale > 0, share * (preferred - best), 0.0)
+        A = rows[:, None] * J * scale[:, None]
+        left = rows * (error - (J @ pull[..., None])[..., 0])
+        small = A @ A.mT
+        floor = 4 * torch.finfo(A.dtype).eps * small.diagonal(dim1=-2, dim2=-1).sum(-1)
+        factor, _ = torch.linalg.cholesky_ex(small + floor[:, None, None] * torch.eye(6, dtype=A.dtype))
+        step = pull + scale * (A.mT @ torch.cholesky_solve(left[..., None], factor))[..., 0]
+        moved = step.abs().amax(-1, keepdim=True)
+        share, before = torch.where(moved > 0.7 * before, 0.6 * share, share), moved
+        trial = best + step * (tolerances.STRIDE / moved).clamp(max=1.0)
+        inside = torch.minimum(torch.maximum(trial, limits[:, 0]), limits[:, 1])
+        scale = torch.where(active[:, None] & (inside != trial), 0.0, scale)
+        best = torch.where(active[:, None], inside, best)
+        active &= (moved >= tolerances.STILL)[:, 0]
+    start = torch.where(torch.isfinite(best).all(-1, keepdim=True), best, q)
+    result = solve_numeric(
+        robot, T, start, tolerance=tolerances.HYBRID_TOLERANCE, motion=task.motion, axes=task.axes
+    )
+    return torch.where((result.status != Status.NOT_CONVERGED)[:, None], result.q, q)

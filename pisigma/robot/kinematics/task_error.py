@@ -1,7 +1,9 @@
 """Pose errors and Jacobians in the axes that a task asks for; see `kinematics.task_axes.TaskAxes`."""
 
+import math
+
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from pisigma.robot.kinematics.task_axes import TaskAxes
@@ -47,3 +49,10 @@ def task_error(
         rotation[:, k] = (direction[:, None] @ turn)[:, 0]
     matrix = torch.cat([torch.cat([T[:, :3, :3].mT, zero], -1), torch.cat([zero, rotation], -1)], -2)
     return error, matrix
+
+
+def tolerated(axes: TaskAxes, error: Float[Tensor, "*batch 6"]) -> Bool[Tensor, "*batch"]:
+    """Whether errors in the axes of the tool keep within all tolerances."""
+    allowed = [abs(value) * (1 + 1e-9) if value else math.inf for value in axes.tolerance]
+    within: Tensor = (error.abs() <= error.new_tensor(allowed)).all(-1)
+    return within

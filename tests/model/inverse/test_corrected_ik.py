@@ -11,7 +11,7 @@ from testing.models import HOMES, hand_made_model, joints_around, poses_around, 
 
 from pisigma.files.errors import ModelError, PoseError
 from pisigma.model.inverse.corrected_ik import CorrectedIK
-from pisigma.model.inverse.reference import NUMERIC
+from pisigma.model.inverse.numeric_ik import NUMERIC
 from pisigma.robot import Robot
 from pisigma.robot.kinematics.closed_form import closed_form_solver
 from pisigma.robot.kinematics.forward import forward_kinematics

@@ -16,7 +16,7 @@ from pisigma.joint_correction.joint_correction import JointCorrection
 from pisigma.joint_correction.shared_features import NominalPose
 from pisigma.model.compiled_model import describe, save_compiled
 from pisigma.model.inverse.compiled_ik import CompiledIK
-from pisigma.model.inverse.reference import ReferenceIK
+from pisigma.model.inverse.numeric_ik import NumericIK
 from pisigma.robot.kinematics.closed_form import closed_form_solver
 from pisigma.robot.kinematics.status import Status
 from pisigma.robot.kinematics.task_error import task_error
@@ -26,7 +26,7 @@ NAMES = ["kiro3", "kiro4", "ur5", "rb5", "panda"]
 
 def _torch_solutions(model, T, near=None, branch=None):
     with no_type_checker():
-        return ReferenceIK(model)(T, near=near, branch=branch)
+        return NumericIK(model).solve_batch(T, near=near, branch=branch)
 
 
 def _both(name, arms, rows=40, near=False, **kind):

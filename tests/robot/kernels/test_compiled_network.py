@@ -14,7 +14,7 @@ from pisigma.files.errors import ModelError
 from pisigma.model.compiled_model import describe, save_compiled
 from pisigma.model.domain import Domain
 from pisigma.model.inverse.compiled_ik import CompiledIK
-from pisigma.model.inverse.reference import ReferenceIK
+from pisigma.model.inverse.numeric_ik import NumericIK
 from pisigma.network.correction_network import CorrectionNetwork, JointGroup
 from pisigma.network.inputs import Inputs
 from pisigma.network.pi_sigma import PiSigma
@@ -109,7 +109,7 @@ def test_solutions_near_to_joint_values_are_those_of_torch(name):
     near = q + 0.1 * torch.sin(17 * q)
     near[::2, 0] += 2 * math.pi
     with no_type_checker():
-        expected = ReferenceIK(model)(T, near=near)
+        expected = NumericIK(model).solve_batch(T, near=near)
     found = _kernels(name).solve_batch(T.numpy(), near=near.numpy())
     _assert_same(found, expected)
     assert {Status.REACHED, Status.OUTSIDE_DOMAIN} <= set(found.status.tolist())
@@ -120,7 +120,7 @@ def test_solutions_near_to_joint_values_are_those_of_torch(name):
 def test_every_branch_is_that_of_torch(name):
     _, T = _poses(name)
     with no_type_checker():
-        expected = ReferenceIK(_model(name)).all_branches(T)
+        expected = NumericIK(_model(name)).all_branches(T)
     found = _kernels(name).all_branches(T.numpy())
     _assert_same(found, expected)
     for index, branch in enumerate(found.branches):
@@ -132,7 +132,7 @@ def test_every_branch_is_that_of_torch(name):
 def test_without_branches_stored_joint_values_are_the_start():
     _, T = _poses("numeric", spread=0.2)
     with no_type_checker():
-        expected = ReferenceIK(_model("numeric"))(T)
+        expected = NumericIK(_model("numeric")).solve_batch(T)
     found = _kernels("numeric").solve_batch(T.numpy())
     _assert_same(found, expected)
     every = _kernels("numeric").all_branches(T.numpy())
@@ -147,7 +147,7 @@ def test_poses_at_ninety_degrees_of_pitch_are_seen_as_in_torch():
     T[:3, :3] = torch.from_numpy(model.network.groups[0].inputs.reference) @ T[:3, :3]
     T[:3, 3] = torch.tensor([0.5, 0.3, 0.4], dtype=torch.float64)
     with no_type_checker():
-        expected = ReferenceIK(model).all_branches(T[None])
+        expected = NumericIK(model).all_branches(T[None])
     assert np.isfinite(expected.q.numpy()).all(-1).any()
     found = _kernels("grouped").all_branches(T[None].numpy())
     _assert_same(

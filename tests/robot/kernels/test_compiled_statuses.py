@@ -9,7 +9,7 @@ from testing.models import hand_made_model, joints_around, no_type_checker, with
 
 from pisigma.files.errors import PoseError
 from pisigma.model.inverse.compiled_ik import CompiledIK
-from pisigma.model.inverse.reference import ReferenceIK
+from pisigma.model.inverse.numeric_ik import NumericIK
 from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.robot.kinematics.status import Status
 
@@ -68,7 +68,7 @@ def test_all_branches_are_those_of_torch_and_those_asked_for_by_name(arms):
     T = model.forward(arms.draw_joints(model.robot, 30, seed=22))
     found = kernels.all_branches(T.numpy())
     with no_type_checker():
-        expected = ReferenceIK(model).all_branches(T)
+        expected = NumericIK(model).all_branches(T)
     assert found.q.shape == (30, 8, 6)
     assert len(found.sentences) == 240
     both = np.isfinite(found.q).all(-1) & np.isfinite(expected.q.numpy()).all(-1)

@@ -106,7 +106,7 @@ def test_forms_are_asked_in_their_order_and_registered_once(registered):
 
 
 def test_corrected_inverse_kinematics_solves_by_it(mast, registered):
-    """Without a compiled form the model goes through the reference, on the registered branches."""
+    """Without a compiled form the model is solved in torch, on the registered branches."""
     q = torch.tensor([[0.4, -1.2], [1.9, 2.5]], dtype=torch.float64)
     ik = CorrectedIK(model_of(mast, q))
     assert ik.branches == ("only",)

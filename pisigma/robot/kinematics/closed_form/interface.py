@@ -15,7 +15,7 @@ from pisigma.robot.kinematics.components import Frame, Scalar, frame_of
 from pisigma.robot.kinematics.joint_limits import wrap_into_limits, wrapped_difference
 from pisigma.robot.kinematics.status import Status
 from pisigma.robot.kinematics.tolerances import NEAREST_MARGIN
-from pisigma.robot.se3 import check_transforms, invert, wrap_to_pi
+from pisigma.robot.se3 import check_transforms, invert, transform, wrap_to_pi
 
 Own = TypeVar("Own", bound="AbstractClosedForm")
 
@@ -124,6 +124,20 @@ class AbstractClosedForm(ABC):
             T: T_base_tool [m].
         """
         return replace(self, margin=NEAREST_MARGIN)._solve_branches(T)[0]
+
+    def upright(self, T: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch 4 4"]:
+        """Poses as a SCARA can take them whose tool may lean.
+
+        They are turned about the tool's point until the last joint's axis is parallel to the first's.
+        """
+        axis = T[..., :3, :3] @ invert(self.rows.T_last_tool.to(T))[:3, 2]
+        first = self.rows.T_base_first.to(T)[:3, 2].expand(axis.shape)
+        c = torch.linalg.cross(axis, first)
+        cosine = (axis * first).sum(-1, keepdim=True)[..., None]
+        columns = T[..., :3, :3]
+        across = torch.linalg.cross(c[..., None].expand(columns.shape), columns, dim=-2)
+        along = c[..., None] * (c[..., None, :] @ columns) / (1 + cosine).clamp(min=1e-6)
+        return transform(cosine * columns + across + along, T[..., :3, 3])
 
     def _solve_branches(
         self, T: Tensor

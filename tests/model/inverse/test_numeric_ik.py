@@ -1,4 +1,4 @@
-"""The reference, which models without kernels go through, and choices that both it and the kernels make."""
+"""What models without kernels go through, and choices that both it and the kernels make."""
 
 from dataclasses import replace
 
@@ -14,7 +14,7 @@ from pisigma.files.errors import PoseError
 from pisigma.joint_correction.backlash import Backlash
 from pisigma.joint_correction.joint_correction import JointCorrection
 from pisigma.model.inverse.corrected_ik import CorrectedIK
-from pisigma.model.inverse.reference import ReferenceIK
+from pisigma.model.inverse.numeric_ik import NumericIK
 from pisigma.robot.kinematics.status import Status
 
 pytestmark = pytest.mark.usefixtures("without_type_checker")
@@ -63,6 +63,12 @@ def test_without_kernels_nothing_need_raise(without_kernels):
             ik(T.numpy(), **options)
 
 
+def test_an_elbow_angle_is_refused_without_kernels():
+    model = calibrated_arm("panda", shared=("pose",))
+    with pytest.raises(PoseError, match="which alone know elbow_angle; leave it out"):
+        CorrectedIK(model)(np.eye(4), elbow_angle=0.3)
+
+
 def test_gradients_without_kernels(without_kernels):
     ik, q, T = without_kernels
     wanted = T[:3].clone().requires_grad_()
@@ -79,14 +85,14 @@ def test_the_side_from_which_joints_come_is_part_of_the_correction(monkeypatch):
         return plain(arm, q) + (0.0 if arm.approach is None else 1e-3 * arm.approach)
 
     monkeypatch.setattr(HybridArm, "delta", with_backlash)
-    ik, T = ReferenceIK(model), model.forward(q)
+    ik, T = NumericIK(model).solve_batch, model.forward(q)
     near, sides = (
         ik(T, near=q),
         torch.tensor([[1.0, 1, 1, -1, -1, 0], [-1.0, 1, 0, 0, 1, 1]]).repeat(3, 1).double(),
     )
     found = ik(T, near=q, approach=sides)
     assert_close(found.q - near.q, -1e-3 * sides, atol=1e-4)
-    assert_close(found.position_residual, 0.0, atol=2e-3)  # forward is as it comes from no stated side
+    assert_close(found.position_residual, 0.0, atol=1e-10)
     assert_close(ik(T, near=q, approach=sides[0]).q[::2], found.q[::2], atol=1e-12)
     assert_close(ik(T, near=q, approach=np.zeros(6)).q, near.q, atol=1e-12)
 
@@ -112,14 +118,15 @@ def test_of_branches_the_first_inside_the_limits_is_taken():
     assert bool((solution.status[outside] == Status.OUTSIDE_JOINT_LIMITS).all())
 
 
-@pytest.mark.parametrize("kind", [CorrectedIK, ReferenceIK])
-def test_poses_in_millimetres_and_near_misses_are_unreachable(kind):
+@pytest.mark.parametrize("kernels", [True, False])
+def test_poses_in_millimetres_and_near_misses_are_unreachable(kernels):
     model = calibrated_arm("ur5")
-    ik, T = kind(model), model.forward(joints_of(model.robot, 40, seed=7))
+    ik, T = CorrectedIK(model), model.forward(joints_of(model.robot, 40, seed=7))
+    solve = ik if kernels else ik.numeric.solve_batch
     T[:20, :3, 3] *= 1e3
     T[20:, :3, 3] *= 1.5 * model.robot.reach / T[20:, :3, 3].norm(dim=-1, keepdim=True)
     for near in (None, torch.zeros(6, dtype=torch.float64)):
-        solution = ik(T, near=near)
+        solution = solve(T, near=near)
         assert bool((solution.status == Status.UNREACHABLE).all())
         assert bool(solution.q.isnan().all())
         assert bool((solution.branch == ik.order[0]).all())
@@ -140,7 +147,7 @@ def arm_with_backlash(size: float = 2e-3):
 
 def test_both_routes_know_from_which_side_joints_come():
     model = arm_with_backlash()
-    ik, reference = CorrectedIK(model), ReferenceIK(model)
+    ik, reference = CorrectedIK(model), NumericIK(model).solve_batch
     assert ik.compiled is not None
     q = joints_of(model.robot, 12, seed=2, share=0.8)
     sides = torch.tensor([[1.0, 1, 1, -1, -1, 0], [-1.0, 1, 0, 0, 1, 1]]).repeat(6, 1).double()

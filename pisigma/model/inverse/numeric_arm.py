@@ -1,0 +1,145 @@
+"""A calibrated arm that is brought to poses from given joint values, in the axes of the tool that count; in torch."""
+
+from dataclasses import dataclass
+from functools import cached_property, partial
+
+import torch
+from jaxtyping import Bool, Float64
+from torch import Tensor
+
+from pisigma.calibration.hybrid.arm import HybridArm
+from pisigma.model.hybrid_motion import hybrid_motion
+from pisigma.robot.description import Robot
+from pisigma.robot.kinematics import tolerances
+from pisigma.robot.kinematics.jacobian import joint_jacobian
+from pisigma.robot.kinematics.joint_limits import nearest_turn, wrap_into_limits, wrapped_difference
+from pisigma.robot.kinematics.numeric import (
+    Motion,
+    TaskMotion,
+    approach_preferred,
+    solve_numeric,
+    solve_within_tolerances,
+)
+from pisigma.robot.kinematics.singularity import smallest_singular_value
+from pisigma.robot.kinematics.status import Status
+from pisigma.robot.kinematics.task_axes import TaskAxes
+
+EXACT_ITERATIONS = 25
+"""Steps with the slope of the correction, where those without it come near a pose but not there."""
+
+
+@dataclass(frozen=True, eq=False)
+class NumericArm:
+    """An arm as identified, with its joint correction.
+
+    Attributes:
+        nominal: the arm as drawn, which has the joint limits.
+        robot: its geometry, of a hybrid the one that goes with its correction.
+        hybrid: the arm with its correction, where it has one.
+        axes: which axes of the tool count.
+    """
+
+    nominal: Robot
+    robot: Robot
+    hybrid: HybridArm | None
+    axes: TaskAxes
+
+    @cached_property
+    def weights(self) -> tuple[float, ...]:
+        """Of the axes in least squares."""
+        return self.axes.weights(self.robot.dof)
+
+    @cached_property
+    def has_spare_joints(self) -> bool:
+        """Whether it has more joints than axes count."""
+        return sum(self.weights) < self.robot.dof
+
+    @cached_property
+    def motions(self) -> tuple[Motion, ...]:
+        """Where the tool is and how it moves: cheaply, and of a hybrid with the slope of the correction too."""
+        if self.hybrid is None:
+            return (partial(joint_jacobian, self.robot),)
+        return tuple(partial(hybrid_motion, self.hybrid, exact=exact) for exact in (False, True))
+
+    def within_reach(self, T: Float64[Tensor, "*batch 4 4"]) -> Bool[Tensor, "*batch"]:
+        """Whether poses T_base_tool are not farther away than the arm is long, as far as their position counts."""
+        if any(self.axes.free[:3]):
+            return torch.ones_like(T[..., 0, 0], dtype=torch.bool)
+        distance: Tensor = (T[..., :3, 3] - T.new_tensor(self.robot.base[:3].tolist())).norm(dim=-1)
+        return distance <= self.robot.reach * (1 + tolerances.REACH_ROUNDING)
+
+    def reach(
+        self, T: Float64[Tensor, "poses 4 4"], start: Float64[Tensor, "poses dof"]
+    ) -> tuple[Float64[Tensor, "poses dof"], Bool[Tensor, " poses"]]:
+        """Joint values [rad or m] from a start for each pose, on its turns, and whether they reach it.
+
+        Poses that cannot be met exactly are met within the tolerances of the axes.
+        """
+        q, reached = start, torch.zeros(len(T), dtype=torch.bool)
+        near, rounds = ~reached, tolerances.ITERATIONS
+        for motion in self.motions:
+            rows = (near & ~reached).nonzero()[:, 0]
+            found = solve_numeric(
+                self.robot,
+                T[rows],
+                q[rows],
+                tolerance=tolerances.TOLERANCE if self.hybrid is None else tolerances.HYBRID_TOLERANCE,
+                max_iterations=rounds,
+                motion=motion,
+                axes=self.axes,
+                weights=self.weights,
+            )
+            q = q.index_copy(0, rows, found.q)
+            reached = reached.index_copy(0, rows, found.status != Status.NOT_CONVERGED)
+            close = (found.position_residual < tolerances.NEARLY * self.robot.reach) & (
+                found.rotation_residual < tolerances.NEARLY
+            )
+            near, rounds = near.index_copy(0, rows, close), EXACT_ITERATIONS
+        rows = (~reached).nonzero()[:, 0]
+        if len(rows) and self.axes.has_tolerances and self.axes.tolerance.count(0.0) < self.robot.dof:
+            better, met = solve_within_tolerances(
+                self.robot, T[rows], start[rows], self.motions[-1], self.axes
+            )
+            q, reached = q.index_copy(0, rows, better), reached.index_copy(0, rows, met)
+        return start + wrapped_difference(self.nominal, q, start), reached
+
+    def settled(
+        self,
+        T: Float64[Tensor, "poses 4 4"],
+        q: Float64[Tensor, "poses dof"],
+        near: Float64[Tensor, "poses dof"] | None,
+    ) -> Float64[Tensor, "poses dof"]:
+        """Joint values that reach poses with joints to spare, moved to `near`, else to the middle of their travel."""
+        limits, half = self._travel
+        q, _ = wrap_into_limits(self.nominal, q)
+        if near is None:
+            middle = limits.mean(-1).expand_as(q)
+            return approach_preferred(self.nominal, self._task, T, q, middle, half)
+        q = nearest_turn(self.nominal, q, near, within_limits=True)
+        return approach_preferred(self.nominal, self._task, T, q, near, torch.ones_like(half))
+
+    def freedom(
+        self, T: Float64[Tensor, "poses 4 4"], q: Float64[Tensor, "poses dof"]
+    ) -> Float64[Tensor, " poses"]:
+        """Singularity measure times the smallest distance of a joint from its limits, over half its travel."""
+        limits, half = self._travel
+        margin = torch.minimum(q - limits[:, 0], limits[:, 1] - q).div(half).clamp(max=1.0).amin(-1)
+        return margin * self.singularity_measure(T, q)
+
+    def singularity_measure(
+        self, T: Float64[Tensor, "poses 4 4"], q: Float64[Tensor, "poses dof"]
+    ) -> Float64[Tensor, " poses"]:
+        """Smallest singular value of the Jacobian in the axes that count, in characteristic lengths."""
+        _, J = self._task.errors(T, q)
+        return smallest_singular_value(self.robot, J, self._task.rows)
+
+    @cached_property
+    def _task(self) -> TaskMotion:
+        weights = torch.tensor(self.weights, dtype=torch.float64)
+        return TaskMotion(self.motions[0], self.axes, weights)
+
+    @cached_property
+    def _travel(self) -> tuple[Tensor, Tensor]:
+        """Limits of the joints, and half their travel [rad or m]."""
+        limits = torch.from_numpy(self.nominal.limits)
+        return limits, ((limits[:, 1] - limits[:, 0]) / 2).clamp(min=1e-9)
