@@ -215,7 +215,7 @@ class HybridCalibrator:
             problem, group = problem.select(chosen), renumbered(group[chosen])
         design, point = Design(problem, ()), solved.solution.linearisation.point
         values = sensor_values(problem, point)
-        distances = [one.residual.norm(dim=1) * one.root / view.scale(k) for k, one in enumerate(values)]
+        distances = [one.residual.norm(dim=1) * one.root / view.scales[k] for k, one in enumerate(values)]
         weights = [
             ((distance < GROSS) | one.certain).to(distance)
             for distance, one in zip(distances, values, strict=True)
