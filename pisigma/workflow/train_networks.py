@@ -31,8 +31,7 @@ class TrainSettings:
     """How a training is run, apart from what it computes.
 
     Attributes:
-        checkpoints: folder for checkpoints of networks, and of a hybrid on mini-batches; None keeps none. It is not
-            removed when the training is done.
+        checkpoints: folder for checkpoints of networks; None keeps none. It is not removed when the training is done.
         resume: go on from the checkpoint there.
         show_progress: draw the bar of networks on stderr, if that is a terminal.
         logs: folder for Lightning's logs of networks: `metrics.csv`, and TensorBoard's events where it is installed.
