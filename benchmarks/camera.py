@@ -21,8 +21,8 @@ import torch
 from torch import Tensor
 
 from pisigma.calibration.geometric.calibrator import GeometricCalibrator
-from pisigma.calibration.geometric.problem.motion import MotionMemory
 from pisigma.calibration.geometric.problem.parameters import Prior
+from pisigma.calibration.geometric.problem.problem import MotionMemory
 from pisigma.measurement.camera.board import Board
 from pisigma.measurement.camera.camera import INTRINSICS, USUAL_DEVIATIONS, Camera
 from pisigma.measurement.camera.image_rows import Images, Repeatability, image_measurements

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from pisigma.calibration.hybrid.evidence import AbstractRegression, LeftOut, SensorCount
 from pisigma.calibration.hybrid.normal_equations import NormalEquations
-from pisigma.calibration.hybrid.value_covariance import ValueCovariance
+from pisigma.calibration.hybrid.regression import ValueCovariance
 
 FORMS = {"normal equations": NormalEquations, "value covariance": ValueCovariance}
 

@@ -1,6 +1,6 @@
 """The calibration as a least-squares problem: normal equations summed over chunks of poses."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 
@@ -13,7 +13,6 @@ from pisigma.calibration.geometric.problem.least_squares import (
     Linearisation,
     covariance_of,
 )
-from pisigma.calibration.geometric.problem.motion import MotionMemory, motion_at
 from pisigma.calibration.geometric.problem.noise import (
     SensorSums,
     SensorView,
@@ -36,11 +35,37 @@ from pisigma.calibration.geometric.problem.prior_sizes import (
 from pisigma.estimation.loss import AbstractLoss, SquaredLoss
 from pisigma.measurement.conditions import JointState
 from pisigma.measurement.sensors.sensor import AbstractSensor, Unknowns
-from pisigma.robot.kinematics.parameter_jacobian import JACOBIAN_CHUNK, ToolMotion
+from pisigma.robot.kinematics.parameter_jacobian import JACOBIAN_CHUNK, ToolMotion, tool_motion
 
 CERTAIN_LOSS = SquaredLoss()
 SETTLED = 1e-2
 """Estimates of noise and prior sizes have settled that change by a smaller share from point to point."""
+
+
+class MotionMemory:
+    """The motion at the last point, which the rank analysis, the search and its next stage all ask for.
+
+    What the motion was made from is compared by identity; so points are replaced and never changed in place.
+    """
+
+    def __init__(self) -> None:
+        self._made_from: tuple[object, ...] = ()
+        self._motion: ToolMotion | None = None
+
+    def motion(self, made_from: tuple[object, ...], make: Callable[[], ToolMotion]) -> ToolMotion:
+        """Return the motion of all rows that was made from the same objects, or else a new one.
+
+        Args:
+            made_from: the objects.
+            make: works the motion out.
+        """
+        same = len(made_from) == len(self._made_from) and all(
+            one is other for one, other in zip(made_from, self._made_from, strict=True)
+        )
+        if not same or self._motion is None:
+            self._made_from, self._motion = made_from, None  # given back before more memory is asked for
+            self._motion = make()
+        return self._motion
 
 
 @dataclass(frozen=True, eq=False)
@@ -246,8 +271,7 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         The columns are 0 for base and tool in rows of other frames and targets, and for parameters that do not
         move the tool.
         """
-        of_rows = (point, self.q[rows], self.frame[rows], self.target[rows])
-        make = partial(motion_at, self.space, *of_rows, self.turning)
+        make = partial(self._motion, point, rows)
         made_from = (point, self.space, self.q, self.frame, self.target, self.turning)
         motion = self.memory.motion(made_from, make) if rows == slice(0, self.rows) else make()
         columns = self.space.motion_columns.to(active.device)
@@ -259,6 +283,16 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
             )
             J = J * moving[:, None, :]
         return ToolMotion(motion.position, motion.rotation, J)
+
+    def _motion(self, point: Tensor, rows: slice) -> ToolMotion:
+        """Tool pose of some rows and its derivative by every kind of parameter."""
+        dh, bases, tools = self.space.split(point)
+        frame, target = (
+            None if len(owners) == 1 else number[rows]
+            for owners, number in ((bases, self.frame), (tools, self.target))
+        )
+        dh_rows, q, robot = dh.cpu().numpy(), self.q[rows], self.space.robot
+        return tool_motion(robot, dh_rows, bases.t(), tools.t(), q, self.turning, frame, target)
 
     def derivative(
         self, sensor: AbstractSensor, motion: ToolMotion, unknowns: Unknowns, rows: slice, active: Tensor
