@@ -19,8 +19,8 @@ import torch
 from camera import ANGLE, BOARD, CAMERA, LENGTH, NOISE, ON_FLANGE, POSTURES, PRIOR, aligned_error, positions
 
 from pisigma.calibration.geometric.calibrator import GeometricCalibrator
-from pisigma.measurement.camera.detection.checkerboard import detect_checkerboard
 from pisigma.measurement.camera.detection.detected_board import DetectedBoard
+from pisigma.measurement.camera.detection.detector import detect_checkerboard
 from pisigma.measurement.camera.image_rows import image_measurements
 from pisigma.robot import Robot
 from pisigma.robot.se3 import invert, transform_from_xyzrpy, xyzrpy_from_transform

@@ -35,8 +35,7 @@ from torch import Tensor
 
 from pisigma.calibration.geometric.calibrator import GeometricCalibrator
 from pisigma.calibration.hybrid.calibrator import HybridCalibrator
-from pisigma.measurement.camera.flatness import bent_corners
-from pisigma.measurement.camera.image_rows import Images, image_measurements
+from pisigma.measurement.camera.image_rows import Images, bent_corners, image_measurements
 from pisigma.measurement.camera.solved_images import IntrinsicsChoice
 from pisigma.measurement.dataset import Measurements, join
 from pisigma.robot import Robot

@@ -6,8 +6,13 @@ import numpy as np
 from testing.camera_cell import BOARD, CAMERA, CameraCell, camera_cell
 from testing.closeness import assert_close
 
-from pisigma.measurement.camera.flatness import bent_corners, shapes
-from pisigma.measurement.camera.image_rows import Images, Repeatability, image_measurements
+from pisigma.measurement.camera.image_rows import (
+    Images,
+    Repeatability,
+    bent_corners,
+    image_measurements,
+    shapes,
+)
 from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.robot.se3 import invert
 from pisigma.simulation.camera.images import ImageNoise
