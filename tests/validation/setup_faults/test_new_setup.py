@@ -13,7 +13,7 @@ from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.new_frames import with_new_frames
 from pisigma.robot import Robot
 from pisigma.robot.se3 import transform_from_xyzrpy
-from pisigma.validation.setup_faults.new_setup import new_setup
+from pisigma.validation.checks.setup_fault import new_setup
 from pisigma.workflow.calibrate import CalibrationSettings, calibrate
 
 ELSEWHERE = transform_from_xyzrpy(torch.tensor([0.3, -0.2, 0.1, 0.5, 0.1, -0.2], dtype=torch.float64))
