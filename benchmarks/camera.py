@@ -39,8 +39,7 @@ from pisigma.robot.se3 import (
     transform_from_xyzrpy,
     xyzrpy_from_transform,
 )
-from pisigma.simulation.camera.images import ImageNoise, simulate_images
-from pisigma.simulation.camera.views import far_apart
+from pisigma.simulation.camera.simulated_images import ImageNoise, far_apart, simulate_images
 
 LENGTH, ANGLE = 1e-3, np.deg2rad(0.3)
 CAMERA = Camera("wrist", 1920, 1200, 1400.0, 1400.0, 960.0, 600.0)

@@ -42,8 +42,7 @@ from pisigma.robot import Robot
 from pisigma.robot.kinematics.closed_form.registry import closed_form_solver
 from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.robot.se3 import invert, transform_from_xyzrpy, xyzrpy_from_transform
-from pisigma.simulation.camera.images import simulate_images
-from pisigma.simulation.camera.views import far_apart
+from pisigma.simulation.camera.simulated_images import far_apart, simulate_images
 
 BESIDE = replace(CAMERA, name="beside", is_fixed=True)
 HAND = replace(BOARD, name="hand")

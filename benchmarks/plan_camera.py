@@ -36,7 +36,7 @@ from pisigma.planning.task import TASK_POSES
 from pisigma.robot import Robot
 from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.robot.se3 import invert, skew, xyzrpy_from_transform
-from pisigma.simulation.camera.images import ImageNoise, simulate_images
+from pisigma.simulation.camera.simulated_images import ImageNoise, simulate_images
 
 LENGTH, ANGLE, POSTURES = 1e-3, np.deg2rad(0.3), 400
 PRIOR = Prior(theta=ANGLE, d=LENGTH, a=LENGTH, alpha=ANGLE, beta=ANGLE)

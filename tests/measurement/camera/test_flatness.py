@@ -15,7 +15,7 @@ from pisigma.measurement.camera.image_rows import (
 )
 from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.robot.se3 import invert
-from pisigma.simulation.camera.images import ImageNoise
+from pisigma.simulation.camera.simulated_images import ImageNoise
 
 NONE = Repeatability(0.0, 0.0)
 BENT = np.array([3e-4, -1e-4, 2e-4])

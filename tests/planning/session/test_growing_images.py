@@ -19,7 +19,7 @@ from pisigma.planning.surroundings.arm_in_cell import ArmInCell
 from pisigma.robot import Robot
 from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.robot.se3 import invert, xyzrpy_from_transform
-from pisigma.simulation.camera.images import ImageNoise, simulate_images
+from pisigma.simulation.camera.simulated_images import ImageNoise, simulate_images
 from pisigma.workflow.measure import MeasureSettings, MeasuringSession
 
 IMAGES, SWAPPED = 9, 7
