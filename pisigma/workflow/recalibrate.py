@@ -21,8 +21,11 @@ from pisigma.lifetime.recalibration.adaptation import Adaptation, adapt
 from pisigma.lifetime.recalibration.candidates import FAR_BETTER, Gate, gate
 from pisigma.lifetime.recalibration.elsewhere import owners_elsewhere
 from pisigma.lifetime.recalibration.moved import Moved, moved_by, what_moved
-from pisigma.lifetime.recalibration.recalibrated import recalibration_diagnostics
-from pisigma.lifetime.recalibration.recalibrated_model import KIND, recalibrated_model
+from pisigma.lifetime.recalibration.recalibrated_model import (
+    KIND,
+    recalibrated_model,
+    recalibration_diagnostics,
+)
 from pisigma.lifetime.recalibration.recalibration_problem import Owner, owners_in, recalibration_problem
 from pisigma.lifetime.recalibration.summary import (
     LeftOutFigures,
