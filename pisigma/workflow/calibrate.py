@@ -35,7 +35,7 @@ from pisigma.validation.checks.scale import scale_figures
 from pisigma.validation.checks.setup_fault import explained, setup_diagnostics
 from pisigma.validation.held_out.calibration_summary import CalibrationSummary, summarise
 from pisigma.validation.held_out.calibration_validation import CalibrationValidation, joined_repeats, judge
-from pisigma.validation.held_out.fit_beside_folds import fit_beside_folds
+from pisigma.validation.held_out.few_rows import fit_beside_folds
 from pisigma.validation.held_out.held_out_rows import HeldOutRows
 from pisigma.validation.held_out.predicted_spread import predicted_at_other_poses
 from pisigma.validation.held_out.trained_calibrations import Calibrator, Result, geometric_of, trained

@@ -221,7 +221,7 @@ class Monitoring:
         Raises:
             OutputError: the page is no .html file or cannot be written.
         """
-        from pisigma.reporting.page.monitoring import monitoring_page  # matplotlib takes a second
+        from pisigma.reporting.page.lifetime import monitoring_page  # matplotlib takes a second
 
         check_page(Path(page))
         lines = (self.sentences, self.warnings)

@@ -1,5 +1,6 @@
 """The part of a recipe that states which images a camera takes on the true robot."""
 
+import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Literal
@@ -7,11 +8,13 @@ from typing import Literal
 import numpy as np
 import torch
 from jaxtyping import Bool, Float64, UInt8
+from PIL import Image
 from pydantic import Field
 from torch import Tensor
 
 from pisigma.files.errors import RecipeError
-from pisigma.files.yaml_file import Count, Section, Seed
+from pisigma.files.output_folder import staged_folder
+from pisigma.files.yaml_file import Count, Section, Seed, yaml_text
 from pisigma.measurement.camera.board import Board, BoardDocument
 from pisigma.measurement.camera.camera import Camera, CameraDocument, IntrinsicsSection
 from pisigma.measurement.camera.image_rows import Images, Repeatability, image_measurements
@@ -29,6 +32,7 @@ CANDIDATES = 8
 """For each view, of which those are taken that are far apart in joint space."""
 ATTEMPTS = 100
 """For each candidate, of which some cannot be reached."""
+STATED = ("joints.csv", "camera.yaml", "board.yaml")
 
 
 class RandomViews(Section):
@@ -343,3 +347,35 @@ def images_of(
     """
     names = tuple(f"{number:04d}" for number in range(len(q)))
     return Images("simulated images", names, q, (0,) * len(q), tuple(corners), tuple(pixels))
+
+
+def write_images(images: SimulatedImages, robot: TrueRobot, folder: str | os.PathLike[str]) -> int:
+    """Render images as `0000.png` and so on, beside `joints.csv`, `camera.yaml` and `board.yaml` as stated.
+
+    Args:
+        images: of a recipe.
+        robot: true robot.
+        folder: to write, whole or not at all; it does not exist or is empty.
+
+    Returns:
+        The number of images.
+
+    Raises:
+        RecipeError: the robot does not reach the views.
+        OutputError: the folder exists, or cannot be written.
+    """
+    axes = robot.nominal.axes
+    names = [f"q{joint + 1}_{axis.file_unit}" for joint, axis in enumerate(axes)]
+    lines = [",".join(("image", *names))]
+    files = [f"{number:04d}.png" for number in range(images.poses.count)]
+    with staged_folder(folder, names=(*files, *STATED)) as scratch:
+        q = robot.nominal.to_controller(images.joints_read(robot)).numpy()
+        for file, joints, image in zip(files, q, images.rendered(robot), strict=True):
+            Image.fromarray(image).save(scratch / file)
+            shown = (axis.in_file_unit(float(value)) for axis, value in zip(axes, joints, strict=True))
+            lines.append(",".join((file, *(f"{value:.9f}" for value in shown))))
+        (scratch / STATED[0]).write_text("\n".join(lines) + "\n", encoding="utf-8")
+        for document, name in zip((images.camera, images.board), STATED[1:], strict=True):
+            stated = document.model_dump(mode="json", exclude_unset=True)
+            (scratch / name).write_text(yaml_text(stated), encoding="utf-8")
+    return len(q)
