@@ -1,4 +1,4 @@
-"""Pages on the life of robots: control charts of sessions, two models beside each other, fleets; all in one file each."""
+"""Pages on the life of robots: control charts of sessions, two models beside each other, fleets; one file each."""
 
 import datetime
 from collections.abc import Mapping, Sequence
