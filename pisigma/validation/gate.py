@@ -22,6 +22,7 @@ from pisigma.validation.held_out.diagnostic import Diagnostic
 from pisigma.validation.held_out.frames.fitted_frames import FrameKind
 from pisigma.validation.held_out.frames.frame_fits import MeasuredPoses, best_base_and_tool
 from pisigma.validation.setup_faults.cause import length_text
+from pisigma.validation.setup_faults.explanations import position_spread
 from pisigma.validation.setup_faults.faults_as_drawn import FEWEST_ROWS_AS_DRAWN, largest_group, usual_error
 from pisigma.validation.setup_faults.hypothesis import COLLAPSED
 from pisigma.validation.setup_faults.joint_faults import joint_causes, signs_and_exchanges
@@ -144,7 +145,10 @@ def size_of_positions(robot: Robot, rows: Measurements) -> Iterator[Diagnostic]:
     group = largest_group(rows)
     if group.position is None or group.rows < FEWEST_ROWS:
         return
-    measured, drawn = _spread(group.position), _spread(forward_kinematics(robot, group.q)[:, :3, 3])
+    measured, drawn = (
+        position_spread(group.position),
+        position_spread(forward_kinematics(robot, group.q)[:, :3, 3]),
+    )
     arm = ARM_SHARE * robot.reach
     if measured > SCALE * (drawn + arm):
         mistake = "x, y and z are millimetres that are named metres"
@@ -197,8 +201,3 @@ def _errors(robot: Robot, rows: Measurements, q: Float64[Tensor, "maps rows dof"
         square = measured.squares(base @ T @ tool).mean()
         errors.append(float((square * 3 * rows.rows / (3 * rows.rows - FITTED)).sqrt()))
     return errors
-
-
-def _spread(position: Float64[Tensor, "rows 3"]) -> float:
-    """Root mean square of the distances from the mean [m]."""
-    return float((position - position.mean(0)).square().sum(1).mean().sqrt())

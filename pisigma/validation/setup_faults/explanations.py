@@ -214,7 +214,7 @@ def units_and_frames(
     """
     advice = "check the order and the directions of the sensor's axes"
     if by_images:
-        factor = _spread(predicted) / _spread(measured.position)
+        factor = position_spread(predicted) / position_spread(measured.position)
         clause = f"the squares of the board are {factor:.4g} times as large as stated"
         cause = Cause("position_unit", clause, "measure them and correct the file of the board", 1.0)
         yield replace(measured, position=measured.position * factor), cause
@@ -243,7 +243,7 @@ def units_and_frames(
     yield positions, Cause("handedness", _MIRRORED.format(what), advice, 1.0)
 
 
-def _spread(position: Float64[Tensor, "rows 3"]) -> float:
+def position_spread(position: Float64[Tensor, "rows 3"]) -> float:
     """Root mean square distance from the mean [m]."""
     return float((position - position.mean(0)).square().sum(-1).mean().sqrt())
 
