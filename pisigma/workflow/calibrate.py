@@ -18,10 +18,9 @@ from pisigma.files.model_files import HELD_OUT_CSV
 from pisigma.files.progress import Progress
 from pisigma.joint_correction.registry import features_from_outside
 from pisigma.measurement.camera.corner_file import CameraFiles, MeasurementFiles, read_rows
-from pisigma.measurement.dataset import Measurements
+from pisigma.measurement.dataset import Measurements, with_new_frames
 from pisigma.measurement.groups import groups_to_keep_whole
 from pisigma.measurement.joint_range import row_warnings, with_limits_of_rows
-from pisigma.measurement.new_frames import with_new_frames
 from pisigma.measurement.sensors.socket import matching_sockets
 from pisigma.measurement.splits import SplitBy, TrainTest, draw_rows, holdout, repeats, with_fewer
 from pisigma.model.calibrated_model import CalibratedModel
