@@ -7,10 +7,10 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from pisigma.calibration.hybrid.abstract_regression import AbstractRegression
 from pisigma.calibration.hybrid.covariance_root import CovarianceRoot
 from pisigma.calibration.hybrid.design import Design, Rows
 from pisigma.calibration.hybrid.evidence import (
-    AbstractRegression,
     GaussianPrior,
     LeftOut,
     Posterior,

@@ -6,7 +6,8 @@ import numpy as np
 from testing.closeness import assert_close
 from torch import Tensor
 
-from pisigma.calibration.hybrid.evidence import AbstractRegression, GaussianPrior, Posterior
+from pisigma.calibration.hybrid.abstract_regression import AbstractRegression
+from pisigma.calibration.hybrid.evidence import GaussianPrior, Posterior
 
 
 def covariance(fit: AbstractRegression, posterior: Posterior) -> Tensor:

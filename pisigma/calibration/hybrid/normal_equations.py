@@ -10,10 +10,10 @@ import torch
 from jaxtyping import Float64, Int64
 from torch import Tensor
 
+from pisigma.calibration.hybrid.abstract_regression import AbstractRegression
 from pisigma.calibration.hybrid.covariance_root import CovarianceRoot
 from pisigma.calibration.hybrid.design import Design, Rows, chunks
 from pisigma.calibration.hybrid.evidence import (
-    AbstractRegression,
     GaussianPrior,
     LeftOut,
     Posterior,

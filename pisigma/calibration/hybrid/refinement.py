@@ -11,8 +11,9 @@ from pisigma.calibration.geometric.prediction import predicted_poses
 from pisigma.calibration.geometric.problem.problem import CalibrationProblem
 from pisigma.calibration.geometric.problem.setup import IdentifiedGeometry, identified_geometry
 from pisigma.calibration.geometric.result import SolvedCalibration
+from pisigma.calibration.hybrid.abstract_regression import AbstractRegression
 from pisigma.calibration.hybrid.design import Design, Rows, chunks, weigh
-from pisigma.calibration.hybrid.evidence import AbstractRegression, LeftOut, Posterior
+from pisigma.calibration.hybrid.evidence import LeftOut, Posterior
 from pisigma.calibration.hybrid.regression import regression
 from pisigma.calibration.hybrid.search import Choice
 from pisigma.calibration.hybrid.sensor_values import Shift, sensor_values

@@ -8,10 +8,10 @@ import torch
 from jaxtyping import Float64, Int64
 from torch import Tensor
 
+from pisigma.calibration.hybrid.abstract_regression import AbstractRegression
 from pisigma.calibration.hybrid.covariance_root import CovarianceRoot, FewValues
 from pisigma.calibration.hybrid.design import Design, Rows
 from pisigma.calibration.hybrid.evidence import (
-    AbstractRegression,
     GaussianPrior,
     LeftOut,
     Posterior,

@@ -8,8 +8,9 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from pisigma.calibration.hybrid.abstract_regression import AbstractRegression
 from pisigma.calibration.hybrid.design import FOLDS, FOLDS_OF_FEW, MOST_GROUPS, Design, Rows
-from pisigma.calibration.hybrid.evidence import AbstractRegression, LeftOut, Posterior
+from pisigma.calibration.hybrid.evidence import LeftOut, Posterior
 from pisigma.calibration.hybrid.regression import extended, regression
 from pisigma.joint_correction.feature import AbstractFeature
 

@@ -10,9 +10,10 @@ from torch import Tensor
 
 from pisigma.calibration.geometric.problem.parameters import ParameterSpace
 from pisigma.calibration.geometric.problem.setup import IdentifiedGeometry
+from pisigma.calibration.hybrid.abstract_regression import AbstractRegression
 from pisigma.calibration.hybrid.covariance_root import CovarianceRoot
 from pisigma.calibration.hybrid.design import FOLDS, FOLDS_OF_FEW, MOST_GROUPS, Design, Rows
-from pisigma.calibration.hybrid.evidence import AbstractRegression, LeftOut, Posterior
+from pisigma.calibration.hybrid.evidence import LeftOut, Posterior
 from pisigma.calibration.hybrid.sensor_values import joint_columns, weight_columns
 from pisigma.joint_correction.feature import AbstractFeature
 from pisigma.measurement.conditions import JointState

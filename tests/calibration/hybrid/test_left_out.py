@@ -8,7 +8,8 @@ from testing.closeness import assert_close
 from testing.regression_cases import CASES, few_values, poses
 from torch import Tensor
 
-from pisigma.calibration.hybrid.evidence import AbstractRegression, LeftOut, SensorCount
+from pisigma.calibration.hybrid.abstract_regression import AbstractRegression
+from pisigma.calibration.hybrid.evidence import LeftOut, SensorCount
 from pisigma.calibration.hybrid.normal_equations import NormalEquations
 from pisigma.calibration.hybrid.regression import ValueCovariance
 
