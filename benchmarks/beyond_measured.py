@@ -21,7 +21,7 @@ from pisigma.calibration.geometric.problem.setup import identified_geometry
 from pisigma.calibration.geometric.result import SolvedCalibration
 from pisigma.calibration.hybrid.calibrator import HybridCalibrator
 from pisigma.calibration.hybrid.design import Design
-from pisigma.calibration.hybrid.refinement import Refined, linearised, refined_at
+from pisigma.calibration.hybrid.refinement import Refined, linearised, network
 from pisigma.calibration.hybrid.regression import regression
 from pisigma.estimation.prior import GaussianPrior
 from pisigma.joint_correction.feature import AbstractFeature
@@ -69,7 +69,12 @@ def fitted(
             posterior = fit.solve(prior, noise)
             posterior = fit.solve(prior, fit.renewed_noise(posterior))
         x, sizes, noise, effective = posterior.x, posterior.prior, posterior.noise, posterior.effective
-    return refined_at(design, posterior, group, ROUNDS)
+    rows = linearised(design, posterior.x, posterior.effective, group)
+    fit = regression(design, rows)
+    there = fit.solve(posterior.prior, posterior.noise)
+    there = fit.solve(posterior.prior, fit.renewed_noise(there))
+    point = problem.nominal.index_add(0, problem.active, there.x[: design.active])
+    return Refined(rows, design, there, fit, point, network(design, there.x), ROUNDS)
 
 
 def amplitudes(both: Refined, prior: GaussianPrior) -> GaussianPrior:

@@ -21,8 +21,8 @@ import torch
 from torch import Tensor
 
 from pisigma.calibration.geometric.calibrator import GeometricCalibrator
-from pisigma.calibration.geometric.problem.motion import MotionMemory
 from pisigma.calibration.geometric.problem.parameters import Prior
+from pisigma.calibration.geometric.problem.problem import MotionMemory
 from pisigma.measurement.camera.board import Board
 from pisigma.measurement.camera.camera import INTRINSICS, USUAL_DEVIATIONS, Camera
 from pisigma.measurement.camera.camera_files import IntrinsicsChoice, Repeatability
@@ -39,8 +39,7 @@ from pisigma.robot.se3 import (
     transform_from_xyzrpy,
     xyzrpy_from_transform,
 )
-from pisigma.simulation.camera.images import ImageNoise, simulate_images
-from pisigma.simulation.camera.views import far_apart
+from pisigma.simulation.camera.simulated_images import ImageNoise, far_apart, simulate_images
 
 LENGTH, ANGLE = 1e-3, np.deg2rad(0.3)
 CAMERA = Camera("wrist", 1920, 1200, 1400.0, 1400.0, 960.0, 600.0)

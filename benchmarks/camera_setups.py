@@ -36,15 +36,13 @@ from torch import Tensor
 from pisigma.calibration.geometric.calibrator import GeometricCalibrator
 from pisigma.calibration.hybrid.calibrator import HybridCalibrator
 from pisigma.measurement.camera.camera_files import IntrinsicsChoice
-from pisigma.measurement.camera.flatness import bent_corners
-from pisigma.measurement.camera.image_rows import Images, image_measurements
+from pisigma.measurement.camera.image_rows import Images, bent_corners, image_measurements
 from pisigma.measurement.dataset import Measurements, join
 from pisigma.robot import Robot
 from pisigma.robot.kinematics.closed_form.registry import closed_form_solver
 from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.robot.se3 import invert, transform_from_xyzrpy, xyzrpy_from_transform
-from pisigma.simulation.camera.images import simulate_images
-from pisigma.simulation.camera.views import far_apart
+from pisigma.simulation.camera.simulated_images import far_apart, simulate_images
 
 BESIDE = replace(CAMERA, name="beside", is_fixed=True)
 HAND = replace(BOARD, name="hand")

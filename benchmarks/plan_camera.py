@@ -26,18 +26,18 @@ from pisigma.measurement.camera.board import Board
 from pisigma.measurement.camera.camera import Camera
 from pisigma.measurement.camera.image_rows import image_measurements
 from pisigma.planning.camera_settings import CameraSettings
-from pisigma.planning.choice import Criterion, choose
+from pisigma.planning.choice import choose
 from pisigma.planning.expected_accuracy import rms_of
 from pisigma.planning.knowledge import Knowledge
 from pisigma.planning.plan_inputs import find_candidates, instrument_of, views_of
-from pisigma.planning.plan_settings import PlanSettings
+from pisigma.planning.plan_settings import Criterion, PlanSettings
 from pisigma.planning.surroundings.arm_in_cell import ArmInCell
 from pisigma.planning.surroundings.cell import Cell
 from pisigma.planning.task import TASK_POSES
 from pisigma.robot import Robot
 from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.robot.se3 import invert, skew, xyzrpy_from_transform
-from pisigma.simulation.camera.images import ImageNoise, simulate_images
+from pisigma.simulation.camera.simulated_images import ImageNoise, simulate_images
 
 LENGTH, ANGLE, POSTURES = 1e-3, np.deg2rad(0.3), 400
 PRIOR = Prior(theta=ANGLE, d=LENGTH, a=LENGTH, alpha=ANGLE, beta=ANGLE)

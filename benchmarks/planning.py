@@ -25,9 +25,10 @@ from pisigma.calibration.geometric.calibrator import GeometricCalibrator
 from pisigma.calibration.hybrid.calibrator import HybridCalibrator
 from pisigma.calibration.hybrid.result import HybridResult
 from pisigma.measurement.dataset import Measurements
-from pisigma.planning.choice import Criterion, choose
+from pisigma.planning.choice import choose
 from pisigma.planning.expected_accuracy import rms_of
 from pisigma.planning.knowledge import Instrument, Knowledge
+from pisigma.planning.plan_settings import Criterion
 from pisigma.robot import Robot
 from pisigma.validation.held_out.few_rows import fit_where_it_helps
 from pisigma.validation.held_out.trained_calibrations import Calibrator, Result

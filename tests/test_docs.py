@@ -2,6 +2,7 @@
 
 import importlib.util
 import json
+import os
 import re
 import shlex
 import subprocess
@@ -145,7 +146,9 @@ def faults(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
         (folder / str(number) / "models").symlink_to(ROOT / "models")
         (folder / str(number) / "snippets.py").write_text("\n".join(blocks), encoding="utf-8")
     command = [sys.executable, "-W", "error", str(folder / "run_all.py"), *map(str, range(len(RUNNABLE)))]
-    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+    paths = filter(None, (str(ROOT / "training" / "papers"), os.environ.get("PYTHONPATH")))
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(paths)}
+    done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     result: dict[str, str] = json.loads(done.stdout.splitlines()[-1])
     return result

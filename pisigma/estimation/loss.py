@@ -17,24 +17,22 @@ HAMPEL_VARIANCE = {1: 0.990933, 2: 0.995409, 3: 0.996914, 6: 0.998435}
 """Weighted variance of standard normal noise under Hampel's weights: `E[w d²] / (components · E[w])`."""
 
 
-Figure = Float[Tensor, "*batch"] | float
+Figure = Float[Tensor, ""] | float
 
 
 class AbstractLoss(ABC):
     """What a row's distance (in standard deviations) costs; `components` is how many values the row has."""
 
     @abstractmethod
-    def cost(self, distance: Float[Tensor, "*batch rows"], components: int) -> Float[Tensor, "*batch rows"]:
+    def cost(self, distance: Float[Tensor, " rows"], components: int) -> Float[Tensor, " rows"]:
         """Cost of every row; the distance's square for small distances."""
 
     @abstractmethod
-    def weight(self, distance: Float[Tensor, "*batch rows"], components: int) -> Float[Tensor, "*batch rows"]:
+    def weight(self, distance: Float[Tensor, " rows"], components: int) -> Float[Tensor, " rows"]:
         """Weight of every row in least squares: half the derivative of the cost over the distance."""
 
     @abstractmethod
-    def scale(
-        self, distance: Float[Tensor, "*batch rows"], components: int, used: Figure
-    ) -> Float[Tensor, "*batch"]:
+    def scale(self, distance: Float[Tensor, " rows"], components: int, used: Figure) -> Float[Tensor, ""]:
         """Standard deviation of one value while the scale is still unknown.
 
         Args:
@@ -45,8 +43,8 @@ class AbstractLoss(ABC):
 
     @abstractmethod
     def deviation(
-        self, distance: Float[Tensor, "*batch rows"], components: int, used: Figure, scale: Figure
-    ) -> Float[Tensor, "*batch"]:
+        self, distance: Float[Tensor, " rows"], components: int, used: Figure, scale: Figure
+    ) -> Float[Tensor, ""]:
         """Standard deviation of one value, from all good rows.
 
         Args:
@@ -61,25 +59,23 @@ class AbstractLoss(ABC):
 class SquaredLoss(AbstractLoss):
     """Plain least squares."""
 
-    def cost(self, distance: Float[Tensor, "*batch rows"], components: int) -> Float[Tensor, "*batch rows"]:
+    def cost(self, distance: Float[Tensor, " rows"], components: int) -> Float[Tensor, " rows"]:
         """The square."""
         return distance.square()
 
-    def weight(self, distance: Float[Tensor, "*batch rows"], components: int) -> Float[Tensor, "*batch rows"]:
+    def weight(self, distance: Float[Tensor, " rows"], components: int) -> Float[Tensor, " rows"]:
         """One."""
         return torch.ones_like(distance)
 
-    def scale(
-        self, distance: Float[Tensor, "*batch rows"], components: int, used: Figure
-    ) -> Float[Tensor, "*batch"]:
+    def scale(self, distance: Float[Tensor, " rows"], components: int, used: Figure) -> Float[Tensor, ""]:
         """Root mean square, corrected for the parameters."""
         return self.deviation(distance, components, used, 1.0)
 
     def deviation(
-        self, distance: Float[Tensor, "*batch rows"], components: int, used: Figure, scale: Figure
-    ) -> Float[Tensor, "*batch"]:
+        self, distance: Float[Tensor, " rows"], components: int, used: Figure, scale: Figure
+    ) -> Float[Tensor, ""]:
         """Root mean square, corrected for the parameters."""
-        return (distance.square().sum(-1) / _left(distance, components, used)).sqrt()
+        return (distance.square().sum() / _left(distance, components, used)).sqrt()
 
 
 @dataclass(frozen=True)
@@ -92,7 +88,7 @@ class HampelLoss(AbstractLoss):
     nearly half of the rows being wrong.
     """
 
-    def cost(self, distance: Float[Tensor, "*batch rows"], components: int) -> Float[Tensor, "*batch rows"]:
+    def cost(self, distance: Float[Tensor, " rows"], components: int) -> Float[Tensor, " rows"]:
         """Square, line, parabola, constant."""
         a = DISTANCE_99[components]
         b, c = 1.5 * a, 3 * a
@@ -100,33 +96,30 @@ class HampelLoss(AbstractLoss):
         cost: Tensor = distance.clamp(max=a).square_().add_(straight, alpha=2 * a)
         return cost.addcmul_(bent, bent, value=-a / (c - b))
 
-    def weight(self, distance: Float[Tensor, "*batch rows"], components: int) -> Float[Tensor, "*batch rows"]:
+    def weight(self, distance: Float[Tensor, " rows"], components: int) -> Float[Tensor, " rows"]:
         """One, a / distance, falling, zero."""
         a = DISTANCE_99[components]
         b, c = 1.5 * a, 3 * a
         falling: Tensor = torch.rsub(distance, c).div_(c - b).clamp_(0, 1)
         return falling.mul_(a).div_(distance.clamp(min=a))
 
-    def scale(
-        self, distance: Float[Tensor, "*batch rows"], components: int, used: Figure
-    ) -> Float[Tensor, "*batch"]:
+    def scale(self, distance: Float[Tensor, " rows"], components: int, used: Figure) -> Float[Tensor, ""]:
         """Median over that of a standard normal vector, corrected for the parameters."""
-        factor = math.sqrt(distance.shape[-1] * components) / MEDIAN_DISTANCE[components]
-        return distance.median(-1).values * _left(distance, components, used).rsqrt() * factor
+        factor = math.sqrt(len(distance) * components) / MEDIAN_DISTANCE[components]
+        return distance.median() * _left(distance, components, used).rsqrt() * factor
 
     def deviation(
-        self, distance: Float[Tensor, "*batch rows"], components: int, used: Figure, scale: Figure
-    ) -> Float[Tensor, "*batch"]:
+        self, distance: Float[Tensor, " rows"], components: int, used: Figure, scale: Figure
+    ) -> Float[Tensor, ""]:
         """Weighted root mean square, less what the parameters used up and what the weights take off."""
-        divisor = scale[..., None] if isinstance(scale, Tensor) else scale
-        weight = self.weight(distance / divisor, components)
-        left = (weight.sum(-1) * components - used).clamp(min=1.0)
-        return ((weight * distance.square()).sum(-1) / left / HAMPEL_VARIANCE[components]).sqrt()
+        weight = self.weight(distance / scale, components)
+        left = (weight.sum() * components - used).clamp(min=1.0)
+        return ((weight * distance.square()).sum() / left / HAMPEL_VARIANCE[components]).sqrt()
 
 
-def _left(distance: Float[Tensor, "*batch rows"], components: int, used: Figure) -> Float[Tensor, "*batch"]:
+def _left(distance: Float[Tensor, " rows"], components: int, used: Figure) -> Float[Tensor, ""]:
     """How many values the estimated parameters leave over, at least one."""
-    values = distance.shape[-1] * components
+    values = len(distance) * components
     if isinstance(used, float | int):
         return distance.new_tensor(max(values - used, 1.0))
     return torch.rsub(used, values).clamp(min=1.0)

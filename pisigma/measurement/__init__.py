@@ -4,21 +4,15 @@ Names are loaded on first use, so that settings of cameras are read without torc
 checkers.
 """
 
-from importlib import import_module
-from typing import Any
+from pisigma.files.lazy_names import lazily
 
-_NAMES = {
-    "dataset": "Measurements join",
-    "fields": "Kind LeftOut",
-    "groups": "groups_of_equal_joints groups_to_keep_whole placements",
-    "jig": "Jig",
-    "splits": "holdout k_folds",
-}
-
-
-def __getattr__(name: str) -> Any:
-    """Import a name when it is first asked for."""
-    for module, names in _NAMES.items():
-        if name in names.split():
-            return getattr(import_module(f"{__name__}.{module}"), name)
-    raise AttributeError(f"module '{__name__}' has no attribute '{name}'")
+__getattr__ = lazily(
+    __name__,
+    {
+        "dataset": "Measurements join",
+        "fields": "Kind LeftOut",
+        "groups": "groups_of_equal_joints groups_to_keep_whole placements",
+        "jig": "Jig",
+        "splits": "holdout k_folds",
+    },
+)

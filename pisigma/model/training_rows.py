@@ -1,5 +1,7 @@
 """Rows that a model was made of: they are recognised when they come again, and count once."""
 
+from dataclasses import replace
+
 import torch
 from jaxtyping import Bool
 from torch import Tensor
@@ -7,6 +9,7 @@ from torch import Tensor
 from pisigma.files.errors import MeasurementError
 from pisigma.measurement.copies import RowValues, copies_of_known, places_text
 from pisigma.measurement.dataset import Measurements
+from pisigma.measurement.joint_range import with_limits_of_rows
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.stored_starts import rows_at_starts
 from pisigma.robot.description import Robot
@@ -91,3 +94,13 @@ def training_row_warnings(
         f"At least {at_starts} of {rows.rows} rows have joint values that {model.name} was made with (it keeps "
         f"{len(model.starts)} of {model.provenance.rows}): as far as they are the same measurements, {consequence}.",
     )
+
+
+def with_wide_limits(model: CalibratedModel, rows: Measurements) -> CalibratedModel:
+    """Return the model with joint limits that are wide enough for the rows that it was made of."""
+    calibrated = None if model.calibrated is None else with_limits_of_rows(model.calibrated, rows)
+    hybrid = model.hybrid
+    if hybrid is not None:
+        hybrid = replace(hybrid, robot=with_limits_of_rows(hybrid.robot, rows))
+    robot = with_limits_of_rows(model.robot, rows)
+    return replace(model, robot=robot, calibrated=calibrated, hybrid=hybrid)

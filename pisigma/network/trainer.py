@@ -3,7 +3,6 @@
 import logging
 import os
 import pickle
-import shutil
 import signal
 import sys
 import threading
@@ -74,10 +73,6 @@ class Checkpoints:
             raise OutputError(
                 f"{self.folder}: cannot be written ({problem.strerror}); choose another --out."
             ) from None
-
-    def discard(self) -> None:
-        """Remove the folder of a training that is done."""
-        shutil.rmtree(self.folder, ignore_errors=True)
 
     def _check(self) -> None:
         if not self.file.is_file():

@@ -1,7 +1,15 @@
-"""What a robot is: its description, its file and the catalogue."""
+"""What a robot is: its description, its file and the catalogue; where it goes: kinematics and kernels.
 
-from pisigma.robot.description import Robot
-from pisigma.robot.robot_file import RobotDocument, catalogue
-from pisigma.robot.row import DH_COLUMNS, FRAME_COLUMNS, JointType, Row
+Names are loaded on first use, so that kernels are without torch; `__init__.pyi` tells them to type checkers.
+"""
 
-__all__ = ["DH_COLUMNS", "FRAME_COLUMNS", "JointType", "Robot", "RobotDocument", "Row", "catalogue"]
+from pisigma.files.lazy_names import lazily
+
+__getattr__ = lazily(
+    __name__,
+    {
+        "description": "Robot",
+        "robot_file": "RobotDocument catalogue",
+        "row": "DH_COLUMNS FRAME_COLUMNS JointType Row",
+    },
+)

@@ -13,9 +13,13 @@ from pisigma.files.errors import PoseError, RobotError, nearest_choice
 from pisigma.robot.coupling import Coupling
 from pisigma.robot.robot_file import read_robot
 from pisigma.robot.row import LARGEST, MOST_ROWS, JointType, Row
+from pisigma.robot.urdf_frames import Frame, frame_of, row_frame, shift, turn
 
 if TYPE_CHECKING:
     import pytorch_kinematics
+
+BASE_FRAME, TOOL_FRAME = "base_link", "tool0"
+"""Names of the first and the last frame of a chain of pytorch-kinematics."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,14 +184,12 @@ class Robot:
         )
 
     def to_pytorch_kinematics(self) -> "pytorch_kinematics.SerialChain":
-        """Give the robot as a chain of pytorch-kinematics in float64; see `pisigma.robot.serial_chain`.
+        """Give the robot as a chain of pytorch-kinematics in float64; see `serial_chain`.
 
         `chain.forward_kinematics(q).get_matrix()` is T_base_tool at joint values q [rad or m] of shape `(*batch, dof)`
         with one batch axis.
         """
-        from pisigma.robot.serial_chain import serial_chain
-
-        return serial_chain(self.rows, self.dh, self.base, self.tool)
+        return serial_chain(self)
 
     def check_joint_count(self, count: int) -> None:
         """Refuse joint values whose last axis does not fit the joints.
@@ -201,3 +203,44 @@ class Robot:
                 f"robot '{self.name}' has {self.dof} joints ({names}), but the joint values have {count} "
                 "columns; give one per joint."
             )
+
+
+def serial_chain(robot: Robot) -> "pytorch_kinematics.SerialChain":
+    """Build the chain from the frame that poses are given in to the tool, in float64 on the CPU.
+
+    A joint stands where its row has it after `RotZ(theta) · Trans(0, 0, d)` and moves about or along z, or against
+    it where its direction is -1; `Trans(a, 0, 0) · RotX(alpha) · RotY(beta)` leads on to the next. Everything is made
+    in float64: a chain that is made in float32 and converted is off by 2e-8 m.
+
+    Args:
+        robot: its rows are the frames of the chain, between `base_link` and `tool0`; joints are named like the rows
+            and take the same joint values [rad or m].
+    """
+    import torch
+    from pytorch_kinematics import SerialChain, Transform3d
+    from pytorch_kinematics import frame as frames
+    from pytorch_kinematics.chain import Chain
+
+    double = torch.float64
+
+    def attach(parent: frames.Frame, name: str, origin: Frame, joint: str, **motion: object) -> frames.Frame:
+        offset = Transform3d(matrix=torch.from_numpy(origin)[None], dtype=double)
+        child = frames.Frame(name, frames.Link(name), frames.Joint(joint, offset, dtype=double, **motion))
+        parent.add_child(child)
+        return child
+
+    root = frames.Frame(BASE_FRAME, frames.Link(BASE_FRAME), frames.Joint("root", dtype=double))
+    last, behind = root, frame_of(robot.base)
+    for row, (theta, d, a, alpha, beta) in zip(robot.rows, robot.dh.tolist(), strict=True):
+        last = attach(
+            last,
+            f"{row.name}_link",
+            behind @ turn(2, theta) @ shift(0.0, 0.0, d),
+            row.name,
+            joint_type=row.type,
+            axis=(0.0, 0.0, float(row.direction)),
+            limits=(row.lower, row.upper) if np.isfinite([row.lower, row.upper]).all() else None,
+        )
+        behind = row_frame(0.0, 0.0, a, alpha, beta)
+    attach(last, TOOL_FRAME, behind @ frame_of(robot.tool), "tool")
+    return SerialChain(Chain(root, dtype=double), TOOL_FRAME, dtype=double)

@@ -13,8 +13,8 @@ from pisigma.files.errors import RobotError, UnknownRobotError, nearest_choice
 from pisigma.files.yaml_file import Section, parse_yaml, read_yaml
 from pisigma.robot.coupling_section import CoupledJointSection, coupled
 from pisigma.robot.drawing import Drawing
-from pisigma.robot.modified_dh import from_modified
 from pisigma.robot.row import MOST_ROWS, Bounded, JointType, Row
+from pisigma.robot.urdf_frames import frame_of, shift, turn, xyzrpy_of
 
 Limits = Annotated[tuple[Bounded, Bounded], Field(description="lower and upper")]
 
@@ -166,3 +166,34 @@ def read_robot(robot: str | os.PathLike[str], base: str | None, tip: str | None)
     raise UnknownRobotError(
         f"'{name}' is no robot of the catalogue and no .yaml or .urdf file: {nearest_choice(name, catalogue())}"
     )
+
+
+def from_modified(
+    dh: Float64[np.ndarray, "rows 5"], base: Float64[np.ndarray, " 6"]
+) -> tuple[Float64[np.ndarray, "rows 5"], Float64[np.ndarray, " 6"]]:
+    """Regroup `Π RotX(alpha) · Trans(a, 0, 0) · RotZ(theta) · Trans(0, 0, d)` into standard rows, exactly.
+
+    What leads to a joint in the modified convention belongs to the row before in the standard one; alpha and a of the
+    first row go into the base.
+
+    Args:
+        dh: theta [rad], d, a [m], alpha, beta [rad] of modified rows.
+        base: x, y, z [m], roll, pitch, yaw [rad].
+
+    Returns:
+        Standard rows and the base that goes with them; the tool stays.
+
+    Raises:
+        RobotError: a row has a beta, which the modified convention does not know.
+    """
+    if dh[:, 4].any():
+        raise RobotError(
+            f"row {int(dh[:, 4].nonzero()[0][0]) + 1}: the modified convention has no beta_deg; leave it out or use "
+            "the standard convention."
+        )
+    standard = dh.copy()
+    standard[:, 2:4] = np.roll(dh[:, 2:4], -1, axis=0)
+    standard[-1, 2:4] = 0.0
+    if dh[0, 2:4].any():
+        base = xyzrpy_of(frame_of(base) @ turn(0, dh[0, 3]) @ shift(dh[0, 2], 0.0, 0.0))
+    return standard, base

@@ -1,7 +1,10 @@
 """The one gate for rows: every command that takes some lets them be judged here, with the same words and status."""
 
 from collections.abc import Collection, Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+
+from jaxtyping import Float64
+from torch import Tensor
 
 from pisigma.calibration.geometric.calibrator import GeometricCalibrator
 from pisigma.files.errors import IdentificationError
@@ -9,18 +12,34 @@ from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.model_posterior import FLEET_PRIOR
 from pisigma.robot.description import Robot
+from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.validation.checks.other_robot import other_robot_diagnostics
 from pisigma.validation.checks.registry import ROW_CHECKS, diagnostics_of_rows
-from pisigma.validation.checks.rows.few_rows import joint_columns, size_of_positions
 from pisigma.validation.checks.rows.other_sensors import diagnosed_lengths
 from pisigma.validation.checks.rows.row_check import Move, RowsUnderModel
 from pisigma.validation.checks.setup_fault import setup_diagnostics
 from pisigma.validation.held_out.diagnostic import Diagnostic
 from pisigma.validation.held_out.frames.fitted_frames import FrameKind
+from pisigma.validation.held_out.frames.frame_fits import MeasuredPoses, best_base_and_tool
+from pisigma.validation.setup_faults.cause import length_text
+from pisigma.validation.setup_faults.explanations import position_spread
+from pisigma.validation.setup_faults.faults_as_drawn import FEWEST_ROWS_AS_DRAWN, largest_group, usual_error
+from pisigma.validation.setup_faults.hypothesis import COLLAPSED
+from pisigma.validation.setup_faults.joint_faults import joint_causes, signs_and_exchanges
 from pisigma.validation.setup_faults.setup_fault import SetupFault
 
 FEWEST_CHECKED = 12
 """From so many rows on a calibration says whether the errors of the arm are too large to be those of this robot."""
+FEWEST_ROWS = 4
+"""Of fewer, the positions may happen to be near each other."""
+SCALE = 30.0
+"""Positions are in another unit that are so many times as far apart as those of the robot as drawn."""
+ARM_SHARE = 0.3
+"""Share of the reach by which a tool that is not drawn spreads positions, and that poses are spread over at least."""
+
+FEWEST_FOR_JOINTS = 8
+"""Rows that tell columns of joints apart: 24 values, of which base and tool take 9."""
+FITTED = 9
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,3 +138,66 @@ def _as_calibrated(rows: Measurements, robot: Robot) -> tuple[Diagnostic, ...]:
     except IdentificationError as refusal:  # no calibration error explains the rows
         sentence = str(refusal).removeprefix(f"{rows.source}: ")
         return (Diagnostic(kind="implausible_errors", severity="implausible", sentence=sentence),)
+
+
+def size_of_positions(robot: Robot, rows: Measurements) -> Iterator[Diagnostic]:
+    """Compare the size of what was measured with that of the robot's motion."""
+    group = largest_group(rows)
+    if group.position is None or group.rows < FEWEST_ROWS:
+        return
+    measured, drawn = (
+        position_spread(group.position),
+        position_spread(forward_kinematics(robot, group.q)[:, :3, 3]),
+    )
+    arm = ARM_SHARE * robot.reach
+    if measured > SCALE * (drawn + arm):
+        mistake = "x, y and z are millimetres that are named metres"
+    elif SCALE * measured < drawn > arm:
+        mistake = "x, y and z are metres that are named millimetres, or do not change with the robot"
+    else:
+        return
+    yield Diagnostic(
+        kind="setup_fault",
+        severity="implausible",
+        sentence=f"The measured positions are {measured * 1e3:,.1f} mm RMS from their mean, and those of robot "
+        f"'{robot.name}' at these joint values {drawn * 1e3:,.1f} mm: {mistake}; check the column names and the "
+        "instrument.",
+    )
+
+
+def joint_columns(robot: Robot, rows: Measurements) -> Iterator[Diagnostic]:
+    """Try a reversed sign of every joint and an exchange of two neighbours, base and tool being fitted each time.
+
+    Of more rows than `FEWEST_ROWS_AS_DRAWN` much more is tried, see `find_faults_as_drawn`.
+    """
+    group = largest_group(rows)
+    if not FEWEST_FOR_JOINTS <= group.rows < FEWEST_ROWS_AS_DRAWN:
+        return
+    here, usual = _errors(robot, group, group.q[None])[0], usual_error(robot, group.q)
+    if not here > usual:
+        return
+    maps = signs_and_exchanges(robot.dof)
+    found = [
+        (left, joint_causes(maps, number, robot)[0])
+        for number, left in enumerate(_errors(robot, group, maps.of(group.q)))
+        if left <= min(usual, COLLAPSED * here)
+    ]
+    if found:
+        left, cause = min(found, key=lambda one: one[0])
+        yield Diagnostic(
+            kind="setup_fault",
+            severity="implausible",
+            sentence=f"{cause.clause[:1].upper()}{cause.clause[1:]}: with this set right, the errors of the robot as "
+            f"drawn fall from {length_text(here)} to {length_text(left)} RMS; {cause.advice}.",
+        )
+
+
+def _errors(robot: Robot, rows: Measurements, q: Float64[Tensor, "maps rows dof"]) -> list[float]:
+    """Root mean squares of the position errors [m] with base and tool fitted, as if nothing were fitted."""
+    measured = MeasuredPoses.of(replace(rows, rotation=None), 0.0)
+    errors = []
+    for T in forward_kinematics(robot, q):
+        base, tool = best_base_and_tool(T, measured)
+        square = measured.squares(base @ T @ tool).mean()
+        errors.append(float((square * 3 * rows.rows / (3 * rows.rows - FITTED)).sqrt()))
+    return errors

@@ -16,10 +16,9 @@ from pisigma.files.model_files import HELD_OUT_CSV
 from pisigma.files.progress import Progress
 from pisigma.joint_correction.registry import features_from_outside
 from pisigma.measurement.camera.corner_file import MeasurementFiles, read_rows
-from pisigma.measurement.dataset import Measurements
+from pisigma.measurement.dataset import Measurements, with_new_frames
 from pisigma.measurement.groups import groups_to_keep_whole
 from pisigma.measurement.joint_range import row_warnings, with_limits_of_rows
-from pisigma.measurement.new_frames import with_new_frames
 from pisigma.measurement.sensors.socket import matching_sockets
 from pisigma.measurement.splits import TrainTest, draw_rows, holdout, repeats, with_fewer
 from pisigma.model.calibrated_model import CalibratedModel
@@ -32,7 +31,7 @@ from pisigma.validation.checks.scale import scale_figures
 from pisigma.validation.checks.setup_fault import explained, setup_diagnostics
 from pisigma.validation.held_out.calibration_summary import CalibrationSummary, summarise
 from pisigma.validation.held_out.calibration_validation import CalibrationValidation, joined_repeats, judge
-from pisigma.validation.held_out.fit_beside_folds import fit_beside_folds
+from pisigma.validation.held_out.few_rows import fit_beside_folds
 from pisigma.validation.held_out.held_out_rows import HeldOutRows
 from pisigma.validation.held_out.predicted_spread import predicted_at_other_poses
 from pisigma.validation.held_out.trained_calibrations import Calibrator, Result, geometric_of, trained

@@ -117,7 +117,7 @@ class ComparedModels:
         Raises:
             OutputError: the page is no .html file or cannot be written.
         """
-        from pisigma.reporting.page.comparison import comparison_page  # matplotlib takes a second
+        from pisigma.reporting.page.lifetime import comparison_page  # matplotlib takes a second
 
         check_page(Path(page))
         says = self.sentences, self.warnings

@@ -10,12 +10,10 @@ from pisigma.files.output_file import check_output, write_whole
 from pisigma.measurement.csv.reading import fields_of
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.foreign.accounting import FileAccount, LeftOutRow, Place, account, sentences
-from pisigma.measurement.foreign.conversion import ConvertedRows, convert
-from pisigma.measurement.foreign.doubts import doubts
+from pisigma.measurement.foreign.conversion import ConvertedRows, MeasurementTable, convert, measurement_table
 from pisigma.measurement.foreign.export_file import read_export
 from pisigma.measurement.foreign.joining import JoinedRows, append_rows, join_rows
-from pisigma.measurement.foreign.mapping import FileMapping, map_columns
-from pisigma.measurement.foreign.measurement_table import MeasurementTable, measurement_table
+from pisigma.measurement.foreign.mapping import FileMapping, doubts, map_columns
 from pisigma.measurement.foreign.quantities import LEFT_OUT
 from pisigma.measurement.foreign.saved_map import check_used, map_for, save_map
 from pisigma.measurement.foreign.units import parse_units

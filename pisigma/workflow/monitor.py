@@ -15,8 +15,15 @@ from pisigma.files.model_files import model_hash
 from pisigma.files.output_file import check_page, write_whole
 from pisigma.files.progress import Progress
 from pisigma.lifetime.monitoring.charts import FALSE_ALARMS_PER_YEAR, SESSIONS_PER_YEAR, Chart
-from pisigma.lifetime.monitoring.history import Record, history_path, in_order, recall, remember
-from pisigma.lifetime.monitoring.rows_again import new_rows, rows_hash
+from pisigma.lifetime.monitoring.history import (
+    Record,
+    history_path,
+    in_order,
+    new_rows,
+    recall,
+    remember,
+    rows_hash,
+)
 from pisigma.lifetime.monitoring.session import judge_session
 from pisigma.lifetime.monitoring.trends import (
     Forecast,
@@ -182,7 +189,7 @@ class Monitoring:
         Raises:
             OutputError: the page is no .html file or cannot be written.
         """
-        from pisigma.reporting.page.monitoring import monitoring_page  # matplotlib takes a second
+        from pisigma.reporting.page.lifetime import monitoring_page  # matplotlib takes a second
 
         check_page(Path(page))
         lines = (self.sentences, self.warnings)

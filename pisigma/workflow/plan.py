@@ -23,10 +23,15 @@ from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.model_source import HoldsModel
 from pisigma.model.training_rows import known_rows, training_row_warnings
 from pisigma.planning.board_views import BoardViews
-from pisigma.planning.camera_prospects import CameraProspects
 from pisigma.planning.candidates import Candidates, spread
 from pisigma.planning.choice import choose
-from pisigma.planning.expected_accuracy import ExpectedAccuracy, RemainingError, curve, remaining_errors
+from pisigma.planning.expected_accuracy import (
+    CameraProspects,
+    ExpectedAccuracy,
+    RemainingError,
+    curve,
+    remaining_errors,
+)
 from pisigma.planning.knowledge import Knowledge
 from pisigma.planning.plan_file import StoredPlan, yaml_of
 from pisigma.planning.plan_inputs import find_candidates, read_planned_rows, views_of, with_measured

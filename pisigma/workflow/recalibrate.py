@@ -20,8 +20,11 @@ from pisigma.lifetime.recalibration.adaptation import Adaptation, adapt
 from pisigma.lifetime.recalibration.candidates import FAR_BETTER, Gate, gate
 from pisigma.lifetime.recalibration.elsewhere import owners_elsewhere
 from pisigma.lifetime.recalibration.moved import Moved, moved_by, what_moved
-from pisigma.lifetime.recalibration.recalibrated import recalibration_diagnostics
-from pisigma.lifetime.recalibration.recalibrated_model import KIND, recalibrated_model
+from pisigma.lifetime.recalibration.recalibrated_model import (
+    KIND,
+    recalibrated_model,
+    recalibration_diagnostics,
+)
 from pisigma.lifetime.recalibration.recalibration_problem import Owner, owners_in, recalibration_problem
 from pisigma.lifetime.recalibration.summary import (
     LeftOutFigures,
@@ -38,8 +41,7 @@ from pisigma.model.geometric_model import model_of_hybrid
 from pisigma.model.model_posterior import FLEET_PRIOR, ModelPosterior, check_fleet_prior
 from pisigma.model.model_source import HoldsModel, ModelSource, model_or_folder
 from pisigma.model.stated_conditions import condition_warnings
-from pisigma.model.training_rows import without_known_rows
-from pisigma.model.wide_limits import with_wide_limits
+from pisigma.model.training_rows import with_wide_limits, without_known_rows
 from pisigma.reporting.recalibration_card import write_recalibration_card
 from pisigma.robot.description import Robot
 from pisigma.validation.checks.rows.row_check import MOVES, Move

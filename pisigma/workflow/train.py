@@ -5,7 +5,6 @@ import time
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from pisigma.calibration.hybrid.mini_batches import MANY_ROWS
 from pisigma.files.errors import RecipeError
 from pisigma.files.progress import Progress, stage
 from pisigma.measurement.dataset import Measurements
@@ -118,9 +117,9 @@ def _call(recipe: Recipe) -> str:
     return f"pisigma.train({recipe.name!r})"
 
 
-def _refuse_resume(recipe: Recipe, reason: str = "") -> None:
+def _refuse_resume(recipe: Recipe) -> None:
     raise RecipeError(
-        f"recipe '{recipe.name}': a recipe of kind {recipe.kind} has no use for --resume{reason}; leave it out."
+        f"recipe '{recipe.name}': a recipe of kind {recipe.kind} has no use for --resume; leave it out."
     )
 
 
@@ -152,14 +151,14 @@ def _train_hybrid(
     settings: TrainSettings,
     progress: Progress,
 ) -> Calibration:
-    rows, batches = data.training, recipe.hybrid.mini_batches
-    if settings.resume and (batches is False or (batches == "auto" and rows.rows < MANY_ROWS)):
-        _refuse_resume(recipe, ": it does not train on mini-batches")
+    if settings.resume:
+        _refuse_resume(recipe)
+    rows = data.training
     measured = data.folds is not None
     judged, splits = data.splits()
     calibrator = recipe.calibrator(data.robot)
     started = time.perf_counter()
-    result = calibrator.fit(rows, stage(progress, "calibration"), settings.checkpoints, settings.resume)
+    result = calibrator.fit(rows, stage(progress, "calibration"))
     seconds = time.perf_counter() - started
     validation = validate(calibrator, judged, splits, stage(progress, "held-out rows"), settings.jobs)
     test = None if data.test is None else judge(calibrator, result, rows, data.test)

@@ -11,7 +11,7 @@ from pisigma.calibration.geometric.initial_guess.base_and_tool import fit_base_a
 from pisigma.files.errors import MeasurementError, RecipeError
 from pisigma.files.progress import Progress, silent
 from pisigma.measurement.dataset import Measurements
-from pisigma.measurement.splits import groups_of_equal_joints
+from pisigma.measurement.groups import groups_of_equal_joints
 from pisigma.model.calibrated_model import CalibratedModel, Provenance
 from pisigma.model.domain import Domain
 from pisigma.model.stored_starts import spread_rows

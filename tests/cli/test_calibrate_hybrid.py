@@ -252,7 +252,7 @@ def test_simulated_rows_of_a_hybrid_recipe(run, refuses, trained_hybrid, tmp_pat
     assert read.kinds == {"position"}
     assert bool(torch.isfinite(read.q).all())
     sentence = refuses("train", recipe, "--out", tmp_path / "model", "--resume")
-    assert "has no use for --resume: it does not train on mini-batches; leave it out." in sentence
+    assert "has no use for --resume; leave it out." in sentence
 
 
 def test_a_measured_recipe_is_cross_validated(run, repository, data, tmp_path):

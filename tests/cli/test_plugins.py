@@ -14,8 +14,7 @@ from pisigma.deployment.export import registry as exports
 from pisigma.files import plugins
 from pisigma.files.errors import PluginError
 from pisigma.joint_correction.registry import FEATURES
-from pisigma.measurement import join
-from pisigma.measurement.dataset import Measurements
+from pisigma.measurement.dataset import Measurements, join
 from pisigma.measurement.readings import READINGS
 from pisigma.measurement.sensors.registry import SENSORS
 from pisigma.model.folder.model_folder import save_model

@@ -24,6 +24,7 @@ def main() -> int:
         parser.error(f"expected subjects of {', '.join(SUBJECTS)}, got {', '.join(sorted(unknown))}")
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     sys.path[:0] = [str(FOLDER.parent.parent), str(FOLDER.parent)]
+    sys.path.append(str(FOLDER.parent.parent / "training" / "papers"))
     failed = {subject: importlib.import_module(f"gate.{subject}").main() for subject in chosen}
     for subject, count in failed.items():
         print(f"{subject}: {count} failed" if count else f"{subject}: passed")

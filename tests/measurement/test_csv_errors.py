@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from pisigma.files.errors import MeasurementError
-from pisigma.measurement import Measurements
+from pisigma.measurement.dataset import Measurements
 from pisigma.robot import Robot
 
 POSITION = "x_mm,y_mm,z_mm"

@@ -7,8 +7,8 @@ import torch
 from testing.closeness import assert_close
 
 from pisigma.files.errors import MeasurementError
-from pisigma.measurement import LeftOut, Measurements
-from pisigma.measurement.dataset import join
+from pisigma.measurement import LeftOut
+from pisigma.measurement.dataset import Measurements, join
 from pisigma.robot.se3 import rotation_from_quaternion
 
 

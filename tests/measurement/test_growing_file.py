@@ -5,9 +5,9 @@ import os
 import pytest
 from testing.closeness import assert_close
 
-from pisigma import Robot
 from pisigma.files.errors import MeasurementError
 from pisigma.measurement.growing_file import GrowingFile
+from pisigma.robot.description import Robot
 
 HEADER = "q1_deg,q2_deg,q3_deg,q4_deg,q5_deg,q6_deg,x_mm,y_mm,z_mm\n"
 ROBOT = Robot.load("rb5")

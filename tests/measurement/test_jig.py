@@ -7,7 +7,7 @@ import torch
 from testing.closeness import assert_close
 
 from pisigma.files.errors import MeasurementError
-from pisigma.measurement import Jig
+from pisigma.measurement.jig import Jig
 
 STAIRS = """\
 name: stairs

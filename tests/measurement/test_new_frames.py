@@ -4,8 +4,7 @@ import pytest
 import torch
 
 from pisigma.files.errors import MeasurementError
-from pisigma.measurement.dataset import Measurements
-from pisigma.measurement.new_frames import with_new_frames
+from pisigma.measurement.dataset import Measurements, with_new_frames
 
 
 def rows(frame: tuple[str, ...], line: tuple[int, ...] = (2, 3, 5, 6)) -> Measurements:

@@ -7,7 +7,9 @@ import torch
 from testing.closeness import assert_close
 
 from pisigma.files.errors import MeasurementError
-from pisigma.measurement import Measurements, groups_to_keep_whole, holdout, join, k_folds
+from pisigma.measurement.dataset import Measurements, join
+from pisigma.measurement.groups import groups_to_keep_whole
+from pisigma.measurement.splits import holdout, k_folds
 
 NAN = float("nan")
 

@@ -8,8 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pisigma.files.errors import MeasurementError
-from pisigma.measurement import Measurements, groups_of_equal_joints, holdout, k_folds, placements
-from pisigma.measurement.splits import SplitBy, repeats
+from pisigma.measurement.dataset import Measurements
+from pisigma.measurement.groups import groups_of_equal_joints, placements
+from pisigma.measurement.splits import SplitBy, holdout, k_folds, repeats
 
 WAYS = ("joints", "interleaved", "time", "space")
 

@@ -4,8 +4,8 @@ import pytest
 import torch
 
 from pisigma.files.errors import MeasurementError
-from pisigma.measurement import Measurements, k_folds
-from pisigma.measurement.splits import draw_rows, with_fewer
+from pisigma.measurement.dataset import Measurements
+from pisigma.measurement.splits import draw_rows, k_folds, with_fewer
 
 
 def repeats(configurations: int, each: int) -> Measurements:

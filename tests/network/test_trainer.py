@@ -22,11 +22,3 @@ def test_a_folder_that_cannot_be_made_is_refused_and_old_checkpoints_go(tmp_path
     (tmp_path / "mine.txt").write_text("")
     Checkpoints(tmp_path, "a").prepare()
     assert [entry.name for entry in sorted(tmp_path.iterdir())] == ["file", "mine.txt"]
-
-
-def test_the_checkpoints_of_a_training_that_is_done_are_removed(tmp_path):
-    checkpoints = Checkpoints(tmp_path / "folder", "a")
-    checkpoints.prepare()
-    checkpoints.discard()
-    checkpoints.discard()
-    assert list(tmp_path.iterdir()) == []

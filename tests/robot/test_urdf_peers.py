@@ -12,9 +12,9 @@ import pytest
 import torch
 from testing.closeness import assert_close
 
+from pisigma.deployment.export.urdf import CALIBRATED_FRAME, CALIBRATED_TOOL, robot_into_urdf
 from pisigma.robot import Robot
 from pisigma.robot.kinematics.forward import forward_kinematics
-from pisigma.robot.urdf_template import CALIBRATED_FRAME, CALIBRATED_TOOL, robot_into_urdf
 from pisigma.robot.writing import BASE_LINK, TOOL_LINK, robot_to_urdf
 
 MODULES = {"mujoco": "mujoco", "pinocchio": "pinocchio", "drake": "pydrake"}

@@ -8,7 +8,8 @@ from testing.closeness import assert_close
 
 from pisigma.files.errors import RecipeError, UnreachablePoseError
 from pisigma.files.yaml_file import parse_yaml
-from pisigma.measurement import Jig, Measurements
+from pisigma.measurement.dataset import Measurements
+from pisigma.measurement.jig import Jig
 from pisigma.robot import Robot
 from pisigma.robot.kinematics.closed_form import closed_form_solver
 from pisigma.robot.kinematics.forward import forward_kinematics

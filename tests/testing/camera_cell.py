@@ -20,7 +20,7 @@ from pisigma.robot.se3 import (
     transform_from_xyzrpy,
     xyzrpy_from_transform,
 )
-from pisigma.simulation.camera.images import ImageNoise, simulate_images
+from pisigma.simulation.camera.simulated_images import ImageNoise, simulate_images
 
 CAMERA = Camera("wrist", 1920, 1200, 1400.0, 1400.0, 960.0, 600.0, -0.1, 0.05, 1e-4, -2e-4, 0.01)
 BOARD = Board("board", 6, 9, 0.03)

@@ -48,17 +48,16 @@ def test_a_recipe_of_geometric_calibration(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("settings", "data", "option"),
-    [(TrainSettings(resume=True), None, "--resume"), (TrainSettings(), "x.csv", "--data")],
+    ("recipe", "settings", "data", "option"),
+    [
+        ("rb5_redundancy", TrainSettings(resume=True), None, "--resume"),
+        ("rb5_redundancy", TrainSettings(), "x.csv", "--data"),
+        ("rb5_hybrid", TrainSettings(resume=True), None, "--resume"),
+    ],
 )
-def test_what_a_kind_of_recipe_has_no_use_for_is_refused(repository, settings, data, option):
+def test_what_a_kind_of_recipe_has_no_use_for_is_refused(repository, recipe, settings, data, option):
     with pytest.raises(RecipeError, match=f"has no use for {option}; leave it out"):
-        pisigma.train(repository / "training" / "rb5_redundancy.yaml", data, settings)
-
-
-def test_a_hybrid_without_mini_batches_cannot_be_resumed(repository):
-    with pytest.raises(RecipeError, match="has no use for --resume: it does not train on mini-batches"):
-        pisigma.train(repository / "training" / "rb5_hybrid.yaml", settings=TrainSettings(resume=True))
+        pisigma.train(repository / "training" / f"{recipe}.yaml", data, settings)
 
 
 def test_rows_that_are_left_out_are_a_warning():

@@ -19,7 +19,6 @@ from pisigma.estimation.loss import SquaredLoss
 from pisigma.files.errors import IdentificationError, RecipeError
 from pisigma.files.yaml_file import Section, read_yaml
 from pisigma.measurement.dataset import Measurements
-from pisigma.planning.touch_planning import PlanningProblem, build_planning_problem
 from pisigma.robot.description import Robot
 from pisigma.robot.kinematics.singularity import singularity_measure
 from pisigma.robot.se3 import rotation_from_rpy, transform
@@ -34,6 +33,7 @@ from pisigma.simulation.touch_candidates import (
 )
 from pisigma.simulation.touching import simulate_touches
 from pisigma.simulation.true_robot import ErrorSource, TrueRobot
+from touch_planning import PlanningProblem, build_planning_problem
 
 Triple = tuple[float, float, float]
 Free = Literal["paper", "default"]

@@ -21,11 +21,11 @@ from jig_accuracy import (
 from jig_recipe import JigCalibration, JigRecipe, calibrate_on, nominal_calibration
 from pisigma.files.errors import RecipeError
 from pisigma.measurement.dataset import Measurements
-from pisigma.planning.touch_planning import MeasurementPlan, PlanningProblem, plan_measurements
 from pisigma.robot.description import Robot
 from pisigma.robot.row import FRAME_COLUMNS
 from pisigma.simulation.touch_candidates import TouchCandidates
 from straight_lines import TrackedLine, i_move, move_l
+from touch_planning import MeasurementPlan, PlanningProblem, plan_measurements
 
 Progress = Callable[[str], None]
 

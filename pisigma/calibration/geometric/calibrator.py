@@ -1,10 +1,8 @@
 """The geometric calibrator."""
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import chain
-from typing import TypeVar
 
 import numpy as np
 import torch
@@ -16,7 +14,7 @@ from pisigma.calibration.geometric.identifiability.plausibility import refuse_im
 from pisigma.calibration.geometric.identifiability.redundancy import (
     Findings,
     Redundancy,
-    find_redundancies,
+    find_redundancy,
     rank_extension,
 )
 from pisigma.calibration.geometric.identifiability.sufficiency import (
@@ -27,25 +25,20 @@ from pisigma.calibration.geometric.identifiability.sufficiency import (
     refuse_too_few,
 )
 from pisigma.calibration.geometric.initial_guess.initial_guess import chosen_rows
-from pisigma.calibration.geometric.problem.alike_setups import build_setups
 from pisigma.calibration.geometric.problem.information import information
 from pisigma.calibration.geometric.problem.least_squares import (
     SHORTEST_STEP,
-    Linearisation,
-    SearchEnd,
     Solution,
     levenberg_marquardt,
 )
 from pisigma.calibration.geometric.problem.noise import view_of
 from pisigma.calibration.geometric.problem.parameters import ParameterSpace, Prior
-from pisigma.calibration.geometric.problem.problem import CalibrationProblem
-from pisigma.calibration.geometric.problem.robots import each_robot, of_robots
 from pisigma.calibration.geometric.problem.setup import (
     CalibrationSetup,
     SetupOptions,
-    identified_geometries,
+    build_setup,
+    identified_geometry,
 )
-from pisigma.calibration.geometric.problem.side_by_side import batches, pattern_of, side_by_side
 from pisigma.calibration.geometric.result import CalibrationResult, SolvedCalibration
 from pisigma.estimation.loss import AbstractLoss, HampelLoss
 from pisigma.files.errors import IdentificationError
@@ -55,7 +48,6 @@ from pisigma.robot.description import Robot
 from pisigma.robot.robot_class import CLASSES
 from pisigma.robot.row import FRAME_COLUMNS
 
-Values = TypeVar("Values")
 ROUGH_ROWS = 4_096
 """Rows that the initial guess and the first steps are worked out from."""
 ROUGH_STEPS = 3
@@ -140,23 +132,6 @@ class GeometricCalibrator:
         """Calibrate; see `solve` for what is raised."""
         return self.solve(measurements).result()
 
-    @torch.inference_mode()
-    def fit_many(self, data: Sequence[Measurements]) -> list[CalibrationResult]:
-        """Calibrate several robots of one type: the same as `fit` of each in less time.
-
-        Robots whose data are alike are calibrated side by side: equally many rows, with poses or positions in the same
-        of them, in frames and of targets with the same names. Others are calibrated one by one. Predictions agree to
-        rounding for positions, and for poses to some 1e-8 m, as rounding may decide whether a last step is taken.
-
-        Args:
-            data: the measurements of every robot.
-
-        Raises:
-            IdentificationError: see `solve`; the message names the measurements.
-            PoseError: see `solve`.
-        """
-        return [solved.result() for solved in self.solve_many(data)]
-
     def solve(self, measurements: Measurements) -> SolvedCalibration:
         """Calibrate, and keep the problem and its solution for what is built upon them.
 
@@ -165,20 +140,20 @@ class GeometricCalibrator:
                 fit that they cannot be of this robot; the message says what to measure or what to fix.
             PoseError: the joint values do not fit the robot.
         """
-        return self.solve_many([measurements])[0]
-
-    def solve_many(self, data: Sequence[Measurements]) -> list[SolvedCalibration]:
-        """Calibrate several robots of one type, those whose data are alike side by side; see `fit_many` and `solve`."""
-        robots = [_Robot(*pair) for pair in zip(data, self._build(data), strict=True)]
-        patterns = [pattern_of(robot.setup.problem) if len(robots) > 1 else None for robot in robots]
-        groups = _groups(patterns)
-        for numbers in chain(*(batches(group, robots[group[0]].setup.problem.rows) for group in groups)):
-            alike = [robots[number] for number in numbers]
-            problem, start = _side_by_side(alike)
-            self._choose(alike, problem, start)
-            for some in _groups_of(alike, problem, start, [tuple(robot.active) for robot in alike]):
-                self._solve(*some)
-        return [robot.solved for robot in robots]
+        setup = self.build(measurements)
+        findings, candidates, active = self._choose(setup, measurements.source)
+        rough, findings, active = self._solve_roughly(setup, findings, candidates, active)
+        problem = setup.problem.with_active(active)
+        start = rough.linearisation
+        if findings.extended or len(view_of(start).sums[0].distance) < problem.rows:
+            start = problem.linearise(start.point, start)
+        else:
+            start = problem.combined(start.point, view_of(start))
+        left = self.maximum_iterations - rough.iterations
+        fine = levenberg_marquardt(problem, start, left, close_enough=SHORTEST_STEP)
+        refuse_implausible(problem, fine.linearisation, measurements.source)
+        geometry = identified_geometry(setup, fine.linearisation.point)
+        return SolvedCalibration(measurements, setup, problem, rough.before(fine), findings, geometry)
 
     def build(self, measurements: Measurements) -> CalibrationSetup:
         """The problem and its start, without solving it.
@@ -187,10 +162,6 @@ class GeometricCalibrator:
             IdentificationError: nothing usable was measured, or too little for base and tool.
             PoseError: the joint values do not fit the robot.
         """
-        return self._build([measurements])[0]
-
-    def _build(self, data: Sequence[Measurements]) -> list[CalibrationSetup]:
-        """The problems of several robots of one type."""
         options = SetupOptions(
             free_base=self._finds("base"),
             free_tool=self._finds("tool"),
@@ -200,7 +171,7 @@ class GeometricCalibrator:
             socket_sigma=self.socket_sigma,
             prior_sizes=self.prior_sizes,  # type: ignore[arg-type]
         )
-        return build_setups(self.robot, data, options, self.prior, self.loss)
+        return build_setup(self.robot, measurements, options, self.prior, self.loss)
 
     def _finds(self, group: str) -> bool:
         """Whether a start of bases or tools is wanted: they are free, or named (of a base all six)."""
@@ -229,27 +200,27 @@ class GeometricCalibrator:
             chosen |= {index for name in self.free for index in space.indices(name)}
         return sorted(chosen)
 
-    def _choose(self, robots: "list[_Robot]", problem: CalibrationProblem, start: Tensor) -> None:
-        """Choose the parameters that robots with alike data start with.
+    def _choose(self, setup: CalibrationSetup, source: str) -> tuple[Findings, list[int], list[int]]:
+        """Choose the parameters to start with.
+
+        Returns:
+            What is found out about the parameters; indices of those that may be estimated, and of those that are.
 
         Raises:
-            IdentificationError: the measurements of one do not determine them.
+            IdentificationError: the measurements do not determine them.
         """
-        space, unknowns = problem.space, robots[0].setup.free_unknowns
-        candidates, explicit, count = self.candidates(space), not isinstance(self.free, str), len(unknowns)
-        at_start = []
-        for robot, every in zip(robots, information(problem, start, unknowns + candidates), strict=True):
-            robot.candidates, of_robot = candidates_at_start(robot.setup, candidates, every)
-            at_start.append(of_robot)
-        sizes = start.reshape(len(robots), -1).cpu().numpy()[:, robots[0].candidates]
-        of_each = zip(robots, sizes, find_redundancies(at_start, sizes), strict=True)
-        for robot, its_sizes, redundancy in of_each:
-            refuse_too_few(robot.setup.problem, redundancy, explicit, count, robot.measurements.source)
-            floating = set(floating_bases(robot.setup))
-            chosen = self._chosen(space, its_sizes, redundancy)
-            robot.active = [*(index for index in chosen if index not in floating), *unknowns]
-            wanted = free_parameters(redundancy, explicit, count)
-            robot.findings = Findings(its_sizes, redundancy, [], wanted)
+        problem, unknowns = setup.problem, setup.free_unknowns
+        candidates, explicit = self.candidates(problem.space), not isinstance(self.free, str)
+        every = information(problem, setup.start, unknowns + candidates)
+        candidates, at_start = candidates_at_start(setup, candidates, every)
+        sizes = setup.start.cpu().numpy()[candidates]
+        redundancy = find_redundancy(at_start, sizes)
+        refuse_too_few(problem, redundancy, explicit, len(unknowns), source)
+        floating = set(floating_bases(setup))
+        chosen = self._chosen(problem.space, sizes, redundancy)
+        active = [*(index for index in chosen if index not in floating), *unknowns]
+        wanted = free_parameters(redundancy, explicit, len(unknowns))
+        return Findings(sizes, redundancy, [], wanted), candidates, active
 
     def _chosen(
         self,
@@ -265,122 +236,28 @@ class GeometricCalibrator:
             names = find_pairwise_redundancy(redundancy.information, sizes).kept
         return [space.index(name) for name in names]
 
-    def _solve(self, robots: "list[_Robot]", problem: CalibrationProblem, start: Tensor) -> None:
-        """Solve roughly without the prior, add what the data determine there, then solve with the prior.
+    def _solve_roughly(
+        self, setup: CalibrationSetup, findings: Findings, candidates: list[int], active: list[int]
+    ) -> tuple[Solution[Tensor], Findings, list[int]]:
+        """Solve roughly without the prior, and add what the data determine there.
 
-        The rough steps show the noise that the prior is weighed against; a few thousand rows are enough for
-        them. The robots have alike data, and start with the same free parameters.
+        The rough steps show the noise that the prior is weighed against; a few thousand rows are enough for them.
+
+        Returns:
+            The end of these steps, the findings with what was added, and indices of all free parameters.
         """
-        problem = problem.with_active(robots[0].active)
-        few = problem
-        if problem.q.shape[0] > ROUGH_ROWS and not problem.robots:
-            few = problem.select(chosen_rows(problem.q.shape[0], ROUGH_ROWS).to(problem.q.device))
+        problem = setup.problem.with_active(active)
+        if problem.rows > ROUGH_ROWS:
+            problem = problem.select(chosen_rows(problem.rows, ROUGH_ROWS).to(problem.q.device))
         steps = min(ROUGH_STEPS, self.maximum_iterations)
-        rough = levenberg_marquardt(few.without_prior(), start, steps, close_enough=1.0)
-        here = rough.linearisation
-        for robot, end in zip(robots, rough.ends, strict=True):
-            robot.end = end
-        self._extend(robots, few, here)
-        extended = [tuple(robot.findings.extended) for robot in robots]
-        for members, some, there in _groups_of(robots, problem, here, extended):
-            if members[0].findings.extended:
-                some = some.with_active(members[0].active)
-            if members[0].findings.extended or few.q is not problem.q:
-                there = some.linearise(there.point, there)
-            else:
-                there = some.combined(there.point, view_of(there))
-            left = [self.maximum_iterations - robot.end.iterations for robot in members]
-            fine = levenberg_marquardt(some, there, left, close_enough=SHORTEST_STEP)
-            _finish(members, some, fine)
-
-    def _extend(
-        self, robots: "list[_Robot]", problem: CalibrationProblem, here: Linearisation[Tensor]
-    ) -> None:
-        """Add parameters that the data determine after the rough steps, though not at the nominal geometry."""
-        unknowns = robots[0].setup.free_unknowns
-        kept = sorted(set(robots[0].active) - set(unknowns))
-        others = [i for i in robots[0].candidates if i not in set(kept)]
-        if (
-            self.elimination != "exact"
-            or not others
-            or len(kept) >= problem.space.most_independent(problem.turning)
-        ):
-            return
-        of_each = information(problem, here.point, unknowns + kept + others, view_of(here))
-        for robot, now in zip(robots, of_each, strict=True):
-            free = after_unknowns(robot.setup, now)
-            extended = [(kept + others)[i] for i in rank_extension(free, len(kept))]
-            robot.active = [*robot.active, *extended]
-            robot.findings = replace(robot.findings, extended=extended)
-
-
-@dataclass(eq=False)
-class _Robot:
-    """One of the robots that are calibrated, with what is found out about it from step to step.
-
-    Attributes:
-        measurements: all of its rows.
-        setup: its problem and start.
-        candidates: indices of the parameters that may be estimated.
-        active: those that are.
-        findings: on them.
-        end: how the rough search ended.
-        solved: its calibration.
-    """
-
-    measurements: Measurements
-    setup: CalibrationSetup
-    candidates: list[int] = field(init=False)
-    active: list[int] = field(init=False)
-    findings: Findings = field(init=False)
-    end: SearchEnd = field(init=False)
-    solved: SolvedCalibration = field(init=False)
-
-
-def _finish(robots: list[_Robot], problem: CalibrationProblem, fine: Solution[Tensor]) -> None:
-    """Put the calibrations of robots with one problem together.
-
-    Raises:
-        IdentificationError: no calibration error explains one of them.
-    """
-    here, count = fine.linearisation, len(robots)
-    refuse_implausible(problem, here, [robot.measurements.source for robot in robots])
-    setups = [robot.setup for robot in robots]
-    geometries = identified_geometries(setups, here.point.reshape(count, -1))
-    of_each = zip(robots, each_robot(here, count) if problem.robots else [here], strict=True)
-    for (robot, its), end, geometry in zip(of_each, fine.ends, geometries, strict=True):
-        solution = Solution(its, (robot.end.before(end),))
-        alone = replace(robot.setup.problem, active=problem.active)
-        robot.solved = SolvedCalibration(
-            robot.measurements, robot.setup, alone, solution, robot.findings, geometry
-        )
-
-
-def _side_by_side(robots: list[_Robot]) -> tuple[CalibrationProblem, Float64[Tensor, "*robots parameters"]]:
-    """The problem of robots with alike data, and its start; of one robot without an axis of robots."""
-    setups = [robot.setup for robot in robots]
-    if len(setups) == 1:
-        return setups[0].problem, setups[0].start
-    problem = side_by_side([setup.problem for setup in setups])
-    return problem, problem.nominal
-
-
-def _groups_of(
-    robots: list[_Robot], problem: CalibrationProblem, values: Values, patterns: Sequence[object]
-) -> Iterator[tuple[list[_Robot], CalibrationProblem, Values]]:
-    """Robots with equal patterns, with their problem and values; as they are where all patterns are equal."""
-    groups = _groups(patterns)
-    if len(groups) == 1:
-        yield robots, problem, values
-        return
-    for group in groups:
-        index = torch.tensor(group)
-        yield [robots[number] for number in group], problem.of_robots(index), of_robots(values, index)
-
-
-def _groups(patterns: Sequence[object]) -> list[list[int]]:
-    """Numbers of equal patterns, in their order; one that is None is a group of its own."""
-    groups: dict[object, list[int]] = {}
-    for number, pattern in enumerate(patterns):
-        groups.setdefault(number if pattern is None else pattern, []).append(number)
-    return list(groups.values())
+        rough = levenberg_marquardt(problem.without_prior(), setup.start, steps, close_enough=1.0)
+        unknowns, here = setup.free_unknowns, rough.linearisation
+        kept = sorted(set(active) - set(unknowns))
+        others = [i for i in candidates if i not in set(kept)]
+        most = problem.space.most_independent(problem.turning)
+        if self.elimination != "exact" or not others or len(kept) >= most:
+            return rough, findings, active
+        now = information(problem, here.point, unknowns + kept + others, view_of(here))
+        columns = rank_extension(after_unknowns(setup, now), len(kept))
+        extended = [(kept + others)[i] for i in columns]
+        return rough, replace(findings, extended=extended), [*active, *extended]

@@ -361,7 +361,7 @@ def _outliers(solved: SolvedCalibration) -> tuple[Outlier, ...]:
     found = []
     view = view_of(solved.refined)
     for number, (sensor, sums) in enumerate(zip(solved.problem.sensors, view.sums, strict=True)):
-        deviations = sums.distance / view.scale(number)
+        deviations = sums.distance / view.scales[number]
         weight = solved.problem.loss_of(sensor).weight(deviations, sensor.components)
         rows = torch.arange(len(weight))
         found += outliers_of(

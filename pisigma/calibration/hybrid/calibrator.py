@@ -3,8 +3,6 @@
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Literal
 
 from jaxtyping import Int64
 from torch import Tensor
@@ -20,12 +18,6 @@ from pisigma.calibration.hybrid.arm import JointCoverage
 from pisigma.calibration.hybrid.delivery import Delivered, delivered
 from pisigma.calibration.hybrid.design import Design, Rows, weigh
 from pisigma.calibration.hybrid.gravity import USUAL, gravity_by_evidence, gravity_sentence, in_first_row
-from pisigma.calibration.hybrid.mini_batches import (
-    MANY_ROWS,
-    MiniBatches,
-    batch_checkpoints,
-    refine_in_batches,
-)
 from pisigma.calibration.hybrid.refinement import Refined, in_chunks, linearised, refine, with_frames_of
 from pisigma.calibration.hybrid.regression import regression
 from pisigma.calibration.hybrid.result import HybridResult, LearnedPart
@@ -78,8 +70,6 @@ class HybridCalibrator:
         products: whether product units are tried, which need two joints; without them the correction is additive.
         gravity: direction in which things fall, in the frame of the robot's base; None for the axis of the base that
             has the highest evidence.
-        mini_batches: whether the unknowns of the chosen model are trained on mini-batches instead of with the
-            normal equations of all rows: True or False; how; or "auto", which does so from `MANY_ROWS` rows on.
     """
 
     robot: Robot | GeometricCalibrator
@@ -87,7 +77,6 @@ class HybridCalibrator:
     harmonics: tuple[int, ...] = (8, 24, 56, 110, 160)
     products: bool = True
     gravity: tuple[float, float, float] | None = None
-    mini_batches: MiniBatches | bool | Literal["auto"] = "auto"
 
     def __post_init__(self) -> None:
         """Refuse choices that do not exist."""
@@ -112,33 +101,18 @@ class HybridCalibrator:
         return GeometricCalibrator(self.robot) if isinstance(self.robot, Robot) else self.robot
 
     def fit(
-        self,
-        measurements: Measurements,
-        progress: Callable[[str], None] = lambda what: None,
-        checkpoints: Path | None = None,
-        resume: bool = False,
+        self, measurements: Measurements, progress: Callable[[str], None] = lambda what: None
     ) -> HybridResult:
         """Calibrate.
 
         Args:
             measurements: what was measured.
             progress: called with what is being tried.
-            checkpoints: folder for checkpoints of a training on mini-batches; None keeps none.
-            resume: go on from the checkpoint there.
-
-        Returns:
-            The result. After a training on mini-batches its verdict says how near to the optimum that came.
 
         Raises:
             IdentificationError: see `GeometricCalibrator.solve`.
             PoseError: the joint values do not fit the robot.
-            TrainingError: the training diverged, or there is no checkpoint of this calibration to resume.
-            OutputError: checkpoints cannot be written.
         """
-        batches = self._batches(measurements.rows)
-        kept = None
-        if batches is not None and checkpoints is not None:
-            kept = batch_checkpoints(checkpoints, f"{self}|{measurements.content_hash()}", resume)
         solved = self.geometric.solve(measurements)
         group = held_out_groups(solved.setup.measurements)
         choice = self._chosen(solved, group, progress)
@@ -151,18 +125,12 @@ class HybridCalibrator:
             return _geometric_alone(solved, choice, _NOTHING_SERVES)
         choice = serving.choice
         progress("solving for everything")
-        trained = ""
-        if batches is None:
-            whole = solved.problem.q.shape[0] == choice.rows.problem.q.shape[0]
-            refined = serving.refined if whole else refine(solved.problem, group, choice)
-        else:
-            refined, trained = refine_in_batches(
-                solved, serving.refined, group, batches=batches, progress=progress, checkpoints=kept
-            )
+        whole = solved.problem.rows == choice.rows.problem.rows
+        refined = serving.refined if whole else refine(solved.problem, group, choice)
         if refined.regression.effective_share(refined.posterior) > choice.best.largest_share:
             return _geometric_alone(solved, choice, _TOO_FEW_ROWS)
         falling = gravity_sentence(self.geometric.robot, choice.best.design.features)
-        verdict, trials = " ".join(filter(None, (_kept_sentence(serving), falling, trained))), choice.trials
+        verdict, trials = " ".join(filter(None, (_kept_sentence(serving), falling))), choice.trials
         learned = self._learned(solved, refined)
         progress("looking at left-out rows")
         uncertainty = position_uncertainty(
@@ -189,13 +157,6 @@ class HybridCalibrator:
             outliers=_outliers(solved, refined),
         )
 
-    def _batches(self, rows: int) -> MiniBatches | None:
-        """How so many rows are trained on mini-batches; None where they are not."""
-        if isinstance(self.mini_batches, MiniBatches):
-            return self.mini_batches
-        wanted = rows >= MANY_ROWS if self.mini_batches == "auto" else self.mini_batches
-        return MiniBatches() if wanted else None
-
     def _chosen(
         self, solved: SolvedCalibration, group: Int64[Tensor, " rows"], progress: Callable[[str], None]
     ) -> Choice:
@@ -215,7 +176,7 @@ class HybridCalibrator:
             problem, group = problem.select(chosen), renumbered(group[chosen])
         design, point = Design(problem, ()), solved.solution.linearisation.point
         values = sensor_values(problem, point)
-        distances = [one.residual.norm(dim=1) * one.root / view.scale(k) for k, one in enumerate(values)]
+        distances = [one.residual.norm(dim=1) * one.root / view.scales[k] for k, one in enumerate(values)]
         weights = [
             ((distance < GROSS) | one.certain).to(distance)
             for distance, one in zip(distances, values, strict=True)

@@ -78,22 +78,6 @@ def refine(problem: CalibrationProblem, group: Int64[Tensor, " rows"], choice: C
     return replace(refined, left_out=choice.best.left_out) if rounds == 1 else refined
 
 
-def refined_at(design: Design, posterior: Posterior, group: Int64[Tensor, " rows"], rounds: int) -> Refined:
-    """All rows linearised and weighted at the most probable values of a posterior, and the posterior there.
-
-    Args:
-        design: all unknowns.
-        posterior: where to look from, with prior sizes, which stand, and noise, which is renewed.
-        group: see `Rows.group`.
-        rounds: rounds that it took to get there.
-    """
-    rows = linearised(design, posterior.x, posterior.effective, group)
-    fit = regression(design, rows)
-    there = fit.solve(posterior.prior, posterior.noise)
-    there = fit.solve(posterior.prior, fit.renewed_noise(there))
-    return _refined(rows, design, there, fit, rounds)
-
-
 def _refined(
     rows: Rows, design: Design, posterior: Posterior, fit: AbstractDesignRegression, rounds: int
 ) -> Refined:

@@ -132,7 +132,7 @@ def status(
         check_output(page, (".html", ".htm"), "a page", (folder / "records",))
     seen = FleetStatus.of(read_records(folder), _day(today), overdue_days, expected_robots(folder))
     if page is not None:
-        from pisigma.reporting.page.fleet import fleet_page
+        from pisigma.reporting.page.lifetime import fleet_page
 
         write_whole(page, fleet_page(seen, folder.resolve().name))
     if as_json:

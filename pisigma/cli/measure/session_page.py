@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from pisigma.planning.camera_settings import CameraSettings
     from pisigma.planning.session.state import SessionState
     from pisigma.planning.surroundings.arm_in_cell import ArmInCell
-    from pisigma.reporting.viewing.mesh_body import MeshBody
+    from pisigma.reporting.viewing.body import MeshBody
     from pisigma.robot.description import Robot
 
 View = Annotated[
@@ -45,7 +45,7 @@ class PageOptions:
         Raises:
             RobotError: the meshes cannot be shown.
         """
-        from pisigma.reporting.viewing.mesh_body import MeshBody
+        from pisigma.reporting.viewing.body import MeshBody
 
         return None if self.urdf is None else MeshBody(robot, self.urdf)
 

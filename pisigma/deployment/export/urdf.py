@@ -1,17 +1,41 @@
 """The calibrated geometry as URDF: the file that the robot was drawn in with other numbers, else a new one."""
 
+import os
 import re
+from typing import Any
+
+import numpy as np
 
 from pisigma.deployment.export.export_format import Exported, ExportFormat, ExportRequest, model_facts
 from pisigma.deployment.export.geometry import check_geometry, chosen_geometry
-from pisigma.files.errors import OutputError
+from pisigma.files.errors import OutputError, RobotError
 from pisigma.files.model_files import DRAWING
 from pisigma.robot.description import Robot
-from pisigma.robot.urdf_rows import URDF_SOURCE
-from pisigma.robot.urdf_template import robot_into_urdf
-from pisigma.robot.writing import robot_to_urdf
+from pisigma.robot.drawing import Drawing
+from pisigma.robot.urdf_chain import Chain, origin_of, parse_xml, read_chain, read_urdf
+from pisigma.robot.urdf_frames import Frame, frame_of, inverse, row_frame
+from pisigma.robot.urdf_rows import URDF_SOURCE, ChainRows, rows_of_chain
+from pisigma.robot.writing import (
+    EFFORT,
+    INERTIA,
+    MASS,
+    VELOCITY,
+    add_inertia,
+    comment_text,
+    origin_attributes,
+    robot_to_urdf,
+    unused_name,
+)
 
 _SOURCE = re.compile(re.escape(URDF_SOURCE) + r".+, from link '(?P<base>.*)' to link '(?P<tip>.*)'")
+CALIBRATED_FRAME = "calibrated_frame"
+CALIBRATED_TOOL = "calibrated_tool"
+MISSING = (
+    f"Masses, inertias, efforts and velocities that the file lacked or had as 0 are placeholders ({MASS} kg, "
+    f"{INERTIA} kg m2, {EFFORT}, {VELOCITY}), in {{links}}. Put in the maker's before you simulate forces."
+)
+SAME = 1e-9
+"""Largest difference [m or rad] of rows that are taken for those of the file."""
 
 
 def _check(request: ExportRequest) -> None:
@@ -68,3 +92,179 @@ def _doubts(request: ExportRequest, nominal: Robot, text: str) -> tuple[str, ...
 
 
 FORMAT = ExportFormat("urdf", "a URDF", (".urdf",), _write, frozenset(("like", "tip", "geometry")), _check)
+
+
+def robot_into_urdf(
+    calibrated: Robot,
+    nominal: Robot,
+    path: str | os.PathLike[str],
+    tip: str | None = None,
+    comments: tuple[str, ...] = (),
+    base: str | None = None,
+) -> str:
+    """The file with the origins of a calibrated robot; links, meshes, limits and all else stay.
+
+    Every joint after the first stands in the link before it where the calibration has it. Links keep their
+    places at the joints that carry them, so meshes still fit. Two links are added: `calibrated_frame`, the
+    parent of the base, is the frame that the model's poses are given in, and
+    `calibrated_tool`, a child of the tip, is the model's tool; from one to the other the forward kinematics is the
+    calibrated robot's. Masses, inertias, efforts and velocities that the file lacks, or has as 0, are placeholders, as
+    simulators refuse files without; a comment says so.
+
+    Args:
+        calibrated: the robot as identified.
+        nominal: the robot as loaded from the file, base and tool apart.
+        path: the file.
+        tip: the link that was the tool.
+        comments: sentences to write at the top.
+        base: the link that poses were given in; the root where None is stated.
+
+    Raises:
+        RobotError: the file cannot be used, or is of another robot.
+    """
+    from lxml import etree
+
+    chain = read_chain(path, base, tip)
+    rows = rows_of_chain(chain)
+    _check_same(rows.drawing, nominal, str(path))
+    urdf, _ = read_urdf(path)
+    root = parse_xml(path, everything=True)
+    elements = {element.get("name"): element for element in root.iterchildren("{*}joint")}
+    for name, origin in _new_origins(chain, rows, calibrated, urdf).items():
+        _set_origin(elements[name], origin)
+    _widen_limits(elements, nominal)
+    if filled := _fill_in(root):
+        comments = (*comments, MISSING.format(links=", ".join(filled)))
+    T_frame_base = frame_of(calibrated.base) @ inverse(frame_of(rows.drawing.base))
+    last = row_frame(*calibrated.dh[-1].tolist()) @ frame_of(calibrated.tool)
+    mount = None
+    if chain.base in urdf.parent_map:
+        mount = _add_link(root, f"{chain.base}_mount")
+        next(elements[urdf.parent_map[chain.base][0]].iterchildren("{*}child")).set("link", mount)
+    frame = _add_link(root, CALIBRATED_FRAME, mount, inverse(T_frame_base))
+    _add_joint(root, frame, (frame, chain.base), T_frame_base)
+    _add_link(root, CALIBRATED_TOOL, chain.tip, inverse(chain.end) @ rows.frames[-1] @ last)
+    for sentence in reversed(comments):
+        root.insert(0, etree.Comment(comment_text(sentence)))
+    etree.indent(root)
+    return f'<?xml version="1.0"?>\n{etree.tostring(root, encoding="unicode")}\n'
+
+
+def _check_same(drawn: Drawing, nominal: Robot, path: str) -> None:
+    """Refuse a file of another robot."""
+    kinds, wanted = ([(row.name, row.type, row.direction) for row in r.rows] for r in (drawn, nominal))
+    if kinds != wanted:
+        joints, other = (", ".join(row.name for row in r.rows) for r in (drawn, nominal))
+        raise RobotError(
+            f"{path}: has the joints {joints}, but the model those of {other}; give the file that the robot was "
+            "loaded from, and the same tip."
+        )
+    far = float(np.abs(drawn.dh - nominal.dh)[:-1].max(initial=0.0))
+    if far > SAME:
+        raise RobotError(
+            f"{path}: its nominal geometry is not the model's (off by {far:.2g} m or rad); give the file that the "
+            "robot was loaded from."
+        )
+
+
+def _new_origins(chain: Chain, rows: ChainRows, calibrated: Robot, urdf: Any) -> dict[str, Frame]:
+    """Origins of the joints that move, in the links before them; that of the first stays."""
+    origins: dict[str, Frame] = {}
+    for i, joint in enumerate(chain.joints[1:], 1):
+        whole = rows.frames[i - 1] @ row_frame(*calibrated.dh[i - 1].tolist()) @ inverse(rows.frames[i])
+        # Fixed joints between the two stay; what is before the joint's own origin is their product.
+        before = joint.origin @ inverse(origin_of(urdf.joint_map[joint.name]))
+        origins[joint.name] = inverse(before) @ whole
+    return origins
+
+
+def _widen_limits(elements: dict[str, Any], nominal: Robot) -> None:
+    """Widen limits of the file that the rows of a calibration exceeded, as those of the model were."""
+    for axis in nominal.axes:
+        limit = next(elements[axis.name].iterchildren("{*}limit"), None)
+        if limit is None or limit.get("lower") is None or limit.get("upper") is None:
+            continue
+        if axis.lower < float(limit.get("lower")) - SAME:
+            limit.set("lower", repr(axis.lower))
+        if axis.upper > float(limit.get("upper")) + SAME:
+            limit.set("upper", repr(axis.upper))
+
+
+def _fill_in(root: Any) -> tuple[str, ...]:
+    """Put placeholders where what a simulator asks for is missing or 0; gives the links and joints that got some."""
+    from lxml import etree
+
+    links = {element.get("name"): element for element in root.iterchildren("{*}link")}
+    joints, filled = list(root.iterchildren("{*}joint")), []
+    fixed: dict[str, list[str]] = {}
+    for joint in joints:
+        if joint.get("type") == "fixed":
+            fixed.setdefault(_link_of(joint, "parent"), []).append(_link_of(joint, "child"))
+    for joint in joints:
+        if joint.get("type") == "fixed":
+            continue
+        together, link = [_link_of(joint, "child")], links[_link_of(joint, "child")]
+        for name in together:
+            together += fixed.get(name, [])
+        if not any(_has_mass(links[name]) for name in together):
+            for before in list(link.iterchildren("{*}inertial")):
+                link.remove(before)
+            add_inertia(etree.SubElement(link, "inertial"))
+            filled.append(link.get("name"))
+        for limit in joint.iterchildren("{*}limit"):
+            lacking = {"effort": EFFORT, "velocity": VELOCITY}
+            lacking = {key: value for key, value in lacking.items() if not _positive(limit.get(key))}
+            limit.attrib.update(lacking)
+            filled += [joint.get("name")] if lacking else []
+    return tuple(dict.fromkeys(filled))
+
+
+def _link_of(joint: Any, end: str) -> str:
+    return str(next(joint.iterchildren(f"{{*}}{end}")).get("link"))
+
+
+def _has_mass(link: Any) -> bool:
+    """Whether a link has a mass and an inertia that a simulator takes."""
+    mass, inertia = (next(link.iterfind(f"{{*}}inertial/{{*}}{name}"), None) for name in ("mass", "inertia"))
+    if mass is None or inertia is None:
+        return False
+    return _positive(mass.get("value")) and all(_positive(inertia.get(key)) for key in ("ixx", "iyy", "izz"))
+
+
+def _positive(text: str | None) -> bool:
+    try:
+        return float(text or 0) > 0
+    except ValueError:
+        return False
+
+
+def _set_origin(element: Any, origin: Frame) -> None:
+    from lxml import etree
+
+    part = next(element.iterchildren("{*}origin"), None)
+    if part is None:
+        part = etree.SubElement(element, "origin")
+        element.insert(0, part)
+    part.attrib.update(origin_attributes(origin))
+
+
+def _add_link(root: Any, name: str, parent: str | None = None, origin: Frame | None = None) -> str:
+    """A link with a fixed joint to its parent, where it has one; gives its name."""
+    from lxml import etree
+
+    name = unused_name(name, {element.get("name") for element in root.iterchildren("{*}link")})
+    etree.SubElement(root, "link", name=name)
+    if parent is not None and origin is not None:
+        _add_joint(root, name, (parent, name), origin)
+    return name
+
+
+def _add_joint(root: Any, name: str, links: tuple[str, str], origin: Frame) -> None:
+    """A fixed joint, named by a link, from the first of two links to the second."""
+    from lxml import etree
+
+    joints = {element.get("name") for element in root.iterchildren("{*}joint")}
+    joint = etree.SubElement(root, "joint", name=unused_name(f"{name}_joint", joints), type="fixed")
+    _set_origin(joint, origin)
+    etree.SubElement(joint, "parent", link=links[0])
+    etree.SubElement(joint, "child", link=links[1])

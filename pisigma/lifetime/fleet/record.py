@@ -1,8 +1,9 @@
-"""What came of the robots of a fleet, one small file each, which a later call goes on from."""
+"""What came of the robots of a fleet: one small file each, which a later call goes on from, and a table of all."""
 
+import io
 import json
-from collections.abc import Collection
-from dataclasses import dataclass
+from collections.abc import Collection, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from pydantic import TypeAdapter, ValidationError
@@ -13,6 +14,7 @@ from pisigma.files.output_file import write_whole
 REFUSED = "refused"
 MARK = "fleet.json"
 """In the folder of a fleet, with the ids of its robots, so that no other folder is written into."""
+RESULTS = "results.parquet"
 
 
 @dataclass(frozen=True)
@@ -161,3 +163,40 @@ def read_records(out: Path) -> tuple[RobotRecord, ...]:
     expected_robots(out)
     found = (read_record(path) for path in sorted((out / "records").glob("*.json")))
     return tuple(one for one in found if one is not None)
+
+
+def write_results(path: Path, records: Sequence[RobotRecord]) -> None:
+    """Write one row per robot and session, ordered by both; parameters and warnings are lists in their columns.
+
+    Raises:
+        OutputError: it cannot be written; what was there stays.
+        ImportError: pyarrow is not installed.
+    """
+    import pyarrow
+    from pyarrow import parquet
+
+    text, number = pyarrow.string(), pyarrow.float64()
+    parameter = [
+        ("name", text),
+        ("unit", text),
+        *((name, number) for name in ("value", "change", "standard_error")),
+    ]
+    schema = pyarrow.schema(
+        [
+            *((name, text) for name in ("robot", "session", "date", "file")),
+            ("rows", pyarrow.int64()),
+            *((name, text) for name in ("verdict", "sentence", "model")),
+            *((name, number) for name in ("rms_mm", "held_out_rms_mm")),
+            *((name, pyarrow.bool_()) for name in ("recalibrate", "moved")),
+            ("parameters", pyarrow.list_(pyarrow.struct(parameter))),
+            ("warnings", pyarrow.list_(text)),
+        ]
+    )
+    rows = [
+        {"robot": record.robot, **asdict(session)}
+        for record in sorted(records, key=lambda one: one.robot)
+        for session in record.sessions
+    ]
+    content = io.BytesIO()
+    parquet.write_table(pyarrow.Table.from_pylist(rows, schema), content)
+    write_whole(path, content.getvalue())

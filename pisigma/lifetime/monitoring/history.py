@@ -5,7 +5,7 @@ import os
 import sqlite3
 from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,10 @@ from pydantic import TypeAdapter, ValidationError
 
 from pisigma.files.errors import OutputError
 from pisigma.lifetime.monitoring.session import JointZeros, Session
-from pisigma.measurement.copies import RowValues
+from pisigma.measurement.copies import RowValues, copies_of_known
+from pisigma.measurement.dataset import Measurements
+from pisigma.model.calibrated_model import CalibratedModel
+from pisigma.model.training_rows import again_warnings
 
 SUFFIX = ".history.sqlite"
 LONGEST_WAIT = 10.0
@@ -172,3 +175,41 @@ def _unpacked(content: bytes) -> tuple[JointZeros, RowValues | None]:
         if not {f"rows_{name}" for name in _VALUES} <= set(arrays):
             return zeros, None
         return zeros, RowValues(*(torch.from_numpy(arrays[f"rows_{name}"]) for name in _VALUES))
+
+
+def new_rows(
+    model: CalibratedModel,
+    rows: Measurements,
+    date: str,
+    earlier: Sequence[Record],
+    judged: Sequence[Record],
+) -> tuple[Measurements, tuple[str, ...]]:
+    """Leave out rows that the model was made of, and those of other sessions; says which.
+
+    Args:
+        model: the model.
+        rows: of a session.
+        date: of it.
+        earlier: sessions of the history; one with exactly these rows is replaced, see `remember`.
+        judged: sessions of this call.
+    """
+    sha256 = rows_hash(rows)
+    warnings = [
+        f"{Path(rows.source).name} of {date} has the rows of {one.file} of {one.date}, and takes its place."
+        for one in earlier
+        if one.rows_sha256 == sha256 and one.date != date
+    ]
+    others = [*(one for one in earlier if one.rows_sha256 != sha256), *judged]
+    those = [(model.made_of, f"those that {model.name} was made of")]
+    those += [(one.values, f"those of {one.file} of {one.date}") for one in others]
+    for values, of in those:
+        if values is not None and rows.rows:
+            again = copies_of_known(rows.as_fields(), model.robot, values)
+            warnings += again_warnings(rows, again, of)
+            rows = rows.select(~again)
+    return rows, tuple(warnings)
+
+
+def rows_hash(rows: Measurements) -> str:
+    """Hash of rows, whatever their date."""
+    return replace(rows, date=None).content_hash()

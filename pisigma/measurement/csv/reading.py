@@ -1,7 +1,8 @@
-"""Reading measurement files: whole with every row checked, or the joint values alone."""
+"""Reading measurement files: whole with every row checked, or the joint values alone; and what to say of exports."""
 
 import math
 import os
+import shlex
 from dataclasses import replace
 
 import numpy as np
@@ -11,6 +12,7 @@ from torch import Tensor
 
 from pisigma.files.errors import MeasurementError, nearest_choice
 from pisigma.measurement.csv.columns import (
+    CORNERS,
     PRISMATIC_UNITS,
     QUATERNION,
     REVOLUTE_UNITS,
@@ -23,11 +25,16 @@ from pisigma.measurement.csv.header import Layout, read_header
 from pisigma.measurement.csv.rows import CheckedRows, check_cells
 from pisigma.measurement.csv.table import Table, read_table
 from pisigma.measurement.fields import TEXTS, LeftOut, MeasuredFields, OnBadRow
-from pisigma.measurement.foreign.import_hint import import_hint
+from pisigma.measurement.foreign.export_file import read_export
+from pisigma.measurement.foreign.mapping import FileMapping, map_columns
+from pisigma.measurement.foreign.quantities import KEYS
 from pisigma.measurement.readings import READINGS, reading_texts, to_si
 from pisigma.measurement.rules import Labels, group_faults, row_faults
 from pisigma.robot import Robot
 from pisigma.robot.se3 import rotation_from_quaternion, rotation_from_rpy
+
+_MOST_BYTES = 2**22
+"""Of a file that is looked at, so that a refusal does not take long."""
 
 
 def read_fields(
@@ -243,3 +250,43 @@ def text_column(table: Table, name: str) -> list[str]:
         )
     place = table.header.index(name)
     return [fields[place].strip() if place < len(fields) else "" for fields in table.records]
+
+
+def import_hint(path: str | os.PathLike[str]) -> str:
+    """Give a sentence with the command that imports a file as an export; "" where none does.
+
+    Args:
+        path: a file whose table or header the reader of measurement files refused.
+    """
+    if _has_columns(path):
+        return ""
+    try:
+        mapping = map_columns(read_export(path, most=_MOST_BYTES), {}, None, {})
+    except MeasurementError:
+        return ""
+    is_half = (mapping.has_joints or mapping.has_measured) and set(KEYS) & set(mapping.quantities)
+    if mapping.possible_joints or not (is_half or (mapping.has_joints and mapping.has_measured)):
+        return ""
+    return f" The command `{_command(mapping)}` would read it as an export."
+
+
+def _has_columns(path: str | os.PathLike[str]) -> bool:
+    """Whether the header of a file has the columns of measurement files or of corners; something else is wrong then."""
+    try:
+        header = read_table(path).header
+        return set(CORNERS) <= set(header) or all(find_column(name) or name in CORNERS for name in header)
+    except MeasurementError:
+        return False
+
+
+def _command(mapping: FileMapping) -> str:
+    words = ["pisigma", "import", shlex.quote(mapping.file.source)]
+    if not mapping.has_measured:
+        words += ["MEASURED", "--join", "point"]
+    elif not mapping.has_joints:
+        words += ["JOINTS", "--join", "point"]
+    if units := mapping.likely_units:
+        words += ["--unit", ",".join(units.values())]
+    if mapping.rotations:
+        words += ["--rotation", "MAKER"]
+    return " ".join([*words, "--out", "data.csv"])

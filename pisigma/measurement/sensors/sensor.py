@@ -258,16 +258,6 @@ class AbstractSensor(ABC):
         }
         return replace(self, **chosen)  # type: ignore[type-var]
 
-    @staticmethod
-    def joined(sensors: "Sequence[AbstractSensor]") -> "AbstractSensor":
-        """Return one sensor with the rows of several of one kind, one behind the other."""
-        first = sensors[0]
-        tensors = {item.name for item in fields(first) if isinstance(getattr(first, item.name), Tensor)}  # type: ignore[arg-type]
-        rows: dict[str, Any] = {
-            name: torch.cat([getattr(sensor, name) for sensor in sensors], -1) for name in tensors
-        }
-        return replace(first, **rows)  # type: ignore[type-var]
-
 
 def _names_in(measurements: Measurements, row: int) -> set[str]:
     return {texts[row] for texts in measurements.as_fields().texts.values()}

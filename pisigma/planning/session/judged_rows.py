@@ -12,6 +12,7 @@ from pisigma.calibration.geometric.prediction import predicted_poses
 from pisigma.measurement.camera.corner_file import with_one_noise
 from pisigma.measurement.dataset import Measurements, join
 from pisigma.measurement.fields import LeftOut
+from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.planning.session.row_alarms import (
     cleared,
     contradicted,
@@ -24,6 +25,9 @@ from pisigma.planning.session.row_judgement import FEW_ROWS, RowJudgement, judge
 from pisigma.planning.session.state import Alarm
 from pisigma.robot.description import Robot
 from pisigma.robot.se3 import invert, transform_from_xyzrpy
+from pisigma.validation.checks.rows.mixed_rows import MOST_WRONG
+from pisigma.validation.checks.rows.row_check import MOVES
+from pisigma.validation.gate import check_rows
 
 
 class JudgedRows:
@@ -146,3 +150,20 @@ def _steps(known: int, count: int) -> Iterator[int]:
         yield upto
     if count > max(known + 1, FEW_ROWS):
         yield count
+
+
+def setup_sentence(
+    rows: Measurements, counts: Bool[Tensor, " rows"], against: Robot | CalibratedModel
+) -> str:
+    """Say what the rows have in common that is wrong; "" where nothing is.
+
+    Where a quarter of the rows or more contradict the others, all of them are judged together.
+
+    Args:
+        rows: all rows that are no copies.
+        counts: those that others do not contradict.
+        against: the robot as drawn, or the model that was planned for.
+    """
+    some = rows.select(counts) if counts.double().mean() > 1 - MOST_WRONG else rows
+    found = check_rows(some, against, may_move=MOVES).implausible
+    return found[0].sentence if found else ""

@@ -3,15 +3,40 @@
 import contextlib
 import math
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import torch
-from jaxtyping import Bool
+from jaxtyping import Bool, Float64, Int64
 from torch import Tensor
 
+from pisigma.calibration.geometric.calibrator import GeometricCalibrator
+from pisigma.calibration.geometric.identifiability.sufficiency import floating_bases
+from pisigma.calibration.geometric.problem.parameters import USUAL_LENGTH
+from pisigma.calibration.geometric.problem.prior_sizes import PriorGroup
+from pisigma.calibration.geometric.problem.setup import (
+    CalibrationSetup,
+    IdentifiedGeometry,
+    identified_geometry,
+)
+from pisigma.calibration.hybrid.design import Design
+from pisigma.calibration.hybrid.gravity import USUAL, in_first_row
+from pisigma.calibration.hybrid.sensor_values import SensorValues, sensor_values
+from pisigma.estimation.dual_regression import DETERMINED, beside_unknown
 from pisigma.files.errors import IdentificationError
+from pisigma.joint_correction.fourier_series import FourierSeries
+from pisigma.joint_correction.gravity_torques import GravityTorques
 from pisigma.measurement.dataset import Measurements
-from pisigma.planning.session.row_model import LeftOutRows, RowModel
+from pisigma.measurement.sensors.corner import CornerSensor, with_held_camera
+from pisigma.measurement.sensors.intrinsics import NOISE_COLUMN
 from pisigma.robot.description import Robot
+from pisigma.robot.robot_class import RobotClass
+from pisigma.robot.se3 import (
+    invert,
+    rotation_from_rpy,
+    rpy_from_rotation,
+    transform_from_xyzrpy,
+    xyzrpy_from_transform,
+)
 
 FALSE_ALARMS = 1e-3
 """Share of right rows that are expected to be called wrong."""
@@ -21,6 +46,241 @@ CONTRADICTORY = 2.0
 """Few rows whose errors are larger than those of the robot's class by this factor contradict each other."""
 CLEARER = 8.0
 """An older row is blamed instead of a newer one where that explains the others better by so much misfit."""
+REPEATABILITY = {"m": 8e-5, "rad": 1e-4}
+"""What a robot of any class does not do again, beside the noise of the sensor."""
+USUAL_NOISE = {"m": 5e-5, "rad": 2e-4}
+"""Of a sensor of which nothing is stated."""
+CLASS_VALUES = 20
+"""The class counts like so many measured values when the size of this robot's errors is estimated."""
+LINEARISATIONS = 2
+
+
+@dataclass(frozen=True, eq=False)
+class LeftOutRows:
+    """Rows that are each predicted from the others.
+
+    Attributes:
+        chance: probability of an error as surprising or more in a row that is right; NaN where it cannot be judged.
+        length: size of the error of the measured length [m]; NaN where it cannot be judged.
+        angle: size of the error of the measured orientation [rad]; NaN likewise.
+        position: error of the measured position, measured - predicted, in the frame of the row [m]; NaN likewise.
+        scale: by which factor this robot's errors are larger than those of its class; 1 where they are smaller.
+    """
+
+    chance: Float64[Tensor, " rows"]
+    length: Float64[Tensor, " rows"]
+    angle: Float64[Tensor, " rows"]
+    position: Float64[Tensor, "rows 3"]
+    scale: float
+
+
+@dataclass(frozen=True, eq=False)
+class RowModel:
+    """Geometry, base, tool, gravity and a series of every joint as normal unknowns of the sizes of the robot's class.
+
+    With X the columns of the unknowns with a prior and G those of base, tool and sensors, of which nothing is known
+    before, the values' covariance is `V = X S X^T + noise²` and `P = V^-1 - V^-1 G (G^T V^-1 G)^-1 G^T V^-1`. A row i
+    that is left out has the error `P_ii^-1 (P r)_i` with the covariance `P_ii^-1` (Rasmussen and Williams 2006,
+    sections 2.7 and 5.4.2), and what it adds to `r^T P r` is chi-square distributed.
+
+    Attributes:
+        setup: rows, and where base and tool start.
+        design: the unknowns.
+        values: per sensor, linearised at `point`.
+        weights: columns of the weights of gravity and series, linearised near that.
+        point: all parameters.
+        sigma: standard deviation of every value [m or rad].
+        kept: the rows that base and tool are fitted to, and others predicted from.
+    """
+
+    setup: CalibrationSetup
+    design: Design
+    values: tuple[SensorValues, ...]
+    weights: Float64[Tensor, "values weights"]
+    point: Float64[Tensor, " parameters"]
+    sigma: Float64[Tensor, " values"]
+    kept: Bool[Tensor, " rows"]
+
+    @staticmethod
+    def of(robot: Robot, rows: Measurements, sigma: float | None, kept: Bool[Tensor, " rows"]) -> "RowModel":
+        """Linearise at the base and the tool that some of the rows determine.
+
+        Args:
+            robot: as drawn.
+            rows: all rows.
+            sigma: standard deviation of the sensor's lengths [m] where the rows state none; None for a usual one.
+            kept: the rows that base and tool are fitted to.
+
+        Raises:
+            IdentificationError: the rows are too few for base and tool.
+            PoseError: the joint values do not fit the robot.
+        """
+        calibrator = GeometricCalibrator(robot)
+        setup = calibrator.build(with_held_camera(rows, REPEATABILITY["m"], REPEATABILITY["rad"]))
+        floating = set(floating_bases(setup))
+        chosen = [index for index in calibrator.candidates(setup.problem.space) if index not in floating]
+        active = [*setup.free_unknowns, *chosen]
+        setup = replace(setup, problem=setup.problem.with_active(active))
+        gravity = GravityTorques(robot, in_first_row(robot, USUAL))
+        design = Design(setup.problem, (gravity, FourierSeries(robot, RobotClass.of(robot).harmonics)))
+        point, rounds = setup.start, LINEARISATIONS
+        if not bool(kept.all()):
+            of_kept = RowModel.of(robot, rows.select(kept), sigma, kept[kept])
+            point, rounds = _start_at(setup, of_kept.geometry), 1
+        values = sensor_values(setup.problem, point)
+        columns = torch.cat([design.columns(one, slice(None)).flatten(0, 1) for one in values])
+        weights = columns[:, design.active :]
+        model = RowModel(setup, design, values, weights, point, _noise(setup, values, sigma), kept)
+        for _ in range(rounds):
+            point = setup.start.clone()
+            point[setup.problem.active] += model._solution()[: design.active]
+            model = replace(model, values=sensor_values(setup.problem, point), point=point)
+        return model
+
+    @property
+    def geometry(self) -> IdentifiedGeometry:
+        """The robot with base and tool, and sensors, at the point of the linearisation."""
+        return identified_geometry(self.setup, self.point)
+
+    @cached_property
+    def misfit(self) -> float:
+        """`r^T P r` of the rows that are kept."""
+        kept = self.kept[self._row].nonzero()[:, 0]
+        return float(self._residual[kept] @ self._projection(kept)[0] @ self._residual[kept])
+
+    def left_out(self) -> LeftOutRows:
+        """Predict every row that is kept from the others that are, and all other rows from those that are kept.
+
+        A robot may err more than its class: the scale is estimated from the rows that are kept, and the squares are
+        compared with Fisher's F distribution.
+        """
+        from scipy.special import fdtrc  # scipy.stats takes a second to import
+
+        rows = len(self.kept)
+        square, count = torch.zeros(2, rows, dtype=torch.float64)
+        errors = torch.full_like(self._residual, math.nan)
+        kept = self.kept[self._row].nonzero()[:, 0]
+        P, _, determined = self._projection(kept)
+        self._leave_out(self.kept.nonzero()[:, 0], kept, P, square, count, errors)
+        left = CLASS_VALUES + len(kept) - determined - torch.where(self.kept, count, 0.0)
+        misfit = self.misfit
+        whole = ((CLASS_VALUES + misfit - torch.where(self.kept, square, 0.0)) / left).clamp(min=1.0)
+        each = float((CLASS_VALUES + square.sum()) / (CLASS_VALUES + count.sum()))
+        scale = torch.where(self.kept, whole, whole.clamp(min=each))
+        for row in (~self.kept).nonzero()[:, 0]:
+            chosen = torch.cat([kept, (self._row == row).nonzero()[:, 0]])
+            self._leave_out(row[None], chosen, self._projection(chosen)[0], square, count, errors)
+        ratio = torch.where(count > 0, square / count, torch.nan) / scale
+        chance = torch.from_numpy(fdtrc(count.numpy(), left.numpy(), ratio.numpy()))
+        total = max(1.0, (CLASS_VALUES + misfit) / (CLASS_VALUES + len(kept) - determined))
+        return LeftOutRows(chance, *self._sizes(errors), total**0.5)
+
+    def _leave_out(
+        self, rows: Tensor, values: Tensor, P: Tensor, square: Tensor, count: Tensor, errors: Tensor
+    ) -> None:
+        """Fill in what some rows, each left out of some values with the projection P, add to the squares."""
+        pull = P @ self._residual[values]
+        for row in rows.tolist():
+            chosen = (self._row[values] == row).nonzero()[:, 0]
+            sigma = self.sigma[values[chosen]]  # makes lengths and angles comparable
+            strength, axes = torch.linalg.eigh(P[chosen][:, chosen] * sigma * sigma[:, None])
+            certain = strength > DETERMINED
+            along = axes.t() @ (sigma * pull[chosen])
+            square[row], count[row] = (along.square() / strength)[certain].sum(), certain.sum()
+            if bool(certain.all()):
+                errors[values[chosen]] = sigma * (axes @ (along / strength))
+
+    def _sizes(self, errors: Float64[Tensor, " values"]) -> tuple[Tensor, Tensor, Tensor]:
+        """Errors of lengths and orientations by their sizes, and those of positions along the axes of the frame."""
+        rows = len(self.setup.measurements.q)
+        length, angle = torch.full((2, rows), torch.nan, dtype=torch.float64)
+        position = torch.full((rows, 3), torch.nan, dtype=torch.float64)
+        start = 0
+        for sensor, one in zip(self.setup.problem.sensors, self.values, strict=True):
+            block = errors[start : start + one.residual.numel()].view_as(one.residual)
+            start += block.numel()
+            (angle if sensor.unit == "rad" else length)[one.row] = block.norm(dim=1)
+            if isinstance(sensor, CornerSensor):
+                block = torch.linalg.solve(sensor.weight.permute(2, 0, 1)[one.row], block[..., None])[..., 0]
+                length[one.row], angle[one.row] = block[:, :3].norm(dim=1), block[:, 3:].norm(dim=1)
+            if sensor.name in ("position", "corner"):
+                frames = self.setup.anchors.bases[self.setup.problem.frame[one.row], :3, :3]
+                position[one.row] = (frames @ block[:, :3, None])[..., 0]
+        return length, angle, position
+
+    def _solution(self) -> Float64[Tensor, " unknowns"]:
+        """The most probable unknowns by the rows that are kept, parameters counted from the start."""
+        return self._projection(self.kept[self._row].nonzero()[:, 0])[1]
+
+    def _projection(self, kept: Int64[Tensor, " chosen"]) -> tuple[Tensor, Tensor, int]:
+        """P of some of the values, the most probable unknowns, and how many of G's unknowns the values determine."""
+        X, r, free = self._columns[kept], self._residual[kept], self._size.isinf()
+        Z, G = X[:, ~free] * self._size[~free], X[:, free]
+        V = Z @ Z.t()
+        V.diagonal().add_(self.sigma[kept].square())
+        P, solution, determined = beside_unknown(V, G)
+        x = torch.zeros_like(self._size)
+        x[free], x[~free] = solution @ r, self._size[~free] * (Z.t() @ (P @ r))
+        return P, x, determined
+
+    @cached_property
+    def _columns(self) -> Float64[Tensor, "values unknowns"]:
+        return torch.cat([torch.cat([one.geometry.flatten(0, 1) for one in self.values]), self.weights], 1)
+
+    @cached_property
+    def _row(self) -> Int64[Tensor, " values"]:
+        """Number of every value's row."""
+        return torch.cat([one.row.repeat_interleave(one.components) for one in self.values])
+
+    @cached_property
+    def _residual(self) -> Float64[Tensor, " values"]:
+        """Measured - predicted of the parameters at the start, as far as the linearised values say."""
+        moved = (self.point - self.setup.start)[self.setup.problem.active]
+        return torch.cat([(one.residual + one.geometry @ moved).flatten() for one in self.values])
+
+    @cached_property
+    def _size(self) -> Float64[Tensor, " unknowns"]:
+        """Standard deviation of the unknowns before anything is measured; infinite where nothing is known."""
+        of_class = RobotClass.of(self.setup.problem.space.robot)
+        prior = self.design.prior([of_class.usual.of(group) / USUAL_LENGTH for group in PriorGroup])
+        sizes = torch.cat(
+            [prior.sizes[: prior.classes], prior.sizes.new_tensor([of_class.gravity, *of_class.bands])]
+        )
+        return replace(prior, sizes=sizes).precision.rsqrt()
+
+
+def _start_at(setup: CalibrationSetup, geometry: IdentifiedGeometry) -> Float64[Tensor, " parameters"]:
+    """The start with the bases and tools of another fit, where that has them."""
+    bases, tools = (block.clone() for block in setup.problem.space.split(setup.start)[1:])
+    for number, frame in enumerate(setup.problem.space.frames):
+        if frame in geometry.bases:
+            T = transform_from_xyzrpy(torch.from_numpy(geometry.bases[frame]))
+            bases[number] = xyzrpy_from_transform(invert(setup.anchors.bases[number]) @ T)
+    for number, target in enumerate(setup.problem.space.targets):
+        if target in geometry.tools:
+            tool = torch.from_numpy(geometry.tools[target])
+            R = rotation_from_rpy(tool[3:]) @ setup.anchors.tools[number].mT
+            tools[number] = torch.cat([tool[:3], rpy_from_rotation(R)])
+    point = setup.start.clone()
+    for name, block in (("base", bases), ("tool", tools)):
+        stretch = setup.problem.space.of(name)
+        point[stretch.start : stretch.stop] = block.flatten()
+    return point
+
+
+def _noise(
+    setup: CalibrationSetup, values: tuple[SensorValues, ...], sigma: float | None
+) -> Float64[Tensor, " values"]:
+    """Standard deviation of every value, with what the robot does not repeat."""
+    blocks = []
+    for sensor, one in zip(setup.problem.sensors, values, strict=True):
+        usual = USUAL_NOISE[sensor.unit] if sigma is None or sensor.unit == "rad" else sigma
+        noise = 1 / one.root if one.stated else torch.full_like(one.root, usual)
+        noise = (noise.square() + REPEATABILITY[sensor.unit] ** 2).sqrt()
+        if isinstance(sensor, CornerSensor):  # whose weights hold the repeatability
+            noise = torch.as_tensor(setup.measurements.readings[NOISE_COLUMN])[one.row]
+        blocks.append(noise.repeat_interleave(one.components))
+    return torch.cat(blocks)
 
 
 @dataclass(frozen=True, eq=False)

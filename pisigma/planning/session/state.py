@@ -7,6 +7,9 @@ from typing import Literal
 
 import numpy as np
 from jaxtyping import Bool, Float64
+from torch import Tensor
+
+from pisigma.robot.description import Robot
 
 AlarmKind = Literal["setup", "unreadable", "duplicate", "frozen", "swapped", "off", "pose", "cleared"]
 """All rows have the same fault, such as a unit; the row cannot be read; it equals another one; the sensor shows an old
@@ -222,3 +225,26 @@ class SessionState:
 def _number(value: float) -> float | None:
     """A number for JSON, which has no NaN."""
     return value if math.isfinite(value) else None
+
+
+def coverage(
+    robot: Robot, measured: Float64[Tensor, "rows dof"], planned: Float64[Tensor, "poses dof"]
+) -> tuple[JointSpan, ...]:
+    """Compare the range in which every joint was measured with that of the plan; nothing of no rows.
+
+    Args:
+        robot: as drawn.
+        measured: joint values of the rows that count [rad or m].
+        planned: joint values of all poses that were planned [rad or m].
+    """
+    if not len(measured):
+        return ()
+    lower, upper = robot.to_controller(measured).aminmax(dim=0)
+    every = robot.to_controller(planned)
+    width = every.amax(0) - every.amin(0)
+    return tuple(
+        JointSpan(joint.name, low, high, min(1.0, (high - low) / max(most, 1e-9)))
+        for joint, low, high, most in zip(
+            robot.axes, lower.tolist(), upper.tolist(), width.tolist(), strict=True
+        )
+    )

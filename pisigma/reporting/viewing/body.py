@@ -1,17 +1,28 @@
 """What a robot looks like: capsules along its links, or the meshes of the URDF file that it was loaded from."""
 
+import io
+import os
 from abc import ABC, abstractmethod
-from typing import TYPE_CHECKING
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 from jaxtyping import Float64
+from scipy.spatial.transform import Rotation
 
+from pisigma.files.errors import RobotError
+from pisigma.files.input_file import read_input
 from pisigma.planning.surroundings.capsules import Capsules
 from pisigma.reporting.viewing.colors import Color
-from pisigma.reporting.viewing.surface import capsule, joined
+from pisigma.reporting.viewing.surface import Surface, capsule, joined
+from pisigma.robot.description import Robot
+from pisigma.robot.urdf_chain import origin_of, parse_xml, read_chain, read_urdf
+from pisigma.robot.urdf_frames import Frame, frame_of, shift
 
 if TYPE_CHECKING:  # names in full, which type checkers at run time find without these imports
+    import trimesh
     import viser
 
 
@@ -58,3 +69,159 @@ class CapsuleBody(AbstractBody):
             [capsule(start, end, radius) for (start, end), radius in zip(segments, radii, strict=True)]
         )
         scene.add_mesh_simple(name, links.points, links.faces, color=color, opacity=opacity)
+
+
+class MeshBody(AbstractBody):
+    """Links as the file shows them, each moved with its joint."""
+
+    def __init__(
+        self, robot: Robot, path: str | os.PathLike[str], base: str | None = None, tip: str | None = None
+    ):
+        """Read the meshes.
+
+        Args:
+            robot: as loaded from the file.
+            path: the URDF file.
+            base: the link that poses are given in, as in `Robot.load`.
+            tip: the link that is the tool, as in `Robot.load`.
+
+        Raises:
+            RobotError: the file cannot be used, it is of another robot or shows no link, or a mesh is not at hand or of
+                no usable format.
+        """
+        chain = read_chain(path, base, tip)
+        self._base, self._joints = chain.base, [joint.name for joint in robot.joints]
+        if [joint.name for joint in chain.joints] != self._joints:
+            raise RobotError(
+                f"{path}: its joints are {', '.join(joint.name for joint in chain.joints)}, but those of robot "
+                f"'{robot.name}' are {', '.join(self._joints)}; give the file that the robot was loaded from."
+            )
+        self._urdf, _ = read_urdf(path)
+        self.links: dict[str, Surface] = {}
+        for element in parse_xml(path).iterchildren("{*}link"):
+            if visuals := [_surface(visual, Path(path)) for visual in element.iterchildren("{*}visual")]:
+                self.links[element.get("name")] = joined(visuals)
+        if not self.links:
+            raise RobotError(f"{path}: no link has a <visual>.")
+        self._drawn: dict[str, viser.MeshHandle] = {}
+
+    def draw(
+        self,
+        scene: "viser.SceneApi",
+        name: str,
+        q: Float64[np.ndarray, " dof"],
+        color: Color,
+        opacity: float | None,
+    ) -> None:
+        """Draw a mesh a link at first and move it afterwards; see `AbstractBody.draw`."""
+        values = dict(zip(self._joints, q.tolist(), strict=True))
+        for link, T in self.frames(values).items():
+            if link not in self.links:
+                continue
+            node = f"{name}/{link}"
+            if node not in self._drawn:
+                surface = self.links[link]
+                self._drawn[node] = scene.add_mesh_simple(
+                    node,
+                    surface.points,
+                    surface.faces,
+                    color=color,
+                    opacity=opacity,
+                    side="double",
+                    flat_shading=True,
+                )
+            self._drawn[node].position = T[:3, 3]
+            self._drawn[node].wxyz = Rotation.from_matrix(T[:3, :3]).as_quat(scalar_first=True)
+
+    def frames(self, values: Mapping[str, float]) -> dict[str, Frame]:
+        """Frames of the links below the base link in it [m], by name.
+
+        Args:
+            values: joint values [rad or m] by the names of the joints; others are 0.
+        """
+        frames, parents = {self._base: np.eye(4)}, [self._base]
+        while parents:
+            parent = parents.pop()
+            for name, child in self._urdf.child_map.get(parent, ()):
+                joint = self._urdf.joint_map[name]
+                if child not in frames:
+                    frames[child] = frames[parent] @ origin_of(joint) @ _motion(joint, values.get(name, 0.0))
+                    parents.append(child)
+        return frames
+
+
+def _motion(joint: Any, value: float) -> Frame:
+    axis = np.array(joint.axis or (1.0, 0.0, 0.0))
+    T: Frame = shift(*(value * axis)) if joint.type == "prismatic" else np.eye(4)
+    if joint.type in ("revolute", "continuous"):
+        T[:3, :3] = Rotation.from_rotvec(value * axis).as_matrix()
+    return T
+
+
+def _surface(visual: Any, path: Path) -> Surface:
+    """What a <visual> shows, in the frame of its link.
+
+    Raises:
+        RobotError: it cannot be drawn; the message names file and line.
+    """
+    origin = next(visual.iterchildren("{*}origin"), None)
+    try:
+        shape = next(
+            child
+            for geometry in visual.iterchildren("{*}geometry")
+            for child in geometry.iterchildren("{*}*")
+        )
+        mesh = _mesh(shape, path)
+        xyz, rpy = ([0.0] * 3 if origin is None else _numbers(origin, key, "0 0 0") for key in ("xyz", "rpy"))
+        T = frame_of([*xyz, *rpy[::-1]])
+    except RobotError:
+        raise
+    except Exception as problem:  # what trimesh raises depends on the bytes
+        raise RobotError(
+            f"{path}, line {visual.sourceline}: this <visual> cannot be drawn ({type(problem).__name__}: {problem})."
+        ) from None
+    return Surface(mesh.vertices, mesh.faces).moved(T[:3, :3], T[:3, 3])
+
+
+def _mesh(shape: Any, path: Path) -> "trimesh.Trimesh":
+    import trimesh
+    from lxml import etree
+
+    mesh: trimesh.Trimesh
+    match etree.QName(shape).localname:
+        case "box":
+            mesh = trimesh.creation.box(_numbers(shape, "size"))
+        case "cylinder":
+            (radius,), (length,) = _numbers(shape, "radius"), _numbers(shape, "length")
+            mesh = trimesh.creation.cylinder(radius, length)
+        case "sphere":
+            mesh = trimesh.creation.icosphere(radius=_numbers(shape, "radius")[0])
+        case _:
+            file = _mesh_file(shape.get("filename", ""), path)
+            mesh = trimesh.load_mesh(io.BytesIO(read_input(file, RobotError)), file.suffix[1:].lower())
+            mesh.apply_transform(np.diag((*_numbers(shape, "scale", "1 1 1"), 1.0)))
+    return mesh
+
+
+def _numbers(element: Any, key: str, default: str = "") -> list[float]:
+    return [float(word) for word in element.get(key, default).split()]
+
+
+def _mesh_file(name: str, path: Path) -> Path:
+    """The file of a mesh: `package://name/...` is looked for beside the folders that the URDF file lies in.
+
+    Raises:
+        RobotError: there is no such file.
+    """
+    kind, _, rest = name.rpartition("://")
+    folders = path.resolve().parents
+    if kind == "package":
+        package, _, inside = rest.partition("/")
+        choices = [folder / rest for folder in folders]
+        choices += [folder / inside for folder in folders if folder.name == package]
+    else:
+        choices = [folders[0] / rest]
+    for choice in choices:
+        if choice.is_file():
+            return choice
+    raise RobotError(f"{path}: the mesh '{name}' is not at hand.")

@@ -66,11 +66,6 @@ def motion_order(rows: int) -> list[int]:
     return [*order, base, base + 1, base + 2, 0, 1, 2, tool, tool + 1, tool + 2, d - 3, d - 2, d - 1]
 
 
-def motion_shape(robot: Robot, turning: bool) -> tuple[int, int]:
-    """Numbers of parameters and components in `ToolMotion.derivative`, with or without the turns."""
-    return 5 * len(robot.rows) + 15, 6 if turning else 3
-
-
 def identification_jacobian(
     robot: Robot, q: Float[Tensor, "*batch dof"]
 ) -> tuple[Float[Tensor, "*batch 4 4"], Float[Tensor, "*batch 6 parameters"]]:
@@ -106,29 +101,25 @@ def identification_jacobian(
 
 def tool_motion(
     robot: Robot,
-    dh: Float64[np.ndarray, "*robots rows 5"],
+    dh: Float64[np.ndarray, "rows 5"],
     base: Float[Tensor, "6 bases"],
     tool: Float[Tensor, "6 tools"],
     q: Float[Tensor, "poses dof"],
     turning: bool,
     frame: Int64[Tensor, " poses"] | None = None,
     target: Int64[Tensor, " poses"] | None = None,
-    out: Float[Tensor, "parameters components poses"] | None = None,
 ) -> ToolMotion:
     """Tool pose and its derivative, with the batch index last.
 
-    Several robots of one type stand one behind the other among the poses, each with equally many.
-
     Args:
         robot: says which rows move.
-        dh: the parameters of the rows; of one robot, or of several.
-        base: x, y, z [m], roll, pitch, yaw [rad]; one for all poses, one a robot, or one a frame.
-        tool: the same; one for all poses, one a robot, or one a target.
+        dh: the parameters of the rows.
+        base: x, y, z [m], roll, pitch, yaw [rad]; one for all poses, or one a frame.
+        tool: the same; one for all poses, or one a target.
         q: joint values [rad or m].
         turning: whether the derivative of the rotation is wanted too.
         frame: per pose the number of its base, where there is one a frame.
         target: per pose the number of its tool, where there is one a target.
-        out: where the derivative is written, of the shape that `motion_shape` gives; a new tensor where None.
     """
     poses = q.shape[0]
     axes, bases = _frame_axes(torch.cat([base, tool], 1), q), base.shape[1]
@@ -141,14 +132,14 @@ def tool_motion(
     tool_steps = _behind(_last(frames), tool_axes)
     position = tool_steps[ORIGIN]
     shifts = 3 * frames.shape[0] + 3
-    J = q.new_empty((*motion_shape(robot, turning), poses)) if out is None else out
+    J = q.new_empty((5 * len(robot.rows) + 15, 6 if turning else 3, poses))
     turns = frames[:, ::3]
     u, v = turns.unbind(2), (position - frames[:, 5])[:, None].unbind(2)
     of_turns = J[: shifts - 3].view(-1, 3, J.shape[1], poses)
     for k in range(3):  # the cross product of the axes and the ways from the origins to the tool
         i, j = (k + 1) % 3, (k + 2) % 3
         torch.mul(u[i], v[j], out=of_turns[:, :, k]).addcmul_(u[j], v[i], value=-1)
-    base_steps = _spread(base_axes[3:6, :3], poses)
+    base_steps = base_axes[3:6, :3].expand(-1, -1, poses)
     torch.cat([frames[1:-1, 6], frames[2:, 0], base_steps, tool_steps[3:6]], out=J[shifts:, :3])
     J[shifts - 3 : shifts, :3] = 0
     if turning:
@@ -167,7 +158,7 @@ def flange_frames(
 
 
 def _walk_rows(
-    robot: Robot, dh: Float64[np.ndarray, "*robots rows 5"], q: Tensor, base_axes: Tensor
+    robot: Robot, dh: Float64[np.ndarray, "rows 5"], q: Tensor, base_axes: Tensor
 ) -> Float[Tensor, "rows_and_2 7 3 poses"]:
     """Walk from the base to the last row.
 
@@ -180,20 +171,21 @@ def _walk_rows(
     """
     frames = q.new_empty((len(robot.rows) + 2, 7, 3, q.shape[0]))
     starts = base_axes.index_select(0, STARTS.to(q.device))[:, :3]
-    frames[:2].flatten(0, 1).copy_(_spread(starts, q.shape[0]))
-    offsets = torch.from_numpy(np.atleast_2d(dh[..., 0]).T.copy()).to(q)
-    angles = torch.addmm(_spread(offsets, q.shape[0]), torch.from_numpy(_turning(robot)).to(q), q.t())
+    frames[:2].flatten(0, 1).copy_(starts)
+    offsets = q.new_tensor(dh[:, :1])
+    angles = torch.addmm(offsets, torch.from_numpy(_turning(robot)).to(q), q.t())
     before, turned, flat, matrices = frames[1:-1], frames[2:, :2], frames.flatten(0, 1), _row_matrices(dh, q)
     blocks = (turned, before[:, 2:4], before[:, 3:5], angles.cos(), angles.sin())
     turns = zip(*(block.unbind(0) for block in blocks), strict=True)
-    lead = torch.mm if matrices.ndim == 3 else _led_by_robots
     sliding = {
         row: joint for joint, row in enumerate(robot.joint_rows) if robot.rows[row].type == "prismatic"
     }
     for row, (after, xy, side, cosine, sine) in enumerate(turns):
         torch.mul(xy, cosine, out=after).addcmul_(side, sine)
         start = 7 * row + 12
-        lead(matrices[row], flat[start : start + 4].flatten(1), out=flat[start + 4 : start + 9].flatten(1))
+        torch.mm(
+            matrices[row], flat[start : start + 4].flatten(1), out=flat[start + 4 : start + 9].flatten(1)
+        )
         if row in sliding:
             joint = sliding[row]
             frames[row + 2, 5].addcmul_(frames[row + 1, 6], q[:, joint], value=robot.directions[joint])
@@ -205,22 +197,20 @@ def _last(frames: Float[Tensor, "rows_and_2 7 3 poses"]) -> Float[Tensor, "4 3 p
     return torch.cat([frames[-1, 2:4], frames[-1, 6:], frames[-1, 5:6]])
 
 
-def _row_matrices(
-    dh: Float64[np.ndarray, "*robots rows 5"], like: Tensor
-) -> Float[Tensor, "rows *robots 5 4"]:
+def _row_matrices(dh: Float64[np.ndarray, "rows 5"], like: Tensor) -> Float[Tensor, "rows 5 4"]:
     """Per row x, y, -x, origin and z after it, by the origin and z before, and x and y turned.
 
     `Trans(a, 0, d) · RotX(alpha) · RotY(beta)`; a joint that slides comes on top.
     """
     _, d, a, alpha, beta = dh.T
     ca, cb, sa, sb = np.cos(alpha), np.cos(beta), np.sin(alpha), np.sin(beta)
-    matrices = np.zeros((*d.shape, 5, 4))
-    x, y, minus_x, origin, z = (matrices[..., i, :] for i in range(5))
-    x[..., 1], x[..., 2], x[..., 3] = -ca * sb, cb, sa * sb
-    y[..., 1], y[..., 3] = sa, ca
+    matrices = np.zeros((len(d), 5, 4))
+    x, y, minus_x, origin, z = (matrices[:, i] for i in range(5))
+    x[:, 1], x[:, 2], x[:, 3] = -ca * sb, cb, sa * sb
+    y[:, 1], y[:, 3] = sa, ca
     np.negative(x, out=minus_x)
-    origin[..., 0], origin[..., 1], origin[..., 2] = 1, d, a
-    z[..., 1], z[..., 2], z[..., 3] = ca * cb, sb, -sa * cb
+    origin[:, 0], origin[:, 1], origin[:, 2] = 1, d, a
+    z[:, 1], z[:, 2], z[:, 3] = ca * cb, sb, -sa * cb
     return torch.from_numpy(matrices).to(like)
 
 
@@ -252,37 +242,11 @@ def _frame_axes(xyzrpy: Float[Tensor, "6 frames"], like: Tensor) -> Float[Tensor
     return torch.from_numpy(axes).to(like)
 
 
-def _spread(values: Float[Tensor, "*shape ways"], poses: int) -> Float[Tensor, "*shape poses"]:
-    """Values that are the same for all poses, or for all of a robot, one a pose."""
-    ways = values.shape[-1]
-    if ways == 1:
-        return values.expand(*values.shape[:-1], poses)
-    return values[..., None].expand(*values.shape, poses // ways).flatten(-2)
-
-
 def _behind(
     frame: Float[Tensor, "4 3 poses"], axes: Float[Tensor, "size 4 ways"]
 ) -> Float[Tensor, "size 3 poses"]:
     """Axes and origins that are given in a frame, seen from outside of it."""
-    (size, _, ways), poses = axes.shape, frame.shape[-1]
-    if ways == poses:
+    if axes.shape[-1] > 1:
         result: Tensor = (axes[:, :, None] * frame).sum(1)
         return result
-    if ways == 1:
-        return (axes[..., 0] @ frame.flatten(1)).view(size, 3, poses)
-    result = frame.new_empty((size, 3 * poses))
-    _led_by_robots(axes.permute(2, 0, 1).contiguous(), frame.flatten(1), out=result)
-    return result.view(size, 3, poses)
-
-
-def _led_by_robots(
-    matrices: Float[Tensor, "robots size 4"],
-    state: Float[Tensor, "4 three_poses"],
-    *,
-    out: Float[Tensor, "size three_poses"],
-) -> None:
-    """Multiply the axes and origins of several robots, one behind the other among the poses, each by its matrix."""
-    robots, size, _ = matrices.shape
-    of_robots = state.view(4, 3 * robots, -1).transpose(0, 1)
-    led = torch.bmm(matrices.repeat(3, 1, 1), of_robots)
-    out.view(size, 3 * robots, -1).copy_(led.transpose(0, 1))
+    return (axes[..., 0] @ frame.flatten(1)).view(-1, 3, frame.shape[-1])

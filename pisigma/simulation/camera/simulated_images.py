@@ -1,26 +1,131 @@
 """The part of a recipe that states which images a camera takes on the true robot."""
 
-from collections.abc import Iterator
-from dataclasses import replace
+import os
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
 import torch
-from jaxtyping import Float64, UInt8
+from jaxtyping import Bool, Float64, UInt8
+from PIL import Image
 from pydantic import Field
 from torch import Tensor
 
-from pisigma.files.yaml_file import Section, Seed
-from pisigma.measurement.camera.board import BoardDocument
+from pisigma.files.errors import RecipeError
+from pisigma.files.output_folder import staged_folder
+from pisigma.files.yaml_file import Count, Section, Seed, yaml_text
+from pisigma.measurement.camera.board import Board, BoardDocument
 from pisigma.measurement.camera.camera import Camera, CameraDocument, IntrinsicsSection
 from pisigma.measurement.camera.camera_files import Repeatability
-from pisigma.measurement.camera.image_rows import image_measurements
+from pisigma.measurement.camera.image_rows import Images, image_measurements
 from pisigma.measurement.dataset import Measurements
-from pisigma.simulation.camera.images import ImageNoise, draw_board_poses, simulate_images
+from pisigma.robot.description import Robot
+from pisigma.robot.kinematics.closed_form import AbstractClosedForm, closed_form_solver
+from pisigma.robot.kinematics.forward import forward_kinematics
+from pisigma.robot.kinematics.status import Status
+from pisigma.robot.se3 import invert, rotation_from_rpy, rotation_from_vector, transform
 from pisigma.simulation.camera.rendering import Exposure, render_image
 from pisigma.simulation.camera.true_board import TrueBoard
-from pisigma.simulation.camera.views import RandomViews
 from pisigma.simulation.true_robot import TrueRobot
+
+CANDIDATES = 8
+"""For each view, of which those are taken that are far apart in joint space."""
+ATTEMPTS = 100
+"""For each candidate, of which some cannot be reached."""
+STATED = ("joints.csv", "camera.yaml", "board.yaml")
+
+
+class RandomViews(Section):
+    """Random views of a whole board, by random branches, of which those are taken that are far apart.
+
+    Of all candidates, each joint vector is the one farthest from those before it, in sines and cosines.
+
+    Attributes:
+        count: how many.
+        seed: of the generator.
+        distance_mm: nearest and farthest distance of the camera from the middle of the board [mm].
+        oblique_deg: largest angle between the camera's axis and the board's [deg].
+    """
+
+    count: Count
+    seed: Seed
+    distance_mm: tuple[float, float] = (300.0, 700.0)
+    oblique_deg: float = Field(default=40.0, ge=0, lt=90)
+
+    def joints(
+        self, robot: Robot, camera: Camera, board: Board, is_fixed: bool = False
+    ) -> Float64[Tensor, "count dof"]:
+        """Joint values to command [rad or m]; the same at every call.
+
+        Args:
+            robot: whose base and tool lead from the board to the base and from the flange to the camera (of a fixed
+                camera: from the camera to the base, and from the flange to the board).
+            camera: that has the whole board in view, with its squares' rim.
+            board: that is looked at from its printed side, from which its z axis points away.
+            is_fixed: whether the camera is fixed and the board on the flange.
+
+        Raises:
+            RecipeError: the robot has no closed form, or does not reach so many views.
+        """
+        solver, rng = self.check(robot), np.random.default_rng(self.seed)
+        chosen, wanted = list[Tensor](), CANDIDATES * self.count
+        for _ in range(ATTEMPTS * wanted):
+            T_board_camera = self._view(board, rng)
+            T_camera_board = invert(T_board_camera)
+            if not _is_whole(camera, board, T_camera_board.numpy()):
+                continue
+            branches = solver.solve(T_camera_board if is_fixed else T_board_camera)
+            reached = branches.q[branches.status == Status.REACHED]
+            if len(reached):
+                chosen.append(reached[rng.integers(len(reached))])
+            if len(chosen) == wanted:
+                return far_apart(torch.stack(chosen), self.count)
+        raise RecipeError(
+            f"views of a board: robot '{robot.name}' reaches {len(chosen)} of {ATTEMPTS * wanted} drawn views, but "
+            f"{wanted} were wanted; check where board and camera are, and the distances."
+        )
+
+    def check(self, robot: Robot) -> AbstractClosedForm:
+        """Return the closed form by which views are reached.
+
+        Raises:
+            RecipeError: the robot has none.
+        """
+        solver = closed_form_solver(robot)
+        if solver is None:
+            raise RecipeError(
+                f"views of a board are for robots with a closed form, which robot '{robot.name}' does not have; "
+                "simulate a tracker with joints_random instead."
+            )
+        return solver
+
+    def _view(self, board: Board, rng: np.random.Generator) -> Float64[Tensor, "4 4"]:
+        """Draw T_board_camera: a direction, a tilt, a roll about the camera's axis, and a distance."""
+        oblique, (near, far) = np.deg2rad(self.oblique_deg), self.distance_mm
+        tilt, direction, roll, distance = rng.uniform((0, 0, 0, near), (oblique, 2 * np.pi, 2 * np.pi, far))
+        angles = torch.tensor([[direction, tilt, 0.0], [roll, 0.0, 0.0]], dtype=torch.float64)
+        around, about_axis = rotation_from_rpy(angles)
+        middle = torch.from_numpy((board.corners.min(0) + board.corners.max(0)) / 2)
+        return transform(around @ about_axis, middle - distance / 1e3 * around[:, 2])
+
+
+def _is_whole(camera: Camera, board: Board, T_camera_board: Float64[np.ndarray, "4 4"]) -> bool:
+    """Whether all of a board is in view up to half a square beyond its corners."""
+    corners = board.corners
+    out = corners + board.square / 2 * np.sign(corners - corners.mean(0))
+    pixels = camera.project(out @ T_camera_board[:3, :3].T + T_camera_board[:3, 3])[0]
+    return bool(((pixels > 0) & (pixels < (camera.width, camera.height))).all())
+
+
+def far_apart(q: Float64[Tensor, "rows dof"], count: int) -> Float64[Tensor, "count dof"]:
+    """Choose joint values [rad] by farthest-point sampling in sines and cosines, the first one first."""
+    points = torch.cat([q.cos(), q.sin()], 1)
+    chosen, distance = [0], (points - points[0]).norm(dim=1)
+    while len(chosen) < count:
+        chosen.append(int(distance.argmax()))
+        distance = torch.minimum(distance, (points - points[chosen[-1]]).norm(dim=1))
+    return q[chosen]
 
 
 class CornerNoise(Section):
@@ -150,3 +255,128 @@ class SimulatedImages(Section):
         camera = stated.with_intrinsics(stated.intrinsics + np.array(self.camera_errors.numbers))
         errors = self.board_errors
         return camera, TrueBoard(self.board.board(), 1 + errors.scale_percent / 100, errors.bow_mm / 1e3)
+
+
+@dataclass(frozen=True)
+class ImageNoise:
+    """What is uncertain in every image.
+
+    Attributes:
+        corner: standard deviation of u and v of every corner [px].
+        repeatability: of the robot's pose, the same for all corners of an image.
+    """
+
+    corner: float = 0.3
+    repeatability: Repeatability = field(default_factory=Repeatability)
+
+
+def draw_board_poses(
+    robot: Robot,
+    q: Float64[Tensor, "images dof"],
+    repeatability: Repeatability,
+    generator: torch.Generator,
+    is_fixed: bool = False,
+) -> Float64[Tensor, "images 4 4"]:
+    """Return T_camera_board of images that a true robot stops for.
+
+    Args:
+        robot: true arm; base and tool lead from the board to the base and from the flange to the camera (of a fixed
+            camera: from the camera to the base, and from the flange to the board).
+        q: joint values of the images [rad or m].
+        repeatability: of the robot.
+        generator: of the poses' errors.
+        is_fixed: whether the camera is fixed and the board on the flange.
+    """
+    T = forward_kinematics(robot, q)
+    turn, shift = (torch.randn((len(q), 3), generator=generator, dtype=torch.float64) for _ in range(2))
+    turned = rotation_from_vector(repeatability.angle * turn) @ T[:, :3, :3]
+    T = transform(turned, T[:, :3, 3] + repeatability.length * shift)
+    return T if is_fixed else invert(T)
+
+
+def project_corners(
+    camera: Camera, board: Board | TrueBoard, T_camera_board: Float64[Tensor, "images 4 4"]
+) -> tuple[Float64[np.ndarray, "images corners 2"], Bool[np.ndarray, "images corners"]]:
+    """Return where corners appear [px], and which of them are in front of the camera and inside of its images."""
+    corners = torch.from_numpy(board.corners)
+    points = (corners @ T_camera_board[:, :3, :3].mT + T_camera_board[:, None, :3, 3]).numpy()
+    pixels = camera.project(points)[0]
+    inside = (points[..., 2] > 0) & (pixels >= 0).all(-1) & (pixels < (camera.width, camera.height)).all(-1)
+    return pixels, inside
+
+
+def simulate_images(
+    robot: Robot,
+    q: Float64[Tensor, "images dof"],
+    camera: Camera,
+    board: Board | TrueBoard,
+    noise: ImageNoise,
+    generator: torch.Generator,
+    is_fixed: bool = False,
+) -> Images:
+    """Project the corners of a board into the images of a camera.
+
+    Args:
+        robot: true arm; see `draw_board_poses`.
+        q: joint values of the images [rad or m].
+        camera: that takes them.
+        board: that they show.
+        noise: of corners and robot.
+        generator: of the noise.
+        is_fixed: whether the camera is fixed and the board on the flange.
+
+    Returns:
+        The corners that are in front of the camera and inside of its images.
+    """
+    T_camera_board = draw_board_poses(robot, q, noise.repeatability, generator, is_fixed)
+    pixels, inside = project_corners(camera, board, T_camera_board)
+    pixels += noise.corner * torch.randn(pixels.shape, generator=generator, dtype=torch.float64).numpy()
+    return images_of(
+        q, [np.flatnonzero(row) for row in inside], [at[row] for at, row in zip(pixels, inside, strict=True)]
+    )
+
+
+def images_of(
+    q: Float64[Tensor, "images dof"], corners: Sequence[np.ndarray], pixels: Sequence[np.ndarray]
+) -> Images:
+    """Gather simulated corners, image by image.
+
+    Args:
+        q: joint values of every image [rad or m].
+        corners: numbers of the corners that every image shows.
+        pixels: where it shows them [px].
+    """
+    names = tuple(f"{number:04d}" for number in range(len(q)))
+    return Images("simulated images", names, q, (0,) * len(q), tuple(corners), tuple(pixels))
+
+
+def write_images(images: SimulatedImages, robot: TrueRobot, folder: str | os.PathLike[str]) -> int:
+    """Render images as `0000.png` and so on, beside `joints.csv`, `camera.yaml` and `board.yaml` as stated.
+
+    Args:
+        images: of a recipe.
+        robot: true robot.
+        folder: to write, whole or not at all; it does not exist or is empty.
+
+    Returns:
+        The number of images.
+
+    Raises:
+        RecipeError: the robot does not reach the views.
+        OutputError: the folder exists, or cannot be written.
+    """
+    axes = robot.nominal.axes
+    names = [f"q{joint + 1}_{axis.file_unit}" for joint, axis in enumerate(axes)]
+    lines = [",".join(("image", *names))]
+    files = [f"{number:04d}.png" for number in range(images.poses.count)]
+    with staged_folder(folder, names=(*files, *STATED)) as scratch:
+        q = robot.nominal.to_controller(images.joints_read(robot)).numpy()
+        for file, joints, image in zip(files, q, images.rendered(robot), strict=True):
+            Image.fromarray(image).save(scratch / file)
+            shown = (axis.in_file_unit(float(value)) for axis, value in zip(axes, joints, strict=True))
+            lines.append(",".join((file, *(f"{value:.9f}" for value in shown))))
+        (scratch / STATED[0]).write_text("\n".join(lines) + "\n", encoding="utf-8")
+        for document, name in zip((images.camera, images.board), STATED[1:], strict=True):
+            stated = document.model_dump(mode="json", exclude_unset=True)
+            (scratch / name).write_text(yaml_text(stated), encoding="utf-8")
+    return len(q)

@@ -11,7 +11,7 @@ from torch import Tensor
 from pisigma.files.errors import RecipeError, nearest_choice
 from pisigma.files.yaml_file import Section
 from pisigma.robot.description import Robot
-from pisigma.simulation.errors.source import AbstractJointSource, JointErrorFunction, joint_values
+from pisigma.simulation.errors.source import AbstractJointSource, JointErrorFunction, amplitude_of
 
 
 class GuideWave(Section):
@@ -71,7 +71,11 @@ class Guide(AbstractJointSource):
             raise RecipeError(
                 f"{place}: the axis '{self.along}' does not slide between limits; name one that does."
             )
-        amplitude = torch.from_numpy(np.stack([_amplitude(robot, wave, place) for wave in self.waves]))
+        amplitudes = [
+            amplitude_of(robot, wave.joint, wave.amplitude_deg, wave.amplitude_mm, place)
+            for wave in self.waves
+        ]
+        amplitude = torch.from_numpy(np.stack(amplitudes))
         harmonic = torch.tensor([wave.harmonic for wave in self.waves], dtype=torch.float64)
         phase = torch.deg2rad(torch.tensor([wave.phase_deg for wave in self.waves], dtype=torch.float64))
 
@@ -80,11 +84,3 @@ class Guide(AbstractJointSource):
             return (torch.sin(along * harmonic.to(q) + phase.to(q))[..., None] * amplitude.to(q)).sum(-2)
 
         return error
-
-
-def _amplitude(robot: Robot, wave: GuideWave, place: str) -> np.ndarray:
-    """The amplitude [rad or m] in the column of its joint, 0 elsewhere."""
-    degrees = {} if wave.amplitude_deg is None else {wave.joint: wave.amplitude_deg}
-    millimetres = {} if wave.amplitude_mm is None else {wave.joint: wave.amplitude_mm}
-    stated = joint_values(robot, degrees, millimetres, ("amplitude_deg", "amplitude_mm"), place)
-    return np.where(robot.revolute, np.deg2rad(stated), stated / 1e3)

@@ -176,3 +176,25 @@ def joint_values(
     """One value per joint, 0 where none is stated. See `stated_joints`."""
     stated = stated_joints(robot, for_revolute, for_prismatic, fields, place)
     return np.array([stated.get(index, 0.0) for index in range(robot.dof)])
+
+
+def amplitude_of(
+    robot: Robot, joint: str, deg: float | None, mm: float | None, place: str
+) -> Float64[np.ndarray, " dof"]:
+    """The amplitude of a wave [rad or m] in the column of its joint, 0 elsewhere. See `stated_joints`.
+
+    Args:
+        robot: the robot.
+        joint: that errs.
+        deg: amplitude of a joint that turns.
+        mm: amplitude of a joint that slides.
+        place: where in the recipe, for complaints.
+    """
+    stated = joint_values(
+        robot,
+        {} if deg is None else {joint: deg},
+        {} if mm is None else {joint: mm},
+        ("amplitude_deg", "amplitude_mm"),
+        place,
+    )
+    return np.where(robot.revolute, np.deg2rad(stated), stated / 1e3)

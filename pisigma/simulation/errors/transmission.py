@@ -14,8 +14,8 @@ from pisigma.robot.description import Robot
 from pisigma.simulation.errors.source import (
     AbstractJointSource,
     JointErrorFunction,
+    amplitude_of,
     joint_index,
-    joint_values,
 )
 
 
@@ -79,7 +79,11 @@ class TransmissionHarmonics(AbstractJointSource):
         places = [f"{place}, terms[{index}]" for index in range(len(self.terms))]
         stated = list(zip(self.terms, places, strict=True))
         # (terms, dof): which joint errs by how much, and the multiples of the joint values inside the sine.
-        amplitude = torch.from_numpy(np.stack([_amplitude(robot, term, where) for term, where in stated]))
+        amplitudes = [
+            amplitude_of(robot, term.joint, term.amplitude_deg, term.amplitude_mm, where)
+            for term, where in stated
+        ]
+        amplitude = torch.from_numpy(np.stack(amplitudes))
         multiple = torch.from_numpy(np.stack([_multiple(robot, term, where) for term, where in stated]))
         phase = torch.deg2rad(torch.tensor([term.phase_deg for term in self.terms], dtype=torch.float64))
 
@@ -88,14 +92,6 @@ class TransmissionHarmonics(AbstractJointSource):
             return (torch.sin(angle)[..., None] * amplitude.to(q)).sum(-2)
 
         return error
-
-
-def _amplitude(robot: Robot, term: Harmonic, place: str) -> np.ndarray:
-    """The term's amplitude [rad or m] in the column of its joint, 0 elsewhere."""
-    degrees = {} if term.amplitude_deg is None else {term.joint: term.amplitude_deg}
-    millimetres = {} if term.amplitude_mm is None else {term.joint: term.amplitude_mm}
-    stated = joint_values(robot, degrees, millimetres, ("amplitude_deg", "amplitude_mm"), place)
-    return np.where(robot.revolute, np.deg2rad(stated), stated / 1e3)
 
 
 def _multiple(robot: Robot, term: Harmonic, place: str) -> np.ndarray:

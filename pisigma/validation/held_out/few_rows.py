@@ -1,6 +1,12 @@
-"""Calibrations of few rows: the arm stays as drawn unless left-out rows are predicted better with a fitted one."""
+"""Calibrations of few rows: the arm stays as drawn unless left-out rows are predicted better with a fitted one.
 
+A calibration and those of its cross-validation may go side by side.
+"""
+
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from functools import partial
+from typing import Any
 
 from scipy.special import fdtrc
 
@@ -9,10 +15,11 @@ from pisigma.calibration.geometric.identifiability.sufficiency import distinct_r
 from pisigma.calibration.geometric.result import CalibrationResult
 from pisigma.calibration.hybrid.calibrator import HybridCalibrator
 from pisigma.files.errors import IdentificationError, MeasurementError
-from pisigma.files.progress import Progress, stage
+from pisigma.files.progress import Progress, silent, stage
 from pisigma.measurement.dataset import Measurements
-from pisigma.measurement.splits import k_folds
-from pisigma.validation.held_out.calibration_validation import validate
+from pisigma.measurement.splits import TrainTest, k_folds
+from pisigma.validation.held_out.calibration_validation import JudgedFold, fold_tasks, judged_folds, validate
+from pisigma.validation.held_out.side_by_side import in_processes
 from pisigma.validation.held_out.trained_calibrations import (
     Calibrator,
     Result,
@@ -92,3 +99,39 @@ def _evident(calibrator: GeometricCalibrator, result: CalibrationResult, rows: M
     more = sum(noise.used - before.used for noise, before in pairs)
     before = sum((one.values - one.used) * (one.sigma / noise.sigma) ** 2 for noise, one in pairs)
     return more > 0 and bool(fdtrc(more, left, (before - left) / more) < CHANCE)
+
+
+def fit_beside_folds(
+    calibrator: Calibrator,
+    rows: Measurements,
+    training: Measurements,
+    repeats: Sequence[Sequence[TrainTest]],
+    progress: Progress,
+    jobs: int | None,
+) -> tuple[Result, Iterator[JudgedFold]]:
+    """Calibrate, and begin a cross-validation.
+
+    Args:
+        calibrator: of either kind.
+        rows: to calibrate with.
+        training: rows of the cross-validation.
+        repeats: training and test rows of every fold, per repeat; none for no cross-validation.
+        progress: called with what is being done, but for what other processes do.
+        jobs: processes that share the calibration and the folds, with one thread each; None for threads of this one.
+
+    Returns:
+        The calibration, see `fit_where_it_helps`, and the folds for `joined_repeats`.
+
+    Raises:
+        IdentificationError: the rows do not determine what is asked for; those of a fold say so when it is taken.
+        MemoryError: a process ended twice with the calibration or a fold.
+    """
+    validating = stage(progress, "cross-validation")
+    if jobs is None or not repeats:
+        result = fit_where_it_helps(calibrator, rows, stage(progress, "calibration"))
+        return result, judged_folds(calibrator, training, repeats, validating)
+    folds = fold_tasks(calibrator, training, repeats, silent)
+    progress(f"calibration and {len(folds)} folds in {jobs} processes")
+    fitting = partial(fit_where_it_helps, calibrator, rows, silent)
+    results: Iterator[Any] = in_processes([fitting, *folds], jobs)  # a calibration, and then folds
+    return next(results), results

@@ -22,13 +22,14 @@ from pisigma.files.progress import Progress
 from pisigma.lifetime.fleet.members import Member, read_fleet
 from pisigma.lifetime.fleet.record import (
     MARK,
+    RESULTS,
     RobotRecord,
     expect_robots,
     read_record,
     read_records,
     record_path,
+    write_results,
 )
-from pisigma.lifetime.fleet.results_table import RESULTS, write_results
 from pisigma.model.folder.model_folder import load_model
 from pisigma.model.model_posterior import check_fleet_prior
 from pisigma.workflow.fleet.one_robot import settings_for, work_out

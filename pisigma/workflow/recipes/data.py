@@ -12,8 +12,7 @@ from pisigma.measurement.camera.corner_file import read_rows
 from pisigma.measurement.dataset import Measurements, join
 from pisigma.measurement.splits import TrainTest, k_folds
 from pisigma.robot.description import Robot
-from pisigma.simulation.camera.image_folder import write_images
-from pisigma.simulation.camera.simulated_images import SimulatedImages
+from pisigma.simulation.camera.simulated_images import SimulatedImages, write_images
 from pisigma.simulation.measure import SimulatedPoses
 from pisigma.simulation.true_robot import TrueRobot
 from pisigma.workflow.recipes.recipe import GeometricRecipe, HybridRecipe, MeasuredData, Recipe, SimulatedData

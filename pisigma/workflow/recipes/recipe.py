@@ -7,7 +7,6 @@ from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
 from pisigma.calibration.geometric.calibrator import GeometricCalibrator
 from pisigma.calibration.geometric.problem.parameters import Prior
 from pisigma.calibration.hybrid.calibrator import HybridCalibrator
-from pisigma.calibration.hybrid.mini_batches import MiniBatches
 from pisigma.estimation.loss import HampelLoss, SquaredLoss
 from pisigma.files.yaml_file import Section, Seed
 from pisigma.network.sections import FitSection, NetworkSection
@@ -183,15 +182,12 @@ class HybridSection(Section):
         harmonics: of the Fourier series, tried in this order.
         products: whether product units are tried.
         gravity: direction in which things fall, in the frame of the robot's base; without it, by evidence.
-        mini_batches: whether the unknowns are trained on mini-batches: true, false, or "auto" for many rows only; or
-            their `batch_rows`, `epochs`, `learning_rate` and `seed`.
     """
 
     features: tuple[str, ...] = HybridCalibrator.features
     harmonics: tuple[Annotated[int, Field(ge=1, le=1000)], ...] = HybridCalibrator.harmonics
     products: bool = HybridCalibrator.products
     gravity: tuple[float, float, float] | None = HybridCalibrator.gravity
-    mini_batches: MiniBatches | bool | Literal["auto"] = HybridCalibrator.mini_batches
 
     def calibrator(self, geometric: GeometricCalibrator) -> HybridCalibrator:
         """The calibrator, on top of a geometric one.

@@ -123,7 +123,7 @@ def test_intervals_cover_the_truth(poses: bool) -> None:
         truths.append(np.concatenate([true.dh.ravel(), BASE, TOOL]))
     covered = [
         abs(parameter.estimated - value) < 1.96 * parameter.standard_error
-        for result, truth in zip(calibrator.fit_many(data), truths, strict=True)
+        for result, truth in zip(map(calibrator.fit, data), truths, strict=True)
         for parameter, value in zip(result.parameters, truth, strict=True)
         if parameter.name in kept
     ]

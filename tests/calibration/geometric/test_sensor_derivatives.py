@@ -18,7 +18,7 @@ from testing.sensors import (
 )
 
 from pisigma.calibration.geometric.calibrator import GeometricCalibrator
-from pisigma.calibration.geometric.identifiability.redundancy import find_redundancies
+from pisigma.calibration.geometric.identifiability.redundancy import find_redundancy
 from pisigma.calibration.geometric.problem.noise import view_of
 from pisigma.estimation.loss import SquaredLoss
 from pisigma.measurement.dataset import Measurements
@@ -77,7 +77,7 @@ def test_23_parameters_come_back_from_exact_touches_without_a_guess() -> None:
     result, at_start = solved.result(), solved.findings.information
     assert len(result.free) == result.rank == 23
     of_arm = at_start.after([k for k, p in enumerate(at_start.parameters) if p.group in ("base", "tool")])
-    assert find_redundancies([of_arm], np.zeros((1, len(of_arm.parameters))))[0].rank == len(ARM)
+    assert find_redundancy(of_arm, np.zeros(len(of_arm.parameters))).rank == len(ARM)
     assert result.status.good
     true = arm.geometric_robot
     assert_close(result.robot.dh, true.dh, atol=1e-9)

@@ -9,8 +9,7 @@ from testing.models import no_type_checker
 from pisigma.calibration.geometric.calibrator import GeometricCalibrator
 from pisigma.calibration.geometric.result import CalibrationResult
 from pisigma.calibration.hybrid.calibrator import HybridCalibrator
-from pisigma.calibration.hybrid.delivery import EXACT_GROUPS
-from pisigma.calibration.hybrid.left_out_rows import SensorErrors
+from pisigma.calibration.hybrid.delivery import EXACT_GROUPS, SensorErrors
 from pisigma.calibration.hybrid.result import HybridResult
 from pisigma.measurement.dataset import Measurements
 from pisigma.robot import Robot

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from pisigma.calibration.hybrid.design_regression import AbstractDesignRegression
 from pisigma.calibration.hybrid.normal_equations import NormalEquations
-from pisigma.calibration.hybrid.value_covariance import ValueCovariance
+from pisigma.calibration.hybrid.regression import ValueCovariance
 from pisigma.estimation.left_out import LeftOut
 from pisigma.estimation.regression import SensorCount
 

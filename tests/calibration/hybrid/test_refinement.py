@@ -10,7 +10,7 @@ from testing.linearised import drawn_joints, tracker_data
 from pisigma.calibration.geometric.calibrator import GeometricCalibrator
 from pisigma.calibration.hybrid.calibrator import HybridCalibrator
 from pisigma.calibration.hybrid.design import Rows
-from pisigma.calibration.hybrid.refinement import Refined, linearised, refine, refined_at
+from pisigma.calibration.hybrid.refinement import Refined, linearised, refine
 from pisigma.calibration.hybrid.search import Choice, Fitted
 from pisigma.measurement.conditions import JointState
 from pisigma.measurement.groups import held_out_groups
@@ -91,13 +91,3 @@ def test_rows_on_which_nothing_was_chosen_are_fitted_as_well(refined: Refined) -
     found = refine(problem, refined.rows.group, chosen_as(refined, rows))
     assert found.rounds >= 2
     assert len(found.rows.values[0].row) == len(refined.rows.values[0].row)
-
-
-def test_unknowns_at_the_solution_are_solved_with_their_sizes_as_they_stand(refined: Refined) -> None:
-    """For a training that ended there: prior sizes stand, noise is renewed."""
-    found = refined_at(refined.design, refined.posterior, refined.rows.group, 7)
-    assert found.rounds == 7
-    assert_close(found.posterior.prior.sizes, refined.posterior.prior.sizes)
-    assert_close(found.posterior.noise[0], refined.posterior.noise[0], rtol=0.05)
-    deviation = refined.regression.covariance_root(refined.posterior).dense.norm(dim=1)
-    assert float(((found.posterior.x - refined.posterior.x) / deviation).abs().max()) < 0.5

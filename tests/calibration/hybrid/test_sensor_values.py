@@ -11,8 +11,7 @@ from testing.sensors import mixed_data, pair_data
 from torch import Tensor
 
 from pisigma.calibration.geometric.calibrator import GeometricCalibrator
-from pisigma.calibration.geometric.problem.motion import MotionMemory
-from pisigma.calibration.geometric.problem.problem import CalibrationProblem
+from pisigma.calibration.geometric.problem.problem import CalibrationProblem, MotionMemory
 from pisigma.calibration.hybrid.design import Design
 from pisigma.calibration.hybrid.refinement import network
 from pisigma.calibration.hybrid.sensor_values import joint_columns, sensor_values

@@ -13,7 +13,7 @@ from testing.regression_cases import CASES, few_values
 
 from pisigma.calibration.hybrid.design import Design
 from pisigma.calibration.hybrid.normal_equations import NormalEquations
-from pisigma.calibration.hybrid.value_covariance import ValueCovariance
+from pisigma.calibration.hybrid.regression import ValueCovariance
 from pisigma.files.errors import IdentificationError
 
 

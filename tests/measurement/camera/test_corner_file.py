@@ -17,7 +17,7 @@ from pisigma.measurement.camera.corner_file import read_rows
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.sensors.intrinsics import boards, without_stated
 from pisigma.robot.kinematics.forward import forward_kinematics
-from pisigma.simulation.camera.images import ImageNoise
+from pisigma.simulation.camera.simulated_images import ImageNoise
 
 EXACT = ImageNoise(0.0, Repeatability(0.0, 0.0))
 BESIDE, HAND = replace(CAMERA, name="beside", is_fixed=True), replace(BOARD, name="hand")

@@ -7,11 +7,10 @@ from testing.camera_cell import BOARD, CAMERA, CameraCell, camera_cell
 from testing.closeness import assert_close
 
 from pisigma.measurement.camera.camera_files import Repeatability
-from pisigma.measurement.camera.flatness import bent_corners, shapes
-from pisigma.measurement.camera.image_rows import Images, image_measurements
+from pisigma.measurement.camera.image_rows import Images, bent_corners, image_measurements, shapes
 from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.robot.se3 import invert
-from pisigma.simulation.camera.images import ImageNoise
+from pisigma.simulation.camera.simulated_images import ImageNoise
 
 NONE = Repeatability(0.0, 0.0)
 BENT = np.array([3e-4, -1e-4, 2e-4])

@@ -16,7 +16,7 @@ from pisigma.measurement.camera.image_rows import image_measurements
 from pisigma.measurement.dataset import Measurements, join
 from pisigma.robot import Robot
 from pisigma.robot.kinematics.forward import forward_kinematics
-from pisigma.simulation.camera.images import ImageNoise
+from pisigma.simulation.camera.simulated_images import ImageNoise
 from pisigma.validation.setup_faults.row_order import find_motion
 
 EXACT = ImageNoise(0.0, Repeatability(0.0, 0.0))

@@ -8,7 +8,7 @@ import torch
 from testing.closeness import assert_close
 
 from pisigma.files.errors import MeasurementError
-from pisigma.measurement import Measurements
+from pisigma.measurement.dataset import Measurements
 from pisigma.robot import Robot
 
 MIXED = """\

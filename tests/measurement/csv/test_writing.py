@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from testing.closeness import assert_close
 
 from pisigma.files.errors import MeasurementError, OutputError
-from pisigma.measurement import Measurements
+from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.rules import TEMPERATURES
 from pisigma.robot import Robot
 from pisigma.robot.se3 import rotation_from_quaternion, rotation_from_rpy

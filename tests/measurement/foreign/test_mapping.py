@@ -6,9 +6,8 @@ import pytest
 
 from pisigma.files.errors import MeasurementError
 from pisigma.measurement.foreign.conversion import convert
-from pisigma.measurement.foreign.doubts import doubts
 from pisigma.measurement.foreign.export_file import read_export
-from pisigma.measurement.foreign.mapping import FileMapping, map_columns
+from pisigma.measurement.foreign.mapping import FileMapping, doubts, map_columns
 
 ROW = "170,-20,30.5,40,50,60,1200.5,-300,400"
 

@@ -3,7 +3,7 @@
 import pytest
 
 from pisigma.files.errors import MeasurementError
-from pisigma.measurement.foreign.text_encoding import decoded
+from pisigma.measurement.foreign.export_file import decoded
 
 TEXT = "Prüfpunkt;J1 [°]\n1;2,5\n"
 

@@ -20,7 +20,7 @@ from pisigma.planning.surroundings.arm_in_cell import ArmInCell
 from pisigma.robot import Robot
 from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.robot.se3 import invert, xyzrpy_from_transform
-from pisigma.simulation.camera.images import ImageNoise, simulate_images
+from pisigma.simulation.camera.simulated_images import ImageNoise, simulate_images
 from pisigma.workflow.measure import MeasuringSession
 from pisigma.workflow.settings.measuring import MeasureSettings
 

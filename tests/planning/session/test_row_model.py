@@ -8,7 +8,7 @@ from testing.measured_plans import NOISE, measured_plan, with_offset
 
 from pisigma.files.errors import IdentificationError
 from pisigma.measurement.dataset import Measurements
-from pisigma.planning.session.row_model import RowModel
+from pisigma.planning.session.row_judgement import RowModel
 
 PLAN = measured_plan()
 ROWS = PLAN.rows(14)

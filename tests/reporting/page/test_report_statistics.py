@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from testing.closeness import assert_close
 
+from pisigma.reporting.page.content import CELLS, worst_region
 from pisigma.reporting.page.dependence import binned
-from pisigma.reporting.page.verdict import CELLS, worst_region
 from pisigma.validation.held_out.rank_tests import SIGNIFICANT
 
 

@@ -6,7 +6,7 @@ import torch
 from testing.closeness import assert_close
 
 from pisigma.files.errors import RobotError
-from pisigma.reporting.viewing.mesh_body import MeshBody
+from pisigma.reporting.viewing.body import MeshBody
 from pisigma.robot.description import Robot
 from pisigma.robot.kinematics.forward import forward_kinematics
 

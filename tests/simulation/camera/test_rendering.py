@@ -65,8 +65,8 @@ def test_blur_grows_away_from_the_distance_in_focus():
 def test_corners_are_detected_where_the_camera_projects_them(bow: float):
     """Of a board that is larger than stated and bowed, through a lens with distortion."""
     pytest.importorskip("cv2", reason="opencv-python-headless is not installed")
-    from pisigma.measurement.camera.detection.checkerboard import detect_checkerboard
     from pisigma.measurement.camera.detection.detected_board import DetectedBoard
+    from pisigma.measurement.camera.detection.detector import detect_checkerboard
 
     board, T = TrueBoard(BOARD, 1.01, bow), pose(0.3, (0.2, -0.3, 0.4))
     image = rendered(Exposure(focus=0.3), T, board)

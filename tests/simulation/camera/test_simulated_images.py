@@ -86,8 +86,8 @@ def test_joints_are_read_late(recipe: GeometricRecipe, robot: TrueRobot):
 
 def test_rendered_images_are_those_of_the_poses(recipe: GeometricRecipe, robot: TrueRobot):
     pytest.importorskip("cv2", reason="opencv-python-headless is not installed")
-    from pisigma.measurement.camera.detection.checkerboard import detect_checkerboard
     from pisigma.measurement.camera.detection.detected_board import DetectedBoard
+    from pisigma.measurement.camera.detection.detector import detect_checkerboard
 
     half = {"width": 960, "height": 600, "fx": 700.0, "fy": 700.0, "cx": 480.0, "cy": 300.0}
     section = images(recipe, camera=half)

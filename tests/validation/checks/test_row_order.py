@@ -13,8 +13,7 @@ from testing.closeness import assert_close
 from testing.simulated_arm import SimulatedArm, simulate
 
 from pisigma.calibration.geometric.calibrator import GeometricCalibrator
-from pisigma.measurement.dataset import Measurements
-from pisigma.measurement.new_frames import with_new_frames
+from pisigma.measurement.dataset import Measurements, with_new_frames
 from pisigma.robot import Robot
 from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.robot.se3 import rotation_from_vector

@@ -7,7 +7,7 @@ from pisigma.calibration.hybrid.calibrator import HybridCalibrator
 from pisigma.files.progress import silent
 from pisigma.measurement.splits import k_folds
 from pisigma.validation.held_out.calibration_validation import joined_repeats
-from pisigma.validation.held_out.fit_beside_folds import fit_beside_folds
+from pisigma.validation.held_out.few_rows import fit_beside_folds
 
 
 def test_processes_give_the_same_to_the_bit() -> None:

@@ -11,9 +11,8 @@ from testing.simulated_arm import simulate
 from pisigma.calibration.geometric.calibrator import GeometricCalibrator
 from pisigma.estimation.loss import SquaredLoss
 from pisigma.files.errors import IdentificationError
-from pisigma.measurement import Measurements, k_folds
-from pisigma.measurement.dataset import join
-from pisigma.measurement.splits import holdout
+from pisigma.measurement.dataset import Measurements, join
+from pisigma.measurement.splits import holdout, k_folds
 from pisigma.reporting.calibration_tables import held_out_lines
 from pisigma.reporting.tables import distance_table
 from pisigma.validation.held_out.calibration_validation import validate

@@ -12,7 +12,7 @@ from testing.sensors import true_robot as true_arm
 
 from pisigma.calibration.geometric.calibrator import GeometricCalibrator
 from pisigma.calibration.hybrid.calibrator import HybridCalibrator
-from pisigma.measurement import holdout, k_folds
+from pisigma.measurement.splits import holdout, k_folds
 from pisigma.robot import Robot
 from pisigma.validation.held_out.calibration_validation import judge, learning_curve, validate
 from pisigma.validation.held_out.pose_statistics import PoseErrors

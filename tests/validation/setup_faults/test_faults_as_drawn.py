@@ -10,8 +10,8 @@ from testing.simulated_arm import simulate
 
 from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.validation.held_out.frames.frame_fits import MeasuredPoses, affine_error, best_base_and_tool
+from pisigma.validation.setup_faults.explanations import other_conventions
 from pisigma.validation.setup_faults.faults_as_drawn import are_unrelated, find_faults_as_drawn, usual_error
-from pisigma.validation.setup_faults.pose_faults import other_conventions
 
 pytestmark = pytest.mark.usefixtures("without_type_checker")
 MISTAKES = {mistake.name: mistake for mistake in (*POSITIONS, *POSES)}

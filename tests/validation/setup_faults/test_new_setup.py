@@ -9,11 +9,10 @@ from testing.simulated_arm import simulate
 
 from pisigma.calibration.geometric.calibrator import GeometricCalibrator
 from pisigma.files.errors import IdentificationError
-from pisigma.measurement.dataset import Measurements
-from pisigma.measurement.new_frames import with_new_frames
+from pisigma.measurement.dataset import Measurements, with_new_frames
 from pisigma.robot import Robot
 from pisigma.robot.se3 import transform_from_xyzrpy
-from pisigma.validation.setup_faults.new_setup import new_setup
+from pisigma.validation.checks.setup_fault import new_setup
 from pisigma.workflow.calibrate import calibrate
 from pisigma.workflow.settings.calibration import CalibrationSettings
 

@@ -5,7 +5,6 @@ import torch
 from testing.closeness import assert_close
 
 from pisigma.calibration.hybrid.calibrator import HybridCalibrator
-from pisigma.calibration.hybrid.mini_batches import MiniBatches
 from pisigma.files.errors import RecipeError
 from pisigma.robot import Robot
 from pisigma.workflow.recipes.data import load_data, repeated, simulate
@@ -46,8 +45,6 @@ def test_every_error_source_is_on(repository):
         (HYBRID, "hybrid: {features: [gravty]}\n", "'hybrid': features: 'gravty' is no choice; did you mean 'gravity'"),
         (HYBRID, "hybrid: {harmonics: []}\n", "'hybrid': harmonics"),
         (HYBRID, "hybrid: {products: 3}\n", "'hybrid.products'"),
-        (HYBRID, "hybrid: {mini_batches: {batch_rows: 0}}\n", "mini_batches.*batch_rows"),
-        (HYBRID, "hybrid: {mini_batches: never}\n", "mini_batches"),
         (HYBRID, "hybrid: {product: true}\n", "unknown key 'product' in 'hybrid'; did you mean 'products'"),
         (HYBRID, "repeats: 0\n", "'repeats'"),
         (HYBRID, "repeats: 1000000000\n", "'repeats'.*less than or equal to 100"),
@@ -97,17 +94,3 @@ def test_measured_recipes_want_a_file_and_simulated_ones_none(write_recipe, tmp_
         simulate(recipe)
     with pytest.raises(RecipeError, match="simulates its data and has no use for --data"):
         load_data(read_recipe(write_recipe(RB5)), tmp_path / "rows.csv")
-
-
-@pytest.mark.parametrize(
-    ("stated", "wanted"),
-    [("true", True), ("auto", "auto"), ("{epochs: 3, seed: 1}", MiniBatches(epochs=3, seed=1))],
-)
-def test_a_recipe_may_choose_mini_batches(repository, tmp_path, stated, wanted):
-    text = (repository / "training" / f"{RB5}.yaml").read_text(encoding="utf-8")
-    file = tmp_path / "recipe.yaml"
-    file.write_text(
-        text.replace(HYBRID, f"repeats: 5\nhybrid: {{mini_batches: {stated}}}\n"), encoding="utf-8"
-    )
-    recipe = read_recipe(file)
-    assert recipe.calibrator(Robot.load(recipe.robot)).mini_batches == wanted

@@ -64,11 +64,11 @@ def find_pairwise_redundancy(
     """Find redundant pairs by Park et al. 2022, section 3.2: |r| = 1 between columns of the Jacobian.
 
     Lengths and angles are looked at apart. It cannot see dependencies of three and more parameters that are
-    not pairs; `find_redundancies` does.
+    not pairs; `find_redundancy` does.
 
     Args:
         information: the condensed Jacobian.
-        sizes: nominal values, see `find_redundancies`.
+        sizes: nominal values, see `find_redundancy`.
         tolerance: see `CORRELATION_TOLERANCE`.
     """
     columns = information.jacobian

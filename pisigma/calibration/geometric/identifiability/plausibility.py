@@ -1,7 +1,5 @@
 """Fits that no calibration error explains: of another robot, in other units, with swapped frame names."""
 
-from collections.abc import Sequence
-
 import numpy as np
 import torch
 from jaxtyping import Float64
@@ -30,45 +28,42 @@ OFF_SHARE = 0.2
 """Share of a frame's rows that must be far off."""
 
 
-def refuse_implausible(
-    problem: CalibrationProblem, here: Linearisation[Tensor], sources: Sequence[str]
-) -> None:
+def refuse_implausible(problem: CalibrationProblem, here: Linearisation[Tensor], source: str) -> None:
     """Refuse a fit of the arm that leaves most positions or distances far from their prediction, or ruins the arm.
 
     Where no parameter of the arm is free (base and tool alone), nothing is refused: the arm may be far off. Touches and
     corners are not judged here.
 
     Args:
-        problem: with its free parameters, of one robot or of several.
+        problem: with its free parameters.
         here: its linearisation at the solution.
-        sources: what complaints call the measurements of every robot.
+        source: what complaints call the measurements.
 
     Raises:
         ImplausibleError: the median residual of positions, balls in sockets or distances is more than 1 % of the
             reach, or a link is half as long again as drawn, or less than half as long.
     """
-    _refuse_ruined_links(problem, here.point.reshape(len(sources), -1), sources)
-    robot, rows = problem.space.robot, problem.rows
+    _refuse_ruined_links(problem, here.point, source)
+    robot = problem.space.robot
     judged = [
-        sensor.present[:rows]
+        sensor.present
         for sensor in problem.sensors
         if sensor.unit == "m" and (sensor.components == 3 or sensor.name in DISTANCES)
     ]
     if not judged or robot.reach == 0 or not bool((problem.active < problem.space.arm_size).any()):
         return
-    sizes = residual_sizes(problem, here)[..., torch.stack(judged).any(0)]
-    typical = sizes.median(-1).values.reshape(-1) if sizes.shape[-1] else sizes.new_zeros(1)
-    for source, size in zip(sources, typical.tolist(), strict=True):
-        if size > IMPLAUSIBLE_SHARE * robot.reach:
-            raise ImplausibleError(
-                f"{source}: with the best fit a typical row is still {size * 1e3:.3g} mm per axis from where robot "
-                f"'{robot.name}' says, {size / robot.reach:.1%} of its reach, which no calibration error explains; "
-                "check the units (millimetres in a _m column?), stated distances, order and directions of the joints, "
-                "and whether this robot was measured."
-            )
+    sizes = residual_sizes(problem, here)[torch.stack(judged).any(0)]
+    size = float(sizes.median()) if len(sizes) else 0.0
+    if size > IMPLAUSIBLE_SHARE * robot.reach:
+        raise ImplausibleError(
+            f"{source}: with the best fit a typical row is still {size * 1e3:.3g} mm per axis from where robot "
+            f"'{robot.name}' says, {size / robot.reach:.1%} of its reach, which no calibration error explains; "
+            "check the units (millimetres in a _m column?), stated distances, order and directions of the joints, "
+            "and whether this robot was measured."
+        )
 
 
-def _refuse_ruined_links(problem: CalibrationProblem, points: Tensor, sources: Sequence[str]) -> None:
+def _refuse_ruined_links(problem: CalibrationProblem, point: Tensor, source: str) -> None:
     """Refuse an arm whose long lengths changed by half, as where metres stand in a column of millimetres.
 
     Raises:
@@ -76,13 +71,13 @@ def _refuse_ruined_links(problem: CalibrationProblem, points: Tensor, sources: S
     """
     robot = problem.space.robot
     is_length = problem.space.is_length.numpy()
-    drawn, fitted = robot.dh.ravel(), points.cpu().numpy()[:, : problem.space.arm_size]
+    drawn, fitted = robot.dh.ravel(), point.cpu().numpy()[: problem.space.arm_size]
     long = is_length[: len(drawn)] & (np.abs(drawn) > LONG_SHARE * robot.reach)
     ruined = long & (np.abs(fitted - drawn) > RUINED_SHARE * np.abs(drawn))
-    for one, number in np.argwhere(ruined)[:1].tolist():
+    for number in np.flatnonzero(ruined)[:1].tolist():
         raise ImplausibleError(
-            f"{sources[one]}: the best fit makes {problem.space.names[number]} of robot '{robot.name}' "
-            f"{float(fitted[one, number]) * 1e3:.4g} mm instead of {float(drawn[number]) * 1e3:.4g} mm, which no "
+            f"{source}: the best fit makes {problem.space.names[number]} of robot '{robot.name}' "
+            f"{float(fitted[number]) * 1e3:.4g} mm instead of {float(drawn[number]) * 1e3:.4g} mm, which no "
             "calibration error explains; check the units (metres in a _mm column?), stated distances, order and "
             "directions of the joints, and whether this robot was measured."
         )
@@ -118,13 +113,11 @@ def misfitting_frames(problem: CalibrationProblem, here: Linearisation[Tensor]) 
     )
 
 
-def residual_sizes(
-    problem: CalibrationProblem, here: Linearisation[Tensor]
-) -> Float64[Tensor, "*robots rows"]:
+def residual_sizes(problem: CalibrationProblem, here: Linearisation[Tensor]) -> Float64[Tensor, " rows"]:
     """Length of every row's residual per component [m], NaN where no length was measured."""
-    sizes = problem.q.new_tensor(torch.nan).expand(*problem.robots, problem.rows)
+    sizes = problem.q.new_full((problem.rows,), torch.nan)
     for sensor, sums in zip(problem.sensors, view_of(here).sums, strict=True):
         if sensor.unit == "m" and not sensor.certain:
-            size = sums.residual.norm(dim=-2) / sensor.components**0.5
-            sizes = torch.where(problem.by_robot(sensor.present), size, sizes)
+            size = sums.residual.norm(dim=0) / sensor.components**0.5
+            sizes = torch.where(sensor.present, size, sizes)
     return sizes

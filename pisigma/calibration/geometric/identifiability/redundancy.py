@@ -109,49 +109,39 @@ class Findings:
         return self.redundancy.information
 
 
-def find_redundancies(
-    of_each: Sequence[Information],
-    sizes: Float64[np.ndarray, "robots parameters"],
-    tolerance: float = RANK_TOLERANCE,
-) -> list[Redundancy]:
-    """Find ranks, choices of independent parameters and the dependencies of the others on them.
+def find_redundancy(
+    information: Information, sizes: Float64[np.ndarray, " parameters"], tolerance: float = RANK_TOLERANCE
+) -> Redundancy:
+    """Find the rank, a choice of independent parameters and the dependencies of the others on them.
 
     The columns are scaled to length one; the rank is that of the singular values. The choice is the first
     `rank` pivots of a QR factorisation with column pivoting (Businger and Golub 1965) of the columns times
     their preference.
 
     Args:
-        of_each: the condensed Jacobian of every robot, by the same parameters.
+        information: the condensed Jacobian.
         sizes: nominal values; of equal columns that with the larger one is kept (a group of parallel axes
             keeps the d that is a real offset).
         tolerance: see `RANK_TOLERANCE`.
     """
-    jacobians, names = np.stack([one.jacobian for one in of_each]), np.array(of_each[0].names)
-    lengths = _lengths(jacobians)
-    preference = preferences(of_each[0].parameters, sizes)
+    jacobian, names = information.jacobian, np.array(information.names)
+    lengths, preference = _lengths(jacobian), preferences(information.parameters, sizes)
     wanted = np.divide(preference, lengths, out=np.zeros_like(lengths), where=lengths > 0)
-    triangles, pivots = pivoted_triangles(jacobians * wanted[:, None])
-    triangles /= np.take_along_axis(preference, pivots, 1)[:, None]
-    acting = (lengths > 0).sum(1)  # the others are the last pivots
-    ranks = _ranks(triangles, tolerance)
+    triangle, pivots = pivoted_triangle(jacobian * wanted)
+    rank = _rank(triangle / preference[pivots], tolerance)
+    acting = int((lengths > 0).sum())  # the others are the last pivots
 
     def named(columns: Int64[np.ndarray, " some"]) -> tuple[str, ...]:
         return tuple(names[np.sort(columns)].tolist())
 
-    return [
-        Redundancy(
-            one, rank, tolerance, named(columns[:rank]), named(columns[rank:count]), named(columns[count:])
-        )
-        for one, rank, columns, count in zip(of_each, ranks, pivots, acting.tolist(), strict=True)
-    ]
+    chosen, others, silent = pivots[:rank], pivots[rank:acting], pivots[acting:]
+    return Redundancy(information, rank, tolerance, named(chosen), named(others), named(silent))
 
 
-def _lengths(
-    jacobians: Float64[np.ndarray, "*robots rank columns"],
-) -> Float64[np.ndarray, "*robots columns"]:
+def _lengths(jacobian: Float64[np.ndarray, "rank columns"]) -> Float64[np.ndarray, " columns"]:
     """Return the lengths of the columns, 0 of those that change no measured value."""
-    lengths: np.ndarray = np.sqrt(np.square(jacobians).sum(-2))
-    lengths[lengths <= NO_EFFECT * lengths.max(-1, initial=0.0, keepdims=True)] = 0.0
+    lengths: np.ndarray = np.sqrt(np.square(jacobian).sum(0))
+    lengths[lengths <= NO_EFFECT * lengths.max(initial=0.0)] = 0.0
     return lengths
 
 
@@ -160,8 +150,8 @@ def _singular_values(A: Float64[np.ndarray, "rows columns"]) -> Float64[np.ndarr
     return values
 
 
-def _ranks(R: Float64[np.ndarray, "robots rank columns"], tolerance: float) -> list[int]:
-    """Count the singular values above a share of the largest, of triangles whose columns have length one, or none.
+def _rank(R: Float64[np.ndarray, "rank columns"], tolerance: float) -> int:
+    """Count the singular values above a share of the largest, of a triangle whose columns have length one, or none.
 
     The largest lies between one and the root of the number of columns. So the rank is k where what is below the k-th
     row is shorter than the tolerance, and the inverse of what is beside it is short enough; nearly always that shows
@@ -169,34 +159,32 @@ def _ranks(R: Float64[np.ndarray, "robots rank columns"], tolerance: float) -> l
     """
     from scipy.linalg.lapack import dtrtri  # here, since models are loaded without scipy
 
-    below = np.sqrt(np.square(R).sum(2)[:, ::-1].cumsum(1)[:, ::-1])
-    ranks: list[int] = (below > tolerance).sum(1).tolist()
-    for number, (triangle, rank) in enumerate(zip(R, ranks, strict=True)):
-        inverse, singular = dtrtri(triangle[:rank, :rank]) if rank else (triangle[:0], 0)
-        if singular or np.square(inverse).sum() * R.shape[2] * tolerance**2 >= 1:
-            values = _singular_values(triangle)
-            ranks[number] = int((values > tolerance * values.max(initial=0.0)).sum())
-    return ranks
+    below = np.sqrt(np.square(R).sum(1)[::-1].cumsum()[::-1])
+    rank = int((below > tolerance).sum())
+    inverse, singular = dtrtri(R[:rank, :rank]) if rank else (R[:0], 0)
+    if singular or np.square(inverse).sum() * R.shape[1] * tolerance**2 >= 1:
+        values = _singular_values(R)
+        rank = int((values > tolerance * values.max(initial=0.0)).sum())
+    return rank
 
 
 def preferences(
-    parameters: Sequence[Parameter], sizes: Float64[np.ndarray, "*robots parameters"]
-) -> Float64[np.ndarray, "*robots parameters"]:
+    parameters: Sequence[Parameter], sizes: Float64[np.ndarray, " parameters"]
+) -> Float64[np.ndarray, " parameters"]:
     """How much parameters are wanted among those that are kept; their order decides ties, the earlier wins."""
     weights = np.array([_WEIGHT[parameter.group] for parameter in parameters])
     result: np.ndarray = weights * (1 + 1e-3 * (np.abs(sizes) > 1e-9) - 1e-6 * np.arange(len(weights)))
     return result
 
 
-def pivoted_triangles(
-    A: Float64[np.ndarray, "robots rows columns"],
-) -> tuple[Float64[np.ndarray, "robots rank columns"], Int64[np.ndarray, "robots columns"]]:
-    """Return R and the pivots of QR factorisations with column pivoting (LAPACK's `geqp3`), matrix by matrix."""
+def pivoted_triangle(
+    A: Float64[np.ndarray, "rows columns"],
+) -> tuple[Float64[np.ndarray, "rank columns"], Int64[np.ndarray, " columns"]]:
+    """Return R and the pivots of a QR factorisation with column pivoting (LAPACK's `geqp3`)."""
     from scipy.linalg.lapack import dgeqp3  # here, since models are loaded without scipy
 
-    factors = [dgeqp3(one)[:2] for one in A]
-    triangles = np.triu(np.stack([R[: A.shape[2]] for R, _ in factors]))
-    return triangles, np.stack([pivots for _, pivots in factors]).astype(np.int64) - 1
+    R, pivots = dgeqp3(A)[:2]
+    return np.triu(R[: A.shape[1]]), pivots.astype(np.int64) - 1
 
 
 def _dependencies(

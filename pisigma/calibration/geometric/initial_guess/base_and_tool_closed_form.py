@@ -127,10 +127,10 @@ def starts_from_positions(
 
 
 def start_from_products(
-    R_flange: Float64[Tensor, "*batch rows 3 3"],
-    p_flange: Float64[Tensor, "*batch rows 3"],
-    position: Float64[Tensor, "*batch rows 3"],
-) -> tuple[Float64[Tensor, "*batch 3 3"], Float64[Tensor, "*batch 3"], Float64[Tensor, "*batch 3"]]:
+    R_flange: Float64[Tensor, "rows 3 3"],
+    p_flange: Float64[Tensor, "rows 3"],
+    position: Float64[Tensor, "rows 3"],
+) -> tuple[Float64[Tensor, "3 3"], Float64[Tensor, " 3"], Float64[Tensor, " 3"]]:
     """Solve `position = R_base (R_flange · point + p_flange) + p_base` for base and point.
 
     Written out, every coordinate is linear in 13 unknowns: the products of `R_base`'s row with the point
@@ -139,9 +139,9 @@ def start_from_products(
     Returns:
         R_base, p_base [m], point [m].
     """
-    regressor = torch.cat([R_flange.flatten(-2), p_flange, torch.ones_like(p_flange[..., :1])], -1)
+    regressor = torch.cat([R_flange.flatten(1), p_flange, torch.ones_like(p_flange[:, :1])], 1)
     solution = _least_squares(regressor, position)
-    R_base = nearest_rotation(solution[..., 9:12, :].mT)
+    R_base = nearest_rotation(solution[9:12].mT)
     return R_base, *_translations(R_base, R_flange, p_flange, position)
 
 
@@ -188,8 +188,8 @@ def _procrustes(points: Tensor, position: Tensor, like: Tensor | None = None) ->
 
 
 def _least_squares(
-    A: Float64[Tensor, "*batch rows columns"], b: Float64[Tensor, "*batch rows values"]
-) -> Float64[Tensor, "*batch columns values"]:
+    A: Float64[Tensor, "rows columns"], b: Float64[Tensor, "rows values"]
+) -> Float64[Tensor, "columns values"]:
     """Solve `A x = b` in least squares; the shortest solution where columns depend on others.
 
     That needs singular values, which are not worked out where the inverse of the triangle is short enough to show that
@@ -197,30 +197,28 @@ def _least_squares(
     """
     Q, R = torch.linalg.qr(A)
     inverse = torch.linalg.solve_triangular(R, torch.eye(R.shape[-1]).to(R), upper=True)
-    condition = inverse.flatten(-2).norm(dim=-1) * R.flatten(-2).norm(dim=-1)
-    if not bool((condition < 1 / DEPENDENT).all()):
+    if not bool(inverse.norm() * R.norm() < 1 / DEPENDENT):
         inverse = torch.linalg.pinv(R, rtol=DEPENDENT)
     solution: Tensor = inverse @ (Q.mT @ b)
     return solution
 
 
 def _translations(
-    R_base: Float64[Tensor, "*batch 3 3"],
-    R_flange: Float64[Tensor, "*batch rows 3 3"],
-    p_flange: Float64[Tensor, "*batch rows 3"],
-    position: Float64[Tensor, "*batch rows 3"],
-) -> tuple[Float64[Tensor, "*batch 3"], Float64[Tensor, "*batch 3"]]:
+    R_base: Float64[Tensor, "3 3"],
+    R_flange: Float64[Tensor, "rows 3 3"],
+    p_flange: Float64[Tensor, "rows 3"],
+    position: Float64[Tensor, "rows 3"],
+) -> tuple[Float64[Tensor, " 3"], Float64[Tensor, " 3"]]:
     """Positions of base and tool for a fixed rotation of the base; they are linear then.
 
     In the base's axes the regressor of a row is `[1 R_flange]`, and rotations are orthogonal.
     """
     b = position @ R_base - p_flange
-    turns, same = R_flange.mean(-3), torch.eye(3).to(position).expand_as(R_base)
-    normal = torch.cat([torch.cat([same, turns], -1), torch.cat([turns.mT, same], -1)], -2)
-    seen = torch.einsum("...nij,...ni->...j", R_flange, b) / b.shape[-2]
-    descent = torch.cat([b.mean(-2), seen], -1)[..., None]
-    solution = torch.linalg.pinv(normal, rtol=1e-10, hermitian=True) @ descent
-    return (R_base @ solution[..., :3, :])[..., 0], solution[..., 3:, 0]
+    turns, same = R_flange.mean(0), torch.eye(3).to(position)
+    normal = torch.cat([torch.cat([same, turns], 1), torch.cat([turns.mT, same], 1)])
+    seen = torch.einsum("nij,ni->j", R_flange, b) / len(b)
+    solution = torch.linalg.pinv(normal, rtol=1e-10, hermitian=True) @ torch.cat([b.mean(0), seen])
+    return R_base @ solution[:3], solution[3:]
 
 
 def _cube_rotations(like: Tensor) -> Tensor:

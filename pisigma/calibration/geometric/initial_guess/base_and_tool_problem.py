@@ -130,7 +130,7 @@ class BaseToolProblem(AbstractLeastSquares[BaseToolState]):
 
     def renewed(
         self, linearisation: Linearisation[BaseToolState]
-    ) -> tuple[Linearisation[BaseToolState], Tensor]:
+    ) -> tuple[Linearisation[BaseToolState], bool]:
         """Weight positions and rotations by 1 / their own scatter, where no sigma is stated."""
         view = _view_of(linearisation)
         values = (3 * len(self.position), 3 * self._rotations)
@@ -140,8 +140,7 @@ class BaseToolProblem(AbstractLeastSquares[BaseToolState]):
             if not stated[k]:
                 noise[k] = max((part[2] / values[k]) ** 0.5, SMALLEST_NOISE)
         settled = all(abs(new / old - 1) < 1e-2 for new, old in zip(noise, view.noise, strict=True))
-        renewed = self._combined(linearisation.point, _View(view.blocks, (noise[0], noise[1])))
-        return renewed, torch.tensor(settled)
+        return self._combined(linearisation.point, _View(view.blocks, (noise[0], noise[1]))), settled
 
     def _combined(self, point: BaseToolState, view: "_View") -> Linearisation[BaseToolState]:
         noise = view.noise[: len(view.blocks)]

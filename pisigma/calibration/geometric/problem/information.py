@@ -89,10 +89,10 @@ class Information:
 
 def information(
     problem: CalibrationProblem,
-    point: Float64[Tensor, "*robots parameters"],
+    point: Float64[Tensor, " parameters"],
     candidates: list[int],
     view: SensorView | None = None,
-) -> list[Information]:
+) -> Information:
     """Condense the Jacobian at a point by QR factorisations, chunk by chunk.
 
     No normal equations are formed, so that singular values down to 1e-15 of the largest stay right.
@@ -102,40 +102,32 @@ def information(
         point: values of all parameters.
         candidates: indices of the parameters to look at.
         view: gives the rows' weights, in 1 / standard deviations; in 1/mm and 1/mrad where None.
-
-    Returns:
-        One of every robot.
     """
     index = torch.tensor(candidates, dtype=torch.int64, device=point.device)
-    roots: list[Tensor] = []
+    blocks: list[Tensor] = []
     unknowns = problem.space.sensor_unknowns(point)
     for rows in problem.chunks():
         motion = problem.motion(point, rows, index)
-        blocks = [roots.pop().t()] if roots and not problem.robots else []
         for k, sensor in enumerate(problem.sensors):
             J, r = (
                 problem.derivative(sensor, motion, unknowns, rows, index),
                 sensor.residual(motion, unknowns, rows),
             )
             weight = torch.full_like(r[0], 1e3) if view is None else _row_weights(problem, view, k, rows)
-            J, r, weight = problem.by_robot(J), problem.by_robot(r), problem.by_robot(weight)
             if not problem.measured_everywhere[k]:
-                present = sensor.present[rows][: weight.shape[-1]]
-                J, r, weight = J[..., present], r[..., present], weight[..., present]
-            block = r.new_empty((*r.shape[:-2], len(candidates) + 2, *r.shape[-2:]))
-            torch.mul(J, weight[..., None, None, :], out=block[..., :-2, :, :])
-            torch.mul(r, weight[..., None, :], out=block[..., -2, :, :])
-            block[..., -1, :, :] = weight[..., None, :]
-            blocks.append(block.flatten(-2))
-        roots.append(
-            torch.linalg.qr((torch.cat(blocks, -1) if len(blocks) > 1 else blocks[0]).mT, mode="r").R
-        )
+                present = sensor.present[rows]
+                J, r, weight = J[..., present], r[:, present], weight[present]
+            block = r.new_empty((len(candidates) + 2, *r.shape))
+            torch.mul(J, weight, out=block[:-2])
+            torch.mul(r, weight, out=block[-2])
+            block[-1] = weight
+            blocks.append(block.flatten(1))
+        blocks = [torch.linalg.qr(torch.cat(blocks, 1).t(), mode="r").R.t()]
     usual = np.append(problem.space.usual_errors[candidates], (1.0, 1.0))
     present = torch.stack([sensor.present for sensor in problem.sensors]).any(0)
-    poses, values = int(present[: problem.rows].sum()), sum(problem.values_measured)
     parameters = tuple(problem.space.parameters[i] for i in candidates)
-    of_each = (one for some in roots for one in some.view(-1, *some.shape[-2:]).cpu().numpy())
-    return [Information(parameters, one * usual, values, poses) for one in of_each]
+    root = blocks[0].t().cpu().numpy() * usual
+    return Information(parameters, root, sum(problem.values_measured), int(present.sum()))
 
 
 def _row_weights(
@@ -143,9 +135,9 @@ def _row_weights(
 ) -> Float64[Tensor, " poses"]:
     """1 / standard deviation of each row for a sensor, 0 where it saw nothing [1/m or 1/rad]."""
     sensor = problem.sensors[number]
-    distance = view.sums[number].distance / view.scale(number)[..., None]
+    distance = view.sums[number].distance[rows] / view.scales[number]
     root = problem.loss_of(sensor).weight(distance, sensor.components).sqrt()
-    root = (root / view.variance(number).sqrt()[..., None]).flatten()[rows]
+    root = root / view.variances[number].sqrt()
     if sensor.sigma is not None:
         root = root / sensor.sigma[rows]
     return torch.where(sensor.present[rows], root, 0.0)

@@ -2,17 +2,14 @@
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
 from typing import Generic, TypeVar
 
-import numpy as np
 import torch
-from jaxtyping import Float, Float64, Int64
+from jaxtyping import Float, Float64
 from torch import Tensor
 
-from pisigma.calibration.geometric.problem.robots import in_order, of_robots, with_robots
 from pisigma.files.errors import IdentificationError
 
 Point = TypeVar("Point")
@@ -45,7 +42,7 @@ class SolutionStatus(Enum):
 
 @dataclass(frozen=True, eq=False)
 class Linearisation(Generic[Point]):
-    """A least-squares problem linearised from one point, with cost `Σ (r / sigma)²`; or those of several robots.
+    """A least-squares problem linearised from one point, with cost `Σ (r / sigma)²`.
 
     Attributes:
         point: where.
@@ -58,16 +55,16 @@ class Linearisation(Generic[Point]):
     """
 
     point: Point
-    cost: Float[Tensor, "*robots"]
-    descent: Float[Tensor, "*robots unknowns"]
-    normal: Float[Tensor, "*robots unknowns unknowns"]
-    misfit: Float[Tensor, "*robots"]
-    rounding: Float[Tensor, "*robots"]
+    cost: Float[Tensor, ""]
+    descent: Float[Tensor, " unknowns"]
+    normal: Float[Tensor, "unknowns unknowns"]
+    misfit: Float[Tensor, ""]
+    rounding: Float[Tensor, ""]
     detail: object
 
 
 class AbstractLeastSquares(ABC, Generic[Point]):
-    """What the solver needs to know of a problem, which may be those of several robots side by side."""
+    """What the solver needs to know of a problem."""
 
     @abstractmethod
     def linearise(self, point: Point, like: Linearisation[Point] | None) -> Linearisation[Point]:
@@ -78,11 +75,11 @@ class AbstractLeastSquares(ABC, Generic[Point]):
         return self.renewed(self.linearise(point, None))[0]
 
     @abstractmethod
-    def renewed(self, linearisation: Linearisation[Point]) -> tuple[Linearisation[Point], Tensor]:
-        """The same with the noise estimated from its residuals, and whether the noise has settled, `*robots`."""
+    def renewed(self, linearisation: Linearisation[Point]) -> tuple[Linearisation[Point], bool]:
+        """The same with the noise estimated from its residuals, and whether the noise has settled."""
 
     @abstractmethod
-    def moved(self, point: Point, step: Float[Tensor, "*robots unknowns"]) -> Point:
+    def moved(self, point: Point, step: Float[Tensor, " unknowns"]) -> Point:
         """The point after a step."""
 
     @property
@@ -90,36 +87,9 @@ class AbstractLeastSquares(ABC, Generic[Point]):
     def step_scale(self) -> Float[Tensor, " unknowns"]:
         """A usual size of every unknown, which the damping is measured with."""
 
-    def rms(self, linearisation: Linearisation[Point]) -> Float[Tensor, "*robots"]:
+    def rms(self, linearisation: Linearisation[Point]) -> Float[Tensor, ""]:
         """A size of the residuals, by which the path of a search is shown; in standard deviations unless said."""
         return linearisation.misfit.sqrt()
-
-    def of_robots(self, robots: Int64[Tensor, " chosen"]) -> "AbstractLeastSquares[Point]":
-        """The problem of some of its robots; that of one robot is the same whichever are chosen.
-
-        Args:
-            robots: numbers of those that are kept.
-        """
-        return self
-
-
-@dataclass(frozen=True)
-class SearchEnd:
-    """How the search for one robot ended.
-
-    Attributes:
-        iterations: steps tried.
-        status: why it ended.
-        path: size of the residuals at every point passed, the start first; see `AbstractLeastSquares.rms`.
-    """
-
-    iterations: int
-    status: SolutionStatus
-    path: tuple[float, ...]
-
-    def before(self, other: "SearchEnd") -> "SearchEnd":
-        """The end of a search that went on from this one."""
-        return SearchEnd(self.iterations + other.iterations, other.status, self.path + other.path[1:])
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,34 +98,25 @@ class Solution(Generic[Point]):
 
     Attributes:
         linearisation: the problem seen from the end point, the noise renewed.
-        ends: how it ended for every robot.
+        iterations: steps tried.
+        status: why the search ended.
+        path: size of the residuals at every point passed, the start first; see `AbstractLeastSquares.rms`.
     """
 
     linearisation: Linearisation[Point]
-    ends: tuple[SearchEnd, ...]
+    iterations: int
+    status: SolutionStatus
+    path: tuple[float, ...]
 
-    @property
-    def iterations(self) -> int:
-        """Steps tried, most of all robots."""
-        return max(end.iterations for end in self.ends)
-
-    @property
-    def status(self) -> SolutionStatus:
-        """Why the search for one robot ended."""
-        (end,) = self.ends
-        return end.status
-
-    @property
-    def path(self) -> tuple[float, ...]:
-        """Size of one robot's residuals at every point passed, the start first."""
-        (end,) = self.ends
-        return end.path
+    def before(self, other: "Solution[Point]") -> "Solution[Point]":
+        """The end of a search that went on from where this one ended."""
+        return replace(other, iterations=self.iterations + other.iterations, path=self.path + other.path[1:])
 
 
 def levenberg_marquardt(
     problem: AbstractLeastSquares[Point],
     start: Point | Linearisation[Point],
-    maximum_iterations: int | Sequence[int] = 50,
+    maximum_iterations: int = 50,
     close_enough: float = 0.0,
 ) -> Solution[Point]:
     """Minimise by Levenberg-Marquardt steps `(normal + damping / step_scale²) step = descent`.
@@ -167,12 +128,10 @@ def levenberg_marquardt(
     left and met again that way; if the best cost is not undercut by then, the search goes back there with a
     hundredfold damping (watchdog technique, Chamberlain et al. 1982).
 
-    Several robots go side by side, each with its own damping and its own end, as if each were searched for alone.
-
     Args:
         problem: what to minimise.
         start: where to begin, or the problem as already seen from there.
-        maximum_iterations: steps tried at most; of all robots, or of each.
+        maximum_iterations: steps tried at most.
         close_enough: length [standard errors] of a step that is not taken any more; the search has converged then.
 
     Returns:
@@ -180,166 +139,91 @@ def levenberg_marquardt(
     """
     first = problem.renewed(start)[0] if isinstance(start, Linearisation) else problem.begin(start)
     search = _Search(problem, first)
-    limits = np.broadcast_to(np.array(maximum_iterations), len(search.robots))
-    while len(search.robots):
-        search.end(limits[search.robots] <= search.iterations, SolutionStatus.ITERATION_LIMIT)
-        if len(search.robots):
-            search.propose()
-            near = search.at_best & (search.decrement < close_enough**2)
-            search.end(near, SolutionStatus.CONVERGED)
-        if len(search.robots):
-            search.go()
-    return Solution(in_order(*zip(*search.ended, strict=True)), tuple(search.ends))
+    status: SolutionStatus | None = None
+    while status is None and search.iterations < maximum_iterations:
+        search.propose()
+        near = search.at_best and search.decrement < close_enough**2
+        status = SolutionStatus.CONVERGED if near else search.go()
+    ended = status or SolutionStatus.ITERATION_LIMIT
+    return Solution(search.best, search.iterations, ended, tuple(search.path))
 
 
 class _Search(Generic[Point]):
-    """The searches that go on; arrays have one entry for each of them.
+    """A search that goes on.
 
     Attributes:
-        robots: whose searches they are, their numbers among all.
-        ended: the best points where searches have ended, and the numbers of their robots.
-        ends: how the searches have ended.
-        best: the best points.
-        here: where the next steps start.
-        at_best: whether those are the best points.
+        best: the best point.
+        here: where the next step starts.
+        at_best: whether that is the best point.
         iterations: steps tried.
         decrement: by how much the next step lowers the cost if the problem is linear [squared standard errors].
+        path: size of the residuals at every point passed.
     """
 
     def __init__(self, problem: AbstractLeastSquares[Point], best: Linearisation[Point]) -> None:
         self.problem, self.here, self.best = problem, best, best
-        self.ended: list[tuple[Linearisation[Point], Tensor]] = []
-        count = best.cost.numel()
-        self.robots, self.iterations = np.arange(count), 0
-        self.at_best, self.uphill = np.ones(count, dtype=bool), np.zeros(count, dtype=np.int64)
-        self.damping, self.decrement, self.step = np.full(count, START_DAMPING), np.zeros(count), best.descent
-        self.ends = [SearchEnd(0, SolutionStatus.ITERATION_LIMIT, (rms,)) for rms in self._rms()]
+        self.iterations, self.at_best, self.uphill = 0, True, 0
+        self.damping, self.decrement, self.step = START_DAMPING, 0.0, best.descent
+        self.path = [float(problem.rms(best))]
 
     def propose(self) -> None:
-        """Work out the next steps."""
-        damping = torch.from_numpy(self.damping).to(self.best.cost).view_as(self.best.cost)
-        self.step = solve_damped(self.here, self.problem.step_scale, damping)
-        self.decrement = _array(_product(self.here.normal, self.step).mul_(self.step).sum(-1))
+        """Work out the next step."""
+        self.step = solve_damped(self.here, self.problem.step_scale, self.damping)
+        self.decrement = float((self.here.normal @ self.step) @ self.step)
 
-    def go(self) -> None:
-        """Take the steps; end the searches that are over, and decide where the others go on."""
+    def go(self) -> SolutionStatus | None:
+        """Take the step, and decide where to go on, or why the search is over."""
         self.iterations += 1
         there = self.problem.linearise(self.problem.moved(self.here.point, self.step), self.best)
-        lower, over = _array(there.cost <= self.best.cost), np.full(len(self.robots), None, dtype=object)
-        settled = self._descend(there) if lower.all() else self._climb_or_descend(there, lower, over)
-        for robot, rms, passed in zip(self.robots, self._rms(), lower, strict=True):
-            if passed:
-                self.ends[robot] = replace(self.ends[robot], path=(*self.ends[robot].path, rms))
-        over[lower & settled & (self.decrement <= SHORTEST_STEP**2)] = SolutionStatus.CONVERGED
-        over[lower & _array(self.best.misfit <= self.best.rounding)] = SolutionStatus.EXACT
-        self.end(over.astype(bool), over)
+        if not bool(there.cost <= self.best.cost):
+            return self._climb(there)
+        settled = self._descend(there)
+        if bool(self.best.misfit <= self.best.rounding):
+            return SolutionStatus.EXACT
+        return SolutionStatus.CONVERGED if settled and self.decrement <= SHORTEST_STEP**2 else None
 
-    def _descend(self, there: Linearisation[Point]) -> np.ndarray:
-        """Go on from where all costs are lower, and say where the noise has settled."""
-        settled = np.ones(len(self.robots), dtype=bool)
+    def _descend(self, there: Linearisation[Point]) -> bool:
+        """Go on from where the cost is lower, and say whether the noise has settled."""
+        settled = True
         if self.iterations <= SWINGING:
-            there, now = self.problem.renewed(there)
-            settled = _array(now)
+            there, settled = self.problem.renewed(there)
         self.best = self.here = there
-        self.damping = np.maximum(self.damping / 10, SMALLEST_DAMPING)
-        self.uphill, self.at_best = np.zeros_like(self.uphill), np.ones_like(self.at_best)
+        self.damping = max(self.damping / 10, SMALLEST_DAMPING)
+        self.uphill, self.at_best = 0, True
+        self.path.append(float(self.problem.rms(there)))
         return settled
 
-    def _climb_or_descend(
-        self, there: Linearisation[Point], lower: np.ndarray, over: np.ndarray
-    ) -> np.ndarray:
-        """Go on from lower costs, follow higher ones or go back; say where the noise has settled, and what is over."""
-        small = (self.decrement <= SHORTEST_STEP**2) | (self.decrement <= 1e-10 * _array(self.best.cost))
-        over[~lower & (self.damping > LARGEST_DAMPING)] = SolutionStatus.STALLED
-        over[~lower & self.at_best & small] = SolutionStatus.CONVERGED
-        over[~lower & _array(self.best.misfit <= 1e4 * self.best.rounding)] = SolutionStatus.EXACT
+    def _climb(self, there: Linearisation[Point]) -> SolutionStatus | None:
+        """Follow a higher cost or go back, or say why the search is over."""
+        small = self.decrement <= max(SHORTEST_STEP**2, 1e-10 * float(self.best.cost))
+        if bool(self.best.misfit <= 1e4 * self.best.rounding):
+            return SolutionStatus.EXACT
+        if self.at_best and small:
+            return SolutionStatus.CONVERGED
+        if self.damping > LARGEST_DAMPING:
+            return SolutionStatus.STALLED
         # there is no descent such as where a loss rejects every row
-        going = np.isfinite(_array(there.cost)) & _array(there.descent.any(-1))
-        climbing = ~lower & (over == None) & (self.uphill < PATIENCE) & going  # noqa: E711 - of every entry
-        there, settled = self._renewed(there, climbing | (lower & (self.iterations <= SWINGING)))
-        self.best = _where(lower, there, self.best)
-        self.here = _where(climbing, there, self.best)
-        back = np.where(climbing, self.damping, np.maximum(100 * self.damping, 0.1))
-        self.damping = np.where(lower, np.maximum(self.damping / 10, SMALLEST_DAMPING), back)
-        self.uphill, self.at_best = np.where(climbing, self.uphill + 1, 0), ~climbing
-        return settled
-
-    def end(self, ended: np.ndarray, status: SolutionStatus | np.ndarray) -> None:
-        """End some of the searches, all by one status or each by its own, and go on with the others."""
-        if not ended.any():
-            return
-        reasons = np.broadcast_to(np.array(status, dtype=object), len(ended))
-        for robot, reason in zip(self.robots[ended], reasons[ended], strict=True):
-            self.ends[robot] = replace(self.ends[robot], iterations=self.iterations, status=reason)
-        numbers, left = torch.from_numpy(np.flatnonzero(ended)), torch.from_numpy(np.flatnonzero(~ended))
-        best = of_robots(self.best, numbers) if len(left) else self.best
-        self.ended.append((best, torch.from_numpy(self.robots[ended])))
-        self.robots = self.robots[~ended]
-        if len(left):
-            self.problem, same = self.problem.of_robots(left), self.here is self.best
-            self.best, self.step = of_robots((self.best, self.step), left)
-            self.here = self.best if same else of_robots(self.here, left)
-            for name in ("at_best", "uphill", "damping", "decrement"):
-                setattr(self, name, getattr(self, name)[~ended])
-
-    def _renewed(
-        self, there: Linearisation[Point], chosen: np.ndarray
-    ) -> tuple[Linearisation[Point], np.ndarray]:
-        """Renew the noise of the chosen, and say where it has settled; that of the others stays as it is."""
-        settled = np.ones(len(chosen), dtype=bool)
-        if chosen.all():
-            renewed, now = self.problem.renewed(there)
-        elif chosen.any():
-            robots = torch.from_numpy(np.flatnonzero(chosen))
-            renewed, now = self.problem.of_robots(robots).renewed(of_robots(there, robots))
-            renewed = with_robots(there, robots, renewed)
+        going = math.isfinite(float(there.cost)) and bool(there.descent.any())
+        self.at_best = not (going and self.uphill < PATIENCE)
+        if self.at_best:
+            self.here, self.uphill, self.damping = self.best, 0, max(100 * self.damping, 0.1)
         else:
-            return there, settled
-        settled[chosen] = _array(now)
-        return renewed, settled
-
-    def _rms(self) -> list[float]:
-        """Size of the residuals at the best points."""
-        sizes: list[float] = _array(self.problem.rms(self.best)).tolist()
-        return sizes
-
-
-def _array(values: Tensor) -> np.ndarray:
-    """One entry for each search."""
-    array: np.ndarray = values.reshape(-1).cpu().numpy()
-    return array
-
-
-def _product(
-    matrix: Float[Tensor, "*robots rows columns"], vector: Float[Tensor, "*robots columns"]
-) -> Tensor:
-    return (matrix @ vector[..., None])[..., 0]
-
-
-def _where(
-    chosen: np.ndarray, these: Linearisation[Point], those: Linearisation[Point]
-) -> Linearisation[Point]:
-    """Return these linearisations for the chosen robots, and those for all others."""
-    if chosen.all():
-        return these
-    if not chosen.any():
-        return those
-    robots = torch.from_numpy(np.flatnonzero(chosen))
-    return with_robots(those, robots, of_robots(these, robots))
+            self.here, self.uphill = self.problem.renewed(there)[0], self.uphill + 1
+        return None
 
 
 def solve_damped(
     linearisation: Linearisation[Point],
     step_scale: Float[Tensor, " unknowns"],
-    damping: Float[Tensor, "*robots"],
-) -> Float[Tensor, "*robots unknowns"]:
+    damping: float,
+) -> Float[Tensor, " unknowns"]:
     """Solve `(normal + damping / step_scale²) step = descent` by Cholesky with column scaling.
 
     Raises:
         IdentificationError: they are not finite.
     """
     normal, descent = linearisation.normal, linearisation.descent
-    diagonal = normal.diagonal(dim1=-2, dim2=-1)
+    diagonal = normal.diagonal()
     # a product of two columns is finite where their squares are
     if not math.isfinite(float((diagonal + descent).sum())):
         raise IdentificationError(
@@ -347,32 +231,25 @@ def solve_damped(
             "the measurements."
         )
     while True:
-        damped = torch.addcdiv(diagonal, damping[..., None], step_scale.square())
+        damped = diagonal + damping / step_scale.square()
         scale = damped.rsqrt()
-        scaled = normal * (scale[..., None, :] * scale[..., None])
-        scaled.diagonal(dim1=-2, dim2=-1).copy_(damped * scale.square() + 1e-14)
+        scaled = normal * (scale * scale[:, None])
+        scaled.diagonal().copy_(damped * scale.square() + 1e-14)
         factor, failed = torch.linalg.cholesky_ex(scaled)
-        if not bool(failed.any()):
-            solved = torch.cholesky_solve((scale * descent)[..., None], factor)[..., 0]
+        if not bool(failed):
+            solved = torch.cholesky_solve((scale * descent)[:, None], factor)[:, 0]
             return scale * solved
-        damping = torch.where(failed > 0, (10 * damping).clamp(min=1e-6), damping)
+        damping = max(10 * damping, 1e-6)
 
 
-def covariance_of(
-    normal: Float64[Tensor, "*robots active active"],
-) -> Float64[Tensor, "*robots active active"]:
+def covariance_of(normal: Float64[Tensor, "active active"]) -> Float64[Tensor, "active active"]:
     """Invert a normal matrix, with column scaling; directions that it does not hold get no variance."""
-    diagonal = normal.diagonal(dim1=-2, dim2=-1)
+    diagonal = normal.diagonal()
     scale = diagonal.masked_fill(diagonal <= 0, 1.0).rsqrt_()
-    scales = scale[..., None, :] * scale[..., None]
+    scales = scale * scale[:, None]
     scaled = normal * scales
     factor, failed = torch.linalg.cholesky_ex(scaled)
-    clear = (factor.diagonal(dim1=-2, dim2=-1) > 1e-6).all(-1)
-    if bool(clear.all()) and not bool(failed.any()):
+    if not bool(failed) and bool((factor.diagonal() > 1e-6).all()):
         return torch.cholesky_inverse(factor).mul_(scales)
-    clear &= failed == 0
-    inverse = torch.linalg.pinv(scaled, rtol=1e-12, hermitian=True)
-    if bool(clear.any()):
-        inverse[clear] = torch.cholesky_inverse(factor[clear])
-    covariance: Tensor = inverse * scales
+    covariance: Tensor = torch.linalg.pinv(scaled, rtol=1e-12, hermitian=True) * scales
     return covariance

@@ -7,7 +7,7 @@ from functools import cached_property
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float64, Int64
+from jaxtyping import Float64, Int64
 from torch import Tensor
 
 from pisigma.calibration.geometric.problem.least_squares import Linearisation
@@ -36,33 +36,31 @@ class SensorSums:
         descent: `Σ w J r / sigma_row²`.
         residual: measured minus predicted, 0 where nothing was measured [m or rad].
         distance: length of the residual over sigma_row, 0 where nothing was measured.
-        measured: number of rows of a robot that were measured.
+        measured: number of rows that were measured.
     """
 
-    normal: Float64[Tensor, "*robots active active"]
-    descent: Float64[Tensor, "*robots active"]
-    residual: Float64[Tensor, "*robots components rows"]
-    distance: Float64[Tensor, "*robots rows"]
+    normal: Float64[Tensor, "active active"]
+    descent: Float64[Tensor, " active"]
+    residual: Float64[Tensor, "components rows"]
+    distance: Float64[Tensor, " rows"]
     measured: int
 
     @property
-    def rms(self) -> Float64[Tensor, "*robots"]:
+    def rms(self) -> Float64[Tensor, ""]:
         """Root mean square of the residuals' lengths [m or rad]."""
-        sizes: Tensor = torch.linalg.vector_norm(self.residual, dim=(-2, -1))
-        return sizes / math.sqrt(max(self.measured, 1))
+        size: Tensor = torch.linalg.vector_norm(self.residual)
+        return size / math.sqrt(max(self.measured, 1))
 
 
 def joined_sums(chunks: Sequence[SensorSums]) -> SensorSums:
-    """Add up what a sensor contributes in chunks of rows, one behind the other; chunks of robots stand side by side."""
+    """Add up what a sensor contributes in chunks of rows, one behind the other."""
     first, *others = chunks
     if not others:
         return first
-    robots = first.distance.ndim > 1
-    normals, descents = [sums.normal for sums in chunks], [sums.descent for sums in chunks]
     return SensorSums(
-        normal=torch.cat(normals) if robots else torch.stack(normals).sum(0),
-        descent=torch.cat(descents) if robots else torch.stack(descents).sum(0),
-        residual=torch.cat([sums.residual for sums in chunks], 0 if robots else -1),
+        normal=torch.stack([sums.normal for sums in chunks]).sum(0),
+        descent=torch.stack([sums.descent for sums in chunks]).sum(0),
+        residual=torch.cat([sums.residual for sums in chunks], 1),
         distance=torch.cat([sums.distance for sums in chunks]),
         measured=first.measured,
     )
@@ -84,39 +82,31 @@ class SensorView:
     """
 
     sums: tuple[SensorSums, ...]
-    noise: Float64[Tensor, "*robots sensors"]
-    repetition: Float64[Tensor, "*robots sensors"]
-    disagreement: Float64[Tensor, "*robots sensors"]
-    prior_scale: Float64[Tensor, "*robots groups"]
+    noise: Float64[Tensor, " sensors"]
+    repetition: Float64[Tensor, " sensors"]
+    disagreement: Float64[Tensor, " sensors"]
+    prior_scale: Float64[Tensor, " groups"]
 
     @staticmethod
     def without_noise(sums: tuple[SensorSums, ...]) -> "SensorView":
         """All sensors as if their values had a standard deviation of 1, the prior being as stated."""
-        ones = sums[0].normal.new_ones((*sums[0].descent.shape[:-1], max(len(sums), len(PriorGroup))))
-        sensors = ones[..., : len(sums)]
-        return SensorView(sums, sensors, sensors, sensors, ones[..., : len(PriorGroup)])
+        ones = sums[0].normal.new_ones(max(len(sums), len(PriorGroup)))
+        sensors = ones[: len(sums)]
+        return SensorView(sums, sensors, sensors, sensors, ones[: len(PriorGroup)])
 
     @cached_property
-    def scales(self) -> Float64[Tensor, "*robots sensors"]:
+    def scales(self) -> Float64[Tensor, " sensors"]:
         """What distances are divided by for the loss."""
         return self.noise.clamp(min=ALWAYS_GOOD)
 
-    def scale(self, sensor: int) -> Float64[Tensor, "*robots"]:
-        """What a sensor's distances are divided by for the loss."""
-        return self.scales[..., sensor]
-
     @cached_property
-    def variances(self) -> Float64[Tensor, "*robots sensors"]:
+    def variances(self) -> Float64[Tensor, " sensors"]:
         """What the sensors' sums are divided by."""
         return self.noise.square() * self.repetition * self.disagreement
 
-    def variance(self, sensor: int) -> Float64[Tensor, "*robots"]:
-        """What a sensor's sums are divided by."""
-        return self.variances[..., sensor]
-
     def scaled(
         self, precision: Float64[Tensor, " active"], group: Int64[Tensor, " active"]
-    ) -> Float64[Tensor, "*robots active"]:
+    ) -> Float64[Tensor, " active"]:
         """1 / variance of parameters by the prior at its present scale."""
         return scaled_precision(precision, group, self.prior_scale)
 
@@ -128,20 +118,20 @@ def view_of(linearisation: Linearisation[Tensor]) -> SensorView:
 
 
 def values_used(
-    view: SensorView, covariance: Float64[Tensor, "*robots active active"]
-) -> Float64[Tensor, "*robots sensors"]:
+    view: SensorView, covariance: Float64[Tensor, "active active"]
+) -> Float64[Tensor, " sensors"]:
     """How many values of every sensor the parameters use up (Förstner 1979); the prior spares some."""
-    used = [(sums.normal * covariance).sum((-2, -1)) for sums in view.sums]
-    return torch.stack(used, -1) / view.variances
+    used = [(sums.normal * covariance).sum() for sums in view.sums]
+    return torch.stack(used) / view.variances
 
 
 def loss_scale(
     sensors: Sequence[AbstractSensor],
     loss: AbstractLoss,
     view: SensorView,
-    used: Float64[Tensor, "*robots sensors"],
+    used: Float64[Tensor, " sensors"],
     refine: bool,
-) -> Float64[Tensor, "*robots sensors"]:
+) -> Float64[Tensor, " sensors"]:
     """Standard deviation of every sensor's values, or factor of 1 or more on those that its rows give.
 
     `refine` uses all good rows instead of the median.
@@ -149,28 +139,26 @@ def loss_scale(
     scales = []
     for k, sensor in enumerate(sensors):
         if sensor.certain:
-            scales.append(torch.ones_like(used[..., k]))
+            scales.append(torch.ones_like(used[k]))
             continue
         distance = view.sums[k].distance
-        if view.sums[k].measured < distance.shape[-1]:
-            distance = distance[..., sensor.present[: distance.shape[-1]]]
+        if view.sums[k].measured < len(distance):
+            distance = distance[sensor.present]
         if refine:
-            scale = loss.deviation(distance, sensor.components, used[..., k], view.scale(k))
+            scale = loss.deviation(distance, sensor.components, used[k], view.scales[k])
         else:
-            scale = loss.scale(distance, sensor.components, used[..., k])
+            scale = loss.scale(distance, sensor.components, used[k])
         scales.append(scale.clamp(min=SMALLEST_NOISE if sensor.sigma is None else 1.0))
-    return torch.stack(scales, -1)
+    return torch.stack(scales)
 
 
-def rejecting(
-    sensors: Sequence[AbstractSensor], losses: Sequence[AbstractLoss], view: SensorView
-) -> Bool[Tensor, "*robots"]:
+def rejecting(sensors: Sequence[AbstractSensor], losses: Sequence[AbstractLoss], view: SensorView) -> bool:
     """Say whether the loss rejects any row of a sensor."""
-    rejected = [
-        loss.weight(sums.distance / view.scale(k)[..., None], sensor.components) == 0
-        for k, (sensor, loss, sums) in enumerate(zip(sensors, losses, view.sums, strict=True))
-    ]
-    return torch.stack(rejected).any(0).any(-1)
+    of_each = zip(sensors, losses, view.sums, view.scales, strict=True)
+    return any(
+        bool((loss.weight(sums.distance / scale, sensor.components) == 0).any())
+        for sensor, loss, sums, scale in of_each
+    )
 
 
 def renumbered(keys: Int64[Tensor, " rows"]) -> Int64[Tensor, " rows"]:
@@ -183,10 +171,10 @@ def group_variance_ratio(
     sensors: Sequence[AbstractSensor],
     loss: AbstractLoss,
     view: SensorView,
-    used: Float64[Tensor, "*robots sensors"],
-    pose: Int64[Tensor, "*robots rows"] | None,
-    configuration: Int64[Tensor, "*robots rows"] | None = None,
-) -> Float64[Tensor, "*robots sensors"]:
+    used: Float64[Tensor, " sensors"],
+    pose: Int64[Tensor, " rows"] | None,
+    configuration: Int64[Tensor, " rows"] | None = None,
+) -> Float64[Tensor, " sensors"]:
     """Variance of the poses' mean residuals over that of independent rows (Kish 1965: design effect).
 
     Targets on one tool share what the model gets wrong with the joints; by how much the mean residuals of
@@ -202,32 +190,31 @@ def group_variance_ratio(
     """
     ratios = []
     for k, (sensor, sums) in enumerate(zip(sensors, view.sums, strict=True)):
-        ratio = torch.ones_like(used[..., k])
+        ratio = torch.ones_like(used[k])
         ratios.append(ratio)
         if sensor.certain:
             continue
-        present = sensor.present.view_as(sums.distance)
-        weight = loss.weight(sums.distance / view.scale(k)[..., None], sensor.components) * present
+        weight = loss.weight(sums.distance / view.scales[k], sensor.components) * sensor.present
         if sensor.sigma is not None:
-            weight = torch.where(present, weight / sensor.sigma.view_as(weight).square(), 0.0)
+            weight = torch.where(sensor.present, weight / sensor.sigma.square(), 0.0)
         square, values = _group_squares(sums.residual, weight, pose)
         if pose is not None:
-            left = (values - used[..., k]).clamp(min=1.0)
-            ratio = (square / left / view.noise[..., k].square()).clamp(min=1.0)
+            left = (values - used[k]).clamp(min=1.0)
+            ratio = (square / left / view.noise[k].square()).clamp(min=1.0)
         if configuration is not None:
             shared, fewer = _group_squares(sums.residual, weight, configuration)
             larger = ((shared / fewer) / (square / values)).clamp(min=1.0)
             ratio = torch.where(square > 0, ratio * larger, ratio)
         ratios[-1] = ratio
-    return torch.stack(ratios, -1)
+    return torch.stack(ratios)
 
 
 def angle_disagreement(
     sensors: Sequence[AbstractSensor],
     view: SensorView,
-    held: Float64[Tensor, "*robots active"],
-    pull: Float64[Tensor, "*robots active"],
-) -> Float64[Tensor, "*robots sensors"]:
+    held: Float64[Tensor, " active"],
+    pull: Float64[Tensor, " active"],
+) -> Float64[Tensor, " sensors"]:
     """Estimate by which factor the variance of measured angles is to be enlarged, per sensor.
 
     What the geometry does not explain of orientations, such as the wobble of a wrist, depends on the pose. Rows taken
@@ -248,9 +235,9 @@ def angle_disagreement(
     lengths = [sensor.unit != "rad" and not sensor.certain for sensor in sensors]
     if not any(angular) or not any(lengths):
         return torch.ones_like(view.noise)
-    variance = (view.noise.square() * view.repetition)[..., None]
-    normals = [sums.normal / variance[..., k, :, None] for k, sums in enumerate(view.sums)]
-    descents = [sums.descent / variance[..., k, :] for k, sums in enumerate(view.sums)]
+    variance = view.noise.square() * view.repetition
+    normals = [sums.normal / variance[k] for k, sums in enumerate(view.sums)]
+    descents = [sums.descent / variance[k] for k, sums in enumerate(view.sums)]
     zero = torch.zeros_like(normals[0]), torch.zeros_like(pull)
     by_lengths, by_angles = (
         (
@@ -260,10 +247,8 @@ def angle_disagreement(
         for which in (False, True)
     )
     systems = (by_lengths[0], by_lengths[1] + pull, *by_angles, held)
-    arrays = (value.reshape(-1, *value.shape[pull.ndim - 1 :]).cpu().numpy() for value in systems)
-    factors = [_angle_disagreement(*system) for system in zip(*arrays, strict=True)]
-    factor = pull.new_tensor(factors).view(pull.shape[:-1])[..., None]
-    return torch.where(torch.tensor(angular, device=pull.device), factor, 1.0)
+    factor = _angle_disagreement(*(value.cpu().numpy() for value in systems))
+    return pull.new_tensor([factor if angle else 1.0 for angle in angular])
 
 
 def _angle_disagreement(
@@ -273,7 +258,7 @@ def _angle_disagreement(
     angles: Float64[np.ndarray, " active"],
     held: Float64[np.ndarray, " active"],
 ) -> float:
-    """Return the factor of one robot: normal matrix and descent by lengths, the same by angles, and the prior."""
+    """Return the factor: normal matrix and descent by lengths, the same by angles, and the prior."""
     A = Q + np.diag(held)
     scale = (A + R).diagonal()
     scale = 1 / np.sqrt(np.where(scale > 0, scale, 1.0))
@@ -300,19 +285,17 @@ def _angle_disagreement(
 
 
 def _group_squares(
-    residual: Float64[Tensor, "*robots components rows"],
-    weight: Float64[Tensor, "*robots rows"],
-    group: Int64[Tensor, "*robots rows"] | None,
-) -> tuple[Float64[Tensor, "*robots"], Int64[Tensor, "*robots"]]:
+    residual: Float64[Tensor, "components rows"],
+    weight: Float64[Tensor, " rows"],
+    group: Int64[Tensor, " rows"] | None,
+) -> tuple[Float64[Tensor, ""], Int64[Tensor, ""]]:
     """Sum of the squared mean residuals of groups of rows, by weight, and of how many values it is."""
-    components = residual.shape[-2]
+    components = residual.shape[0]
     if group is None:
-        square = (residual.square() * weight[..., None, :]).sum((-2, -1))
-        return square, (weight > 0).sum(-1) * components
+        return (residual.square() * weight).sum(), (weight > 0).sum() * components
     groups = int(group.max()) + 1
-    total = weight.new_zeros((*weight.shape[:-1], groups)).scatter_add(-1, group, weight)
-    weighted, index = residual * weight[..., None, :], group[..., None, :].expand_as(residual)
-    summed = torch.zeros_like(total)[..., None, :].repeat_interleave(components, -2)
-    squares = summed.scatter_add(-1, index, weighted).square().sum(-2) / total
+    total = weight.new_zeros(groups).scatter_add(0, group, weight)
+    summed = residual.new_zeros((components, groups)).index_add(1, group, residual * weight)
+    squares = summed.square().sum(0) / total
     measured = total > 0
-    return torch.where(measured, squares, 0.0).sum(-1), measured.sum(-1) * components
+    return torch.where(measured, squares, 0.0).sum(), measured.sum() * components

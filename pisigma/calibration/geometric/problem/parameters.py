@@ -241,21 +241,18 @@ class ParameterSpace:
         return torch.from_numpy(np.concatenate([block.ravel() for block in blocks]))
 
     def split(
-        self, values: Float64[Tensor, "*robots parameters"]
+        self, values: Float64[Tensor, " parameters"]
     ) -> tuple[
-        Float64[Tensor, "*robots rows 5"],
-        Float64[Tensor, "*robots frames 6"],
-        Float64[Tensor, "*robots targets 6"],
+        Float64[Tensor, "rows 5"],
+        Float64[Tensor, "frames 6"],
+        Float64[Tensor, "targets 6"],
     ]:
-        """Rows, bases and tools of a vector of all parameters, or of one a robot."""
-        bases, tools = (values[..., self.of(group).start : self.of(group).stop] for group in ("base", "tool"))
-        arm = values[..., : self.arm_size]
-        blocks = ((arm, 5), (bases, 6), (tools, 6))
-        rows, frames, targets = (block.reshape(*block.shape[:-1], -1, size) for block, size in blocks)
-        return rows, frames, targets
+        """Rows, bases and tools of a vector of all parameters."""
+        bases, tools = (values[self.of(group).start : self.of(group).stop] for group in ("base", "tool"))
+        return values[: self.arm_size].view(-1, 5), bases.view(-1, 6), tools.view(-1, 6)
 
-    def sensor_unknowns(self, values: Float64[Tensor, "*robots parameters"]) -> Unknowns:
-        """What a vector of all parameters says of the sensors' unknowns, which several robots side by side lack."""
+    def sensor_unknowns(self, values: Float64[Tensor, " parameters"]) -> Unknowns:
+        """What a vector of all parameters says of the sensors' unknowns."""
         return {
             own.name: values[self.of(own.name).start : self.of(own.name).stop].view(-1, len(own.columns)).t()
             for own in self.unknowns

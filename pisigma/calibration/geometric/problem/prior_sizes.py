@@ -53,9 +53,9 @@ def prior_group_of(column: str, drawn: bool) -> int:
 def effective_parameters(
     precision: Float64[Tensor, " active"],
     group: Int64[Tensor, " active"],
-    prior_scale: Float64[Tensor, "*robots groups"],
-    covariance: Float64[Tensor, "*robots active active"],
-) -> Float64[Tensor, "*robots groups"]:
+    prior_scale: Float64[Tensor, " groups"],
+    covariance: Float64[Tensor, "active active"],
+) -> Float64[Tensor, " groups"]:
     """How many parameters with a prior the data determine, per group: each counts by how much of it they do.
 
     `γ = Σ (1 - variance after / variance before)` of MacKay 1992, Neural Computation 4(3), eq. 4.5.
@@ -66,7 +66,7 @@ def effective_parameters(
         prior_scale: the scale of the prior.
         covariance: of the parameters.
     """
-    variance = covariance.diagonal(dim1=-2, dim2=-1)
+    variance = covariance.diagonal()
     lost = scaled_precision(precision, group, prior_scale) * variance
     return _group_totals(torch.where(precision > 0, torch.rsub(lost, 1), 0.0), group)
 
@@ -74,27 +74,27 @@ def effective_parameters(
 def scaled_precision(
     precision: Float64[Tensor, " active"],
     group: Int64[Tensor, " active"],
-    prior_scale: Float64[Tensor, "*robots groups"],
-) -> Float64[Tensor, "*robots active"]:
+    prior_scale: Float64[Tensor, " groups"],
+) -> Float64[Tensor, " active"]:
     """1 / variance of parameters by the prior at a scale of its standard deviations per group."""
-    return precision / prior_scale.square()[..., group]
+    return precision / prior_scale.square()[group]
 
 
 def _group_totals(
-    values: Float64[Tensor, "*robots active"], group: Int64[Tensor, " active"]
-) -> Float64[Tensor, "*robots groups"]:
+    values: Float64[Tensor, " active"], group: Int64[Tensor, " active"]
+) -> Float64[Tensor, " groups"]:
     """Sum of the parameters' values per group of the prior."""
-    return values.new_zeros((*values.shape[:-1], len(PriorGroup))).index_add(-1, group, values)
+    return values.new_zeros(len(PriorGroup)).index_add(0, group, values)
 
 
 def prior_scales(
-    off: Float64[Tensor, "*robots active"],
+    off: Float64[Tensor, " active"],
     precision: Float64[Tensor, " active"],
     group: Int64[Tensor, " active"],
-    before: Float64[Tensor, "*robots groups"],
-    covariance: Float64[Tensor, "*robots active active"],
+    before: Float64[Tensor, " groups"],
+    covariance: Float64[Tensor, "active active"],
     floor: float = 1.0,
-) -> Float64[Tensor, "*robots groups"]:
+) -> Float64[Tensor, " groups"]:
     """How many times as large as stated the parameters' errors turn out, per group of parameters.
 
     MacKay's update (1992, Neural Computation 4(3), eq. 4.7) with the `effective_parameters` of every group.
@@ -115,15 +115,14 @@ def prior_scales(
 
 
 def settled_scales(
-    normal: Float64[Tensor, "*robots active active"],
-    pull: Float64[Tensor, "*robots active 1"],
+    normal: Float64[Tensor, "active active"],
+    pull: Float64[Tensor, " active"],
     precision: Float64[Tensor, " active"],
     group: Int64[Tensor, " active"],
-    before: Float64[Tensor, "*robots groups"],
+    before: Float64[Tensor, " groups"],
     floor: float,
-    rounds: int = PRIOR_ROUNDS,
-) -> Float64[Tensor, "*robots groups"]:
-    """Estimate the prior's sizes together with the step that they lead to, each robot's until they have settled.
+) -> Float64[Tensor, " groups"]:
+    """Estimate the prior's sizes together with the step that they lead to, until they have settled.
 
     Args:
         normal: of the data, without the prior.
@@ -132,23 +131,18 @@ def settled_scales(
         group: see there.
         before: see there.
         floor: see there.
-        rounds: estimates at most.
     """
-    held = normal.clone()
-    held.diagonal(dim1=-2, dim2=-1).add_(scaled_precision(precision, group, before))
-    covariance = covariance_of(held)
-    scale = prior_scales((covariance @ pull)[..., 0], precision, group, before, covariance, floor)
-    moving = ~alike(before, scale, PRIOR_SETTLED)
-    if rounds == 1 or not bool(moving.any()):
-        return scale
-    left = (normal, pull, scale) if bool(moving.all()) else (normal[moving], pull[moving], scale[moving])
-    settled = settled_scales(*left[:2], precision, group, left[2], floor, rounds - 1)
-    if left[2] is scale:
-        return settled
-    scale[moving] = settled
+    scale = before
+    for _ in range(PRIOR_ROUNDS):
+        held, before = normal.clone(), scale
+        held.diagonal().add_(scaled_precision(precision, group, before))
+        covariance = covariance_of(held)
+        scale = prior_scales(covariance @ pull, precision, group, before, covariance, floor)
+        if alike(before, scale, PRIOR_SETTLED):
+            break
     return scale
 
 
-def alike(before: Tensor, after: Tensor, share: float) -> Tensor:
+def alike(before: Tensor, after: Tensor, share: float) -> bool:
     """Whether two estimates of noise and of the prior's sizes differ by less than a share."""
-    return ((after / before - 1).abs() < share).all(-1)
+    return bool(((after / before - 1).abs() < share).all())

@@ -1,10 +1,6 @@
-"""The calibration as a least-squares problem: normal equations summed over chunks of poses.
+"""The calibration as a least-squares problem: normal equations summed over chunks of poses."""
 
-A problem may be that of several robots of one type, with equally many rows, values in the same of them and the same
-free parameters. Rows stand robot by robot; what is one a robot has an axis of robots first.
-"""
-
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 
@@ -17,9 +13,7 @@ from pisigma.calibration.geometric.problem.least_squares import (
     Linearisation,
     covariance_of,
 )
-from pisigma.calibration.geometric.problem.motion import MotionMemory, motion_at
 from pisigma.calibration.geometric.problem.noise import (
-    ALWAYS_GOOD,
     SensorSums,
     SensorView,
     angle_disagreement,
@@ -38,23 +32,48 @@ from pisigma.calibration.geometric.problem.prior_sizes import (
     prior_scales,
     settled_scales,
 )
-from pisigma.calibration.geometric.problem.robots import of_robots, with_robots
 from pisigma.estimation.loss import AbstractLoss, SquaredLoss
 from pisigma.measurement.conditions import JointState
 from pisigma.measurement.sensors.sensor import AbstractSensor, Unknowns
-from pisigma.robot.kinematics.parameter_jacobian import JACOBIAN_CHUNK, ToolMotion, motion_shape
+from pisigma.robot.kinematics.parameter_jacobian import JACOBIAN_CHUNK, ToolMotion, tool_motion
 
 CERTAIN_LOSS = SquaredLoss()
 SETTLED = 1e-2
 """Estimates of noise and prior sizes have settled that change by a smaller share from point to point."""
 
 
+class MotionMemory:
+    """The motion at the last point, which the rank analysis, the search and its next stage all ask for.
+
+    What the motion was made from is compared by identity; so points are replaced and never changed in place.
+    """
+
+    def __init__(self) -> None:
+        self._made_from: tuple[object, ...] = ()
+        self._motion: ToolMotion | None = None
+
+    def motion(self, made_from: tuple[object, ...], make: Callable[[], ToolMotion]) -> ToolMotion:
+        """Return the motion of all rows that was made from the same objects, or else a new one.
+
+        Args:
+            made_from: the objects.
+            make: works the motion out.
+        """
+        same = len(made_from) == len(self._made_from) and all(
+            one is other for one, other in zip(made_from, self._made_from, strict=True)
+        )
+        if not same or self._motion is None:
+            self._made_from, self._motion = made_from, None  # given back before more memory is asked for
+            self._motion = make()
+        return self._motion
+
+
 @dataclass(frozen=True, eq=False)
 class CalibrationProblem(AbstractLeastSquares[Tensor]):
-    """Rows, sensors, the parameters that are free and what the prior says of them; of one robot or of several.
+    """Rows, sensors, the parameters that are free and what the prior says of them.
 
     Attributes:
-        space: the parameters; a point is a vector of all of them, or one a robot.
+        space: the parameters; a point is a vector of all of them.
         q: joint values [rad or m] of the rows.
         frame: index of every row's frame.
         target: index of every row's target.
@@ -77,7 +96,7 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
     target: Int64[Tensor, " rows"]
     sensors: tuple[AbstractSensor, ...]
     loss: AbstractLoss
-    nominal: Float64[Tensor, "*robots parameters"]
+    nominal: Float64[Tensor, " parameters"]
     precision: Float64[Tensor, " parameters"]
     active: Int64[Tensor, " active"]
     pose: Int64[Tensor, " rows"] | None = None
@@ -93,19 +112,14 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         return torch.from_numpy(self.space.usual_errors).to(self.q.device)[self.active]
 
     @property
-    def robots(self) -> torch.Size:
-        """The axis of robots, of several; no axis of one."""
-        return self.nominal.shape[:-1]
-
-    @cached_property
     def rows(self) -> int:
-        """Number of rows of every robot."""
-        return self.q.shape[0] // self.robots.numel()
+        """Number of rows."""
+        return self.q.shape[0]
 
     @cached_property
     def values_measured(self) -> tuple[int, ...]:
-        """Number of values of every sensor for a robot."""
-        return tuple(int(sensor.present[: self.rows].sum()) * sensor.components for sensor in self.sensors)
+        """Number of values of every sensor."""
+        return tuple(int(sensor.present.sum()) * sensor.components for sensor in self.sensors)
 
     @cached_property
     def prior_group(self) -> Int64[Tensor, " active"]:
@@ -113,8 +127,7 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         active = self.active
         if self.prior_sizes != "estimated":
             return self.space.is_length.to(active.device)[active].long()
-        nominal = self.nominal.reshape(-1, len(self.precision))[0]  # robots of one type are drawn alike
-        drawn = (nominal.square() * self.precision > 1)[active].long()
+        drawn = (self.nominal.square() * self.precision > 1)[active].long()
         return self.space.prior_groups.to(active.device)[drawn, active]
 
     def with_active(self, active: Sequence[int]) -> "CalibrationProblem":
@@ -149,12 +162,6 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
             memory=MotionMemory(),
         )
 
-    def of_robots(self, robots: Int64[Tensor, " chosen"]) -> "CalibrationProblem":
-        """Those of several robots that are chosen."""
-        robots = robots.to(self.q.device)
-        rows = (robots[:, None] * self.rows + torch.arange(self.rows, device=robots.device)).flatten()
-        return replace(self.select(rows), nominal=self.nominal[robots])
-
     @cached_property
     def state(self) -> JointState:
         """Joint values of the rows, and what is stated beside them."""
@@ -162,9 +169,9 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
 
     def moved(self, point: Tensor, step: Tensor) -> Tensor:
         """The parameters after a step of the free ones."""
-        return point.index_add(-1, self.active, step)
+        return point.index_add(0, self.active, step)
 
-    def rms(self, linearisation: Linearisation[Tensor]) -> Float64[Tensor, "*robots"]:
+    def rms(self, linearisation: Linearisation[Tensor]) -> Float64[Tensor, ""]:
         """Root mean square of the first sensor's residuals' lengths [m or rad]."""
         return view_of(linearisation).sums[0].rms
 
@@ -175,8 +182,7 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         chunks = []
         for rows in self.chunks():
             motion = self.motion(point, rows, self.active)
-            noise = None if before is None else self._of_rows(before.noise, rows)
-            chunks.append([self._sums(k, noise, motion, unknowns, rows) for k in range(len(self.sensors))])
+            chunks.append([self._sums(k, before, motion, unknowns, rows) for k in range(len(self.sensors))])
         sums = tuple(joined_sums(of_sensor) for of_sensor in zip(*chunks, strict=True))
         view = SensorView.without_noise(sums) if before is None else replace(before, sums=sums)
         return self.combined(point, view)
@@ -187,19 +193,12 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         Gross errors would decide the first step otherwise, where the loss rejects any.
         """
         weighted = self.renewed(self.linearise(point, None))[0]
-        rejects = rejecting(
-            self.sensors, [self.loss_of(sensor) for sensor in self.sensors], view_of(weighted)
-        )
-        if not bool(rejects.any()):
+        losses = [self.loss_of(sensor) for sensor in self.sensors]
+        if not rejecting(self.sensors, losses, view_of(weighted)):
             return weighted
-        if bool(rejects.all()):
-            return self.renewed(self.linearise(point, weighted))[0]
-        robots = rejects.nonzero()[:, 0]
-        some = self.of_robots(robots)
-        theirs = some.renewed(some.linearise(point[robots], of_robots(weighted, robots)))[0]
-        return with_robots(weighted, robots, theirs)
+        return self.renewed(self.linearise(point, weighted))[0]
 
-    def renewed(self, linearisation: Linearisation[Tensor]) -> tuple[Linearisation[Tensor], Tensor]:
+    def renewed(self, linearisation: Linearisation[Tensor]) -> tuple[Linearisation[Tensor], bool]:
         """Estimate the noise robustly, what repeats are worth, and how wide the prior has to be."""
         return self._renewed(linearisation, refine=False)
 
@@ -209,17 +208,16 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
 
     def _renewed(
         self, linearisation: Linearisation[Tensor], refine: bool
-    ) -> tuple[Linearisation[Tensor], Tensor]:
+    ) -> tuple[Linearisation[Tensor], bool]:
         view = view_of(linearisation)
         covariance = covariance_of(linearisation.normal)
         used = values_used(view, covariance)
         noise = loss_scale(self.sensors, self.loss, view, used, refine)
         repetition = view.repetition
         if self.pose is not None or self.configuration is not None:
-            renewed_noise = replace(view, noise=noise)
-            shape = (*self.robots, self.rows)
-            groups = (None if one is None else one.view(shape) for one in (self.pose, self.configuration))
-            repetition = group_variance_ratio(self.sensors, self.loss, renewed_noise, used, *groups)
+            repetition = group_variance_ratio(
+                self.sensors, self.loss, replace(view, noise=noise), used, self.pose, self.configuration
+            )
         off = self._off(linearisation.point)
         renewed = replace(view, noise=noise, repetition=repetition)
         if not refine and any(sensor.unit == "rad" for sensor in self.sensors):
@@ -230,14 +228,14 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         if self._sized:
             renewed = replace(renewed, prior_scale=self._prior_scales(renewed, off, covariance, refine))
         before, after = (
-            torch.cat([one.noise, one.repetition, one.disagreement, one.prior_scale], -1)
+            torch.cat([one.noise, one.repetition, one.disagreement, one.prior_scale])
             for one in (view, renewed)
         )
         return self.combined(linearisation.point, renewed), alike(before, after, SETTLED)
 
     def _prior_scales(
         self, view: SensorView, off: Tensor, covariance: Tensor, refine: bool
-    ) -> Float64[Tensor, "*robots groups"]:
+    ) -> Float64[Tensor, " groups"]:
         """Estimate the prior's sizes; during a search with the step they lead to, the residuals being linear in it."""
         floor, prior = (
             1.0 if self.prior_sizes == "widened" else SMALLEST_PRIOR,
@@ -247,36 +245,25 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         if refine:
             return scale
         normal, descent = self._data_sums(view)
-        pull = (descent + (normal @ off[..., None])[..., 0])[..., None]
-        return settled_scales(normal, pull, *prior, scale, floor)
+        return settled_scales(normal, descent + normal @ off, *prior, scale, floor)
 
     @cached_property
     def _sized(self) -> bool:
         """Whether there is a prior whose sizes are estimated."""
         return self.prior_sizes != "stated" and bool((self._prior > 0).any())
 
-    def _off(self, point: Tensor) -> Float64[Tensor, "*robots active"]:
+    def _off(self, point: Tensor) -> Float64[Tensor, " active"]:
         """Distance of the free parameters from where the prior has them."""
-        return (point - self.nominal).index_select(-1, self.active)
+        return (point - self.nominal)[self.active]
 
     def loss_of(self, sensor: AbstractSensor) -> AbstractLoss:
         """How a sensor's rows count."""
         return CERTAIN_LOSS if sensor.certain else self.loss
 
     def chunks(self) -> list[slice]:
-        """Rows that are worked on together; all or none of a robot where there are several."""
-        # several robots take more operations a chunk, which larger chunks make up for
-        size = JACOBIAN_CHUNK if not self.robots else max(2 * JACOBIAN_CHUNK // self.rows, 1) * self.rows
-        count = self.q.shape[0]
-        return [slice(start, min(start + size, count)) for start in range(0, count, size)]
-
-    def _of_rows(self, values: Float64[Tensor, "*robots size"], rows: slice) -> Float64[Tensor, "*some size"]:
-        """What has one entry a robot, for the robots of some rows."""
-        return values[rows.start // self.rows : rows.stop // self.rows] if self.robots else values
-
-    def by_robot(self, values: Tensor) -> Tensor:
-        """Values of rows, their last axis, with an axis of robots first where there are several."""
-        return torch.unflatten(values, -1, (-1, self.rows)).movedim(-2, 0) if self.robots else values
+        """Rows that are worked on together."""
+        starts = range(0, self.rows, JACOBIAN_CHUNK)
+        return [slice(start, min(start + JACOBIAN_CHUNK, self.rows)) for start in starts]
 
     def motion(self, point: Tensor, rows: slice, active: Tensor) -> ToolMotion:
         """Tool pose of some rows and its derivative by some parameters.
@@ -284,14 +271,9 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         The columns are 0 for base and tool in rows of other frames and targets, and for parameters that do not
         move the tool.
         """
-        of_rows = (self._of_rows(point, rows), self.q[rows], self.frame[rows], self.target[rows])
-        make = partial(motion_at, self.space, *of_rows, self.turning)
+        make = partial(self._motion, point, rows)
         made_from = (point, self.space, self.q, self.frame, self.target, self.turning)
-        if self.robots or rows == slice(0, self.q.shape[0]):
-            shape = motion_shape(self.space.robot, self.turning)
-            motion = self.memory.motion(made_from, rows, shape, self.q, make)
-        else:
-            motion = make()
+        motion = self.memory.motion(made_from, make) if rows == slice(0, self.rows) else make()
         columns = self.space.motion_columns.to(active.device)
         J = motion.derivative.index_select(0, columns[0].index_select(0, active))
         if not self.space.always_moving:
@@ -301,6 +283,16 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
             )
             J = J * moving[:, None, :]
         return ToolMotion(motion.position, motion.rotation, J)
+
+    def _motion(self, point: Tensor, rows: slice) -> ToolMotion:
+        """Tool pose of some rows and its derivative by every kind of parameter."""
+        dh, bases, tools = self.space.split(point)
+        frame, target = (
+            None if len(owners) == 1 else number[rows]
+            for owners, number in ((bases, self.frame), (tools, self.target))
+        )
+        dh_rows, q, robot = dh.cpu().numpy(), self.q[rows], self.space.robot
+        return tool_motion(robot, dh_rows, bases.t(), tools.t(), q, self.turning, frame, target)
 
     def derivative(
         self, sensor: AbstractSensor, motion: ToolMotion, unknowns: Unknowns, rows: slice, active: Tensor
@@ -320,24 +312,24 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         precision = view.scaled(self._prior, self.prior_group)
         pull = off * precision
         normal, descent = self._data_sums(view)
-        normal.diagonal(dim1=-2, dim2=-1).add_(precision)
+        normal.diagonal().add_(precision)
         descent.sub_(pull)
         costs = [
-            self.loss_of(sensor).cost(sums.distance / view.scale(k)[..., None], sensor.components).sum(-1)
+            self.loss_of(sensor).cost(sums.distance / view.scales[k], sensor.components).sum()
             for k, (sensor, sums) in enumerate(zip(self.sensors, view.sums, strict=True))
         ]
-        misfit = (torch.stack(costs, -1) * view.scales.square() / view.variances).sum(-1)
-        rounding = (self._rounding / view.variances).sum(-1)
-        cost = misfit + (off * pull).sum(-1)
+        misfit = (torch.stack(costs) * view.scales.square() / view.variances).sum()
+        rounding = (self._rounding / view.variances).sum()
+        cost = misfit + (off * pull).sum()
         return Linearisation(point, cost, descent, normal, misfit, rounding, view)
 
     def _data_sums(
         self, view: SensorView
-    ) -> tuple[Float64[Tensor, "*robots active active"], Float64[Tensor, "*robots active"]]:
+    ) -> tuple[Float64[Tensor, "active active"], Float64[Tensor, " active"]]:
         """Divide the sums by their variances; the prior is not in it."""
         terms = [
-            (sums.normal / variance[..., None, None], sums.descent / variance[..., None])
-            for sums, variance in zip(view.sums, view.variances.unbind(-1), strict=True)
+            (sums.normal / variance, sums.descent / variance)
+            for sums, variance in zip(view.sums, view.variances, strict=True)
         ]
         normal, descent = terms[0]
         for more_normal, more_descent in terms[1:]:
@@ -371,7 +363,7 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         )
 
     def _sums(
-        self, number: int, noise: Tensor | None, motion: ToolMotion, unknowns: Unknowns, rows: slice
+        self, number: int, view: SensorView | None, motion: ToolMotion, unknowns: Unknowns, rows: slice
     ) -> SensorSums:
         """What one sensor contributes in some rows, weighted by its noise, or all alike where that is None."""
         sensor, everywhere = self.sensors[number], self.measured_everywhere[number]
@@ -381,20 +373,18 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         distance = residual.square().sum(0).sqrt_()
         if sensor.sigma is not None:
             distance = torch.where(sensor.present[rows], distance / sensor.sigma[rows], 0.0)
-        residual, distance = self.by_robot(residual), self.by_robot(distance)
-        if noise is None:
+        if view is None:
             root = torch.ones_like(distance)
         else:
-            scale = noise[..., number, None].clamp(min=ALWAYS_GOOD)
-            root = self.loss_of(sensor).weight(distance / scale, sensor.components).sqrt_()
+            root = self.loss_of(sensor).weight(distance / view.scales[number], sensor.components).sqrt_()
         if sensor.sigma is not None:
-            root = root / self.by_robot(sensor.sigma[rows])
+            root = root / sensor.sigma[rows]
         if not everywhere:
-            root = torch.where(self.by_robot(sensor.present[rows]), root, 0.0)
-        J = self.by_robot(self.derivative(sensor, motion, unknowns, rows, self.active))
-        A = J.new_empty((*J.shape[:-3], J.shape[-3] + 1, *J.shape[-2:]))  # the residual is its last row
-        torch.mul(J, root[..., None, None, :], out=A[..., :-1, :, :])
-        torch.mul(residual, root[..., None, :], out=A[..., -1, :, :])
-        A = A.flatten(-2)
+            root = torch.where(sensor.present[rows], root, 0.0)
+        J = self.derivative(sensor, motion, unknowns, rows, self.active)
+        A = J.new_empty((J.shape[0] + 1, *J.shape[1:]))  # the residual is its last row
+        torch.mul(J, root, out=A[:-1])
+        torch.mul(residual, root, out=A[-1])
+        A = A.flatten(1)
         sums, measured = A @ A.mT, self.values_measured[number] // sensor.components
-        return SensorSums(sums[..., :-1, :-1], sums[..., :-1, -1], residual, distance, measured)
+        return SensorSums(sums[:-1, :-1], sums[:-1, -1], residual, distance, measured)

@@ -1,7 +1,7 @@
 """The calibration problem with its initial guess, and points of the problem in the user's coordinates."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -207,16 +207,16 @@ def repeated(q: Tensor, *names: Tensor) -> Tensor | None:
     Returns:
         None where no two rows are the same.
     """
-    numbers = renumbered(mixed_keys(q, *names))
+    numbers = renumbered(_mixed_keys(q, *names))
     return None if int(numbers.max()) + 1 == len(q) else numbers
 
 
-def mixed_keys(q: Float64[Tensor, "*batch rows dof"], *names: Tensor) -> Int64[Tensor, "*batch rows"]:
+def _mixed_keys(q: Float64[Tensor, "rows dof"], *names: Tensor) -> Int64[Tensor, " rows"]:
     """Mix every row's joint values (to 1e-9) and names into one number, which is the same where they are."""
-    keys, dof = (q * 1e9).round().long(), q.shape[-1]
+    keys, dof = (q * 1e9).round().long(), q.shape[1]
     factors = [FACTOR * pow(MULTIPLIER, dof - 1 - joint, 2**64) for joint in range(dof)]
     signed = [(factor + 2**63) % 2**64 - 2**63 for factor in factors]
-    mixed: Tensor = (keys * torch.tensor(signed, device=q.device)).sum(-1)  # integers wrap around
+    mixed: Tensor = (keys * torch.tensor(signed, device=q.device)).sum(1)  # integers wrap around
     for name in names:
         mixed = mixed * MULTIPLIER + name * FACTOR
     return mixed
@@ -298,48 +298,31 @@ class IdentifiedGeometry:
 
 def identified_geometry(setup: CalibrationSetup, point: Float64[Tensor, " parameters"]) -> IdentifiedGeometry:
     """Put the anchors back; as rotation vectors, small turns mean the same with and without them."""
-    return identified_geometries([setup], point[None])[0]
-
-
-def identified_geometries(
-    setups: Sequence[CalibrationSetup], points: Float64[Tensor, "robots parameters"]
-) -> list[IdentifiedGeometry]:
-    """Put the anchors back of robots of one type with the same frames and targets; see `identified_geometry`."""
-    space = setups[0].problem.space
-    blocks = zip(*behind_anchors(setups, points), strict=True)
-    return [
-        IdentifiedGeometry(
-            robot=space.robot.with_geometry(dh=dh, base=bases[0], tool=tools[0]),
-            bases=dict(zip(space.frames, bases, strict=True)),
-            tools=dict(zip(space.targets, tools, strict=True)),
-            unknowns={
-                own.name: dict(zip(own.owners, values, strict=True))
-                for own, values in zip(space.unknowns, unknowns_in_frames(setup, point).values(), strict=True)
-            },
-            setup=setup,
-            point=point,
-        )
-        for setup, point, (dh, bases, tools) in zip(setups, points, blocks, strict=True)
-    ]
+    space = setup.problem.space
+    dh, bases, tools = behind_anchors(setup, point)
+    return IdentifiedGeometry(
+        robot=space.robot.with_geometry(dh=dh, base=bases[0], tool=tools[0]),
+        bases=dict(zip(space.frames, bases, strict=True)),
+        tools=dict(zip(space.targets, tools, strict=True)),
+        unknowns={
+            own.name: dict(zip(own.owners, values, strict=True))
+            for own, values in zip(space.unknowns, unknowns_in_frames(setup, point).values(), strict=True)
+        },
+        setup=setup,
+        point=point,
+    )
 
 
 def behind_anchors(
-    setups: Sequence[CalibrationSetup], points: Float64[Tensor, "robots parameters"]
-) -> tuple[
-    Float64[np.ndarray, "robots rows 5"],
-    Float64[np.ndarray, "robots frames 6"],
-    Float64[np.ndarray, "robots targets 6"],
-]:
-    """Return rows, bases and tools at points of problems with one space, in the user's coordinates."""
-    dh, bases, tools = (block.clone() for block in setups[0].problem.space.split(points.cpu()))
-    T_anchor, R_tool = (
-        torch.stack([getattr(setup.anchors, name) for setup in setups]).cpu() for name in ("bases", "tools")
-    )
-    R_anchor, frames = T_anchor[..., :3, :3], bases.shape[1]
-    turned = rotation_from_rpy(torch.cat([bases, tools], 1)[..., 3:])
-    rpy = rpy_from_rotation(torch.cat([R_anchor @ turned[:, :frames], turned[:, frames:] @ R_tool], 1))
-    bases[..., :3] = (R_anchor @ bases[..., :3, None])[..., 0] + T_anchor[..., :3, 3]
-    bases[..., 3:], tools[..., 3:] = rpy[:, :frames], rpy[:, frames:]
+    setup: CalibrationSetup, point: Float64[Tensor, " parameters"]
+) -> tuple[Float64[np.ndarray, "rows 5"], Float64[np.ndarray, "frames 6"], Float64[np.ndarray, "targets 6"]]:
+    """Return rows, bases and tools at a point of the problem, in the user's coordinates."""
+    dh, bases, tools = (block.clone() for block in setup.problem.space.split(point.cpu()))
+    T_anchor, R_tool = setup.anchors.bases.cpu(), setup.anchors.tools.cpu()
+    R_anchor = T_anchor[:, :3, :3]
+    bases[:, 3:] = rpy_from_rotation(R_anchor @ rotation_from_rpy(bases[:, 3:]))
+    bases[:, :3] = (R_anchor @ bases[:, :3, None])[..., 0] + T_anchor[:, :3, 3]
+    tools[:, 3:] = rpy_from_rotation(rotation_from_rpy(tools[:, 3:]) @ R_tool)
     return dh.numpy(), bases.numpy(), tools.numpy()
 
 
@@ -354,7 +337,7 @@ def coordinate_change(
     """
     space, anchors = setup.problem.space, setup.anchors
     _, bases, tools = space.split(point)
-    _, user_bases, user_tools = (torch.from_numpy(block[0]) for block in behind_anchors([setup], point[None]))
+    _, user_bases, user_tools = (torch.from_numpy(block) for block in behind_anchors(setup, point))
     change = torch.eye(len(point), dtype=point.dtype)
     for k, anchor in enumerate(anchors.bases.cpu()):
         first = space.of("base").start + 6 * k

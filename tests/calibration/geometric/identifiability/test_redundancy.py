@@ -10,7 +10,7 @@ from testing.simulated_arm import BASE, TOOL, draw_joints
 
 from pisigma.calibration.geometric.calibrator import GeometricCalibrator
 from pisigma.calibration.geometric.identifiability.pairwise import find_pairwise_redundancy
-from pisigma.calibration.geometric.identifiability.redundancy import find_redundancies, pivoted_triangles
+from pisigma.calibration.geometric.identifiability.redundancy import find_redundancy, pivoted_triangle
 from pisigma.calibration.geometric.problem.information import Information, information
 from pisigma.measurement.dataset import Measurements
 from pisigma.robot import Robot
@@ -59,7 +59,7 @@ def condensed(
     )
     setup = GeometricCalibrator(robot, base="fixed", tool="fixed").build(data)
     count = setup.problem.space.arm_size if arm_only else len(setup.start)
-    (at_start,) = information(setup.problem, setup.start, list(range(count)))
+    at_start = information(setup.problem, setup.start, list(range(count)))
     return at_start, setup.start.numpy()[:count]
 
 
@@ -68,7 +68,7 @@ def condensed(
 def test_the_papers_sets_are_found_exactly(name: str, seed: int) -> None:
     seen, sizes = condensed(Robot.load(name), seed, rows=40, poses=False, arm_only=True)
     pairwise = find_pairwise_redundancy(seen, sizes)
-    exact = find_redundancies([seen], sizes[None])[0]
+    exact = find_redundancy(seen, sizes)
     assert pairwise.sets == PAPER[name]["sets"]
     assert pairwise.no_effect == PAPER[name]["no_effect"]
     assert len(pairwise.kept) == PAPER[name]["left"]
@@ -83,7 +83,7 @@ def test_the_papers_sets_are_found_exactly(name: str, seed: int) -> None:
 def test_rank_with_base_and_tool_is_4r_2p_3(name: str, rank: int, poses: bool) -> None:
     robot = Robot.load(name).with_geometry(base=BASE, tool=TOOL)
     seen, sizes = condensed(robot, 0, rows=60, poses=poses, arm_only=False)
-    redundancy = find_redundancies([seen], sizes[None])[0]
+    redundancy = find_redundancy(seen, sizes)
     turning, sliding = robot.revolute.count(True), robot.revolute.count(False)
     assert rank == 4 * turning + 2 * sliding + 3
     assert redundancy.rank == rank + 3 * poses
@@ -112,8 +112,8 @@ def test_no_more_is_independent_than_axes_targets_and_frames_have(
     problem, point = setup.problem, setup.start.clone()
     tools = problem.space.of("tool")
     point[list(tools)] += 0.1 * torch.from_numpy(rng.standard_normal(len(tools)))
-    (seen,) = information(problem, point, list(range(len(point))))
-    found = find_redundancies([seen], point.numpy()[None])[0]
+    seen = information(problem, point, list(range(len(point))))
+    found = find_redundancy(seen, point.numpy())
     assert found.rank == problem.space.most_independent(turning=poses)
 
 
@@ -121,7 +121,7 @@ def test_no_more_is_independent_than_axes_targets_and_frames_have(
 def test_every_dependency_holds(name: str) -> None:
     robot = Robot.load(name).with_geometry(tool=TOOL)
     seen, sizes = condensed(robot, 1, rows=30, poses=True, arm_only=False)
-    redundancy = find_redundancies([seen], sizes[None])[0]
+    redundancy = find_redundancy(seen, sizes)
     names = redundancy.names
     usual = np.array([parameter.usual_error for parameter in seen.parameters])
     J = seen.jacobian / usual
@@ -138,7 +138,7 @@ def test_every_dependency_holds(name: str) -> None:
 
 def test_dependencies_are_said_in_words_and_the_preferred_are_kept() -> None:
     seen, sizes = condensed(Robot.load("rb5"), 0, rows=40, poses=False, arm_only=True)
-    redundancy = find_redundancies([seen], sizes[None])[0]
+    redundancy = find_redundancy(seen, sizes)
     assert redundancy.group("d_3") == "d_2 + d_3 + d_4 is identified, the single values are not"
     assert redundancy.group("beta_4") == "theta_4 - beta_4 is identified, the single values are not"
     assert redundancy.group("a_2") is None
@@ -165,7 +165,7 @@ def test_correlations_are_pearsons() -> None:
 def test_pivots_span_the_columns(rank: int, seed: int) -> None:
     rng = np.random.default_rng(seed)
     A = rng.normal(size=(12, rank)) @ rng.normal(size=(rank, 8))
-    pivots = pivoted_triangles(A[None])[1][0, :rank]
+    pivots = pivoted_triangle(A)[1][:rank]
     assert len(set(pivots.tolist())) == rank
     basis, _ = np.linalg.qr(A[:, pivots])
     assert_close(A - basis @ (basis.T @ A), 0.0, atol=1e-6 * float(np.abs(A).max()))
@@ -174,7 +174,7 @@ def test_pivots_span_the_columns(rank: int, seed: int) -> None:
 @pytest.mark.parametrize("smallest", [1.0, 1e-3, 3e-6, 1e-6, 3e-7, 1e-9, 0.0])
 def test_the_rank_counts_the_singular_values_above_the_tolerance(smallest: float) -> None:
     seen, sizes = condensed(Robot.load("rb5"), 3, rows=40, poses=False, arm_only=True)
-    redundancy = find_redundancies([seen], sizes[None])[0]
+    redundancy = find_redundancy(seen, sizes)
     kept, removed = (
         [seen.names.index(name) for name in names] for names in (redundancy.kept, redundancy.removed)
     )
@@ -182,7 +182,7 @@ def test_the_rank_counts_the_singular_values_above_the_tolerance(smallest: float
     beside = np.linalg.qr(np.column_stack([root[:, kept], np.ones(len(root))]))[0][:, -1]
     length = np.linalg.norm(root[:, removed[0]])
     root[:, removed[0]] += smallest * length * beside
-    changed = find_redundancies([replace(seen, root=root)], sizes[None])[0]
+    changed = find_redundancy(replace(seen, root=root), sizes)
     values = changed.singular_values
     assert changed.rank == int((values > changed.tolerance * values[0]).sum())
     assert changed.rank == len(changed.kept)

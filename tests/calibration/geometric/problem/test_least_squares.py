@@ -35,10 +35,8 @@ class Curve(AbstractLeastSquares[torch.Tensor]):
         J = torch.tensor(slopes, dtype=torch.float64) / SIGMA
         return Linearisation(point, r @ r, -J.mT @ r, J.mT @ J, r @ r, ROUNDING, None)
 
-    def renewed(
-        self, linearisation: Linearisation[torch.Tensor]
-    ) -> tuple[Linearisation[torch.Tensor], torch.Tensor]:
-        return linearisation, torch.tensor(True)
+    def renewed(self, linearisation: Linearisation[torch.Tensor]) -> tuple[Linearisation[torch.Tensor], bool]:
+        return linearisation, True
 
     def moved(self, point: torch.Tensor, step: torch.Tensor) -> torch.Tensor:
         return point + step
@@ -58,11 +56,9 @@ class Swinging(AbstractLeastSquares[torch.Tensor]):
         r = torch.stack([point[0] - believed, torch.ones(()).double()])
         return Linearisation(point, r @ r, -r[:1], torch.eye(1).double(), r @ r, ROUNDING, believed)
 
-    def renewed(
-        self, linearisation: Linearisation[torch.Tensor]
-    ) -> tuple[Linearisation[torch.Tensor], torch.Tensor]:
+    def renewed(self, linearisation: Linearisation[torch.Tensor]) -> tuple[Linearisation[torch.Tensor], bool]:
         other = replace(linearisation, detail=-float(linearisation.detail))
-        return self.linearise(linearisation.point, other), torch.tensor(False)
+        return self.linearise(linearisation.point, other), False
 
     def moved(self, point: torch.Tensor, step: torch.Tensor) -> torch.Tensor:
         return point + step
@@ -123,7 +119,7 @@ def test_badly_scaled_systems_are_solved(generator: torch.Generator) -> None:
     A = torch.randn(20, 4, generator=generator, dtype=torch.float64) * scale
     x = torch.randn(4, generator=generator, dtype=torch.float64) / scale
     seen = Linearisation(x, ONE, A.mT @ (A @ x), A.mT @ A, ONE, 0 * ONE, None)
-    assert_close(solve_damped(seen, 1 / scale, 1e-14 * ONE), x, rtol=1e-9)
+    assert_close(solve_damped(seen, 1 / scale, 1e-14), x, rtol=1e-9)
     assert_close(covariance_of(A.mT @ A) @ (A.mT @ A) * scale[:, None] / scale, torch.eye(4), atol=1e-9)
 
 
@@ -133,5 +129,5 @@ def test_singular_systems_give_the_short_step(generator: torch.Generator) -> Non
     b = torch.randn(20, generator=generator, dtype=torch.float64)
     seen = Linearisation(b[:3], ONE, A.mT @ b, A.mT @ A, ONE, 0 * ONE, None)
     expected = torch.linalg.pinv(A) @ b
-    assert_close(solve_damped(seen, torch.ones(3).double(), 1e-9 * ONE), expected, atol=1e-5)
+    assert_close(solve_damped(seen, torch.ones(3).double(), 1e-9), expected, atol=1e-5)
     assert_close(covariance_of(A.mT @ A), torch.linalg.pinv(A.mT @ A), atol=1e-10)

@@ -6,10 +6,10 @@ from testing.identified import off_by
 from testing.models import joints_around
 
 from pisigma.deployment.export.controllers.xacro import with_properties
+from pisigma.deployment.export.urdf import CALIBRATED_FRAME, CALIBRATED_TOOL, robot_into_urdf
 from pisigma.files.errors import RobotError
 from pisigma.robot import Robot
 from pisigma.robot.kinematics.forward import forward_kinematics
-from pisigma.robot.urdf_template import CALIBRATED_FRAME, CALIBRATED_TOOL, robot_into_urdf
 from pisigma.robot.writing import robot_to_urdf
 
 

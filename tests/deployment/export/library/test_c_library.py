@@ -11,8 +11,7 @@ from testing.models import hand_made_model, no_type_checker
 from testing.serving import CLIENTS
 
 from pisigma.deployment.export.export_format import ExportRequest
-from pisigma.deployment.export.library.c_library import HEADER, LIBRARY, MODEL
-from pisigma.deployment.export.library.model_file import model_file
+from pisigma.deployment.export.library.c_library import HEADER, LIBRARY, MODEL, model_file
 from pisigma.deployment.export.registry import export_model
 from pisigma.files.errors import OutputError
 from pisigma.model.inverse.corrected_ik import CorrectedIK

@@ -22,7 +22,7 @@ from testing.rewritten_programs import (
 from pisigma.deployment.export.export_format import ExportRequest
 from pisigma.deployment.export.programs.text import millimetres_and_euler
 from pisigma.deployment.export.registry import export_model
-from pisigma.deployment.export.rewriting.arcs import Arcs, is_straight
+from pisigma.deployment.export.rewriting.correction import Arcs, is_straight
 from pisigma.model.folder.model_folder import load_model
 
 POINTS = torch.tensor([[0.0, 0.0, 0.0], [0.05, 0.09, 0.02], [0.16, 0.1, 0.05]], dtype=torch.float64)

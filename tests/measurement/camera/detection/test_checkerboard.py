@@ -6,8 +6,8 @@ from testing.board_images import CAMERA, draw_board, view
 from testing.closeness import assert_close
 
 from pisigma.measurement.camera.board import Board
-from pisigma.measurement.camera.detection.checkerboard import detect_checkerboard
 from pisigma.measurement.camera.detection.detected_board import DetectedBoard, EdgeProfiles, NoBoard
+from pisigma.measurement.camera.detection.detector import detect_checkerboard
 
 BOARD = Board("board", 4, 5, 0.03)
 

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from pisigma.files.errors import MeasurementError
-from pisigma.measurement.camera.detection.joined_joints import join_joints
+from pisigma.measurement.foreign.joining import join_joints
 
 
 def log(folder: Path, text: str) -> Path:

@@ -4,7 +4,7 @@ import numpy as np
 from scipy.special import erf
 from testing.closeness import assert_close
 
-from pisigma.measurement.camera.detection.saddle import fit_saddles
+from pisigma.measurement.camera.detection.detected_board import fit_saddles
 
 CORNERS = np.array([[30.31, 34.77], [90.0, 31.5]])
 AXES = np.array([[[40.0, 8.0], [6.0, 35.0]], [[30.0, -25.0], [25.0, 30.0]]])

@@ -9,10 +9,10 @@ from lxml import etree
 from testing.closeness import assert_close
 from testing.urdf import DrawnJoint, peer_poses, urdf_text
 
+from pisigma.deployment.export.urdf import robot_into_urdf
 from pisigma.files.errors import RobotError
 from pisigma.robot import Robot
 from pisigma.robot.kinematics.forward import forward_kinematics
-from pisigma.robot.urdf_template import robot_into_urdf
 
 TEXT = """\
 <robot name="arm">

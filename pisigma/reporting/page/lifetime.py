@@ -1,21 +1,33 @@
-"""The sessions of a robot and their control charts as one page that loads nothing from elsewhere."""
+"""Pages on the life of robots: control charts of sessions, two models beside each other, fleets; one file each."""
 
 import datetime
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from markupsafe import Markup
 from matplotlib.axes import Axes
 from matplotlib.dates import AutoDateLocator, ConciseDateFormatter
 
+from pisigma.lifetime.comparison.displacement import Displacement
+from pisigma.lifetime.comparison.parameter_differences import ParameterDifferences
+from pisigma.lifetime.fleet.status import FleetStatus
 from pisigma.lifetime.monitoring.charts import FALSE_ALARMS_PER_YEAR, SESSIONS_PER_YEAR, Chart
 from pisigma.lifetime.monitoring.history import Record
 from pisigma.lifetime.recalibration.moved import NORMAL_95
 from pisigma.model.calibrated_model import CalibratedModel
+from pisigma.reporting.comparison_tables import comparison_tables
+from pisigma.reporting.difference_tables import difference_table
+from pisigma.reporting.fleet_tables import STATES, WHOSE_ERRORS, not_compared, robot_table, state_table
 from pisigma.reporting.monitoring_tables import chart_table, session_table
-from pisigma.reporting.page.figures import AFTER, BEFORE, OTHER, Drawing, drawing_style, panel
+from pisigma.reporting.page.error_map import Layer
+from pisigma.reporting.page.figures import AFTER, BEFORE, OTHER, Drawing, draw_map, drawing_style, panel
 from pisigma.reporting.page.page import image, resource
 from pisigma.reporting.rendering import render
+from pisigma.reporting.tables import pose_rows
+from pisigma.validation.held_out.model_comparison import ModelComparison
+
+WIDE = 10_000
+"""Characters: tables of a page scroll."""
 
 
 def monitoring_page(
@@ -101,3 +113,78 @@ def _dates(axes: Axes) -> None:
     locator = AutoDateLocator(minticks=2, maxticks=6)  # type: ignore[no-untyped-call]
     axes.xaxis.set_major_locator(locator)
     axes.xaxis.set_major_formatter(ConciseDateFormatter(locator))  # type: ignore[no-untyped-call]
+
+
+def fleet_page(status: FleetStatus, name: str) -> str:
+    """Lay the robots of a fleet out as HTML; every text is shown as it is, whatever it holds.
+
+    Args:
+        status: of the fleet.
+        name: of the fleet.
+    """
+    order = {one.robot: place for place, one in enumerate(status.worst_first)}
+    robots = sorted(
+        status.robots, key=lambda one: (STATES.index(one.state), order.get(one.robot, len(order)))
+    )
+    return render(
+        "fleet.html.j2",
+        name=name,
+        status=status,
+        states=state_table(status),
+        robots=robots,
+        table=robot_table(robots),
+        notes=(WHOSE_ERRORS, *filter(None, [not_compared(status)]), *status.warnings),
+        style=Markup(resource("style.css")),  # ours
+    )
+
+
+def comparison_page(
+    models: Mapping[str, CalibratedModel],
+    parameters: ParameterDifferences,
+    displacements: Mapping[str, Displacement],
+    rows: ModelComparison | None,
+    says: tuple[Sequence[str], Sequence[str]],
+) -> str:
+    """Lay a comparison out as HTML; every text is shown as it is, whatever it holds.
+
+    Args:
+        models: the two, by name.
+        parameters: side by side.
+        displacements: distances between both models' poses, by what the poses are.
+        rows: errors of both models; None where none were given.
+        says: sentences, and what to heed.
+    """
+    first, second = models
+    sentences, warnings = says
+    return render(
+        "comparison.html.j2",
+        names=(first, second),
+        models=models,
+        robot=models[first].robot,
+        parameters=difference_table(parameters, (first, second)),
+        differs=bool(parameters.differing),
+        level=f"{parameters.level:.2g}",
+        maps=[draw_displacement(what, one) for what, one in displacements.items()],
+        displacements=pose_rows({what: one.errors.figures for what, one in displacements.items()}),
+        rows=() if rows is None else comparison_tables(rows, "the rows", WIDE),
+        sentences=sentences,
+        warnings=warnings,
+        image=image,
+        style=Markup(resource("style.css")),  # ours
+    )
+
+
+def draw_displacement(what: str, displacement: Displacement) -> Drawing:
+    """Draw distances between both models' poses from above and from the side.
+
+    Args:
+        what: the poses are.
+        displacement: at the poses.
+    """
+    errors = displacement.errors
+    layers = [Layer("distance", "distance", "mm", errors.position.numpy() * 1e3, "")]
+    if errors.rotation is not None:
+        layers.append(Layer("turn", "turn", "deg", np.rad2deg(errors.rotation.numpy()), ""))
+    seen = f"Distance and turn between the poses of both models, {what},"
+    title = f"{what[:1].upper()}{what[1:]}"
+    return draw_map(f"displacement_{what}", title, seen, displacement.place.numpy() * 1e3, layers)

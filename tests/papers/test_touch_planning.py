@@ -9,16 +9,16 @@ from testing.closeness import assert_close
 
 from pisigma.calibration.geometric.problem.parameters import ParameterSpace, Prior
 from pisigma.files.errors import IdentificationError
-from pisigma.planning.touch_planning import (
+from pisigma.robot import Robot
+from pisigma.robot.kinematics.forward import forward_kinematics
+from pisigma.robot.se3 import rotation_from_vector, transform, transform_from_xyzrpy
+from pisigma.simulation.touch_candidates import JigPlacement, TouchCandidatesSection
+from touch_planning import (
     PlanningProblem,
     _best_exchange,
     build_planning_problem,
     plan_measurements,
 )
-from pisigma.robot import Robot
-from pisigma.robot.kinematics.forward import forward_kinematics
-from pisigma.robot.se3 import rotation_from_vector, transform, transform_from_xyzrpy
-from pisigma.simulation.touch_candidates import JigPlacement, TouchCandidatesSection
 
 FREE = ("a_1", "a_2", "a_3", "d_4", "theta_2", "theta_3", "theta_4", "theta_5")
 PLACEMENTS = (
