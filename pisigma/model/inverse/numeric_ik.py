@@ -358,7 +358,7 @@ class _Poses:
 
     def shaped(self, values: Tensor) -> Tensor:
         """Values of the rows in the shape in which the poses were given."""
-        return values.reshape(*self.batch, *values.shape[1:])
+        return values.reshape((*self.batch, *values.shape[1:]))
 
 
 def _among(every: Solution, rank: Tensor, wanted: Sequence[int]) -> Tensor:

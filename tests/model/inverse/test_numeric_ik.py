@@ -48,6 +48,26 @@ def test_a_model_without_kernels_is_solved_all_the_same(without_kernels, way):
         assert_close(arrays.q[reached], q[torch.from_numpy(reached)], atol=1e-6)
 
 
+def test_without_kernels_single_poses_are_solved_as_in_a_batch(without_kernels):
+    ik, q, T = without_kernels
+    batch = ik(T[:2].numpy(), near=q[:2].numpy())
+    assert_close(ik(T[1].numpy(), near=q[1].numpy()).q, batch.q[1], atol=1e-12)
+    assert_close(ik(T[1].tolist()).position_residual, 0.0, atol=1e-10)
+    every = ik.all_branches(T[1].numpy())
+    assert every.q.shape == (len(ik.branches), 6)
+    assert int(ik(T[1], throw=False).status) == Status.REACHED
+
+
+def test_without_kernels_a_path_with_joints_to_spare_is_followed():
+    model = calibrated_arm("panda", shared=("pose",))
+    ik, q = CorrectedIK(model), joints_of(model.robot, 1, seed=3, share=0.5)
+    line = q + torch.linspace(0, 0.1, 3, dtype=torch.float64)[:, None]
+    path = ik.path(model.forward(line).numpy(), near=q[0].numpy())
+    assert not path.switches
+    assert (path.solution.status == Status.REACHED).all()
+    assert np.abs(np.diff(path.solution.q, axis=0)).max() < 0.2
+
+
 def test_without_kernels_nothing_need_raise(without_kernels):
     ik, q, T = without_kernels
     bad = T.numpy().copy()
