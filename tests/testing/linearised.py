@@ -11,7 +11,7 @@ from pisigma.calibration.geometric.calibrator import GeometricCalibrator
 from pisigma.calibration.geometric.problem.noise import view_of
 from pisigma.calibration.geometric.problem.setup import CalibrationSetup
 from pisigma.calibration.hybrid.design import Design, Rows
-from pisigma.calibration.hybrid.normal_equations import NormalEquations
+from pisigma.calibration.hybrid.regression import NormalEquations
 from pisigma.calibration.hybrid.search import Fitted
 from pisigma.calibration.hybrid.sensor_values import sensor_values
 from pisigma.estimation.loss import SquaredLoss

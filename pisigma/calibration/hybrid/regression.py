@@ -1,19 +1,218 @@
-"""Regression by the covariance of the values, for few values and many unknowns, and which form is the cheaper one."""
+"""Regression of values on the unknowns of a design: by normal equations, or for few values by their covariance."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 import torch
-from jaxtyping import Int64
+from jaxtyping import Float64, Int64
 from torch import Tensor
 
-from pisigma.calibration.hybrid.design import Design, Rows
+from pisigma.calibration.hybrid.design import Design, Rows, chunks
 from pisigma.calibration.hybrid.design_regression import AbstractDesignRegression
-from pisigma.calibration.hybrid.normal_equations import NormalEquations
+from pisigma.calibration.hybrid.sensor_values import SensorValues
+from pisigma.estimation.cholesky import BLOCK, blocks, return_free_memory
 from pisigma.estimation.dual_regression import DualRegression, gram, places_of_pairs, stacked
 from pisigma.estimation.left_out import LeftOut
-from pisigma.estimation.regression import Posterior
+from pisigma.estimation.primal_regression import PrimalRegression, Solved
+from pisigma.estimation.prior import GaussianPrior
+from pisigma.estimation.regression import Posterior, SensorCount
+from pisigma.joint_correction.feature import AbstractFeature
+
+NARROW = 64
+"""Rows of which all columns are in memory at a time where only products with some of them are made."""
+
+
+@dataclass(frozen=True, eq=False)
+class NormalEquations(PrimalRegression, AbstractDesignRegression):
+    """The normal equations of linearised rows for the unknowns of a design.
+
+    Attributes:
+        design: the unknowns.
+        rows: linearised values.
+    """
+
+    design: Design
+    rows: Rows
+
+    @staticmethod
+    def of(design: Design, rows: Rows) -> "NormalEquations":
+        """Sum up the rows, chunk by chunk.
+
+        The columns of a joint's weights are its features times the derivative by its value, `J_j f_jm`. So for two
+        joints `X_j^T X_i = f_j^T diag(J_j^T J_i) f_i`: the components of a value are summed before the products.
+        """
+        size = design.unknowns
+        return_free_memory(size)
+        normal = design.problem.q.new_empty((len(rows.values), size, size))
+        descent, square = normal.new_empty((len(rows.values), size)), []
+        for k, sensor in enumerate(rows.values):
+            square.append(_add_sums(design, sensor, normal[k], descent[k]))
+        return NormalEquations(normal, descent, tuple(square), rows.sensors, design, rows)
+
+    def select(self, design: Design) -> "NormalEquations":
+        """See `AbstractDesignRegression.select`."""
+        if design.unknowns == self.design.unknowns and design.features == self.design.features:
+            return self
+        return_free_memory(design.unknowns)
+        columns = self.design.indices(design.features)
+        normal = self.normal.new_empty((len(self.normal), len(columns), len(columns)))
+        for whole, part in zip(self.normal, normal, strict=True):
+            _copy_chosen(whole, columns, part)
+        return replace(self, design=design, normal=normal, descent=self.descent[:, columns])
+
+    def extended(self, design: Design) -> "NormalEquations":
+        """The same rows for the unknowns of a design that has some of the features, and a new one as its last.
+
+        Sums that are there already are copied.
+        """
+        self.latest.clear()
+        return_free_memory(design.unknowns)
+        before = self.design.indices(design.features[:-1])
+        first, new = len(before), slice(len(before), None)
+        normal = self.normal.new_empty((len(self.normal), design.unknowns, design.unknowns))
+        descent = torch.cat(
+            [self.descent[:, before], normal.new_zeros((len(normal), len(normal[0]) - first))], 1
+        )
+        for N, b, whole, sensor in zip(normal, descent, self.normal, self.rows.values, strict=True):
+            _copy_chosen(whole, before, N[:first, :first])
+            N[new] = 0.0
+            for rows in chunks(len(sensor.row), NARROW):
+                root = sensor.root[rows, None]
+                X = (design.columns(sensor, rows) * root[..., None]).flatten(0, 1)
+                N[new].addmm_(X[:, new].t(), X)
+                b[new].addmv_(X[:, new].t(), (sensor.residual[rows] * root).flatten())
+            N[:first, new] = N[new, :first].t()
+        return replace(self, design=design, normal=normal, descent=descent)
+
+    def without(self, groups: Int64[Tensor, " groups"]) -> "NormalEquations":
+        """See `AbstractDesignRegression.without`."""
+        other = NormalEquations.of(self.design, self.rows.held_out(groups))
+        counts = zip(self.sensors, other.sensors, strict=True)
+        return replace(
+            self,
+            normal=torch.sub(self.normal, other.normal, out=other.normal),
+            descent=self.descent - other.descent,
+            square=tuple(a - b for a, b in zip(self.square, other.square, strict=True)),
+            sensors=tuple(replace(a, values=a.values - b.values) for a, b in counts),
+        )
+
+    def left_out(self, posterior: Posterior, folds: Sequence[Int64[Tensor, " _groups"]]) -> LeftOut:
+        """See `AbstractDesignRegression.left_out`."""
+        solved = self.solved_with(posterior.prior, posterior.noise)
+        return LeftOut.joined([self._left_out(groups, solved) for groups in folds])
+
+    def _left_out(self, groups: Int64[Tensor, " groups"], solved: Solved) -> LeftOut:
+        """Leave out one fold."""
+        return_free_memory(len(solved.x))
+        test, x = self.rows.held_out(groups).values, solved.x
+        whitened = x.new_empty((sum(sensor.residual.numel() for sensor in test), len(x)))
+        r, number, first = [], [], 0
+        for k, (sensor, sigma) in enumerate(zip(test, solved.noise, strict=True)):
+            root = sensor.root[:, None] / sigma
+            columns = self.design.columns(sensor, slice(None))
+            r.append(((sensor.residual - columns @ x) * root).flatten())
+            number.append(torch.full(r[-1].shape, k, device=x.device))
+            block = whitened[first : first + len(r[-1])].view(columns.shape)
+            torch.mul(columns, root[..., None], out=block).mul_(solved.scale)
+            first += len(r[-1])
+            del columns
+        M = torch.eye(first, dtype=x.dtype, device=x.device)
+        for rows in blocks(len(x), BLOCK):
+            S = solved.inverse[rows, : rows.stop] @ whitened[:, : rows.stop].t()
+            M.addmm_(S.t(), S, alpha=-1)
+        return LeftOut.of(M, torch.cat(r), torch.cat(number), self.sensors)
+
+    def first_sizes(
+        self, posterior: Posterior, design: Design, features: AbstractFeature
+    ) -> tuple[float, Tensor | None]:
+        """See `AbstractDesignRegression.first_sizes`.
+
+        The other unknowns are taken out of the normal equations (Schur complement), so that only the weights of the
+        features are left.
+        """
+        columns = self.design.indices((*design.features, features))
+        old, new = columns[: design.unknowns], columns[design.unknowns :]
+        solved = self.select(design).solved_with(posterior.prior, posterior.noise)
+        normal = sum(N[new] * sigma**-2 for N, sigma in zip(self.normal, posterior.noise, strict=True))
+        descent = sum(b * sigma**-2 for b, sigma in zip(self.descent, posterior.noise, strict=True))
+        square = sum(total / sigma**2 for total, sigma in zip(self.square, posterior.noise, strict=True))
+        cross = normal[:, old]
+        root = solved.inverse @ (cross * solved.scale).t()
+        rest = square - float(descent[old] @ solved.x)
+        alone = PrimalRegression(
+            normal=(normal[:, new] - root.t() @ root)[None],
+            descent=(descent[new] - cross @ solved.x)[None],
+            square=(rest,),
+            sensors=(SensorCount(float(len(new)), False, True),),
+        )
+        whole = Design(design.problem, (*design.features, features)).prior((1.0,) * design.classes)
+        first = int(whole.group[design.unknowns :].min())
+        prior = GaussianPrior(
+            whole.base[design.unknowns :], whole.group[design.unknowns :] - first, whole.sizes[first:], 0
+        )
+        best = alone.maximise_evidence(prior, (1.0,))
+        return best.log_evidence + rest / 2, best.prior.sizes
+
+
+def _add_sums(design: Design, sensor: SensorValues, N: Tensor, b: Tensor) -> float:
+    """Fill in normal matrix and right side of one sensor's values; their square is returned."""
+    active, dof = design.active, sensor.joints.shape[-1]
+    count = sum(chosen.count for chosen in design.features)
+    size = active + dof * count
+    normal = sensor.root.new_zeros((size, size))
+    descent, square, weight = normal.new_zeros(size), 0.0, sensor.root.square()
+    for rows in chunks(len(sensor.row)):
+        G, y, w = sensor.geometry[rows], sensor.residual[rows], weight[rows]
+        Gw = G * w[:, None, None]
+        normal[:active, :active] += Gw.flatten(0, 1).t() @ G.flatten(0, 1)
+        descent[:active] += Gw.flatten(0, 1).t() @ y.flatten()
+        square += float((y.square() * w[:, None]).sum())
+        sides = [(_feature_columns(design, row[rows]), joints[rows]) for row, joints in sensor.sides if count]
+        for f, J in sides:
+            Jw = J * w[:, None, None]
+            along, pull = Jw.mT @ G, torch.einsum("rcj,rc->rj", Jw, y)
+            for g, other in sides:
+                shared = Jw.mT @ other
+                for j in range(dof):
+                    first = active + j * count
+                    right = (g[:, j:] * shared[:, j, j:, None]).flatten(1)
+                    normal[first : first + count, first:].addmm_(f[:, j].t(), right)
+            for j in range(dof):
+                block = slice(active + j * count, active + (j + 1) * count)
+                normal[:active, block].addmm_(along[:, j].t(), f[:, j])
+                descent[block].addmv_(f[:, j].t(), pull[:, j])
+    order = torch.cat([torch.arange(active), active + _places(design, dof, count)])
+    for rows in chunks(size):
+        corner = normal[rows, rows]
+        corner.copy_(corner.triu() + corner.triu(1).t())
+        normal[rows.stop :, rows] = normal[rows, rows.stop :].t()
+    _copy_chosen(normal, order, N)
+    b.copy_(descent[order])
+    return square
+
+
+def _copy_chosen(matrix: Tensor, chosen: Int64[Tensor, " chosen"], to: Tensor) -> None:
+    """Copy some rows and columns of a matrix, without another one beside the two."""
+    for rows in chunks(len(chosen)):
+        torch.index_select(matrix[chosen[rows]], 1, chosen, out=to[rows])
+
+
+def _feature_columns(design: Design, row: Tensor) -> Float64[Tensor, "rows dof columns"]:
+    """Columns of all features at some rows of the problem, those that a joint does not have as well."""
+    state = design.problem.state[row]
+    return torch.cat([chosen.columns(state) for chosen in design.features], -1)
+
+
+def _places(design: Design, dof: int, count: int) -> Int64[Tensor, " weights"]:
+    """Where the weights stand, joint by joint and all columns of all features in turn."""
+    first, places = 0, [torch.zeros(0, dtype=torch.int64)]
+    for chosen in design.features:
+        own = torch.arange(dof)[:, None] * count + first + torch.arange(chosen.count)
+        places.append(own[chosen.used])
+        first += chosen.count
+    return torch.cat(places)
+
 
 MOST_VALUES = 1_000
 """The covariance of the values is used up to so many, whose matrices of all groups then take up to 200 MB."""
@@ -58,7 +257,7 @@ class ValueCovariance(DualRegression, AbstractDesignRegression):
         )
 
     def select(self, design: Design) -> "ValueCovariance":
-        """See `AbstractRegression.select`."""
+        """See `AbstractDesignRegression.select`."""
         columns = self.design.indices(design.features)
         X, prior = self.X[:, columns], design.prior((1.0,) * design.classes)
         before = self.prior.group[columns]
@@ -71,7 +270,7 @@ class ValueCovariance(DualRegression, AbstractDesignRegression):
         return replace(self, design=design, X=X, prior=prior, K=stacked(K, self.y))
 
     def without(self, groups: Int64[Tensor, " groups"]) -> "ValueCovariance":
-        """See `AbstractRegression.without`."""
+        """See `AbstractDesignRegression.without`."""
         kept = (~torch.isin(self.group, groups)).nonzero()[:, 0]
         sensor = self.sensor[kept]
         left, all_ = (
@@ -90,7 +289,7 @@ class ValueCovariance(DualRegression, AbstractDesignRegression):
         )
 
     def left_out(self, posterior: Posterior, folds: Sequence[Int64[Tensor, " _groups"]]) -> LeftOut:
-        """See `AbstractRegression.left_out`; `noise² P` is `I - X C X^T`, and `noise² P y` the residual."""
+        """See `AbstractDesignRegression.left_out`; `noise² P` is `I - X C X^T`, and `noise² P y` the residual."""
         if self.is_ill(posterior.prior, posterior.noise):
             return self.primal.left_out(posterior, folds)
         sigma = self.y.new_tensor(posterior.noise)[self.sensor]

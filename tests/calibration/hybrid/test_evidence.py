@@ -13,7 +13,7 @@ from testing.posteriors import covariance as covariance_of
 from testing.regression_cases import poses
 from torch import Tensor
 
-from pisigma.calibration.hybrid.normal_equations import NormalEquations
+from pisigma.calibration.hybrid.regression import NormalEquations
 from pisigma.estimation.prior import SMALLEST_SIZE, GaussianPrior
 
 GROUP = torch.tensor([0, 0, 1, 1, 1, 2, 2, 2])

@@ -9,8 +9,7 @@ from testing.regression_cases import CASES, few_values, poses
 from torch import Tensor
 
 from pisigma.calibration.hybrid.design_regression import AbstractDesignRegression
-from pisigma.calibration.hybrid.normal_equations import NormalEquations
-from pisigma.calibration.hybrid.regression import ValueCovariance
+from pisigma.calibration.hybrid.regression import NormalEquations, ValueCovariance
 from pisigma.estimation.left_out import LeftOut
 from pisigma.estimation.regression import SensorCount
 

@@ -13,7 +13,7 @@ from testing.regression_cases import CASES, poses, several_targets
 from torch import Tensor
 
 from pisigma.calibration.hybrid.design import Design
-from pisigma.calibration.hybrid.normal_equations import NormalEquations
+from pisigma.calibration.hybrid.regression import NormalEquations
 from pisigma.files.errors import IdentificationError
 from pisigma.joint_correction.gravity_torques import GravityTorques
 from pisigma.joint_correction.input_products import InputProducts

@@ -6,8 +6,7 @@ from testing.closeness import assert_close
 from testing.regression_cases import few_values, poses, several_targets
 
 from pisigma.calibration.hybrid.design import Design
-from pisigma.calibration.hybrid.normal_equations import NormalEquations
-from pisigma.calibration.hybrid.regression import ValueCovariance, regression
+from pisigma.calibration.hybrid.regression import NormalEquations, ValueCovariance, regression
 
 
 def test_few_values_of_many_unknowns_are_regressed_by_their_covariance() -> None:

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from pisigma.calibration.geometric.calibrator import GeometricCalibrator
 from pisigma.calibration.hybrid.design import Design, Rows
-from pisigma.calibration.hybrid.normal_equations import NormalEquations
+from pisigma.calibration.hybrid.regression import NormalEquations
 from pisigma.calibration.hybrid.sensor_values import SensorValues, sensor_values
 from pisigma.joint_correction.fourier_series import FourierSeries
 from pisigma.measurement.dataset import Measurements

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from pisigma.calibration.geometric.prediction import predicted_poses
 from pisigma.calibration.geometric.problem.setup import identified_geometry
-from pisigma.calibration.hybrid.normal_equations import NormalEquations
+from pisigma.calibration.hybrid.regression import NormalEquations
 from pisigma.calibration.hybrid.search import Fitted
 from pisigma.calibration.hybrid.uncertainty import PositionUncertainty, position_uncertainty
 from pisigma.estimation.left_out import LARGEST_SCALE, LeftOut, left_out_scale

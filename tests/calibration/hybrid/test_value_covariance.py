@@ -12,8 +12,7 @@ from testing.posteriors import assert_same_posterior
 from testing.regression_cases import CASES, few_values
 
 from pisigma.calibration.hybrid.design import Design
-from pisigma.calibration.hybrid.normal_equations import NormalEquations
-from pisigma.calibration.hybrid.regression import ValueCovariance
+from pisigma.calibration.hybrid.regression import NormalEquations, ValueCovariance
 from pisigma.files.errors import IdentificationError
 
 
