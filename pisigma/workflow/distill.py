@@ -32,7 +32,7 @@ from pisigma.validation.held_out.distillation_summary import (
     AbsoluteFigures,
     DistillationSummary,
     DistilledErrors,
-    JointErrorFigures,
+    DistilledJoint,
     JointRange,
     ParentFigures,
     PoseFigures,
@@ -306,12 +306,12 @@ def _tool_errors(
 
 def _joint_errors(
     robot: Robot, correction: Float64[Tensor, "poses dof"], predicted: Float64[Tensor, "poses dof"]
-) -> tuple[JointErrorFigures, ...]:
+) -> tuple[DistilledJoint, ...]:
     """Per joint what the full solution adds, and how far the distilled model is from it."""
     joints = []
     for joint, full, rest in zip(robot.joints, correction.T, (correction - predicted).T, strict=True):
         sizes = {"correction": _absolute(full, joint), "error": _absolute(rest, joint)}
-        joints.append(JointErrorFigures(name=joint.name, unit=joint.file_unit, **sizes))
+        joints.append(DistilledJoint(name=joint.name, unit=joint.file_unit, **sizes))
     return tuple(joints)
 
 

@@ -107,7 +107,7 @@ class AbsoluteFigures(Section):
     max: float
 
 
-class JointErrorFigures(Section):
+class DistilledJoint(Section):
     """What the full solution adds to the values of a joint, and how far the network is from that; in `unit`."""
 
     name: str
@@ -137,6 +137,6 @@ class DistillationSummary(AbstractSummary):
     poses: PoseFigures
     sizes: tuple[SizeFigures, ...]
     held_out: DistilledErrors
-    joints: tuple[JointErrorFigures, ...]
+    joints: tuple[DistilledJoint, ...]
     warnings: tuple[str, ...] = ()
     limitations: tuple[str, ...] = ()
