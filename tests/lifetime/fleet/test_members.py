@@ -4,6 +4,7 @@ import pytest
 
 from pisigma.files.errors import FleetError, MeasurementError
 from pisigma.lifetime.fleet.members import read_fleet
+from pisigma.workflow.fleet.one_robot import settings_for
 from pisigma.workflow.settings.fleet import FleetSettings
 
 
@@ -37,7 +38,7 @@ def test_cameras_and_boards_of_corners(tmp_path):
     assert a.cameras is not None
     wrist, beside, board = (str(tmp_path / name) for name in ("wrist.yaml", "beside.yaml", "board.yaml"))
     assert a.cameras.files == (wrist, beside, board)
-    assert FleetSettings().of(a).cameras == a.cameras
+    assert settings_for(FleetSettings(), a).cameras == a.cameras
     assert b.cameras is None
     with pytest.raises(FleetError, match="line 2: the columns 'camera' and 'board' belong together"):
         read_fleet(write(tmp_path, f"{header}a,ur5,a.csv,wrist.yaml,\n"))
