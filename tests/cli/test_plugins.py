@@ -140,12 +140,12 @@ def test_an_installed_package_is_loaded_by_every_command(run, example, tmp_path,
     folder = tmp_path / "limits_of_joints-1.0.dist-info"
     folder.mkdir()
     (folder / "METADATA").write_text("Metadata-Version: 2.1\nName: limits-of-joints\nVersion: 1.0\n")
-    (folder / "entry_points.txt").write_text("[pisigma.files.plugins]\nlimits = limits_of_joints\n")
+    (folder / "entry_points.txt").write_text("[pisigma.plugins]\nlimits = limits_of_joints\n")
     monkeypatch.syspath_prepend(tmp_path)
     assert run("robots").exit_code == 0
     assert "limits" in exports.export_names()
     monkeypatch.setattr(plugins, "_loaded", plugins.Plugins())
-    (folder / "entry_points.txt").write_text("[pisigma.files.plugins]\nlimits = limits_of_nothing\n")
+    (folder / "entry_points.txt").write_text("[pisigma.plugins]\nlimits = limits_of_nothing\n")
     result = run("robots")
     assert (result.exit_code, result.stdout) == (2, "")
     assert "plug-in 'limits' of limits-of-joints" in result.stderr

@@ -141,7 +141,7 @@ def test_the_key_holds_what_the_code_depends_on(monkeypatch):
 
 def test_loading_kernels_on_a_fresh_cache_needs_no_compiler(tmp_path):
     """As on a new machine without numba, from a copy of the package that has no machine code beside it."""
-    package = Path(build.__file__).parent.parent
+    package = Path(build.__file__).parents[2]
     shutil.copytree(package, tmp_path / "pisigma", ignore=shutil.ignore_patterns("__pycache__", "catalogue"))
     script = (
         "import sys\nfor name in ('numba', 'torch'):\n    sys.modules[name] = None\n"
@@ -151,7 +151,7 @@ def test_loading_kernels_on_a_fresh_cache_needs_no_compiler(tmp_path):
     command = [sys.executable, "-c", script]
     done = subprocess.run(command, capture_output=True, text=True, check=False, env=environment, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
-    folder = tmp_path / "pisigma" / "kernels" / "__pycache__"
+    folder = tmp_path / "pisigma" / "robot" / "kernels" / "__pycache__"
     assert [path.suffix for path in folder.iterdir() if path.suffix == ".o"] == [".o"]
 
 
