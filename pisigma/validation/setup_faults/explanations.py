@@ -25,9 +25,8 @@ from pisigma.validation.held_out.frames.frame_fits import (
     best_base_and_tool,
     best_tool,
 )
-from pisigma.validation.setup_faults.arm import PredictingArm
 from pisigma.validation.setup_faults.cause import Cause, length_text
-from pisigma.validation.setup_faults.hypothesis import COLLAPSED, Hypothesis
+from pisigma.validation.setup_faults.hypothesis import COLLAPSED, Hypothesis, PredictingArm
 from pisigma.validation.setup_faults.joint_faults import NEAR_BEST, NOTICED, joint_causes, likely_maps
 
 if TYPE_CHECKING:
@@ -154,21 +153,23 @@ def in_frames(
     """
     rows = len(here.T)
     bound = float(affine_error(here.T, here.measured)) * (1 - 13 / rows) if rows > 13 else 0.0
+    frames, targets = numbers_of_names(some.frame), numbers_of_names(some.target)
+    count, tools = int(frames.max()) + 1, int(targets.max()) + 1
+    both = None
+    if bound <= most**2 and (arm.model is None or count == tools == 1):
+        both = best_base_and_tool(here.T, here.measured)
     if arm.model is None:
-        if bound <= most**2:
-            base, tool = best_base_and_tool(here.T, here.measured)
-            yield replace(here, T=base @ here.T @ tool)
+        if both is not None:
+            yield replace(here, T=both[0] @ here.T @ both[1])
         return
     yield here
-    frames, targets = numbers_of_names(some.frame), numbers_of_names(some.target)
     per_tool = 6 if bool(here.measured.has_rotation.any()) else 3
-    count, tools = int(frames.max()) + 1, int(targets.max()) + 1
     X, Y = _per_group(best_base, frames, here), _per_group(best_tool, targets, here)
     bases = bases_of_rows(arm.model, some)
     yield here.with_cause(_moved("frame", X, bases), X @ here.T, 6 * count)
     yield here.with_cause(_moved("tool", Y), here.T @ Y, per_tool * tools)
-    if count == 1 and tools == 1 and bound <= most**2:
-        base, tool = best_base_and_tool(here.T, here.measured)
+    if both is not None:
+        base, tool = both
         moved = here.with_cause(_moved("frame", base[None], bases), base @ here.T, 6)
         yield moved.with_cause(_moved("tool", tool[None]), base @ here.T @ tool, per_tool)
 

@@ -3,7 +3,7 @@
 import math
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -24,8 +24,7 @@ from pisigma.validation.held_out.frames.frame_fits import (
     affine_error,
     best_base_and_tool,
 )
-from pisigma.validation.setup_faults.arm import PredictingArm
-from pisigma.validation.setup_faults.cause import Cause
+from pisigma.validation.setup_faults.cause import Cause, joined
 from pisigma.validation.setup_faults.explanations import (
     AS_GOOD,
     hypotheses,
@@ -33,10 +32,9 @@ from pisigma.validation.setup_faults.explanations import (
     largest_explained,
     simplest,
 )
-from pisigma.validation.setup_faults.free_joint import freed_joints
-from pisigma.validation.setup_faults.hypothesis import Hypothesis
+from pisigma.validation.setup_faults.hypothesis import Hypothesis, PredictingArm
+from pisigma.validation.setup_faults.joint_values import MARGIN, freed_joints, shifted_rows
 from pisigma.validation.setup_faults.setup_fault import SetupFault, fault_of
-from pisigma.validation.setup_faults.target_faults import better_labellings, fit_targets
 
 MOST_ROWS = 1_000
 """Rows that explanations are tried on, spread over all of them."""
@@ -50,14 +48,18 @@ LARGEST_SLIDE = 3 * HOBBY.largest.length
 """[m] The same of joints that slide."""
 USUAL = 1e-3
 """Usual prior standard deviation of geometric errors [m and rad]."""
-SHIFTS = (1, -1, 2, -2)
-"""Rows by which joint values may be shifted against what was measured."""
-MARGIN = max(SHIFTS)
-ENDS = 3
-"""Base and tool are fitted to the first and to the last third of the rows where a row may have been lost between."""
 SURE = 1e-3
 """Joint values explain positions where chance would explain as much of them with a probability below this."""
-_ADVICE = "look for a row that was lost or written twice on one side, and put both sides together again"
+MOST_TARGETS = 4
+"""Targets that are looked for under one name."""
+EXAMPLES = 3
+"""Rows that are named, at most."""
+TARGET_TURNS = 20
+"""Turns of fitting base and targets, at most."""
+TARGETS_SETTLED = 1e-2
+"""They end where a turn lowers the mean square by less than this share."""
+NAMING_ROUNDS = 8
+"""Rounds of naming every row after the nearest target and fitting base and targets anew, at most."""
 
 
 def find_faults_as_drawn(robot: Robot, measurements: Measurements) -> tuple[SetupFault, ...]:
@@ -222,60 +224,6 @@ def spread(rows: Int64[Tensor, " rows"], most: int) -> Int64[Tensor, " chosen"]:
     return rows[torch.linspace(0, len(rows) - 1, count).round().long()]
 
 
-def shifted_rows(
-    arm: PredictingArm, rows: Measurements, chosen: Int64[Tensor, " chosen"], measured: MeasuredPoses
-) -> Iterator[tuple[Float64[Tensor, "chosen dof"], MeasuredPoses, Cause]]:
-    """Go through joint values or orientations of a row before or behind, in all rows or from one on.
-
-    Args:
-        arm: with which is predicted.
-        rows: in the order of the file.
-        chosen: those to judge, `MARGIN` or more from both ends.
-        measured: their poses.
-    """
-    q = rows.q[chosen]
-    for shift in SHIFTS:
-        cause = Cause(
-            "rows", f"the joint values are shifted by {_count(shift)} against the measurements", _ADVICE, 1.0
-        )
-        yield rows.q[chosen + shift], measured, cause
-        if bool(measured.has_rotation.any()):
-            assert rows.rotation is not None
-            other = rows.rotation[chosen + shift]
-            there = torch.isfinite(other).flatten(1).all(1)
-            rotations = replace(measured, rotation=torch.where(there[:, None, None], other, 0.0))
-            rotations = replace(rotations, has_rotation=there & measured.has_rotation)
-            clause = f"the orientations are shifted by {_count(shift)} against the positions"
-            yield q, rotations, Cause("rows", clause, _ADVICE, 1.0)
-    yield from _shifted_from_a_row(arm, rows, chosen)
-
-
-def _shifted_from_a_row(
-    arm: PredictingArm, rows: Measurements, chosen: Int64[Tensor, " chosen"]
-) -> Iterator[tuple[Float64[Tensor, "chosen dof"], MeasuredPoses, Cause]]:
-    """Find the row from which on, or up to which, a shift explains most; base and tool are fitted beyond it.
-
-    The rows about it are left out, as what was lost there stands nowhere.
-    """
-    inner = torch.arange(MARGIN, rows.rows - MARGIN)
-    measured = MeasuredPoses.of(rows.select(inner), LEVER_SHARE * arm.robot.reach)
-    T = {shift: arm.poses(replace(rows, q=rows.q.roll(-shift, 0)))[inner] for shift in (0, *SHIFTS)}
-    third = len(chosen) // ENDS
-    for at_start, end in ((True, chosen[:third] - MARGIN), (False, chosen[-third:] - MARGIN)):
-        base, tool = best_base_and_tool(T[0][end], measured.select(end))
-        errors = {shift: measured.squares(base @ poses @ tool) for shift, poses in T.items()}
-        for shift in SHIFTS:
-            gain = errors[0] - errors[shift] if at_start else errors[shift] - errors[0]
-            change = int(gain.flip(0).cumsum(0).flip(0).argmax())
-            place = rows.place(int(inner[change]))
-            where = f"from about {place} on" if at_start else f"up to about {place}"
-            clause = f"{where} the joint values are shifted by {_count(shift)} against the measurements"
-            kept = chosen[(chosen - inner[change] + 0.5).abs() > abs(shift)]
-            behind = kept >= inner[change]
-            q = torch.where((behind == at_start)[:, None], rows.q[kept + shift], rows.q[kept])
-            yield q, measured.select(kept - MARGIN), Cause("rows", clause, _ADVICE, 1.5)
-
-
 def explains_nothing(T: Float64[Tensor, "rows 4 4"], position: Float64[Tensor, "rows 3"]) -> bool:
     """Say whether predicted poses explain no more of measured positions than chance, by an F test of the affine fit.
 
@@ -292,6 +240,126 @@ def explains_nothing(T: Float64[Tensor, "rows 4 4"], position: Float64[Tensor, "
     return float(fdtrc(free, left, (total - unexplained) / free / (unexplained / left))) > SURE
 
 
-def _count(shift: int) -> str:
-    """Write by how many rows joint values are shifted."""
-    return "one row" if abs(shift) == 1 else f"{abs(shift)} rows"
+@dataclass(frozen=True, eq=False)
+class Labelling:
+    """Rows named after the targets that they fit.
+
+    Attributes:
+        cause: what is wrong with the names of the file.
+        T: predicted poses of the targets, base and tools being fitted under the better names.
+        targets: number of targets.
+    """
+
+    cause: Cause
+    T: Float64[Tensor, "rows 4 4"]
+    targets: int
+
+
+def better_labellings(robot: Robot, rows: Measurements, measured: MeasuredPoses) -> Iterator[Labelling]:
+    """Find targets from the measurements alone: points of the tool that the measured positions cluster about.
+
+    As k-means, but base and targets are fitted to all rows in every round. With several names there are as many
+    targets, and each keeps the name that most of its rows have; with one name there are 2, then 3, up to
+    `MOST_TARGETS`.
+
+    Args:
+        robot: as drawn.
+        rows: with positions, of one frame.
+        measured: their poses.
+    """
+    names = tuple(dict.fromkeys(rows.target))
+    T = forward_kinematics(robot, rows.q)
+    for count in range(2, MOST_TARGETS + 1) if len(names) == 1 else (len(names),):
+        number, poses = _clustered(T, measured, count)
+        cause = _one_name(rows, number) if len(names) == 1 else _other_names(rows, number, names)
+        yield Labelling(cause, poses, count)
+
+
+def fit_targets(
+    T: Float64[Tensor, "rows 4 4"], measured: MeasuredPoses, number: Int64[Tensor, " rows"]
+) -> tuple[Float64[Tensor, "4 4"], Float64[Tensor, "rows 4 4"]]:
+    """Fit base and targets to measured poses by turns: base and the targets' mean, then every target's place.
+
+    Args:
+        T: predicted poses, with any base and tool.
+        measured: what was measured there.
+        number: of every row's target, 0 and up.
+
+    Returns:
+        The base, and the poses that are predicted with it.
+    """
+    places = torch.zeros(int(number.max()) + 1, 3).to(T)
+    last = math.inf
+    for _ in range(TARGET_TURNS):
+        of_rows = T.clone()
+        of_rows[:, :3, 3] += (T[:, :3, :3] @ places[number][..., None])[..., 0]
+        base, tool = best_base_and_tool(of_rows, measured)
+        fitted = base @ of_rows @ tool
+        error = float(measured.squares(fitted).mean())
+        if error > (1 - TARGETS_SETTLED) * last:
+            break
+        last = error
+        points = _behind(base @ T, measured)
+        places = torch.stack([points[number == k].mean(0) for k in range(len(places))])
+    return base, fitted
+
+
+def _behind(T: Float64[Tensor, "rows 4 4"], measured: MeasuredPoses) -> Float64[Tensor, "rows 3"]:
+    """Give measured positions as predicted poses see them [m]."""
+    return (T[:, :3, :3].mT @ (measured.position - T[:, :3, 3])[..., None])[..., 0]
+
+
+def _one_name(rows: Measurements, number: Int64[Tensor, " rows"]) -> Cause:
+    used, sizes = torch.unique(number, return_counts=True)
+    first = [_where(rows, int((number == k).nonzero()[0, 0])) for k in used]
+    shares = joined(f"{100 * size / len(number):.0f} %" for size in sizes.tolist())
+    clause = (
+        f"the targets look mixed up: the rows are of {len(used)} targets under one name ({shares} of them)"
+    )
+    return Cause(
+        "target",
+        clause,
+        f"name the targets in a column 'target'; they begin in {joined(first)}",
+        float(len(used)),
+    )
+
+
+def _other_names(rows: Measurements, number: Int64[Tensor, " rows"], names: tuple[str, ...]) -> Cause:
+    shared = torch.zeros(int(number.max()) + 1, len(names))
+    shared.index_put_((number, numbers_of_names(rows.target)), torch.tensor(1.0), accumulate=True)
+    better = [names[k] for k in shared.argmax(1)[number].tolist()]
+    wrong = [row for row, (name, other) in enumerate(zip(rows.target, better, strict=True)) if name != other]
+    examples = [
+        f"{_where(rows, row)} fits '{better[row]}' instead of '{rows.target[row]}'"
+        for row in wrong[:EXAMPLES]
+    ]
+    clause = f"the targets look mixed up: {len(wrong)} of {rows.rows} rows fit another target than the one they name"
+    return Cause("target", clause, f"check the column 'target': {joined(examples)}", 2.0)
+
+
+def _where(rows: Measurements, row: int) -> str:
+    """Name a row in short: the file stands before it."""
+    return f"line {rows.line[row]}" if rows.line[row] else f"row {row}"
+
+
+def _clustered(
+    T: Float64[Tensor, "rows 4 4"], measured: MeasuredPoses, count: int
+) -> tuple[Int64[Tensor, " rows"], Float64[Tensor, "rows 4 4"]]:
+    """Cluster the points of the tool that were measured; returns their numbers and the predicted poses."""
+    number = torch.zeros(len(T), dtype=torch.int64)
+    base, tool = best_base_and_tool(T, measured)
+    points, fitted = _behind(base @ T, measured), base @ T @ tool
+    centres = points.median(0).values[None]
+    for _ in range(count):
+        far = torch.cdist(points, centres).amin(1).topk(max(1, len(T) // (4 * count))).indices
+        centres = torch.cat([centres, points[far].median(0).values[None]])
+    centres = centres[1:]
+    for _ in range(NAMING_ROUNDS):
+        nearest = torch.cdist(points, centres).argmin(1)
+        if bool((nearest == number).all()):
+            break
+        number = torch.unique(nearest, return_inverse=True)[1]
+        base, fitted = fit_targets(T, measured, number)
+        points = _behind(base @ T, measured)
+        centres = torch.stack([points[number == k].median(0).values for k in range(int(number.max()) + 1)])
+    return number, fitted

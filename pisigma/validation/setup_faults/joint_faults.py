@@ -15,8 +15,8 @@ from pisigma.measurement.dataset import Measurements
 from pisigma.robot.description import Robot
 from pisigma.robot.se3 import wrap_to_pi
 from pisigma.validation.held_out.frames.frame_fits import MeasuredPoses
-from pisigma.validation.setup_faults.arm import PredictingArm
 from pisigma.validation.setup_faults.cause import Cause, joints_text
+from pisigma.validation.setup_faults.hypothesis import PredictingArm
 
 QUARTER = math.pi / 2
 GRADIANS = 0.9

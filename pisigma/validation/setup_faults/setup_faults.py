@@ -13,7 +13,6 @@ from pisigma.validation.held_out.calibration_summary import has_orientation
 from pisigma.validation.held_out.frames.fitted_frames import FrameKind, fit_frames, with_names_of
 from pisigma.validation.held_out.frames.frame_fits import LEVER_SHARE, MeasuredPoses
 from pisigma.validation.held_out.model_comparison import ModelFigures
-from pisigma.validation.setup_faults.arm import PredictingArm
 from pisigma.validation.setup_faults.explanations import (
     PLAUSIBLE_SHARE,
     PLAUSIBLE_TURN,
@@ -28,7 +27,7 @@ from pisigma.validation.setup_faults.faults_as_drawn import (
     measured_rows,
     spread,
 )
-from pisigma.validation.setup_faults.hypothesis import Hypothesis
+from pisigma.validation.setup_faults.hypothesis import Hypothesis, PredictingArm
 from pisigma.validation.setup_faults.joint_faults import NOTICED
 from pisigma.validation.setup_faults.setup_fault import SetupFault, fault_of
 
