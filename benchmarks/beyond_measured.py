@@ -29,8 +29,8 @@ from pisigma.joint_correction.input_products import InputProducts
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.groups import held_out_groups
 from pisigma.robot import Robot
+from pisigma.robot.frame_fits import LEVER_SHARE, MeasuredPoses
 from pisigma.validation.held_out.frames.fitted_frames import fit_frames
-from pisigma.validation.held_out.frames.frame_fits import LEVER_SHARE, MeasuredPoses
 
 DATA = Path(os.environ.get("PISIGMA_DATA", "../shared/data")) / "ur10"
 ROUNDS = 3
@@ -100,7 +100,7 @@ def error(solved: SolvedCalibration, refined: Refined, rows: Measurements) -> fl
     with torch.no_grad():
         moved = replace(rows, q=rows.q + refined.correction.of_rows(rows))
     T: Tensor = predicted_poses(geometry.robot, geometry.bases, geometry.tools, moved)
-    measured = MeasuredPoses.of(rows, LEVER_SHARE * geometry.robot.reach)
+    measured = MeasuredPoses.of(rows.position, rows.rotation, LEVER_SHARE * geometry.robot.reach)
     T, _ = fit_frames(T, measured, rows, ("base", "tool"))
     assert rows.position is not None
     return float((rows.position - T[:, :3, 3]).square().sum(1).mean().sqrt() * 1e3)

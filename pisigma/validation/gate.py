@@ -1,7 +1,7 @@
 """The one gate for rows: every command that takes some lets them be judged here, with the same words and status."""
 
 from collections.abc import Collection, Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from jaxtyping import Float64
 from torch import Tensor
@@ -12,6 +12,7 @@ from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.model_posterior import FLEET_PRIOR
 from pisigma.robot.description import Robot
+from pisigma.robot.frame_fits import MeasuredPoses, best_base_and_tool
 from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.validation.checks.other_robot import other_robot_diagnostics
 from pisigma.validation.checks.registry import ROW_CHECKS, diagnostics_of_rows
@@ -20,7 +21,6 @@ from pisigma.validation.checks.rows.row_check import Move, RowsUnderModel
 from pisigma.validation.checks.setup_fault import setup_diagnostics
 from pisigma.validation.held_out.diagnostic import Diagnostic
 from pisigma.validation.held_out.frames.fitted_frames import FrameKind
-from pisigma.validation.held_out.frames.frame_fits import MeasuredPoses, best_base_and_tool
 from pisigma.validation.setup_faults.cause import length_text
 from pisigma.validation.setup_faults.explanations import position_spread
 from pisigma.validation.setup_faults.faults_as_drawn import FEWEST_ROWS_AS_DRAWN, largest_group, usual_error
@@ -194,7 +194,7 @@ def joint_columns(robot: Robot, rows: Measurements) -> Iterator[Diagnostic]:
 
 def _errors(robot: Robot, rows: Measurements, q: Float64[Tensor, "maps rows dof"]) -> list[float]:
     """Root mean squares of the position errors [m] with base and tool fitted, as if nothing were fitted."""
-    measured = MeasuredPoses.of(replace(rows, rotation=None), 0.0)
+    measured = MeasuredPoses.of(rows.position, None, 0.0)
     errors = []
     for T in forward_kinematics(robot, q):
         base, tool = best_base_and_tool(T, measured)

@@ -13,8 +13,8 @@ from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.row_poses import poses_of_rows
 from pisigma.robot.description import Robot
+from pisigma.robot.frame_fits import LEVER_SHARE, MeasuredPoses, best_base_and_tool
 from pisigma.robot.se3 import pose_error, transform_from_xyzrpy
-from pisigma.validation.held_out.frames.frame_fits import LEVER_SHARE, MeasuredPoses, best_base_and_tool
 
 FrameChoice = Literal["fitted", "fixed"]
 """Whether base and tool of the second model are fitted to those of the first, or are the same by their names."""

@@ -16,9 +16,9 @@ from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.sensors.sensor import SHOWN_UNITS
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.hybrid_motion import corrected_joints
+from pisigma.robot.frame_fits import LEVER_SHARE
 from pisigma.robot.kinematics.parameter_jacobian import identification_jacobian
 from pisigma.robot.se3 import rotation_from_vector, rotation_vector, skew, xyzrpy_from_transform
-from pisigma.validation.held_out.frames.frame_fits import LEVER_SHARE
 
 FLOOR = 2e-5
 """[m] Standard deviation of predicted coordinates that no posterior knows of, as a robot's repeatability."""

@@ -16,8 +16,7 @@ from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.groups import numbers_of_names
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.row_poses import bases_of_rows, nominal_poses_of_rows, poses_of_rows
-from pisigma.robot.se3 import rotation_vector
-from pisigma.validation.held_out.frames.frame_fits import (
+from pisigma.robot.frame_fits import (
     LEVER_SHARE,
     MeasuredPoses,
     affine_error,
@@ -25,6 +24,7 @@ from pisigma.validation.held_out.frames.frame_fits import (
     best_base_and_tool,
     best_tool,
 )
+from pisigma.robot.se3 import rotation_vector
 from pisigma.validation.setup_faults.cause import Cause, length_text
 from pisigma.validation.setup_faults.hypothesis import COLLAPSED, Hypothesis, PredictingArm
 from pisigma.validation.setup_faults.joint_faults import NEAR_BEST, NOTICED, joint_causes, likely_maps

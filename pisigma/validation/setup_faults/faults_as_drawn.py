@@ -15,15 +15,15 @@ from pisigma.files.errors import IdentificationError
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.groups import numbers_of_names
 from pisigma.robot.description import Robot
-from pisigma.robot.kinematics.forward import forward_kinematics
-from pisigma.robot.kinematics.parameter_jacobian import identification_jacobian
-from pisigma.robot.robot_class import HOBBY
-from pisigma.validation.held_out.frames.frame_fits import (
+from pisigma.robot.frame_fits import (
     LEVER_SHARE,
     MeasuredPoses,
     affine_error,
     best_base_and_tool,
 )
+from pisigma.robot.kinematics.forward import forward_kinematics
+from pisigma.robot.kinematics.parameter_jacobian import identification_jacobian
+from pisigma.robot.robot_class import HOBBY
 from pisigma.validation.setup_faults.cause import Cause, joined
 from pisigma.validation.setup_faults.explanations import (
     AS_GOOD,
@@ -82,7 +82,7 @@ def find_faults_as_drawn(robot: Robot, measurements: Measurements) -> tuple[Setu
         return ()
     chosen = spread(torch.arange(MARGIN, rows.rows - MARGIN), MOST_ROWS_AS_DRAWN)
     some, arm = rows.select(chosen), PredictingArm(robot)
-    measured = MeasuredPoses.of(some, LEVER_SHARE * robot.reach)
+    measured = MeasuredPoses.of(some.position, some.rotation, LEVER_SHARE * robot.reach)
     raw = Hypothesis(some.q, arm.poses(some), measured)
     here, usual = next(in_frames(arm, some, raw)), usual_error(robot, some.q)
     if len(set(measurements.target)) > 1:
@@ -141,7 +141,10 @@ def _named_otherwise(robot: Robot, measurements: Measurements, usual: float) -> 
     """Find better names for the targets of the frame that most rows are of, where errors are larger than usual [m]."""
     rows = largest_group(measurements, by_target=False)
     rows = rows.select(spread(torch.arange(rows.rows), MOST_ROWS))
-    measured, T = MeasuredPoses.of(rows, LEVER_SHARE * robot.reach), forward_kinematics(robot, rows.q)
+    measured, T = (
+        MeasuredPoses.of(rows.position, rows.rotation, LEVER_SHARE * robot.reach),
+        forward_kinematics(robot, rows.q),
+    )
     here = Hypothesis(rows.q, fit_targets(T, measured, numbers_of_names(rows.target))[1], measured)
     if not here.error > usual:
         return ()

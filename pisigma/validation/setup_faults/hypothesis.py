@@ -12,9 +12,9 @@ from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.row_poses import poses_of_rows
 from pisigma.robot.description import Robot
+from pisigma.robot.frame_fits import MeasuredPoses, affine_error, best_base
 from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.robot.se3 import rotation_vector
-from pisigma.validation.held_out.frames.frame_fits import MeasuredPoses, affine_error, best_base
 from pisigma.validation.setup_faults.cause import Cause
 
 COLLAPSED = 0.25

@@ -13,8 +13,8 @@ from torch import Tensor
 
 from pisigma.measurement.dataset import Measurements
 from pisigma.robot.description import Robot
+from pisigma.robot.frame_fits import MeasuredPoses
 from pisigma.robot.se3 import wrap_to_pi
-from pisigma.validation.held_out.frames.frame_fits import MeasuredPoses
 from pisigma.validation.setup_faults.cause import Cause, joints_text
 from pisigma.validation.setup_faults.hypothesis import PredictingArm
 

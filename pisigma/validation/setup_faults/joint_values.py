@@ -9,14 +9,14 @@ from torch import Tensor
 
 from pisigma.measurement.dataset import Measurements
 from pisigma.robot.description import Robot
-from pisigma.robot.kinematics.jacobian import joint_jacobian
-from pisigma.validation.held_out.frames.frame_fits import (
+from pisigma.robot.frame_fits import (
     LEVER_SHARE,
     MeasuredPoses,
     base_and_tool_step,
     best_base_and_tool,
     moved_base_and_tool,
 )
+from pisigma.robot.kinematics.jacobian import joint_jacobian
 from pisigma.validation.setup_faults.cause import Cause
 from pisigma.validation.setup_faults.hypothesis import PredictingArm
 
@@ -73,7 +73,8 @@ def _shifted_from_a_row(
     The rows about it are left out, as what was lost there stands nowhere.
     """
     inner = torch.arange(MARGIN, rows.rows - MARGIN)
-    measured = MeasuredPoses.of(rows.select(inner), LEVER_SHARE * arm.robot.reach)
+    among = rows.select(inner)
+    measured = MeasuredPoses.of(among.position, among.rotation, LEVER_SHARE * arm.robot.reach)
     T = {shift: arm.poses(replace(rows, q=rows.q.roll(-shift, 0)))[inner] for shift in (0, *SHIFTS)}
     third = len(chosen) // ENDS
     for at_start, end in ((True, chosen[:third] - MARGIN), (False, chosen[-third:] - MARGIN)):

@@ -9,9 +9,9 @@ import torch
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.row_poses import poses_of_rows
+from pisigma.robot.frame_fits import LEVER_SHARE, MeasuredPoses
 from pisigma.validation.held_out.calibration_summary import has_orientation
 from pisigma.validation.held_out.frames.fitted_frames import FrameKind, fit_frames, with_names_of
-from pisigma.validation.held_out.frames.frame_fits import LEVER_SHARE, MeasuredPoses
 from pisigma.validation.held_out.model_comparison import ModelFigures
 from pisigma.validation.setup_faults.explanations import (
     PLAUSIBLE_SHARE,
@@ -72,7 +72,7 @@ def find_setup_faults(
     if not bool(predicted.any()):
         return ()
     some, known, T = some.select(predicted), known.select(predicted), T[predicted]
-    measured = MeasuredPoses.of(some, LEVER_SHARE * model.robot.reach)
+    measured = MeasuredPoses.of(some.position, some.rotation, LEVER_SHARE * model.robot.reach)
     here = Hypothesis(some.q, T, measured)
     if fitted:
         T, columns = fit_frames(T, measured, some, fitted)

@@ -8,8 +8,8 @@ from scipy.spatial.transform import Rotation
 from testing.closeness import assert_close
 from testing.simulated_arm import simulate
 
+from pisigma.robot.frame_fits import MeasuredPoses, affine_error, best_base_and_tool
 from pisigma.robot.kinematics.forward import forward_kinematics
-from pisigma.validation.held_out.frames.frame_fits import MeasuredPoses, affine_error, best_base_and_tool
 from pisigma.validation.setup_faults.explanations import other_conventions
 from pisigma.validation.setup_faults.faults_as_drawn import are_unrelated, find_faults_as_drawn, usual_error
 
@@ -53,7 +53,7 @@ def test_healthy_and_unrelated_rows_have_no_fault(arm):
 
 
 def test_no_rigid_base_and_tool_leave_less_than_affine_ones(arm):
-    measured = MeasuredPoses.of(arm.measurements, 0.2)
+    measured = MeasuredPoses.of(arm.measurements.position, arm.measurements.rotation, 0.2)
     T = forward_kinematics(arm.nominal, arm.measurements.q)
     base, tool = best_base_and_tool(T, measured)
     rigid = measured.squares(base @ T @ tool).mean()

@@ -15,9 +15,9 @@ from pisigma.measurement.dataset import Measurements
 from pisigma.model.accuracy import deviation_of_rows
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.row_poses import poses_of_rows
+from pisigma.robot.frame_fits import LEVER_SHARE, MeasuredPoses
 from pisigma.validation.held_out.diagnostic import Diagnostic
 from pisigma.validation.held_out.frames.fitted_frames import FrameKind, fit_frames, with_names_of
-from pisigma.validation.held_out.frames.frame_fits import LEVER_SHARE, MeasuredPoses
 from pisigma.validation.setup_faults.setup_fault import SetupFault
 from pisigma.validation.setup_faults.setup_faults import find_setup_faults, judged_values
 
@@ -89,7 +89,7 @@ class RowsUnderModel:
     @cached_property
     def measured(self) -> MeasuredPoses:
         """The measured poses."""
-        return MeasuredPoses.of(self.rows, LEVER_SHARE * self.model.robot.reach)
+        return MeasuredPoses.of(self.rows.position, self.rows.rotation, LEVER_SHARE * self.model.robot.reach)
 
     @cached_property
     def errors(self) -> Float64[Tensor, " rows"]:

@@ -8,10 +8,10 @@ from torch import Tensor
 
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.row_poses import poses_of_rows
+from pisigma.robot.frame_fits import best_base_and_tool
 from pisigma.robot.se3 import skew
 from pisigma.validation.checks.rows.row_check import AbstractRowCheck, RowsUnderModel
 from pisigma.validation.held_out.diagnostic import Diagnostic
-from pisigma.validation.held_out.frames.frame_fits import best_base_and_tool
 from pisigma.validation.setup_faults.cause import length_text
 
 SMALLEST = 5e-4

@@ -7,9 +7,9 @@ import torch
 
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.row_poses import poses_of_rows
+from pisigma.robot.frame_fits import best_base_and_tool
 from pisigma.validation.checks.rows.row_check import AbstractRowCheck, RowsUnderModel
 from pisigma.validation.held_out.diagnostic import Diagnostic
-from pisigma.validation.held_out.frames.frame_fits import best_base_and_tool
 from pisigma.validation.setup_faults.explanations import PLAUSIBLE_SHARE
 from pisigma.validation.setup_faults.setup_faults import unexplained
 

@@ -13,8 +13,7 @@ from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.groups import groups_to_keep_whole, numbers_of_names
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.row_poses import poses_of_rows
-from pisigma.validation.held_out.calibration_summary import has_orientation
-from pisigma.validation.held_out.frames.frame_fits import (
+from pisigma.robot.frame_fits import (
     FIRST_DAMPING,
     LEVER_SHARE,
     SETTLED,
@@ -25,6 +24,7 @@ from pisigma.validation.held_out.frames.frame_fits import (
     frame_columns,
     moved_frame,
 )
+from pisigma.validation.held_out.calibration_summary import has_orientation
 from pisigma.validation.held_out.frames.row_errors import errors_of_rows
 from pisigma.validation.held_out.pose_statistics import ErrorVectors
 
@@ -106,7 +106,7 @@ def errors_in_fitted_frames(
     rows = measurements.select(usable.nonzero()[:, 0])
     _check_configurations(model, measurements, rows, fitted)
     known = rows if has_orientation(model) or "tool" in fitted else replace(rows, rotation=None)
-    measured = MeasuredPoses.of(known, LEVER_SHARE * model.robot.reach)
+    measured = MeasuredPoses.of(known.position, known.rotation, LEVER_SHARE * model.robot.reach)
     fit, columns = fit_frames(T[usable], measured, rows, fitted)
     T = T.index_put((usable.nonzero()[:, 0],), fit)
     U, size, _ = torch.linalg.svd(columns.flatten(0, 1), full_matrices=False)

@@ -6,7 +6,6 @@ import torch
 from jaxtyping import Bool, Float64
 from torch import Tensor
 
-from pisigma.measurement.dataset import Measurements
 from pisigma.robot.se3 import nearest_rotation, rotation_from_vector, rotation_vector, skew, transform
 
 LEVER_SHARE = 0.2
@@ -38,16 +37,19 @@ class MeasuredPoses:
     lever: float
 
     @staticmethod
-    def of(measurements: Measurements, lever: float) -> "MeasuredPoses":
-        """Take the poses of measurements; every row has a position."""
-        assert measurements.position is not None
-        eye = torch.eye(3, dtype=torch.float64)
-        if measurements.rotation is None:
-            none = torch.zeros(measurements.rows, dtype=torch.bool)
-            return MeasuredPoses(measurements.position, eye.expand(measurements.rows, 3, 3), none, lever)
-        has_rotation = torch.isfinite(measurements.rotation).flatten(1).all(-1)
-        rotation = torch.where(has_rotation[:, None, None], measurements.rotation, eye)
-        return MeasuredPoses(measurements.position, rotation, has_rotation, lever)
+    def of(
+        position: Float64[Tensor, "rows 3"] | None, rotation: Float64[Tensor, "rows 3 3"] | None, lever: float
+    ) -> "MeasuredPoses":
+        """Take measured poses; every row has a position [m], and some may have a rotation."""
+        assert position is not None
+        rows, eye = len(position), torch.eye(3, dtype=torch.float64)
+        if rotation is None:
+            none = torch.zeros(rows, dtype=torch.bool)
+            return MeasuredPoses(position, eye.expand(rows, 3, 3), none, lever)
+        has_rotation = torch.isfinite(rotation).flatten(1).all(-1)
+        return MeasuredPoses(
+            position, torch.where(has_rotation[:, None, None], rotation, eye), has_rotation, lever
+        )
 
     def select(self, rows: Tensor) -> "MeasuredPoses":
         """Select the rows of a mask or an index."""

@@ -5,13 +5,13 @@ import torch
 from testing.closeness import assert_close
 
 from pisigma.measurement.dataset import Measurements
-from pisigma.robot.se3 import rotation_from_vector, transform, transform_from_xyzrpy
-from pisigma.validation.held_out.frames.frame_fits import (
+from pisigma.robot.frame_fits import (
     MeasuredPoses,
     best_base,
     best_base_and_tool,
     best_tool,
 )
+from pisigma.robot.se3 import rotation_from_vector, transform, transform_from_xyzrpy
 
 BASE = transform_from_xyzrpy(torch.tensor([0.3, -0.2, 0.1, 0.5, 0.2, -0.3], dtype=torch.float64))
 TOOL = transform_from_xyzrpy(torch.tensor([0.03, -0.02, 0.05, 0.2, 0.1, 0.0], dtype=torch.float64))
@@ -31,7 +31,7 @@ def measured_as(T, turned: bool) -> MeasuredPoses:
     rows = Measurements(
         q=torch.zeros(len(T), 1).double(), position=T[:, :3, 3].contiguous(), rotation=rotation
     )
-    return MeasuredPoses.of(rows, LEVER)
+    return MeasuredPoses.of(rows.position, rows.rotation, LEVER)
 
 
 @pytest.mark.parametrize("turned", [False, True])
