@@ -22,8 +22,8 @@ from pisigma.measurement.camera.camera_files import IntrinsicsChoice
 from pisigma.measurement.camera.image_rows import image_measurements
 from pisigma.measurement.dataset import Measurements, join
 from pisigma.model.accuracy import deviation_of_rows
+from pisigma.model.calibrated_model import poses_of_rows
 from pisigma.model.geometric_model import model_of_hybrid
-from pisigma.model.row_poses import poses_of_rows
 from pisigma.robot import Robot
 from pisigma.robot.kinematics.closed_form.registry import closed_form_solver
 from pisigma.robot.kinematics.forward import forward_kinematics

@@ -25,9 +25,8 @@ from pisigma.calibration.hybrid.calibrator import HybridCalibrator
 from pisigma.files.errors import IdentificationError
 from pisigma.lifetime.recalibration.adaptation import adapt
 from pisigma.measurement.dataset import Measurements
-from pisigma.model.calibrated_model import CalibratedModel
+from pisigma.model.calibrated_model import CalibratedModel, poses_of_rows
 from pisigma.model.geometric_model import model_of_hybrid
-from pisigma.model.row_poses import poses_of_rows
 from pisigma.planning.plan_settings import PlanSettings
 from pisigma.robot import Robot
 from pisigma.validation.held_out.trained_calibrations import fit

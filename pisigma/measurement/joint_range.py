@@ -7,7 +7,6 @@ from jaxtyping import Float64
 
 from pisigma.measurement.copies import copy_warnings
 from pisigma.measurement.dataset import Measurements
-from pisigma.measurement.rules import rows_where
 from pisigma.robot.coupling import hull
 from pisigma.robot.description import Robot
 from pisigma.robot.kinematics.joint_limits import beyond_limits, grossly_beyond
@@ -65,8 +64,8 @@ def joint_ranges(robot: Robot, rows: Measurements) -> tuple[JointRange, ...]:
     values = robot.to_controller(rows.q.detach().cpu().double().numpy())
     found = []
     for axis, q in zip(robot.axes, np.moveaxis(values, -1, 0), strict=True):
-        if outside := rows_where(beyond_limits(q, axis)):
-            found.append(JointRange(axis, q, tuple(outside)))
+        if outside := tuple(np.flatnonzero(beyond_limits(q, axis)).tolist()):
+            found.append(JointRange(axis, q, outside))
     return tuple(found)
 
 

@@ -9,9 +9,7 @@ from torch import Tensor
 from pisigma.calibration.geometric.posterior import ParameterPosterior
 from pisigma.measurement.conditions import CONDITIONS
 from pisigma.measurement.dataset import Measurements
-from pisigma.model.calibrated_model import CalibratedModel
-from pisigma.model.hybrid_motion import corrected_joints
-from pisigma.model.row_poses import known_names
+from pisigma.model.calibrated_model import CalibratedModel, corrected_joints, known_names
 
 
 def position_accuracy(model: CalibratedModel, q: Float[Tensor, "*batch dof"]) -> Float64[Tensor, "*batch"]:

@@ -1,4 +1,4 @@
-"""A calibrated robot: geometry, learned joint corrections and where both hold."""
+"""A calibrated robot: geometry, learned joint corrections and where both hold, and the poses that it predicts."""
 
 import platform
 from dataclasses import dataclass, field
@@ -7,14 +7,16 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
-from jaxtyping import Float64
+from jaxtyping import Float, Float64
 from torch import Tensor
 
 from pisigma.calibration.hybrid.arm import HybridArm
 from pisigma.calibration.hybrid.uncertainty import PositionUncertainty
+from pisigma.files.errors import MeasurementError, nearest_choice
+from pisigma.measurement.conditions import JointState
 from pisigma.measurement.copies import RowValues
+from pisigma.measurement.dataset import Measurements
 from pisigma.model.domain import Domain
-from pisigma.model.hybrid_motion import hybrid_motion, hybrid_poses
 from pisigma.model.stored_starts import middle_of_starts
 from pisigma.network.correction_network import CorrectionNetwork
 from pisigma.robot.description import Robot
@@ -22,9 +24,17 @@ from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.robot.kinematics.jacobian import joint_jacobian
 from pisigma.robot.kinematics.joint_limits import nearest_turn
 from pisigma.robot.kinematics.tolerances import FORWARD_ACCEPTED, FORWARD_ITERATIONS, FORWARD_TOLERANCE
+from pisigma.robot.se3 import invert, transform_from_xyzrpy
 
 if TYPE_CHECKING:
     import pytorch_kinematics
+
+Frames = dict[str, Float64[np.ndarray, " 6"]]
+"""Bases per frame or tools per target: x, y, z [m], roll, pitch, yaw [rad]."""
+CHUNK = 4_096
+"""Poses whose features are in memory at a time: a few hundred columns a joint."""
+STEP = 1e-5
+"""[rad or m] Of differences: with 100 cycles a turn their error is a millionth of a slope."""
 
 
 @dataclass(frozen=True)
@@ -192,3 +202,150 @@ class CalibratedModel:
                 break
         settled = (moved <= FORWARD_ACCEPTED).all(-1, keepdim=True)
         return torch.where(settled, q_nominal, torch.nan)
+
+
+def poses_of_rows(model: CalibratedModel, measurements: Measurements) -> Float64[Tensor, "rows 4 4"]:
+    """Where a model of any kind says that the targets were, each in the frame of its row.
+
+    NaN where the model predicts nothing; see `CalibratedModel.forward`. Under the conditions (payload, temperature)
+    of the rows, where a hybrid knows of them; `CalibratedModel.forward` is under the usual ones.
+
+    Raises:
+        MeasurementError: the model does not know a frame or target of the rows.
+        PoseError: the joint values do not fit the robot.
+    """
+    arm = model.hybrid
+    if arm is not None:
+        model.robot.check_joint_count(measurements.q.shape[-1])
+        T = forward_kinematics(arm.robot, corrected_joints(arm, measurements))
+        return _seen(T, arm.robot, model.hybrid_bases, model.hybrid_tools, measurements)
+    return _seen(model.forward(measurements.q), model.robot, model.bases, model.tools, measurements)
+
+
+def nominal_poses_of_rows(model: CalibratedModel, measurements: Measurements) -> Float64[Tensor, "rows 4 4"]:
+    """The same for the model's robot without any correction, its bases and tools as fitted.
+
+    For errors see `poses_of_rows`.
+    """
+    T = forward_kinematics(model.robot, measurements.q)
+    return _seen(T, model.robot, model.bases, model.tools, measurements)
+
+
+def bases_of_rows(model: CalibratedModel, measurements: Measurements) -> Float64[Tensor, "#rows 4 4"]:
+    """Where the robot's base stands in the frame of every row; for errors see `poses_of_rows`."""
+    bases = _of_rows(model.bases, measurements.frame, "frame", measurements)
+    return transform_from_xyzrpy(torch.from_numpy(model.robot.base[None].copy())) if bases is None else bases
+
+
+def known_names(
+    known: Frames, names: tuple[str, ...], what: str, measurements: Measurements
+) -> tuple[str, ...]:
+    """The frame or target of every row as the model calls it.
+
+    A model that was fitted to rows without names takes rows of any one name, and one that was fitted to a
+    single name takes rows without.
+
+    Args:
+        known: what the model knows.
+        names: of the rows.
+        what: "frame" or "target".
+        measurements: the rows, for messages.
+
+    Raises:
+        MeasurementError: the model does not know a name.
+    """
+    if not set(known) - {""}:
+        if len(set(names)) > 1:
+            other = next(row for row, name in enumerate(names) if name != names[0])
+            raise MeasurementError(
+                f"{measurements.place(other)}: {what} '{names[other]}' stands there, but "
+                f"{measurements.place(0)} has '{names[0]}', and the model knows one {what} only; give a file for each."
+            )
+        return ("",) * len(names)
+    if len(known) == 1 and not any(names):
+        return tuple(known) * len(names)
+    for row, name in enumerate(names):
+        if name not in known:
+            crossed = (measurements.target if what == "frame" else measurements.frame)[row] in known
+            hint = " (of a camera, check --fixed-camera)" if name and crossed else ""
+            raise MeasurementError(
+                f"{measurements.place(row)}: the model was not fitted to {what} '{name}'{hint}; "
+                f"{nearest_choice(name, known)}"
+            )
+    return names
+
+
+def _seen(
+    T: Float64[Tensor, "rows 4 4"], robot: Robot, bases: Frames, tools: Frames, measurements: Measurements
+) -> Float64[Tensor, "rows 4 4"]:
+    """Poses T_base_tool as poses of the rows' targets in the rows' frames."""
+    before = _of_rows(bases, measurements.frame, "frame", measurements)
+    behind = _of_rows(tools, measurements.target, "target", measurements)
+    if before is not None:
+        T = before @ invert(transform_from_xyzrpy(torch.from_numpy(robot.base.copy()))) @ T
+    if behind is not None:
+        T = T @ invert(transform_from_xyzrpy(torch.from_numpy(robot.tool.copy()))) @ behind
+    return T
+
+
+def _of_rows(
+    known: Frames, names: tuple[str, ...], what: str, measurements: Measurements
+) -> Float64[Tensor, "rows 4 4"] | None:
+    """The base or tool of every row; None where there is one only, which the robot has already."""
+    names = known_names(known, names, what, measurements)
+    if len(known) < 2:
+        return None
+    order = list(known)
+    frames = transform_from_xyzrpy(torch.from_numpy(np.stack([known[name] for name in order])))
+    return frames[torch.tensor([order.index(name) for name in names], dtype=torch.int64)]
+
+
+def hybrid_poses(arm: HybridArm, q: Float[Tensor, "*batch dof"]) -> Float[Tensor, "*batch 4 4"]:
+    """Poses T_base_tool of an arm at commanded joint values [rad or m], of any number of rows.
+
+    Raises:
+        PoseError: q has another number of columns than the robot has joints.
+    """
+    arm.robot.check_joint_count(q.shape[-1])
+    flat = q.reshape(-1, q.shape[-1])
+    return torch.cat([arm.forward(part) for part in torch.split(flat, CHUNK)]).reshape(*q.shape[:-1], 4, 4)
+
+
+def corrected_joints(arm: HybridArm, measurements: Measurements) -> Float64[Tensor, "rows dof"]:
+    """Joint values of measured rows with the correction of the network in full, `q + Δ(q)` [rad or m]."""
+    chunks = JointState.of(measurements).split(CHUNK)
+    with torch.no_grad():
+        return torch.cat([state.q + arm.correction(state) for state in chunks])
+
+
+def hybrid_motion(
+    arm: HybridArm, q: Float[Tensor, "poses dof"], exact: bool = True
+) -> tuple[Float[Tensor, "poses 4 4"], Float[Tensor, "poses 6 dof"]]:
+    """Poses and joint Jacobian `J(q + Δ) (1 + dΔ/dq)` of a hybrid arm.
+
+    Args:
+        arm: the arm.
+        q: commanded joint values [rad or m].
+        exact: whether dΔ/dq is computed, which costs some times as much as Δ. Without it Newton steps contract by
+            |dΔ/dq|, of the order of 1e-2.
+    """
+    chunk = CHUNK // (2 * q.shape[1]) if exact else CHUNK
+    with torch.no_grad():
+        parts = [_motion(arm, part, exact) for part in torch.split(q, chunk)]
+    T, J = zip(*parts, strict=True)
+    return torch.cat(T), torch.cat(J)
+
+
+def _motion(arm: HybridArm, q: Tensor, exact: bool) -> tuple[Tensor, Tensor]:
+    T, J = joint_jacobian(arm.robot, q + arm.delta(q))
+    if exact:
+        J = J + J @ _slope(arm, q)
+    return T, J
+
+
+def _slope(arm: HybridArm, q: Float[Tensor, "poses dof"]) -> Float[Tensor, "poses dof dof"]:
+    """Derivatives of the corrections by the joint values, by central differences in one call."""
+    step = STEP * torch.eye(q.shape[1], dtype=q.dtype, device=q.device)
+    above, below = torch.chunk(arm.delta(q[:, None] + torch.cat([step, -step])), 2, 1)
+    slope: Tensor = (above - below).mT / (2 * STEP)
+    return slope

@@ -38,6 +38,7 @@ def model_of_calibration(
         measurements: the rows it was calibrated with.
         recipe: name and SHA-256 of the recipe, where there was one.
     """
+    made_of = kept_rows(nominal, measurements)
     robot = nominal.with_geometry(base=result.robot.base, tool=result.robot.tool)
     starts = spread_rows(torch.unique(measurements.q.cpu(), dim=0))
     return CalibratedModel(
@@ -51,7 +52,7 @@ def model_of_calibration(
         calibrated=result.robot,
         bases=dict(result.bases),
         tools=dict(result.tools),
-        made_of=kept_rows(nominal, measurements),
+        made_of=made_of,
         provenance=Provenance(
             recipe=recipe[0],
             recipe_sha256=recipe[1],
@@ -75,8 +76,12 @@ def model_of_hybrid(
 
     For the arguments see `model_of_calibration`.
     """
+    return with_hybrid(model_of_calibration(name, nominal, result.geometric, measurements, recipe), result)
+
+
+def with_hybrid(model: CalibratedModel, result: HybridResult) -> CalibratedModel:
+    """Add to the model of a geometric calibration what a hybrid calibration that builds upon it has learned."""
     known, learned = result.geometric, result.learned
-    model = model_of_calibration(name, nominal, known, measurements, recipe)
     if learned is None:
         geometry = IdentifiedGeometry(known.robot, model.bases, model.tools, known.unknowns)
         return replace(model, uncertainty=_kept(result.uncertainty, geometry))

@@ -2,7 +2,7 @@
 
 import os
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
@@ -19,10 +19,10 @@ from pisigma.measurement.camera.corner_file import MeasurementFiles, read_rows
 from pisigma.measurement.dataset import Measurements, with_new_frames
 from pisigma.measurement.groups import groups_to_keep_whole
 from pisigma.measurement.joint_range import row_warnings, with_limits_of_rows
-from pisigma.measurement.sensors.socket import matching_sockets
+from pisigma.measurement.sensors.socket import PairOfSockets, matching_sockets
 from pisigma.measurement.splits import TrainTest, draw_rows, holdout, repeats, with_fewer
 from pisigma.model.calibrated_model import CalibratedModel
-from pisigma.model.geometric_model import model_of_calibration, model_of_hybrid
+from pisigma.model.geometric_model import model_of_calibration, with_hybrid
 from pisigma.reporting.cards import CardTexts, write_calibration_card
 from pisigma.robot.description import Robot
 from pisigma.validation.checks.check import CheckedCalibration
@@ -34,7 +34,13 @@ from pisigma.validation.held_out.calibration_validation import CalibrationValida
 from pisigma.validation.held_out.few_rows import fit_beside_folds
 from pisigma.validation.held_out.held_out_rows import HeldOutRows
 from pisigma.validation.held_out.predicted_spread import predicted_at_other_poses
-from pisigma.validation.held_out.trained_calibrations import Calibrator, Result, geometric_of, trained
+from pisigma.validation.held_out.trained_calibrations import (
+    Calibrator,
+    Result,
+    geometric_of,
+    geometric_result,
+    trained,
+)
 from pisigma.workflow.result import AbstractModelResult
 from pisigma.workflow.settings.calibration import CalibrationSettings, ModelKind
 
@@ -121,7 +127,8 @@ def calibrate(
     rows = training
     if settings.train_rows is not None:
         rows = training.select(draw_rows(training, settings.train_rows, settings.seed))
-    calibrator = calibrator_of(settings, nominal, training.socket or ())
+    distances = matching_sockets(settings.socket_distances, training.socket or ())
+    calibrator = calibrator_of(settings, nominal, distances)
     faulty = any(one.severity == "implausible" for one in setup_diagnostics(nominal, rows))
     if faulty:
         calibrator, splits = geometric_of(calibrator), []
@@ -185,17 +192,15 @@ def compose(
         diagnostics=diagnostics,
         warnings=summary.warnings + warnings,
     )
-    name = recipe[0] or nominal.name
-    if isinstance(result, HybridResult):
-        model = model_of_hybrid(name, nominal, result, rows, recipe)
-    else:
-        model = model_of_calibration(name, nominal, result, rows, recipe)
     if validation is None and summary.test is None and summary.held_out is None:
         predicted = predicted_at_other_poses(result, rows)
         summary = summary.having(predicted_rms_mm=None if predicted is None else predicted * 1e3)
     kept = None if validation is None or held_out is None else HeldOutRows.of(validation, held_out)
     if kept is not None:
         summary = summary.having(held_out_rows=kept.hashes(kept.to_csv(nominal)))
+    model = model_of_calibration(recipe[0] or nominal.name, nominal, geometric_result(result), rows, recipe)
+    if isinstance(result, HybridResult):
+        model = with_hybrid(model, result)
     model = replace(model, metrics=summary.to_json())
     return Calibration(model, result, rows, validation, test, kept, summary, texts)
 
@@ -226,16 +231,18 @@ def _description(model: ModelKind, nominal: Robot) -> str:
     )
 
 
-def calibrator_of(settings: CalibrationSettings, robot: Robot, sockets: Iterable[str] = ()) -> Calibrator:
+def calibrator_of(
+    settings: CalibrationSettings, robot: Robot, distances: Mapping[PairOfSockets, float]
+) -> Calibrator:
     """Give the calibrator of a robot.
 
     Args:
         settings: see `CalibrationSettings`.
         robot: as drawn.
-        sockets: names of the sockets in the data, for `socket_distances`.
+        distances: stated ones [m] between sockets of the data.
 
     Raises:
-        IdentificationError: a setting does not fit the robot, or the data have no such sockets.
+        IdentificationError: a setting does not fit the robot.
     """
     length, angle = settings.prior_length, settings.prior_angle
     geometric = GeometricCalibrator(
@@ -244,7 +251,7 @@ def calibrator_of(settings: CalibrationSettings, robot: Robot, sockets: Iterable
         prior=Prior(theta=angle, d=length, a=length, alpha=angle, beta=angle) if length else None,
         loss=HampelLoss() if settings.robust else SquaredLoss(),
         robot_class=settings.robot_class,
-        socket_distances=matching_sockets(settings.socket_distances, sockets),
+        socket_distances=dict(distances),
     )
     if settings.model != "hybrid":
         return geometric

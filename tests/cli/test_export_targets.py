@@ -13,8 +13,8 @@ from testing.program_readers import READERS
 from pisigma.joint_correction.conditions import ConditionFeatures
 from pisigma.joint_correction.fourier_series import FourierSeries
 from pisigma.measurement.dataset import Measurements
+from pisigma.model.calibrated_model import poses_of_rows
 from pisigma.model.folder.model_folder import load_model, save_model
-from pisigma.model.row_poses import poses_of_rows
 from pisigma.robot import Robot
 from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.robot.se3 import xyzrpy_from_transform

@@ -10,7 +10,7 @@ from testing.aged import model_before, rows_later
 from testing.simulated_arm import dh_errors
 
 from pisigma.measurement.dataset import Measurements
-from pisigma.model.row_poses import poses_of_rows
+from pisigma.model.calibrated_model import poses_of_rows
 from pisigma.robot import Robot
 from pisigma.robot.kinematics.forward import forward_kinematics
 

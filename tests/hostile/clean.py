@@ -15,9 +15,8 @@ from testing.sensors import joints, mixed_data, true_robot
 from testing.simulated_arm import simulate
 
 from pisigma.measurement.dataset import Measurements
-from pisigma.model.calibrated_model import CalibratedModel
+from pisigma.model.calibrated_model import CalibratedModel, poses_of_rows
 from pisigma.model.folder.model_folder import save_model
-from pisigma.model.row_poses import poses_of_rows
 from pisigma.robot import Robot
 from pisigma.robot.kernels.machine_code import load_kernels
 from pisigma.robot.kinematics.forward import forward_kinematics

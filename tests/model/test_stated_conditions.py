@@ -17,11 +17,10 @@ from pisigma.joint_correction.gravity_torques import GravityTorques
 from pisigma.joint_correction.shared_features import ScaledJoints
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.accuracy import deviation_of_rows
-from pisigma.model.calibrated_model import CalibratedModel
+from pisigma.model.calibrated_model import CalibratedModel, poses_of_rows
 from pisigma.model.folder.model_folder import save_model
 from pisigma.model.geometric_model import model_of_hybrid
 from pisigma.model.inverse.corrected_ik import CorrectedIK
-from pisigma.model.row_poses import poses_of_rows
 from pisigma.model.stated_conditions import condition_warnings, under_stated_conditions
 from pisigma.reporting.page.content import report_content
 from pisigma.robot.description import Robot

@@ -8,6 +8,7 @@ from testing.simulated_arm import simulate
 
 import pisigma
 from pisigma.files.errors import IdentificationError, MeasurementError
+from pisigma.measurement.sensors.socket import matching_sockets
 from pisigma.model.folder.model_folder import load_model
 from pisigma.validation.held_out.calibration_summary import CalibrationSummary
 from pisigma.workflow.calibrate import calibrator_of
@@ -92,7 +93,8 @@ def test_settings_at_fault(settings, complaint):
 def distances(*stated: str) -> dict[tuple[str, str], float]:
     """Known distances of the calibrator, as the command line states them."""
     settings = CalibrationSettings(model="geometric", socket_distances=socket_distances(stated))
-    return calibrator_of(settings, pisigma.Robot.load("panda"), SOCKETS).socket_distances
+    matching = matching_sockets(settings.socket_distances, SOCKETS)
+    return calibrator_of(settings, pisigma.Robot.load("panda"), matching).socket_distances
 
 
 def test_known_distances_between_sockets():

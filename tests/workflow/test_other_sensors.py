@@ -11,8 +11,7 @@ from testing.sensors import joints, pair_data, socket_data, touch_data, true_rob
 
 from pisigma.files.errors import IdentificationError, MeasurementError
 from pisigma.measurement.dataset import Measurements, join
-from pisigma.model.calibrated_model import CalibratedModel
-from pisigma.model.row_poses import poses_of_rows
+from pisigma.model.calibrated_model import CalibratedModel, poses_of_rows
 from pisigma.validation.gate import check_rows
 from pisigma.validation.held_out.frames.row_errors import errors_of_rows
 from pisigma.workflow.evaluate import evaluate

@@ -13,9 +13,9 @@ import pisigma
 from pisigma.files.errors import AcceptanceError, IdentificationError, MeasurementError, ModelError
 from pisigma.lifetime.recalibration.summary import RecalibrationSummary
 from pisigma.measurement.dataset import Measurements, join
+from pisigma.model.calibrated_model import poses_of_rows
 from pisigma.model.folder.model_folder import load_model, save_model
 from pisigma.model.inverse.corrected_ik import CorrectedIK
-from pisigma.model.row_poses import poses_of_rows
 from pisigma.robot import Robot
 from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.robot.se3 import transform_from_xyzrpy

@@ -13,8 +13,8 @@ from testing.simulated_arm import simulate
 from pisigma.calibration.geometric.calibrator import GeometricCalibrator
 from pisigma.files.errors import MeasurementError
 from pisigma.measurement.dataset import Measurements
+from pisigma.model.calibrated_model import nominal_poses_of_rows
 from pisigma.model.geometric_model import model_of_calibration, model_of_hybrid
-from pisigma.model.row_poses import nominal_poses_of_rows
 from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.robot.se3 import transform_from_xyzrpy
 from pisigma.workflow.settings.verification import VerificationSettings

@@ -10,8 +10,7 @@ from torch import Tensor
 
 from pisigma.files.errors import ModelError
 from pisigma.measurement.dataset import Measurements
-from pisigma.model.calibrated_model import CalibratedModel
-from pisigma.model.row_poses import poses_of_rows
+from pisigma.model.calibrated_model import CalibratedModel, poses_of_rows
 from pisigma.robot.description import Robot
 from pisigma.robot.frame_fits import LEVER_SHARE, MeasuredPoses, best_base_and_tool
 from pisigma.robot.se3 import pose_error, transform_from_xyzrpy

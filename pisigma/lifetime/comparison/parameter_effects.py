@@ -14,8 +14,7 @@ from pisigma.lifetime.recalibration.moved import Moved, deviation_along
 from pisigma.measurement.conditions import JointState
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.sensors.sensor import SHOWN_UNITS
-from pisigma.model.calibrated_model import CalibratedModel
-from pisigma.model.hybrid_motion import corrected_joints
+from pisigma.model.calibrated_model import CalibratedModel, corrected_joints
 from pisigma.robot.frame_fits import LEVER_SHARE
 from pisigma.robot.kinematics.parameter_jacobian import identification_jacobian
 from pisigma.robot.se3 import rotation_from_vector, rotation_vector, skew, xyzrpy_from_transform

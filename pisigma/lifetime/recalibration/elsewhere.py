@@ -9,9 +9,8 @@ from pisigma.files.errors import IdentificationError
 from pisigma.lifetime.recalibration.adaptation import adapt
 from pisigma.lifetime.recalibration.recalibration_problem import Owner, recalibration_problem
 from pisigma.measurement.dataset import Measurements
-from pisigma.model.calibrated_model import CalibratedModel
+from pisigma.model.calibrated_model import CalibratedModel, Frames
 from pisigma.model.model_posterior import ModelPosterior
-from pisigma.model.row_poses import Frames
 
 MOST_ROWS = 30
 """Rows that the question is decided on."""

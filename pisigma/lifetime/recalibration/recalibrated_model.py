@@ -16,10 +16,9 @@ from pisigma.lifetime.recalibration.candidates import Gate
 from pisigma.lifetime.recalibration.moved import Moved
 from pisigma.lifetime.recalibration.wear import beyond_wear
 from pisigma.measurement.dataset import Measurements
-from pisigma.model.calibrated_model import CalibratedModel, Provenance
+from pisigma.model.calibrated_model import CalibratedModel, Frames, Provenance
 from pisigma.model.geometric_model import branches_of
 from pisigma.model.model_posterior import FLEET_PRIOR
-from pisigma.model.row_poses import Frames
 from pisigma.model.stored_starts import spread_rows
 from pisigma.model.training_rows import kept_rows
 from pisigma.robot.se3 import invert, transform_from_xyzrpy, xyzrpy_from_transform

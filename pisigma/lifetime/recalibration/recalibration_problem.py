@@ -26,9 +26,8 @@ from pisigma.measurement.groups import groups_to_keep_whole
 from pisigma.measurement.sensors.intrinsics import without_stated
 from pisigma.measurement.sensors.registry import unknown_groups
 from pisigma.measurement.sensors.sensor import ParameterUnit, UnknownGroup
-from pisigma.model.calibrated_model import CalibratedModel
+from pisigma.model.calibrated_model import CalibratedModel, Frames
 from pisigma.model.model_posterior import ModelPosterior
-from pisigma.model.row_poses import Frames
 
 Owner = tuple[str, str]
 """What can stand elsewhere: ("base", frame) or ("tool", target)."""

@@ -24,14 +24,13 @@ from pisigma.joint_correction.input_products import InputProducts
 from pisigma.joint_correction.joint_correction import JointCorrection
 from pisigma.joint_correction.registry import feature_from
 from pisigma.measurement.sensors.sensor import UnknownGroup
-from pisigma.model.calibrated_model import CalibratedModel
+from pisigma.model.calibrated_model import CalibratedModel, Frames
 from pisigma.model.folder.model_document import (
     LearnedSection,
     ModelDocument,
     UncertaintySection,
     UnknownsSection,
 )
-from pisigma.model.row_poses import Frames
 from pisigma.robot.description import Robot
 
 Shape = tuple[int | None, ...]

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float64
 from torch import Tensor
 
 from pisigma.calibration.hybrid.arm import HybridArm
-from pisigma.model.hybrid_motion import hybrid_motion
+from pisigma.model.calibrated_model import hybrid_motion
 from pisigma.robot.description import Robot
 from pisigma.robot.kinematics import tolerances
 from pisigma.robot.kinematics.jacobian import joint_jacobian

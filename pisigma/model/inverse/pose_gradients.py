@@ -10,8 +10,7 @@ from jaxtyping import Float, Float64
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from pisigma.model.calibrated_model import CalibratedModel
-from pisigma.model.hybrid_motion import hybrid_motion
+from pisigma.model.calibrated_model import CalibratedModel, hybrid_motion
 from pisigma.model.inverse.solution import AbstractInverse, Solution
 from pisigma.robot.description import Robot
 from pisigma.robot.kinematics.jacobian import joint_jacobian

@@ -9,10 +9,9 @@ from torch import Tensor
 from pisigma.files.errors import ModelError
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.accuracy import deviation_of_rows
-from pisigma.model.calibrated_model import CalibratedModel
+from pisigma.model.calibrated_model import CalibratedModel, poses_of_rows
 from pisigma.model.folder.model_folder import load_model, save_model
 from pisigma.model.inverse.corrected_ik import CorrectedIK, load
-from pisigma.model.row_poses import poses_of_rows
 
 PROBED = 20
 """Joint values at which the model in memory and the one in the folder are compared."""

@@ -15,8 +15,7 @@ from pisigma.measurement.copies import copy_warnings
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.groups import groups_of_equal_joints, numbers_of_names
 from pisigma.model.accuracy import deviation_of_rows
-from pisigma.model.calibrated_model import CalibratedModel
-from pisigma.model.row_poses import nominal_poses_of_rows, poses_of_rows
+from pisigma.model.calibrated_model import CalibratedModel, nominal_poses_of_rows, poses_of_rows
 from pisigma.model.training_rows import known_rows, training_row_warnings
 from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.robot.se3 import invert, transform_from_xyzrpy

@@ -14,8 +14,7 @@ from pisigma.files.errors import MeasurementError
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.groups import groups_to_keep_whole
 from pisigma.measurement.sensors.socket import PairOfSockets
-from pisigma.model.calibrated_model import CalibratedModel
-from pisigma.model.row_poses import poses_of_rows
+from pisigma.model.calibrated_model import CalibratedModel, poses_of_rows
 from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.validation.held_out.bootstrap import STATISTICS, Intervals, confidence_intervals, statistics
 from pisigma.validation.held_out.frames.fitted_frames import FrameKind, errors_in_fitted_frames

@@ -9,8 +9,7 @@ from torch import Tensor
 
 from pisigma.files.errors import MeasurementError
 from pisigma.measurement.dataset import Measurements
-from pisigma.model.calibrated_model import CalibratedModel
-from pisigma.model.row_poses import nominal_poses_of_rows, poses_of_rows
+from pisigma.model.calibrated_model import CalibratedModel, nominal_poses_of_rows, poses_of_rows
 from pisigma.robot.se3 import rotation_vector
 from pisigma.validation.held_out.validation_figures import ErrorFigures
 

@@ -7,8 +7,7 @@ import torch
 from pisigma.calibration.geometric.calibrator import GeometricCalibrator
 from pisigma.files.errors import IdentificationError, ModelError
 from pisigma.measurement.dataset import Measurements
-from pisigma.model.calibrated_model import CalibratedModel
-from pisigma.model.row_poses import poses_of_rows
+from pisigma.model.calibrated_model import CalibratedModel, poses_of_rows
 from pisigma.validation.held_out.trained_calibrations import base_and_tool
 
 

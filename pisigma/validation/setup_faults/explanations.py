@@ -14,8 +14,12 @@ from torch import Tensor
 from pisigma.measurement.csv.columns import MISNAMED_UNITS, RPY
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.groups import numbers_of_names
-from pisigma.model.calibrated_model import CalibratedModel
-from pisigma.model.row_poses import bases_of_rows, nominal_poses_of_rows, poses_of_rows
+from pisigma.model.calibrated_model import (
+    CalibratedModel,
+    bases_of_rows,
+    nominal_poses_of_rows,
+    poses_of_rows,
+)
 from pisigma.robot.frame_fits import (
     LEVER_SHARE,
     MeasuredPoses,

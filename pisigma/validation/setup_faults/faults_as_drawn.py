@@ -99,7 +99,7 @@ def find_faults_as_drawn(robot: Robot, measurements: Measurements) -> tuple[Setu
     faults = simplest(tried, most)
     if not faults and not are_unrelated(robot, rows):
         freed = ((q, measured, cause) for q, cause in freed_joints(arm, some, measured))
-        faults = simplest(_with_joints(arm, freed, most, values=1) + _labelled(robot, some, measured), most)
+        faults = simplest(_with_joints(arm, freed, most, values=1) + _labelled(some, raw.T, measured), most)
     if faults:
         faults = _better_than_zeros(faults, _error_with_zeros(robot, some, measured), usual)
     return tuple(fault_of(here, other, float("nan")) for other in faults)
@@ -141,24 +141,24 @@ def _named_otherwise(robot: Robot, measurements: Measurements, usual: float) -> 
     """Find better names for the targets of the frame that most rows are of, where errors are larger than usual [m]."""
     rows = largest_group(measurements, by_target=False)
     rows = rows.select(spread(torch.arange(rows.rows), MOST_ROWS))
-    measured, T = (
-        MeasuredPoses.of(rows.position, rows.rotation, LEVER_SHARE * robot.reach),
-        forward_kinematics(robot, rows.q),
-    )
-    here = Hypothesis(rows.q, fit_targets(T, measured, numbers_of_names(rows.target))[1], measured)
+    measured = MeasuredPoses.of(rows.position, rows.rotation, LEVER_SHARE * robot.reach)
+    number, T = numbers_of_names(rows.target), forward_kinematics(robot, rows.q)
+    here = Hypothesis(rows.q, fit_targets(T, measured, number)[1], measured)
     if not here.error > usual:
         return ()
     most = largest_explained(here, robot.reach)
     return tuple(
-        fault_of(here, other, float("nan")) for other in simplest(_labelled(robot, rows, measured), most)
+        fault_of(here, other, float("nan")) for other in simplest(_labelled(rows, T, measured), most)
     )
 
 
-def _labelled(robot: Robot, rows: Measurements, measured: MeasuredPoses) -> list[Hypothesis]:
-    """Make hypotheses of other names of targets."""
+def _labelled(
+    rows: Measurements, T: Float64[Tensor, "rows 4 4"], measured: MeasuredPoses
+) -> list[Hypothesis]:
+    """Make hypotheses of other names of targets; see `better_labellings`."""
     return [
         Hypothesis(rows.q, one.T, measured, (one.cause,), 3 * one.targets)
-        for one in better_labellings(robot, rows, measured)
+        for one in better_labellings(rows, T, measured)
     ]
 
 
@@ -258,7 +258,9 @@ class Labelling:
     targets: int
 
 
-def better_labellings(robot: Robot, rows: Measurements, measured: MeasuredPoses) -> Iterator[Labelling]:
+def better_labellings(
+    rows: Measurements, T: Float64[Tensor, "rows 4 4"], measured: MeasuredPoses
+) -> Iterator[Labelling]:
     """Find targets from the measurements alone: points of the tool that the measured positions cluster about.
 
     As k-means, but base and targets are fitted to all rows in every round. With several names there are as many
@@ -266,12 +268,11 @@ def better_labellings(robot: Robot, rows: Measurements, measured: MeasuredPoses)
     `MOST_TARGETS`.
 
     Args:
-        robot: as drawn.
         rows: with positions, of one frame.
+        T: poses that are predicted for them, with any base and tool.
         measured: their poses.
     """
     names = tuple(dict.fromkeys(rows.target))
-    T = forward_kinematics(robot, rows.q)
     for count in range(2, MOST_TARGETS + 1) if len(names) == 1 else (len(names),):
         number, poses = _clustered(T, measured, count)
         cause = _one_name(rows, number) if len(names) == 1 else _other_names(rows, number, names)
@@ -329,7 +330,8 @@ def _one_name(rows: Measurements, number: Int64[Tensor, " rows"]) -> Cause:
 
 def _other_names(rows: Measurements, number: Int64[Tensor, " rows"], names: tuple[str, ...]) -> Cause:
     shared = torch.zeros(int(number.max()) + 1, len(names))
-    shared.index_put_((number, numbers_of_names(rows.target)), torch.tensor(1.0), accumulate=True)
+    named = torch.tensor([names.index(name) for name in rows.target])
+    shared.index_put_((number, named), torch.tensor(1.0), accumulate=True)
     better = [names[k] for k in shared.argmax(1)[number].tolist()]
     wrong = [row for row, (name, other) in enumerate(zip(rows.target, better, strict=True)) if name != other]
     examples = [

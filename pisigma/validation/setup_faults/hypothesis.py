@@ -9,8 +9,7 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from pisigma.measurement.dataset import Measurements
-from pisigma.model.calibrated_model import CalibratedModel
-from pisigma.model.row_poses import poses_of_rows
+from pisigma.model.calibrated_model import CalibratedModel, poses_of_rows
 from pisigma.robot.description import Robot
 from pisigma.robot.frame_fits import MeasuredPoses, affine_error, best_base
 from pisigma.robot.kinematics.forward import forward_kinematics
@@ -39,9 +38,9 @@ class PredictingArm:
 
     def poses(self, rows: Measurements) -> Float64[Tensor, "rows 4 4"]:
         """Predict the poses of rows."""
-        return (
-            forward_kinematics(self.robot, rows.q) if self.model is None else poses_of_rows(self.model, rows)
-        )
+        if self.model is not None:
+            return poses_of_rows(self.model, rows)
+        return forward_kinematics(self.robot, rows.q)
 
     def screened_errors(
         self, rows: Measurements, q: Float64[Tensor, "maps rows dof"], measured: MeasuredPoses

@@ -7,8 +7,7 @@ import numpy as np
 import torch
 
 from pisigma.measurement.dataset import Measurements
-from pisigma.model.calibrated_model import CalibratedModel
-from pisigma.model.row_poses import poses_of_rows
+from pisigma.model.calibrated_model import CalibratedModel, poses_of_rows
 from pisigma.robot.frame_fits import LEVER_SHARE, MeasuredPoses
 from pisigma.validation.held_out.calibration_summary import has_orientation
 from pisigma.validation.held_out.frames.fitted_frames import FrameKind, fit_frames, with_names_of

@@ -16,8 +16,8 @@ from pisigma.lifetime.recalibration.elsewhere import owners_elsewhere
 from pisigma.lifetime.recalibration.moved import moved_by, what_moved
 from pisigma.lifetime.recalibration.recalibrated_model import recalibrated_model
 from pisigma.lifetime.recalibration.recalibration_problem import recalibration_problem
+from pisigma.model.calibrated_model import poses_of_rows
 from pisigma.model.model_posterior import ModelPosterior
-from pisigma.model.row_poses import poses_of_rows
 
 COLLISION = (0.0, 0.0, math.radians(0.25), 0.0, 0.0, 0.0)
 SHIFTED = (0.3, -0.2, 0.1, 0.5, 0.2, -0.3)

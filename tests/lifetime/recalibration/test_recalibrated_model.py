@@ -10,9 +10,9 @@ from testing.closeness import assert_close
 from pisigma.lifetime.recalibration.adaptation import adapt
 from pisigma.lifetime.recalibration.recalibrated_model import recalibrated_model
 from pisigma.lifetime.recalibration.recalibration_problem import recalibration_problem
+from pisigma.model.calibrated_model import poses_of_rows
 from pisigma.model.folder.model_folder import load_model, save_model
 from pisigma.model.model_posterior import ModelPosterior
-from pisigma.model.row_poses import poses_of_rows
 from pisigma.robot.se3 import invert, transform_from_xyzrpy
 
 ELSEWHERE = (0.3, -0.2, 0.1, 0.5, 0.2, -0.3)

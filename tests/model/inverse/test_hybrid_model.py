@@ -16,10 +16,9 @@ from pisigma.estimation.covariance_root import CovarianceRoot
 from pisigma.files.errors import MeasurementError, ModelError, PoseError
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.accuracy import deviation_of_rows, parameter_posterior, position_accuracy
+from pisigma.model.calibrated_model import hybrid_motion, hybrid_poses, nominal_poses_of_rows, poses_of_rows
 from pisigma.model.folder.model_folder import load_model, save_model
 from pisigma.model.geometric_model import model_of_hybrid
-from pisigma.model.hybrid_motion import hybrid_motion, hybrid_poses
-from pisigma.model.row_poses import nominal_poses_of_rows, poses_of_rows
 from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.robot.kinematics.jacobian import joint_jacobian
 from pisigma.robot.se3 import pose_error

@@ -14,7 +14,7 @@ from testing.report import folder_with_held_out, geometric_under_test, hybrid_un
 
 from pisigma.files.errors import MeasurementError
 from pisigma.measurement.dataset import Measurements
-from pisigma.model.row_poses import poses_of_rows
+from pisigma.model.calibrated_model import poses_of_rows
 from pisigma.reporting.page.accuracy import limit_of
 from pisigma.reporting.page.advice import measured_stretches
 from pisigma.reporting.page.content import report_content

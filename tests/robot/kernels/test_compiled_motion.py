@@ -5,7 +5,7 @@ import pytest
 import torch
 from testing.closeness import assert_close
 
-from pisigma.model.hybrid_motion import hybrid_motion
+from pisigma.model.calibrated_model import hybrid_motion
 from pisigma.robot.kernels.arrays import DRAWN, IDENTIFIED, NOMINAL
 from pisigma.robot.kinematics.jacobian import joint_jacobian
 

@@ -14,8 +14,8 @@ from pisigma.calibration.geometric.calibrator import GeometricCalibrator
 from pisigma.calibration.geometric.initial_guess.base_and_tool import fit_base_and_tool
 from pisigma.files.errors import IdentificationError, MeasurementError, ModelError
 from pisigma.measurement.dataset import Measurements
+from pisigma.model.calibrated_model import nominal_poses_of_rows, poses_of_rows
 from pisigma.model.geometric_model import model_of_calibration, model_of_hybrid
-from pisigma.model.row_poses import nominal_poses_of_rows, poses_of_rows
 from pisigma.robot import Robot
 from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.robot.se3 import invert, rotation_vector, transform_from_xyzrpy

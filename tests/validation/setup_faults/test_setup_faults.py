@@ -10,8 +10,8 @@ from testing.hybrid import hybrid_of, joints_in
 from testing.models import no_type_checker
 
 from pisigma.measurement.dataset import Measurements
+from pisigma.model.calibrated_model import nominal_poses_of_rows, poses_of_rows
 from pisigma.model.geometric_model import model_of_hybrid
-from pisigma.model.row_poses import nominal_poses_of_rows, poses_of_rows
 from pisigma.robot.se3 import transform_from_xyzrpy
 from pisigma.validation.held_out.reference_models import nominal_model
 from pisigma.validation.setup_faults.setup_faults import find_setup_faults

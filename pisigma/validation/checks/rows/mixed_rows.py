@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float64
 from torch import Tensor
 
 from pisigma.measurement.dataset import Measurements
-from pisigma.model.row_poses import poses_of_rows
+from pisigma.model.calibrated_model import poses_of_rows
 from pisigma.robot.frame_fits import best_base, best_tool
 from pisigma.validation.checks.rows.distinguishing import what_distinguishes
 from pisigma.validation.checks.rows.row_check import AbstractRowCheck, RowsUnderModel

@@ -11,8 +11,7 @@ from torch import Tensor
 
 from pisigma.files.errors import IdentificationError
 from pisigma.measurement.dataset import Measurements
-from pisigma.model.calibrated_model import CalibratedModel
-from pisigma.model.row_poses import poses_of_rows
+from pisigma.model.calibrated_model import CalibratedModel, poses_of_rows
 from pisigma.robot.se3 import transform
 from pisigma.validation.checks.rows.row_check import FEWEST_ROWS, LARGE_SHARE, Move, fitted_or_new
 from pisigma.validation.held_out.diagnostic import Diagnostic

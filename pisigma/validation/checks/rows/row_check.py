@@ -13,8 +13,7 @@ from torch import Tensor
 
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.accuracy import deviation_of_rows
-from pisigma.model.calibrated_model import CalibratedModel
-from pisigma.model.row_poses import poses_of_rows
+from pisigma.model.calibrated_model import CalibratedModel, poses_of_rows
 from pisigma.robot.frame_fits import LEVER_SHARE, MeasuredPoses
 from pisigma.validation.held_out.diagnostic import Diagnostic
 from pisigma.validation.held_out.frames.fitted_frames import FrameKind, fit_frames, with_names_of
@@ -153,7 +152,7 @@ def fitted_or_new(
 
 
 def _unknown(names: tuple[str, ...], known: Collection[str]) -> bool:
-    """Whether rows have a frame or target that a model does not, see `pisigma.model.row_poses.known_names`."""
+    """Whether rows have a frame or target that a model does not, see `pisigma.model.calibrated_model.known_names`."""
     if not set(known) - {""}:
         return len(set(names)) > 1
     return not set(names) <= set(known) and not (len(known) == 1 and not any(names))

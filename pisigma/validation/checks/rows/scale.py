@@ -7,7 +7,7 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from pisigma.measurement.dataset import Measurements
-from pisigma.model.row_poses import poses_of_rows
+from pisigma.model.calibrated_model import poses_of_rows
 from pisigma.robot.frame_fits import best_base_and_tool
 from pisigma.robot.se3 import skew
 from pisigma.validation.checks.rows.row_check import AbstractRowCheck, RowsUnderModel

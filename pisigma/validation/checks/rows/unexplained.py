@@ -6,7 +6,7 @@ from collections.abc import Iterator
 import torch
 
 from pisigma.measurement.dataset import Measurements
-from pisigma.model.row_poses import poses_of_rows
+from pisigma.model.calibrated_model import poses_of_rows
 from pisigma.robot.frame_fits import best_base_and_tool
 from pisigma.validation.checks.rows.row_check import AbstractRowCheck, RowsUnderModel
 from pisigma.validation.held_out.diagnostic import Diagnostic

@@ -8,8 +8,7 @@ from jaxtyping import Bool, Float64
 from torch import Tensor
 
 from pisigma.measurement.dataset import Measurements
-from pisigma.model.calibrated_model import CalibratedModel
-from pisigma.model.row_poses import poses_of_rows
+from pisigma.model.calibrated_model import CalibratedModel, poses_of_rows
 from pisigma.robot.se3 import rotation_vector
 from pisigma.validation.checks.rows.row_check import RowsUnderModel
 from pisigma.validation.held_out.frames.fitted_frames import FrameKind, fit_frames

@@ -11,8 +11,7 @@ from torch import Tensor
 from pisigma.files.errors import MeasurementError
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.groups import groups_to_keep_whole, numbers_of_names
-from pisigma.model.calibrated_model import CalibratedModel
-from pisigma.model.row_poses import poses_of_rows
+from pisigma.model.calibrated_model import CalibratedModel, poses_of_rows
 from pisigma.robot.frame_fits import (
     FIRST_DAMPING,
     LEVER_SHARE,

@@ -10,7 +10,7 @@ from testing.closeness import assert_close
 from testing.models import no_type_checker
 
 from pisigma.files.errors import MeasurementError
-from pisigma.model.row_poses import poses_of_rows
+from pisigma.model.calibrated_model import poses_of_rows
 from pisigma.robot.se3 import transform_from_xyzrpy
 from pisigma.validation.held_out.frames.fitted_frames import FEWEST, errors_in_fitted_frames, fitted_remark
 
