@@ -22,7 +22,7 @@ from pisigma.calibration.hybrid.calibrator import HybridCalibrator
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.splits import k_folds, with_fewer
 from pisigma.robot import Robot
-from pisigma.validation.held_out.predicted_spread import PredictedSpread, predicted_spread
+from pisigma.validation.held_out.pose_statistics import PredictedSpread, predicted_spread
 
 DATA = Path(os.environ.get("PISIGMA_DATA", "../shared/data"))
 FILES = {"ur5": "ur5/grid.csv", "ur10": "ur10/series_c_train.csv"}

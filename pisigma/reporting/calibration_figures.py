@@ -17,7 +17,7 @@ from pisigma.calibration.geometric.identifiability.pairwise import CorrelationTa
 from pisigma.joint_correction.joint_correction import JointCorrection
 from pisigma.measurement.dataset import Measurements
 from pisigma.reporting.figures import save_figure, set_margins
-from pisigma.validation.held_out.predicted_spread import WITHIN, PredictedSpread
+from pisigma.validation.held_out.pose_statistics import WITHIN, PredictedSpread
 from pisigma.validation.held_out.validation_figures import LearningPoint
 
 _UNITS = {"position": ("mm", 1e3), "rotation": ("deg", float(np.rad2deg(1.0)))}

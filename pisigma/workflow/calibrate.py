@@ -33,7 +33,7 @@ from pisigma.validation.held_out.calibration_summary import CalibrationSummary, 
 from pisigma.validation.held_out.calibration_validation import CalibrationValidation, joined_repeats, judge
 from pisigma.validation.held_out.few_rows import fit_beside_folds
 from pisigma.validation.held_out.held_out_rows import HeldOutRows
-from pisigma.validation.held_out.predicted_spread import predicted_at_other_poses
+from pisigma.validation.held_out.pose_statistics import predicted_at_other_poses
 from pisigma.validation.held_out.trained_calibrations import (
     Calibrator,
     Result,

@@ -8,6 +8,7 @@ from pathlib import Path
 import torch
 
 from pisigma.calibration.geometric.initial_guess.base_and_tool import fit_base_and_tool
+from pisigma.files.engines.processes import in_processes
 from pisigma.files.errors import MeasurementError, RecipeError
 from pisigma.files.progress import Progress, silent
 from pisigma.measurement.dataset import Measurements
@@ -20,7 +21,6 @@ from pisigma.network.patterns import build_network, build_patterns
 from pisigma.network.sections import LevenbergMarquardtSection
 from pisigma.robot.description import Robot
 from pisigma.validation.held_out.pose_statistics import Comparison, PoseErrors, compare_on
-from pisigma.validation.held_out.side_by_side import in_processes
 from pisigma.validation.held_out.training_summary import ComparisonFigures, JointErrors, TrainingRun
 from pisigma.workflow.recipes.data import RecipeData
 from pisigma.workflow.recipes.recipe import InverseRecipe, SimulatedData

@@ -28,7 +28,7 @@ from pisigma.validation.held_out.diagnostic import Diagnostic
 from pisigma.validation.held_out.frames.fitted_frames import FrameKind, fitted_remark
 from pisigma.validation.held_out.frames.row_errors import places_remark
 from pisigma.validation.held_out.model_comparison import Difference, ModelComparison, compare_models
-from pisigma.validation.held_out.predicted_spread import image_remark
+from pisigma.validation.held_out.pose_statistics import image_remark
 from pisigma.validation.held_out.reference_models import geometric_model, nominal_model
 from pisigma.validation.resampling import Bootstrap
 from pisigma.validation.setup_faults.cause import length_text

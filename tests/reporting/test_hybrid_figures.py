@@ -21,7 +21,7 @@ from pisigma.reporting.calibration_tables import (
     trial_table,
 )
 from pisigma.validation.held_out.calibration_summary import TrialFigures, summarise
-from pisigma.validation.held_out.predicted_spread import PredictedSpread
+from pisigma.validation.held_out.pose_statistics import PredictedSpread
 from pisigma.validation.held_out.validation_figures import ErrorFigures, LearningPoint
 
 

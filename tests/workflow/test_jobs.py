@@ -6,8 +6,8 @@ from testing.models import no_type_checker, trained_run
 from testing.simulated_arm import simulate
 
 import pisigma
+from pisigma.files.engines import processes
 from pisigma.files.progress import silent, stage
-from pisigma.validation.held_out import side_by_side
 from pisigma.workflow.recipes.recipe import MeasuredData
 from pisigma.workflow.settings.calibration import CalibrationSettings
 from pisigma.workflow.settings.training import TrainSettings
@@ -18,7 +18,7 @@ def tasks(monkeypatch):
     """How many items went to other processes."""
     counted = []
     monkeypatch.setattr(
-        side_by_side, "ProcessEngine", lambda jobs: PicklingEngine(jobs, lambda: counted.append(jobs))
+        processes, "ProcessEngine", lambda jobs: PicklingEngine(jobs, lambda: counted.append(jobs))
     )
     return counted
 

@@ -25,7 +25,7 @@ from pisigma.robot.se3 import invert, transform_from_xyzrpy, xyzrpy_from_transfo
 from pisigma.validation.checks.rows.mixed_rows import MOST_WRONG, many_wrong
 from pisigma.validation.gate import check_rows
 from pisigma.validation.held_out.diagnostic import Diagnostic
-from pisigma.validation.held_out.predicted_spread import image_deviation
+from pisigma.validation.held_out.pose_statistics import image_deviation
 from pisigma.validation.setup_faults.explanations import PLAUSIBLE_SHARE
 
 KIND = "recalibration"

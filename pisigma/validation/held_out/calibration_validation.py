@@ -11,15 +11,19 @@ from torch import Tensor
 
 from pisigma.calibration.geometric.calibrator import GeometricCalibrator
 from pisigma.calibration.hybrid.result import HybridResult
+from pisigma.files.engines.processes import in_processes, side_by_side
 from pisigma.files.errors import IdentificationError
 from pisigma.files.progress import Progress, silent, stage
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.sensors.registry import SENSORS
 from pisigma.measurement.sensors.socket import PairOfSockets
 from pisigma.measurement.splits import TrainTest, with_fewer
-from pisigma.validation.held_out.pose_statistics import PoseErrors, error_statistics
-from pisigma.validation.held_out.predicted_spread import PredictedSpread, predicted_spread
-from pisigma.validation.held_out.side_by_side import in_processes, side_by_side
+from pisigma.validation.held_out.pose_statistics import (
+    PoseErrors,
+    PredictedSpread,
+    error_statistics,
+    predicted_spread,
+)
 from pisigma.validation.held_out.trained_calibrations import (
     Calibrator,
     DistanceErrors,
@@ -193,9 +197,8 @@ def judged_folds(
     jobs: int | None = None,
 ) -> Iterator[JudgedFold]:
     """Judge every fold of every repeat in turn, in threads or in processes; see `fold_tasks` and `validate`."""
-    if jobs is not None:
-        return in_processes(fold_tasks(calibrator, measurements, repeats, silent), jobs)
-    return side_by_side(fold_tasks(calibrator, measurements, repeats, progress), measurements.rows > FEW_ROWS)
+    tasks = fold_tasks(calibrator, measurements, repeats, progress if jobs is None else silent)
+    return side_by_side(tasks, measurements.rows > FEW_ROWS) if jobs is None else in_processes(tasks, jobs)
 
 
 def fold_tasks(

@@ -14,12 +14,12 @@ from pisigma.calibration.geometric.calibrator import GeometricCalibrator
 from pisigma.calibration.geometric.identifiability.sufficiency import distinct_rows, distinct_values
 from pisigma.calibration.geometric.result import CalibrationResult
 from pisigma.calibration.hybrid.calibrator import HybridCalibrator
+from pisigma.files.engines.processes import in_processes
 from pisigma.files.errors import IdentificationError, MeasurementError
 from pisigma.files.progress import Progress, silent, stage
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.splits import TrainTest, k_folds
 from pisigma.validation.held_out.calibration_validation import JudgedFold, fold_tasks, judged_folds, validate
-from pisigma.validation.held_out.side_by_side import in_processes
 from pisigma.validation.held_out.trained_calibrations import (
     Calibrator,
     Result,

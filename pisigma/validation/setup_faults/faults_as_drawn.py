@@ -32,8 +32,13 @@ from pisigma.validation.setup_faults.explanations import (
     largest_explained,
     simplest,
 )
-from pisigma.validation.setup_faults.hypothesis import Hypothesis, PredictingArm
-from pisigma.validation.setup_faults.joint_values import MARGIN, freed_joints, shifted_rows
+from pisigma.validation.setup_faults.hypothesis import (
+    MARGIN,
+    Hypothesis,
+    PredictingArm,
+    freed_joints,
+    shifted_rows,
+)
 from pisigma.validation.setup_faults.setup_fault import SetupFault, fault_of
 
 MOST_ROWS = 1_000
@@ -141,8 +146,8 @@ def _named_otherwise(robot: Robot, measurements: Measurements, usual: float) -> 
     """Find better names for the targets of the frame that most rows are of, where errors are larger than usual [m]."""
     rows = largest_group(measurements, by_target=False)
     rows = rows.select(spread(torch.arange(rows.rows), MOST_ROWS))
-    measured = MeasuredPoses.of(rows.position, rows.rotation, LEVER_SHARE * robot.reach)
-    number, T = numbers_of_names(rows.target), forward_kinematics(robot, rows.q)
+    number, lever = numbers_of_names(rows.target), LEVER_SHARE * robot.reach
+    measured, T = MeasuredPoses.of(rows.position, rows.rotation, lever), forward_kinematics(robot, rows.q)
     here = Hypothesis(rows.q, fit_targets(T, measured, number)[1], measured)
     if not here.error > usual:
         return ()

@@ -17,8 +17,7 @@ from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.validation.held_out.calibration_validation import CalibrationValidation
 from pisigma.validation.held_out.held_out_rows import HeldOutRows, read_held_out
-from pisigma.validation.held_out.pose_statistics import PoseErrors
-from pisigma.validation.held_out.predicted_spread import PredictedSpread
+from pisigma.validation.held_out.pose_statistics import PoseErrors, PredictedSpread
 
 ROWS = 20
 

@@ -15,8 +15,7 @@ from pisigma.calibration.hybrid.calibrator import HybridCalibrator
 from pisigma.measurement.splits import holdout, k_folds
 from pisigma.robot import Robot
 from pisigma.validation.held_out.calibration_validation import judge, learning_curve, validate
-from pisigma.validation.held_out.pose_statistics import PoseErrors
-from pisigma.validation.held_out.predicted_spread import PredictedSpread, predicted_spread
+from pisigma.validation.held_out.pose_statistics import PoseErrors, PredictedSpread, predicted_spread
 from pisigma.validation.held_out.trained_calibrations import with_frames
 
 ROWS = 240

@@ -7,8 +7,8 @@ import pytest
 import torch
 from testing.engine_work import refuse, square
 
+from pisigma.files.engines.processes import in_processes, side_by_side
 from pisigma.files.errors import IdentificationError
-from pisigma.validation.held_out.side_by_side import in_processes, side_by_side
 
 
 @pytest.mark.parametrize(("wide", "threads"), [(True, 1), (False, 2)])
