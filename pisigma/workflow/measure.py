@@ -20,8 +20,7 @@ from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.fields import LeftOut
 from pisigma.planning.plan_file import StoredPlan, read_plan
 from pisigma.planning.plan_inputs import find_candidates, with_measured
-from pisigma.planning.session.judged_rows import JudgedRows, setup_sentence
-from pisigma.planning.session.planned_again import FurtherPoses
+from pisigma.planning.session.judged_rows import FurtherPoses, JudgedRows, setup_sentence
 from pisigma.planning.session.reached import Reached, cross_validated, expected, reached
 from pisigma.planning.session.row_alarms import NEAR_POSE, joint_differences, of_all_rows
 from pisigma.planning.session.state import (

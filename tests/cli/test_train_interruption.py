@@ -13,7 +13,7 @@ from testing.closeness import assert_close
 from pisigma.workflow.recipes.data import load_data
 from pisigma.workflow.recipes.reader import read_recipe
 from pisigma.workflow.settings.training import TrainSettings
-from pisigma.workflow.train_networks import train_networks
+from pisigma.workflow.train import train_networks
 
 # Slow enough to be caught in the middle: every epoch waits, the last ones for long, which changes no number.
 SLOW = """

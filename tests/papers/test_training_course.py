@@ -5,7 +5,7 @@ from testing.closeness import assert_close
 
 from pisigma.workflow.recipes.data import load_data
 from pisigma.workflow.recipes.reader import read_recipe
-from pisigma.workflow.train_networks import train_networks
+from pisigma.workflow.train import train_networks
 from training_course import EPOCHS_SHOWN, epochs_shown, report_course
 
 

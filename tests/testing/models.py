@@ -121,7 +121,7 @@ def trained_run(name: str):
     from pisigma.files.yaml_file import parse_yaml
     from pisigma.workflow.recipes.data import load_data
     from pisigma.workflow.recipes.recipe import InverseRecipe
-    from pisigma.workflow.train_networks import train_networks
+    from pisigma.workflow.train import train_networks
 
     recipe = parse_yaml(small_recipe_text(name), InverseRecipe, RecipeError, name)
     with no_type_checker():

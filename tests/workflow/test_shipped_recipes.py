@@ -14,7 +14,7 @@ from pisigma.validation.held_out.training_summary import TrainingRun
 from pisigma.workflow.recipes.data import load_data
 from pisigma.workflow.recipes.reader import read_recipe
 from pisigma.workflow.recipes.recipe import GeometricRecipe, InverseRecipe, SimulatedData
-from pisigma.workflow.train_networks import train_networks
+from pisigma.workflow.train import train_networks
 
 FOLDER = Path(__file__).parents[2] / "training"
 INVERSE = sorted(p.stem for p in FOLDER.glob("*.yaml") if "network" in yaml.safe_load(p.read_text()))

@@ -15,8 +15,7 @@ from pisigma.workflow.recipes.data import load_data, simulate
 from pisigma.workflow.recipes.reader import recipe_hash
 from pisigma.workflow.recipes.recipe import MeasuredData, SingularRows
 from pisigma.workflow.settings.training import TrainSettings
-from pisigma.workflow.train import InverseTraining
-from pisigma.workflow.train_networks import cross_validate, train_networks
+from pisigma.workflow.train import InverseTraining, cross_validate, train_networks
 
 
 def test_a_recipe_of_inverse_calibration_in_two_lines(tmp_path):

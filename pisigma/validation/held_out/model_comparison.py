@@ -1,4 +1,4 @@
-"""Any number of models on the same measured rows: their errors, confidence intervals and differences."""
+"""Any number of models on the same measured rows: their errors, differences, and confidence intervals of both."""
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -16,7 +16,6 @@ from pisigma.measurement.groups import groups_to_keep_whole
 from pisigma.measurement.sensors.socket import PairOfSockets
 from pisigma.model.calibrated_model import CalibratedModel, poses_of_rows
 from pisigma.robot.kinematics.forward import forward_kinematics
-from pisigma.validation.held_out.bootstrap import STATISTICS, Intervals, confidence_intervals, statistics
 from pisigma.validation.held_out.frames.fitted_frames import FrameKind, errors_in_fitted_frames
 from pisigma.validation.held_out.frames.row_errors import has_position, other_lengths
 from pisigma.validation.held_out.pose_statistics import axis_statistics, error_statistics
@@ -27,10 +26,71 @@ from pisigma.validation.resampling import Bootstrap
 
 Interval = tuple[float, float]
 """Lower and upper end."""
-
 NOTHING_TO_JUDGE = "expected positions, balls in sockets, wires, pairs or touches, got none; give x, y and z."
 UNITS = {"position": ("mm", 1e3), "orientation": ("deg", float(np.rad2deg(1.0)))}
 """Of every quantity the unit of tables and files, and what an SI value is multiplied by."""
+STATISTICS = ("mean", "rms", "p95")
+"""Statistics that have an interval; the maximum has none, as no resample exceeds what was measured."""
+QUANTILE = 0.95
+"""Of the statistic "p95"."""
+_BATCH = 2**22
+"""Indices that are drawn at a time, at most."""
+
+
+@dataclass(frozen=True)
+class Intervals:
+    """Confidence intervals of the statistics in `STATISTICS`, of several models [m or rad].
+
+    Attributes:
+        value: lower and upper end of each statistic of each model; NaN where there is one configuration only.
+        difference: the same of its difference to the first model's.
+    """
+
+    value: Float64[np.ndarray, "statistics models 2"]
+    difference: Float64[np.ndarray, "statistics models 2"]
+
+
+def confidence_intervals(
+    bootstrap: Bootstrap, errors: Float64[np.ndarray, "models rows"], group: Int64[np.ndarray, " rows"]
+) -> Intervals:
+    """Compute the intervals of all models on the same resamples.
+
+    Args:
+        bootstrap: how they are computed.
+        errors: of the same rows under every model, lengths or angles [m or rad]; none is NaN.
+        group: index of every row's group, from 0; every index occurs.
+    """
+    from scipy import stats
+
+    groups = int(group.max()) + 1
+    if groups < 2:
+        unknown = np.full((len(STATISTICS), len(errors), 2), np.nan)
+        return Intervals(unknown, unknown)
+    order = np.argsort(group, kind="stable")
+    sizes, errors = np.bincount(group), errors[:, order]
+
+    def of_resample(drawn: Int64[np.ndarray, " groups"]) -> np.ndarray:
+        times = np.bincount(drawn.astype(np.int64), minlength=groups)
+        values = statistics(np.repeat(errors, np.repeat(times, sizes), axis=1))
+        return np.stack([values, values - values[:, :1]])
+
+    result = stats.bootstrap(
+        (np.arange(groups),),
+        of_resample,
+        vectorized=False,
+        method="percentile",
+        n_resamples=bootstrap.resamples,
+        confidence_level=bootstrap.confidence,
+        batch=max(1, _BATCH // groups),
+        rng=np.random.default_rng(bootstrap.seed),
+    )
+    return Intervals(*np.stack([result.confidence_interval.low, result.confidence_interval.high], -1))
+
+
+def statistics(errors: Float64[np.ndarray, "models rows"]) -> Float64[np.ndarray, "statistics models"]:
+    """Compute mean, root mean square and 95 % quantile of every model's errors, as `STATISTICS` names them."""
+    quantile = np.quantile(errors, QUANTILE, axis=1)
+    return np.stack([errors.mean(1), np.sqrt((errors**2).mean(1)), quantile])
 
 
 @dataclass(frozen=True)

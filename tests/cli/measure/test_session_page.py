@@ -7,7 +7,7 @@ import pytest
 from testing.models import no_type_checker
 from testing.sessions import arm_beside_tracker, session_state
 
-from pisigma.cli.measure.session_page import PageOptions, shown_in_browser
+from pisigma.cli.measure.command import PageOptions, shown_in_browser
 from pisigma.files.errors import RobotError, missing_extra
 
 OPTIONS = PageOptions("127.0.0.1", 8080, None)

@@ -5,8 +5,8 @@ import pytest
 from testing.closeness import assert_close
 
 from pisigma.files.errors import MeasurementError
-from pisigma.validation.held_out import bootstrap as module
-from pisigma.validation.held_out.bootstrap import STATISTICS, confidence_intervals, statistics
+from pisigma.validation.held_out import model_comparison as module
+from pisigma.validation.held_out.model_comparison import STATISTICS, confidence_intervals, statistics
 from pisigma.validation.resampling import Bootstrap
 
 ROWS = 40
