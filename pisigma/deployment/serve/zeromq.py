@@ -1,0 +1,118 @@
+"""The same requests over ZeroMQ: a message is a line of JSON without its end, or a binary frame."""
+
+import threading
+
+from pisigma.deployment.serve.binary_frames import MAGIC, BinaryFrames
+from pisigma.deployment.serve.connection import MOST_REST
+from pisigma.deployment.serve.json_lines import LONGEST_LINE, JsonLines
+from pisigma.deployment.serve.metrics import Metrics
+from pisigma.deployment.serve.models import ServedModels
+from pisigma.deployment.serve.protocol import AbstractProtocol, BrokenStreamError, is_token
+from pisigma.files.errors import OutputError
+
+SILENCE_MS = 200
+"""[ms] Without a message, after which all that was sent before the server stops has come."""
+WAITING = 100
+"""Messages of a client, and answers to it, that wait at most."""
+
+
+class ZeroMq:
+    """A ROUTER socket in a thread of its own, so that any number of REQ and DEALER sockets can ask.
+
+    Attributes:
+        port: where it listens.
+    """
+
+    def __init__(
+        self, models: ServedModels, metrics: Metrics, host: str, port: int, token: bytes | None
+    ) -> None:
+        """Listen.
+
+        Args:
+            models: that answer.
+            metrics: that count the answers.
+            host: address of this machine.
+            port: to listen at; 0 for a free one.
+            token: that stands as a part of its own before every message; None where none is wanted.
+
+        Raises:
+            ImportError: pyzmq is not installed.
+            OutputError: the port is taken.
+        """
+        try:
+            import zmq
+        except ImportError as problem:
+            raise ImportError(str(problem), name="pyzmq") from None
+        self._json, self._binary = JsonLines(models, metrics), BinaryFrames(models, metrics)
+        self._token, self._context = token, zmq.Context(1)
+        self._socket, self._stopping = self._context.socket(zmq.ROUTER), threading.Event()
+        options = {
+            zmq.LINGER: 1000,
+            zmq.MAXMSGSIZE: LONGEST_LINE,
+            zmq.RCVTIMEO: SILENCE_MS,
+            zmq.IPV6: int(":" in host),
+        }
+        options |= {zmq.RCVHWM: WAITING, zmq.SNDHWM: WAITING}
+        for option, value in options.items():
+            self._socket.setsockopt(option, value)
+        try:
+            self._socket.bind(f"tcp://{f'[{host}]' if ':' in host else host}:{port or '*'}")
+        except zmq.ZMQError as problem:
+            self._close()
+            raise OutputError(
+                f"port {port} of '{host}' cannot be served by ZeroMQ ({problem.strerror}); give a free port, or 0 for "
+                "any."
+            ) from None
+        self.port = int(self._socket.getsockopt_string(zmq.LAST_ENDPOINT).rpartition(":")[2])
+        self._again = zmq.Again
+        self._thread = threading.Thread(target=self._run, name="ZeroMQ", daemon=True)
+        self._thread.start()
+
+    @property
+    def is_running(self) -> bool:
+        """Whether it answers still."""
+        return self._thread.is_alive()
+
+    def stop(self) -> None:
+        """Have what has come in answered, and the socket closed then."""
+        self._stopping.set()
+
+    def _run(self) -> None:
+        rest = 0
+        while rest < MOST_REST:
+            stopping = (
+                self._stopping.is_set()
+            )  # before the look for a message: what came until then is answered
+            try:
+                # waits when it stops, too, as the next messages of a full queue take a moment
+                client, *parts = self._socket.recv_multipart()
+            except self._again:
+                if stopping:
+                    break
+                continue
+            rest += sum(map(len, parts)) if stopping else 0
+            envelope = [client, b""] if len(parts) > 1 and not parts[0] else [client]
+            self._socket.send_multipart([*envelope, self._reply(parts[len(envelope) - 1 :])])
+        self._close()
+
+    def _reply(self, parts: list[bytes]) -> bytes:
+        """Answer the parts of a message behind its envelope: the token, where one is wanted, and the request."""
+        message = parts[-1] if parts else b""
+        protocol: AbstractProtocol = self._binary if message.startswith(MAGIC) else self._json
+        if len(parts) != (1 if self._token is None else 2) or (
+            self._token is not None and not is_token(parts[0], self._token)
+        ):
+            return protocol.admission(False)
+        if protocol is self._json:
+            message = message.removesuffix(b"\n") + b"\n"
+        try:
+            if protocol.cut(bytearray(message)) != len(message):
+                return protocol.broken()
+        except BrokenStreamError as problem:
+            return problem.last_words
+        reply = protocol.answer(message)
+        return reply if isinstance(reply, bytes) else reply()
+
+    def _close(self) -> None:
+        self._socket.close()
+        self._context.term()
