@@ -155,27 +155,26 @@ def in_frames(
 
     Both are fitted only where an affine fit, which leaves less, does not leave more than `most` [m].
     """
-    rows = len(here.T)
+    rows, per_tool = len(here.T), 6 if bool(here.measured.has_rotation.any()) else 3
     bound = float(affine_error(here.T, here.measured)) * (1 - 13 / rows) if rows > 13 else 0.0
-    frames, targets = numbers_of_names(some.frame), numbers_of_names(some.target)
-    count, tools = int(frames.max()) + 1, int(targets.max()) + 1
-    both = None
-    if bound <= most**2 and (arm.model is None or count == tools == 1):
-        both = best_base_and_tool(here.T, here.measured)
-    if arm.model is None:
-        if both is not None:
-            yield replace(here, T=both[0] @ here.T @ both[1])
+    alone = True
+    if arm.model is not None:
+        yield here
+        frames, targets = numbers_of_names(some.frame), numbers_of_names(some.target)
+        count, tools = int(frames.max()) + 1, int(targets.max()) + 1
+        X, Y = _per_group(best_base, frames, here), _per_group(best_tool, targets, here)
+        yield here.with_cause(_moved("frame", X, bases_of_rows(arm.model, some)), X @ here.T, 6 * count)
+        yield here.with_cause(_moved("tool", Y), here.T @ Y, per_tool * tools)
+        alone = count == tools == 1
+    if not alone or bound > most**2:
         return
-    yield here
-    per_tool = 6 if bool(here.measured.has_rotation.any()) else 3
-    X, Y = _per_group(best_base, frames, here), _per_group(best_tool, targets, here)
-    bases = bases_of_rows(arm.model, some)
-    yield here.with_cause(_moved("frame", X, bases), X @ here.T, 6 * count)
-    yield here.with_cause(_moved("tool", Y), here.T @ Y, per_tool * tools)
-    if both is not None:
-        base, tool = both
-        moved = here.with_cause(_moved("frame", base[None], bases), base @ here.T, 6)
-        yield moved.with_cause(_moved("tool", tool[None]), base @ here.T @ tool, per_tool)
+    base, tool = best_base_and_tool(here.T, here.measured)
+    T = base @ here.T @ tool
+    if arm.model is None:
+        yield replace(here, T=T)
+    else:
+        moved = _moved("frame", base[None], bases_of_rows(arm.model, some))
+        yield here.with_cause(moved, base @ here.T, 6).with_cause(_moved("tool", tool[None]), T, per_tool)
 
 
 def _per_group(
