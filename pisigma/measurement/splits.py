@@ -2,6 +2,7 @@
 
 import heapq
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Literal, get_args
 
 import torch
@@ -22,8 +23,60 @@ AT_RANDOM: tuple[SplitBy, ...] = ("joints", "placement")
 JUDGED_GROUPS, MOST_REPEATS = 200, 10
 """Groups held out, counted anew in every repeat, after which the luck of a single repeat hardly shows."""
 
+FOLDS = 5
+"""Of a cross-validation that is not by placement."""
+
 TrainTest = tuple[Int64[Tensor, " _train"], Int64[Tensor, " _test"]]
 """Rows to train on and rows to test on, each in the order of the measurements."""
+
+
+@dataclass(frozen=True)
+class Splitting:
+    """How rows are split into those to train on and those to judge on.
+
+    Attributes:
+        by: what stays together, see `SplitBy`.
+        seed: of all draws.
+        folds: of a cross-validation; 0 for none, None for `FOLDS` or one for every placement.
+        hold_out: share of the rows that are held out once, instead of folds.
+    """
+
+    by: SplitBy
+    seed: int
+    folds: int | None
+    hold_out: float | None
+
+    def of(
+        self, measurements: Measurements, times: int | None, train_rows: int | None
+    ) -> Sequence[Sequence[TrainTest]]:
+        """Give training and test rows of every fold, per repeat; nothing without a validation.
+
+        Args:
+            measurements: the rows.
+            times: see `repeats`.
+            train_rows: so many training rows are drawn in every fold; None for all.
+
+        Raises:
+            MeasurementError: the measurements cannot be split like that.
+        """
+        if self.hold_out is not None:
+            splits: Sequence[Sequence[TrainTest]] = [
+                [holdout(measurements, self.hold_out, self.seed, self.by)]
+            ]
+        elif self.folds == 0:
+            return []
+        else:
+            folds = FOLDS if self.folds is None and self.by != "placement" else self.folds
+            if folds is not self.folds and len(set(groups_to_keep_whole(measurements).tolist())) < FOLDS:
+                raise MeasurementError(
+                    f"{measurements.source}: {FOLDS} different poses or more were wanted, so that each can be left out "
+                    "once to judge the others; measure more, about 50 for a good calibration, or leave that out "
+                    "(--folds 0)."
+                )
+            splits = repeats(measurements, folds, self.seed, self.by, times)
+        if train_rows is None:
+            return splits
+        return [with_fewer(measurements, folds, train_rows, self.seed) for folds in splits]
 
 
 def k_folds(

@@ -2,7 +2,7 @@
 
 import os
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
@@ -11,16 +11,15 @@ from pisigma.calibration.geometric.problem.parameters import Prior
 from pisigma.calibration.hybrid.calibrator import HybridCalibrator
 from pisigma.calibration.hybrid.result import HybridResult
 from pisigma.estimation.loss import HampelLoss, SquaredLoss
-from pisigma.files.errors import IdentificationError, MeasurementError
+from pisigma.files.errors import IdentificationError
 from pisigma.files.model_files import HELD_OUT_CSV
 from pisigma.files.progress import Progress
 from pisigma.joint_correction.registry import features_from_outside
 from pisigma.measurement.camera.corner_file import MeasurementFiles, read_rows
 from pisigma.measurement.dataset import Measurements, with_new_frames
-from pisigma.measurement.groups import groups_to_keep_whole
 from pisigma.measurement.joint_range import row_warnings, with_limits_of_rows
 from pisigma.measurement.sensors.socket import PairOfSockets, matching_sockets
-from pisigma.measurement.splits import TrainTest, draw_rows, holdout, repeats, with_fewer
+from pisigma.measurement.splits import Splitting, draw_rows
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.geometric_model import model_of_calibration, with_hybrid
 from pisigma.reporting.cards import CardTexts, write_calibration_card
@@ -43,9 +42,6 @@ from pisigma.validation.held_out.trained_calibrations import (
 )
 from pisigma.workflow.result import AbstractModelResult
 from pisigma.workflow.settings.calibration import CalibrationSettings, ModelKind
-
-FOLDS = 5
-"""Of a cross-validation that is not by placement."""
 
 ONLY_GEOMETRY = (
     "The geometry alone was calibrated, and nothing was cross-validated: errors that a fault of the setup or of the "
@@ -123,7 +119,8 @@ def calibrate(
     measurements = with_new_frames(measurements, settings.new_frame_at)
     beyond, nominal = row_warnings(nominal, measurements), with_limits_of_rows(nominal, measurements)
     training, test_rows = measurements.split_sets()
-    splits = splits_of(settings, training)
+    splitting = Splitting(settings.split, settings.seed, settings.folds, settings.hold_out)
+    splits = splitting.of(training, settings.repeats, settings.train_rows)
     rows = training
     if settings.train_rows is not None:
         rows = training.select(draw_rows(training, settings.train_rows, settings.seed))
@@ -261,29 +258,3 @@ def calibrator_of(
         features=features if settings.features is None else settings.features,
         gravity=settings.gravity,
     )
-
-
-def splits_of(settings: CalibrationSettings, measurements: Measurements) -> Sequence[Sequence[TrainTest]]:
-    """Give training and test rows of every fold, per repeat; nothing without a validation.
-
-    Raises:
-        MeasurementError: the measurements cannot be split like that.
-    """
-    if settings.hold_out is not None:
-        splits: Sequence[Sequence[TrainTest]] = [
-            [holdout(measurements, settings.hold_out, settings.seed, settings.split)]
-        ]
-    elif settings.folds == 0:
-        return []
-    else:
-        folds = FOLDS if settings.folds is None and settings.split != "placement" else settings.folds
-        if folds is not settings.folds and len(set(groups_to_keep_whole(measurements).tolist())) < FOLDS:
-            raise MeasurementError(
-                f"{measurements.source}: {FOLDS} different poses or more were wanted, so that each can be left out "
-                "once to judge the others; measure more, about 50 for a good calibration, or leave that out "
-                "(--folds 0)."
-            )
-        splits = repeats(measurements, folds, settings.seed, settings.split, settings.repeats)
-    if settings.train_rows is None:
-        return splits
-    return [with_fewer(measurements, folds, settings.train_rows, settings.seed) for folds in splits]
