@@ -57,7 +57,7 @@ from pisigma.workflow.result import AbstractModelResult
 from pisigma.workflow.settings.recalibration import RecalibrationSettings
 
 if TYPE_CHECKING:
-    from pisigma.lifetime.fleet.likeness import Likeness
+    from pisigma.lifetime.fleet.prior import Likeness
 
 FEW_ROWS = 5
 """Different poses below which nothing can be said of left-out rows."""
@@ -283,7 +283,7 @@ def _likeness(model: CalibratedModel, rows: Measurements) -> "Likeness | None":
     """How like its fleet the robot of some rows is; None where the model is not the prior of a fleet."""
     if model.kind != FLEET_PRIOR:
         return None
-    from pisigma.lifetime.fleet.likeness import Likeness  # brings statistics that take half a second
+    from pisigma.lifetime.fleet.prior import Likeness  # brings statistics that take half a second
 
     return Likeness.of(model, rows)
 

@@ -1,4 +1,4 @@
-"""What robots of one type have in common: means and covariances of their errors, by empirical Bayes."""
+"""What robots of one type have in common, by empirical Bayes, and how like the others of its fleet one robot is."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 from jaxtyping import Float64
+from scipy.stats import chi2
 from torch import Tensor
 
 from pisigma.calibration.geometric.problem.parameters import ParameterSpace
@@ -13,7 +14,7 @@ from pisigma.calibration.geometric.problem.setup import IdentifiedGeometry
 from pisigma.calibration.hybrid.arm import HybridArm, JointCoverage
 from pisigma.calibration.hybrid.uncertainty import PositionUncertainty
 from pisigma.estimation.covariance_root import CovarianceRoot
-from pisigma.estimation.population import FEWEST_ROBOTS, Information, Population, without_odd
+from pisigma.estimation.population import FEWEST_ROBOTS, ODD, Information, Population, without_odd
 from pisigma.files.errors import FleetError
 from pisigma.joint_correction.feature import AbstractFeature
 from pisigma.joint_correction.joint_correction import JointCorrection
@@ -210,3 +211,55 @@ def _medians(noises: Sequence[Mapping[str, float]]) -> dict[str, float]:
     names = dict.fromkeys(name for noise in noises for name in noise)
     values = {name: sorted(noise[name] for noise in noises if name in noise) for name in names}
     return {name: those[len(those) // 2] for name, those in values.items()}
+
+
+@dataclass(frozen=True)
+class Likeness:
+    """How like the other robots of a fleet one is.
+
+    Attributes:
+        probability: that a robot of the fleet is as far from its mean, or farther.
+        gain: log evidence of its rows as those of a robot of the fleet, minus that as those of any of its class.
+    """
+
+    probability: float
+    gain: float
+
+    @staticmethod
+    def of(model: CalibratedModel, rows: Measurements) -> "Likeness":
+        """See how far the robot of some rows is from the mean of a fleet prior.
+
+        Args:
+            model: of the prior.
+            rows: of the robot.
+
+        Raises:
+            IdentificationError: the rows do not determine where the robot stands.
+        """
+        posterior = ModelPosterior.of(model)
+        root = of_arm(posterior.root, posterior.space)
+        drawn = posterior.space.robot
+        errors = torch.from_numpy(posterior.geometry.robot.dh - drawn.dh)
+        mean = torch.cat([errors.flatten(), posterior.weights])
+        evidence = evidence_of(model, mean, rows)
+        fleet = Population(mean, root @ root.t(), posterior.space.arm_size)
+        square, count = fleet.surprise(evidence)
+        gain = fleet.log_evidence(evidence) - class_population(drawn).log_evidence(evidence)
+        return Likeness(float(chi2.sf(square, count)), gain)
+
+    @property
+    def odd(self) -> bool:
+        """Whether the fleet says little of the robot: less than the usual errors of its class."""
+        return self.probability < ODD and self.gain < 0
+
+    @property
+    def sentence(self) -> str:
+        """The same in words."""
+        if self.odd:
+            return (
+                f"This robot is unlike the fleet: fewer than 1 in {1 / ODD:,.0f} of its robots are as far from the "
+                "mean, and the usual errors of its class explain its rows better. The fleet does not count where the "
+                "rows are enough for a calibration of their own."
+            )
+        share = f"{100 * self.probability:.0f} %" if self.probability >= 0.01 else "fewer than 1 %"
+        return f"This robot is like the fleet: {share} of its robots are as far from the mean, or farther."

@@ -16,13 +16,13 @@ from pisigma.estimation.hypotheses import Explanation, Motion, SessionEvidence
 from pisigma.estimation.posterior_update import PosteriorUpdate
 from pisigma.estimation.wrong_rows import Explained, with_wrong_rows
 from pisigma.files.errors import IdentificationError
-from pisigma.lifetime.monitoring.hypotheses import hypotheses
 from pisigma.lifetime.recalibration.adaptation import AdaptedArm, linear_values, noise_of_sensors
 from pisigma.lifetime.recalibration.elsewhere import FAR
 from pisigma.lifetime.recalibration.moved import Moved, moved_of_group
 from pisigma.lifetime.recalibration.recalibration_problem import (
     Owner,
     RecalibrationProblem,
+    hypotheses,
     recalibration_problem,
 )
 from pisigma.measurement.dataset import Measurements

@@ -1,5 +1,6 @@
 """The problem of a recalibration: new rows, and the posterior of a model as the prior of all unknowns."""
 
+import math
 from collections.abc import Collection, Sequence, Set
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -31,14 +32,14 @@ from pisigma.model.model_posterior import ModelPosterior
 
 Owner = tuple[str, str]
 """What can stand elsewhere: ("base", frame) or ("tool", target)."""
-
 ELSEWHERE: dict[ParameterUnit, float] = {"m": 0.1, "rad": 0.1, "px": 100.0, "1": 1.0}
 """Standard deviation of a base, a tool or a sensor's unknown that stands anywhere, about its guess, by its unit."""
 LARGEST_CORRECTION = 10.0
 """Size 1 of the drift of a correction, in root mean squares of its weights."""
-
 WORTH_OF_CORRECTION = 12.0
 """[nats] Its many weights explain what a model gets wrong of few rows by chance, so it has to show more clearly."""
+WORTH = math.log(100)
+"""[nats] Prior odds of 1 to 100 that a thing moved since the calibration, against that nothing did."""
 
 
 def owners_in(rows: Measurements, kinds: Collection[str]) -> frozenset[Owner]:
@@ -276,3 +277,24 @@ def _arm_groups(space: ParameterSpace, free: Bool[Tensor, " parameters"]) -> lis
         scale = torch.ones(len(chosen), dtype=torch.float64)
         groups.append(DriftGroup(what, torch.tensor(chosen, dtype=torch.int64), scale))
     return groups
+
+
+def hypotheses(problem: RecalibrationProblem) -> tuple[DriftGroup, ...]:
+    """Everything that can have moved by itself: joints, bases, tools, single lengths and angles; or the correction.
+
+    The correction stands for joints that err otherwise than before in many ways, which no single motion explains. Zeros
+    of joints slip more often than arms are bent: all lengths together have a tenth of the odds of a joint, and so have
+    all angles.
+    """
+    parameters = problem.design.problem.space.parameters
+    single: list[DriftGroup] = []
+    for group in problem.groups:
+        if group.stands:
+            continue
+        if group.what not in ("lengths", "angles"):
+            single.append(replace(group, worth=WORTH))
+            continue
+        for index, scale in zip(group.index, group.scale, strict=True):
+            worth = WORTH + math.log(10 * len(group.index))
+            single.append(DriftGroup(parameters[int(index)].name, index[None], scale[None], worth=worth))
+    return tuple(single)

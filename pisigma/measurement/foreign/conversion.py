@@ -15,6 +15,7 @@ from pisigma.measurement.csv.columns import POSITION, QUATERNION, RPY, find_colu
 from pisigma.measurement.csv.reading import fields_of
 from pisigma.measurement.csv.table import Table
 from pisigma.measurement.foreign.accounting import LeftOutRow, Place
+from pisigma.measurement.foreign.dialect import is_missing
 from pisigma.measurement.foreign.export_file import ExportFile
 from pisigma.measurement.foreign.mapping import (
     FileMapping,
@@ -23,7 +24,6 @@ from pisigma.measurement.foreign.mapping import (
     coordinates,
     joint_columns,
 )
-from pisigma.measurement.foreign.number_format import is_missing
 from pisigma.measurement.foreign.quantities import (
     KEYS,
     LEFT_OUT,

@@ -10,9 +10,8 @@ from pisigma.files.errors import MeasurementError, printable
 from pisigma.files.input_file import MOST_BYTES, read_input
 from pisigma.measurement.csv.table import SPREADSHEET_ERRORS
 from pisigma.measurement.foreign.accounting import LeftOutRow, Place
-from pisigma.measurement.foreign.dialect import COMMENT, Dialect, sniff
+from pisigma.measurement.foreign.dialect import COMMENT, Decimal, Dialect, sniff
 from pisigma.measurement.foreign.headings import is_recognised
-from pisigma.measurement.foreign.number_format import Decimal
 from pisigma.measurement.foreign.summary_rows import summary_rows
 from pisigma.measurement.foreign.units import ambiguous_unit, unit_symbol
 

@@ -6,9 +6,9 @@ from dataclasses import dataclass, replace
 
 from pisigma.files.errors import MeasurementError, nearest_choice
 from pisigma.measurement.csv.columns import POSITION
+from pisigma.measurement.foreign.dialect import is_missing
 from pisigma.measurement.foreign.export_file import ExportFile
 from pisigma.measurement.foreign.headings import Maker, parse_heading
-from pisigma.measurement.foreign.number_format import is_missing
 from pisigma.measurement.foreign.proposal import (
     NO_ROTATION,
     UNRECOGNISED,

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from jaxtyping import Float64
 
-from pisigma.measurement.foreign.number_format import NumberFormat
+from pisigma.measurement.foreign.dialect import NumberFormat
 
 _CALLED_AVERAGES = """
 mean average avg ave median ø mittel mittelwert durchschnitt moyenne médiane media mediana promedio

@@ -15,7 +15,7 @@ from pisigma.measurement.camera.camera import INTRINSICS
 from pisigma.measurement.camera.detection.detected_board import DetectedBoard
 from pisigma.measurement.camera.detection.detected_boards import DetectedBoards, predict_boards
 from pisigma.measurement.camera.detection.detector import detect_boards, image_files
-from pisigma.measurement.camera.intrinsic_calibration import (
+from pisigma.measurement.camera.solved_images import (
     BoardView,
     IntrinsicCalibration,
     calibrate_intrinsics,

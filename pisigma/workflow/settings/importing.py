@@ -9,8 +9,8 @@ from pisigma.files.errors import MeasurementError, check_choice
 from pisigma.files.setting import Option
 
 if TYPE_CHECKING:
+    from pisigma.measurement.foreign.dialect import Decimal
     from pisigma.measurement.foreign.joining import JoinBy
-    from pisigma.measurement.foreign.number_format import Decimal
 
 _SIGNS = {"point": ".", "comma": ","}
 

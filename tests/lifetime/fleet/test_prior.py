@@ -9,8 +9,7 @@ from testing.models import no_type_checker
 
 from pisigma.estimation.population import Population, expectation_maximisation, without_odd
 from pisigma.files.errors import FleetError
-from pisigma.lifetime.fleet.likeness import Likeness
-from pisigma.lifetime.fleet.prior import RobotEvidence, fleet_prior
+from pisigma.lifetime.fleet.prior import Likeness, RobotEvidence, fleet_prior
 from pisigma.lifetime.fleet.prior_summary import summarise_prior
 from pisigma.workflow.calibrate import calibrate
 from pisigma.workflow.recalibrate import recalibrate

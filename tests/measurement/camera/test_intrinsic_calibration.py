@@ -8,7 +8,7 @@ from testing.closeness import assert_close
 
 from pisigma.files.errors import MeasurementError
 from pisigma.measurement.camera.camera import Camera
-from pisigma.measurement.camera.intrinsic_calibration import (
+from pisigma.measurement.camera.solved_images import (
     BoardView,
     IntrinsicCalibration,
     calibrate_intrinsics,

@@ -3,8 +3,7 @@
 import pytest
 
 from pisigma.files.errors import MeasurementError
-from pisigma.measurement.foreign.dialect import Dialect, sniff
-from pisigma.measurement.foreign.number_format import Decimal
+from pisigma.measurement.foreign.dialect import Decimal, Dialect, sniff
 
 
 def sniffed(lines: list[str], decimal: Decimal | None = None) -> Dialect:

@@ -2,7 +2,7 @@
 
 import pytest
 
-from pisigma.measurement.foreign.number_format import NumberFormat, is_missing
+from pisigma.measurement.foreign.dialect import NumberFormat, is_missing
 
 
 @pytest.mark.parametrize(
