@@ -28,6 +28,7 @@ sys.path.append(str(Path(__file__).parent.parent / "training" / "papers"))
 
 import testing.type_checker  # noqa: F401  its place is before pisigma's, which it shall check
 from testing.models import no_type_checker
+from testing.pictures import no_pictures
 
 from pisigma.workflow.recipes.reader import read_recipe
 from pisigma.workflow.recipes.recipe import InverseRecipe
@@ -86,6 +87,13 @@ def generator() -> torch.Generator:
 def without_type_checker() -> Iterator[None]:
     """Call pisigma as users do, whom no type checker stops before our own complaints."""
     with no_type_checker():
+        yield
+
+
+@pytest.fixture(scope="module")
+def blank_pictures() -> Iterator[None]:
+    """Write blank figures where they are not what is tested."""
+    with no_pictures():
         yield
 
 

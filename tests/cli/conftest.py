@@ -26,6 +26,11 @@ def _run(*arguments: object) -> Result:
     return result
 
 
+@pytest.fixture(scope="module", autouse=True)
+def without_pictures(blank_pictures: None) -> None:
+    """Commands write blank figures; those of `trained`, made before, are drawn."""
+
+
 @pytest.fixture(scope="session")
 def run() -> Run:
     """Run a command; gives exit code, stdout and stderr."""

@@ -145,7 +145,8 @@ def test_a_file_does_not_count_twice(run, files, tmp_path):
     assert "a file is stated twice" in " ".join(result.stderr.split())
     copy = tmp_path / "copy.csv"
     copy.write_bytes((files / "corners.csv").read_bytes())
-    result = run("calibrate", "ur5", files / "corners.csv", copy, *cameras(files), "--out", tmp_path / "arm")
+    command = ("calibrate", "ur5", files / "corners.csv", copy, *cameras(files), "--folds", 0)
+    result = run(*command, "--out", tmp_path / "arm")
     assert f"{copy}, line" in " ".join(result.stdout.split())
 
 

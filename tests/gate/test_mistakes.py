@@ -15,8 +15,8 @@ from pisigma.validation.gate import check_rows
 pytestmark = pytest.mark.usefixtures("without_type_checker")
 
 EVERYWHERE = (
-    "inches named mm",
-    "sign of q4",
+    "metres named mm",
+    "sign of q5",
     "half in inches",
     "tracker moved by 2 mm half-way",
     "lengths x 1.001",

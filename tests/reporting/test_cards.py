@@ -1,12 +1,16 @@
 """The card of a model: all its sections, and the figures that were measured."""
 
 import pytest
-from testing.models import trained_run
+from PIL import Image
+from testing.models import no_type_checker, trained_run
+from testing.simulated_arm import simulate
 
-from pisigma.files.model_files import CARD
+from pisigma.files.model_files import CARD, CORRELATION_PNG, HELD_OUT_PNG, RESIDUALS_PNG
 from pisigma.reporting.cards import CardTexts, write_training_card
 from pisigma.reporting.tables import joint_table
 from pisigma.validation.held_out.training_summary import summarise_training
+from pisigma.workflow.calibrate import calibrate
+from pisigma.workflow.settings.calibration import CalibrationSettings
 
 SECTIONS = ("Data", "Joint errors", "Figures", "Domain", "Not validated", "Use", "Provenance")
 
@@ -53,3 +57,15 @@ def test_provenance_is_complete(card):
     assert provenance.data_sha256 in text
     for name, version in provenance.versions.items():
         assert f"{name} {version}" in text
+
+
+def test_the_figures_of_a_calibration_are_drawn(tmp_path):
+    arm = simulate("ur5", rows=40, noise=5e-5)
+    with no_type_checker():
+        calibrate("ur5", arm.measurements, CalibrationSettings(model="geometric", folds=2)).save(
+            tmp_path / "arm"
+        )
+    for name in (CORRELATION_PNG, RESIDUALS_PNG, HELD_OUT_PNG):
+        with Image.open(tmp_path / "arm" / name) as image:
+            assert min(image.size) > 300
+        assert f"]({name})" in (tmp_path / "arm" / CARD).read_text()

@@ -14,6 +14,8 @@ from pisigma.model.folder.model_folder import save_model
 from pisigma.workflow.monitor import monitor
 from pisigma.workflow.settings.monitoring import MonitorSettings
 
+pytestmark = pytest.mark.usefixtures("without_type_checker")
+
 COLLISION = (0.0, 0.0, 0.00436, 0.0, 0.0, 0.0)
 
 

@@ -19,6 +19,8 @@ from pisigma.workflow.settings.evaluation import EvaluationSettings
 from pisigma.workflow.settings.verification import VerificationSettings
 from pisigma.workflow.verify import verify
 
+pytestmark = pytest.mark.usefixtures("without_type_checker")
+
 
 @cache
 def model() -> CalibratedModel:

@@ -19,6 +19,8 @@ from pisigma.robot import Robot
 from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.robot.se3 import transform_from_xyzrpy
 
+pytestmark = pytest.mark.usefixtures("without_type_checker")
+
 SENSORS: dict[str, Callable[[], Measurements]] = {
     "wire": wire_data,
     "wire from a stated anchor": lambda: wire_data(known=True),

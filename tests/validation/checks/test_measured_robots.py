@@ -14,6 +14,8 @@ from pisigma.measurement.dataset import Measurements
 from pisigma.robot import Robot
 from pisigma.validation.checks.registry import diagnostics_of
 
+pytestmark = pytest.mark.usefixtures("without_type_checker")
+
 FILES = {
     "ur5": "ur5/grid.csv",
     "ur10": "ur10/series_c_train.csv",

@@ -10,6 +10,8 @@ from testing.simulated_arm import simulate
 from pisigma.calibration.geometric.calibrator import GeometricCalibrator
 from pisigma.validation.setup_faults.faults_as_drawn import find_faults_as_drawn
 
+pytestmark = pytest.mark.usefixtures("without_type_checker")
+
 
 @pytest.mark.parametrize(
     ("length", "angle", "severity"),
