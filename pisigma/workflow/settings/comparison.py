@@ -19,8 +19,8 @@ class ComparisonSettings:
     """How two models are compared.
 
     Attributes:
-        frames: fixed: both models were measured in the same frame with the same tool; fitted: base or tool may stand
-            elsewhere for the second model, are fitted so that the arms agree best, and compared apart.
+        frames: "fixed" where both models were measured in the same frame with the same tool; else base or tool may
+            stand elsewhere for the second model, are fitted so that the arms agree best, and compared apart.
         level: probability that any parameter at all is called different by chance.
         bootstrap: how confidence intervals of errors on rows are computed.
         cameras: what the pixels mean where the rows are corners of boards in images.

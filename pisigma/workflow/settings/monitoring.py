@@ -21,8 +21,8 @@ class MonitorSettings:
         moved: what stands elsewhere since the model was made: base, tool, or base,tool; nothing for neither. None: what
             the rows show.
         limit_mm: RMS error to stay below [mm]; says when it will be passed.
-        history: without a history, MODEL.history.sqlite is neither read nor written; else it keeps the sessions of
-            every call.
+        history: MODEL.history.sqlite keeps the sessions of every call; without a history it is neither read nor
+            written.
         cameras: what the pixels mean where files hold corners of boards in images.
 
     Raises:
