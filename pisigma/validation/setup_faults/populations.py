@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
-from pisigma.validation.setup_faults.ordered_rows import OrderedRows
+from pisigma.validation.setup_faults.ordered_rows import OrderedRows, inverse_of
 
 FEWEST_ROWS = 20
 """Of fewer rows two arms are not told apart."""
@@ -246,12 +246,7 @@ class _Em:
         mixed, flat = wX.T @ Z if not Z.shape[1] else X.T @ wZ, self.r.ravel()
         data = np.block([[wX.T @ X, mixed], [mixed.T, wZ.T @ Z]])
         normal = data + np.diag(self.precision * state.variance)
-        scale = 1 / np.sqrt(np.maximum(normal.diagonal(), 1e-300))
-        inverse = (
-            np.linalg.pinv(normal * scale * scale[:, None], rcond=1e-12, hermitian=True)
-            * scale
-            * scale[:, None]
-        )
+        inverse = inverse_of(normal)
         x = inverse @ np.concatenate([wX.T @ flat, wZ.T @ flat])
         used = float(np.einsum("ij,ji->", inverse, data))
         squares = self.squares(x)

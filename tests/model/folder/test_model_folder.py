@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import torch
 import yaml
-from safetensors.torch import load_file, save_file
 from testing.closeness import assert_close
+from testing.edited_folders import edit, edit_tensors
 from testing.models import HOMES, hand_made_model, joints_around
 
 from pisigma.files.errors import ModelError
@@ -37,25 +37,6 @@ def folder(tmp_path) -> Path:
         replace(hand_made_model("kiro3"), provenance=PROVENANCE, metrics={"rows": {"used": 64}}), tmp_path
     )
     return tmp_path
-
-
-def edit(folder: Path, change) -> None:
-    """Change the description and sign it again, as a foreign program might."""
-    text = (folder / "model.yaml").read_text()
-    document = yaml.load(text[: text.index("\nsha256: ") + 1], Loader=yaml.CSafeLoader)
-    change(document)
-    body = yaml.dump(document, Dumper=yaml.CSafeDumper, sort_keys=False)
-    (folder / "model.yaml").write_text(f"{body}sha256: {hashlib.sha256(body.encode()).hexdigest()}\n")
-
-
-def edit_tensors(folder: Path, change) -> None:
-    """Change the weights and note their new hash."""
-    path = folder / "model.safetensors"
-    tensors = load_file(path)
-    change(tensors)
-    save_file({name: value.contiguous() for name, value in tensors.items()}, path)
-    digest = hashlib.sha256(path.read_bytes()).hexdigest()
-    edit(folder, lambda document: document.update(weights_sha256=digest))
 
 
 def refused(folder: Path) -> str:

@@ -1,15 +1,13 @@
 """Models of hybrid calibrations: predictions, their folder, and folders that cannot be true."""
 
-import hashlib
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-import yaml
-from safetensors.torch import load_file, save_file
 from testing.closeness import assert_close
+from testing.edited_folders import edit, edit_tensors
 from testing.hybrid import hybrid_of, joints_in
 
 from pisigma.estimation.covariance_root import CovarianceRoot
@@ -197,25 +195,6 @@ def test_the_jacobian_agrees_with_differences(set_up):
 def folder(tmp_path) -> Path:
     save_model(model_of("products")[1], tmp_path)
     return tmp_path
-
-
-def edit(folder: Path, change) -> None:
-    """Change the description and sign it again, as a foreign program might."""
-    text = (folder / "model.yaml").read_text()
-    document = yaml.load(text[: text.index("\nsha256: ") + 1], Loader=yaml.CSafeLoader)
-    change(document)
-    body = yaml.dump(document, Dumper=yaml.CSafeDumper, sort_keys=False)
-    (folder / "model.yaml").write_text(f"{body}sha256: {hashlib.sha256(body.encode()).hexdigest()}\n")
-
-
-def edit_tensors(folder: Path, change) -> None:
-    """Change the weights and note their new hash."""
-    path = folder / "model.safetensors"
-    tensors = load_file(path)
-    change(tensors)
-    save_file({name: value.contiguous() for name, value in tensors.items()}, path)
-    digest = hashlib.sha256(path.read_bytes()).hexdigest()
-    edit(folder, lambda document: document.update(weights_sha256=digest))
 
 
 def refused(folder: Path) -> str:
