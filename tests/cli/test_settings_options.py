@@ -1,3 +1,8 @@
+"""Options of commands are those of the settings that they take, with the defaults that Python has."""
+
+import dataclasses
+import importlib
+import pkgutil
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -7,8 +12,11 @@ import typer
 from typer.testing import CliRunner
 
 from pisigma.cli.settings_options import takes_settings
+from pisigma.deployment.serve import settings as serve_settings
 from pisigma.files.errors import PisigmaError
-from pisigma.files.setting import FILE, Option
+from pisigma.files.setting import FILE, Option, settings_of
+from pisigma.planning import plan_settings
+from pisigma.workflow import settings as of_commands
 
 
 @dataclass(frozen=True)
@@ -85,3 +93,26 @@ def test_what_needs_something_else_is_refused(built):
         built("--width-mm", "2")
     with pytest.raises(AssertionError, match="greater than or equal to 1"):
         built("--count", "0")
+
+
+def settings_classes() -> list[type]:
+    """Classes of settings of all commands, and those of which they are made."""
+    names = [f"{of_commands.__name__}.{one.name}" for one in pkgutil.iter_modules(of_commands.__path__)]
+    modules = map(importlib.import_module, [*names, plan_settings.__name__, serve_settings.__name__])
+    found = {
+        value for module in modules for value in vars(module).values() if dataclasses.is_dataclass(value)
+    }
+    return sorted((one for one in found if isinstance(one, type)), key=lambda one: one.__name__)
+
+
+@pytest.mark.parametrize("group", settings_classes(), ids=lambda one: one.__name__)
+def test_defaults_of_every_command_are_those_of_python(group):
+    """In the units of Python, also where the command line has another one."""
+    own = {one.name: one for one in dataclasses.fields(group)}
+    for setting in settings_of(group):
+        if setting.is_required or setting.is_group or setting.default is None:
+            continue
+        python, read = own[setting.field].default, setting.read(setting.default)
+        assert read == (pytest.approx(python, rel=1e-12) if isinstance(python, float) else python), (
+            setting.name
+        )
