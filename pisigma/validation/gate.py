@@ -17,7 +17,7 @@ from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.validation.checks.other_robot import other_robot_diagnostics
 from pisigma.validation.checks.registry import ROW_CHECKS, diagnostics_of_rows
 from pisigma.validation.checks.rows.other_sensors import diagnosed_lengths
-from pisigma.validation.checks.rows.row_check import Move, RowsUnderModel
+from pisigma.validation.checks.rows.row_check import FITTED, Move, RowsUnderModel
 from pisigma.validation.checks.setup_fault import setup_diagnostics
 from pisigma.validation.held_out.diagnostic import Diagnostic
 from pisigma.validation.held_out.frames.fitted_frames import FrameKind
@@ -39,7 +39,6 @@ ARM_SHARE = 0.3
 
 FEWEST_FOR_JOINTS = 8
 """Rows that tell columns of joints apart: 24 values, of which base and tool take 9."""
-FITTED = 9
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,9 +7,8 @@ import time
 
 from pisigma.deployment.serve.metrics import Metrics
 from pisigma.deployment.serve.models import ServedModel, ServedModels
-from pisigma.deployment.serve.protocol import AbstractProtocol, BrokenStreamError, Reply
+from pisigma.deployment.serve.protocol import STATUS_NAMES, AbstractProtocol, BrokenStreamError, Reply
 from pisigma.files.errors import RequestError
-from pisigma.robot.kinematics.status import Status
 
 MAGIC = b"PSI1"
 JOINTS = 8
@@ -39,7 +38,6 @@ class Refusal(enum.IntEnum):
 
 
 _NO_JOINTS = (math.nan,) * JOINTS
-_NAMES = {float(status): status.name.lower() for status in Status}
 
 
 class BinaryFrames(AbstractProtocol):
@@ -100,7 +98,7 @@ class BinaryFrames(AbstractProtocol):
             reply = ANSWER.pack(MAGIC, ANSWER.size, name, int(status), dof, *q, position, rotation)
         except Exception:
             return self._refuse(name, Refusal.DEFECT, begun)
-        self._metrics.count(_NAMES[status], begun)
+        self._metrics.count(STATUS_NAMES[status], begun)
         return reply
 
     def _refuse(self, name: int, why: Refusal, begun: int) -> bytes:

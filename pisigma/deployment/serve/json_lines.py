@@ -13,7 +13,7 @@ from pydantic_core import from_json
 
 from pisigma.deployment.serve.metrics import Metrics
 from pisigma.deployment.serve.models import ServedModel, ServedModels, solution_row
-from pisigma.deployment.serve.protocol import AbstractProtocol, BrokenStreamError, Reply
+from pisigma.deployment.serve.protocol import STATUS_NAMES, AbstractProtocol, BrokenStreamError, Reply
 from pisigma.files.errors import PisigmaError, RequestError, nearest_choice, printable
 from pisigma.model.inverse.corrected_ik import CorrectedIK
 from pisigma.robot.kernels.array_kinematics import transform_entries, xyzrpy_of
@@ -44,7 +44,6 @@ _PLAIN = {"id", "model", "pose", *_NEAR, "brief"}
 """Keys of requests for poses that state no task of their own."""
 _POSE = struct.Struct("<16d")
 
-_NAMES = {float(status): status.name.lower() for status in Status}
 _REACHING = frozenset(float(status) for status in Status if status.reaches)
 _encode = json.JSONEncoder(allow_nan=False, separators=(", ", ": ")).encode
 
@@ -236,7 +235,7 @@ def _record(model: ServedModel, row: list[float], ignored_axes: tuple[str, ...])
     """The values of an answer to one pose, from what `CompiledIK.solve_packed` gives."""
     units = model.per_file_unit
     position, rotation, measure, status, branch = row[2 * len(units) :]
-    values: dict[str, Any] = {model.joints_key: None, "status": _NAMES[status]}
+    values: dict[str, Any] = {model.joints_key: None, "status": STATUS_NAMES[status]}
     if status in _REACHING:
         values[model.joints_key] = [q * unit for q, unit in zip(row, units, strict=False)]
         values["branch"] = model.ik.branches[int(branch)]
@@ -268,7 +267,7 @@ def _follow(model: ServedModel, request: dict[str, Any]) -> tuple[str, dict[str,
     q = (np.asarray(path.solution.q) * np.array(model.per_file_unit)).tolist()
     return "path", {
         model.joints_key: [row if math.isfinite(row[0]) else None for row in q],
-        "status": [_NAMES[status] for status in path.solution.status.tolist()],
+        "status": [STATUS_NAMES[status] for status in path.solution.status.tolist()],
         "switches": [asdict(switch) for switch in path.switches],
     }
 

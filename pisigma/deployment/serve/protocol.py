@@ -4,6 +4,10 @@ import hmac
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 
+from pisigma.robot.kinematics.status import Status
+
+STATUS_NAMES = {float(status): status.name.lower() for status in Status}
+"""Of statuses as solutions hold them."""
 Reply = bytes | Callable[[], bytes]
 """The answer to a message, or what gives it when it is called in a thread that may take its time."""
 

@@ -23,8 +23,6 @@ from pisigma.measurement.camera.detection.detected_board import (
 from pisigma.measurement.camera.detection.detected_boards import BoardImage
 from pisigma.measurement.camera.detection.markers import detect_apriltags, detect_charuco
 
-MOST_BLUR = 3.0
-"""[px] Images whose edges are blurred more are left out unless another limit is stated."""
 SMALLEST_PIECE = 3
 """Rows and columns of corners of a piece of a board that is recognised as one."""
 

@@ -10,7 +10,7 @@ from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import poses_of_rows
 from pisigma.robot.frame_fits import best_base, best_tool
 from pisigma.validation.checks.rows.distinguishing import what_distinguishes
-from pisigma.validation.checks.rows.row_check import AbstractRowCheck, RowsUnderModel
+from pisigma.validation.checks.rows.row_check import STEP, AbstractRowCheck, RowsUnderModel
 from pisigma.validation.held_out.diagnostic import Diagnostic
 from pisigma.validation.setup_faults.cause import joined, length_text
 from pisigma.validation.setup_faults.setup_fault import either
@@ -33,8 +33,6 @@ DRAWS, SAMPLE = 100, 4
 SPARE_ROWS = 3
 """Rows beyond those of a set that agree with what was fitted to it."""
 ADVICE = " Nothing is concluded from them together; measure again, or give each group a file or a frame of its own."
-STEP = 1e-6
-"""[rad or m] For derivatives by the joints."""
 EXPLAINED = 2.5
 """Errors of usual size, where moved zeros of the joints explain them."""
 

@@ -25,6 +25,10 @@ Move = Literal["frame", "tool", "joint_zero"]
 MOVES: Final[frozenset[Move]] = frozenset({"frame", "tool", "joint_zero"})
 LARGE_SHARE = 2e-3
 """Share of the reach beyond which errors are those of a mistake or a motion, and not of wear."""
+STEP = 1e-6
+"""[rad or m] For derivatives by the joints."""
+FITTED = 9
+"""Numbers of a base and of a tool of positions."""
 FEWEST_ROWS = 5
 """Fewer rows with positions say nothing of a mistake."""
 

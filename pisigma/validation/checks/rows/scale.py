@@ -10,7 +10,7 @@ from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import poses_of_rows
 from pisigma.robot.frame_fits import best_base_and_tool
 from pisigma.robot.se3 import skew
-from pisigma.validation.checks.rows.row_check import AbstractRowCheck, RowsUnderModel
+from pisigma.validation.checks.rows.row_check import FITTED, STEP, AbstractRowCheck, RowsUnderModel
 from pisigma.validation.held_out.diagnostic import Diagnostic
 from pisigma.validation.setup_faults.cause import length_text
 
@@ -24,9 +24,6 @@ AS_GOOD = 1.3
 """Another explanation leaves errors that are larger by this factor at least."""
 CLEAR = 5.0
 """[standard deviations] By which the factor is not 1."""
-STEP = 1e-6
-FITTED = 9
-"""Numbers of a base and of a tool of positions."""
 
 
 class ScaleOfRowsCheck(AbstractRowCheck):

@@ -8,18 +8,14 @@ import torch
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import poses_of_rows
 from pisigma.robot.frame_fits import best_base_and_tool
-from pisigma.validation.checks.rows.row_check import AbstractRowCheck, RowsUnderModel
+from pisigma.validation.checks.rows.row_check import FITTED, STEP, AbstractRowCheck, RowsUnderModel
 from pisigma.validation.held_out.diagnostic import Diagnostic
 from pisigma.validation.setup_faults.explanations import PLAUSIBLE_SHARE
 from pisigma.validation.setup_faults.setup_faults import unexplained
 
 ROUNDS = 8
-STEP = 1e-6
-"""[rad or m] For derivatives by the joints."""
 LARGEST_STEP = 0.3
 """[rad, or of the reach] A round moves no zero by more."""
-FITTED = 9
-"""Numbers of a base and of a tool of positions."""
 
 
 class UnexplainedRowsCheck(AbstractRowCheck):
