@@ -10,9 +10,11 @@ from pisigma.deployment.serve.models import ServedModels
 from pisigma.deployment.serve.protocol import AbstractProtocol, BrokenStreamError, is_token
 from pisigma.files.errors import OutputError
 
-SILENCE_MS = 200
+SILENCE_MS = 500
 """[ms] Without a message, after which all that was sent before the server stops has come."""
-WAITING = 100
+PATIENCE_MS = 2000
+"""[ms] Wait for a client that does not read its answers, before one of them is dropped."""
+MAX_QUEUED = 100
 """Messages of a client, and answers to it, that wait at most."""
 
 
@@ -47,12 +49,16 @@ class ZeroMq:
         self._token, self._context = token, zmq.Context(1)
         self._socket, self._stopping = self._context.socket(zmq.ROUTER), threading.Event()
         options = {
-            zmq.LINGER: 1000,
+            zmq.LINGER: PATIENCE_MS,
             zmq.MAXMSGSIZE: LONGEST_LINE,
             zmq.RCVTIMEO: SILENCE_MS,
+            zmq.SNDTIMEO: PATIENCE_MS,
             zmq.IPV6: int(":" in host),
+            zmq.RCVHWM: MAX_QUEUED,
+            zmq.SNDHWM: MAX_QUEUED,
+            # else a ROUTER drops answers silently as soon as so many of them wait
+            zmq.ROUTER_MANDATORY: 1,
         }
-        options |= {zmq.RCVHWM: WAITING, zmq.SNDHWM: WAITING}
         for option, value in options.items():
             self._socket.setsockopt(option, value)
         try:
@@ -64,7 +70,8 @@ class ZeroMq:
                 "any."
             ) from None
         self.port = int(self._socket.getsockopt_string(zmq.LAST_ENDPOINT).rpartition(":")[2])
-        self._again = zmq.Again
+        self._again, self._no_wait, self._unreachable = zmq.Again, zmq.DONTWAIT, zmq.ZMQError
+        self._not_reading: set[bytes] = set()
         self._thread = threading.Thread(target=self._run, name="ZeroMQ", daemon=True)
         self._thread.start()
 
@@ -92,8 +99,18 @@ class ZeroMq:
                 continue
             rest += sum(map(len, parts)) if stopping else 0
             envelope = [client, b""] if len(parts) > 1 and not parts[0] else [client]
-            self._socket.send_multipart([*envelope, self._reply(parts[len(envelope) - 1 :])])
+            self._send(client, [*envelope, self._reply(parts[len(envelope) - 1 :])])
         self._close()
+
+    def _send(self, client: bytes, parts: list[bytes]) -> None:
+        """Send, and wait for a client that does not read only once, so that it does not hold up the others."""
+        try:
+            self._socket.send_multipart(parts, self._no_wait if client in self._not_reading else 0)
+            self._not_reading.discard(client)
+        except self._again:
+            self._not_reading.add(client)
+        except self._unreachable:  # it has gone
+            self._not_reading.discard(client)
 
     def _reply(self, parts: list[bytes]) -> bytes:
         """Answer the parts of a message behind its envelope: the token, where one is wanted, and the request."""

@@ -3,6 +3,7 @@
 import json
 import math
 import sys
+import time
 
 import pytest
 from testing.closeness import assert_close
@@ -86,20 +87,50 @@ def test_without_pyzmq_the_extra_is_named(monkeypatch, repository):
     assert 'pip install "pisigma[serve]"' in str(missing_extra(caught.value))
 
 
-def test_all_that_came_in_is_answered_when_the_server_stops(repository):
-    """More messages than wait in a queue of ZeroMQ at a time."""
+@pytest.fixture
+def unread():
+    """Give a function that connects a socket to a server and sends it many messages before it reads an answer."""
     context = zmq.Context()
-    with running(repository / "models" / "kiro4", settings=ServeSettings(zmq_port=0)) as server:
+    sockets = []
+
+    def send(server, messages, **queues):
         socket = context.socket(zmq.DEALER)
-        for option, value in ((zmq.SNDHWM, 0), (zmq.RCVHWM, 0), (zmq.LINGER, 0), (zmq.RCVTIMEO, 5000)):
-            socket.setsockopt(option, value)
+        sockets.append(socket)
+        options = {"SNDHWM": 0, "RCVHWM": 0, "LINGER": 0, "RCVTIMEO": 20_000} | queues
+        for name, value in options.items():
+            socket.setsockopt(getattr(zmq, name), value)
         socket.connect(f"tcp://127.0.0.1:{server.ports['zmq_port']}")
         socket.send(LINE)
         socket.recv()
-        for _ in range(2000):
-            socket.send(LINE)
+        for message in messages:
+            socket.send(message)
+        return socket
+
+    yield send
+    for socket in sockets:
+        socket.close()
+    context.term()
+
+
+def test_all_that_came_in_is_answered_when_the_server_stops(unread, repository):
+    """More messages than wait in a queue of ZeroMQ at a time."""
+    with running(repository / "models" / "kiro4", settings=ServeSettings(zmq_port=0)) as server:
+        socket = unread(server, 2000 * [LINE])
         socket.recv()
     for _ in range(1999):
         socket.recv()
-    socket.close()
-    context.term()
+
+
+def test_a_slow_reader_gets_every_answer_and_one_that_never_reads_holds_nobody_up(unread, repository):
+    """Answers wait for a client that reads late; ROUTER sockets drop them silently where nobody asks for more."""
+    small = {"RCVHWM": 1, "RCVBUF": 4096}
+    padded = json.dumps({"id": int(4000 * "1"), "pose": POSE}).encode()
+    with running(repository / "models" / "kiro4", settings=ServeSettings(zmq_port=0)) as server:
+        slow = unread(server, 1000 * [padded], **small)
+        time.sleep(0.5)
+        for _ in range(1000):
+            slow.recv()
+        unread(server, 2000 * [padded], **small)
+        for _ in range(50):
+            slow.send(LINE)
+            slow.recv()
