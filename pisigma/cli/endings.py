@@ -13,6 +13,7 @@ from typing import Annotated, Any, NoReturn
 
 import typer
 
+from pisigma.cli.output import print_json
 from pisigma.files.errors import AcceptanceError, PisigmaError, missing_extra, printable
 from pisigma.files.plugins import load_files, load_installed
 
@@ -56,7 +57,7 @@ def tell_problems(command: Callable[..., None]) -> Callable[..., None]:
         except (typer.BadParameter, typer.Exit):
             raise  # the command line itself says these
         except (Exception, KeyboardInterrupt) as problem:
-            end_with(problem)
+            end_with(problem, as_json=bool(values.get("as_json")))
 
     own = [*inspect.signature(command).parameters.values(), _PLUGIN]
     keyword = inspect.Parameter.KEYWORD_ONLY
@@ -68,15 +69,22 @@ def tell_problems(command: Callable[..., None]) -> Callable[..., None]:
 _PLUGIN = inspect.Parameter("plugin", inspect.Parameter.KEYWORD_ONLY, default=None, annotation=PluginFiles)
 
 
-def end_with(problem: BaseException) -> None:
+def end_with(problem: BaseException, as_json: bool = False) -> None:
     """Say in one line what is wrong and end with the exit status that says whose fault it is.
 
-    2 where the user's input is at fault, 3 where a model does not meet its limits, 130 after an interruption, 141 where
-    nobody reads what is printed, and 1 for whatever else there is.
+    The status is 2 where the user's input is at fault, 3 where a model does not meet its limits, 130 after an
+    interruption, 141 where nobody reads what is printed, and 1 for everything else.
+
+    Args:
+        problem: what ended the command.
+        as_json: also print the fields of a refused input as a JSON object with the key `error` on stdout. A model that
+            does not meet its limits has its whole result there already.
     """
     if isinstance(problem, AcceptanceError):
         fail(str(problem), NOT_ACCEPTED)
     if isinstance(problem, PisigmaError):
+        if as_json:
+            print_json({"error": problem.fields()})
         fail(str(problem))
     if isinstance(problem, ImportError) and (missing := missing_extra(problem)) is not None:
         fail(str(missing))

@@ -8,9 +8,11 @@ from typing import Any
 import pytest
 from click.testing import CliRunner, Result
 from testing.models import hand_made_model, no_type_checker, small_recipe_text
+from testing.refusals import assert_fields, problem_of
 from typer.main import get_command
 
 from pisigma.cli.main import app
+from pisigma.files.errors import PisigmaError
 from pisigma.model.folder.model_folder import save_model
 
 Run = Callable[..., Result]
@@ -59,9 +61,14 @@ def models(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def refuses(run: Run) -> Callable[..., str]:
-    """Run a command that must end with status 2 and one line on stderr; gives that line."""
+    """Run a command that must end with status 2 and one line on stderr; gives that line.
 
-    def check(*arguments: object, stdout: str | None = "") -> str:
+    With `error` and fields, as of `testing.refusals.refused`, also the exception that ended it is checked.
+    """
+
+    def check(
+        *arguments: object, stdout: str | None = "", error: type[PisigmaError] | None = None, **fields: object
+    ) -> str:
         result = run(*arguments)
         assert result.exit_code == 2, result.output
         assert stdout is None or result.stdout == stdout
@@ -69,6 +76,10 @@ def refuses(run: Run) -> Callable[..., str]:
         assert len(lines) == 1, result.stderr
         assert lines[0].startswith("pisigma: ")
         assert "Traceback" not in result.stderr
+        if error is not None or fields:
+            problem = problem_of(result)
+            assert isinstance(problem, error or PisigmaError), repr(problem)
+            assert_fields(problem, **fields)
         return lines[0].removeprefix("pisigma: ")
 
     return check

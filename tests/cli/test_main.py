@@ -8,6 +8,7 @@ import sys
 
 import pytest
 from testing.models import small_recipe_text
+from testing.refusals import problem_of
 
 import pisigma
 from pisigma.cli.endings import TRACEBACK
@@ -328,3 +329,12 @@ def test_no_command_writes_over_what_it_reads(refuses, models, tmp_path, monkeyp
     monkeypatch.chdir(tmp_path)
     assert refuses(*arguments).startswith(complaint)
     assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
+
+
+def test_a_refused_input_is_an_object_of_json_and_a_line(run):
+    result = run("robots", "--check", "no_such_robot", "--json")
+    error = json.loads(result.stdout)["error"]
+    assert result.exit_code == 2
+    assert error["class"] == "UnknownRobotError"
+    assert error["message"] in result.stderr
+    assert error.items() >= problem_of(result).fields().items()

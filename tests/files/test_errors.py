@@ -1,8 +1,11 @@
 """Messages may stand on a terminal, whatever a file has put into them."""
 
+import json
+import pickle
+
 import pytest
 
-from pisigma.files.errors import LONGEST_TEXT, MissingExtraError, RobotError, printable
+from pisigma.files.errors import LONGEST_TEXT, MissingExtraError, PisigmaError, Place, RobotError, printable
 
 
 @pytest.mark.parametrize("odd", ["\x1b[31m", "\x00", "\x9b2J", "\u202e", "\udcff", "\x07", "\r"])
@@ -21,3 +24,43 @@ def test_long_words_and_texts_are_cut():
     shown = str(MissingExtraError("no " * 1_000_000 + "end"))
     assert len(shown) < LONGEST_TEXT
     assert shown.endswith("no end")
+
+
+def test_a_message_is_made_of_its_fields():
+    problem = RobotError(
+        expected="a length > 0",
+        value=-3.0,
+        at=Place("cell.yaml", 12, "links.2"),
+        remedy="give a positive length",
+    )
+    assert (
+        str(problem)
+        == "expected a length > 0, got -3 (cell.yaml, line 12, key 'links.2'); give a positive length."
+    )
+    assert (problem.file, problem.line, problem.column, problem.value) == ("cell.yaml", 12, "links.2", -3.0)
+    assert (
+        str(PisigmaError(expected="a file", value="x", option="--camera"))
+        == "--camera: expected a file, got 'x'."
+    )
+    assert str(PisigmaError("no rows", at=Place("a.csv", 3, 2))) == "no rows (a.csv, line 3, column 2)."
+    assert str(PisigmaError("the whole message")) == "the whole message"
+
+
+def test_fields_are_plain_values_for_json():
+    problem = RobotError(expected="six joints", value=(3, 4), at=Place("a.csv", 3))
+    assert json.loads(json.dumps(problem.fields())) == {
+        "class": "RobotError",
+        "message": "expected six joints, got (3, 4) (a.csv, line 3).",
+        "file": "a.csv",
+        "line": 3,
+        "value": "(3, 4)",
+        "expected": "six joints",
+    }
+
+
+def test_fields_survive_another_process_and_a_text_that_follows():
+    problem = RobotError("no rows", at=Place("a.csv", 3), value=0, option="--rows")
+    for other in (pickle.loads(pickle.dumps(problem)), problem.followed_by(" See the log.")):
+        assert type(other) is RobotError
+        assert {**other.fields(), "message": ""} == {**problem.fields(), "message": ""}
+    assert str(problem.followed_by(" See the log.")) == "--rows: no rows (a.csv, line 3). See the log."

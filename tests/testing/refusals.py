@@ -1,0 +1,44 @@
+"""What an input is refused with: class and fields of an exception, never its sentence."""
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import pytest
+from click.testing import Result
+
+from pisigma.files.errors import PisigmaError
+
+
+@contextmanager
+def refused(error: type[PisigmaError], **fields: Any) -> Iterator[pytest.ExceptionInfo[PisigmaError]]:
+    """Assert that the block raises `error` with these fields.
+
+    Args:
+        error: the class of the exception.
+        **fields: attributes of the exception (`file`, `line`, `column`, `option`, `value`, `expected`, `remedy`) and
+            what they have to equal. Of `file`, the name alone may be given.
+    """
+    with pytest.raises(error) as caught:
+        yield caught
+    assert_fields(caught.value, **fields)
+
+
+def assert_fields(problem: PisigmaError, **fields: Any) -> None:
+    """Assert that the attributes of an exception equal `fields`; see `refused`."""
+    for name, wanted in fields.items():
+        stated = getattr(problem, name)
+        if name == "file" and wanted is not None:
+            is_name = os.sep not in str(wanted)
+            stated, wanted = os.path.basename(stated or "") if is_name else stated, str(wanted)
+        assert stated == wanted, f"{name} of '{problem}' is {stated!r}, not {wanted!r}"
+
+
+def problem_of(result: Result) -> PisigmaError:
+    """The exception that ended a command that `CliRunner` ran."""
+    problem: BaseException | None = result.exc_info[1] if result.exc_info else None
+    while problem is not None and not isinstance(problem, PisigmaError):
+        problem = problem.__context__
+    assert problem is not None, f"no PisigmaError ended the command: {result.output}"
+    return problem
