@@ -14,15 +14,15 @@ FINEST_PX, COARSEST_PX = 1e-3, 100.0
 
 @dataclass(frozen=True)
 class CameraSettings:
-    """Which camera sees which board.
+    """Camera and board of a plan.
 
     Attributes:
-        camera: of the sensor camera: its YAML (of pisigma, ROS or OpenCV).
-        board: of the sensor camera: the board that it sees (YAML).
-        is_fixed: the camera is fixed and the board is on the flange, not the other way round.
-        sigma_px: of a camera: standard deviation of u and v of a corner [px].
-        repeatability_mm: of images: standard deviation with which a position repeats, per axis [mm].
-        repeatability_deg: of images: standard deviation with which a direction repeats, per axis [deg].
+        camera: YAML file of the camera (of pisigma, ROS or OpenCV), for the sensor camera.
+        board: YAML file of the board, for the sensor camera.
+        is_fixed: the camera is fixed and the board is on the flange (default: the other way round).
+        sigma_px: standard deviation of u and v of a detected corner [px].
+        repeatability_mm: standard deviation of the robot's position repeatability, per axis [mm].
+        repeatability_deg: standard deviation of the robot's orientation repeatability, per axis [deg].
 
     Raises:
         PlanningError: a number is none that it can be.

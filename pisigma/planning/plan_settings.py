@@ -1,4 +1,4 @@
-"""What is to be planned, as it is asked for: numbers in the units of files, and files by their paths."""
+"""Settings of a plan: numbers in the units of files, and files by their paths."""
 
 import math
 import os
@@ -38,30 +38,31 @@ def box(stated: str) -> tuple[float, ...]:
 
 @dataclass(frozen=True)
 class PlanSettings:
-    """What is to be planned.
+    """Settings of a plan.
 
     Attributes:
-        count: poses to calibrate with.
-        check: poses to measure besides, which judge the calibration (set test).
-        sensor: what is measured: position (of a reflector), pose, distance (from a fixed point), or camera (corners of
-            a board).
-        camera: which camera sees which board; None where none measures.
+        count: number of poses to calibrate with.
+        check: number of additional poses that test the calibration (rows of the set test).
+        sensor: what is measured, position (of a reflector), pose, distance (from a fixed point) or camera (corners of a
+            board).
+        camera: camera and board, for the sensor camera only.
         sigma_mm: standard deviation of a measured length [mm]. None: of laser trackers.
-        criterion: I: what lowers the uncertainty of the tool's position over the task most; D: that of all unknowns.
-        limit_mm: length below which 95 % of the tool's position errors over the task stay [mm], as in `measure`: how
-            many poses does it need?
-        candidates: poses to draw, of which some are chosen.
-        candidates_from: choose from the joint values of this CSV file instead.
-        box_mm: box of the reflector's positions: lowest and then highest x, y, z in the robot's base frame [mm].
-        task: CSV file of joint values, or of poses of the drawing's or the model's tool, where the robot shall be
-            accurate. None: everywhere.
-        measured: measurements that are there already (CSV).
-        seed: seed of what is drawn.
-        speed_deg_s: speed of every joint that turns between the poses [deg/s].
-        settling_s: time at every pose until it is measured [s].
+        criterion: optimality criterion, I (uncertainty of the tool's position over the task) or D (uncertainty of all
+            unknowns).
+        limit_mm: limit of the 95 % quantile of the tool's position errors over the task [mm], as in `measure`. The plan
+            then states how many poses this takes.
+        candidates: number of random candidate poses to choose from.
+        candidates_from: CSV file of candidate joint values to choose from, instead of random ones.
+        box_mm: box of the reflector's positions, lowest and then highest x, y, z in the robot's base frame [mm].
+        task: CSV file of joint values or tool poses where the robot has to be accurate. Poses are of the drawing's or
+            the model's tool. None: the whole workspace.
+        measured: measurements that already exist (CSV).
+        seed: random seed.
+        speed_deg_s: joint speed between the poses [deg/s].
+        settling_s: time at every pose before it is measured [s].
 
     Raises:
-        PlanningError: a setting is no choice, or no number that it can be.
+        PlanningError: a setting is not a valid choice, or a number is out of range.
     """
 
     __pydantic_config__: ClassVar = {"extra": "forbid", "allow_inf_nan": False}

@@ -17,9 +17,9 @@ class Bootstrap:
     replacement.
 
     Attributes:
-        resamples: resamples of the configurations, for confidence intervals.
-        seed: seed of the resamples; equal seeds draw equal groups, so that models are compared on the same resamples.
-        confidence: share of the resamples within an interval.
+        resamples: number of bootstrap resamples for confidence intervals.
+        seed: random seed of the resamples. Equal seeds draw equal groups, so that models are compared on the same ones.
+        confidence: confidence level of an interval.
     """
 
     resamples: Annotated[int, Option(least=2)] = 2000

@@ -55,9 +55,9 @@ class PageOptions:
     """How a session is shown in the browser.
 
     Attributes:
-        host: where the page is served; 0.0.0.0: for other machines too.
-        port: port of the page; where it is taken, the next one that is free.
-        urdf: URDF file of the robot, whose meshes the page shows instead of capsules.
+        host: address to serve the page at (0.0.0.0: also for other machines).
+        port: port of the page, or the next free one.
+        urdf: URDF file whose meshes the page shows instead of capsules.
     """
 
     host: Annotated[str, Option("--view-host")] = "127.0.0.1"

@@ -1,4 +1,4 @@
-"""Where a server listens, and to whom."""
+"""Settings of a server."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,17 +21,17 @@ def token_in(file: Path) -> str:
 
 @dataclass(frozen=True)
 class ServeSettings:
-    """Where a server listens.
+    """Settings of a server.
 
     Attributes:
-        host: address to listen at; other than that of this machine only with a token.
-        json_port: port for lines of JSON; 0 for a free one.
-        binary_port: port for binary frames; 0 for a free one.
-        zmq_port: port for ZeroMQ too; 0 for a free one; needs the extra serve. None: none.
-        token: what every client has to send first; options state a file that holds it.
+        host: address to listen at. An address other than that of this machine needs a token.
+        json_port: port for lines of JSON (0: any free port).
+        binary_port: port for binary frames (0: any free port).
+        zmq_port: port for ZeroMQ (0: any free port). Needs the extra serve. None: no ZeroMQ.
+        token: token that every client has to send first; on a command line, a file that contains it.
         patience: see `PATIENCE`.
-        polling: time to stay awake for the next request [s], where requests come that often and no other program wants
-            the processor; 0 to sleep at once.
+        polling: time to busy-poll for the next request [s] (0: sleep at once). The server polls only where requests
+            come that often and no other program needs the processor.
     """
 
     host: str = "127.0.0.1"

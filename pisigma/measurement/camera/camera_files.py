@@ -15,11 +15,11 @@ MOST_REPEATABILITY = 0.01, 0.105
 
 @dataclass(frozen=True)
 class Repeatability:
-    """By how much the robot misses, anew in every image, the pose that its joint values mean.
+    """Repeatability of the robot: how far it is off, independently in each image, the pose of its joint values.
 
     Attributes:
-        length: of images: standard deviation with which a position repeats, per axis [m].
-        angle: of images: standard deviation with which a direction repeats, per axis [rad].
+        length: standard deviation of the robot's position repeatability, per axis [m], for images.
+        angle: standard deviation of the robot's orientation repeatability, per axis [rad], for images.
     """
 
     length: Annotated[float, Option("--repeatability-mm", unit="mm")] = 2e-5
@@ -36,22 +36,22 @@ class Repeatability:
 
 @dataclass(frozen=True)
 class CameraFiles:
-    """What the pixels of files of corners mean.
+    """Cameras and boards of files of detected corners (columns image, corner, u_px, v_px and joint values).
 
     Attributes:
-        cameras: cameras (YAML of pisigma, ROS or OpenCV) whose corners a file holds: columns image, corner, u_px, v_px
-            and joints; with boards. Of several, the column camera has the names.
-        boards: boards that the cameras see (YAML: rows, columns, square_mm). Of several, the column board has the
+        cameras: YAML file of a camera (of pisigma, ROS or OpenCV), where the rows are corners of boards in images.
+            Needs `boards`. With several cameras, the column camera contains their names.
+        boards: YAML file of a board (rows, columns, square_mm). With several boards, the column board contains their
             names.
-        is_fixed: every camera is fixed and the boards are on the flange, not the other way round; of several cameras,
-            state is_fixed: true in the files of those that are.
-        repeatability: of the robot.
-        intrinsics: of cameras: fixed: as their files state them; prior: within the standard deviations in their files,
-            or those of a usual calibration where they state none; free: as the images show them.
+        is_fixed: all cameras are fixed and the boards are on the flange (default: the other way round). Where only some
+            are fixed, state is_fixed in their files instead.
+        repeatability: repeatability of the robot.
+        intrinsics: treatment of the cameras' intrinsics, fixed (as in their files), prior (within their standard
+            deviations) or free. Where a file states no standard deviations, those of a usual calibration are used.
 
     Raises:
-        MeasurementError: no camera or no board is stated.
-        IdentificationError: the intrinsics are no choice.
+        MeasurementError: no camera or no board is given.
+        IdentificationError: `intrinsics` is not a valid choice.
     """
 
     cameras: Annotated[tuple[str, ...], Option("--camera", kind=list[Path], read=texts)]

@@ -1,4 +1,4 @@
-"""Recipes: what to train, on what, how, and which published figures to hold it against."""
+"""Recipes: what to train, on which data, how, and which published figures to compare it with."""
 
 from typing import Annotated, Literal
 
@@ -17,12 +17,12 @@ from pisigma.validation.held_out.training_summary import BeforeAfter
 
 
 class AbstractRecipe(Section):
-    """What every recipe states.
+    """Keys of every recipe.
 
     Attributes:
-        name: of the recipe and, by default, of the model.
-        description: what it shows, for the model's card.
-        not_validated: what a reader must not take from it, for the card.
+        name: name of the recipe and, by default, of the model.
+        description: what the recipe shows, for the model's card.
+        not_validated: what the results do not prove, for the model's card.
         robot: catalogue name or robot file of the nominal robot.
     """
 
@@ -37,9 +37,9 @@ class SimulatedData(Section):
 
     Attributes:
         kind: "simulated".
-        errors: what is wrong with the true robot, completely.
-        training: what is measured for training.
-        held_out: what the fit is judged on and never sees.
+        errors: all error sources of the true robot.
+        training: measurements for training.
+        held_out: held-out measurements for validation.
     """
 
     kind: Literal["simulated"]
@@ -53,8 +53,8 @@ class MeasuredData(Section):
 
     Attributes:
         kind: "measured".
-        folds: number of folds of the cross-validation; rows of equal joints stay together.
-        seed: of the folds.
+        folds: number of folds of the cross-validation. Rows of equal joint values stay together.
+        seed: random seed of the folds.
     """
 
     kind: Literal["measured"]
@@ -63,11 +63,12 @@ class MeasuredData(Section):
 
 
 class SingularRows(Section):
-    """What happens to training rows near a singularity, where joint differences explode.
+    """Treatment of training rows near a singularity, where joint differences become arbitrarily large.
 
     Attributes:
-        rule: "keep", or "leave_out" where the measure is below the bound.
-        below: smallest singular value of the joint Jacobian, translations over the characteristic length.
+        rule: "keep" all rows, or "leave_out" those whose smallest singular value is below `below`.
+        below: limit of the smallest singular value of the Jacobian, whose translations are divided by the
+            characteristic length.
     """
 
     rule: Literal["keep", "leave_out"] = "leave_out"
@@ -78,16 +79,16 @@ class InverseRecipe(AbstractRecipe):
     """An inverse calibration: networks on nominal joint values.
 
     Attributes:
-        kind: "inverse_calibration", which need not be stated.
-        name: of the recipe and, by default, of the model.
-        description: what it shows, for the model's card.
-        not_validated: what a reader must not take from it, for the card.
+        kind: "inverse_calibration", the default.
+        name: name of the recipe and, by default, of the model.
+        description: what the recipe shows, for the model's card.
+        not_validated: what the results do not prove, for the model's card.
         robot: catalogue name or robot file of the nominal robot.
-        data: where measurements come from.
-        network: the groups of joints to correct.
+        data: source of the measurements.
+        network: groups of joints to correct, with a network each.
         fit: how the networks are trained.
-        singular_rows: rule for rows near a singularity.
-        paper: published figures by joint, to stand beside ours.
+        singular_rows: treatment of training rows near a singularity.
+        paper: published figures by joint, for comparison.
     """
 
     kind: Literal["inverse_calibration"] = "inverse_calibration"
@@ -99,18 +100,18 @@ class InverseRecipe(AbstractRecipe):
 
 
 class PriorSection(Section):
-    """Standard deviations of the parameters' errors: what the maker's tolerances say.
+    """Prior standard deviations of the errors of geometric parameters, such as from the maker's tolerances.
 
     Attributes:
-        length_mm: of a and d [mm].
-        angle_mrad: of theta, alpha and beta [mrad].
+        length_mm: prior standard deviation of a and d [mm].
+        angle_mrad: prior standard deviation of theta, alpha and beta [mrad].
     """
 
     length_mm: PositiveFloat = 1.0
     angle_mrad: PositiveFloat = 1.0
 
     def prior(self) -> Prior:
-        """The same in SI units."""
+        """Return the prior in SI units."""
         length, angle = self.length_mm / 1e3, self.angle_mrad / 1e3
         return Prior(theta=angle, d=length, a=length, alpha=angle, beta=angle)
 
@@ -119,13 +120,13 @@ class CalibrationSection(Section):
     """Settings of `GeometricCalibrator`.
 
     Attributes:
-        free: "identifiable", "joint_offsets" or names of parameters.
-        base: "free", or "fixed" to the robot's own.
-        tool: the same for the tool.
-        elimination: how redundant parameters are left out: "exact", "pairwise" (the paper's) or "none".
-        prior: None for none.
-        robust: whether rows that are far off count less.
-        maximum_iterations: steps tried at most.
+        free: parameters to identify, "identifiable", "joint_offsets" or names.
+        base: "free" to identify the base, or "fixed" to that of the robot.
+        tool: "free" to identify the tool, or "fixed" to that of the robot.
+        elimination: how redundant parameters are eliminated, "exact", "pairwise" (as in the paper) or "none".
+        prior: prior of the geometric errors, null for none.
+        robust: whether outliers are down-weighted.
+        maximum_iterations: maximum number of iterations.
     """
 
     free: Literal["identifiable", "joint_offsets"] | tuple[str, ...] = "identifiable"
@@ -137,7 +138,7 @@ class CalibrationSection(Section):
     maximum_iterations: Annotated[int, Field(ge=1, le=100_000)] = 100
 
     def calibrator(self, robot: Robot) -> GeometricCalibrator:
-        """The calibrator for a robot."""
+        """Return the calibrator for a robot."""
         return GeometricCalibrator(
             robot,
             free=self.free,
@@ -155,15 +156,15 @@ class GeometricRecipe(AbstractRecipe):
 
     Attributes:
         kind: "geometric_calibration".
-        name: of the recipe and, by default, of the model.
-        description: what it shows, for the model's card.
-        not_validated: what a reader must not take from it, for the card.
+        name: name of the recipe and, by default, of the model.
+        description: what the recipe shows, for the model's card.
+        not_validated: what the results do not prove, for the model's card.
         robot: catalogue name or robot file of the nominal robot.
-        errors: what is wrong with the true robot, completely.
-        measurements: what is measured for the calibration.
-        held_out: what the calibration is judged on and never sees.
+        errors: all error sources of the true robot.
+        measurements: measurements for the calibration.
+        held_out: held-out measurements for validation.
         calibration: settings of the calibrator.
-        paper: published figures to stand beside ours, by name.
+        paper: published figures by name, for comparison.
     """
 
     kind: Literal["geometric_calibration"]
@@ -175,13 +176,13 @@ class GeometricRecipe(AbstractRecipe):
 
 
 class HybridSection(Section):
-    """What `HybridCalibrator` may choose from; whatever does not help is left out.
+    """Candidates that `HybridCalibrator` chooses from; those that do not improve the fit are left out.
 
     Attributes:
-        features: of the unit of order 1 that are tried.
-        harmonics: of the Fourier series, tried in this order.
-        products: whether product units are tried.
-        gravity: direction in which things fall, in the frame of the robot's base; without it, by evidence.
+        features: features of the unit of order 1 to try.
+        harmonics: harmonics of the Fourier series to try, in this order.
+        products: whether to try product units.
+        gravity: direction of gravity in the robot's base frame; null to choose the axis by evidence.
     """
 
     features: tuple[str, ...] = HybridCalibrator.features
@@ -190,20 +191,20 @@ class HybridSection(Section):
     gravity: tuple[float, float, float] | None = HybridCalibrator.gravity
 
     def calibrator(self, geometric: GeometricCalibrator) -> HybridCalibrator:
-        """The calibrator, on top of a geometric one.
+        """Return the calibrator that extends a geometric one.
 
         Raises:
-            IdentificationError: a choice does not exist.
+            IdentificationError: a setting is not a valid choice.
         """
         return HybridCalibrator(geometric, **dict(self))
 
 
 class LearningCurveSection(Section):
-    """Which numbers of training rows are tried.
+    """Numbers of training rows of a learning curve.
 
     Attributes:
-        rows: the numbers; all training rows come on top.
-        seed: decides which rows are drawn.
+        rows: numbers of training rows to try, in addition to all of them.
+        seed: random seed of the choice of rows.
     """
 
     rows: Annotated[tuple[PositiveInt, ...], Field(min_length=1)]
@@ -211,19 +212,19 @@ class LearningCurveSection(Section):
 
 
 class HybridRecipe(AbstractRecipe):
-    """A hybrid calibration, judged beside the nominal robot and the geometric calibration.
+    """A hybrid calibration, compared with the nominal robot and with the geometric calibration.
 
     Attributes:
         kind: "hybrid_calibration".
-        name: of the recipe and, by default, of the model.
-        description: what it shows, for the model's card.
-        not_validated: what a reader must not take from it, for the card.
+        name: name of the recipe and, by default, of the model.
+        description: what the recipe shows, for the model's card.
+        not_validated: what the results do not prove, for the model's card.
         robot: catalogue name or robot file of the nominal robot.
-        data: where measurements come from; measured ones are judged in folds, simulated ones on held-out rows.
-        repeats: of a simulation, with all its seeds one higher each time; the model is of the first.
+        data: source of the measurements. Measured ones are validated in folds, simulated ones on held-out rows.
+        repeats: number of repeats of a simulation, each with all seeds one higher. The model is that of the first.
         calibration: settings of the geometric calibrator.
         hybrid: settings of the hybrid calibrator.
-        learning_curve: numbers of training rows to try; None for none.
+        learning_curve: learning curve to compute, null for none.
     """
 
     kind: Literal["hybrid_calibration"]
@@ -234,10 +235,10 @@ class HybridRecipe(AbstractRecipe):
     learning_curve: LearningCurveSection | None = None
 
     def calibrator(self, robot: Robot) -> HybridCalibrator:
-        """The calibrator for a robot.
+        """Return the calibrator for a robot.
 
         Raises:
-            IdentificationError: a choice of the section `hybrid` does not exist.
+            IdentificationError: a setting of the section `hybrid` is not a valid choice.
         """
         return self.hybrid.calibrator(self.calibration.calibrator(robot))
 

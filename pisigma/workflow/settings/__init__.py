@@ -1,1 +1,1 @@
-"""What steps are asked for: settings, which are read without torch so that command lines begin at once."""
+"""Settings of the workflow's steps; they import without torch, so that command lines start at once."""

@@ -1,4 +1,4 @@
-"""How a robot is calibrated, and how the calibration is validated."""
+"""Settings of a calibration and of its validation."""
 
 import math
 from collections.abc import Iterable, Mapping
@@ -19,12 +19,12 @@ ModelKind = Literal["hybrid", "geometric"]
 
 
 def free_parameters(stated: str) -> str | tuple[str, ...]:
-    """Free parameters from "identifiable", "joint_offsets", or names with commas between."""
+    """Return the free parameters from "identifiable", "joint_offsets" or comma-separated names."""
     return stated if stated in ("identifiable", "joint_offsets") else names(stated)
 
 
 def direction(stated: str) -> tuple[float, ...]:
-    """Direction of gravity, from "X,Y,Z"."""
+    """Return the direction of gravity from "X,Y,Z"."""
     try:
         numbers = tuple(map(float, stated.split(",")))
     except ValueError:
@@ -37,7 +37,7 @@ def direction(stated: str) -> tuple[float, ...]:
 
 
 def socket_distances(stated: Iterable[str]) -> dict[tuple[str, str], float]:
-    """Known distances of two sockets each [m], from "A,B,MM"."""
+    """Return known distances between pairs of sockets [m] from "A,B,MM" [mm]."""
     distances: dict[tuple[str, str], float] = {}
     for one in stated:
         sockets, distance = _socket_distance(one)
@@ -71,38 +71,37 @@ SocketDistances = Annotated[
 
 @dataclass(frozen=True)
 class CalibrationSettings:
-    """How a robot is calibrated, and how the calibration is validated.
+    """Settings of a calibration and of its validation.
 
     Attributes:
-        model: hybrid: geometry and, where the data are for it, a joint correction; or geometric.
-        folds: folds of the cross-validation; 0 for none. None: 5, or one per placement.
-        hold_out: share of the rows to hold out once, instead of folds.
-        split: how rows are split: joints (at random), interleaved, time, space or placement.
-        repeats: repeats of the cross-validation. None: 200 / number of different joint values, 1 to 10.
-        jobs: processes that calibrate with all rows and with those of each fold side by side, with one thread each.
-            None: threads.
-        seed: seed of the split, and of drawing training rows.
-        train_rows: number of rows, drawn at random, to calibrate with, in the cross-validation too. None: all.
-        free: free parameters: identifiable, joint_offsets, or names such as a_2,theta_3.
-        prior_length: prior standard deviation of length errors [m]; 0 for no prior.
-        prior_angle: prior standard deviation of angle errors [rad]; 0 for no prior.
-        robot_class: how large errors of the geometry can be: industrial, cobot or hobby (also of old and surgical
-            arms). None: as the maker and the data say.
-        robust: let rows that are far off count less.
-        features: features of the joint correction that are tried, such as gravity,lines,series. None: all that fit, and
+        model: kind of calibration, hybrid (geometry and, where the data support it, a joint correction) or geometric.
+        folds: number of folds of the cross-validation (0: none). None: 5, or one per placement.
+        hold_out: fraction of the rows to hold out once, instead of a cross-validation.
+        split: how to split the rows, by joints (at random), interleaved, time, space or placement. Rows of equal joint
+            values always stay together.
+        repeats: number of repeats of the cross-validation. None: 200 / number of different joint values, 1 to 10.
+        jobs: number of processes that calibrate in parallel, for all rows and for each fold. Each uses one thread.
+            None: threads of one process.
+        seed: random seed of the split and of the choice of training rows.
+        train_rows: number of randomly chosen rows to calibrate with, also in each fold. None: all.
+        free: parameters to identify, either identifiable, joint_offsets, or names such as a_2,theta_3.
+        prior_length: prior standard deviation of length errors [m] (0: no prior).
+        prior_angle: prior standard deviation of angle errors [rad] (0: no prior).
+        robot_class: expected size of the geometric errors, industrial, cobot or hobby (also for old and surgical arms).
+            None: from the maker and the data.
+        robust: down-weight outliers.
+        features: features of the joint correction to try, such as gravity,lines,series. None: all that apply, including
             those of plug-ins.
-        gravity: direction in which things fall, in the robot's base frame, such as 0,0,-1. None: the axis that the data
-            show.
-        new_frame_at: lines of the measurements from which on the rows are in a frame of their own, as the instrument
-            was moved.
-        socket_distances: known distances of two sockets [m]; */0,*/1,50 states 50 mm for every placement, as * in both
-            names stands for the same text.
-        cameras: what the pixels mean where files of measurements hold corners of boards in images.
+        gravity: direction of gravity in the robot's base frame, such as 0,0,-1. None: the axis that fits the data best.
+        new_frame_at: first line measured after the instrument was moved. Its rows get a frame of their own.
+        socket_distances: known distance between two sockets [m], such as */0,*/1,50. An asterisk stands for the same
+            text in both names, here for every placement.
+        cameras: cameras and boards, for files of detected board corners.
 
     Raises:
-        IdentificationError: the model is no choice, has no use for gravity, or only one of the two prior standard
-            deviations is 0.
-        MeasurementError: the split is no choice, or settings of the validation exclude each other.
+        IdentificationError: the model is not a valid choice, does not use `gravity` or `features`, or only one of the
+            two prior standard deviations is 0.
+        MeasurementError: the split is not a valid choice, or settings of the validation exclude each other.
     """
 
     model: ModelKind = "hybrid"

@@ -1,4 +1,4 @@
-"""How two models are compared."""
+"""Settings of the comparison of two models."""
 
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Annotated, get_args
@@ -16,17 +16,18 @@ _FRAMES = {True: "fixed", False: "fitted"}
 
 @dataclass(frozen=True)
 class ComparisonSettings:
-    """How two models are compared.
+    """Settings of the comparison of two models.
 
     Attributes:
-        frames: "fixed" where both models were measured in the same frame with the same tool; else base or tool may
-            stand elsewhere for the second model, are fitted so that the arms agree best, and compared apart.
-        level: probability that any parameter at all is called different by chance.
+        frames: compare base and tool as they are, for models measured in the same frame with the same tool ("fixed").
+            Otherwise ("fitted"), base and tool of the second model are first fitted so that the arms agree best, and
+            are compared separately.
+        level: probability of calling any parameter different by chance.
         bootstrap: how confidence intervals of errors on rows are computed.
-        cameras: what the pixels mean where the rows are corners of boards in images.
+        cameras: cameras and boards, for files of detected board corners.
 
     Raises:
-        IdentificationError: the level is no probability, or the frames are treated otherwise.
+        IdentificationError: the level is not a probability, or `frames` is not a valid choice.
     """
 
     frames: Annotated["FrameChoice", Option("--fixed-frames", kind=bool, read=_FRAMES.get)] = "fitted"

@@ -1,4 +1,4 @@
-"""How a model is distilled."""
+"""Settings of a distillation."""
 
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated
@@ -13,17 +13,17 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class DistillationSettings:
-    """How a model is distilled.
+    """Settings of a distillation.
 
     Attributes:
-        region: where poses are drawn; None for around the joint values that the model was measured at.
-        poses: number of poses to fit to; others are drawn besides for choosing and judging.
-        size: the only one to fit; None tries those of `sizes_for`.
-        seed: seed of poses and starts.
-        epochs: largest number of iterations for a joint.
+        region: where poses are drawn. None: around the joint values that the model was measured at.
+        poses: number of poses to fit to, in addition to those for model selection and testing.
+        size: the only network size to fit. None: those of `sizes_for`.
+        seed: random seed.
+        epochs: maximum number of iterations for a joint.
 
     Raises:
-        RecipeError: the seed is none.
+        RecipeError: the seed is out of range.
     """
 
     region: Annotated["Region | None", HIDDEN] = None

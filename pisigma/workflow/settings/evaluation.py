@@ -1,4 +1,4 @@
-"""How models are evaluated, and what is accepted."""
+"""Settings of an evaluation, and limits of acceptance."""
 
 import math
 from dataclasses import asdict, dataclass, field
@@ -24,13 +24,16 @@ _LIMITED = {
 
 @dataclass(frozen=True)
 class Limits:
-    """Largest errors that are accepted; None where there is no limit.
+    """Limits of acceptance; None where there is no limit.
 
     Attributes:
-        mean_mm: accept only where the mean position error is at most this [mm].
-        p95_mm: accept only where 95 % of the position errors are at most this [mm].
-        max_mm: accept only where no position error is larger [mm].
-        mean_deg: accept only where the mean orientation error is at most this [deg].
+        mean_mm: limit of the mean position error [mm].
+        p95_mm: limit of the 95 % quantile of the position error [mm].
+        max_mm: limit of the largest position error [mm].
+        mean_deg: limit of the mean orientation error [deg].
+
+    Raises:
+        MeasurementError: a limit is not positive and finite.
     """
 
     mean_mm: Annotated[float | None, Option("--max-mean-mm")] = None
@@ -46,7 +49,7 @@ class Limits:
 
     @property
     def stated(self) -> dict[str, float]:
-        """The limits that there are, by name."""
+        """The limits that are not None, by name."""
         return {name: limit for name, limit in asdict(self).items() if limit is not None}
 
     def missed_by(self, model: "ModelFigures") -> list[str]:
@@ -81,16 +84,16 @@ class Limits:
 
 @dataclass(frozen=True)
 class EvaluationSettings:
-    """How models are evaluated.
+    """Settings of an evaluation.
 
     Attributes:
-        limits: that every model, but no reference, has to meet.
-        fit_frame: the sensor was moved since: fit its frame to these rows, 6 poses or more.
-        fit_tool: another reflector was mounted since: fit its place to these rows, 6 poses or more.
+        limits: limits of acceptance of every model, except the references.
+        fit_frame: fit the sensor's frame to these rows, as the sensor was moved. Needs 6 poses or more.
+        fit_tool: fit the reflector's position to these rows, as another one was mounted. Needs 6 poses or more.
         bootstrap: how confidence intervals are computed.
-        cameras: what the pixels mean where files of measurements hold corners of boards in images.
-        socket_distances: known distances of two sockets [m]; */0,*/1,50 states 50 mm for every placement, as * in both
-            names stands for the same text.
+        cameras: cameras and boards, for files of detected board corners.
+        socket_distances: known distance between two sockets [m], such as */0,*/1,50. An asterisk stands for the same
+            text in both names, here for every placement.
     """
 
     limits: Limits = field(default_factory=Limits)
@@ -102,7 +105,7 @@ class EvaluationSettings:
 
     @property
     def fitted(self) -> "tuple[FrameKind, ...]":
-        """What is fitted to the rows."""
+        """Frames that are fitted to the rows."""
         from pisigma.validation.held_out.frames.fitted_frames import fitted_kinds
 
         return fitted_kinds(self.fit_frame, self.fit_tool)

@@ -1,4 +1,4 @@
-"""What is done with every robot of a fleet, and where."""
+"""Settings of the calibration of a fleet."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,22 +14,23 @@ EngineName = Literal["processes", "ray"]
 
 @dataclass(frozen=True)
 class FleetSettings:
-    """What is done with every robot, and where.
+    """Settings of the calibration of a fleet.
 
     Attributes:
-        task: calibrate: every session by itself; recalibrate: the first is calibrated, and every later one brings the
-            model of the one before up to date; monitor: the first is calibrated, and the later ones are compared with
-            its model. A robot with a model of its own begins with that.
+        task: what to do with each robot's sessions, calibrate, recalibrate or monitor. Calibrate treats every session
+            by itself, recalibrate updates the model of the session before, and monitor compares later sessions with the
+            first one's model. A robot that states a model starts from it.
         validate: cross-validate every calibration and draw the figures of its card.
-        calibration: of every robot, but for what its own options say; its folds count only with `validate`.
-        engine: processes: of this machine; or ray.
-        jobs: processes that work side by side. None: one per core.
+        calibration: settings of every robot's calibration, which the robot's own options override. Its folds are used
+            only with `validate`.
+        engine: where to run, processes (of this machine) or ray.
+        jobs: number of processes that work in parallel. None: one per core.
         address: address of a Ray cluster. None: Ray on this machine.
-        prior: model folder of `pisigma fleet prior` that calibrations begin with, which have no use for the settings of
-            a calibration and whose rows are left out in turn anyway.
+        prior: model folder of `pisigma fleet prior` to start the calibrations from. It replaces the settings of the
+            calibration, and every row is cross-validated.
 
     Raises:
-        FleetError: something is no choice, or there are no jobs.
+        FleetError: a setting is not a valid choice, or there are no jobs.
     """
 
     task: Task = "calibrate"

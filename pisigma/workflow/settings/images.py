@@ -1,4 +1,4 @@
-"""How boards are found in images, and a camera is calibrated by them."""
+"""Settings of the detection of boards in images, and of the calibration of a camera."""
 
 from dataclasses import dataclass
 from typing import Annotated
@@ -10,11 +10,11 @@ MostBlur = Annotated[float, Option("--most-blur-px", least=0.0)]
 
 @dataclass(frozen=True)
 class DetectionSettings:
-    """How corners are detected.
+    """Settings of the detection of boards in images.
 
     Attributes:
-        most_blur: images whose edges are blurred more (standard deviation) are left out [px].
-        within: largest difference of time stamps of images and joint values that are joined [s].
+        most_blur: maximum blur of the edges in an image, as a standard deviation [px].
+        within: maximum difference between the time stamps of an image and of its joint values [s].
     """
 
     most_blur: MostBlur = 3.0
@@ -23,12 +23,12 @@ class DetectionSettings:
 
 @dataclass(frozen=True)
 class IntrinsicsSettings:
-    """How a camera is calibrated.
+    """Settings of the calibration of a camera.
 
     Attributes:
         name: name of the camera.
-        free_k3: identify k3, too, which is 0 else.
-        most_blur: images whose edges are blurred more (standard deviation) are left out [px].
+        free_k3: also estimate k3, which is otherwise 0.
+        most_blur: maximum blur of the edges in an image, as a standard deviation [px].
     """
 
     name: str = "camera"

@@ -1,4 +1,4 @@
-"""How exports are read."""
+"""Settings of the import of exports of instruments and controllers."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -16,14 +16,14 @@ _SIGNS = {"point": ".", "comma": ","}
 
 
 def stated_map(stated: str) -> Sequence[Mapping[str, str]]:
-    """Mappings of columns, from text or a file."""
+    """Return column mappings from text or from a file."""
     from pisigma.measurement.foreign.saved_map import parse_map
 
     return parse_map(stated)
 
 
 def seconds(stated: str) -> float:
-    """Seconds of a duration such as 0.2s or 200ms."""
+    """Return the seconds of a duration such as "0.2s" or "200ms"."""
     match = re.fullmatch(r"\s*([0-9]*\.?[0-9]+)\s*(s|ms)?\s*", stated)
     if match is None:
         raise MeasurementError(f"--within {stated}: a duration was wanted, such as 0.2s or 200ms.")
@@ -32,22 +32,23 @@ def seconds(stated: str) -> float:
 
 @dataclass(frozen=True)
 class ImportSettings:
-    """How exports are read.
+    """Settings of the import of exports of instruments and controllers.
 
     Attributes:
-        maps: what columns are, by headings or numbers from 1 on, such as A1=q1_deg,X=x_mm,note=-, or a file that
-            --save-map wrote: a column of measurement files (q1_deg), such a quantity in another unit (x_in) or in that
-            which the file states (x), a value of a rotation (ur_rx_rad), point, time, or - for a column that is not
-            wanted. Of several the one that fits a file counts.
-        units: units of columns for which the file states none, such as mm,deg or m,rad.
-        rotation: maker whose rotations these are, such as kuka or ur; none leaves them out. None: by the headings.
-        decimal: sign before decimals, on a command line point or comma. None: by the cells.
-        join: by what joint values of one file and measurements of another are put together: point, order or time. None:
-            the files stand behind each other.
-        within: time stamps that are put together differ by no more [s].
+        maps: meaning of the columns, such as A1=q1_deg,X=x_mm,note=-, or a file that --save-map wrote. Columns are
+            named by heading or by number (from 1). Meanings are a column of measurement files (q1_deg), its quantity in
+            another unit (x_in) or in the unit that the file states (x), a value of a rotation (ur_rx_rad), point, time,
+            or - for a column to skip. Of several mappings, the one that fits a file is used.
+        units: units of the columns for which the file states none, such as mm,deg or m,rad.
+        rotation: maker whose rotation convention applies, such as kuka or ur, or none to skip rotations. None: from the
+            headings.
+        decimal: decimal separator, point or comma on a command line. None: from the cells.
+        join: how to join joint values of one file with measurements of another, by point, order or time. None:
+            the files are concatenated.
+        within: maximum difference between joined time stamps [s].
 
     Raises:
-        MeasurementError: there is no such way to join.
+        MeasurementError: `join` is not a valid choice.
     """
 
     maps: Annotated[Sequence[Mapping[str, str]], Option("--map", kind=str, read=stated_map)] = ()

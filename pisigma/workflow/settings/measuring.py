@@ -1,4 +1,4 @@
-"""When a session of measuring stops, and how often it is judged."""
+"""Settings of a measuring session: when it stops, and how often it replans."""
 
 import math
 from dataclasses import dataclass
@@ -8,16 +8,16 @@ from pisigma.files.errors import PlanningError
 
 @dataclass(frozen=True)
 class MeasureSettings:
-    """When a session stops, and how often it is judged.
+    """Settings of a measuring session: when it stops, and how often it replans.
 
     Attributes:
-        limit_mm: stop where 95 % of the errors are expected below this [mm].
-        least_gain_mm: stop where the next 10 poses would lower these 95 % by less than this [mm].
-        every: rows after which the accuracy is worked out and the rest planned again.
-        replan: plan what is left again.
+        limit_mm: stop when the expected 95 % quantile of the tool's position errors is below this [mm].
+        least_gain_mm: stop when 10 more poses would lower that quantile of the errors by less than this [mm].
+        every: number of rows between updates of the accuracy and of the plan.
+        replan: replan the remaining poses.
 
     Raises:
-        PlanningError: a setting is no number that it can be.
+        PlanningError: a number is out of range.
     """
 
     limit_mm: float | None = None

@@ -1,4 +1,4 @@
-"""How sessions of a robot are judged."""
+"""Settings of the monitoring of a robot."""
 
 from dataclasses import dataclass
 from operator import not_
@@ -13,21 +13,20 @@ from pisigma.workflow.settings.recalibration import Moved, RecalibrationSettings
 
 @dataclass(frozen=True)
 class MonitorSettings:
-    """How sessions are judged.
+    """Settings of the monitoring of a robot.
 
     Attributes:
-        dates: days of the files, one each, such as 2026-10-01,2026-11-01. None: column date, name of the file, its
-            change.
-        moved: what stands elsewhere since the model was made: base, tool, or base,tool; nothing for neither. None: what
-            the rows show.
-        limit_mm: RMS error to stay below [mm]; says when it will be passed.
-        history: MODEL.history.sqlite keeps the sessions of every call; without a history it is neither read nor
-            written.
-        cameras: what the pixels mean where files hold corners of boards in images.
+        dates: date of each file, such as 2026-10-01,2026-11-01. None: the column date, else the file's name, else its
+            time of modification.
+        moved: what was moved after the model was made, base, tool or base,tool (empty: neither). None: as the rows
+            show.
+        limit_mm: limit of the RMS error [mm], whose crossing is predicted.
+        history: without history, neither read nor write MODEL.history.sqlite, which keeps the sessions of every call.
+        cameras: cameras and boards, for files of detected board corners.
 
     Raises:
-        IdentificationError: something else is named in `moved`, or the limit is no length.
-        MeasurementError: a date is none.
+        IdentificationError: `moved` names something else, or the limit is not positive.
+        MeasurementError: a date is not valid.
     """
 
     dates: Annotated[tuple[str, ...], Option(kind=str, read=names, metavar="DAY,...")] = ()

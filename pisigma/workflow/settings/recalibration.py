@@ -1,4 +1,4 @@
-"""How a model is recalibrated."""
+"""Settings of a recalibration."""
 
 import shlex
 from dataclasses import dataclass
@@ -16,29 +16,29 @@ Moved = Annotated[tuple[str, ...] | None, NAMES]
 
 @dataclass(frozen=True)
 class RecalibrationSettings:
-    """How a model is recalibrated.
+    """Settings of a recalibration.
 
     Attributes:
-        moved: what stands elsewhere since the model was made: base, tool, or base,tool; nothing for neither. None: what
-            the rows show.
-        cameras: what the pixels mean where files of rows hold corners of boards in images.
+        moved: what was moved after the model was made, base, tool or base,tool (empty: neither). None: as the rows
+            show.
+        cameras: cameras and boards, for files of detected board corners.
 
     Raises:
-        IdentificationError: something else is named.
+        IdentificationError: `moved` names something else.
     """
 
     moved: Moved = None
     cameras: CameraFiles | None = None
 
     def command(self, model: str, data: str) -> str:
-        """The line that recalibrates a model with a file in this way."""
+        """Return the command line that recalibrates a model with a file and these settings."""
         stated = [] if self.moved is None else ["--moved", ",".join(self.moved)]
         stated += self.cameras.options if self.cameras else []
         return shlex.join(["pisigma", "recalibrate", model, data, *stated, "--out", "DIR"])
 
     @property
     def fitted(self) -> "tuple[FrameKind, ...]":
-        """What is stated to stand elsewhere."""
+        """Frames that were moved, as stated."""
         from pisigma.validation.held_out.frames.fitted_frames import fitted_kinds
 
         return fitted_kinds("base" in (self.moved or ()), "tool" in (self.moved or ()))

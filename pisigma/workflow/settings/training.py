@@ -1,4 +1,4 @@
-"""How a training is run, apart from what it computes."""
+"""Settings of how a training is run; they do not change what it computes."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,15 +10,16 @@ from pisigma.files.setting import HIDDEN
 
 @dataclass(frozen=True)
 class TrainSettings:
-    """How a training is run, apart from what it computes.
+    """Settings of how a training is run; they do not change what it computes.
 
     Attributes:
-        checkpoints: folder for checkpoints of networks, and of a hybrid on mini-batches; None keeps none. It is not
-            removed when the training is done.
-        resume: go on from where an interrupted training of this folder stopped.
-        show_progress: draw the bar of networks on stderr, if that is a terminal.
-        logs: folder for metrics.csv of every epoch of networks, and TensorBoard's events if it is there.
-        jobs: processes that judge folds and simulations side by side, with one thread each. None: threads.
+        checkpoints: folder for checkpoints of networks, and of a hybrid on mini-batches. It is kept after the training.
+            None: no checkpoints.
+        resume: resume an interrupted training of this folder.
+        show_progress: show the networks' progress bar on stderr, if that is a terminal.
+        logs: folder for the metrics of every epoch (metrics.csv), and for TensorBoard if it is installed.
+        jobs: number of processes that validate folds and simulations in parallel. Each uses one thread.
+            None: threads of one process.
 
     Raises:
         RecipeError: there are no jobs.

@@ -1,4 +1,4 @@
-"""How a model is verified."""
+"""Settings of a verification."""
 
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Annotated
@@ -13,15 +13,15 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class VerificationSettings:
-    """How a model is verified.
+    """Settings of a verification.
 
     Attributes:
-        fit_frame: the sensor was moved since: fit its frame to these rows, 6 poses or more.
-        fit_tool: another reflector was mounted since: fit its place to these rows, 6 poses or more.
-        seed: of the resamples for confidence intervals.
-        cameras: what the pixels mean where the file holds corners of boards in images.
-        socket_distances: known distances of two sockets [m]; */0,*/1,50 states 50 mm for every placement, as * in both
-            names stands for the same text.
+        fit_frame: fit the sensor's frame to these rows, as the sensor was moved. Needs 6 poses or more.
+        fit_tool: fit the reflector's position to these rows, as another one was mounted. Needs 6 poses or more.
+        seed: random seed of the resamples for confidence intervals.
+        cameras: cameras and boards, for files of detected board corners.
+        socket_distances: known distance between two sockets [m], such as */0,*/1,50. An asterisk stands for the same
+            text in both names, here for every placement.
     """
 
     fit_frame: bool = False
@@ -32,7 +32,7 @@ class VerificationSettings:
 
     @property
     def fitted(self) -> "tuple[FrameKind, ...]":
-        """What is fitted to the rows."""
+        """Frames that are fitted to the rows."""
         from pisigma.validation.held_out.frames.fitted_frames import fitted_kinds
 
         return fitted_kinds(self.fit_frame, self.fit_tool)
