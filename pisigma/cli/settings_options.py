@@ -55,7 +55,7 @@ def _parameter(setting: Setting) -> inspect.Parameter:
     kind = setting.kind
     if kind is bool and default:
         name = f"{name}/--no-{name[2:]}"
-    bounds: dict[str, Any] = {"min": option.least, "max": option.most}
+    bounds: dict[str, Any] = {"min": option.min, "max": option.max}
     shown = typer.Option(name, help=setting.help, metavar=option.metavar, **bounds)
     return inspect.Parameter(
         _name(setting),

@@ -41,7 +41,7 @@ def train(
     Exit status 3, and no folder, where a calibration must not be trusted.
     """
     started = time.perf_counter()
-    from pisigma.files.conflicts import check_apart
+    from pisigma.files.conflicts import check_conflicts
     from pisigma.files.output_folder import check_folder
     from pisigma.robot.robot_file import robot_file
     from pisigma.workflow.recipes.reader import read_recipe
@@ -53,7 +53,7 @@ def train(
     inputs = (recipe, data, robot_file(read.robot))
     check_folder(folder, overwrite, inputs)
     if settings.logs is not None:
-        check_apart(settings.logs / "metrics.csv", inputs, "--logs")
+        check_conflicts(settings.logs / "metrics.csv", inputs, "--logs")
     checkpoints = folder.parent / f".{folder.name}.training"
     settings = replace(settings, checkpoints=checkpoints, show_progress=True)
     with progress_of("training") as progress:

@@ -1,1 +1,1 @@
-"""Files that come in and go out: inputs within bounds, outputs whole or not at all, and nothing lost for them."""
+"""Reading and writing files: bounded inputs, outputs that are complete or absent, and errors with file and line."""

@@ -1,43 +1,51 @@
-"""What an output must not be: an input of the same call, or a part of a model folder."""
+"""Conflicts of an output: with an input of the same call, or with a model folder."""
 
 import os
 from collections.abc import Iterable
 from pathlib import Path
 
-from pisigma.files.errors import OutputError
+from pisigma.files.errors import OutputError, Place
 from pisigma.files.model_files import is_model
 
 Input = str | os.PathLike[str] | None
-"""A file or folder that a call reads; None and what is not there are passed over."""
+"""A file or folder that a call reads; None and missing paths are skipped."""
 
 
-def check_apart(output: str | os.PathLike[str], inputs: Iterable[Input], option: str = "--out") -> None:
-    """Refuse an output that is, holds or lies in an input, by whatever links, or that lies in a model folder.
+def check_conflicts(output: str | os.PathLike[str], inputs: Iterable[Input], option: str = "--out") -> None:
+    """Check that an output is not an input, inside an input, around one or in a model folder, links resolved.
 
     Args:
         output: file or folder to write.
-        inputs: files and folders that are read.
-        option: which names the output, for complaints.
+        inputs: files and folders that the same call reads.
+        option: option that names the output, for the message.
 
     Raises:
-        OutputError: it does; the message names the two.
-        OSError: a path cannot be looked at.
+        OutputError: the output is in conflict; `file` is the output and `value` the input or model folder.
+        OSError: a path cannot be accessed.
     """
+    remedy = f"choose another {option}"
     target = Path(os.path.realpath(output))
     for source in inputs:
         if source is None or not os.path.exists(source):
             continue
         for path in (Path(os.path.realpath(source)), Path(os.path.abspath(source))):
             if target == path or (target.exists() and os.path.samefile(target, path)):
-                raise OutputError(f"{output}: is an input of this command; choose another {option}.")
-            if path in target.parents:
-                raise OutputError(
-                    f"{output}: lies in {source}, an input of this command; choose another {option}."
+                problem, what = "the output is an input of this command", "a path that is not an input"
+            elif path in target.parents:
+                problem, what = (
+                    f"the output is inside {source}, an input of this command",
+                    "a path outside the inputs",
                 )
-            if target in path.parents:
-                raise OutputError(
-                    f"{output}: holds {source}, an input of this command; choose another {option}."
+            elif target in path.parents:
+                problem, what = (
+                    f"the output contains {source}, an input of this command",
+                    "a folder without inputs",
                 )
+            else:
+                continue
+            value = os.fspath(source)
+            raise OutputError(problem, expected=what, value=value, at=Place(output), remedy=remedy)
     for folder in target.parents:
         if is_model(folder):
-            raise OutputError(f"{output}: lies in the model folder {folder}; choose another {option}.")
+            problem, what = f"the output is inside the model folder {folder}", "a path outside model folders"
+            raise OutputError(problem, expected=what, value=str(folder), at=Place(output), remedy=remedy)

@@ -12,45 +12,45 @@ from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 from typing import Any
 
-LONGEST_WORD = 200
-"""Letters of a word of a file or a command line that a message quotes."""
+MAX_WORD_CHARACTERS = 200
+"""Longest word of a file or a command line that a message quotes in full."""
 
-LONGEST_TEXT = 2000
-"""Letters of a message."""
+MAX_MESSAGE_CHARACTERS = 2000
+"""Longest message."""
 
 _UNPRINTABLE = re.compile(
     r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]"
 )
-_LONG_WORD = re.compile(rf"\S{{{LONGEST_WORD + 1},}}")
+_LONG_WORD = re.compile(rf"\S{{{MAX_WORD_CHARACTERS + 1},}}")
 
 
 def printable(text: str, cut: bool = True) -> str:
-    r"""Give a text as it may stand on a terminal, whatever a file has put into it.
+    r"""Return a text that is safe to print on a terminal, even if parts of it come from a file.
 
-    Control characters, marks of the direction of writing and halves of characters are written as `\x1b`, so that
-    nothing moves the cursor, sets colours or hides what follows. Of words of more than `LONGEST_WORD` letters the begin
-    and the length are given, and of texts of more than `LONGEST_TEXT` letters the begin and the end.
+    Control characters, direction marks and surrogates are written as escapes (`\x1b`), so that nothing moves the
+    cursor, sets colours or hides the text that follows. A word longer than `MAX_WORD_CHARACTERS` is shortened to its
+    start and its length, a text longer than `MAX_MESSAGE_CHARACTERS` to its start and its end.
 
     Args:
-        text: whatever it holds.
-        cut: whether long words and texts are cut.
+        text: any text.
+        cut: whether to shorten long words and texts.
     """
     if cut:
         text = _LONG_WORD.sub(lambda match: f"{match[0][:40]}... ({len(match[0]):,} characters)", text)
-    if cut and len(text) > LONGEST_TEXT:
-        text = f"{text[: LONGEST_TEXT - 500]} ... {text[-400:]}"
+    if cut and len(text) > MAX_MESSAGE_CHARACTERS:
+        text = f"{text[: MAX_MESSAGE_CHARACTERS - 500]} ... {text[-400:]}"
     return _UNPRINTABLE.sub(lambda match: ascii(match[0])[1:-1], text)
 
 
 @dataclass(frozen=True)
 class Place:
-    """Where in a file something is: ``str(Place("a.csv", 3, "x_mm"))`` is ``"a.csv, line 3, column 'x_mm'"``.
+    """A place in a file: ``str(Place("a.csv", 3, "x_mm"))`` is ``"a.csv, line 3, column 'x_mm'"``.
 
     Attributes:
-        file: path of the file, as the user gave it, or another name of the source.
-        line: line number, counted from 1; None where the whole file is meant.
+        file: path of the file as the user gave it, or another name of the source.
+        line: line number, counted from 1; None for the whole file.
         column: name or number (from 1) of a column of a table, or the key of a YAML file (`"joints.2.a_mm"`); None
-            where the whole line is meant.
+            for the whole line.
     """
 
     file: str | os.PathLike[str]
@@ -68,19 +68,19 @@ class Place:
 
 
 class PisigmaError(Exception):
-    """Base of every error that pisigma raises on purpose.
+    """Base class of every error that pisigma raises on purpose.
 
-    The message is made of the fields: ``expected a length > 0, got -3 mm (cell.yaml, line 12); give a positive
-    length.`` It is made `printable`. All fields are attributes, so that callers need not parse the message.
+    The message is built from the fields: ``expected a length > 0, got -3 mm (cell.yaml, line 12); give a positive
+    length.`` It is always `printable`. All fields are attributes, so that callers need not parse the message.
 
     Attributes:
-        file: the file at fault, None where no file is.
-        line: its line, counted from 1; None where the whole file is meant.
-        column: name or number of the column, or the YAML key; None where the whole line is meant.
-        option: the option or the argument at fault, for example ``"--camera"``; empty where none is.
-        value: what was given instead; None where that is not stated.
+        file: the file at fault; None if there is none.
+        line: its line, counted from 1; None for the whole file.
+        column: name or number of the column, or the YAML key; None for the whole line.
+        option: the option or argument at fault, for example ``"--camera"``; empty if there is none.
+        value: the value that was given; None if it is not known.
         expected: what was expected; empty where `problem` says what is wrong.
-        remedy: what to do about it; empty where the message ends without it.
+        remedy: how to correct the input; empty if the message does not say.
     """
 
     def __init__(
@@ -93,16 +93,16 @@ class PisigmaError(Exception):
         option: str = "",
         remedy: str = "",
     ) -> None:
-        """Make the message of its parts.
+        """Build the message from its parts.
 
         Args:
-            problem: what is wrong, a clause without a full stop; without it the message says
-                ``expected ..., got ...``. Alone it is the whole message, as it is.
+            problem: what is wrong, a clause without a full stop; if omitted, the message says
+                ``expected ..., got ...``. Without any other argument it is the whole message, unchanged.
             expected: what was expected, for example ``"a length > 0"``.
-            value: what was given instead.
-            at: where in a file; it follows the problem in parentheses.
+            value: the value that was given.
+            at: the place in a file; it follows the problem in parentheses.
             option: the option or argument at fault; it precedes the problem.
-            remedy: what to do about it, an imperative clause without a full stop.
+            remedy: how to correct the input, an imperative clause without a full stop.
         """
         self.file = None if at is None else os.fspath(at.file)
         self.line = None if at is None else at.line
@@ -124,7 +124,7 @@ class PisigmaError(Exception):
         super().__init__(printable(sentence if is_whole else f"{sentence}."))
 
     def fields(self) -> dict[str, Any]:
-        """The fields that are stated, for JSON: class, message and the attributes."""
+        """Return class, message and all fields that are set, as plain values for JSON."""
         stated = {"class": type(self).__name__, "message": str(self)}
         names = ("file", "line", "column", "option", "value", "expected", "remedy")
         values = {name: getattr(self, name) for name in names}
@@ -136,14 +136,25 @@ class PisigmaError(Exception):
         return stated | plain
 
     def followed_by(self, text: str) -> "PisigmaError":
-        """The same error with a text after its message."""
+        """Return a copy of the error with a text after its message."""
         other = type(self)(f"{self}{text}")
         other.__dict__.update(self.__dict__)
         return other
 
+    def located(self, at: Place) -> "PisigmaError":
+        """Return a copy of the error whose message starts with a place; an error without a file also takes its fields.
+
+        For errors of values that a file states, found by code that does not know the file.
+        """
+        other = type(self)(f"{at}: {self}")
+        other.__dict__.update(self.__dict__)
+        if self.file is None:
+            other.file, other.line, other.column = os.fspath(at.file), at.line, at.column
+        return other
+
 
 def _quoted(value: Any) -> str:
-    """A value as a message shows it: texts in quotation marks, numbers as they are."""
+    """Format a value for a message: texts in quotation marks, numbers as they are."""
     if isinstance(value, str):
         return f"'{value}'"
     return f"{value:,.12g}" if isinstance(value, float) else str(value)
@@ -170,23 +181,23 @@ class ModelError(PisigmaError, ValueError):
 
 
 class PoseError(PisigmaError, ValueError):
-    """A wanted pose is no pose, or joint values do not fit the robot."""
+    """A target pose is not a valid pose, or joint values do not fit the robot."""
 
 
 class RequestError(PisigmaError, ValueError):
-    """A request to a server cannot be answered as it stands."""
+    """A request to a server is invalid."""
 
 
 class UnreachablePoseError(PisigmaError, ValueError):
-    """The robot cannot take a wanted pose as asked; the message gives the status."""
+    """The robot cannot reach a target pose under the stated conditions; the message states the status."""
 
 
 class IdentificationError(PisigmaError, ValueError):
-    """The measurements do not determine what is asked for."""
+    """The measurements do not determine the requested parameters."""
 
 
 class ImplausibleError(IdentificationError):
-    """No calibration error explains what was measured: it is of another robot, or in other units."""
+    """No calibration error explains the measurements: they belong to another robot or are in other units."""
 
 
 class PlanningError(PisigmaError, ValueError):
@@ -202,19 +213,19 @@ class PluginError(PisigmaError, ValueError):
 
 
 class OutputError(PisigmaError, ValueError):
-    """An output cannot be written where it was asked for."""
+    """An output cannot be written to the requested place."""
 
 
 class AcceptanceError(PisigmaError, ValueError):
-    """A model does not meet the limits that were set for it, or must not be trusted."""
+    """A model exceeds the limits that were set for it, or must not be trusted."""
 
 
 class TrainingError(PisigmaError, RuntimeError):
-    """A training cannot go on, for example because it diverged."""
+    """A training cannot continue, for example because it diverged."""
 
 
 class MissingExtraError(PisigmaError, ImportError):
-    """A package that comes with an extra of pisigma is not installed."""
+    """A package of one of pisigma's extras is not installed."""
 
 
 EXTRAS = {
@@ -227,37 +238,38 @@ EXTRAS = {
     "pyzmq": "serve",
     "opencv-python-headless": "camera",
 }
-"""By the package that is imported on use, the extra that it comes with."""
+"""The extra that installs each optional package."""
 _PACKAGES = {"cv2": "opencv-python-headless"}
-"""Packages that are imported by another name."""
+"""Packages whose module has another name, by that name."""
 
 
 def missing_extra(problem: ImportError) -> MissingExtraError | None:
-    """Say which extra brings the package that could not be imported; None where none does."""
+    """Return an error that names the extra with the package that could not be imported; None if no extra has it."""
     module = (problem.name or "").split(".")[0]
     package = _PACKAGES.get(module, module)
     if package not in EXTRAS:
         return None
     return MissingExtraError(
-        f"this needs the package {package}, which is not installed; install it with "
-        f'`pip install "pisigma[{EXTRAS[package]}]"`.'
+        f"this needs the package {package}, which is not installed",
+        value=package,
+        remedy=f'install it with `pip install "pisigma[{EXTRAS[package]}]"`',
     )
 
 
 def check_choice(
     error: type[PisigmaError], name: str, value: str, choices: Collection[str], at: Place | None = None
 ) -> None:
-    """Refuse a value that is not one of the valid choices.
+    """Check that a value is one of the valid choices.
 
     Args:
         error: class of the exception.
         name: the option, argument or key.
-        value: what was given.
-        choices: the valid ones.
-        at: where in a file it was given.
+        value: the value to check.
+        choices: the valid values.
+        at: where in a file the value was given.
 
     Raises:
-        PisigmaError: of the class `error`, with the nearest choice.
+        PisigmaError: the value is not valid; the exception has the class `error` and names the nearest choice.
     """
     if value not in choices:
         raise error(
@@ -270,7 +282,7 @@ def check_choice(
 
 
 def nearest_choice(given: str, choices: Iterable[str]) -> str:
-    """Say which choices there are and which is nearest to `given`.
+    """Return a remedy that lists the valid choices and the one nearest to `given`.
 
     Returns:
         For example ``"did you mean 'epochs'? Valid: epochs, seed."``.

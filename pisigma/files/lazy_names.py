@@ -1,4 +1,4 @@
-"""Names of a package that are loaded on first use (PEP 562), so that its light modules need no others."""
+"""Load names of a package on first use (PEP 562), so that its light modules can be imported alone."""
 
 from collections.abc import Callable, Mapping
 from importlib import import_module
@@ -6,11 +6,11 @@ from typing import Any
 
 
 def lazily(package: str, names: Mapping[str, str]) -> Callable[[str], Any]:
-    """Make the `__getattr__` of a package.
+    """Return a `__getattr__` function for a package.
 
     Args:
-        package: its name.
-        names: that it gives, separated by spaces, by the module of the package that holds them.
+        package: name of the package.
+        names: exported names, separated by spaces, by the submodule that defines them.
     """
 
     def getattribute(name: str) -> Any:

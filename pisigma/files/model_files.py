@@ -1,25 +1,25 @@
-"""The files of a model folder, known without torch."""
+"""Names and hashes of the files of a model folder, without importing torch."""
 
 import hashlib
 import os
 import re
 from pathlib import Path
 
-from pisigma.files.errors import ModelError
-from pisigma.files.input_file import MOST_BYTES, read_input
+from pisigma.files.errors import ModelError, Place
+from pisigma.files.input_file import MAX_BYTES, read_input
 
 DESCRIPTION = "model.yaml"
-"""Robot, network, provenance, metrics."""
+"""Description: robot, network, provenance, metrics."""
 WEIGHTS = "model.safetensors"
-"""All tensors."""
+"""All tensors of the model."""
 COMPILED = "compiled.npz"
-"""The same as arrays for the compiled kernels, made from the two others; a folder is whole without it."""
+"""The model as arrays for the compiled kernels, made from the two files above; a folder is complete without it."""
 DRAWING = "drawing.urdf"
-"""The URDF file that the robot was drawn in, where it was."""
+"""The URDF file of the nominal robot, if the robot came from one."""
 CARD = "README.md"
-"""What people read."""
+"""Model card for people."""
 HELD_OUT_CSV = "held_out.csv"
-"""Every held-out row with its errors."""
+"""All held-out rows with their errors."""
 PARAMETERS_CSV = "parameters.csv"
 CORRELATION_CSV = "correlation.csv"
 ENERGY_CSV = "energy.csv"
@@ -35,11 +35,11 @@ SPREAD_PNG = "predicted_spread.png"
 MODEL_FILES = frozenset(
     value for name, value in list(globals().items()) if name.isupper() and isinstance(value, str)
 )
-"""All that pisigma writes into a model folder: whatever else lies in one is somebody's work."""
+"""All files that pisigma writes into a model folder; any other file belongs to the user."""
 
 
-_MOST = {DESCRIPTION: 2**21, WEIGHTS: 2**28, HELD_OUT_CSV: 2**28}
-"""Bytes of files for which it is not `MOST_BYTES`."""
+_MAX_BYTES = {DESCRIPTION: 2**21, WEIGHTS: 2**28, HELD_OUT_CSV: 2**28}
+"""Largest sizes of files for which it is not `MAX_BYTES`."""
 
 _SIGNED = re.compile(rb"(.*\n)compiled_sha256: (\S+)\nsha256: ([0-9a-f]{64})\n", re.DOTALL)
 
@@ -48,47 +48,51 @@ def read_model_file(folder: Path, name: str) -> bytes:
     """Read a file of a model folder.
 
     Raises:
-        ModelError: it is missing, no regular file, larger than one of its kind can be, or cannot be read.
+        ModelError: the file is missing, not a regular file, too large, or cannot be read.
     """
     path = folder / name
     if path.exists() and not path.is_file():
-        raise ModelError(f"{path}: is a folder, a pipe or a device, no regular file; copy the model again.")
-    return read_input(path, ModelError, _MOST.get(name, MOST_BYTES))
+        problem = "the path is a folder, a pipe or a device"
+        raise ModelError(problem, expected="a regular file", at=Place(path), remedy="copy the model again")
+    return read_input(path, ModelError, _MAX_BYTES.get(name, MAX_BYTES))
 
 
 def model_hash(folder: str | os.PathLike[str]) -> str:
-    """SHA-256 of `model.yaml`, which holds those of the other files that `pisigma.load` reads.
+    """Return the SHA-256 of `model.yaml`, which contains the hashes of the other files that `pisigma.load` reads.
 
     Raises:
-        ModelError: it cannot be read.
+        ModelError: the file cannot be read.
     """
     return hashlib.sha256(read_model_file(Path(folder), DESCRIPTION)).hexdigest()
 
 
 def check_model_hash(folder: str | os.PathLike[str], sha256: str) -> None:
-    """Make sure that a model is the one that somebody means.
+    """Check that a model is the expected one.
 
     Args:
-        folder: of the model.
-        sha256: wanted `model_hash`, as `sha256sum` prints it.
+        folder: folder of the model.
+        sha256: the expected `model_hash`, as `sha256sum` prints it.
 
     Raises:
-        ModelError: the model is another one, or cannot be read.
+        ModelError: the model is another one or was changed, or cannot be read.
     """
-    if (came := model_hash(folder)) != sha256.strip().lower():
+    if (actual := model_hash(folder)) != sha256.strip().lower():
         raise ModelError(
-            f"{folder}: a model whose {DESCRIPTION} has the SHA-256 {sha256} was wanted, but it is {came}; this "
-            "is another model, or it was changed."
+            f"expected a model whose {DESCRIPTION} has the SHA-256 {sha256}, got {actual}",
+            expected=sha256,
+            value=actual,
+            at=Place(folder),
+            remedy="this is another model, or it was changed",
         )
 
 
 def content_hash(description: bytes, weights: bytes) -> str:
-    """SHA-256 of the description, without its last two lines, and the weights: what compiled arrays are made from."""
+    """Return the SHA-256 of the sources of the compiled arrays: description without its last two lines, and weights."""
     return hashlib.sha256(description + weights).hexdigest()
 
 
 def ready_hash(folder: Path) -> str | None:
-    """Give the `content_hash` of a folder whose `compiled.npz` is the one that its description states; else None."""
+    """Return the `content_hash` of a folder if its `compiled.npz` has the hash in its description, else None."""
     try:
         description, weights, compiled = (
             read_model_file(folder, name) for name in (DESCRIPTION, WEIGHTS, COMPILED)
@@ -102,10 +106,10 @@ def ready_hash(folder: Path) -> str | None:
 
 
 def is_model(folder: Path) -> bool:
-    """Whether a folder holds the description of a model, of whatever format and state.
+    """Whether a folder contains the description of a model, of any format version and even if damaged.
 
     Raises:
-        OSError: the folder cannot be looked into.
+        OSError: the folder cannot be accessed.
     """
     path = folder / DESCRIPTION
     if not path.is_file():

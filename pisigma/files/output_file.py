@@ -1,4 +1,4 @@
-"""Writing one file whole or not at all, and never over an input or a part of a model."""
+"""Write a file completely or not at all, and never over an input or a part of a model."""
 
 import os
 from collections.abc import Iterable, Iterator
@@ -6,52 +6,66 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TextIO
 
-from pisigma.files.conflicts import Input, check_apart
-from pisigma.files.errors import OutputError
+from pisigma.files.conflicts import Input, check_conflicts
+from pisigma.files.errors import OutputError, Place
 from pisigma.files.scratch import FILE, scratch_beside, sweep
 
 
 def check_output(
     path: Path, suffixes: tuple[str, ...] = (), what: str = "", inputs: Iterable[Input] = ()
 ) -> None:
-    """Make sure that a file may be written: before the work, not after it.
+    """Check that a file may be written, before the work rather than after it.
 
     Args:
         path: the file.
-        suffixes: endings that it may have; () for any.
-        what: what the file is to hold, for the complaint about its ending.
-        inputs: files and folders that are read.
+        suffixes: file name extensions that are allowed; () for any.
+        what: contents of the file, for the message about its extension.
+        inputs: files and folders that the same call reads.
 
     Raises:
-        OutputError: another ending, an input, a part of a model, no regular file, or a folder that cannot be written
-            to.
+        OutputError: the path has another extension, is an input, a part of a model or not a regular file, or its folder
+            is missing or read-only.
     """
     if suffixes and path.suffix.lower() not in suffixes:
-        raise OutputError(f"{path}: {what} goes into a {' or '.join(suffixes)} file; choose another --out.")
+        endings = " or ".join(suffixes)
+        problem = f"{what} goes into a {endings} file"
+        raise _refusal(path, problem, expected=f"a {endings} file", value=path.suffix)
     try:
         if path.is_dir():
-            raise OutputError(f"{path}: is a folder; choose another --out.")
+            raise _refusal(path, "the output is a folder", expected="a file", value="a folder")
         if path.exists() and not path.is_file():
-            raise OutputError(f"{path}: is no regular file, but a device or a pipe; choose another --out.")
+            problem = "the output is not a regular file, but a device or a pipe"
+            raise _refusal(path, problem, expected="a file", value="a device or a pipe")
         if not path.parent.is_dir():
-            raise OutputError(f"{path}: there is no folder {path.parent}; make it or choose another --out.")
+            raise OutputError(
+                f"there is no folder {path.parent}",
+                expected="an existing folder",
+                value=str(path.parent),
+                at=Place(path),
+                remedy="create it or choose another --out",
+            )
         if not os.access(path.parent, os.W_OK):
-            raise OutputError(f"{path}: the folder cannot be written to; choose another --out.")
-        check_apart(path, inputs)
+            problem = f"the folder {path.parent} cannot be written to"
+            raise _refusal(path, problem, expected="a writable folder", value=str(path.parent))
+        check_conflicts(path, inputs)
     except OSError as problem:
-        raise _not_writable(path, problem) from None
+        raise not_writable(path, problem) from None
+
+
+def _refusal(path: Path, problem: str, expected: str, value: str) -> OutputError:
+    return OutputError(problem, expected=expected, value=value, at=Place(path), remedy="choose another --out")
 
 
 def check_page(page: Path, inputs: Iterable[Input] = ()) -> None:
-    """Make sure that an HTML page may be written; see `check_output`."""
+    """Check that an HTML page may be written; see `check_output`."""
     check_output(page, (".html", ".htm"), "a page", inputs)
 
 
 def write_whole(path: Path, content: str | bytes) -> None:
-    """Write the content beside `path` and move it there in one step; what was there is replaced.
+    """Write a file next to `path` and rename it to `path` in one step; an existing file is replaced.
 
     Raises:
-        OutputError: see `check_output`, or it cannot be written; nothing is left behind.
+        OutputError: see `check_output`, or writing fails; nothing is left behind.
     """
     with writing_whole(path) as file:
         if isinstance(content, bytes):
@@ -62,13 +76,13 @@ def write_whole(path: Path, content: str | bytes) -> None:
 
 @contextmanager
 def writing_whole(path: Path) -> Iterator[TextIO]:
-    """A text file beside `path` to write to bit by bit, moved there at the end; what was there is replaced.
+    """Open a text file next to `path` for writing and rename it to `path` at the end; an existing file is replaced.
 
-    Nothing is left behind where the block ends with an exception, an interruption among them; what a killed process
-    left behind is swept.
+    Nothing is left behind if the block ends with an exception or an interruption. Scratch files of killed processes are
+    removed.
 
     Raises:
-        OutputError: see `check_output`, or it cannot be written.
+        OutputError: see `check_output`, or writing fails.
     """
     check_output(path)
     try:
@@ -82,8 +96,14 @@ def writing_whole(path: Path) -> Iterator[TextIO]:
             scratch.chmod(0o644)
             os.replace(scratch, target)
     except OSError as problem:
-        raise _not_writable(path, problem) from None
+        raise not_writable(path, problem) from None
 
 
-def _not_writable(path: Path, problem: OSError) -> OutputError:
-    return OutputError(f"{path}: cannot be written ({problem.strerror}); choose another --out.")
+def not_writable(path: str | os.PathLike[str], problem: OSError) -> OutputError:
+    """Return the error of an output that the operating system does not let us write."""
+    return OutputError(
+        f"the output cannot be written: {problem.strerror}",
+        value=problem.strerror,
+        at=Place(path),
+        remedy="choose another --out",
+    )

@@ -1,17 +1,18 @@
-"""Writing a model folder whole or not at all, and never over anything but a model."""
+"""Write a model folder completely or not at all, and never over anything but a model."""
 
 import os
 from collections.abc import Collection, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from pisigma.files.conflicts import Input, check_apart
-from pisigma.files.errors import OutputError
+from pisigma.files.conflicts import Input, check_conflicts
+from pisigma.files.errors import OutputError, Place
 from pisigma.files.model_files import MODEL_FILES, is_model
+from pisigma.files.output_file import not_writable
 from pisigma.files.scratch import ASIDE, FOLDER, KEPT, scratch_beside, sweep
 
-MOST_NEW_FOLDERS = 100
-"""Folders in one another that are made for a model at most."""
+MAX_NEW_FOLDERS = 100
+"""Most nested folders that are created for a model."""
 
 
 def check_folder(
@@ -20,88 +21,99 @@ def check_folder(
     inputs: Iterable[Input] = (),
     names: Collection[str] = MODEL_FILES,
 ) -> None:
-    """Make sure that a model may be written to a folder: before the work, not after it.
+    """Check that a model may be written to a folder, before the work rather than after it.
 
     Args:
-        folder: to write; one that is empty is taken, and one that holds a model with `overwrite`.
-        overwrite: whether a model that is there may be replaced.
-        inputs: files and folders that are read.
-        names: of the files that may be replaced with the model.
+        folder: folder to write; it may be missing, empty or, with `overwrite`, a model.
+        overwrite: whether an existing model may be replaced.
+        inputs: files and folders that the same call reads.
+        names: names of the files that may be replaced with the model.
 
     Raises:
-        OutputError: it is a file, the working directory or above it, is, holds or lies in an input, lies in a model,
-            holds anything but a model, or a model without `overwrite`; it lies too many folders deep; or it
-            cannot be written to.
+        OutputError: the folder is a file, the working directory or a parent of it, conflicts with an input or another
+            model (see `check_conflicts`), contains anything but a model, or a model without `overwrite`, needs too many
+            new parent folders, or cannot be written to.
     """
     try:
         target = Path(os.path.realpath(folder))
         if target in (here := Path.cwd(), *here.parents):
-            raise OutputError(
-                f"{folder}: is the working directory, or the working directory lies in it; choose another --out."
-            )
+            problem = "the output is the working directory or contains it"
+            raise _refusal(folder, problem, expected="a folder of its own", value=str(here))
         parent = next(path for path in target.parents if path.exists())
-        if len(target.relative_to(parent).parts) > MOST_NEW_FOLDERS:
-            raise OutputError(
-                f"{folder}: more than {MOST_NEW_FOLDERS} folders in one another would have to be made; choose another "
-                "--out."
-            )
+        if (new := len(target.relative_to(parent).parts)) > MAX_NEW_FOLDERS:
+            problem = f"the output needs more than {MAX_NEW_FOLDERS} nested new folders"
+            raise _refusal(folder, problem, expected=f"{MAX_NEW_FOLDERS} new folders or fewer", value=new)
         if parent == target.parent:
             sweep(target)
-        check_apart(folder, inputs)
+        check_conflicts(folder, inputs)
         _check_content(folder, target, overwrite, names)
         with scratch_beside(parent / target.name, FOLDER):
             pass
     except OSError as problem:
-        raise _not_writable(folder, problem) from None
+        raise not_writable(folder, problem) from None
 
 
 def _check_content(
     folder: str | os.PathLike[str], target: Path, overwrite: bool, names: Collection[str]
 ) -> None:
-    """Refuse to replace what is there.
+    """Check that the existing contents of a folder may be replaced.
 
     Raises:
         OutputError: see `check_folder`.
-        OSError: it cannot be looked at.
+        OSError: the folder cannot be accessed.
     """
-    if target.exists() and not target.is_dir():
-        raise OutputError(f"{folder}: exists and is no model folder; choose another --out or remove it.")
-    if not target.is_dir() or not any(target.iterdir()):
+    if not target.exists() or (target.is_dir() and not any(target.iterdir())):
         return
     if not is_model(target):
-        raise OutputError(f"{folder}: exists and is no model folder; choose another --out or remove it.")
+        raise OutputError(
+            "the output exists and is not a model folder",
+            expected="a model folder",
+            at=Place(folder),
+            remedy="choose another --out or remove it",
+        )
     others = sorted(
         entry.name for entry in target.iterdir() if entry.name not in names or not entry.is_file()
     )
     if others:
         also = f" and {len(others) - 1} more" if len(others) > 1 else ""
         raise OutputError(
-            f"{folder}: holds a model, but also '{others[0]}'{also}, which pisigma does not write there; move that "
-            "away or choose another --out."
+            f"the output contains a model, but also '{others[0]}'{also}, not written by pisigma",
+            expected="a model alone",
+            value=others[0],
+            at=Place(folder),
+            remedy="move that away or choose another --out",
         )
     if not overwrite:
         raise OutputError(
-            f"{folder}: holds a model already; replace it with --overwrite (overwrite=True in Python) or choose "
-            "another --out."
+            "the output already contains a model",
+            expected="a new or empty folder",
+            at=Place(folder),
+            remedy="replace it with --overwrite (overwrite=True in Python) or choose another --out",
         )
+
+
+def _refusal(folder: str | os.PathLike[str], problem: str, expected: str, value: str | int) -> OutputError:
+    return OutputError(
+        problem, expected=expected, value=value, at=Place(folder), remedy="choose another --out"
+    )
 
 
 @contextmanager
 def staged_folder(
     folder: str | os.PathLike[str], overwrite: bool = False, names: Collection[str] = MODEL_FILES
 ) -> Iterator[Path]:
-    """Give a scratch folder that becomes `folder` when the block ends well, and is removed when it does not.
+    """Yield a scratch folder that becomes `folder` if the block succeeds, and is removed otherwise.
 
-    A process that is killed leaves the old model, the new one, or between two renames none under this name, but the old
-    one beside it, which the next call puts back; never a part of one.
+    A killed process leaves the old model or the new one, never a part of one. If it is killed between the two renames,
+    the old model is kept next to `folder` and restored by the next call.
 
     Args:
-        folder: to write; see `check_folder`.
-        overwrite: whether a model that is there may be replaced.
-        names: of the files that are written.
+        folder: folder to write; see `check_folder`.
+        overwrite: whether an existing model may be replaced.
+        names: names of the files that may be written.
 
     Raises:
-        OutputError: see `check_folder`, or something cannot be written.
+        OutputError: see `check_folder`, or writing fails.
     """
     check_folder(folder, overwrite, names=names)
     target = Path(os.path.realpath(folder))
@@ -112,16 +124,14 @@ def staged_folder(
             yield scratch
             strange = {entry.name for entry in scratch.iterdir()} - set(names)
             assert not strange, f"{sorted(strange)} could not be replaced later: name them in MODEL_FILES"
-            _check_content(
-                folder, target, overwrite, names
-            )  # somebody may have put something there meanwhile
+            _check_content(folder, target, overwrite, names)  # files may have been added meanwhile
             _replace(scratch, target)
     except OSError as problem:
-        raise _not_writable(folder, problem) from None
+        raise not_writable(folder, problem) from None
 
 
 def _replace(scratch: Path, target: Path) -> None:
-    """Put `scratch` where `target` is; what was there comes back when that fails."""
+    """Rename `scratch` to `target`; an existing folder is restored if that fails."""
     if not target.exists():
         os.replace(scratch, target)
         return
@@ -132,7 +142,3 @@ def _replace(scratch: Path, target: Path) -> None:
         except BaseException:
             os.replace(aside / KEPT, target)
             raise
-
-
-def _not_writable(folder: str | os.PathLike[str], problem: OSError) -> OutputError:
-    return OutputError(f"{folder}: cannot be written ({problem.strerror}); choose another --out.")

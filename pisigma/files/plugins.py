@@ -1,8 +1,8 @@
 """Plug-ins: modules from outside the package that register sensors, features, exports, error sources or closed forms.
 
-A plug-in is a program that runs with the rights of whoever calls pisigma. So only installed packages (entry points of
-the group `pisigma.plugins`) and the command line (`--plugin FILE`) name one: never a model, a recipe, a manifest or a
-cell, which others may have sent.
+A plug-in is a program that runs with the rights of the user. So only installed packages (entry points of the group
+`pisigma.plugins`) and the command line (`--plugin FILE`) can name one: never a model, a recipe, a manifest or a cell,
+which may come from someone else.
 """
 
 import contextlib
@@ -16,18 +16,18 @@ from importlib.machinery import SourceFileLoader
 from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
 
-from pisigma.files.errors import PluginError
+from pisigma.files.errors import Place, PluginError
 
 ENTRY_POINTS = "pisigma.plugins"
-"""Group of the entry points of installed packages."""
+"""Entry point group of plug-in packages."""
 
 
 @dataclass(frozen=True)
 class Plugins:
-    """What this process has loaded, for other processes to load too.
+    """The plug-ins that a process has loaded, to be loaded by its workers too.
 
     Attributes:
-        files: absolute paths, in the order in which they were loaded.
+        files: absolute paths in the order of loading.
         installed: whether the entry points of installed packages were loaded.
     """
 
@@ -35,7 +35,7 @@ class Plugins:
     installed: bool = False
 
     def load(self) -> None:
-        """Load all that this process has not loaded yet.
+        """Load the plug-ins that this process has not loaded yet.
 
         Raises:
             PluginError: a file or an entry point cannot be loaded.
@@ -45,7 +45,7 @@ class Plugins:
         load_files(self.files)
 
     def content(self) -> tuple[str, ...]:
-        """SHA-256 of every file, for results that depend on what they do."""
+        """Return the SHA-256 of every file, for caches of results that depend on the plug-ins."""
         return tuple(hashlib.sha256(Path(file).read_bytes()).hexdigest() for file in self.files)
 
 
@@ -53,12 +53,12 @@ _loaded = Plugins()
 
 
 def loaded() -> Plugins:
-    """Give what this process has loaded."""
+    """Return the plug-ins that this process has loaded."""
     return _loaded
 
 
 def load_installed() -> None:
-    """Import the modules that installed packages name as entry points; once a process.
+    """Import the modules that installed packages name as entry points, once per process.
 
     Raises:
         PluginError: one cannot be imported.
@@ -70,16 +70,16 @@ def load_installed() -> None:
 
     for point in entry_points(group=ENTRY_POINTS):
         origin = f"plug-in '{point.name}'" + (f" of {point.dist.name}" if point.dist else "")
-        with _as_plugin(origin, "mend or uninstall the package"):
+        with _as_plugin(origin, "repair or uninstall the package"):
             point.load()
     _loaded = Plugins(_loaded.files, True)
 
 
 def load_files(files: Iterable[str | os.PathLike[str]]) -> None:
-    """Run Python files as modules, each once a process.
+    """Run Python files as modules, each once per process.
 
     Raises:
-        PluginError: a file is missing, is no Python file, or cannot be run.
+        PluginError: a file is missing, is not a Python file, or cannot be run.
     """
     global _loaded
     for file in files:
@@ -87,14 +87,16 @@ def load_files(files: Iterable[str | os.PathLike[str]]) -> None:
         if str(path) in _loaded.files:
             continue
         if path.suffix != ".py" or not path.is_file():
-            raise PluginError(f"--plugin: expected a Python file (.py), got '{file}'; check the path.")
-        with _as_plugin(str(file), "correct the file"):
+            raise PluginError(
+                expected="a Python file (.py)", value=str(file), option="--plugin", remedy="check the path"
+            )
+        with _as_plugin("the plug-in", "correct the file", file):
             _run(path)
         _loaded = Plugins((*_loaded.files, str(path)), _loaded.installed)
 
 
 def _run(path: Path) -> None:
-    """Run a file as a module of a name of its own, under which other processes unpickle what it defines."""
+    """Run a file as a module with a unique name, under which other processes unpickle its objects."""
     name = f"pisigma_plugin_{path.stem}_{hashlib.sha256(str(path).encode()).hexdigest()[:8]}"
     spec = spec_from_file_location(name, path, loader=SourceFileLoader(name, str(path)))
     assert spec is not None
@@ -108,14 +110,17 @@ def _run(path: Path) -> None:
 
 
 @contextlib.contextmanager
-def _as_plugin(origin: str, advice: str) -> Iterator[None]:
-    """Say of a problem that it is the plug-in's; what it prints goes to stderr, as stdout is for results."""
+def _as_plugin(origin: str, remedy: str, file: str | os.PathLike[str] | None = None) -> Iterator[None]:
+    """Attribute any exception to the plug-in, and redirect its output to stderr, as stdout is for results."""
     try:
         with contextlib.redirect_stdout(sys.stderr):
             yield
-    except (Exception, SystemExit) as problem:  # nor may it end the command, as if that were done
+    except (Exception, SystemExit) as problem:  # SystemExit would end the command as if it had succeeded
         frames = traceback.extract_tb(problem.__traceback__)
         line = f", line {frames[-1].lineno} of {Path(frames[-1].filename).name}" if frames else ""
         raise PluginError(
-            f"{origin}: the plug-in cannot be loaded ({type(problem).__name__}: {problem}{line}); {advice}."
+            f"{origin} cannot be loaded: {type(problem).__name__}: {problem}{line}",
+            value=type(problem).__name__,
+            at=None if file is None else Place(file),
+            remedy=remedy,
         ) from problem

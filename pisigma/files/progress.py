@@ -1,20 +1,20 @@
-"""How a long computation says what it is doing."""
+"""Progress messages of long computations."""
 
 from collections.abc import Callable
 from functools import partial
 
 Progress = Callable[[str], None]
-"""Called with what is being done, in a few words."""
+"""Callback that receives a short description of the current step."""
 
 
 def silent(what: str) -> None:
-    """Say nothing, in processes that nobody listens to."""
+    """Ignore progress, for processes without a listener."""
 
 
 def stage(progress: Progress, name: str, separator: str = ": ") -> Progress:
-    """Give what a stage of a computation calls: the name of the stage stands before what it does.
+    """Return a callback that puts the name of a stage before each message.
 
-    It can be pickled where `progress` can, so that stages go to other processes too.
+    It can be pickled if `progress` can, so that stages may run in other processes.
     """
     return partial(_within_stage, progress, f"{name}{separator}")
 

@@ -1,7 +1,7 @@
-"""Scratch files and folders beside an output, which stay owned while their process lives and are swept after it died.
+"""Scratch files and folders next to an output, owned by a living process and removed after its death.
 
-The owner holds a lock on its scratch (flock(2)), which the kernel lets go of when the process ends, however it ends. So
-whoever gets the lock knows that nobody will finish or clear away what a kill left behind.
+The owner holds a lock on its scratch (flock(2)), which the kernel releases when the process ends for any reason. A
+process that gets the lock therefore knows that the owner was killed and that it may remove the scratch.
 """
 
 import contextlib
@@ -14,21 +14,21 @@ from contextlib import contextmanager
 from pathlib import Path
 
 FILE, FOLDER, ASIDE = ".part", ".partial", ".old"
-"""Endings of scratch files, of scratch folders, and of folders that hold what is about to be replaced."""
+"""Suffixes of scratch files, of scratch folders, and of folders with the output that is being replaced."""
 KEPT = "model"
-"""What a folder that is about to be replaced is called in its folder `ASIDE`."""
+"""Name of the folder that is being replaced within its folder with the suffix `ASIDE`."""
 
 
 @contextmanager
 def scratch_beside(target: Path, suffix: str) -> Iterator[Path]:
-    """Give a fresh scratch file or folder beside `target`; what is still there in the end is removed.
+    """Yield a new scratch file or folder next to `target`, and remove it at the end if it still exists.
 
     Args:
-        target: what is to be written; without links.
+        target: path to be written, links resolved.
         suffix: `FILE`, `FOLDER` or `ASIDE`.
 
     Raises:
-        OSError: it cannot be made.
+        OSError: the scratch cannot be created.
     """
     prefix = f".{target.name}."
     if suffix == FILE:
@@ -45,13 +45,13 @@ def scratch_beside(target: Path, suffix: str) -> Iterator[Path]:
 
 
 def sweep(target: Path) -> None:
-    """Remove what killed processes left beside `target`; what they had put aside comes back where `target` is gone.
+    """Remove the scratch of killed processes next to `target`, and restore a moved `target` if it is missing.
 
     Args:
-        target: what is to be written; without links.
+        target: path to be written, links resolved.
     """
     ours = re.compile(rf"\.{re.escape(target.name)}\.[a-z0-9_]{{8}}(\{FILE}|\{FOLDER}|\{ASIDE})")
-    with contextlib.suppress(OSError):  # of a folder that cannot be read, nothing can be swept
+    with contextlib.suppress(OSError):  # nothing can be removed from a folder that cannot be read
         for path in [path for path in target.parent.iterdir() if ours.fullmatch(path.name)]:
             with _owned(path) as owned:
                 if owned and (path / KEPT).is_dir() and not target.exists():
@@ -62,9 +62,9 @@ def sweep(target: Path) -> None:
 
 @contextmanager
 def _owned(path: Path) -> Iterator[bool]:
-    """Hold the lock of a scratch; says whether that succeeded, which it does not where another process holds it."""
+    """Hold the lock of a scratch; yields False if another process holds it."""
     handle = None
-    with contextlib.suppress(OSError, ImportError):  # there are file systems without such locks, and Windows
+    with contextlib.suppress(OSError, ImportError):  # some file systems and Windows have no such locks
         import fcntl
 
         handle = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)

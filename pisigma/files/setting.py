@@ -1,7 +1,7 @@
-"""Settings that are stated once: fields of a dataclass, of which command lines and pages of the documentation are made.
+"""Settings as fields of a dataclass, from which command-line options and pages of the documentation are generated.
 
-The type and the default of a setting are those of the field, what it means is what the docstring of the class says of
-the attribute, and an `Option` in the annotation says what a command line has otherwise.
+The type and the default of a setting are those of the field, its help is the attribute's text in the docstring of the
+class, and an `Option` in the annotation states how the command line differs.
 """
 
 import math
@@ -14,66 +14,66 @@ from pathlib import Path
 from typing import Annotated, Any, ForwardRef, Literal, Union, get_args, get_origin
 
 UNITS = {"mm": ("m", 1e-3), "mrad": ("rad", 1e-3), "deg": ("rad", math.pi / 180.0), "ms": ("s", 1e-3)}
-"""Units of command lines, with those of settings and what one of them is there."""
+"""Units of the command line, with the unit of the setting and the conversion factor."""
 
 
 @dataclass(frozen=True)
 class Option:
-    """How a setting is stated on a command line, where its name and type do not say.
+    """How the command line states a setting, where that does not follow from its name and type.
 
     Attributes:
-        name: of the option, such as "--class"; None for that of the setting.
-        kind: type of what is stated, where it is not that of the setting.
-        read: makes the setting of what is stated.
-        unit: that is stated, one of `UNITS`; `read` turns it into that of the setting where there is one.
-        least: that can be stated.
-        most: that can be stated.
-        metavar: what stands for the value in the help.
-        default: what the help shows where the setting's own default is of another type.
-        hidden: whether only Python states it.
+        name: name of the option, such as "--class"; None: made from the name of the setting.
+        kind: type of the command-line value if it differs from that of the setting.
+        read: function that converts the command-line value to the setting.
+        unit: unit of the command-line value, one of `UNITS`; `read`, if given, has to convert it.
+        min: smallest value that is accepted.
+        max: largest value that is accepted.
+        metavar: placeholder of the value in the help.
+        default: default that the help shows if that of the setting has another type.
+        hidden: whether the setting has no option and can be set in Python only.
     """
 
     name: str | None = None
     kind: Any = None
     read: Callable[[Any], Any] | None = None
     unit: str | None = None
-    least: float | int | None = None
-    most: float | int | None = None
+    min: float | int | None = None
+    max: float | int | None = None
     metavar: str | None = None
     default: Any = None
     hidden: bool = False
 
 
 HIDDEN = Option(hidden=True)
-"""Of settings that only Python states."""
+"""For settings that can be set in Python only."""
 FILE = Option(kind=Path, read=str)
-"""Of settings that are a path as text."""
+"""For settings that are a path as text."""
 
 
 def texts(stated: Iterable[object]) -> tuple[str, ...]:
-    """What is stated, as texts."""
+    """Convert several command-line values to texts."""
     return tuple(map(str, stated))
 
 
 def names(stated: str) -> tuple[str, ...]:
-    """Names with commas between."""
+    """Split names that are separated by commas."""
     return tuple(name.strip() for name in stated.split(",")) if stated else ()
 
 
 NAMES = Option(kind=str, read=names)
-"""Of settings that are several names."""
+"""For settings that are several names."""
 
 
 @dataclass(frozen=True)
 class Setting:
-    """A setting of a class as a command line states it.
+    """A setting of a class, as an option of the command line.
 
     Attributes:
-        field: its name in Python.
-        kind: type of what is stated, or the class of a group of settings.
-        default: what holds where nothing is stated, in the option's unit.
-        is_required: whether it has no default.
-        help: what it means.
+        field: name of the field in Python.
+        kind: type of the command-line value, or the class of a group of settings.
+        default: default in the unit of the option.
+        is_required: whether there is no default.
+        help: help text of the option.
         option: see `Option`.
     """
 
@@ -86,25 +86,25 @@ class Setting:
 
     @property
     def is_group(self) -> bool:
-        """Whether it is made of settings of its own."""
+        """Whether the setting is itself a dataclass of settings."""
         return self.option.kind is None and is_dataclass(self.kind)
 
     @property
     def name(self) -> str:
-        """The option, such as "--prior-mm"."""
+        """Name of the option, such as "--prior-mm"."""
         return self.option.name or f"--{self.field.replace('_', '-')}"
 
     def read(self, stated: Any) -> Any:
-        """The setting by what a command line states."""
+        """Convert a command-line value to the setting."""
         if self.option.read is not None:
             return self.option.read(stated)
         return stated if self.option.unit is None else stated * UNITS[self.option.unit][1]
 
 
 def settings_of(group: type) -> list[Setting]:
-    """The settings of a class that a command line states.
+    """Return the settings of a class that have command-line options.
 
-    A type that cannot be resolved, as it is imported for type checkers alone, is stated as text.
+    A setting whose type cannot be resolved, because it is imported for type checkers only, is read as text.
     """
     meanings, found = attributes_of(group), []
     for one in fields(group):
@@ -123,7 +123,7 @@ def settings_of(group: type) -> list[Setting]:
 
 
 def attributes_of(documented: type) -> dict[str, str]:
-    """What the docstring of a class says of every attribute."""
+    """Return the text of every attribute in the docstring of a class."""
     lines = (documented.__doc__ or "").partition("Attributes:")[2].splitlines()
     found: dict[str, str] = {}
     last = ""
@@ -148,7 +148,7 @@ def _resolved(kind: Any, names: dict[str, Any]) -> Any:
 
 
 def _stated_as(kind: Any) -> Any:
-    """The type that a command line has for that of a setting: lists for tuples of any length, text for choices."""
+    """Return the command-line type for the type of a setting: lists for tuples of any length, text for choices."""
     arguments = get_args(kind)
     if get_origin(kind) is Literal:
         return str
@@ -170,10 +170,10 @@ def _stated_default(default: Any, option: Option) -> Any:
 
 
 def _help(meaning: str, option: Option, is_repeated: bool) -> str:
-    """What an option means, in sentences and with its unit; what None means is its default."""
+    """Return the help of an option: full sentences in the option's unit, with the meaning of None as the default."""
     if option.unit is not None:
         meaning = meaning.replace(f"[{UNITS[option.unit][0]}]", f"[{option.unit}]")
     meaning = re.sub(r"[;.]? None: ([^.]*)\.?$", r". [default: \1]", meaning)
-    begins_with_choice = meaning.partition(" ")[0].endswith(":")
-    sentence = meaning if begins_with_choice else meaning[:1].upper() + meaning[1:]
+    starts_with_choice = meaning.partition(" ")[0].endswith(":")
+    sentence = meaning if starts_with_choice else meaning[:1].upper() + meaning[1:]
     return f"{sentence} May be repeated." if is_repeated else sentence

@@ -1,4 +1,4 @@
-"""Texts from templates: Python computes, a template holds layout and wording."""
+"""Texts from templates: Python computes, the template defines layout and wording."""
 
 from collections.abc import Callable
 from typing import Any
@@ -7,12 +7,13 @@ import jinja2
 
 
 def template_environment(package: str, filters: dict[str, Callable[..., Any]]) -> jinja2.Environment:
-    """Read templates from the folder `templates` of a package; a name that nothing was filled in for is an error.
+    """Return an environment that reads templates from the folder `templates` of a package.
+
+    An undefined name is an error. Values in templates whose names end with .html.j2 are escaped.
 
     Args:
-        package: such as "pisigma.reporting".
-        filters: functions that templates call, by name. What a template whose name ends with .html.j2 fills in shows
-            as text, whatever it holds.
+        package: name of the package, such as "pisigma.reporting".
+        filters: functions that templates may call, by name.
     """
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader(package),

@@ -1,10 +1,10 @@
-"""Reading YAML files into validated, typed documents, with file and line in every complaint."""
+"""Read YAML files as validated, typed documents; every error carries file, line and key."""
 
 import functools
 import json
 import os
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Annotated, Any, TypeVar, Union
@@ -21,49 +21,49 @@ from pydantic import (
 )
 from pydantic_core import CoreSchema, core_schema
 
-from pisigma.files.errors import PisigmaError, nearest_choice
+from pisigma.files.errors import PisigmaError, Place, nearest_choice
 from pisigma.files.input_file import read_text
 
-MOST_BYTES = 2**18
-"""Of a file that people write: reading it takes two seconds."""
-MOST_VALUES = 200_000
-"""Values that a file may hold, aliases written out; `LETTERS_OF_VALUE` of a text count as one."""
-LETTERS_OF_VALUE = 64
+MAX_BYTES = 2**18
+"""Largest YAML file that people write; reading it takes two seconds."""
+MAX_VALUES = 200_000
+"""Most values in a file with its aliases expanded; `CHARACTERS_PER_VALUE` characters of a text count as one."""
+CHARACTERS_PER_VALUE = 64
 SAFE_DEPTH = 2000
-"""Nested lists and mappings for which the stack of libyaml, which does not watch it, surely suffices."""
+"""Nesting depth that libyaml, which does not check its stack, certainly parses without overflow."""
 
 
 class Section(BaseModel):
-    """Base of every section of a file that people write: frozen, and no key that it does not know."""
+    """Base class of all sections of files that people write: frozen, and without unknown keys."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
 
 Seed = Annotated[int, Field(ge=0, lt=2**63)]
-"""Of a generator of random numbers."""
-MOST_POSES = 100_000
-Count = Annotated[int, Field(ge=1, le=MOST_POSES)]
-"""Of poses or rows to simulate; more would take gigabytes."""
+"""Seed of a random number generator."""
+MAX_POSES = 100_000
+Count = Annotated[int, Field(ge=1, le=MAX_POSES)]
+"""Number of poses or rows to simulate; more would take gigabytes."""
 
 
 @dataclass(frozen=True, eq=False)
 class OneOf:
-    """Annotates a value as a section of a registry, chosen by its `kind`; sections may be registered later.
+    """Annotation of a value that is a section of a registry, selected by its `kind`.
 
     `Annotated[AbstractErrorSource, OneOf(ERROR_SOURCES)]` reads `{kind: encoder, ...}` as the section that is
-    registered as "encoder", and its complaints list what is registered then.
+    registered as "encoder". Sections may be registered later; errors list those registered at the time of reading.
 
     Attributes:
-        registry: two sections or more by their kinds.
+        registry: two or more section classes by kind.
     """
 
     registry: Mapping[str, type[Section]]
 
-    def _sections(self) -> Any:  # a TypeAdapter, which beartype does not take for a type
+    def _sections(self) -> Any:  # a TypeAdapter, which beartype does not accept as a type
         return _one_of(tuple(self.registry.values()))
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
-        """How pydantic reads the value: by the registry as it is when it reads."""
+        """Validate with the sections that are registered at the time of reading."""
         plain = core_schema.no_info_plain_validator_function
         return core_schema.json_or_python_schema(plain(self._from_json), plain(self._from_python))
 
@@ -76,7 +76,7 @@ class OneOf:
     def __get_pydantic_json_schema__(
         self, schema: CoreSchema, handler: GetJsonSchemaHandler
     ) -> dict[str, Any]:
-        """What may be written there now."""
+        """Return the JSON schema of the sections that are registered now."""
         return handler(self._sections().core_schema)
 
 
@@ -91,7 +91,7 @@ _Path = tuple[str | int, ...]
 
 
 class _PlainLoader(yaml.SafeLoader):
-    """YAML's safe loader with the plain scalars of YAML 1.2, refusing a key that stands twice.
+    """YAML's safe loader with the plain scalars of YAML 1.2, which rejects duplicate keys.
 
     YAML 1.1 reads `010` as 8, `1:30` as 90, `no` as false and `1e-3` as text. Here they are 10, text, text
     and 0.001.
@@ -101,7 +101,7 @@ class _PlainLoader(yaml.SafeLoader):
 
 
 class _CompiledLoader(yaml.CSafeLoader if yaml.__with_libyaml__ else yaml.SafeLoader):  # type: ignore[misc]
-    """The same by libyaml, ten times as fast."""
+    """The same loader on libyaml, ten times as fast."""
 
     yaml_implicit_resolvers: dict[str, Any] = {}  # noqa: RUF012
 
@@ -112,9 +112,9 @@ def _construct_mapping(loader: Any, node: yaml.MappingNode) -> dict[Any, Any]:
         key = loader.construct_object(key_node, deep=True)
         mark = key_node.start_mark
         if not isinstance(key, str):
-            raise yaml.constructor.ConstructorError(None, None, f"the key {key!r} is no text", mark)
+            raise yaml.constructor.ConstructorError(None, None, f"the key {key!r} is not a text", mark)
         if key in mapping:
-            raise yaml.constructor.ConstructorError(None, None, f"the key '{key}' stands twice", mark)
+            raise yaml.constructor.ConstructorError(None, None, f"the key '{key}' appears twice", mark)
         mapping[key] = loader.construct_object(value_node, deep=True)
     return mapping
 
@@ -124,7 +124,7 @@ def _construct_number(loader: Any, node: yaml.ScalarNode) -> int | float:
     try:
         return float(text.replace(".inf", "inf").replace(".nan", "nan").lower())
     except ValueError:
-        problem = f"'{text}' is no number"
+        problem = f"'{text}' is not a number"
         raise yaml.constructor.ConstructorError(None, None, problem, node.start_mark) from None
 
 
@@ -149,7 +149,7 @@ for _tag, _pattern, _first in (
 
 
 class _QuotingDumper(yaml.SafeDumper):
-    """YAML's safe dumper, which puts texts into quotes that read as something else by YAML 1.1 or 1.2."""
+    """YAML's safe dumper, which quotes texts that YAML 1.1 or 1.2 would read as something else."""
 
 
 for _letter, _resolvers in _PlainLoader.yaml_implicit_resolvers.items():
@@ -158,16 +158,16 @@ for _letter, _resolvers in _PlainLoader.yaml_implicit_resolvers.items():
 
 
 def yaml_text(content: dict[str, Any]) -> str:
-    """Give plain values as YAML text that this and other readers read back as they are."""
+    """Format plain values as YAML text that any YAML 1.1 or 1.2 reader restores unchanged."""
     text: str = yaml.dump(content, Dumper=_QuotingDumper, sort_keys=False, allow_unicode=True)
     return text
 
 
 def plain_content(text: str, error: type[PisigmaError], source: str) -> Any:
-    """Give what YAML text holds, as plain values; for documents whose form has to be looked at first.
+    """Parse YAML text as plain values, for documents whose format has to be determined first.
 
     Raises:
-        error: it is no YAML, or holds too much.
+        error: the text is not valid YAML, or has too many values.
     """
     return _load(text, error, source)[1]
 
@@ -177,61 +177,66 @@ def read_yaml(path: str | os.PathLike[str], document: type[Document], error: typ
 
     Args:
         path: the file.
-        document: the pydantic model that says what the file may hold.
-        error: the exception to raise, so that callers can tell a bad recipe from a bad robot.
+        document: pydantic model of the file.
+        error: class of the exception to raise, so that callers can distinguish a bad recipe from a bad robot.
 
     Raises:
-        error: the file is missing, no YAML, or does not fit; the message names file, line and key.
+        error: the file is missing, is not valid YAML, or does not fit the model; its `file`, `line` and `column` (the
+            key, such as "rows.2.a_mm") say where.
     """
-    return parse_yaml(read_text(path, error, "YAML", MOST_BYTES), document, error, source=str(path))
+    return parse_yaml(read_text(path, error, "YAML", MAX_BYTES), document, error, source=str(path))
 
 
 def parse_yaml(text: str, document: type[Document], error: type[PisigmaError], source: str) -> Document:
-    """Read YAML text as a `document`; `source` is what complaints call it. See `read_yaml`.
+    """Read YAML text as a `document`; `source` is its name in errors. See `read_yaml`.
 
-    Types are taken strictly: a text is no number, and a number no text.
+    Types are strict: a text is not accepted as a number, nor a number as a text.
     """
     node, content = _load(text, error, source)
     if node is None or not isinstance(content, dict):
-        raise error(f"{source}: a YAML mapping of keys to values was wanted, but it holds none.")
+        raise error(expected="a YAML mapping of keys to values", at=Place(source))
     try:
-        # By way of JSON, because strict validation of Python objects wants tuples where YAML has lists.
+        # By way of JSON, because strict validation of Python objects expects tuples where YAML has lists.
         return document.model_validate_json(json.dumps(content), strict=True)
     except TypeError as problem:
-        raise error(f"{source}: {problem}; write numbers, texts, lists and mappings without tags.") from None
+        remedy = "write numbers, texts, lists and mappings without tags"
+        raise error(str(problem), expected="plain values", at=Place(source), remedy=remedy) from None
     except ValidationError as problem:
-        raise error(_complaint(problem, node, document, source)) from None
+        raise _error_of(problem, node, document, error, source) from None
 
 
-def line_of(path: str | os.PathLike[str], keys: _Path) -> int:
-    """Line of a YAML file, counted from 1, on which the value under `keys` stands; as near as the keys lead.
+def place_of_key(path: str | os.PathLike[str], keys: _Path) -> Place:
+    """Return the place of the value under `keys` in a YAML file, or of its innermost section that the file has.
 
-    For complaints about values that only other things than the file's form can judge.
+    For errors of values that are checked against something else than the file's own format, such as a robot.
     """
-    node, _ = _load(read_text(path, PisigmaError, "YAML", MOST_BYTES), PisigmaError, str(path))
-    return _locate(node, keys)[0] if node else 1
+    node, _ = _load(read_text(path, PisigmaError, "YAML", MAX_BYTES), PisigmaError, str(path))
+    return Place(path, _locate(node, keys)[0] if node else 1, _dotted(keys))
 
 
 def _load(text: str, error: type[PisigmaError], source: str) -> tuple[yaml.Node | None, Any]:
-    """The YAML nodes, for places, and what they hold."""
+    """Return the root node, which knows the lines, and the document as plain values."""
     try:
         loader, node = _composed(text)
-        if node is not None and _count(node, {}) > MOST_VALUES:
+        if node is not None and _count(node, {}) > MAX_VALUES:
             raise error(
-                f"{source}: holds more than {MOST_VALUES:,} values with its aliases written out; fewer were wanted."
+                f"the file has more than {MAX_VALUES:,} values with its aliases expanded",
+                expected=f"{MAX_VALUES} values or fewer",
+                at=Place(source),
             )
         return node, loader.construct_document(node) if node else None
     except yaml.YAMLError as problem:
         mark = getattr(problem, "problem_mark", None)
-        place = f"{source}, line {mark.line + 1}" if mark else source
         what = getattr(problem, "problem", None) or " ".join(str(problem).split())
-        raise error(f"{place}: {what}; correct the YAML there.") from None
+        at = Place(source, mark.line + 1 if mark else None)
+        raise error(what, expected="valid YAML", at=at, remedy="correct the YAML there") from None
     except RecursionError:
-        raise error(f"{source}: is nested too deeply or within itself; correct the YAML.") from None
+        what = "the document is nested too deeply or within itself"
+        raise error(what, expected="valid YAML", at=Place(source), remedy="correct the YAML") from None
 
 
 def _composed(text: str) -> tuple[Any, yaml.Node | None]:
-    """The loader and its nodes: libyaml's, but where it could overflow its stack, or has a complaint less plain."""
+    """Return a loader and the root node: of libyaml, unless it might overflow its stack or fails (less clearly)."""
     longest_line = max(map(len, text.splitlines()), default=0)
     if text.count("[") + text.count("{") + 2 * longest_line < SAFE_DEPTH:
         with suppress(yaml.YAMLError):
@@ -240,59 +245,82 @@ def _composed(text: str) -> tuple[Any, yaml.Node | None]:
 
 
 def _count(node: yaml.Node, known: dict[int, int]) -> int:
-    """Number of values at and below a node, long texts as several, and aliases wherever they stand."""
+    """Count the values at and below a node; long texts count as several, aliases once per use."""
     if id(node) not in known:
         children: list[yaml.Node] = []
         if isinstance(node, yaml.MappingNode):
             children = [child for pair in node.value for child in pair]
         elif isinstance(node, yaml.SequenceNode):
             children = node.value
-        letters = len(node.value) if isinstance(node, yaml.ScalarNode) else 0
-        known[id(node)] = 1 + letters // LETTERS_OF_VALUE + sum(_count(child, known) for child in children)
+        characters = len(node.value) if isinstance(node, yaml.ScalarNode) else 0
+        own = 1 + characters // CHARACTERS_PER_VALUE
+        known[id(node)] = own + sum(_count(child, known) for child in children)
     return known[id(node)]
 
 
-def _complaint(problem: ValidationError, node: yaml.Node, document: type[BaseModel], source: str) -> str:
-    """Say in one sentence what the first finding is and where it stands."""
+def _error_of(
+    problem: ValidationError,
+    node: yaml.Node,
+    document: type[BaseModel],
+    error: type[PisigmaError],
+    source: str,
+) -> PisigmaError:
+    """Make an error of the first finding of pydantic, unknown keys before others as they often cause them."""
     errors = problem.errors()
     first = next((item for item in errors if item["type"] == "extra_forbidden"), errors[0])
-    path: _Path = first["loc"]
+    found = _error_at(first, node, document, error, source)
+    others = len(errors) - 1
+    if not others:
+        return found
+    return found.followed_by(f" {others} more mistake{'s' if others > 1 else ''} in this file.")
+
+
+def _error_at(
+    finding: Any, node: yaml.Node, document: type[BaseModel], error: type[PisigmaError], source: str
+) -> PisigmaError:
+    """Make an error of one finding of pydantic."""
+    path: _Path = finding["loc"]
     line, keys = _locate(node, path)
-    key = ".".join(str(part) for part in keys) or "the file"
-    where = f"{source}, line {line}"
-    more = f" ({len(errors) - 1} more findings)" if len(errors) > 1 else ""
-    context = first.get("ctx", {})
-    if first["type"] == "extra_forbidden":
-        section = ".".join(str(part) for part in keys[:-1]) or "the file"
+    context, value = finding.get("ctx", {}), finding["input"]
+    if finding["type"] == "extra_forbidden":
         hint = nearest_choice(str(keys[-1]), valid_keys(document, path[:-1]))
-        return f"{where}: unknown key '{keys[-1]}' in '{section}'; {hint}{more}"
-    if first["type"] == "missing":
-        return f"{where}: the key '{path[-1]}' is missing in '{key}'; add it.{more}"
-    if first["type"] == "union_tag_not_found":
+        at = Place(source, line, _dotted(keys))
+        return error(f"unknown key '{keys[-1]}'", value=keys[-1], at=at, remedy=hint)
+    if finding["type"] == "missing":
+        at = Place(source, line, _dotted((*keys, path[-1])))
+        return error(f"the key '{path[-1]}' is missing", expected="a value", at=at, remedy="add it")
+    if finding["type"].startswith("union_tag"):
         tag = str(context["discriminator"]).strip("'()")
-        choices = ", ".join(allowed_texts(document, (*path, tag)))
-        return f"{where}: the key '{tag}' is missing in '{key}'; add it. Valid: {choices}.{more}"
-    if first["type"] == "union_tag_invalid":
-        path = (*path, str(context["discriminator"]).strip("'()"))
+        path = (*path, tag)
+        if finding["type"] == "union_tag_not_found":
+            at, choices = Place(source, line, _dotted((*keys, tag))), allowed_texts(document, path)
+            remedy = f"add it. Valid: {', '.join(choices)}."
+            return error(f"the key '{tag}' is missing", expected="a value", at=at, remedy=remedy)
         line, keys = _locate(node, path)
-        return _wrong_choice(source, line, keys, str(context["tag"]), allowed_texts(document, path)) + more
-    if first["type"] == "literal_error" and (texts := allowed_texts(document, path)):
-        return _wrong_choice(source, line, keys, str(first["input"]), texts) + more
-    message = first["msg"].removeprefix("Value error, ").rstrip(".")
-    value = first["input"]
-    came = f", but got {value!r}" if isinstance(value, str | int | float) else ""
-    return f"{where}: '{key}': {message[:1].lower()}{message[1:]}{came}.{more}"
+        value = context["tag"]
+    at = Place(source, line, _dotted(keys) or None)
+    if finding["type"] in ("union_tag_invalid", "literal_error") and (texts := allowed_texts(document, path)):
+        return error(f"unknown value '{value}'", value=value, at=at, remedy=nearest_choice(str(value), texts))
+    value = value if isinstance(value, str | int | float) else None
+    message = finding["msg"].removeprefix("Value error, ").rstrip(".")
+    if message.startswith("Input should be "):
+        expected = message.removeprefix("Input should be ")
+        is_bound = expected.startswith(("greater", "less"))
+        return error(expected=f"a number {expected}" if is_bound else expected, value=value, at=at)
+    problem, _, remedy = f"{message[:1].lower()}{message[1:]}".partition("; ")
+    problem = f"{problem}, got {value!r}" if value is not None else problem
+    return error(problem, value=value, at=at, remedy=remedy)
 
 
-def _wrong_choice(source: str, line: int, keys: list[str | int], stated: str, choices: list[str]) -> str:
-    key = ".".join(str(part) for part in keys)
-    return f"{source}, line {line}: '{key}' cannot be '{stated}'; {nearest_choice(stated, choices)}"
+def _dotted(keys: Iterable[str | int]) -> str:
+    """Join keys to a column of a `Place`."""
+    return ".".join(map(str, keys))
 
 
 def _locate(node: yaml.Node, path: _Path) -> tuple[int, list[str | int]]:
-    """Follow a validation path through the YAML nodes as far as it goes; give the line and the keys followed.
+    """Follow a validation path through the YAML nodes as far as it leads; return the line and the keys followed.
 
-    Parts of the path that are no keys (tags of discriminated unions) are passed over.
+    Parts of the path that are not keys (tags of discriminated unions) are skipped.
     """
     line = node.start_mark.line + 1
     keys: list[str | int] = []
@@ -315,12 +343,12 @@ _Schema = dict[str, Any]
 
 
 def valid_keys(document: type[BaseModel], path: _Path) -> set[str]:
-    """Keys that are valid where a validation path leads."""
+    """Return the keys that are valid at the end of a validation path."""
     return {key for schema in _follow(document, path) for key in schema.get("properties", {})}
 
 
 def allowed_texts(document: type[BaseModel], path: _Path) -> list[str]:
-    """Texts that are allowed where a validation path leads, sorted; none where any text is."""
+    """Return the texts that are allowed at the end of a validation path, sorted; none where any text is allowed."""
     texts: set[str] = set()
     for schema in _follow(document, path):
         values = [schema["const"]] if "const" in schema else schema.get("enum", [])
@@ -329,7 +357,7 @@ def allowed_texts(document: type[BaseModel], path: _Path) -> list[str]:
 
 
 def _follow(document: type[BaseModel], path: _Path) -> list[_Schema]:
-    """Plain schemas at the end of a validation path, which holds keys, indices and tags of unions."""
+    """Return the plain schemas at the end of a validation path of keys, indices and union tags."""
     schema = document.model_json_schema()
     definitions = schema.get("$defs", {})
     nodes = _alternatives([schema], definitions)
@@ -346,7 +374,7 @@ def _follow(document: type[BaseModel], path: _Path) -> list[_Schema]:
                 following.append(candidate["additionalProperties"])
         if following:
             nodes = _alternatives(following, definitions)
-        else:  # a union's tag: keep the alternative of that tag
+        else:  # the tag of a union: keep the alternative with that tag
             nodes = [candidate for candidate in nodes if part in _tags(candidate)] or nodes
     return nodes
 
@@ -356,7 +384,7 @@ def _tags(schema: _Schema) -> list[Any]:
 
 
 def _alternatives(nodes: list[_Schema], definitions: dict[str, _Schema]) -> list[_Schema]:
-    """Resolve references and unions into the plain schemas that they stand for."""
+    """Resolve references and unions into plain schemas."""
     plain: list[_Schema] = []
     open_nodes = list(nodes)
     while open_nodes:

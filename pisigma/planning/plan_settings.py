@@ -85,7 +85,7 @@ class PlanSettings:
 
     def __post_init__(self) -> None:
         """Refuse settings that are none."""
-        from pisigma.files.yaml_file import MOST_POSES
+        from pisigma.files.yaml_file import MAX_POSES
 
         check_choice(PlanningError, "sensor", self.sensor, get_args(SensorKind))
         check_choice(PlanningError, "criterion", self.criterion, get_args(Criterion))
@@ -95,7 +95,7 @@ class PlanSettings:
                 "for no other one."
             )
         for name, least in (("count", 1), ("check", 0), ("candidates", 1), ("seed", 0)):
-            most = 2**63 - 1 if name == "seed" else MOST_POSES
+            most = 2**63 - 1 if name == "seed" else MAX_POSES
             if not least <= getattr(self, name) <= most:
                 raise PlanningError(f"{name}: {least} to {most:,} was wanted, got {getattr(self, name):,}.")
         for name in ("sigma_mm", "limit_mm"):

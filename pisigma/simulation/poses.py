@@ -11,7 +11,7 @@ from pydantic import Field, field_validator, model_validator
 from torch import Tensor
 
 from pisigma.files.errors import RecipeError
-from pisigma.files.yaml_file import MOST_POSES, Count, Section, Seed
+from pisigma.files.yaml_file import MAX_POSES, Count, Section, Seed
 from pisigma.robot.description import Robot
 from pisigma.robot.se3 import rotation_from_rpy, transform
 from pisigma.simulation.errors.source import stated_joints
@@ -148,10 +148,8 @@ class JointsRandom(Section):
 
 
 def _check_count(count: int) -> None:
-    if count > MOST_POSES:
-        raise ValueError(
-            f"the grid has {count:,} poses, {MOST_POSES:,} at most were wanted; take fewer steps"
-        )
+    if count > MAX_POSES:
+        raise ValueError(f"the grid has {count:,} poses, {MAX_POSES:,} at most were wanted; take fewer steps")
 
 
 class AbstractPoses(Section, ABC):

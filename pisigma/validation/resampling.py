@@ -22,7 +22,7 @@ class Bootstrap:
         confidence: confidence level of an interval.
     """
 
-    resamples: Annotated[int, Option(least=2)] = 2000
+    resamples: Annotated[int, Option(min=2)] = 2000
     seed: int = 0
     confidence: Annotated[float, HIDDEN] = 0.95
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import torch
 
 from pisigma.calibration.geometric.initial_guess.base_and_tool import fit_base_and_tool
-from pisigma.files.engines.processes import in_processes
+from pisigma.files.engines.processes import run_in_processes
 from pisigma.files.errors import MeasurementError, RecipeError
 from pisigma.files.progress import Progress, silent, stage
 from pisigma.measurement.dataset import Measurements
@@ -319,7 +319,7 @@ def cross_validate(
         )
         for number, (training, test) in enumerate(folds, start=1)
     ]
-    comparisons = (task() for task in tasks) if jobs is None else in_processes(tasks, jobs)
+    comparisons = (task() for task in tasks) if jobs is None else run_in_processes(tasks, jobs)
     for (_, test), comparison in zip(folds, comparisons, strict=True):
         not_predicted += comparison.not_predicted
         nominal.put(test, comparison.nominal)

@@ -46,7 +46,7 @@ class Settings:
         lens: that sees.
     """
 
-    count: Annotated[int, Option(least=1)] = 5
+    count: Annotated[int, Option(min=1)] = 5
     is_class: Annotated[str | None, Option("--class")] = None
     bright: bool = True
     marks: tuple[int, ...] = ()

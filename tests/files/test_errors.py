@@ -1,32 +1,39 @@
-"""Messages may stand on a terminal, whatever a file has put into them."""
+"""Messages are built from fields and are safe to print on a terminal."""
 
 import json
 import pickle
 
 import pytest
 
-from pisigma.files.errors import LONGEST_TEXT, MissingExtraError, PisigmaError, Place, RobotError, printable
+from pisigma.files.errors import (
+    MAX_MESSAGE_CHARACTERS,
+    MissingExtraError,
+    PisigmaError,
+    Place,
+    RobotError,
+    printable,
+)
 
 
 @pytest.mark.parametrize("odd", ["\x1b[31m", "\x00", "\x9b2J", "\u202e", "\udcff", "\x07", "\r"])
-def test_what_moves_the_cursor_is_written_out(odd: str):
+def test_control_characters_are_escaped(odd: str):
     sentence = str(RobotError(f"row '{odd}': unknown"))
     assert sentence == f"row '{ascii(odd)[1:-1]}': unknown"
     assert sentence.isprintable()
 
 
-def test_what_people_write_stays():
+def test_printable_text_is_unchanged():
     assert printable("Größe 10°, 測定, a\tb\nc") == "Größe 10°, 測定, a\tb\nc"
 
 
-def test_long_words_and_texts_are_cut():
+def test_long_words_and_texts_are_shortened():
     assert printable(f"'{'x' * 1_000_000}' is unknown") == f"'{'x' * 39}... (1,000,002 characters) is unknown"
     shown = str(MissingExtraError("no " * 1_000_000 + "end"))
-    assert len(shown) < LONGEST_TEXT
+    assert len(shown) < MAX_MESSAGE_CHARACTERS
     assert shown.endswith("no end")
 
 
-def test_a_message_is_made_of_its_fields():
+def test_a_message_is_built_from_its_fields():
     problem = RobotError(
         expected="a length > 0",
         value=-3.0,
@@ -58,7 +65,20 @@ def test_fields_are_plain_values_for_json():
     }
 
 
-def test_fields_survive_another_process_and_a_text_that_follows():
+def test_a_place_is_added_to_an_error_without_one():
+    problem = PisigmaError("no rows", value=0).located(Place("a.csv", 3))
+    assert (str(problem), problem.file, problem.line, problem.value) == (
+        "a.csv, line 3: no rows",
+        "a.csv",
+        3,
+        0,
+    )
+    again = problem.located(Place("b.yaml", 7, "rows"))
+    assert (again.file, again.line, again.column) == ("a.csv", 3, None)
+    assert str(again) == "b.yaml, line 7, key 'rows': a.csv, line 3: no rows"
+
+
+def test_fields_survive_pickling_and_an_appended_text():
     problem = RobotError("no rows", at=Place("a.csv", 3), value=0, option="--rows")
     for other in (pickle.loads(pickle.dumps(problem)), problem.followed_by(" See the log.")):
         assert type(other) is RobotError

@@ -1,14 +1,14 @@
-"""Output files: whole or not at all."""
+"""Output files are written completely or not at all."""
 
 import os
 
-import pytest
+from testing.refusals import refused
 
 from pisigma.files.errors import OutputError
 from pisigma.files.output_file import check_output, write_whole
 
 
-def test_a_file_is_replaced_whole(tmp_path):
+def test_a_file_is_replaced_completely(tmp_path):
     path = tmp_path / "out.csv"
     path.write_text("old")
     check_output(path, (".csv",), "a table")
@@ -18,27 +18,27 @@ def test_a_file_is_replaced_whole(tmp_path):
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_nothing_is_left_when_it_cannot_be_moved_there(tmp_path, monkeypatch):
+def test_nothing_is_left_behind_if_the_rename_fails(tmp_path, monkeypatch):
     def fail(*_):
         raise OSError(28, "No space left on device")
 
     (tmp_path / "out.csv").write_text("old")
     monkeypatch.setattr(os, "replace", fail)
-    with pytest.raises(OutputError, match=r"cannot be written \(No space left"):
+    with refused(OutputError, file="out.csv", value="No space left on device"):
         write_whole(tmp_path / "out.csv", "new")
     assert [(p.name, p.read_text()) for p in tmp_path.iterdir()] == [("out.csv", "old")]
 
 
-def test_where_nothing_can_be_written(tmp_path):
+def test_paths_that_cannot_be_written_are_rejected(tmp_path):
     (tmp_path / "folder.csv").mkdir()
-    for path, complaint in (
-        (tmp_path / "out.txt", "a table goes into a .csv or .yaml file"),
-        (tmp_path / "folder.csv", "is a folder"),
-        (tmp_path / "none" / "out.csv", "there is no folder"),
+    for path, value in (
+        (tmp_path / "out.txt", ".txt"),
+        (tmp_path / "folder.csv", "a folder"),
+        (tmp_path / "none" / "out.csv", str(tmp_path / "none")),
     ):
-        with pytest.raises(OutputError, match=complaint):
+        with refused(OutputError, file=path, value=value):
             check_output(path, (".csv", ".yaml"), "a table")
-    with pytest.raises(OutputError, match="there is no folder"):
+    with refused(OutputError, file="out.csv", value=str(tmp_path / "none")):
         write_whole(tmp_path / "none" / "out.csv", "text")
 
 
@@ -48,10 +48,10 @@ def test_an_input_is_never_overwritten(tmp_path):
     (tmp_path / "soft.csv").symlink_to(source)
     os.link(source, tmp_path / "hard.csv")
     for name in ("in.csv", "soft.csv", "hard.csv", "../" + tmp_path.name + "/in.csv"):
-        with pytest.raises(OutputError, match="is an input of this command; choose another --out"):
+        with refused(OutputError, file=tmp_path / name, value=str(source)):
             check_output(tmp_path / name, inputs=("no robot", source))
     (tmp_path / "folder").mkdir()
-    with pytest.raises(OutputError, match=r"out\.csv: lies in .*folder, an input of this command"):
+    with refused(OutputError, file="out.csv", value=str(tmp_path / "folder")):
         check_output(tmp_path / "folder" / "out.csv", inputs=(tmp_path / "folder",))
     assert source.read_text() == "mine"
 
@@ -60,18 +60,18 @@ def test_a_part_of_a_model_is_never_overwritten(tmp_path):
     (tmp_path / "model.yaml").write_text("format: 4\n")
     (tmp_path / "sub").mkdir()
     for path in (tmp_path / "model.yaml", tmp_path / "sub" / "new.csv"):
-        with pytest.raises(OutputError, match="lies in the model folder"):
+        with refused(OutputError, file=path, value=str(tmp_path)):
             write_whole(path, "text")
     assert (tmp_path / "model.yaml").read_text() == "format: 4\n"
 
 
-def test_a_pipe_is_no_file_to_replace(tmp_path):
+def test_a_pipe_is_not_replaced(tmp_path):
     os.mkfifo(tmp_path / "pipe.csv")
-    with pytest.raises(OutputError, match="is no regular file, but a device or a pipe"):
+    with refused(OutputError, file="pipe.csv", value="a device or a pipe"):
         write_whole(tmp_path / "pipe.csv", "text")
 
 
-def test_a_linked_file_stays_linked_and_what_a_kill_left_is_swept(tmp_path):
+def test_a_linked_file_stays_linked_and_scratch_of_killed_processes_is_removed(tmp_path):
     (tmp_path / "real.csv").write_text("old")
     (tmp_path / "link.csv").symlink_to(tmp_path / "real.csv")
     (tmp_path / ".real.csv.k2j_9xyz.part").write_text("half")
@@ -81,7 +81,7 @@ def test_a_linked_file_stays_linked_and_what_a_kill_left_is_swept(tmp_path):
     assert (tmp_path / "real.csv").read_text() == "new"
 
 
-def test_paths_that_are_too_long_are_refused(tmp_path):
+def test_paths_that_are_too_long_are_rejected(tmp_path):
     for path in (tmp_path / ("x" * 5000), tmp_path / ("x" * 5000) / "y.csv"):
-        with pytest.raises(OutputError, match="File name too long"):
+        with refused(OutputError, file=path, value="File name too long"):
             write_whole(path, "text")

@@ -1,4 +1,4 @@
-"""Model folders are written whole or not at all."""
+"""Model folders are written completely or not at all."""
 
 import os
 import signal
@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 from testing.models import hand_made_model
+from testing.refusals import refused
 
 from pisigma.files.errors import OutputError
 from pisigma.files.output_folder import check_folder, staged_folder
@@ -23,7 +24,7 @@ def names(folder: Path) -> list[str]:
     return sorted(entry.name for entry in folder.iterdir())
 
 
-def test_a_folder_and_its_parents_are_made(tmp_path):
+def test_a_folder_and_its_parents_are_created(tmp_path):
     write(tmp_path / "a" / "b" / "model")
     assert names(tmp_path / "a" / "b") == ["model"]
     assert load_model(tmp_path / "a" / "b" / "model").robot.name == "kiro3"
@@ -38,7 +39,7 @@ def test_a_model_is_replaced_and_nothing_is_left_behind(tmp_path):
     assert load_model(tmp_path / "model").robot.name == "kiro4"
 
 
-def test_an_empty_folder_is_taken(tmp_path):
+def test_an_empty_folder_is_used(tmp_path):
     (tmp_path / "model").mkdir()
     write(tmp_path / "model")
     assert load_model(tmp_path / "model").robot.name == "kiro3"
@@ -54,7 +55,7 @@ def test_a_linked_folder_stays_linked(tmp_path):
 
 @pytest.mark.parametrize("before", [None, "kiro3"])
 @pytest.mark.parametrize("end", [KeyboardInterrupt, RuntimeError])
-def test_an_interruption_leaves_what_was_there(tmp_path, before, end):
+def test_an_interruption_leaves_the_folder_as_it_was(tmp_path, before, end):
     if before:
         write(tmp_path / "model", before)
 
@@ -70,7 +71,7 @@ def test_an_interruption_leaves_what_was_there(tmp_path, before, end):
         assert load_model(tmp_path / "model").robot.name == before
 
 
-def test_a_failing_rename_brings_the_old_model_back(tmp_path, monkeypatch):
+def test_a_failing_rename_restores_the_old_model(tmp_path, monkeypatch):
     write(tmp_path / "model")
     rename = os.replace
 
@@ -80,15 +81,15 @@ def test_a_failing_rename_brings_the_old_model_back(tmp_path, monkeypatch):
         rename(source, target)
 
     monkeypatch.setattr(os, "replace", failing)
-    with pytest.raises(OutputError, match=r"model: cannot be written \(No space left on device\)"):
+    with refused(OutputError, file="model", value="No space left on device"):
         write(tmp_path / "model", "kiro4")
     assert names(tmp_path) == ["model"]
     assert load_model(tmp_path / "model").robot.name == "kiro3"
 
 
 @pytest.mark.parametrize("before", [None, "kiro3"])
-def test_a_killed_process_leaves_what_was_there(tmp_path, before):
-    """SIGKILL when all but the last rename is done."""
+def test_a_killed_process_leaves_the_folder_as_it_was(tmp_path, before):
+    """Killed just before the last rename."""
     if before:
         write(tmp_path / "model", before)
     script = (
@@ -108,74 +109,71 @@ def test_a_killed_process_leaves_what_was_there(tmp_path, before):
     assert names(tmp_path) == ["model"]
 
 
-def test_what_is_no_model_is_not_touched(tmp_path):
+def test_files_and_other_folders_are_not_touched(tmp_path):
     (tmp_path / "file").write_text("mine")
     (tmp_path / "folder").mkdir()
     (tmp_path / "folder" / "thesis.txt").write_text("mine")
     for name in ("file", "folder"):
-        with pytest.raises(OutputError, match=f"{name}: exists and is no model folder; choose another --out"):
+        with refused(OutputError, file=tmp_path / name, expected="a model folder"):
             write(tmp_path / name)
     assert (tmp_path / "folder" / "thesis.txt").read_text() == (tmp_path / "file").read_text() == "mine"
 
 
-def test_a_place_that_cannot_be_written_is_refused_before_the_work(tmp_path):
+def test_a_path_that_cannot_be_written_is_rejected_before_the_work(tmp_path):
     (tmp_path / "file").write_text("mine")
-    with pytest.raises(OutputError, match=r"model: cannot be written \(.+\); choose another --out"):
+    with refused(OutputError, file=tmp_path / "file" / "model", value="Not a directory"):
         check_folder(tmp_path / "file" / "model", overwrite=False)
     check_folder(tmp_path / "new" / "model", overwrite=False)
     assert names(tmp_path) == ["file"]
 
 
-def test_a_model_is_replaced_only_where_that_is_asked_for(tmp_path):
+def test_a_model_is_replaced_on_request_only(tmp_path):
     write(tmp_path / "model")
     before = (tmp_path / "model" / "model.yaml").read_bytes()
-    with pytest.raises(OutputError, match="model: holds a model already; replace it with --overwrite"):
+    with refused(OutputError, file="model", expected="a new or empty folder"):
         check_folder(tmp_path / "model", overwrite=False)
     assert (tmp_path / "model" / "model.yaml").read_bytes() == before
 
 
 @pytest.mark.parametrize("other", ["notes.txt", ".git", "data.csv", "photo.png"])
-def test_a_folder_that_holds_more_than_a_model_is_refused(tmp_path, other):
+def test_a_model_folder_with_other_files_is_not_replaced(tmp_path, other):
     write(tmp_path / "model")
     (tmp_path / "model" / other).mkdir()
-    with pytest.raises(
-        OutputError, match=f"holds a model, but also '{other}', which pisigma does not write there"
-    ):
+    with refused(OutputError, file="model", value=other):
         write(tmp_path / "model")
     assert (tmp_path / "model" / other).is_dir()
 
 
-def test_a_card_alone_is_no_model(tmp_path):
-    """As in somebody's project, of which even `model.yaml` may be a file."""
+def test_a_card_alone_is_not_a_model(tmp_path):
+    """As in another project, which may even have a file `model.yaml`."""
     for name in ("README.md", "model.yaml"):
         (tmp_path / name).write_text("layers: 4\n")
-        with pytest.raises(OutputError, match="exists and is no model folder"):
+        with refused(OutputError, file=tmp_path, expected="a model folder"):
             check_folder(tmp_path, overwrite=True)
 
 
-def test_the_working_directory_is_refused(tmp_path, monkeypatch):
+def test_the_working_directory_is_rejected(tmp_path, monkeypatch):
     (tmp_path / "project" / "work").mkdir(parents=True)
     monkeypatch.chdir(tmp_path / "project" / "work")
     for folder in (".", "..", tmp_path / "project", "/"):
-        with pytest.raises(
-            OutputError, match="is the working directory, or the working directory lies in it"
-        ):
+        with refused(OutputError, file=folder, value=str(tmp_path / "project" / "work")):
             check_folder(folder, overwrite=True)
 
 
-def test_a_folder_that_has_to_do_with_an_input_is_refused(tmp_path):
+def test_a_folder_in_conflict_with_an_input_is_rejected(tmp_path):
     write(tmp_path / "model")
     data = tmp_path / "model" / "held_out.csv"
     data.write_text("q1_deg")
     (tmp_path / "link").symlink_to(tmp_path / "model")
-    for folder, source, complaint in (
-        ("model", "model", "model: is an input of this command"),
-        ("link", "model", "link: is an input of this command"),
-        ("model", "model/held_out.csv", "model: holds .*held_out.csv, an input"),
-        ("model/new", "link", "new: lies in .*link, an input"),
-        ("link/new", "missing.csv", "new: lies in the model folder .*model"),
+    for folder, source, expected in (
+        ("model", "model", "a path that is not an input"),
+        ("link", "model", "a path that is not an input"),
+        ("model", "model/held_out.csv", "a folder without inputs"),
+        ("model/new", "link", "a path outside the inputs"),
+        ("link/new", "missing.csv", "a path outside model folders"),
     ):
-        with pytest.raises(OutputError, match=complaint):
+        value = str(tmp_path / ("model" if source == "missing.csv" else source))
+        with refused(OutputError, file=tmp_path / folder, expected=expected, value=value):
             check_folder(tmp_path / folder, overwrite=True, inputs=(None, tmp_path / source))
     assert data.read_text() == "q1_deg"
 
@@ -197,18 +195,18 @@ def killed_between_renames(folder: Path) -> None:
     assert done.returncode == -signal.SIGKILL
 
 
-def test_a_model_that_a_kill_left_aside_comes_back(tmp_path):
+def test_a_model_that_a_killed_process_moved_away_is_restored(tmp_path):
     write(tmp_path / "model")
     killed_between_renames(tmp_path / "model")
     assert not (tmp_path / "model").exists()
     assert {Path(name).suffix for name in names(tmp_path)} == {".old", ".partial"}
-    with pytest.raises(OutputError, match="holds a model already"):
+    with refused(OutputError, file="model", expected="a new or empty folder"):
         check_folder(tmp_path / "model", overwrite=False)
     assert names(tmp_path) == ["model"]
     assert load_model(tmp_path / "model").robot.name == "kiro3"
 
 
-def test_what_a_living_process_writes_is_not_swept(tmp_path):
+def test_scratch_of_a_living_process_is_not_removed(tmp_path):
     with staged_folder(tmp_path / "model") as scratch:
         write(tmp_path / "model")
         assert scratch.is_dir()
@@ -219,7 +217,7 @@ def test_what_a_living_process_writes_is_not_swept(tmp_path):
     assert load_model(tmp_path / "model").robot.name == "kiro4"
 
 
-def test_only_scratch_of_ours_is_swept(tmp_path):
+def test_only_scratch_of_pisigma_is_removed(tmp_path):
     others = {
         ".model.partial",
         ".model.a.b.partial",
@@ -243,7 +241,7 @@ def test_a_file_that_could_not_be_replaced_later_is_a_defect(tmp_path):
         (scratch / "plan.csv").write_text("")
 
 
-def test_what_somebody_puts_there_meanwhile_is_not_replaced(tmp_path):
+def test_a_file_added_meanwhile_is_not_replaced(tmp_path):
     write(tmp_path / "model")
 
     def disturbed() -> None:
@@ -251,14 +249,14 @@ def test_what_somebody_puts_there_meanwhile_is_not_replaced(tmp_path):
             save_model(hand_made_model("kiro4"), scratch)
             (tmp_path / "model" / "notes.txt").write_text("mine")
 
-    with pytest.raises(OutputError, match=r"holds a model, but also 'notes\.txt'"):
+    with refused(OutputError, file="model", value="notes.txt"):
         disturbed()
     assert (tmp_path / "model" / "notes.txt").read_text() == "mine"
     assert load_model(tmp_path / "model").robot.name == "kiro3"
     assert names(tmp_path) == ["model"]
 
 
-def test_folders_are_not_made_without_limit(tmp_path):
-    with pytest.raises(OutputError, match="more than 100 folders in one another"):
+def test_the_number_of_new_folders_is_limited(tmp_path):
+    with refused(OutputError, expected="100 new folders or fewer", value=1_500):
         check_folder(tmp_path.joinpath(*["a"] * 1_500), overwrite=False)
     assert not list(tmp_path.iterdir())

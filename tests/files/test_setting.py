@@ -17,7 +17,7 @@ class Inner:
         length: how far it reaches [m].
     """
 
-    length: Annotated[float, Option("--reach-mm", unit="mm", least=0, most=5.0)] = 2e-3
+    length: Annotated[float, Option("--reach-mm", unit="mm", min=0, max=5.0)] = 2e-3
 
 
 @dataclass(frozen=True)
@@ -25,7 +25,7 @@ class Outer:
     """Outer.
 
     Attributes:
-        count: how many there are, which may be told on
+        count: how many there are, which may be described on
             two lines. None: as many as fit.
         kind: fast: at once; slow: later.
         elsewhere: of a type that is not there.
@@ -53,7 +53,7 @@ class Outer:
 SETTINGS = {one.field: one for one in settings_of(Outer)}
 
 
-def test_settings_are_the_fields_that_are_not_hidden():
+def test_hidden_fields_are_not_options():
     assert list(SETTINGS) == [name for name in Outer.__dataclass_fields__ if name != "secret"]
     kinds = {name: one.kind for name, one in SETTINGS.items()}
     assert (kinds["count"], kinds["kind"], kinds["elsewhere"], kinds["words"]) == (int, str, str, str)
@@ -68,15 +68,15 @@ def test_settings_are_the_fields_that_are_not_hidden():
     assert SETTINGS["inner"].is_group
 
 
-def test_meanings_are_sentences_of_the_docstring():
-    assert attributes_of(Outer)["count"].endswith("told on two lines. None: as many as fit.")
+def test_help_is_taken_from_the_docstring():
+    assert attributes_of(Outer)["count"].endswith("described on two lines. None: as many as fit.")
     assert SETTINGS["count"].help.startswith("How many there are")
     assert SETTINGS["count"].help.endswith("on two lines. [default: as many as fit]")
     assert SETTINGS["kind"].help == "fast: at once; slow: later."
     assert SETTINGS["lines"].help == "Which are meant. May be repeated."
 
 
-def test_units_of_options_become_those_of_settings():
+def test_option_units_are_converted_to_setting_units():
     (reach,) = settings_of(Inner)
     assert (reach.name, reach.default, reach.help) == ("--reach-mm", 2.0, "How far it reaches [mm].")
     assert_close(reach.read(3.0), 3e-3, rtol=1e-15)

@@ -1,4 +1,4 @@
-"""Templates: each can be read, and a name that nothing was filled in for is an error."""
+"""Templates: each can be read, and an undefined name is an error."""
 
 import jinja2
 import pytest
@@ -22,14 +22,14 @@ def test_every_template_can_be_read(package, name):
     assert ENVIRONMENTS[package].get_template(name)
 
 
-def test_names_without_a_value_are_errors():
+def test_undefined_names_are_errors():
     template = template_environment("pisigma.reporting", {}).from_string("{{ figure }}")
     assert template.render(figure="0.1 <mm>") == "0.1 <mm>"
     with pytest.raises(jinja2.UndefinedError, match="'figure' is undefined"):
         template.render()
 
 
-def test_filters_are_those_of_the_package():
+def test_filters_are_available_in_templates():
     template = template_environment("pisigma.reporting", {"twice": lambda text: 2 * text}).from_string(
         "{{ 'ab' | twice }}"
     )

@@ -1,4 +1,4 @@
-"""Work for engines, which other processes import."""
+"""Functions that engines run in other processes."""
 
 import os
 import time
@@ -9,25 +9,25 @@ from pisigma.files.errors import IdentificationError
 
 
 def square(number: int) -> int:
-    """The square; the process of -1 ends."""
+    """Return the square; -1 ends the process."""
     if number == -1:
         os._exit(1)
     return number * number
 
 
 def environment(name: str) -> tuple[str | None, int]:
-    """A variable of the environment, and the process."""
+    """Return an environment variable and the process ID."""
     return os.environ.get(name), os.getpid()
 
 
 def refuse(after: float) -> None:
-    """Refuse after some seconds."""
+    """Raise an error after some seconds."""
     time.sleep(after)
-    raise IdentificationError(f"refused after {after} s")
+    raise IdentificationError("refused", value=after)
 
 
 class PicklingEngine(AbstractEngine):
-    """Pickles work, items and results as for other processes, and works in this one."""
+    """Pickles work, items and results as for other processes, but runs the work in this process."""
 
     def __init__(self, workers: int = 1, before_each: Callable[[], None] = lambda: None) -> None:
         self._workers, self._before_each = workers, before_each

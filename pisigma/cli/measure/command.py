@@ -61,7 +61,7 @@ class PageOptions:
     """
 
     host: Annotated[str, Option("--view-host")] = "127.0.0.1"
-    port: Annotated[int, Option("--view-port", least=1, most=65535)] = 8080
+    port: Annotated[int, Option("--view-port", min=1, max=65535)] = 8080
     urdf: Annotated[Path | None, Option("--view-urdf")] = None
 
     def body(self, robot: "Robot") -> "MeshBody | None":

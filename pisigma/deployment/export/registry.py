@@ -5,7 +5,7 @@ from importlib import import_module
 from pathlib import Path
 
 from pisigma.deployment.export.export_format import OPTIONS, Exported, ExportFormat, ExportRequest
-from pisigma.files.conflicts import check_apart
+from pisigma.files.conflicts import check_conflicts
 from pisigma.files.errors import OutputError, nearest_choice
 from pisigma.files.output_file import check_output, write_whole
 
@@ -96,7 +96,7 @@ def export_model(name: str, request: ExportRequest) -> Exported:
     if form.suffixes:
         check_output(request.out, form.suffixes, form.contents, inputs)
     else:
-        check_apart(request.out, inputs)
+        check_conflicts(request.out, inputs)
     exported = form.write(request)
     if isinstance(exported.content, str | bytes):
         write_whole(request.out, exported.content)

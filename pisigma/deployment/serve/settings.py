@@ -35,9 +35,9 @@ class ServeSettings:
     """
 
     host: str = "127.0.0.1"
-    json_port: Annotated[int, Option("--port", least=0, most=LAST_PORT)] = 0
-    binary_port: Annotated[int, Option(least=0, most=LAST_PORT)] = 0
-    zmq_port: Annotated[int | None, Option(least=0, most=LAST_PORT)] = None
+    json_port: Annotated[int, Option("--port", min=0, max=LAST_PORT)] = 0
+    binary_port: Annotated[int, Option(min=0, max=LAST_PORT)] = 0
+    zmq_port: Annotated[int | None, Option(min=0, max=LAST_PORT)] = None
     token: Annotated[str | None, Option("--token-file", kind=Path, read=token_in)] = None
     patience: Annotated[float, HIDDEN] = PATIENCE
-    polling: Annotated[float, Option("--poll-ms", unit="ms", least=0, most=100)] = DURATION
+    polling: Annotated[float, Option("--poll-ms", unit="ms", min=0, max=100)] = DURATION

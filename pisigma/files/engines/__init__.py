@@ -1,1 +1,1 @@
-"""Where work for many items is done: in processes of this machine, or on a cluster."""
+"""Engines that run the same work for many items: in processes of this machine, or on a cluster."""

@@ -1,4 +1,4 @@
-"""Where the same work for many items is done: on this machine or on many, behind one interface."""
+"""Interface of engines, which run the same work for many items on one machine or many."""
 
 import math
 import pickle
@@ -12,33 +12,34 @@ Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 ONE_THREAD: Final = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
-"""Environment of all workers: sums come in the same order however many there are, so results do to the bit."""
+"""Environment of all workers. With one thread each, sums have the same order and results the same bits for any number
+of workers."""
 
 
 class AbstractEngine(ABC):
-    """Does the same work for many items in other processes.
+    """Runs the same function for many items in other processes.
 
-    What works on an item writes what it came to itself, so that an ended call loses only what was being worked on.
+    The function writes its results itself, so that an interrupted call loses only the items in progress.
     """
 
     @abstractmethod
     def _chunks(
         self, work: Callable[[Item], Result], chunks: Sequence[Sequence[Item]]
     ) -> Iterator[tuple[Sequence[Item], list[Result] | None]]:
-        """Every chunk with its results in the order in which they end, None where its worker ended before."""
+        """Yield every chunk with its results as they finish; None instead of results if its worker died."""
 
     def results(
         self, work: Callable[[Item], Result], items: Sequence[Item], chunk: int
     ) -> Iterator[tuple[Item, Result | None]]:
-        """Give every item with its result, in the order in which they end.
+        """Yield every item with its result as they finish.
 
-        Where a worker is killed or runs out of memory, the items that it had are tried once more, one at a time; the
-        item that a worker ends with again has no result.
+        If a worker is killed or runs out of memory, its items are tried once more, one at a time. An item whose worker
+        dies again has the result None.
 
         Args:
-            work: what is done with an item: a function of a module, or a `functools.partial` of one.
+            work: function to call with each item: a function of a module, or a `functools.partial` of one.
             items: the items; they and the results are pickled. Workers first load the plug-ins of this process.
-            chunk: so many are given to a worker at once; some seconds of work.
+            chunk: number of items that a worker gets at once; it should be some seconds of work.
         """
         size = max(1, min(chunk, math.ceil(len(items) / self.workers)))
         lost: list[Item] = []
@@ -54,22 +55,22 @@ class AbstractEngine(ABC):
     @property
     @abstractmethod
     def workers(self) -> int:
-        """How many work side by side."""
+        """Number of workers."""
 
 
 def packed(work: Callable[[Item], Result], chunk: Sequence[Item]) -> tuple[Plugins, bytes]:
-    """Give the arguments of `work_on`: plug-ins are loaded before what they define is unpickled."""
+    """Return the arguments of `work_on`; plug-ins are separate, to be loaded before their objects are unpickled."""
     return loaded(), pickle.dumps((work, list(chunk)))
 
 
 def work_on(plugins: Plugins, pickled: bytes) -> bytes:
-    """Work on a chunk, in a worker; gives the results, pickled."""
+    """Process a chunk in a worker, and return the pickled results."""
     plugins.load()
     work, chunk = pickle.loads(pickled)
     return pickle.dumps([work(item) for item in chunk])
 
 
 def unpacked(pickled: bytes) -> list[Any]:
-    """Give the results of `work_on`."""
+    """Return the results of `work_on`."""
     results: list[Any] = pickle.loads(pickled)
     return results

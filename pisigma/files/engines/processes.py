@@ -1,4 +1,4 @@
-"""Work in processes of this machine, or in threads: an engine, and several tasks at once."""
+"""Run work in processes or threads of this machine: an engine for many items, and several tasks at once."""
 
 import contextlib
 import multiprocessing
@@ -11,28 +11,26 @@ from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from typing import Any
 
-import torch
-
 from pisigma.files.engines.engine import ONE_THREAD, AbstractEngine, Item, Result, packed, unpacked, work_on
 from pisigma.files.errors import PisigmaError
 
 
 class ProcessEngine(AbstractEngine):
-    """Works in processes of this machine, which start afresh and end with this one."""
+    """Runs the work in newly started processes of this machine, which end with this one."""
 
     def __init__(self, workers: int) -> None:
-        """Take so many processes."""
+        """Make an engine with a number of processes."""
         self._workers = workers
 
     @property
     def workers(self) -> int:
-        """How many processes work side by side."""
+        """Number of processes."""
         return self._workers
 
     def _chunks(
         self, work: Callable[[Item], Result], chunks: Sequence[Sequence[Item]]
     ) -> Iterator[tuple[Sequence[Item], list[Result] | None]]:
-        """See `AbstractEngine`; as many chunks as workers are handed out, so that a broken pool loses no others."""
+        """See `AbstractEngine`; only one chunk per worker is submitted, so that a broken pool loses no others."""
         waiting = list(reversed(chunks))
         while waiting:
             running: dict[Future[bytes], Sequence[Item]] = {}
@@ -56,11 +54,11 @@ class ProcessEngine(AbstractEngine):
 
     @contextmanager
     def _pool(self, workers: int) -> Iterator[ProcessPoolExecutor]:
-        """A pool whose processes have one thread each; they are ended where the block ends with an exception."""
+        """Yield a pool of processes with one thread each; an exception in the block terminates them."""
         before = {name: os.environ.get(name) for name in ONE_THREAD}
         os.environ.update(ONE_THREAD)
         context = multiprocessing.get_context("spawn")
-        pool = ProcessPoolExecutor(workers, context, initializer=_begin)
+        pool = ProcessPoolExecutor(workers, context, initializer=_start_worker)
         try:
             yield pool
         except BaseException:
@@ -75,8 +73,8 @@ class ProcessEngine(AbstractEngine):
                 os.environ.pop(name, None) if value is None else os.environ.__setitem__(name, value)
 
 
-def _begin(*_: Any) -> None:
-    """Leave interruptions to the process that started this one, and end with it however it ends."""
+def _start_worker(*_: Any) -> None:
+    """Ignore interruptions, which the parent process handles, and end whenever the parent ends."""
     with contextlib.suppress(ValueError):
         signal.signal(signal.SIGINT, signal.SIG_IGN)
     parent = multiprocessing.parent_process()
@@ -89,17 +87,19 @@ def _begin(*_: Any) -> None:
     threading.Thread(target=follow, daemon=True).start()
 
 
-def side_by_side(tasks: Sequence[Callable[[], Result]], wide: bool) -> Iterator[Result]:
-    """Give what every task returns, in their order.
+def run_in_threads(tasks: Sequence[Callable[[], Result]], one_at_a_time: bool) -> Iterator[Result]:
+    """Yield the results of tasks in their order.
 
-    Small calibrations gain nothing from several threads in one matrix product, but they leave Python's lock to others
-    in most of their time: with one thread each, two of them take 0.6 of the time that they take in turn.
+    Small calibrations gain nothing from several threads in one matrix product, but they release Python's lock most of
+    the time: two of them with one thread each take 0.6 of the time that they take one after the other.
 
     Args:
-        tasks: none may change what others read.
-        wide: whether one task alone keeps all cores busy, or needs so much memory that only one may have it.
+        tasks: functions without arguments; none may change data that others read.
+        one_at_a_time: whether to run the tasks sequentially, as a single one keeps all cores busy or needs much memory.
     """
-    workers = 1 if wide else min(len(tasks), torch.get_num_threads())
+    import torch  # here, so that workers, which import this module, start without it
+
+    workers = 1 if one_at_a_time else min(len(tasks), torch.get_num_threads())
     if workers < 2:
         yield from (task() for task in tasks)
         return
@@ -107,16 +107,17 @@ def side_by_side(tasks: Sequence[Callable[[], Result]], wide: bool) -> Iterator[
         yield from pool.map(lambda task: task(), tasks)
 
 
-def in_processes(tasks: Sequence[Callable[[], Result]], jobs: int) -> Iterator[Result]:
-    """Give what every task returns, in their order and as soon as that allows, from processes with one thread each.
+def run_in_processes(tasks: Sequence[Callable[[], Result]], jobs: int) -> Iterator[Result]:
+    """Yield the results of tasks in their order, each as soon as it is known, from processes with one thread each.
 
     Args:
-        tasks: each a `functools.partial` of a function of a module; the first is started first.
-        jobs: processes at most.
+        tasks: each a `functools.partial` of a function of a module; they are started in their order.
+        jobs: largest number of processes.
 
     Raises:
-        PisigmaError: a task raised it and all before that one returned, so that it does not depend on which ends first.
-        MemoryError: a process ended twice with a task, as it does where memory is short.
+        PisigmaError: a task raised it. It is raised when all earlier tasks have returned, so that the outcome does not
+            depend on which task ends first.
+        MemoryError: the process of a task died twice, as happens when memory runs out.
     """
     engine, outcomes, due = ProcessEngine(min(jobs, len(tasks))), dict[int, Result | PisigmaError](), 0
     for (number, _), outcome in engine.results(_outcome, [*enumerate(tasks)], 1):
@@ -132,7 +133,7 @@ def in_processes(tasks: Sequence[Callable[[], Result]], jobs: int) -> Iterator[R
 
 
 def _outcome(numbered: tuple[int, Callable[[], Result]]) -> Result | PisigmaError:
-    """What a numbered task returns, or how it refuses."""
+    """Return the result of a numbered task, or the error that it raised."""
     try:
         return numbered[1]()
     except PisigmaError as refusal:

@@ -1,4 +1,4 @@
-"""The engine of a Ray cluster, or of Ray's workers on this machine."""
+"""Engine of a Ray cluster, or of Ray's workers on this machine."""
 
 import logging
 import os
@@ -10,14 +10,14 @@ from pisigma.files.engines.engine import ONE_THREAD, AbstractEngine, Item, Resul
 
 
 class RayEngine(AbstractEngine):
-    """Works in Ray's tasks, one core each; all machines must see the files under the same paths."""
+    """Runs the work as Ray tasks of one core each; all machines must see the files under the same paths."""
 
     def __init__(self, workers: int | None, address: str | None = None) -> None:
-        """Start Ray on this machine with so many workers, or join a cluster.
+        """Start Ray on this machine, or join a cluster.
 
         Args:
-            workers: on this machine; None for all of its cores. A cluster has its own.
-            address: of a cluster, such as "auto" or "ray://head:10001"; None for this machine.
+            workers: number of workers on this machine; None for one per core. Ignored for a cluster.
+            address: address of a cluster, such as "auto" or "ray://head:10001"; None for this machine.
 
         Raises:
             ImportError: Ray is not installed.
@@ -34,11 +34,11 @@ class RayEngine(AbstractEngine):
 
     @property
     def workers(self) -> int:
-        """How many cores the cluster has."""
+        """Number of cores of the cluster."""
         return self._workers
 
     def close(self) -> None:
-        """Leave the cluster, or end Ray on this machine."""
+        """Leave the cluster, or stop Ray on this machine."""
         self._ray.shutdown()
 
     def _chunks(

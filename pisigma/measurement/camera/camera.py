@@ -11,7 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from pisigma.files.errors import MeasurementError
 from pisigma.files.input_file import read_text
-from pisigma.files.yaml_file import MOST_BYTES, Section, parse_yaml, yaml_text
+from pisigma.files.yaml_file import MAX_BYTES, Section, parse_yaml, yaml_text
 from pisigma.measurement.sensors.intrinsics import CAMERA_UNITS
 
 INTRINSICS = tuple(CAMERA_UNITS)
@@ -177,7 +177,7 @@ class Camera:
             MeasurementError: the file cannot be read or describes no such camera; the message names file and key.
         """
         source = os.fspath(path)
-        text = read_text(path, MeasurementError, "YAML", MOST_BYTES)
+        text = read_text(path, MeasurementError, "YAML", MAX_BYTES)
         if not re.search(r"^\s*camera_matrix\s*:", text, re.MULTILINE):
             return parse_yaml(text, CameraDocument, MeasurementError, source).camera()
         # OpenCV writes a directive and a tag that YAML does not know; commented out, they keep the lines' numbers

@@ -7,7 +7,7 @@ from collections import Counter
 from dataclasses import dataclass
 
 from pisigma.files.errors import MeasurementError, printable
-from pisigma.files.input_file import MOST_BYTES, read_input
+from pisigma.files.input_file import MAX_BYTES, read_input
 from pisigma.measurement.csv.table import SPREADSHEET_ERRORS
 from pisigma.measurement.foreign.accounting import LeftOutRow, Place
 from pisigma.measurement.foreign.dialect import COMMENT, Decimal, Dialect, sniff
@@ -84,7 +84,7 @@ class ExportFile:
 
 
 def read_export(
-    path: str | os.PathLike[str], decimal: Decimal | None = None, most: int = MOST_BYTES
+    path: str | os.PathLike[str], decimal: Decimal | None = None, most: int = MAX_BYTES
 ) -> ExportFile:
     """Read an export: encoding, separator and decimal sign are recognised, headings, unit row and comments told apart.
 

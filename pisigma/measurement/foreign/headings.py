@@ -3,7 +3,7 @@
 import re
 from dataclasses import dataclass
 
-from pisigma.files.errors import LONGEST_WORD
+from pisigma.files.errors import MAX_WORD_CHARACTERS
 from pisigma.measurement.csv.columns import find_column
 from pisigma.measurement.foreign.rotations import ROTATIONS
 from pisigma.measurement.foreign.units import ambiguous_unit, unit_symbol
@@ -43,7 +43,7 @@ class Heading:
 
 def parse_heading(text: str) -> Heading:
     """Take a heading apart; one that is longer than headings are means nothing."""
-    if len(text) > LONGEST_WORD:
+    if len(text) > MAX_WORD_CHARACTERS:
         return Heading(text, "", "")
     column = find_column(text.strip().lower())
     if column is not None:

@@ -10,7 +10,7 @@ from pydantic import Field, model_validator
 from torch import Tensor
 
 from pisigma.files.errors import PlanningError, RecipeError, nearest_choice
-from pisigma.files.yaml_file import Section, line_of, read_yaml
+from pisigma.files.yaml_file import Section, place_of_key, read_yaml
 from pisigma.planning.surroundings.capsules import TOOL_RADIUS, Capsules
 from pisigma.robot.description import Robot
 from pisigma.robot.robot_file import FrameSection, Limits
@@ -319,12 +319,14 @@ def read_cell(path: str | os.PathLike[str], robot: Robot) -> Cell:
     names = [row.name for row in robot.rows]
     for name in cell.links.radii_mm:
         if name not in names:
-            line = line_of(path, ("links", "radii_mm", name))
             raise PlanningError(
-                f"{path}, line {line}: robot '{robot.name}' has no row '{name}'; {nearest_choice(name, names)}"
+                f"robot '{robot.name}' has no row '{name}'",
+                value=name,
+                at=place_of_key(path, ("links", "radii_mm", name)),
+                remedy=nearest_choice(name, names),
             )
     try:
         cell.joints.limits(robot)
     except (RecipeError, PlanningError) as problem:
-        raise PlanningError(f"{path}, line {line_of(path, ('joints',))}: {problem}") from None
+        raise PlanningError(str(problem), at=place_of_key(path, ("joints",))) from None
     return cell

@@ -19,7 +19,7 @@ from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter, NullLocator
 
-from pisigma.files.conflicts import Input, check_apart
+from pisigma.files.conflicts import Input, check_conflicts
 from pisigma.files.errors import OutputError
 from pisigma.files.output_file import write_whole
 from pisigma.reporting.calibration_figures import STYLES, show_correlations
@@ -127,7 +127,7 @@ def check_figures(folder: Path, inputs: Iterable[Input] = ()) -> None:
     Raises:
         OutputError: it is a file, lies in a model folder or an input, or it cannot be made or written to.
     """
-    check_apart(folder / "figure.png", inputs, "--figures")
+    check_conflicts(folder / "figure.png", inputs, "--figures")
     if folder.exists() and not folder.is_dir():
         raise OutputError(f"{folder}: is a file; choose another folder for --figures.")
     if not folder.exists() and not folder.parent.is_dir():

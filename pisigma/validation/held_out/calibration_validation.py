@@ -11,7 +11,7 @@ from torch import Tensor
 
 from pisigma.calibration.geometric.calibrator import GeometricCalibrator
 from pisigma.calibration.hybrid.result import HybridResult
-from pisigma.files.engines.processes import in_processes, side_by_side
+from pisigma.files.engines.processes import run_in_processes, run_in_threads
 from pisigma.files.errors import IdentificationError
 from pisigma.files.progress import Progress, silent, stage
 from pisigma.measurement.dataset import Measurements
@@ -198,7 +198,9 @@ def judged_folds(
 ) -> Iterator[JudgedFold]:
     """Judge every fold of every repeat in turn, in threads or in processes; see `fold_tasks` and `validate`."""
     tasks = fold_tasks(calibrator, measurements, repeats, progress if jobs is None else silent)
-    return side_by_side(tasks, measurements.rows > FEW_ROWS) if jobs is None else in_processes(tasks, jobs)
+    return (
+        run_in_threads(tasks, measurements.rows > FEW_ROWS) if jobs is None else run_in_processes(tasks, jobs)
+    )
 
 
 def fold_tasks(

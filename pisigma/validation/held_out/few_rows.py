@@ -14,7 +14,7 @@ from pisigma.calibration.geometric.calibrator import GeometricCalibrator
 from pisigma.calibration.geometric.identifiability.sufficiency import distinct_rows, distinct_values
 from pisigma.calibration.geometric.result import CalibrationResult
 from pisigma.calibration.hybrid.calibrator import HybridCalibrator
-from pisigma.files.engines.processes import in_processes
+from pisigma.files.engines.processes import run_in_processes
 from pisigma.files.errors import IdentificationError, MeasurementError
 from pisigma.files.progress import Progress, silent, stage
 from pisigma.measurement.dataset import Measurements
@@ -133,5 +133,5 @@ def fit_beside_folds(
     folds = fold_tasks(calibrator, training, repeats, silent)
     progress(f"calibration and {len(folds)} folds in {jobs} processes")
     fitting = partial(fit_where_it_helps, calibrator, rows, silent)
-    results: Iterator[Any] = in_processes([fitting, *folds], jobs)  # a calibration, and then folds
+    results: Iterator[Any] = run_in_processes([fitting, *folds], jobs)  # a calibration, and then folds
     return next(results), results

@@ -12,7 +12,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from pisigma.files.conflicts import check_apart
+from pisigma.files.conflicts import check_conflicts
 from pisigma.files.engines.engine import AbstractEngine
 from pisigma.files.engines.processes import ProcessEngine
 from pisigma.files.errors import OutputError, PisigmaError
@@ -182,7 +182,7 @@ def _prepare(folder: Path, source: Path, members: tuple[Member, ...]) -> None:
     inputs += [Path(file) for member in members if member.cameras for file in member.cameras.files]
     mark = folder / MARK
     try:
-        check_apart(folder, inputs)
+        check_conflicts(folder, inputs)
         if folder.exists() and not folder.is_dir():
             raise OutputError(f"{folder}: is no folder; choose another --out.")
         if folder.is_dir() and any(folder.iterdir()) and not mark.is_file():

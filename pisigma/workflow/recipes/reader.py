@@ -13,7 +13,7 @@ from pydantic import ConfigDict
 
 from pisigma.calibration.geometric.problem.parameters import ParameterSpace
 from pisigma.files.errors import IdentificationError, RecipeError, RobotError, nearest_choice
-from pisigma.files.yaml_file import Section, line_of, read_yaml
+from pisigma.files.yaml_file import Section, place_of_key, read_yaml
 from pisigma.network.inputs import Inputs
 from pisigma.network.sections import GradientDescentSection
 from pisigma.robot.description import Robot
@@ -58,13 +58,12 @@ def read_recipe(path: str | os.PathLike[str]) -> Recipe:
     try:
         robot = Robot.load(recipe.robot)
     except RobotError as problem:
-        raise type(problem)(f"{path}, line {line_of(path, ('robot',))}: 'robot': {problem}") from None
+        raise problem.located(place_of_key(path, ("robot",))) from None
     for keys, check in checks(recipe, robot):
         try:
             check()
         except (RecipeError, IdentificationError) as problem:
-            name = ".".join(str(key) for key in keys)
-            raise RecipeError(f"{path}, line {line_of(path, keys)}: '{name}': {problem}") from None
+            raise RecipeError(str(problem), at=place_of_key(path, keys)) from None
     return recipe
 
 

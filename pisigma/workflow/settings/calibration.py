@@ -105,10 +105,10 @@ class CalibrationSettings:
     """
 
     model: ModelKind = "hybrid"
-    folds: Annotated[int | None, Option(least=0)] = None
+    folds: Annotated[int | None, Option(min=0)] = None
     hold_out: float | None = None
     split: "SplitBy" = "joints"
-    repeats: Annotated[int | None, Option(least=1)] = None
+    repeats: Annotated[int | None, Option(min=1)] = None
     jobs: int | None = None
     seed: int = 0
     train_rows: int | None = None

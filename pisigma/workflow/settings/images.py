@@ -5,7 +5,7 @@ from typing import Annotated
 
 from pisigma.files.setting import Option
 
-MostBlur = Annotated[float, Option("--most-blur-px", least=0.0)]
+MostBlur = Annotated[float, Option("--most-blur-px", min=0.0)]
 
 
 @dataclass(frozen=True)

@@ -150,7 +150,7 @@ def test_a_long_cell_is_cut(tmp_path):
 def test_a_file_without_lines_or_a_silent_pipe_is_refused(tmp_path, monkeypatch):
     with pytest.raises(MeasurementError, match="line 1: has more than 10,000,000 characters"):
         read_poses("/dev/zero")
-    monkeypatch.setattr(input_file, "LONGEST_WAIT", 0.05)
+    monkeypatch.setattr(input_file, "MAX_WAIT_S", 0.05)
     os.mkfifo(tmp_path / "pipe")
     with pytest.raises(MeasurementError, match="nothing came through it"):
         read_poses(tmp_path / "pipe")
