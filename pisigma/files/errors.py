@@ -80,6 +80,7 @@ class PisigmaError(Exception):
         option: the option or argument at fault, for example ``"--camera"``; empty if there is none.
         value: the value that was given; None if it is not known.
         expected: what was expected; empty where `problem` says what is wrong.
+        problem: what is wrong, a clause; empty where the message says what was expected.
         remedy: how to correct the input; empty if the message does not say.
     """
 
@@ -108,6 +109,7 @@ class PisigmaError(Exception):
         self.line = None if at is None else at.line
         self.column = None if at is None else at.column
         self.option, self.value, self.expected, self.remedy = option, value, expected, remedy
+        self.problem, self._follows = problem, ""
         if expected and not problem:
             problem = (
                 f"expected {expected}" if value is None else f"expected {expected}, got {_quoted(value)}"
@@ -139,14 +141,22 @@ class PisigmaError(Exception):
         """Return a copy of the error with a text after its message."""
         other = type(self)(f"{self}{text}")
         other.__dict__.update(self.__dict__)
+        other._follows = self._follows + text
         return other
 
-    def located(self, at: Place) -> "PisigmaError":
-        """Return a copy of the error whose message starts with a place; an error without a file also takes its fields.
+    def located(self, at: Place, error: "type[PisigmaError] | None" = None) -> "PisigmaError":
+        """Return a copy of the error with a place, for errors that are found by code that does not know the file.
 
-        For errors of values that a file states, found by code that does not know the file.
+        Args:
+            at: the place in a file. If the error has a place already, `at` precedes the message instead.
+            error: class of the copy; None for the class of this error.
         """
-        other = type(self)(f"{at}: {self}")
+        make = error or type(self)
+        if self.file is None and not self._follows:
+            names = ("expected", "value", "option", "remedy")
+            fields = {name: getattr(self, name) for name in names}
+            return make(self.problem.rstrip("."), at=at, **fields)
+        other = make(f"{at}: {self}")
         other.__dict__.update(self.__dict__)
         if self.file is None:
             other.file, other.line, other.column = os.fspath(at.file), at.line, at.column

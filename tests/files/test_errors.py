@@ -66,16 +66,19 @@ def test_fields_are_plain_values_for_json():
 
 
 def test_a_place_is_added_to_an_error_without_one():
-    problem = PisigmaError("no rows", value=0).located(Place("a.csv", 3))
-    assert (str(problem), problem.file, problem.line, problem.value) == (
-        "a.csv, line 3: no rows",
-        "a.csv",
-        3,
-        0,
-    )
+    problem = RobotError("no rows", value=0, remedy="add rows").located(Place("a.csv", 3), PisigmaError)
+    assert type(problem) is PisigmaError
+    assert str(problem) == "no rows (a.csv, line 3); add rows."
+    assert (problem.file, problem.line, problem.value) == ("a.csv", 3, 0)
     again = problem.located(Place("b.yaml", 7, "rows"))
     assert (again.file, again.line, again.column) == ("a.csv", 3, None)
-    assert str(again) == "b.yaml, line 7, key 'rows': a.csv, line 3: no rows"
+    assert str(again) == "b.yaml, line 7, key 'rows': no rows (a.csv, line 3); add rows."
+    more = PisigmaError("no rows").followed_by(" See the log.").located(Place("a.csv", 3))
+    assert (str(more), more.line) == ("a.csv, line 3: no rows See the log.", 3)
+    assert (
+        str(PisigmaError(expected="a row", value=0).located(Place("a", 1)))
+        == "expected a row, got 0 (a, line 1)."
+    )
 
 
 def test_fields_survive_pickling_and_an_appended_text():

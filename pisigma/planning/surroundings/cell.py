@@ -328,5 +328,5 @@ def read_cell(path: str | os.PathLike[str], robot: Robot) -> Cell:
     try:
         cell.joints.limits(robot)
     except (RecipeError, PlanningError) as problem:
-        raise PlanningError(str(problem), at=place_of_key(path, ("joints",))) from None
+        raise problem.located(place_of_key(path, ("joints",)), PlanningError) from None
     return cell

@@ -63,7 +63,7 @@ def read_recipe(path: str | os.PathLike[str]) -> Recipe:
         try:
             check()
         except (RecipeError, IdentificationError) as problem:
-            raise RecipeError(str(problem), at=place_of_key(path, keys)) from None
+            raise problem.located(place_of_key(path, keys), RecipeError) from None
     return recipe
 
 
