@@ -67,7 +67,7 @@ def moved(rows: Measurements, joint: int, tracker: bool) -> Measurements:
 
 def is_right(session: Session, joint: int) -> bool:
     """Whether the joint that moved, and nothing else of the arm, is named; of no joint whether there is no alarm."""
-    named = [one.moved.what for one in session.moved if not is_frame(one.moved.what)]
+    named = [one.what for one in session.moved if not is_frame(one.what)]
     return named == ([f"joint {joint}"] if joint else []) and session.verdict != "unclear"
 
 

@@ -1,7 +1,7 @@
 """Differences of two models as tables."""
 
 from pisigma.lifetime.comparison.parameter_differences import ParameterDifference, ParameterDifferences
-from pisigma.lifetime.recalibration.moved import NORMAL_95
+from pisigma.lifetime.recalibration.movement import NORMAL_95
 from pisigma.reporting.tables import Table
 
 NO_VALUE = "-"

@@ -19,7 +19,7 @@ from pisigma.files.progress import Progress, stage
 from pisigma.lifetime.recalibration.adaptation import Adaptation, adapt
 from pisigma.lifetime.recalibration.candidates import FAR_BETTER, Gate, gate
 from pisigma.lifetime.recalibration.elsewhere import owners_elsewhere
-from pisigma.lifetime.recalibration.moved import Moved, moved_by, what_moved
+from pisigma.lifetime.recalibration.movement import Movement, movements_text, significant_movements
 from pisigma.lifetime.recalibration.recalibrated_model import (
     KIND,
     recalibrated_model,
@@ -28,7 +28,6 @@ from pisigma.lifetime.recalibration.recalibrated_model import (
 from pisigma.lifetime.recalibration.recalibration_problem import Owner, owners_in, recalibration_problem
 from pisigma.lifetime.recalibration.summary import (
     LeftOutFigures,
-    MovedFigures,
     RecalibrationSummary,
     WrongRowFigures,
 )
@@ -83,7 +82,7 @@ class Recalibration(AbstractModelResult):
     parent: CalibratedModel
     adaptation: Adaptation
     gate: Gate
-    moved: tuple[Moved, ...]
+    moved: tuple[Movement, ...]
     summary: RecalibrationSummary
     seconds: float
 
@@ -147,7 +146,7 @@ def recalibrate(
     odd = likeness is not None and likeness.odd
     from_scratch = stage(progress, "from scratch")
     judged, kept = _kept(judged, odd, parent, adaptation, rows, calibrator, from_scratch)
-    moved = moved_by(adaptation) if likeness is None and _believable(judged, drawn) else None
+    moved = significant_movements(adaptation) if likeness is None and _believable(judged, drawn) else None
     wrong = [one.row for one in outliers]
     diagnostics = verdict.implausible or recalibration_diagnostics(parent, judged, every, wrong, moved or ())
     moved = None if diagnostics else moved
@@ -255,7 +254,7 @@ def _summary(
     rows: Measurements,
     adaptation: Adaptation,
     judged: Gate,
-    moved: tuple[Moved, ...] | None,
+    moved: tuple[Movement, ...] | None,
 ) -> RecalibrationSummary:
     """All figures; `moved` is None where nothing can be said of it."""
     return RecalibrationSummary(
@@ -270,8 +269,8 @@ def _summary(
             name: LeftOutFigures(rms_mm=None if rms is None else rms * 1e3)
             for name, rms in judged.rms.items()
         },
-        changed=UNBELIEVABLE if moved is None else what_moved(moved),
-        moved=tuple(MovedFigures.model_validate(one.to_json()) for one in moved or ()),
+        changed=UNBELIEVABLE if moved is None else movements_text(moved),
+        moved=moved or (),
         elsewhere=(),
         effective_parameters=adaptation.effective,
         noise=adaptation.noise,

@@ -34,7 +34,7 @@ def test_rows_of_several_days_are_several_sessions():
 
 def test_an_instrument_that_was_moved_raises_no_alarm():
     monitoring = monitor(model_before(), [rows_later(12, 3, base=(1e-3, -2e-3, 5e-4, 2e-3, 0.0, 0.0))])
-    assert [one.moved.what for one in monitoring.sessions[0].session.moved] == ["base", "base"]
+    assert [one.what for one in monitoring.sessions[0].session.moved] == ["base", "base"]
     assert monitoring.sentences == ()
     assert not monitoring.action
 

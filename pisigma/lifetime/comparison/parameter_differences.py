@@ -12,7 +12,7 @@ from torch import Tensor
 from pisigma.calibration.geometric.problem.parameters import ParameterSpace
 from pisigma.lifetime.comparison.model_pair import ModelPair, as_drawn
 from pisigma.lifetime.comparison.parameter_effects import Difference, ParameterEffects
-from pisigma.lifetime.recalibration.moved import Moved
+from pisigma.lifetime.recalibration.movement import Movement
 from pisigma.measurement.sensors.sensor import SHOWN_UNITS, ShownUnit
 from pisigma.model.accuracy import parameter_posterior
 from pisigma.model.calibrated_model import CalibratedModel
@@ -84,7 +84,7 @@ class ParameterDifferences:
 
     parameters: tuple[ParameterDifference, ...]
     differing: tuple[Difference, ...]
-    frames: tuple[Moved, ...]
+    frames: tuple[Movement, ...]
     remainder: Remainder | None
     level: float
 

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from pisigma.calibration.geometric.problem.parameters import ParameterSpace
 from pisigma.lifetime.comparison.model_pair import ModelPair, frames_of
-from pisigma.lifetime.recalibration.moved import Moved, deviation_along
+from pisigma.lifetime.recalibration.movement import Movement, deviation_along
 from pisigma.measurement.conditions import JointState
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.sensors.sensor import SHOWN_UNITS
@@ -41,7 +41,7 @@ class Difference:
         alike: names of parameters that have the same effect on the tool, so that it may be these instead.
     """
 
-    shift: Moved
+    shift: Movement
     alike: tuple[str, ...]
 
     @property
@@ -146,7 +146,7 @@ class ParameterEffects:
         of_both = torch.tensor([mean**2, square * mean], dtype=torch.float64) / half_variance / 2
         return float(torch.special.gammaincc(of_both[0], of_both[1]))
 
-    def differing(self, chosen: Sequence[int]) -> tuple[tuple[Difference, ...], tuple[Moved, ...]]:
+    def differing(self, chosen: Sequence[int]) -> tuple[tuple[Difference, ...], tuple[Movement, ...]]:
         """Estimate shifts of chosen parameters together with base and tool.
 
         Returns:
@@ -170,7 +170,7 @@ class ParameterEffects:
             row = self._pair.first.identified.rows[number // 5]
             name, factor = f"joint {name.partition('_')[2]}", factor * row.direction
         alike = tuple(map(self._name, self.alike(number)))
-        return Difference(Moved(name, shift * factor, deviation * abs(factor), unit), alike)
+        return Difference(Movement(name, shift * factor, deviation * abs(factor), unit), alike)
 
     def _name(self, number: int) -> str:
         if number < self._arm:
@@ -192,7 +192,7 @@ class ParameterEffects:
 
     def _frames(
         self, shift: Float64[Tensor, "12"], covariance: Float64[Tensor, "12 12"]
-    ) -> tuple[Moved, ...]:
+    ) -> tuple[Movement, ...]:
         """How far the second model has base and tool elsewhere: the motion that was fitted, and the linear rest."""
         pair, (base, _) = self._pair, frames_of(self._pair.first, self._pair.owner[0])
         X, Y, origin = pair.T_base, pair.T_tool, base[:3, 3]
@@ -205,7 +205,7 @@ class ParameterEffects:
             length = now + step[:3] - was
             angle = rotation_vector(rotation_from_vector(step[3:]) @ R.t())
             moved += [
-                Moved(what, float(vector.norm()) * factor, deviation_along(vector, block) * factor, unit)
+                Movement(what, float(vector.norm()) * factor, deviation_along(vector, block) * factor, unit)
                 for vector, block, (unit, factor) in (
                     (length, C[:3, :3], SHOWN_UNITS["m"]),
                     (angle, C[3:, 3:], SHOWN_UNITS["rad"]),

@@ -18,7 +18,7 @@ from pisigma.estimation.wrong_rows import Explained, with_wrong_rows
 from pisigma.files.errors import IdentificationError
 from pisigma.lifetime.recalibration.adaptation import AdaptedArm, linear_values, noise_of_sensors
 from pisigma.lifetime.recalibration.elsewhere import FAR
-from pisigma.lifetime.recalibration.moved import Moved, moved_of_group
+from pisigma.lifetime.recalibration.movement import HistoryMovement, Movement, movements_of_group
 from pisigma.lifetime.recalibration.recalibration_problem import (
     Owner,
     RecalibrationProblem,
@@ -45,18 +45,6 @@ LEAST_NAMED = 0.05
 MOST_ROUNDS = 4
 SETTLED = 1.0
 """Rounds end when predicted values move by less than this share of the noise."""
-
-
-@dataclass(frozen=True)
-class Shifted:
-    """One thing that moved, with its probability against all other explanations."""
-
-    moved: Moved
-    probability: float
-
-    def to_json(self) -> dict[str, object]:
-        """Return it as plain values."""
-        return {**self.moved.to_json(), "probability": self.probability}
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,7 +87,7 @@ class Session:
 
     rows: int
     unchanged: float
-    moved: tuple[Shifted, ...]
+    moved: tuple[HistoryMovement, ...]
     candidates: tuple[tuple[str, float], ...]
     rms: float
     rms_after: float
@@ -121,7 +109,7 @@ class Session:
     @property
     def recalibrate(self) -> bool:
         """Whether the arm changed so much that recalibrating pays."""
-        arm = any(not is_frame(one.moved.what) for one in self.moved) or bool(self.candidates)
+        arm = any(not is_frame(one.what) for one in self.moved) or bool(self.candidates)
         return arm and (self.rms > PAYS * self.rms_after or max(self.rotation_ratio, self.score_ratio) > PAYS)
 
     @property
@@ -132,7 +120,7 @@ class Session:
             return f"something changed, and these rows do not show what: {' or '.join(named)}."
         if self.verdict == "unchanged":
             return "nothing moved beyond its uncertainty."
-        moved = (f"{one.moved.sentence} ({shown_probability(one.probability)})" for one in self.moved)
+        moved = (f"{one.sentence} ({shown_probability(one.probability)})" for one in self.moved)
         return f"{'; '.join(moved)}."
 
     @property
@@ -331,7 +319,7 @@ def _judged(solved: _Solved, elsewhere: dict[Owner, float]) -> Session:
     )
 
 
-def _moved(solved: _Solved, elsewhere: dict[Owner, float]) -> tuple[Shifted, ...]:
+def _moved(solved: _Solved, elsewhere: dict[Owner, float]) -> tuple[Movement, ...]:
     """How far everything that moved has, all estimated together; the arm first."""
     problem, explanation = solved.problem, solved.explanation
     found = [(_freed(one), one.probability) for one in explanation.motions]
@@ -342,13 +330,14 @@ def _moved(solved: _Solved, elsewhere: dict[Owner, float]) -> tuple[Shifted, ...
         return ()
     shift, covariance = solved.evidence.shift([group for group, _ in found], explanation.noise_factor)
     geometry = solved.arm_with(tuple(_sized(one) for one in explanation.motions)).geometry
-    moved, first = [], 0
+    moved: list[Movement] = []
+    first = 0
     for group, probability in found:
         members = slice(first, first + len(group.index))
         first = members.stop
-        parts = moved_of_group(problem, geometry, group, shift[members], covariance[members, members])
-        moved += [Shifted(part, probability) for part in parts]
-    return tuple(sorted(moved, key=lambda one: is_frame(one.moved.what)))
+        parts = movements_of_group(problem, geometry, group, shift[members], covariance[members, members])
+        moved += [replace(part, probability=probability) for part in parts]
+    return tuple(sorted(moved, key=lambda one: is_frame(one.what)))
 
 
 def _zeros(solved: _Solved) -> JointZeros:
@@ -365,8 +354,10 @@ def _joints(solved: _Solved) -> list[DriftGroup]:
     return [replace(group, size=ANYWHERE) for group in groups if group.what.startswith("joint ")]
 
 
-def shown_probability(probability: float) -> str:
-    """Write a probability as a percentage that is never rounded to 100 %."""
+def shown_probability(probability: float | None) -> str:
+    """Write a probability as a percentage that is never rounded to 100 %; "unknown" for None."""
+    if probability is None:
+        return "unknown"
     return "more than 99.9 %" if probability > 0.999 else f"{100 * probability:.1f} %"
 
 

@@ -14,7 +14,7 @@ from pisigma.estimation.drift import NOISE_SPREAD
 from pisigma.lifetime.monitoring.changes import Event, Series
 from pisigma.lifetime.monitoring.charts import Chart, innovations, limits_of
 from pisigma.lifetime.monitoring.history import Record
-from pisigma.lifetime.recalibration.moved import CLEAR, NORMAL_95
+from pisigma.lifetime.recalibration.movement import CLEAR, NORMAL_95
 from pisigma.measurement.sensors.sensor import SHOWN_UNITS, ShownUnit
 
 DAYS_PER_MONTH = 365.25 / 12

@@ -48,7 +48,7 @@ def judged_motion(
         some = posterior.renamed(some)
         with torch.no_grad():
             session, _ = judge_session(model, posterior, some, owners_in(some, fitted) if fitted else None)
-        moved = tuple(one for one in session.moved if one.moved.what.split()[0] not in fitted)
+        moved = tuple(one for one in session.moved if one.what.split()[0] not in fitted)
         if not session_diagnostics(model, some, session):
             return replace(session, moved=moved)
     return None
@@ -75,7 +75,7 @@ def session_diagnostics(
             "a unit is wrong; run `pisigma verify` on them."
         )
         return (Diagnostic(kind="implausible_errors", severity="implausible", sentence=sentence),)
-    return beyond_wear(model.robot, [one.moved for one in session.moved])
+    return beyond_wear(model.robot, session.moved)
 
 
 def motion_sentence(motion: Session, comparison: ModelComparison) -> str:
@@ -101,9 +101,9 @@ def motion_warnings(motion: Session) -> tuple[str, ...]:
 
 def motion_text(motion: Session) -> str:
     """Say what has moved, such as "Joint 3 has moved by 0.24 ± 0.01 deg (probability more than 99.9 %)"."""
-    amounts: dict[tuple[str, float], list[str]] = {}
+    amounts: dict[tuple[str, float | None], list[str]] = {}
     for one in motion.moved:
-        amounts.setdefault((one.moved.what, one.probability), []).append(one.moved.size)
+        amounts.setdefault((one.what, one.probability), []).append(one.size)
     text = joined(
         f"{_subject(what)} by {joined(those)} (probability {shown_probability(probability)})"
         for (what, probability), those in amounts.items()

@@ -13,7 +13,7 @@ from pisigma.calibration.hybrid.uncertainty import PositionUncertainty
 from pisigma.estimation.covariance_root import CovarianceRoot
 from pisigma.lifetime.recalibration.adaptation import Adaptation
 from pisigma.lifetime.recalibration.candidates import Gate
-from pisigma.lifetime.recalibration.moved import Moved
+from pisigma.lifetime.recalibration.movement import Movement
 from pisigma.lifetime.recalibration.wear import beyond_wear
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel, Frames, Provenance
@@ -122,7 +122,7 @@ def recalibration_diagnostics(
     judged: Gate,
     rows: Measurements,
     wrong: Sequence[int],
-    moved: Sequence[Moved],
+    moved: Sequence[Movement],
 ) -> tuple[Diagnostic, ...]:
     """Say why the result is not to be trusted, although the checks of the rows found nothing.
 

@@ -2,6 +2,7 @@
 
 from pisigma.files.yaml_file import Section
 from pisigma.lifetime.recalibration.candidates import Kept
+from pisigma.lifetime.recalibration.movement import SummaryMovement
 from pisigma.validation.held_out.distillation_summary import ParentFigures
 from pisigma.validation.held_out.summary import AbstractSummary
 
@@ -10,15 +11,6 @@ class LeftOutFigures(Section):
     """Errors of left-out rows under one candidate; None where the rows are too few for it."""
 
     rms_mm: float | None
-
-
-class MovedFigures(Section):
-    """One thing that moved, with the 95 % interval of its shift; see `pisigma.lifetime.recalibration.moved.Moved`."""
-
-    what: str
-    shift_mm: float | None = None
-    shift_deg: float | None = None
-    interval: tuple[float, float]
 
 
 class WrongRowFigures(Section):
@@ -75,7 +67,7 @@ class RecalibrationSummary(AbstractSummary):
     left_out: int
     cross_validation: dict[str, LeftOutFigures]
     changed: str
-    moved: tuple[MovedFigures, ...]
+    moved: tuple[SummaryMovement, ...]
     elsewhere: tuple[str, ...]
     effective_parameters: float
     noise: dict[str, float]

@@ -4,14 +4,14 @@ import math
 from collections.abc import Sequence
 
 from pisigma.lifetime.monitoring.session import is_frame
-from pisigma.lifetime.recalibration.moved import Moved
+from pisigma.lifetime.recalibration.movement import Movement
 from pisigma.robot.description import Robot
 from pisigma.robot.robot_class import ChangeLimits, RobotClass
 from pisigma.validation.held_out.diagnostic import Diagnostic
 from pisigma.validation.setup_faults.cause import joined
 
 
-def beyond_wear(robot: Robot, moved: Sequence[Moved]) -> tuple[Diagnostic, ...]:
+def beyond_wear(robot: Robot, moved: Sequence[Movement]) -> tuple[Diagnostic, ...]:
     """Say which changes no wear and no collision makes; bases, tools and the zero of a single joint move by any size.
 
     Args:
@@ -34,7 +34,7 @@ def beyond_wear(robot: Robot, moved: Sequence[Moved]) -> tuple[Diagnostic, ...]:
     )
 
 
-def _is_beyond(one: Moved, limits: ChangeLimits) -> bool:
+def _is_beyond(one: Movement, limits: ChangeLimits) -> bool:
     if one.unit == "mm":
         return abs(one.shift) > limits.length * 1e3
     return abs(one.shift) > math.degrees(limits.joint_zero if one.what.startswith("joint ") else limits.angle)

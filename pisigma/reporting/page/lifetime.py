@@ -13,7 +13,7 @@ from pisigma.lifetime.comparison.parameter_differences import ParameterDifferenc
 from pisigma.lifetime.fleet.status import FleetStatus
 from pisigma.lifetime.monitoring.charts import FALSE_ALARMS_PER_YEAR, SESSIONS_PER_YEAR, Chart
 from pisigma.lifetime.monitoring.history import Record
-from pisigma.lifetime.recalibration.moved import NORMAL_95
+from pisigma.lifetime.recalibration.movement import NORMAL_95
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.reporting.comparison_tables import comparison_tables
 from pisigma.reporting.difference_tables import difference_table

@@ -10,7 +10,7 @@ from testing.compared import COLLISION, after_collision, model_of
 
 from pisigma.lifetime.comparison.model_pair import ModelPair
 from pisigma.lifetime.comparison.parameter_differences import parameter_differences
-from pisigma.lifetime.recalibration.moved import NORMAL_95
+from pisigma.lifetime.recalibration.movement import NORMAL_95
 from pisigma.validation.held_out.reference_models import nominal_model
 
 

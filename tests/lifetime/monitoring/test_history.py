@@ -12,12 +12,12 @@ from testing.closeness import assert_close
 
 from pisigma.files.errors import OutputError
 from pisigma.lifetime.monitoring.history import Record, history_path, remember
-from pisigma.lifetime.monitoring.session import JointZeros, Session, Shifted
-from pisigma.lifetime.recalibration.moved import Moved
+from pisigma.lifetime.monitoring.session import JointZeros, Session
+from pisigma.lifetime.recalibration.movement import Movement
 
 
 def record(number, date="2026-01-01"):
-    moved = (Shifted(Moved("joint 3", 0.05, 0.002, "deg"), 0.999),)
+    moved = (Movement("joint 3", 0.05, 0.002, "deg", 0.999),)
     session = Session(
         10, 1e-9, moved, (("joint 3", 0.9),), 1e-4 * number, 5e-5, 1.0, 1.1, 30, ("base",), (True, False)
     )

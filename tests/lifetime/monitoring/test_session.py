@@ -28,8 +28,8 @@ def test_the_joint_that_moved_is_named_from_five_poses(joint):
     degrees = 0.05 if joint < 4 else 0.5  # nearer to the reflector
     session, zeros = judged(rows_later(5, 20 + joint, moved_joint(joint, degrees)))
     assert session.verdict == "moved"
-    assert [one.moved.what for one in session.moved] == [f"joint {joint}"]
-    low, high = session.moved[0].moved.interval
+    assert [one.what for one in session.moved] == [f"joint {joint}"]
+    low, high = session.moved[0].interval
     assert low < degrees < high
     assert session.moved[0].probability > 0.9
     assert session.unchanged < 0.01
@@ -57,21 +57,21 @@ def test_a_wrong_row_is_named_and_not_taken_for_a_motion(joint):
     wrong[4, 1] += 0.005
     session, _ = judged(replace(rows, position=wrong))
     assert session.outliers == (rows.place(4),)
-    assert [one.moved.what for one in session.moved] == (["joint 3"] if joint else [])
+    assert [one.what for one in session.moved] == (["joint 3"] if joint else [])
     assert_close(session.rms, judged(rows.select(torch.tensor([0, 1, 2, 3, 5, 6, 7, 8, 9])))[0].rms, rtol=0.1)
 
 
 def test_two_joints_that_moved_are_both_named():
     both = tuple(a + b for a, b in zip(moved_joint(2, 0.2), moved_joint(5, -0.3), strict=True))
     session, _ = judged(rows_later(12, 4, both))
-    assert {one.moved.what for one in session.moved} == {"joint 2", "joint 5"}
+    assert {one.what for one in session.moved} == {"joint 2", "joint 5"}
 
 
 @pytest.mark.parametrize("joint", [0, 3])
 def test_an_instrument_elsewhere_is_told_from_a_joint(joint):
     session, _ = judged(rows_later(12, 5, moved_joint(joint, 0.1), ELSEWHERE))
     expected = ["joint 3"] if joint else []
-    assert [one.moved.what for one in session.moved] == [*expected, "base", "base"]
+    assert [one.what for one in session.moved] == [*expected, "base", "base"]
     assert session.recalibrate == bool(joint)
     assert "base" in session.standing
     assert not session.observable[0]
@@ -80,14 +80,14 @@ def test_an_instrument_elsewhere_is_told_from_a_joint(joint):
 
 def test_a_small_motion_of_the_base_is_not_taken_for_a_joint():
     session, _ = judged(rows_later(10, 6, base=(3e-4, -2e-4, 4e-4, 0.0, 0.0, 0.0)))
-    assert {one.moved.what for one in session.moved} == {"base"}
+    assert {one.what for one in session.moved} == {"base"}
     assert not session.recalibrate
 
 
 def test_what_stands_elsewhere_can_be_stated():
     session, _ = judged(rows_later(12, 5), frozenset({("base", "")}))
     assert session.standing == ("base",)
-    assert all(one.moved.what == "base" for one in session.moved)
+    assert all(one.what == "base" for one in session.moved)
 
 
 def test_scores_are_as_large_as_expected_where_nothing_changes():

@@ -13,7 +13,7 @@ from testing.models import hand_made_model
 from pisigma.files.errors import ModelError
 from pisigma.lifetime.recalibration.adaptation import Adaptation, adapt
 from pisigma.lifetime.recalibration.elsewhere import owners_elsewhere
-from pisigma.lifetime.recalibration.moved import moved_by, what_moved
+from pisigma.lifetime.recalibration.movement import significant_movements
 from pisigma.lifetime.recalibration.recalibrated_model import recalibrated_model
 from pisigma.lifetime.recalibration.recalibration_problem import recalibration_problem
 from pisigma.model.calibrated_model import poses_of_rows
@@ -50,19 +50,18 @@ def test_a_collision_is_found_and_repaired():
     adaptation = adapted(model, rows_later(10, 2, COLLISION))
     after = rms(adaptation.errors_of(rows_later(300, 50, COLLISION, noise=0.0))["position"])
     assert after < 1.15 * before
-    moved = moved_by(adaptation)
+    moved = significant_movements(adaptation)
     assert [one.what for one in moved] == ["joint 3"]
     low, high = moved[0].interval
     assert low < 0.25 < high
     assert high - low < 0.05
-    assert what_moved(moved).startswith("Joint 3 moved by 0.2")
-    (turned,) = moved_by(with_turned_joint_3(adaptation))
+    (turned,) = significant_movements(with_turned_joint_3(adaptation))
     assert_close(turned.shift, -moved[0].shift)
 
 
 def test_nothing_moved_is_said_where_nothing_moved():
     adaptation = adapted(model_before(), rows_later(10, 2))
-    assert what_moved(moved_by(adaptation)) == "Nothing moved beyond its uncertainty."
+    assert significant_movements(adaptation) == ()
 
 
 @pytest.mark.parametrize("moved", [(0.0,) * 6, COLLISION])
@@ -74,7 +73,7 @@ def test_an_instrument_elsewhere_is_found(moved):
     adaptation = adapted(model, rows, {("base", "")})
     errors = adaptation.errors_of(rows_later(300, 50, moved, SHIFTED, noise=0.0))["position"]
     assert rms(errors) < 1.5 * rms_of(model, rows_later(300, 50, noise=0.0))
-    whats = [one.what for one in moved_by(adaptation)]
+    whats = [one.what for one in significant_movements(adaptation)]
     assert whats == [*(["joint 3"] if any(moved) else []), "base", "base"]
 
 

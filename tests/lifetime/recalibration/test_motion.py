@@ -34,7 +34,7 @@ def test_six_rows_in_another_frame_are_enough(collision):
     rows = rows_later(6, 11, COLLISION if collision else (0.0,) * 6, ELSEWHERE)
     verification = verify(model_before(), rows, VerificationSettings(fit_frame=True))
     assert verification.verdict == ("moved" if collision else "better")
-    assert [one.moved.what for one in verification.motion.moved] == ["joint 3"] * collision
+    assert [one.what for one in verification.motion.moved] == ["joint 3"] * collision
     assert ("--moved base" in verification.recalibration) == collision
     assert "12 degrees of freedom, 18 values less 6" in verification.warnings[-1]
 

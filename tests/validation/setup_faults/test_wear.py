@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pytest
 
-from pisigma.lifetime.recalibration.moved import Moved
+from pisigma.lifetime.recalibration.movement import Movement
 from pisigma.lifetime.recalibration.wear import beyond_wear
 from pisigma.robot.description import Robot
 from pisigma.robot.robot_class import CLASSES, RobotClass
@@ -26,10 +26,10 @@ def of_class(name: str) -> Robot:
     return robot
 
 
-def moved(what: str, size: float) -> Moved:
+def moved(what: str, size: float) -> Movement:
     """A change [m or rad]."""
     unit, factor = ("mm", 1e3) if KINDS[what] == "length" else ("deg", math.degrees(1.0))
-    return Moved(what, size * factor, 1e-3, unit)
+    return Movement(what, size * factor, 1e-3, unit)
 
 
 @pytest.mark.parametrize("name", CLASSES)
@@ -54,5 +54,5 @@ def test_one_joint_may_be_zeroed_again_but_not_several(name):
 @pytest.mark.parametrize("what", ["base", "tool", "base cell"])
 def test_frames_move_by_any_size(what):
     robot = of_class("industrial")
-    assert beyond_wear(robot, [Moved(what, 6000.0, 0.1, "mm"), Moved(what, 90.0, 0.1, "deg")]) == ()
+    assert beyond_wear(robot, [Movement(what, 6000.0, 0.1, "mm"), Movement(what, 90.0, 0.1, "deg")]) == ()
     assert beyond_wear(robot, []) == ()

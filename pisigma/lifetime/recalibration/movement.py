@@ -1,0 +1,186 @@
+"""Movements of joint zeros, parameters, bases and tools since a calibration, with their uncertainties."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Annotated, Any
+
+import numpy as np
+import torch
+from jaxtyping import Float64
+from pydantic import BeforeValidator, PlainSerializer
+from torch import Tensor
+
+from pisigma.calibration.geometric.problem.setup import IdentifiedGeometry
+from pisigma.estimation.drift import DriftGroup
+from pisigma.lifetime.recalibration.adaptation import Adaptation
+from pisigma.lifetime.recalibration.recalibration_problem import RecalibrationProblem, frame_stretch
+from pisigma.measurement.sensors.sensor import SHOWN_UNITS, ShownUnit
+from pisigma.robot.se3 import rotation_vector, transform_from_xyzrpy
+
+CLEAR = 3.3
+"""Standard deviations above which a movement is significant: chance exceeds them in one of 1,000 cases."""
+NORMAL_95 = 1.959964
+"""Half-width of the 95 % interval of a normal distribution [standard deviations]."""
+
+
+@dataclass(frozen=True)
+class Movement:
+    """Movement of one joint zero, parameter, base or tool between two times or two models.
+
+    Attributes:
+        what: what moved, such as "joint 3", "a_2", "base" or "tool".
+        shift: signed change of a joint zero or parameter [`unit`]; a joint zero counts in the positive direction of the
+            joint. Of a base or a tool: the distance of its origins, or the angle of its rotation.
+        deviation: standard deviation of the shift [`unit`].
+        unit: "mm" or "deg"; a base or a tool has one movement of each.
+        probability: posterior probability of this explanation among all others; None where it was not computed.
+    """
+
+    what: str
+    shift: float
+    deviation: float
+    unit: ShownUnit
+    probability: float | None = None
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """95 % confidence interval of the shift [`unit`]."""
+        half = NORMAL_95 * self.deviation
+        return self.shift - half, self.shift + half
+
+    @property
+    def size(self) -> str:
+        """Shift, half-width of its 95 % interval and unit, such as "0.25 ± 0.01 deg"."""
+        half = NORMAL_95 * self.deviation
+        digits = min(max(1 - math.floor(math.log10(max(half, 1e-6))), 0), 4)
+        shown = max(half, 10.0**-digits)  # never an uncertainty of 0
+        return f"{self.shift:.{digits}f} ± {shown:.{digits}f} {self.unit}"
+
+    @property
+    def sentence(self) -> str:
+        """Clause such as "joint 3 moved by 0.25 ± 0.01 deg"."""
+        return f"{self.what} moved by {self.size}"
+
+    def to_json(self) -> dict[str, object]:
+        """Return plain values; the key of the shift carries the unit: `shift_mm` or `shift_deg`."""
+        plain = {"what": self.what, f"shift_{self.unit}": self.shift, "interval": list(self.interval)}
+        return plain if self.probability is None else plain | {"probability": self.probability}
+
+
+def _fields(stored: Any) -> Any:
+    """Convert stored forms of a movement to its fields: `to_json`, and what histories held before."""
+    if not isinstance(stored, Mapping):
+        return stored
+    if isinstance(stored.get("moved"), Mapping):  # histories nested the movement in its probability
+        return {**stored["moved"], "probability": stored.get("probability")}
+    key = next((key for key in stored if key.startswith("shift_") and stored[key] is not None), None)
+    if key is None or "interval" not in stored:
+        return stored
+    low, high = stored["interval"]
+    deviation = (high - low) / (2 * NORMAL_95)
+    fields = {"what": stored.get("what"), "shift": stored[key], "deviation": deviation}
+    return fields | {"unit": key.removeprefix("shift_"), "probability": stored.get("probability")}
+
+
+HistoryMovement = Annotated[Movement, BeforeValidator(_fields)]
+"""A movement that a history stores by its fields."""
+SummaryMovement = Annotated[Movement, BeforeValidator(_fields), PlainSerializer(Movement.to_json)]
+"""A movement that a model folder stores as `Movement.to_json`."""
+
+
+def significant_movements(adaptation: Adaptation) -> tuple[Movement, ...]:
+    """Return the movements above `CLEAR` standard deviations: joints first, then lengths and angles, bases and tools.
+
+    The shift of a joint zero is estimated without a prior, together with all else that has drifted. It counts in the
+    positive direction of the joint: a joint with the shift 0.1 deg is 0.1 deg beyond the value that its controller
+    shows.
+    """
+    moved: list[Movement] = []
+    for number, group in enumerate(adaptation.drift.groups):
+        if group.size and group.what.split()[0] in ("base", "tool", "joint", "lengths", "angles"):
+            estimate = adaptation.search.shift(number, held=not group.what.startswith("joint"))
+            moved += movements_of_group(adaptation.problem, adaptation.arm.geometry, group, *estimate)
+    return tuple(one for one in moved if abs(one.shift) > CLEAR * one.deviation)
+
+
+def movements_of_group(
+    problem: RecalibrationProblem,
+    after: IdentifiedGeometry,
+    group: DriftGroup,
+    shift: Float64[Tensor, " members"],
+    covariance: Float64[Tensor, "members members"],
+) -> list[Movement]:
+    """Return the movements of a group: one per parameter of the arm, or a distance and an angle of a base or a tool.
+
+    Args:
+        problem: recalibration problem that the group belongs to.
+        after: geometry after the movement.
+        group: group that moved.
+        shift: shifts of its unknowns [m or rad].
+        covariance: their covariance [m or rad, squared].
+    """
+    kind, _, name = group.what.partition(" ")
+    if kind in ("base", "tool"):
+        return _of_frame(problem, after, group, name, shift, covariance)
+    space, moved = problem.design.problem.space, []
+    for index, by, variance in zip(group.index, shift, covariance.diagonal(), strict=True):
+        parameter = space.parameters[int(index)]
+        unit, factor = SHOWN_UNITS[parameter.unit]
+        what, sign = parameter.name, 1
+        if kind == "joint":
+            what, sign = group.what, int(space.robot.directions[int(name) - 1])
+        moved.append(Movement(what, sign * float(by) * factor, float(variance) ** 0.5 * factor, unit))
+    return moved
+
+
+def movements_text(moved: tuple[Movement, ...]) -> str:
+    """Write significant movements as a sentence."""
+    if not moved:
+        return "Nothing moved beyond its uncertainty."
+    clauses = "; ".join(one.sentence for one in moved)
+    return f"{clauses[:1].upper()}{clauses[1:]}; nothing else moved beyond its uncertainty."
+
+
+def _of_frame(
+    problem: RecalibrationProblem,
+    geometry: IdentifiedGeometry,
+    group: DriftGroup,
+    name: str,
+    shift: Float64[Tensor, " members"],
+    of_members: Float64[Tensor, "members members"],
+) -> list[Movement]:
+    """Return the distance and the angle by which a base or a tool has moved."""
+    space, kind = problem.design.problem.space, group.what.split()[0]
+    before, after = (
+        one.bases if kind == "base" else one.tools for one in (problem.posterior.geometry, geometry)
+    )
+    name = name or next(iter(after))
+    if name not in before:
+        return []
+    column = group.index - frame_stretch(space, kind, name).start
+    motion, covariance = torch.zeros(6).double(), torch.zeros(6, 6).double()
+    motion[column], covariance[column[:, None], column] = shift, of_members
+    if group.stands:  # relocated: `shift` counts from the initial guess, not from the frame of the model
+        old, new = (transform_from_xyzrpy(torch.from_numpy(np.asarray(one[name]))) for one in (before, after))
+        turn = rotation_vector(new[:3, :3] @ old[:3, :3].mT)
+        motion = torch.cat([new[:3, 3] - old[:3, 3], turn])
+        if kind == "base":
+            motion = (
+                motion.view(2, 3) @ problem.setup.anchors.bases[space.frames.index(name), :3, :3]
+            ).flatten()
+    return [
+        Movement(group.what, float(vector.norm()) * factor, deviation_along(vector, block) * factor, unit)
+        for vector, block, (unit, factor) in (
+            (motion[:3], covariance[:3, :3], SHOWN_UNITS["m"]),
+            (motion[3:], covariance[3:, 3:], SHOWN_UNITS["rad"]),
+        )
+    ]
+
+
+def deviation_along(vector: Float64[Tensor, " 3"], covariance: Float64[Tensor, "3 3"]) -> float:
+    """Compute the standard deviation along a vector; the largest of all directions where the vector is 0."""
+    length = float(vector.norm())
+    if length > 0.0:
+        return math.sqrt(float(vector @ covariance @ vector)) / length
+    return math.sqrt(max(float(torch.linalg.eigvalsh(covariance)[-1]), 0.0))
