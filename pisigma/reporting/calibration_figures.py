@@ -1,6 +1,5 @@
 """Figures of a calibration: residuals, held-out errors, correlations, and what was learned beyond the geometry."""
 
-import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -19,13 +18,9 @@ from pisigma.measurement.dataset import Measurements
 from pisigma.reporting.figures import save_figure, set_margins
 from pisigma.validation.held_out.pose_statistics import WITHIN, PredictedSpread
 from pisigma.validation.held_out.validation_figures import LearningPoint
+from pisigma.validation.report.corrections import JOINT_UNITS
 
 _UNITS = {"position": ("mm", 1e3), "rotation": ("deg", float(np.rad2deg(1.0)))}
-JOINT_UNITS = {
-    "revolute": ("deg", math.degrees(1.0), "mdeg", math.degrees(1e3)),
-    "prismatic": ("mm", 1e3, "µm", 1e6),
-}
-"""Unit of a joint's values and of its correction, each with the factor from [rad] or [m]."""
 _REDUNDANT = 1 - 1e-6
 _LETTER = 0.07
 """[inch] Width of a letter of the names along tables."""

@@ -12,6 +12,7 @@ from pisigma.reporting.tables import (
     figure_text,
     joint_table,
     markdown_table,
+    p_text,
     percent_text,
     pose_table,
 )
@@ -48,6 +49,7 @@ def _environment() -> jinja2.Environment:
             "pose_table": pose_table,
             "joint_table": joint_table,
             "distance_table": lambda distances: markdown_table(*distance_table(distances)),
+            "p_value": p_text,
             "percent": percent_text,
             "table": lambda table: markdown_table(*table),
         },

@@ -35,6 +35,11 @@ def percent_text(share: float) -> str:
     return "more than 99 %" if share > 0.995 else f"{100 * share:.0f} %"
 
 
+def p_text(probability: float) -> str:
+    """Write a probability by chance, such as "p = 0.02"."""
+    return "p < 1e-12" if probability < 1e-12 else f"p = {probability:.2g}"
+
+
 def joint_rows(joints: Sequence[JointFigures]) -> list[tuple[str, ...]]:
     """Per joint and rows: joint, unit, rows, then average, deviation, maximum before and after."""
     lines = []

@@ -117,7 +117,7 @@ def report(
     if data is not None:
         rows, remarks = _right_rows(loaded, read_rows(data, loaded.robot, cameras))
         diagnostics = check_rows(rows, loaded).implausible
-    content = report_content(loaded, Path(model), rows, (*(one.sentence for one in diagnostics), *remarks))
+    content = report_content(loaded, Path(model), rows, remarks, diagnostics)
     progress("drawing")
     figures = draw_figures(content)
     return Report(content, figures, diagnostics, time.perf_counter() - begin)

@@ -1,13 +1,12 @@
-"""Everything that a report says, as figures and sentences, before it is drawn and laid out."""
+"""Content of a calibration report: findings of `pisigma.validation.report`, and the sentences about them."""
 
-import functools
 import math
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float64
 
 from pisigma.files.model_files import CORRELATION_CSV, CORRELATION_PNG
 from pisigma.measurement.dataset import Measurements
@@ -18,45 +17,43 @@ from pisigma.reporting.calibration_tables import (
     undetermined_lines,
     warning_lines,
 )
-from pisigma.reporting.page.accuracy import Accuracy, JudgedJoint, Limit, accuracies, judged_joints, limit_of
 from pisigma.reporting.page.advice import advice_for
-from pisigma.reporting.page.corrections import (
-    CorrectionCurve,
-    ParameterFindings,
-    correction_curves,
-    parameter_findings,
-)
-from pisigma.reporting.page.dependence import (
-    LEAST_ROWS,
-    Dependence,
-    NameErrors,
-    by_name,
-    dependences,
-    error_lengths,
-    root_mean_square,
-)
-from pisigma.reporting.page.error_map import ErrorMap, map_of_rows, map_of_workspace
-from pisigma.reporting.rendering import sentences
+from pisigma.reporting.page.wording import TITLES, dependence_text, rows_text, say
 from pisigma.validation.held_out.calibration_summary import CalibrationSummary
+from pisigma.validation.held_out.diagnostic import Diagnostic
 from pisigma.validation.held_out.held_out_rows import read_held_out
 from pisigma.validation.held_out.judged_rows import JudgedRows, rows_of_file, rows_of_folder
-from pisigma.validation.held_out.rank_tests import SIGNIFICANT, groups_differ
+from pisigma.validation.report.accuracy import (
+    Accuracy,
+    AccuracyLimit,
+    JudgedJoint,
+    accuracies,
+    judged_joints,
+    limit_of,
+)
+from pisigma.validation.report.corrections import (
+    CorrectionCurve,
+    ParameterCorrelations,
+    correction_curves,
+    parameter_correlations,
+)
+from pisigma.validation.report.dependence import Dependence, ErrorsByName, by_name, dependences
+from pisigma.validation.report.error_map import ErrorMap, map_of_rows, map_of_workspace
+from pisigma.validation.report.largest_errors import largest_errors
 
-CELLS = 4
-"""Cells of the measured space along every axis."""
-
-_say = functools.partial(sentences, "report.txt.j2")
+WITHOUT_CAUSE = ("few_rows", "search", "camera", "stated_noise", "temperature")
+"""Kinds of warnings that name no cause of the errors."""
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """What there is to say first.
+    """The first statements of a report.
 
     Attributes:
-        sentence: how accurate, how much better than nominal, where worst, what limits it.
-        worst: where it is worst, in a sentence.
-        limit: what limits it, in a sentence.
-        held_out: whether the sentence rests on rows that the model was made without.
+        sentence: how accurate the model is, how much better than nominal, where it is worst and what limits it.
+        worst: where it is worst, as a sentence.
+        limit: what limits it, as a sentence: the first diagnosed cause, else scatter or model.
+        held_out: whether the sentence refers to rows that the model was made without.
         joint: the worst joint of a network, where no pose was judged.
     """
 
@@ -67,149 +64,105 @@ class Verdict:
     joint: JudgedJoint | None = None
 
 
-@dataclass(frozen=True)
-class Region:
-    """The cell of the measured space with the largest errors.
-
-    Attributes:
-        low: its corner [m].
-        high: the opposite corner [m].
-        rows: how many are in it.
-        rms: of their errors.
-        ratio: RMS over that of all rows.
-        significant: whether errors there are larger than elsewhere more than by chance.
-    """
-
-    low: tuple[float, ...]
-    high: tuple[float, ...]
-    rows: int
-    rms: float
-    ratio: float
-    significant: bool
-
-
 def verdict_of(
     model: CalibratedModel,
     accuracies: tuple[Accuracy, ...],
     joints: tuple[JudgedJoint, ...],
     rows: JudgedRows | None,
-    limit: Limit,
+    limit: AccuracyLimit,
+    causes: tuple[str, ...] = (),
 ) -> Verdict:
-    """Put the verdict together.
+    """Compose the verdict.
 
     Args:
         model: the model.
-        accuracies: the first one counts.
+        accuracies: error figures, of which the first one counts.
         joints: errors of joints, which count where no pose was judged.
         rows: judged rows, or None.
-        limit: what limits the accuracy.
+        limit: contribution of measurement scatter.
+        causes: diagnosed causes of the errors; the first one is then what limits the accuracy.
     """
     if not accuracies:
         return _without_poses(model, joints)
     best = accuracies[0]
     clause, worst = _worst(model, rows)
-    clauses = [*_say("how_accurate", model, best), *([clause] if clause else [])]
-    clauses += [f"what limits it is {limit.clause}"] if best.unit == "mm" else []
-    return Verdict(f"{'; '.join(clauses)}.", worst, limit.sentence, best.held_out)
+    clauses = [*say("how_accurate", model, best), *([clause] if clause else [])]
+    if best.unit == "mm" and not causes:
+        clauses.append(f"what limits it is {say('limit_clause', limit)[0]}")
+    sentence = causes[0] if causes else say("limit", limit)[0]
+    return Verdict(f"{'; '.join(clauses)}.", worst, sentence, best.held_out)
+
+
+def causes_of(summary: CalibrationSummary | None, diagnostics: Sequence[Diagnostic]) -> tuple[str, ...]:
+    """Return the diagnosed causes of the errors, one sentence each: those of the judged rows, else of the calibration.
+
+    Args:
+        summary: figures of the calibration; None for other models.
+        diagnostics: why the judged rows are implausible.
+    """
+    found = diagnostics or (() if summary is None else summary.diagnostics)
+    named = (one for one in found if one.severity == "implausible" or one.kind not in WITHOUT_CAUSE)
+    return tuple(one.sentence for one in named)
 
 
 def _without_poses(model: CalibratedModel, joints: tuple[JudgedJoint, ...]) -> Verdict:
-    """Say what joint errors say where no pose was judged."""
+    """Say what joint errors show where no pose was judged."""
     if not joints:
-        advice = "Give a file with measurements that the model was not made of."
-        return Verdict(_say("no_figures", model)[0], "", advice, held_out=False)
+        advice = "Give a file with measurements that the model was not calibrated with."
+        return Verdict(say("no_figures", model)[0], "", advice, held_out=False)
     of_kind = [one for one in joints if one.held_out == joints[0].held_out]
     worst = max(of_kind, key=lambda one: one.errors.after.values[0])
     advice = "Give a file with measured positions or poses to judge them."
-    return Verdict(_say("how_accurate_joint", model, worst)[0], "", advice, worst.held_out, worst)
+    return Verdict(say("how_accurate_joint", model, worst)[0], "", advice, worst.held_out, worst)
 
 
 def _worst(model: CalibratedModel, rows: JudgedRows | None) -> tuple[str, str]:
     """Say where errors are largest: a clause for the verdict and a sentence; both empty without rows."""
-    if rows is None:
+    largest = None if rows is None else largest_errors(rows)
+    if rows is None or largest is None:
         return "", ""
-    _, after, unit = error_lengths(rows)
-    finite = np.isfinite(after)
-    if not finite.any():
-        return "", ""
-    place, errors = rows.place.numpy()[finite], after[finite]
-    region, worst = worst_region(place, errors), int(errors.argmax())
-    number = int(np.flatnonzero(finite)[worst])
     joints = [
         f"{np.degrees(value):.1f} deg" if turns else f"{value * 1e3:.1f} mm"
-        for value, turns in zip(rows.measurements.q.numpy()[number], model.robot.revolute, strict=True)
+        for value, turns in zip(rows.measurements.q.numpy()[largest.row], model.robot.revolute, strict=True)
     ]
-    at = [round(value * 1e3) for value in place[worst].tolist()]
-    (row,) = _say("worst_row", rows, number, float(errors[worst]), unit, at, joints)
+    at = [round(value * 1e3) for value in largest.position]
+    (row,) = say("worst_row", rows, largest, at, joints)
+    region = largest.region
     if region is None:
         return "", row
     where = ", ".join(
         f"{axis} {round(low * 1e3)} to {round(high * 1e3)}"
         for axis, low, high in zip("xyz", region.low, region.high, strict=True)
     )
-    clause, sentence = _say("worst_region", region, where, unit, rows.origin)
+    clause, sentence = say("worst_region", region, where, largest.unit, rows.origin)
     return clause, f"{sentence} {row}"
-
-
-def worst_region(place: Float64[np.ndarray, "rows 3"], errors: Float64[np.ndarray, " rows"]) -> Region | None:
-    """Find the cell of a grid over the measured space whose errors are surely the largest.
-
-    Args:
-        place: position of every row [m].
-        errors: their lengths, all finite.
-
-    Returns:
-        None where there are too few rows, or all are in one cell.
-    """
-    low, high = (place.min(0), place.max(0)) if len(place) else (np.zeros(3), np.zeros(3))
-    width = np.where(high > low, (high - low) / CELLS, 1.0)
-    cell = np.clip(((place - low) / width).astype(int), 0, CELLS - 1)
-    number = (cell * [CELLS * CELLS, CELLS, 1]).sum(1)
-    least = max(LEAST_ROWS, len(errors) // 100)
-    cells = [(int(k), errors[number == k]) for k in np.unique(number)]
-    cells = [(k, inside) for k, inside in cells if len(inside) >= least]
-    if len(cells) < 2:
-        return None
-    # one standard error less, so that a cell of few rows is not the worst by luck
-    worst, _ = max(cells, key=lambda one: root_mean_square(one[1]) * (1 - 1 / math.sqrt(len(one[1]))))
-    inside = number == worst
-    _, chance = groups_differ(inside.astype(int), errors)
-    corner = low + width * cell[inside][0]
-    rms = root_mean_square(errors[inside])
-    return Region(
-        low=tuple(corner.tolist()),
-        high=tuple((corner + width).tolist()),
-        rows=int(inside.sum()),
-        rms=rms,
-        ratio=rms / root_mean_square(errors),
-        significant=chance < SIGNIFICANT / len(cells),
-    )
 
 
 @dataclass(frozen=True, eq=False)
 class ReportContent:
-    """What a report says.
+    """Findings of a report, and the sentences about them.
 
     Attributes:
         model: the model.
-        summary: figures of its calibration; None of other models.
-        verdict: what there is to say first.
-        accuracies: the first one is that of the verdict.
-        limit: what limits the accuracy.
+        summary: figures of its calibration; None for other models.
+        verdict: the first statements.
+        accuracies: error figures; the first ones are those of the verdict.
+        limit: contribution of measurement scatter to the error.
         rows: judged rows, or None.
-        remarks: what a reader should know of these rows, a sentence each.
-        map: points in space.
+        remarks: remarks on these rows, one sentence each.
+        map: points of the error map.
         dependences: errors over joint values, order, payload and temperature.
-        frames: errors per frame, and a sentence; empty where there is one.
-        targets: the same per target.
-        parameters: what is known of the parameters.
-        curves: of the learned correction.
-        learned: of the learned correction, in sentences.
-        not_identified: parameters that the data cannot determine, in sentences.
-        advice: what to measure next.
-        provenance: name and value.
-        joints: errors of joints that a network was judged by; empty for other models.
-        missing: what could not be said and why.
+        frames: errors per frame; empty where there is one.
+        targets: errors per target; empty where there is one.
+        correlations: correlations of the parameters.
+        curves: curves of the learned correction.
+        learned: sentences on the learned correction.
+        not_identified: sentences on parameters that the data cannot determine.
+        advice: what to measure next, one sentence each.
+        provenance: names and values.
+        joints: errors of the joints of a network; empty for other models.
+        missing: what the report cannot say and why, one sentence each.
+        missing_parameters: what the folder does not keep about the parameters, one sentence each.
         correlation_png: figure of the folder, where it does not keep the correlations as numbers.
     """
 
@@ -217,14 +170,14 @@ class ReportContent:
     summary: CalibrationSummary | None
     verdict: Verdict
     accuracies: tuple[Accuracy, ...]
-    limit: Limit
+    limit: AccuracyLimit
     rows: JudgedRows | None
     remarks: tuple[str, ...]
     map: ErrorMap
     dependences: tuple[Dependence, ...]
-    frames: tuple[tuple[NameErrors, ...], str]
-    targets: tuple[tuple[NameErrors, ...], str]
-    parameters: ParameterFindings
+    frames: ErrorsByName
+    targets: ErrorsByName
+    correlations: ParameterCorrelations
     curves: tuple[CorrectionCurve, ...]
     learned: tuple[str, ...]
     not_identified: tuple[str, ...]
@@ -232,10 +185,11 @@ class ReportContent:
     provenance: tuple[tuple[str, str], ...]
     joints: tuple[JudgedJoint, ...]
     missing: tuple[str, ...]
+    missing_parameters: tuple[str, ...]
     correlation_png: bytes = b""
 
     def to_json(self) -> dict[str, Any]:
-        """Return figures and sentences as plain values, without single rows; what is no number is None."""
+        """Return figures and sentences as plain values, without single rows; NaN and infinity become None."""
         rows = self.rows
         values = {
             "model": self.model.name,
@@ -245,12 +199,12 @@ class ReportContent:
             "limit": {
                 "noise_rms_mm": self.limit.noise,
                 "share": self.limit.share,
-                "says": self.limit.sentence,
+                "says": self.verdict.limit if self.accuracies else say("limit", self.limit)[0],
             },
             "accuracy": [
                 {
-                    "of": one.title,
-                    "how": one.how,
+                    "of": TITLES[one.origin],
+                    "how": rows_text(one),
                     "held_out": one.held_out,
                     "rows": one.rows,
                     "models": {name: figures.by_name for name, figures in one.models.items()},
@@ -260,12 +214,12 @@ class ReportContent:
             "rows": None
             if rows is None
             else {"count": rows.measurements.rows, "origin": rows.origin, "remarks": list(self.remarks)},
-            "residuals": [{"over": one.title, "says": one.sentence} for one in self.dependences],
-            "frames": [asdict(one) for one in self.frames[0]],
-            "targets": [asdict(one) for one in self.targets[0]],
+            "residuals": [{"over": one.title, "says": dependence_text(one)} for one in self.dependences],
+            "frames": [asdict(one) for one in self.frames.names],
+            "targets": [asdict(one) for one in self.targets.names],
             "not_identified": list(self.not_identified),
             "observability": {} if self.summary is None else self.summary.observability.model_dump(),
-            "correlated": [list(pair) for pair in self.parameters.pairs],
+            "correlated": [list(pair) for pair in self.correlations.pairs],
             "advice": list(self.advice),
             "missing": list(self.missing),
             "provenance": dict(self.provenance),
@@ -278,15 +232,17 @@ def report_content(
     model: CalibratedModel,
     folder: Path,
     measurements: Measurements | None = None,
-    doubts: tuple[str, ...] = (),
+    remarks: tuple[str, ...] = (),
+    diagnostics: tuple[Diagnostic, ...] = (),
 ) -> ReportContent:
-    """Work out everything that a report says.
+    """Collect the findings of a report and write the sentences about them.
 
     Args:
         model: the model.
         folder: its folder.
-        measurements: rows to judge it on, or None.
-        doubts: why nothing is to be concluded from these rows, a sentence each.
+        measurements: rows to judge it on, or None for the held-out rows that the folder keeps.
+        remarks: remarks on these rows, one sentence each.
+        diagnostics: why these rows are implausible.
 
     Raises:
         MeasurementError: the rows cannot be judged.
@@ -296,31 +252,47 @@ def report_content(
     rows = None if held_out is None else rows_of_folder(model, held_out)
     if measurements is not None:
         rows = rows_of_file(model, measurements, held_out)
-    remarks = () if rows is None else (*doubts, *sentences("report.txt.j2", "remarks_on_rows", rows))
+    causes = causes_of(summary, diagnostics)
+    if rows is not None:
+        remarks = (*(one.sentence for one in diagnostics), *remarks, *say("remarks_on_rows", rows))
     figures, joints = accuracies(model, summary, rows), judged_joints(model)
     limit = limit_of(model, summary, figures[0] if figures else None, rows)
+    correlations = parameter_correlations(folder)
     return ReportContent(
         model=model,
         summary=summary,
-        verdict=verdict_of(model, figures, joints, rows, limit),
+        verdict=verdict_of(model, figures, joints, rows, limit, causes),
         accuracies=figures,
         limit=limit,
         rows=rows,
         remarks=remarks,
         map=map_of_workspace(model) if rows is None else map_of_rows(model, rows),
         dependences=() if rows is None else dependences(rows, model.robot),
-        frames=((), "") if rows is None else by_name(rows, rows.measurements.frame),
-        targets=((), "") if rows is None else by_name(rows, rows.measurements.target),
-        parameters=parameter_findings(model, summary, folder),
+        frames=ErrorsByName() if rows is None else by_name(rows, rows.measurements.frame),
+        targets=ErrorsByName() if rows is None else by_name(rows, rows.measurements.target),
+        correlations=correlations,
         curves=correction_curves(model),
         learned=_learned(summary),
         not_identified=() if summary is None else (*undetermined_lines(summary), *warning_lines(summary)),
-        advice=advice_for(model, summary, rows, figures, limit),
+        advice=advice_for(model, summary, rows, figures, limit, causes),
         provenance=_provenance(model, rows),
         joints=joints,
-        missing=sentences("report.txt.j2", "missing", rows, model),
+        missing=say("missing", rows, model),
+        missing_parameters=_missing_parameters(model, summary, correlations),
         correlation_png=_correlation_png(folder),
     )
+
+
+def _missing_parameters(
+    model: CalibratedModel, summary: CalibrationSummary | None, correlations: ParameterCorrelations
+) -> tuple[str, ...]:
+    """Say what the folder does not keep about the parameters."""
+    if summary is not None:
+        text = "The model folder does not keep the correlations as numbers; calibrate again to have them."
+        return () if correlations.tables else (text,)
+    if model.calibrated is None:
+        return ("This model has no identified parameters: its geometry is the nominal one.",)
+    return ("The model folder does not keep the figures of its parameters; calibrate again.",)
 
 
 def _learned(summary: CalibrationSummary | None) -> tuple[str, ...]:

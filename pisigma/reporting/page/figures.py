@@ -20,14 +20,15 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter, NullLocator
 
 from pisigma.files.conflicts import Input, check_conflicts
-from pisigma.files.errors import OutputError
+from pisigma.files.errors import OutputError, Place
 from pisigma.files.output_file import write_whole
 from pisigma.reporting.calibration_figures import STYLES, show_correlations
 from pisigma.reporting.page.content import ReportContent
-from pisigma.reporting.page.corrections import CorrectionCurve, Correlations
-from pisigma.reporting.page.dependence import Dependence, binned
-from pisigma.reporting.page.error_map import Layer
+from pisigma.reporting.page.wording import LAYER_LABELS, curve_text, dependence_text
 from pisigma.validation.held_out.validation_figures import LearningPoint
+from pisigma.validation.report.corrections import CorrectionCurve, Correlations
+from pisigma.validation.report.dependence import Dependence, binned
+from pisigma.validation.report.error_map import Layer
 
 SIZE = (5.2, 3.1)
 """Of a panel [inch]."""
@@ -129,13 +130,18 @@ def check_figures(folder: Path, inputs: Iterable[Input] = ()) -> None:
     """
     check_conflicts(folder / "figure.png", inputs, "--figures")
     if folder.exists() and not folder.is_dir():
-        raise OutputError(f"{folder}: is a file; choose another folder for --figures.")
+        raise OutputError(expected="a folder", value="a file", at=Place(folder), option="--figures")
     if not folder.exists() and not folder.parent.is_dir():
         raise OutputError(
-            f"{folder}: there is no folder {folder.parent}; make it or choose another --figures."
+            f"there is no folder {folder.parent}",
+            at=Place(folder),
+            option="--figures",
+            remedy="make it or choose another",
         )
     if not os.access(folder if folder.exists() else folder.parent, os.W_OK):
-        raise OutputError(f"{folder}: cannot be written to; choose another --figures.")
+        raise OutputError(
+            "cannot be written to", at=Place(folder), option="--figures", remedy="choose another folder"
+        )
 
 
 def write_figures(drawings: Sequence[Drawing], folder: Path) -> list[Path]:
@@ -159,7 +165,10 @@ def write_figures(drawings: Sequence[Drawing], folder: Path) -> list[Path]:
             written += [png, svg]
     except OSError as problem:
         raise OutputError(
-            f"{folder}: cannot be written ({problem.strerror}); choose another --figures."
+            f"cannot be written to: {problem.strerror}",
+            at=Place(folder),
+            option="--figures",
+            remedy="choose another folder",
         ) from None
     return written
 
@@ -172,7 +181,7 @@ def draw_figures(content: ReportContent) -> ReportFigures:
             "error_map", "map", "Errors over the workspace", content.map.place, content.map.layers[:3]
         ),
         dependences=tuple(map(draw_dependence, content.dependences)),
-        correlations=draw_correlations(content.parameters.correlations),
+        correlations=draw_correlations(content.correlations.tables),
         corrections=tuple(map(draw_correction, content.curves)),
         learning_curve=(draw_learning_curve(points),) if len(points) > 1 else (),
     )
@@ -188,7 +197,7 @@ def draw_dependence(dependence: Dependence) -> Drawing:
             _signed(axes, dependence)
         unit = f" [{dependence.unit}]" if dependence.unit else ""
         axes.set_xlabel(f"{dependence.title}{unit}")
-    return Drawing(f"residual_{dependence.key}", dependence.title, dependence.sentence, figure)
+    return Drawing(f"residual_{dependence.key}", dependence.title, dependence_text(dependence), figure)
 
 
 def draw_correction(curve: CorrectionCurve) -> Drawing:
@@ -204,7 +213,7 @@ def draw_correction(curve: CorrectionCurve) -> Drawing:
             axes.plot(curve.values, shown, line, color=AFTER, linewidth=1.3)
         axes.axhline(0.0, color="black", linewidth=0.6)
         axes.set(xlabel=f"{curve.joint} [{curve.unit}]", ylabel=f"correction [{curve.small_unit}]")
-    return Drawing(f"correction_{curve.joint}", curve.joint, curve.sentence, figure)
+    return Drawing(f"correction_{curve.joint}", curve.joint, curve_text(curve), figure)
 
 
 def draw_correlations(tables: Sequence[Correlations]) -> tuple[Drawing, ...]:
@@ -278,7 +287,7 @@ def draw_map(
                 )  # fmt: skip
                 axes.set_aspect("equal", "datalim")
                 axes.set(xlabel=f"{'xyz'[a]} [mm]", ylabel=f"{'xyz'[b]} [mm]")
-            grid[0, column].set_title(f"{layer.label}, largest {top:.3g} {layer.unit}")
+            grid[0, column].set_title(f"{LAYER_LABELS[layer.key]}, largest {top:.3g} {layer.unit}")
             bar = figure.colorbar(dots, ax=list(grid[:, column]), orientation="horizontal", format="%.2g")
             bar.set_label(layer.unit)
     return Drawing(key, title, f"{what} from above and from the side.", figure)

@@ -19,12 +19,12 @@ from pisigma.reporting.comparison_tables import comparison_tables
 from pisigma.reporting.difference_tables import difference_table
 from pisigma.reporting.fleet_tables import STATES, WHOSE_ERRORS, not_compared, robot_table, state_table
 from pisigma.reporting.monitoring_tables import chart_table, session_table
-from pisigma.reporting.page.error_map import Layer
 from pisigma.reporting.page.figures import AFTER, BEFORE, OTHER, Drawing, draw_map, drawing_style, panel
 from pisigma.reporting.page.page import image, resource
 from pisigma.reporting.rendering import render
 from pisigma.reporting.tables import pose_rows
 from pisigma.validation.held_out.model_comparison import ModelComparison
+from pisigma.validation.report.error_map import Layer
 
 WIDE = 10_000
 """Characters: tables of a page scroll."""
@@ -182,9 +182,9 @@ def draw_displacement(what: str, displacement: Displacement) -> Drawing:
         displacement: at the poses.
     """
     errors = displacement.errors
-    layers = [Layer("distance", "distance", "mm", errors.position.numpy() * 1e3, "")]
+    layers = [Layer("distance", "mm", errors.position.numpy() * 1e3)]
     if errors.rotation is not None:
-        layers.append(Layer("turn", "turn", "deg", np.rad2deg(errors.rotation.numpy()), ""))
+        layers.append(Layer("turn", "deg", np.rad2deg(errors.rotation.numpy())))
     seen = f"Distance and turn between the poses of both models, {what},"
     title = f"{what[:1].upper()}{what[1:]}"
     return draw_map(f"displacement_{what}", title, seen, displacement.place.numpy() * 1e3, layers)

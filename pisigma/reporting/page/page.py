@@ -10,12 +10,20 @@ from markupsafe import Markup
 
 from pisigma.measurement.groups import numbers_of_names
 from pisigma.reporting.calibration_tables import parameter_table
-from pisigma.reporting.page.accuracy import LABELS
 from pisigma.reporting.page.content import ReportContent
-from pisigma.reporting.page.error_map import ErrorMap
 from pisigma.reporting.page.figures import Drawing, ReportFigures
+from pisigma.reporting.page.wording import (
+    LAYER_LABELS,
+    MODEL_LABELS,
+    TITLES,
+    layer_text,
+    map_text,
+    names_text,
+    rows_text,
+)
 from pisigma.reporting.rendering import render
 from pisigma.robot.description import Robot
+from pisigma.validation.report.error_map import ErrorMap
 
 _ESCAPED = {ord(mark): f"\\u{ord(mark):04x}" for mark in "<>&\u2028\u2029"}
 _PACKAGE = "pisigma.reporting.page"
@@ -30,7 +38,11 @@ def render_page(content: ReportContent, figures: ReportFigures) -> str:
         "page.html.j2",
         c=content,
         figures=figures,
-        labels=LABELS,
+        labels=MODEL_LABELS,
+        titles=TITLES,
+        rows_text=rows_text,
+        names_text=names_text,
+        map_text=map_text(content.map),
         parameter_table=parameter_table,
         image=image,
         png=lambda png: _address("png", png),
@@ -49,7 +61,16 @@ def map_data(error_map: ErrorMap, robot: Robot) -> dict[str, Any]:
     """Pack what the viewer reads; arrays as base64 of little-endian float32."""
     return {
         "place": _packed(error_map.place),
-        "layers": [vars(layer) | {"values": _packed(layer.values)} for layer in error_map.layers],
+        "layers": [
+            {
+                "key": layer.key,
+                "label": LAYER_LABELS[layer.key],
+                "unit": layer.unit,
+                "values": _packed(layer.values),
+                "says": layer_text(layer, error_map),
+            }
+            for layer in error_map.layers
+        ],
         "row": _packed(error_map.row),
         "q": _packed(error_map.q),
         "joints": [

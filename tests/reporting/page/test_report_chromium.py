@@ -123,7 +123,7 @@ def test_the_legend_counts_every_point(browser, page_file):
         assert sum(counts) == 120
 
 
-def test_points_tell_their_values(browser, page_file):
+def test_points_show_their_values(browser, page_file):
     with opened(browser, page_file, 1600) as page:
         page.click("button[data-view=worst]")
         first = page.inner_text("#point")
@@ -132,7 +132,7 @@ def test_points_tell_their_values(browser, page_file):
         page.click("button[data-view=worst]")
         assert page.inner_text("#point") != first
         page.click("button[data-view=reset]")
-        # the worst point lies under its ring: pointing at it tells the same as the button
+        # the worst point lies under its ring: pointing at it shows the same as the button
         page.focus("#canvas")
         page.keyboard.press("w")
         assert page.inner_text("#point") == first
@@ -143,5 +143,5 @@ def test_the_page_reads_without_scripts(browser, page_file):
     page = context.new_page()
     page.goto(page_file.as_uri())
     assert "from above and from the side" in page.inner_text("#map")
-    assert "that it never saw" in page.inner_text("#verdict")
+    assert "120 rows" in page.inner_text("#verdict")
     context.close()

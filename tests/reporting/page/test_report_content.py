@@ -1,8 +1,7 @@
-"""What a report says: figures against numpy, and whose figures they are said to be."""
+"""Content of reports: figures against numpy, and the rows that they are attributed to."""
 
 import json
 import math
-import re
 from dataclasses import replace
 
 import numpy as np
@@ -10,18 +9,20 @@ import pytest
 import torch
 from testing.closeness import assert_close
 from testing.models import hand_made_model, joints_around
+from testing.refusals import refused
 from testing.report import folder_with_held_out, geometric_under_test, hybrid_under_test, measured
 
 from pisigma.files.errors import MeasurementError
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import poses_of_rows
-from pisigma.reporting.page.accuracy import limit_of
-from pisigma.reporting.page.advice import measured_stretches
-from pisigma.reporting.page.content import report_content
-from pisigma.reporting.page.corrections import correction_curves
+from pisigma.reporting.page.content import causes_of, report_content
 from pisigma.validation.held_out.calibration_summary import CalibrationSummary
+from pisigma.validation.held_out.diagnostic import Diagnostic
 from pisigma.validation.held_out.judged_rows import MOST_PREDICTED, predicted_at
 from pisigma.validation.held_out.validation_figures import ErrorFigures
+from pisigma.validation.report.accuracy import limit_of
+from pisigma.validation.report.corrections import correction_curves
+from pisigma.validation.report.joint_gaps import joint_gaps, measured_stretches
 
 pytestmark = pytest.mark.usefixtures("without_type_checker")
 
@@ -31,13 +32,14 @@ def hybrid():
     return hybrid_under_test()
 
 
-def test_figures_of_unseen_rows_are_numpys(hybrid, tmp_path):
+def test_figures_of_other_rows_agree_with_numpy(hybrid, tmp_path):
     arm, model = hybrid
     rows = measured(arm, 150, seed=9)
     content = report_content(model, tmp_path, rows)
     assert content.rows.origin == "other"
     first = content.accuracies[0]
-    assert (first.held_out, first.rows, list(first.models)) == (True, 150, ["nominal", "geometric", "hybrid"])
+    assert (first.origin, first.held_out, first.rows) == ("file", True, 150)
+    assert list(first.models) == ["nominal", "geometric", "hybrid"]
     error = np.linalg.norm((rows.position - poses_of_rows(model, rows)[:, :3, 3]).numpy(), axis=1) * 1e3
     for name, value in (
         ("mean_mm", error.mean()),
@@ -49,35 +51,36 @@ def test_figures_of_unseen_rows_are_numpys(hybrid, tmp_path):
     after = next(layer for layer in content.map.layers if layer.key == "after")
     assert_close(after.values, error, rtol=1e-12)
     assert_close(first.factor, first.models["nominal"].rms_mm / first.models["hybrid"].rms_mm, rtol=0, atol=0)
-    assert "150 rows that it never saw" in content.verdict.sentence
+    assert content.verdict.held_out
     assert first.models["nominal"].rms_mm > 2 * first.models["hybrid"].rms_mm
 
 
-def test_rows_of_the_calibration_are_known_by_their_hash(hybrid, tmp_path):
+def test_rows_of_the_calibration_are_recognised_by_their_hash(hybrid, tmp_path):
     arm, model = hybrid
     content = report_content(model, tmp_path, arm.measurements)
     assert content.rows.origin == "training"
     own = content.accuracies[-1]
+    assert own.origin == "training"
     assert not own.held_out
-    assert "very rows that the model was made of" in own.how
-    assert content.accuracies[0].held_out  # the model's own held-out figures lead
+    assert content.accuracies[0].origin == "cross_validation"  # the held-out figures of the model come first
     assert content.accuracies[0].models == CalibrationSummary.read(model).cross_validation.models
 
 
-def test_training_rows_alone_are_no_held_out_figures(hybrid, tmp_path):
+def test_training_rows_alone_do_not_count_as_held_out(hybrid, tmp_path):
     arm, model = hybrid
     bare = replace(model, metrics={})
-    verdict = report_content(bare, tmp_path, arm.measurements).verdict
-    assert not verdict.held_out
-    assert "200 rows that it was made of" in verdict.sentence
+    content = report_content(bare, tmp_path, arm.measurements)
+    assert not content.verdict.held_out
+    assert [(one.origin, one.rows) for one in content.accuracies] == [("training", 200)]
 
 
-def test_joint_values_of_the_calibration_measured_again_are_said(hybrid, tmp_path):
+def test_joint_values_measured_again_are_reported(hybrid, tmp_path):
     arm, model = hybrid
     again = replace(arm.measurements, position=arm.measurements.position + 1e-5)
     content = report_content(model, tmp_path, again)
     assert content.rows.origin == "other"
-    assert any("200 of 200 rows have joint values" in line for line in content.remarks)
+    assert any("200 of 200" in line for line in content.rows.again)
+    assert set(content.rows.again) < set(content.remarks)
 
 
 def test_a_folder_that_keeps_held_out_rows_shows_them(hybrid, tmp_path):
@@ -88,42 +91,44 @@ def test_a_folder_that_keeps_held_out_rows_shows_them(hybrid, tmp_path):
         content = report_content(kept, tmp_path / "arm", rows)
         assert content.rows.origin == "held_out"
         assert_close(content.rows.after.position, 1.1 * training.after.position, rtol=1e-5)
-        assert content.parameters.correlations
+        assert content.correlations.tables
     other = report_content(kept, tmp_path / "arm", measured(arm, 40, seed=9))
     assert other.rows.origin == "other"
 
 
-def test_a_model_in_another_frame_is_called_worse(hybrid, tmp_path):
+def test_a_model_in_another_frame_is_worse_than_nominal(hybrid, tmp_path):
     rows = measured(hybrid[0], 60, seed=9)
     moved = replace(rows, position=rows.position + 0.05)
-    sentence = report_content(hybrid[1], tmp_path, moved).verdict.sentence
-    assert "times worse than the nominal robot" in sentence
-    assert "check that the rows are in the frame" in sentence
+    content = report_content(hybrid[1], tmp_path, moved)
+    factor = content.accuracies[0].factor
+    assert factor < 1
+    assert f"{1 / factor:.1f} times" in content.verdict.sentence
 
 
 def test_rows_marked_as_train_are_left_out(hybrid, tmp_path):
     arm, model = hybrid
     rows = replace(measured(arm, 40, seed=9), split=("train",) * 10 + ("test",) * 30)
     content = report_content(model, tmp_path, rows)
-    assert content.rows.measurements.rows == 30
-    assert any("10 rows that the file marks as 'train'" in line for line in content.remarks)
+    assert (content.rows.measurements.rows, content.rows.left_out) == (30, 10)
+    assert any("10 rows" in line for line in content.remarks)
 
 
-def test_frames_and_targets_are_told_apart(tmp_path):
+def test_errors_per_frame_and_target(tmp_path):
     arm, model = hybrid_under_test(frames=True)
     content = report_content(model, tmp_path, arm.measurements)
-    names, sentence = content.frames
+    names = content.frames.names
     assert [one.name for one in names] == ["wall", "floor"]
     assert sum(one.rows for one in names) == 200
     error = content.rows.residual.norm(dim=-1).numpy() * 1e3
     wall = np.array([name == "wall" for name in arm.measurements.frame])
     assert_close(names[0].after, np.sqrt((error[wall] ** 2).mean()), rtol=1e-12)
     assert_close(names[0].bias, content.rows.residual.numpy()[wall].mean(0) * 1e3, rtol=1e-9)
-    assert sentence
-    assert len(content.targets[0]) == 2
+    assert 0 < content.frames.p <= 1
+    assert content.frames.largest.after == max(one.after for one in names)
+    assert len(content.targets.names) == 2
 
 
-def test_sockets_are_judged_from_where_they_are_on_average(hybrid, tmp_path):
+def test_rows_in_sockets_are_compared_with_the_mean_of_the_socket(hybrid, tmp_path):
     arm, model = hybrid
     q = arm.measurements.q[:9]
     rows = Measurements(q=q, socket=("A",) * 4 + ("B",) * 4 + ("alone",))
@@ -132,35 +137,34 @@ def test_sockets_are_judged_from_where_they_are_on_average(hybrid, tmp_path):
     expected = torch.cat([ball[:4].mean(0) - ball[:4], ball[4:8].mean(0) - ball[4:8]])
     assert_close(content.rows.residual[:8], expected, atol=1e-12)
     assert bool(torch.isnan(content.rows.residual[8]).all())
-    said = " ".join(content.remarks)
-    assert "1 of 9 rows have no position error" in said
-    assert "that all rows of a socket share does not show" in said
+    assert content.rows.unknown == 1
+    assert any("1 of 9 rows" in line for line in content.remarks)
 
 
 def test_rows_that_cannot_be_judged_are_refused(hybrid, tmp_path):
     q = hybrid[0].measurements.q[:5]
     rows = Measurements(q=q, frame=("jig",) * 5, touch_axis=("x",) * 5, touch=torch.zeros(5).double())
-    with pytest.raises(MeasurementError, match="cannot be judged on this file"):
+    with refused(MeasurementError):
         report_content(hybrid[1], tmp_path, rows)
 
 
-def test_without_rows_the_workspace_is_shown(hybrid, tmp_path):
+def test_the_workspace_is_shown_without_rows(hybrid, tmp_path):
     content = report_content(hybrid[1], tmp_path)
     assert content.rows is None
     assert [layer.key for layer in content.map.layers] == ["correction", "predicted"]
     assert len(content.map.place) == 3000
-    assert any("No measured rows" in line for line in content.missing)
+    assert (content.map.rows, content.map.random) == (0, 3000 - len(hybrid[1].starts))
+    assert content.missing
     assert content.dependences == ()
 
 
-def test_a_geometric_model_says_what_it_lacks(tmp_path):
+def test_a_geometric_model_has_no_curves_and_no_noise(tmp_path):
     arm, model = geometric_under_test()
     content = report_content(model, tmp_path, measured(arm, 80, seed=9))
     assert list(content.accuracies[0].models) == ["nominal", "geometric"]
     assert content.curves == ()
-    assert any("no uncertainty" in line for line in content.missing)
-    assert content.limit.share is None
-    assert "cannot tell which" in content.verdict.sentence
+    assert len(content.missing) == 1  # no predicted accuracy
+    assert (content.limit.noise, content.limit.share) == (None, None)
     assert content.summary == CalibrationSummary.read(model)
 
 
@@ -168,7 +172,8 @@ def test_a_geometric_model_says_what_it_lacks(tmp_path):
 def test_a_network_alone_is_reported(name, tmp_path):
     model = hand_made_model(name)
     alone = report_content(model, tmp_path)
-    assert "holds no figures" in alone.verdict.sentence
+    assert alone.accuracies == ()
+    assert not alone.verdict.held_out
     assert alone.summary is None
     q = joints_around(name, 50, seed=4)
     T = model.forward(q)
@@ -188,21 +193,21 @@ def test_orientations_alone_are_reported(hybrid, tmp_path):
     assert content.accuracies[0].last.max_deg < 1e-6
 
 
-def test_repeated_rows_tell_the_scatter(hybrid, tmp_path):
+def test_repeated_rows_show_the_scatter(hybrid, tmp_path):
     arm, model = hybrid
     q = arm.measurements.q[:60].repeat(4, 1)
     rng = np.random.default_rng(0)
     position = arm.true.forward(q)[:, :3, 3] + torch.from_numpy(rng.normal(0, 1e-4, (240, 3)))
     content = report_content(model, tmp_path, Measurements(q=q, position=position))
     limit = content.limit
-    assert "more than once" in limit.source
+    assert limit.source == "repeats"
     values = content.rows.residual.numpy().reshape(4, 60, 3)
     pooled = ((values - values.mean(0)) ** 2).sum() / (240 - 60)
     assert_close(limit.noise, math.sqrt(pooled) * 1e3, rtol=1e-12)
     assert_close(limit.noise, math.sqrt(3) * 0.1, rtol=0.1)
 
 
-def test_the_noise_that_a_hybrid_found_is_the_limit(hybrid, tmp_path):
+def test_the_noise_that_a_hybrid_identified_is_the_limit(hybrid, tmp_path):
     model = hybrid[1]
     sigma = model.metrics["hybrid"]["learned"]["noise"][0]["sigma_mm"]
     accuracy = report_content(model, tmp_path).accuracies[0]
@@ -211,19 +216,17 @@ def test_the_noise_that_a_hybrid_found_is_the_limit(hybrid, tmp_path):
     larger = replace(accuracy, models={"hybrid": ErrorFigures(rms_mm=2 * limit.noise)})
     limit = limit_of(model, CalibrationSummary.read(model), larger, None)
     assert_close(limit.share, 0.25, rtol=1e-12)
-    assert "25 % of the squared error; the rest, 75 %, comes of the model" in limit.sentence
+    assert (limit.source, limit.mostly_scatter) == ("hybrid", False)
 
 
-def test_scatter_above_the_error_is_no_share_of_it(hybrid, tmp_path):
-    """Rows that scatter more than the whole error leave nothing to divide."""
+def test_scatter_above_the_error_has_no_share(hybrid, tmp_path):
     model = hybrid[1]
     accuracy = report_content(model, tmp_path).accuracies[0]
     smaller = replace(accuracy, models={"hybrid": ErrorFigures(rms_mm=1e-3)})
     limit = limit_of(model, CalibrationSummary.read(model), smaller, None)
     assert limit.noise > 1e-3
     assert limit.share is None
-    assert "no less than the error itself (0.0010 mm RMS)" in limit.sentence
-    assert "%" not in limit.sentence + limit.clause
+    assert limit.error == 1e-3
 
 
 def test_accuracy_is_predicted_at_many_rows_at_most(hybrid, monkeypatch):
@@ -256,25 +259,28 @@ def test_measured_values_are_in_the_stretches_up_to_turns(hybrid):
 
 
 @pytest.mark.parametrize("name", ["kiro3", "ur10"])
-def test_gaps_are_said_of_joints_that_were_measured_in_part(name, tmp_path):
-    advice = " ".join(report_content(hand_made_model(name), tmp_path).advice)
-    assert "Joints were measured in part only" in advice
-    found = re.search(r"theta_1 (-?[0-9]+) to (-?[0-9]+) deg", advice)
-    own = np.degrees(hand_made_model(name).starts[:, 0].numpy())
-    assert_close([float(part) for part in found.groups()], [own.min(), own.max()], atol=0.51)
+def test_gaps_of_joints_that_were_measured_in_part(name, tmp_path):
+    model = hand_made_model(name)
+    gap = joint_gaps(model, None)[0]
+    own = np.degrees(model.starts[:, 0].numpy())
+    assert gap.joint == "theta_1"
+    assert gap.share < 1
+    assert_close(gap.measured[0], [own.min(), own.max()], atol=0.51)
+    assert any("theta_1" in line for line in report_content(model, tmp_path).advice)
 
 
-def test_a_dependence_on_temperature_is_said(hybrid, tmp_path):
+def test_a_dependence_on_temperature_is_found(hybrid, tmp_path):
     arm, model = hybrid
     rows = measured(arm, 300, seed=9)
     warm = torch.linspace(18, 30, 300, dtype=torch.float64)
     off = torch.linspace(0, 2e-3, 300, dtype=torch.float64)[:, None] * torch.tensor([0.0, 1.0, 0.0])
     content = report_content(model, tmp_path, replace(rows, temperature=warm, position=rows.position + off))
-    said = {found.key: found.sentence for found in content.dependences}
-    assert "grows with temperature" in said["temperature"]
-    assert "Component y of the error changes with the order" in said["order"]
+    tests = {found.key: found.test for found in content.dependences}
+    assert tests["temperature"].significant
+    assert tests["temperature"].correlation > 0
+    assert (tests["order"].component, tests["order"].significant) == ("y", True)
     calm = report_content(model, tmp_path, replace(rows, temperature=warm))
-    assert "No dependence on temperature" in {f.key: f.sentence for f in calm.dependences}["temperature"]
+    assert not {found.key: found.test for found in calm.dependences}["temperature"].significant
 
 
 def test_the_summary_is_json(hybrid, tmp_path):
@@ -297,7 +303,25 @@ def test_a_distilled_model_is_judged_by_its_parent(tmp_path):
     }
     content = report_content(replace(hand_made_model("ur10"), kind="distilled", metrics=metrics), tmp_path)
     assert list(content.accuracies[0].models) == ["nominal", "full", "distilled"]
-    assert "On 77 poses that it never saw" in content.verdict.sentence
-    assert "the full model whole, whose own errors come on top" in content.verdict.sentence
-    assert content.limit.sentence == "Reach: less."
+    first = content.accuracies[0]
+    assert (first.origin, first.rows, first.source) == ("poses", 77, "whole")
+    assert content.limit.of_parent
+    assert content.verdict.limit == "Reach: less."
     assert content.joints == ()
+
+
+def test_a_report_names_one_first_cause(hybrid, tmp_path):
+    """A diagnosed fault is what limits the accuracy; scatter and model are then not named as well."""
+    rows = measured(hybrid[0], 60, seed=9)
+    fault = Diagnostic(kind="setup_fault", severity="implausible", sentence="Joint 2 counts the other way.")
+    content = report_content(hybrid[1], tmp_path, rows, diagnostics=(fault,))
+    assert content.verdict.limit == content.advice[0] == content.remarks[0] == fault.sentence
+    assert content.to_json()["limit"]["says"] == fault.sentence
+    plain = report_content(hybrid[1], tmp_path, rows)
+    assert len(content.verdict.sentence) < len(plain.verdict.sentence)
+
+
+def test_warnings_about_the_rows_are_no_causes():
+    few = Diagnostic(kind="few_rows", severity="warning", sentence="Measure more poses.")
+    lag = Diagnostic(kind="lag", severity="warning", sentence="Joint values were logged late.")
+    assert causes_of(None, (few, lag)) == (lag.sentence,)

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from testing.closeness import assert_close
 
-from pisigma.reporting.page.content import CELLS, worst_region
-from pisigma.reporting.page.dependence import binned
 from pisigma.validation.held_out.rank_tests import SIGNIFICANT
+from pisigma.validation.report.dependence import binned
+from pisigma.validation.report.largest_errors import CELLS, worst_region
 
 
 def test_a_planted_region_is_found():
@@ -35,7 +35,7 @@ def test_chance_plants_no_region():
 
 
 @pytest.mark.parametrize("rows", [0, 1, 5])
-def test_too_few_rows_have_no_region(rows):
+def test_too_few_rows_give_no_region(rows):
     assert worst_region(np.zeros((rows, 3)), np.ones(rows)) is None
 
 

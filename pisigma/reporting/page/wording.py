@@ -1,0 +1,75 @@
+"""Findings of a report as titles and sentences; the wording of sentences is in the template `report.txt.j2`."""
+
+import functools
+
+from pisigma.reporting.calibration_tables import cross_validation_text
+from pisigma.reporting.rendering import sentences
+from pisigma.validation.report.accuracy import Accuracy, RowOrigin
+from pisigma.validation.report.corrections import CorrectionCurve
+from pisigma.validation.report.dependence import Dependence, ErrorsByName
+from pisigma.validation.report.error_map import ErrorMap, Layer, Quantity
+
+MODEL_LABELS = {
+    "nominal": "nominal",
+    "geometric": "geometric",
+    "hybrid": "hybrid",
+    "corrected": "with the network",
+    "full": "full solution",
+    "distilled": "distilled",
+}
+"""Column headings by the name of the model."""
+TITLES: dict[RowOrigin, str] = {
+    "file": "rows of the file",
+    "training": "rows of the calibration",
+    "test": "test set",
+    "cross_validation": "held-out rows",
+    "simulation": "held-out rows",
+    "poses": "held-out poses",
+}
+"""Titles of the tables of errors by the origin of the rows."""
+LAYER_LABELS: dict[Quantity, str] = {
+    "before": "before (nominal)",
+    "after": "after calibration",
+    "predicted": "predicted accuracy",
+    "before_deg": "orientation, before",
+    "after_deg": "orientation, after",
+    "correction": "correction",
+    "distance": "distance",
+    "turn": "rotation",
+}
+"""Labels of what a map shows."""
+
+say = functools.partial(sentences, "report.txt.j2")
+"""Fill in a macro of `report.txt.j2`; see `sentences`."""
+
+
+def rows_text(accuracy: Accuracy) -> str:
+    """Say which rows the errors belong to and which models predicted them."""
+    figures = accuracy.validation
+    folds = cross_validation_text(figures) if figures is not None and (figures.folds or 1) > 1 else ""
+    return say("judged_rows", accuracy, folds)[0]
+
+
+def dependence_text(dependence: Dependence) -> str:
+    """Say whether errors depend on a quantity."""
+    return " ".join(say("dependence", dependence, dependence.test))
+
+
+def names_text(errors: ErrorsByName) -> str:
+    """Say whether errors differ between frames or targets."""
+    return say("by_name", errors)[0]
+
+
+def map_text(error_map: ErrorMap) -> str:
+    """Say which points a map shows."""
+    return say("map", error_map)[0]
+
+
+def layer_text(layer: Layer, error_map: ErrorMap) -> str:
+    """Say what the values of a layer are."""
+    return say("layer", layer.key, error_map.origin)[0]
+
+
+def curve_text(curve: CorrectionCurve) -> str:
+    """Say how large the correction of a joint is and where it was measured."""
+    return say("curve", curve)[0]

@@ -1,0 +1,1 @@
+"""Figures of a calibration report: what the pages of `pisigma.reporting` render."""

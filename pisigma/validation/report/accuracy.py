@@ -1,0 +1,229 @@
+"""Accuracy of a model before and after calibration, on every set of rows with known errors, and what limits it."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+
+from pisigma.model.calibrated_model import CalibratedModel
+from pisigma.validation.held_out.calibration_summary import CalibrationSummary
+from pisigma.validation.held_out.judged_rows import JudgedRows
+from pisigma.validation.held_out.pose_statistics import PoseErrors, error_statistics
+from pisigma.validation.held_out.training_summary import BeforeAfter, TrainingSummary
+from pisigma.validation.held_out.validation_figures import ErrorFigures, ValidationFigures
+
+MODELS = ("nominal", "geometric", "hybrid", "corrected", "full", "distilled")
+"""Names of the models in the order of the tables."""
+DOMINANT_SHARE = 0.8
+"""Share of the squared error above which measurement scatter limits the accuracy."""
+_JOINT_ROWS = (("held_out", True), ("training", False))
+
+RowOrigin = Literal["file", "training", "test", "cross_validation", "simulation", "poses"]
+"""Which rows errors belong to.
+
+"file": rows of a file that the model was not calibrated with. "training": rows that it was calibrated with. "test":
+rows that its file marks as test. "cross_validation": rows held out in k-fold cross-validation, or once.
+"simulation": other rows of a simulation. "poses": poses of a region, on which a distilled model was compared with its
+parent.
+"""
+
+
+@dataclass(frozen=True)
+class Accuracy:
+    """Errors of a set of rows under several models.
+
+    Attributes:
+        origin: which rows these are.
+        rows: number of rows.
+        models: error figures by the name of the model, "nominal" first; the last is the model of the report.
+        source: file of the rows; of "poses" the name of the parent model, whose poses the errors refer to.
+        validation: figures of the cross-validation, with its folds and repeats; None of other rows.
+    """
+
+    origin: RowOrigin
+    rows: int
+    models: Mapping[str, ErrorFigures]
+    source: str = ""
+    validation: ValidationFigures | None = None
+
+    @property
+    def held_out(self) -> bool:
+        """Whether the models were made without the rows."""
+        return self.origin != "training"
+
+    @property
+    def unit(self) -> str:
+        """Unit of the leading quantity: "mm" of positions, "deg" of orientations where no position was measured."""
+        return "deg" if self.last.rms_mm is None else "mm"
+
+    @property
+    def last(self) -> ErrorFigures:
+        """Error figures of the model of the report."""
+        return list(self.models.values())[-1]
+
+    def figure(self, statistic: str, model: str = "") -> float:
+        """Return a statistic of the leading quantity [`unit`].
+
+        Args:
+            statistic: "rms", "mean", "p95" or "max".
+            model: name of a model; "" for the model of the report.
+        """
+        return float(getattr(self.models[model] if model else self.last, f"{statistic}_{self.unit}"))
+
+    @property
+    def factor(self) -> float | None:
+        """RMS error of the nominal robot over that of the model; None without a nominal robot."""
+        if "nominal" not in self.models or len(self.models) < 2 or not self.figure("rms") > 0:
+            return None
+        return self.figure("rms", "nominal") / self.figure("rms")
+
+
+def accuracies(
+    model: CalibratedModel, summary: CalibrationSummary | None, rows: JudgedRows | None
+) -> tuple[Accuracy, ...]:
+    """Collect the error figures of a model, the most meaningful first.
+
+    Rows of another file come first, then the held-out rows of the model, and rows that it was calibrated with last.
+    """
+    kept = _of_distilled(model) if model.kind == "distilled" else _of_metrics(model, summary)
+    if rows is None or rows.origin == "held_out":
+        return tuple(kept)
+    of_rows = _of_rows(rows)
+    return (of_rows, *kept) if of_rows.held_out else (*kept, of_rows)
+
+
+def figures_of(errors: PoseErrors) -> ErrorFigures:
+    """Compute the statistics of position errors [mm] and orientation errors [deg], where there are any."""
+    figures: dict[str, float] = {}
+    for values, unit, factor in ((errors.position, "mm", 1e3), (errors.rotation, "deg", 180 / torch.pi)):
+        if values is not None and bool(torch.isfinite(values).any()):
+            figures |= {f"{name}_{unit}": value * factor for name, value in error_statistics(values).items()}
+    return ErrorFigures(**figures)
+
+
+def _of_rows(rows: JudgedRows) -> Accuracy:
+    models = {name: figures_of(errors) for name, errors in rows.models.items()}
+    origin: RowOrigin = "training" if rows.origin == "training" else "file"
+    return Accuracy(origin, rows.measurements.rows, models, rows.measurements.source)
+
+
+def _of_metrics(model: CalibratedModel, summary: CalibrationSummary | None) -> list[Accuracy]:
+    """Read the figures of held-out rows that a model folder keeps."""
+    origins: dict[str, RowOrigin] = {
+        "test": "test",
+        "cross_validation": "cross_validation",
+        "held_out": "simulation",
+    }
+    kept = []
+    for key, origin in origins.items():
+        if models := _models(model.metrics.get(key)):
+            rows = int(model.metrics[key].get("rows", model.provenance.rows))
+            folds = summary.cross_validation if summary and origin == "cross_validation" else None
+            kept.append(Accuracy(origin, rows, models, model.provenance.data_source, folds))
+    return kept
+
+
+def _of_distilled(model: CalibratedModel) -> list[Accuracy]:
+    """Read the errors of a distilled model against the poses of its parent."""
+    models, parent = _models(model.metrics.get("held_out")), str(model.metrics["parent"]["name"])
+    rows = int(model.metrics["poses"]["held_out"])
+    return [Accuracy("poses", rows, models, parent)] if models else []
+
+
+def _models(figures: object) -> dict[str, ErrorFigures]:
+    if not isinstance(figures, Mapping):
+        return {}
+    kept = {name: figures[name] for name in MODELS if isinstance(figures.get(name), Mapping)}
+    return {name: ErrorFigures.model_validate(errors) for name, errors in kept.items()}
+
+
+@dataclass(frozen=True)
+class JudgedJoint:
+    """Errors of one joint of a network on a set of rows.
+
+    Attributes:
+        name: name of the joint.
+        held_out: whether the network was trained without the rows.
+        errors: mean, standard deviation and maximum of the absolute errors before and after the correction.
+    """
+
+    name: str
+    held_out: bool
+    errors: BeforeAfter
+
+    @property
+    def unit(self) -> str:
+        """Unit of the errors: "deg" or "mm"."""
+        return self.errors.after.unit
+
+
+def judged_joints(model: CalibratedModel) -> tuple[JudgedJoint, ...]:
+    """Read the joint errors of a network, held-out rows first; empty for models without a network."""
+    summary = TrainingSummary.read(model)
+    joints = () if summary is None else summary.joints
+    rows = ((joint.name, held_out, getattr(joint, key)) for joint in joints for key, held_out in _JOINT_ROWS)
+    return tuple(JudgedJoint(name, held_out, errors) for name, held_out, errors in rows if errors is not None)
+
+
+@dataclass(frozen=True)
+class AccuracyLimit:
+    """Contribution of measurement scatter to the error.
+
+    Attributes:
+        noise: RMS length of the scatter of a measured position [mm]; None where it is not known.
+        source: where `noise` comes from: "repeats" of joint values in the rows, or the "hybrid" calibration.
+        error: RMS length of the position error [mm]; 0 where no position was judged.
+        residual_sigma: standard deviation of the residuals of the geometric calibration per coordinate [mm]; None
+            without one.
+        of_parent: whether the model stands for another one, whose errors add to its own.
+        limitations: limitations that such a model states, one sentence each.
+    """
+
+    noise: float | None = None
+    source: Literal["repeats", "hybrid", ""] = ""
+    error: float = 0.0
+    residual_sigma: float | None = None
+    of_parent: bool = False
+    limitations: tuple[str, ...] = ()
+
+    @property
+    def share(self) -> float | None:
+        """Share of the scatter in the squared error; None where it is unknown or the scatter exceeds the error."""
+        return None if self.noise is None or self.noise >= self.error else (self.noise / self.error) ** 2
+
+    @property
+    def mostly_scatter(self) -> bool:
+        """Whether scatter makes up most of the squared error."""
+        return self.share is not None and self.share >= DOMINANT_SHARE
+
+
+def limit_of(
+    model: CalibratedModel,
+    summary: CalibrationSummary | None,
+    accuracy: Accuracy | None,
+    rows: JudgedRows | None,
+) -> AccuracyLimit:
+    """Compare the error with the scatter of repeated rows, or with the noise that a hybrid calibration identified."""
+    if accuracy is not None and accuracy.origin == "poses":
+        return AccuracyLimit(of_parent=True, limitations=tuple(model.metrics.get("limitations", ())))
+    scatter = None if rows is None else rows.scatter
+    noise, source = (scatter, "repeats") if scatter is not None else (_identified_noise(summary), "hybrid")
+    error = accuracy.figure("rms") if accuracy is not None and accuracy.unit == "mm" else 0.0
+    sensors = () if summary is None else summary.noise
+    sigma = next((one.sigma_mm for one in sensors if one.sigma_mm is not None), None)
+    if noise is None or not error > 0:
+        return AccuracyLimit(error=error, residual_sigma=sigma)
+    return AccuracyLimit(noise, "repeats" if source == "repeats" else "hybrid", error, sigma)
+
+
+def _identified_noise(summary: CalibrationSummary | None) -> float | None:
+    """Return the RMS length of the position noise that a hybrid identified [mm].
+
+    None of a geometric calibration, whose residuals contain what geometry cannot express as well as noise.
+    """
+    if summary is None or summary.hybrid is None or summary.hybrid.learned is None:
+        return None
+    of_points = [one.sigma_mm for one in summary.hybrid.learned.noise if one.sensor in ("position", "socket")]
+    return None if not of_points or of_points[0] is None else math.sqrt(3) * of_points[0]

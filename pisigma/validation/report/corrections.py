@@ -1,0 +1,188 @@
+"""Curves of the learned joint correction, and correlations of the geometric parameters that a model folder keeps."""
+
+import csv
+import io
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float64
+from torch import Tensor
+
+from pisigma.files.model_files import CORRELATION_CSV, read_model_file
+from pisigma.model.calibrated_model import CalibratedModel
+from pisigma.robot.description import Robot
+from pisigma.robot.kinematics.forward import forward_kinematics
+from pisigma.robot.kinematics.tolerances import MEASURED_ROUNDING
+
+POINTS_PER_CURVE = 1_500
+"""Enough for 13 points to a period of the 110th harmonic over a whole revolution."""
+ROWS_PER_CHUNK = 4_096
+"""Rows that the correction is computed for at once, to bound memory."""
+STRONG_CORRELATION = 0.9
+"""Absolute correlation above which a pair of parameters is named."""
+MAX_PAIRS = 12
+"""Pairs that are named."""
+JOINT_UNITS = {
+    "revolute": ("deg", math.degrees(1.0), "mdeg", math.degrees(1e3)),
+    "prismatic": ("mm", 1e3, "µm", 1e6),
+}
+"""Units of a joint's value and of its correction, each followed by its factor from [rad] or [m]."""
+
+Correlations = tuple[tuple[str, ...], Float64[np.ndarray, "_names _names"]]
+"""Names of parameters, and the matrix of their correlations."""
+
+
+@dataclass(frozen=True, eq=False)
+class ParameterCorrelations:
+    """Correlations of the columns of the identification Jacobian.
+
+    Attributes:
+        tables: names and matrix of lengths and of angles; empty where the folder does not keep them.
+        pairs: two strongly correlated parameters and their correlation each, the strongest first.
+    """
+
+    tables: tuple[Correlations, ...]
+    pairs: tuple[tuple[str, str, float], ...]
+
+
+def parameter_correlations(folder: Path) -> ParameterCorrelations:
+    """Read the correlations that a model folder keeps."""
+    tables = read_correlations(folder / CORRELATION_CSV)
+    return ParameterCorrelations(tables, _pairs(tables))
+
+
+def read_correlations(path: Path) -> tuple[Correlations, ...]:
+    """Read the correlations of lengths and of angles; empty where there is no such file or it has another form."""
+    if not path.is_file():
+        return ()
+    kinds: dict[str, dict[tuple[str, str], float]] = {"lengths": {}, "angles": {}}
+    tables = []
+    try:
+        text = read_model_file(path.parent, path.name).decode()
+        for row in csv.DictReader(io.StringIO(text, newline="")):
+            value = float(row["correlation"]) if row["correlation"] else np.nan
+            kinds[row["of"]][row["parameter"], row["with"]] = value
+        for cells in kinds.values():
+            names = tuple(dict.fromkeys(name for name, _ in cells))
+            values = np.array([[cells[a, b] for b in names] for a in names])
+            tables.append((names, values.reshape(len(names), -1)))
+    except (KeyError, ValueError, TypeError, OSError):
+        return ()
+    return tuple(tables)
+
+
+def _pairs(tables: tuple[Correlations, ...]) -> tuple[tuple[str, str, float], ...]:
+    """List strongly correlated parameters, the strongest first."""
+    strong = [
+        (name, names[k], float(values[i, k]))
+        for names, values in tables
+        for i, name in enumerate(names)
+        for k in range(i)
+        if abs(values[i, k]) >= STRONG_CORRELATION
+    ]
+    return tuple(sorted(strong, key=lambda pair: -abs(pair[2]))[:MAX_PAIRS])
+
+
+@dataclass(frozen=True, eq=False)
+class CorrectionCurve:
+    """Learned correction of one joint over its own value, the other joints held at those of a measured row.
+
+    Attributes:
+        joint: name of the joint.
+        unit: unit of its values, "deg" or "mm".
+        small_unit: unit of its correction, "mdeg" or "µm".
+        values: joint values [`unit`].
+        correction: correction at these values [`small_unit`].
+        measured: whether each value was measured for the calibration.
+        dots: corrections at the measured rows that the model keeps [`small_unit`].
+        dot_values: joint values of these rows [`unit`].
+    """
+
+    joint: str
+    unit: str
+    small_unit: str
+    values: Float64[np.ndarray, " points"]
+    correction: Float64[np.ndarray, " points"]
+    measured: Bool[np.ndarray, " points"]
+    dots: Float64[np.ndarray, " dots"]
+    dot_values: Float64[np.ndarray, " dots"]
+
+    @property
+    def rms(self) -> float:
+        """RMS correction at the measured rows [`small_unit`]."""
+        return float(np.sqrt((self.dots**2).mean()))
+
+    @property
+    def largest(self) -> float:
+        """Largest absolute correction at the measured rows [`small_unit`]."""
+        return float(np.abs(self.dots).max())
+
+    @property
+    def measured_range(self) -> tuple[float, float] | None:
+        """Lowest and highest measured value [`unit`]; None where all of the curve was measured, or nothing."""
+        inside = self.values[self.measured]
+        low, high = inside.min(initial=math.inf), inside.max(initial=-math.inf)
+        return (float(low), float(high)) if not self.measured.all() and high > low else None
+
+
+def correction_curves(model: CalibratedModel) -> tuple[CorrectionCurve, ...]:
+    """Compute the curves of all corrected joints; empty for a model without a learned correction.
+
+    The other joints have the values of the kept row that is nearest to the median of all.
+    """
+    robot, hybrid, q = model.robot, model.hybrid, model.starts
+    if (hybrid is None and model.network is None) or not len(q):
+        return ()
+    at_rows, middle = correction_at(model, q), _middle_row(q)
+    curves = []
+    for j in range(robot.dof):
+        at = middle.repeat(POINTS_PER_CURVE, 1)
+        at[:, j] = torch.linspace(*_range(robot, q, j), POINTS_PER_CURVE, dtype=torch.float64)
+        measured = torch.ones(POINTS_PER_CURVE, dtype=torch.bool)
+        if hybrid is not None:
+            measured = hybrid.coverage.beyond(at)[:, j] <= MEASURED_ROUNDING
+        curve = correction_at(model, at)[:, j]
+        if not (bool((curve != 0).any()) or bool((at_rows[:, j] != 0).any())):
+            continue
+        unit, factor, small_unit, small = JOINT_UNITS[robot.joints[j].type]
+        curves.append(
+            CorrectionCurve(
+                joint=robot.joints[j].name,
+                unit=unit,
+                small_unit=small_unit,
+                values=at[:, j].numpy() * factor,
+                correction=curve.numpy() * small,
+                measured=measured.numpy(),
+                dots=at_rows[:, j].numpy() * small,
+                dot_values=q[:, j].numpy() * factor,
+            )
+        )
+    return tuple(curves)
+
+
+def correction_at(model: CalibratedModel, q: Float64[Tensor, "rows dof"]) -> Float64[Tensor, "rows dof"]:
+    """Compute the learned correction [rad or m] at joint values [rad or m]."""
+    hybrid, chunks = model.hybrid, torch.split(q, ROWS_PER_CHUNK)
+    with torch.no_grad():
+        if hybrid is not None:
+            return torch.cat([hybrid.correction(chunk) for chunk in chunks])
+        return torch.cat(
+            [model.correction(forward_kinematics(model.robot, chunk), chunk) for chunk in chunks]
+        )
+
+
+def _middle_row(q: Float64[Tensor, "rows dof"]) -> Float64[Tensor, " dof"]:
+    spread = (q.amax(0) - q.amin(0)).clamp(min=1e-9)
+    off = ((q - q.median(0).values) / spread).square().sum(-1)
+    return q[int(off.argmin())]
+
+
+def _range(robot: Robot, q: Float64[Tensor, "rows dof"], joint: int) -> tuple[float, float]:
+    """Return the measured range of a joint, widened by a fifth on either side, within its limits [rad or m]."""
+    low, high = float(q[:, joint].min()), float(q[:, joint].max())
+    more = max((high - low) / 5, math.radians(20) if robot.revolute[joint] else 0.02)
+    lower, upper = robot.limits[joint]
+    return max(low - more, float(lower)), min(high + more, float(upper))

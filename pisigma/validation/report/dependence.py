@@ -1,0 +1,321 @@
+"""Dependence of errors on joint values, order of measurement, payload, temperature, frame and target."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float64, Int64
+
+from pisigma.measurement.conditions import CONDITIONS, conditions_of
+from pisigma.measurement.groups import groups_of_equal_joints, numbers_of_names
+from pisigma.robot.description import Robot
+from pisigma.validation.held_out.judged_rows import JudgedRows
+from pisigma.validation.held_out.rank_tests import SIGNIFICANT, groups_differ, rank_correlation
+
+NOTABLE_RATIO = 1.25
+"""Ratio of the largest to the smallest RMS error of bins below which a dependence is called small."""
+ORDERED = 0.3
+"""Rank correlation of a joint with the order of the rows above which time and position are hard to separate."""
+MAX_BINS = 12
+"""Bins of a joint's measured values."""
+MIN_ROWS = 8
+"""Rows of a region or a bin."""
+MIN_ROWS_OF_RMS = 3
+"""Rows that the RMS error of a bin is computed from."""
+_DEGREES = math.degrees(1.0)
+_UNITS = {"kg": "kg", "c": "°C"}
+
+Untested = Literal["joint not moved", "too few rows"]
+"""Why a dependence on a joint was not tested."""
+
+
+@dataclass(frozen=True)
+class BinTest:
+    """Test of Kruskal and Wallis whether errors differ between bins of a joint's values.
+
+    Attributes:
+        p: probability of such differences by chance.
+        low: smallest RMS error of a bin.
+        high: largest RMS error of a bin, in the unit of the errors.
+        edges: joint values between which the bin with the largest RMS error extends, in the unit of the joint.
+    """
+
+    p: float
+    low: float
+    high: float
+    edges: tuple[float, float]
+
+    @property
+    def significant(self) -> bool:
+        """Whether the differences are more than chance."""
+        return self.p < SIGNIFICANT
+
+    @property
+    def notable(self) -> bool:
+        """Whether the RMS errors of bins differ by `NOTABLE_RATIO` or more."""
+        return self.high >= NOTABLE_RATIO * self.low
+
+
+@dataclass(frozen=True)
+class OrderTest:
+    """Rank correlation (Spearman) of the error with the order of the rows.
+
+    Attributes:
+        component: "x", "y" or "z" of the signed error with the largest correlation; "length" where signs are unknown.
+        correlation: rank correlation with the order.
+        p: its two-sided probability by chance.
+        change: mean error of the last tenth of the rows minus that of the first, in the unit of the errors; 0 where
+            the correlation is not significant.
+        ordered_joint: number of the joint, from 1, whose values follow the order of the rows, so that order and
+            position cannot be separated; None where none does.
+        joint_correlation: absolute rank correlation of that joint with the order.
+        of_training: whether signed errors are residuals of rows that the model was calibrated with.
+    """
+
+    component: Literal["x", "y", "z", "length"]
+    correlation: float
+    p: float
+    change: float
+    ordered_joint: int | None = None
+    joint_correlation: float = 0.0
+    of_training: bool = False
+
+    @property
+    def significant(self) -> bool:
+        """Whether the correlation is more than chance."""
+        return self.p < SIGNIFICANT
+
+
+@dataclass(frozen=True)
+class ConditionTest:
+    """Rank correlation (Spearman) of the length of the error with payload or temperature.
+
+    Attributes:
+        low: smallest stated value.
+        high: largest stated value.
+        correlation: rank correlation.
+        p: its two-sided probability by chance.
+    """
+
+    low: float
+    high: float
+    correlation: float
+    p: float
+
+    @property
+    def significant(self) -> bool:
+        """Whether the correlation is more than chance."""
+        return self.p < SIGNIFICANT
+
+
+@dataclass(frozen=True, eq=False)
+class Dependence:
+    """Errors over one quantity.
+
+    Attributes:
+        key: key of the quantity, for file names.
+        title: name of the quantity.
+        unit: unit of the quantity; "" for none.
+        values: values of the quantity, one per row.
+        errors: lengths "before" and "after" per row, or signed components "x", "y" and "z".
+        error_unit: "mm" or "deg".
+        test: whether the errors depend on the quantity.
+    """
+
+    key: str
+    title: str
+    unit: str
+    values: Float64[np.ndarray, " rows"]
+    errors: dict[str, Float64[np.ndarray, " rows"]]
+    error_unit: str
+    test: BinTest | OrderTest | ConditionTest | Untested
+
+
+@dataclass(frozen=True)
+class NameErrors:
+    """Errors of the rows of one frame or target.
+
+    Attributes:
+        name: frame or target.
+        rows: number of rows.
+        before: RMS error of the robot as drawn [mm or deg].
+        after: RMS error of the model [mm or deg].
+        bias: mean signed error in the row's frame [mm]; None where no signed error is known.
+    """
+
+    name: str
+    rows: int
+    before: float
+    after: float
+    bias: tuple[float, float, float] | None
+
+
+@dataclass(frozen=True)
+class ErrorsByName:
+    """Errors per frame or per target.
+
+    Attributes:
+        names: errors of each; empty where there is one only.
+        unit: "mm" or "deg", of the RMS errors.
+        p: probability of such differences by chance (Kruskal and Wallis).
+    """
+
+    names: tuple[NameErrors, ...] = ()
+    unit: str = "mm"
+    p: float = 1.0
+
+    @property
+    def significant(self) -> bool:
+        """Whether the differences are more than chance."""
+        return self.p < SIGNIFICANT
+
+    @property
+    def largest(self) -> NameErrors | None:
+        """The frame or target with the largest RMS error under the model; None where none has rows."""
+        return max((one for one in self.names if one.rows), key=lambda one: one.after, default=None)
+
+
+@dataclass(frozen=True, eq=False)
+class Binned:
+    """Errors in bins of a quantity's values.
+
+    Attributes:
+        edges: edges of the bins, one more than there are bins.
+        rms: RMS error of every bin; NaN where there are too few rows.
+        number: bin of every row.
+    """
+
+    edges: Float64[np.ndarray, " edges"]
+    rms: Float64[np.ndarray, " bins"]
+    number: Int64[np.ndarray, " rows"]
+
+
+def error_lengths(rows: JudgedRows) -> tuple[Float64[np.ndarray, " rows"], Float64[np.ndarray, " rows"], str]:
+    """Return errors before and after, and their unit: positions in mm; orientations in deg where none was measured."""
+    if bool(np.isfinite(rows.after.position.numpy()).any()) or rows.after.rotation is None:
+        return rows.before.position.numpy() * 1e3, rows.after.position.numpy() * 1e3, "mm"
+    before = rows.before.rotation
+    after = rows.after.rotation.numpy() * _DEGREES
+    return (np.full_like(after, np.nan) if before is None else before.numpy() * _DEGREES), after, "deg"
+
+
+def dependences(rows: JudgedRows, robot: Robot) -> tuple[Dependence, ...]:
+    """Test errors against every joint's value, the order of the rows, and payload and temperature where they vary.
+
+    Args:
+        rows: rows with their errors.
+        robot: robot whose joints these are.
+    """
+    before, after, unit = error_lengths(rows)
+    judged = np.isfinite(after)
+    errors = {"before": before[judged], "after": after[judged]}
+    q = rows.measurements.q.numpy()[judged]
+    groups = groups_of_equal_joints(rows.measurements.q).numpy()[judged]
+    result = []
+    for j, joint in enumerate(robot.joints):
+        factor, joint_unit = (_DEGREES, "deg") if robot.revolute[j] else (1e3, "mm")
+        values = q[:, j] * factor
+        test = _over_joint(values, errors["after"], groups)
+        result.append(Dependence(f"joint_{j + 1}", joint.name, joint_unit, values, errors, unit, test))
+    result.append(_over_order(rows, errors, judged, unit))
+    conditions = conditions_of(rows.measurements, CONDITIONS).numpy()[judged]
+    for name, values in zip(CONDITIONS, conditions.T, strict=True):
+        title, suffix = name.rsplit("_", 1)
+        stated = np.isfinite(values)
+        if stated.sum() > 2 and np.ptp(values[stated]) > 0:
+            those = {when: lengths[stated] for when, lengths in errors.items()}
+            found = _over_condition(values[stated], those["after"])
+            result.append(Dependence(title, title, _UNITS[suffix], values[stated], those, unit, found))
+    return tuple(result)
+
+
+def by_name(rows: JudgedRows, names: Sequence[str]) -> ErrorsByName:
+    """Compute errors per name, and test whether they differ; empty where there is one name only.
+
+    Args:
+        rows: rows with their errors.
+        names: frame or target of every row.
+    """
+    before, after, unit = error_lengths(rows)
+    judged = np.isfinite(after)
+    number, different = numbers_of_names(names).numpy(), dict.fromkeys(names)
+    if len(different) < 2:
+        return ErrorsByName()
+    residual = rows.residual.numpy() * 1e3
+    result = []
+    for k, name in enumerate(different):
+        inside = judged & (number == k)
+        signed = residual[inside]
+        bias = tuple(np.nanmean(signed, 0).tolist()) if np.isfinite(signed).all(1).any() else None
+        rms = [root_mean_square(lengths[inside]) for lengths in (before, after)]
+        result.append(NameErrors(name, int(inside.sum()), rms[0], rms[1], bias))
+    _, chance = groups_differ(number[judged], after[judged])
+    return ErrorsByName(tuple(result), unit, chance)
+
+
+def _over_joint(values: np.ndarray, errors: np.ndarray, groups: np.ndarray) -> BinTest | Untested:
+    """Test errors against a joint's values; rows of equal joint values count once."""
+    if len(errors) < 3 or np.ptp(values) == 0:
+        return "joint not moved"
+    bins = binned(values, errors)
+    if np.isnan(bins.rms).all():
+        return "too few rows"
+    # repeated rows are not independent: each joint configuration enters the test with its mean error
+    _, first, group = np.unique(groups, return_index=True, return_inverse=True)
+    _, chance = groups_differ(bins.number[first], np.bincount(group, errors) / np.bincount(group))
+    worst = int(np.nanargmax(bins.rms))
+    edges = (float(bins.edges[worst]), float(bins.edges[worst + 1]))
+    return BinTest(chance, float(np.nanmin(bins.rms)), float(bins.rms[worst]), edges)
+
+
+def _over_order(rows: JudgedRows, errors: dict[str, np.ndarray], judged: np.ndarray, unit: str) -> Dependence:
+    """Test signed errors against the order of the rows; lengths where signs are unknown."""
+    number = np.arange(1.0, len(judged) + 1)[judged]
+    residual = rows.residual.numpy()[judged] * 1e3
+    signed = unit == "mm" and bool(np.isfinite(residual).all()) and len(residual) > 0
+    components: dict[Literal["x", "y", "z", "length"], np.ndarray] = {"length": errors["after"]}
+    if signed:
+        components = {"x": residual[:, 0], "y": residual[:, 1], "z": residual[:, 2]}
+    tests = {name: rank_correlation(number, values) for name, values in components.items()}
+    name = max(tests, key=lambda name: abs(tests[name][0]))
+    (r, chance), values = tests[name], components[name]
+    significant, tenth = chance < SIGNIFICANT, max(len(number) // 10, 1)
+    change = float(values[-tenth:].mean() - values[:tenth].mean()) if significant else 0.0
+    joint, joint_r = _ordered_joint(rows) if significant else (None, 0.0)
+    test = OrderTest(name, r, chance, change, joint, joint_r, signed and rows.residual_origin == "training")
+    shown: dict[str, np.ndarray] = (
+        {str(one): those for one, those in components.items()} if signed else errors
+    )
+    return Dependence("order", "order of the rows", "", number, shown, unit, test)
+
+
+def _ordered_joint(rows: JudgedRows) -> tuple[int | None, float]:
+    """Find the joint whose values follow the order of the rows most closely; None where none does."""
+    q = rows.measurements.q.numpy()
+    r = [abs(rank_correlation(np.arange(float(len(q))), values)[0]) for values in q.T]
+    return (None, 0.0) if max(r) < ORDERED else (int(np.argmax(r)) + 1, max(r))
+
+
+def _over_condition(values: np.ndarray, errors: np.ndarray) -> ConditionTest:
+    r, chance = rank_correlation(values, errors)
+    return ConditionTest(float(values.min()), float(values.max()), r, chance)
+
+
+def root_mean_square(values: Float64[np.ndarray, " values"]) -> float:
+    """Compute the root mean square; NaN without values."""
+    return float(np.sqrt(np.mean(values**2))) if len(values) else math.nan
+
+
+def binned(
+    values: Float64[np.ndarray, " rows"], errors: Float64[np.ndarray, " rows"], bins: int = MAX_BINS
+) -> Binned:
+    """Compute RMS errors in bins of equal width; of few rows in fewer bins."""
+    bins = int(np.clip(len(values) // MIN_ROWS, 1, bins))
+    low, high = float(values.min()), float(values.max())
+    edges = np.linspace(low, high if high > low else low + 1.0, bins + 1)
+    number = np.clip(np.searchsorted(edges, values, "right") - 1, 0, bins - 1)
+    inside = [errors[number == k] for k in range(bins)]
+    rms = [root_mean_square(those) if len(those) >= MIN_ROWS_OF_RMS else math.nan for those in inside]
+    return Binned(edges, np.array(rms), number)

@@ -1,0 +1,156 @@
+"""Points of the three-dimensional error map: measured rows, or samples of the workspace."""
+
+import math
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float64, Int64
+from torch import Tensor
+
+from pisigma.measurement.dataset import Measurements
+from pisigma.model.calibrated_model import CalibratedModel
+from pisigma.robot.kinematics.forward import forward_kinematics
+from pisigma.validation.held_out.judged_rows import JudgedRows, inside, place_of, predicted_at
+
+MAX_POINTS = 20_000
+"""Points of a map; of more rows the largest errors and an even selection of the others are shown."""
+WORST_SHARE = 0.05
+"""Share of `MAX_POINTS` that is reserved for the largest errors."""
+SAMPLES = 3_000
+"""Samples of the workspace, where no row was measured."""
+
+Quantity = Literal[
+    "before", "after", "predicted", "before_deg", "after_deg", "correction", "distance", "turn"
+]
+"""Quantity that a map shows.
+
+"before" and "after": position error of the robot as drawn and of the model; with "_deg" the orientation error.
+"predicted": standard deviation of the predicted position. "correction": distance by which the calibration moves the
+tool. "distance" and "turn": distance and angle between the poses of two models.
+"""
+
+
+@dataclass(frozen=True, eq=False)
+class Layer:
+    """One quantity at every point of a map.
+
+    Attributes:
+        key: the quantity.
+        unit: "mm" or "deg".
+        values: value at every point; NaN where it is unknown.
+    """
+
+    key: Quantity
+    unit: str
+    values: Float64[np.ndarray, " points"]
+
+
+@dataclass(frozen=True, eq=False)
+class ErrorMap:
+    """Points in the robot's base frame with the quantities at each.
+
+    Attributes:
+        place: position of the tool in the robot's base frame [mm].
+        layers: quantities that can be shown, at least one.
+        row: number of every point's row: its line in the file, else its number from 1; 0 for samples.
+        q: joint values [deg or mm].
+        frame: frame of every point.
+        target: target of every point.
+        inside: whether every joint value was measured for the calibration.
+        rows: number of judged rows; 0 for samples of the workspace.
+        source: file of the rows, or name of the model.
+        origin: `JudgedRows.origin` of the rows; "" for samples of the workspace.
+        random: number of points that were drawn at random.
+    """
+
+    place: Float64[np.ndarray, "points 3"]
+    layers: tuple[Layer, ...]
+    row: Int64[np.ndarray, " points"]
+    q: Float64[np.ndarray, "points dof"]
+    frame: tuple[str, ...]
+    target: tuple[str, ...]
+    inside: Bool[np.ndarray, " points"]
+    rows: int
+    source: str
+    origin: str
+    random: int
+
+
+def map_of_rows(model: CalibratedModel, rows: JudgedRows) -> ErrorMap:
+    """Map judged rows; of very many, those with the largest errors and an even selection of the others."""
+    before, after = rows.before, rows.after
+    layers = _finite(
+        _layer("before", before.position),
+        _layer("after", after.position),
+        _layer("predicted", rows.predicted),
+        _layer("before_deg", before.rotation, "deg"),
+        _layer("after_deg", after.rotation, "deg"),
+    )
+    count = rows.measurements.rows
+    chosen = _chosen(layers, count)
+    number = torch.tensor([line or k + 1 for k, line in enumerate(rows.measurements.line)])
+    points = rows.measurements.select(chosen)
+    shown = [replace(layer, values=layer.values[chosen.numpy()]) for layer in layers]
+    return _map(model, points, shown, number[chosen], (count, rows.measurements.source, rows.origin, 0))
+
+
+def map_of_workspace(model: CalibratedModel) -> ErrorMap:
+    """Map the workspace without measurements: joint values that the model keeps, and random ones in their ranges."""
+    q = model.starts
+    more = max(SAMPLES - len(q), 0) if len(q) else 0
+    if more:
+        low, high = q.amin(0), q.amax(0)
+        generator = torch.Generator().manual_seed(0)
+        drawn = torch.rand(more, q.shape[1], generator=generator, dtype=torch.float64)
+        q = torch.cat([q, low + drawn * (high - low)])
+    frame, target = (next(iter(names), "") for names in (model.bases, model.tools))
+    samples = Measurements(q=q, frame=(frame,) * len(q), target=(target,) * len(q), source=model.name)
+    moved = model.forward(q)[:, :3, 3] - forward_kinematics(model.robot, q)[:, :3, 3]
+    layers = _finite(
+        _layer("correction", moved.norm(dim=-1)), _layer("predicted", predicted_at(model, samples))
+    )
+    number = torch.zeros(len(q), dtype=torch.int64)
+    return _map(model, samples, layers, number, (0, model.name, "", more))
+
+
+def _layer(key: Quantity, values: Float64[Tensor, " points"] | None, unit: str = "mm") -> Layer | None:
+    """Make a layer of values [m or rad]; None without values."""
+    factor = 1e3 if unit == "mm" else math.degrees(1.0)
+    return None if values is None else Layer(key, unit, values.numpy() * factor)
+
+
+def _finite(*layers: Layer | None) -> list[Layer]:
+    """Return the layers with at least one known value."""
+    return [layer for layer in layers if layer is not None and np.isfinite(layer.values).any()]
+
+
+def _chosen(layers: list[Layer], rows: int) -> Int64[Tensor, " chosen"]:
+    """Choose the rows that are shown, in their order."""
+    if rows <= MAX_POINTS:
+        return torch.arange(rows)
+    worst = np.argsort(-np.nan_to_num(layers[min(1, len(layers) - 1)].values), kind="stable")
+    worst = worst[: int(MAX_POINTS * WORST_SHARE)]
+    others = np.linspace(0, rows - 1, MAX_POINTS - len(worst)).round().astype(int)
+    return torch.from_numpy(np.unique(np.concatenate([worst, others])))
+
+
+def _map(
+    model: CalibratedModel,
+    points: Measurements,
+    layers: list[Layer],
+    number: Int64[Tensor, " points"],
+    about: tuple[int, str, str, int],
+) -> ErrorMap:
+    factor = [math.degrees(1.0) if turns else 1e3 for turns in model.robot.revolute]
+    return ErrorMap(
+        place_of(model, points.q).numpy() * 1e3,
+        tuple(layers),
+        number.numpy(),
+        points.q.numpy() * factor,
+        points.frame,
+        points.target,
+        inside(model, points.q).numpy(),
+        *about,
+    )

@@ -1,0 +1,139 @@
+"""Parts of the joint ranges that were not measured, and the errors of rows beyond the measured joint values."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float64
+from torch import Tensor
+
+from pisigma.calibration.hybrid.arm import JointCoverage
+from pisigma.model.calibrated_model import CalibratedModel
+from pisigma.validation.held_out.judged_rows import JudgedRows
+
+Stretch = tuple[float, float]
+"""Lowest and highest joint value [rad or m]."""
+
+COVERED = 0.98
+"""Share of a joint's range above which no gap is reported."""
+NOT_MOVED = 1e-3
+"""Share of a joint's range below which the joint counts as not moved."""
+
+
+@dataclass(frozen=True)
+class JointGap:
+    """A joint whose range was measured in part only.
+
+    Attributes:
+        joint: name of the joint.
+        unit: "deg" or "mm", of all values.
+        measured: measured stretches of the range; the constant value where the joint was not moved.
+        range: the whole range.
+        share: share of the range that was measured.
+        whole_turn: whether the range is one revolution.
+    """
+
+    joint: str
+    unit: str
+    measured: tuple[Stretch, ...]
+    range: Stretch
+    share: float
+    whole_turn: bool
+
+    @property
+    def moved(self) -> bool:
+        """Whether the joint was moved at all."""
+        return self.share >= NOT_MOVED
+
+
+@dataclass(frozen=True)
+class OutsideErrors:
+    """Errors of rows with joint values beyond those that the model was calibrated with.
+
+    Attributes:
+        outside: number of such rows.
+        rows: number of all rows.
+        rms_outside: their RMS position error [mm]; None where it is not known.
+        rms_inside: RMS position error of the other rows [mm]; None where it is not known.
+    """
+
+    outside: int
+    rows: int
+    rms_outside: float | None
+    rms_inside: float | None
+
+
+def joint_gaps(model: CalibratedModel, rows: JudgedRows | None) -> tuple[JointGap, ...]:
+    """List the joints whose range was measured in part only.
+
+    Args:
+        model: the model.
+        rows: judged rows, whose joint values count unless they belong to another file; None for those that the model
+            keeps.
+    """
+    q = model.starts if rows is None or rows.origin == "other" else rows.measurements.q
+    if not len(q):
+        return ()
+    gaps = []
+    for j, (stretches, (low, high)) in enumerate(measured_stretches(model, q)):
+        turns = bool(model.robot.revolute[j])
+        share = sum(b - a for a, b in stretches) / (high - low) if high > low else 1.0
+        if not math.isfinite(high - low) or share >= COVERED:
+            continue
+        factor, unit = (math.degrees(1.0), "deg") if turns else (1e3, "mm")
+        measured = stretches if share >= NOT_MOVED else [(float(q[0, j]), float(q[0, j]))]
+        gaps.append(
+            JointGap(
+                joint=model.robot.joints[j].name,
+                unit=unit,
+                measured=tuple((a * factor, b * factor) for a, b in measured),
+                range=(low * factor, high * factor),
+                share=share,
+                whole_turn=turns and high - low > 2 * math.pi - 1e-6,
+            )
+        )
+    return tuple(gaps)
+
+
+def outside_errors(rows: JudgedRows | None) -> OutsideErrors | None:
+    """Compare rows beyond the measured joint values with the others; None where there are no such rows."""
+    if rows is None or bool(rows.inside.all()):
+        return None
+    after = rows.after.position.numpy() * 1e3
+    apart = [after[mask & np.isfinite(after)] for mask in (~rows.inside.numpy(), rows.inside.numpy())]
+    rms = [float(np.sqrt((errors**2).mean())) if len(errors) else None for errors in apart]
+    return OutsideErrors(int((~rows.inside).sum()), rows.measurements.rows, rms[0], rms[1])
+
+
+def measured_stretches(
+    model: CalibratedModel, q: Float64[Tensor, "rows dof"]
+) -> list[tuple[list[Stretch], Stretch]]:
+    """Return the measured stretches of every joint and its range [rad or m].
+
+    The range of a joint that can turn without end is one revolution, to which its stretches are wrapped.
+
+    Args:
+        model: a hybrid keeps the stretches that it was calibrated with.
+        q: measured joint values, for models that keep none [rad or m].
+    """
+    coverage = model.hybrid.coverage if model.hybrid else JointCoverage.of(model.robot, q)
+    result = []
+    for j, limits in enumerate(map(tuple, model.robot.limits.tolist())):
+        of_joint, rate = coverage.joint == j, float(coverage.rate[j])
+        middle, half = coverage.middle[of_joint].tolist(), coverage.half[of_joint].tolist()
+        ends = [((m - h) / rate, (m + h) / rate) for m, h in zip(middle, half, strict=True)]
+        result.append(_in_range(ends, limits, 2 * math.pi / rate if coverage.turning[j] else None))
+    return result
+
+
+def _in_range(ends: list[Stretch], limits: Stretch, turn: float | None) -> tuple[list[Stretch], Stretch]:
+    """Wrap stretches to one revolution of an endless joint, or clip them to the limits of another."""
+    low, high = limits
+    if turn is not None and not high - low < turn - 1e-9:
+        if any(b - a >= turn - 1e-9 for a, b in ends):
+            return [(-turn / 2, turn / 2)], (-turn / 2, turn / 2)
+        back = [turn * round((a + b) / (2 * turn)) for a, b in ends]
+        return [(a - k, b - k) for (a, b), k in zip(ends, back, strict=True)], (-turn / 2, turn / 2)
+    shifts = [0.0] if turn is None else [turn * k for k in range(-2, 3)]
+    clipped = [(max(a + shift, low), min(b + shift, high)) for a, b in ends for shift in shifts]
+    return sorted((a, b) for a, b in clipped if b > a), limits
