@@ -9,24 +9,26 @@ def outlier(row):
     return OutlierFigures(row=row, place=f"a.csv, line {row}", sensor="position", deviations=9.0)
 
 
-def test_every_paragraph_is_a_sentence():
-    left_out, first = sentences("report.txt.j2", "weak_parameters", ["a + b is weak."], ["c_1"], "2")
-    assert left_out == "Hardly identified: a + b is weak. Choose poses that move more of what it depends on."
-    assert first.startswith("c_1: the change from nominal is less than 2 standard errors")
+def test_paragraphs_of_a_macro_are_sentences_of_their_own():
+    direction, first = sentences("report.txt.j2", "weak_parameters", ["a + b is weak."], ["c_1"], "2")
+    assert "a + b is weak." in direction
+    assert first.startswith("c_1:")
+    assert direction.endswith(".")
+    assert first.endswith(".")
 
 
-def test_a_macro_may_say_nothing():
+def test_a_macro_may_be_empty():
     assert sentences("report.txt.j2", "outliers", []) == ()
-    (said,) = sentences("report.txt.j2", "outliers", [outlier(row) for row in range(2, 7)])
-    assert said.startswith("5 rows counted")
-    assert said.endswith("(a.csv, line 2, a.csv, line 3, a.csv, line 4).")
+    (text,) = sentences("report.txt.j2", "outliers", [outlier(row) for row in range(2, 7)])
+    assert text.startswith("5 ")
+    assert text.endswith("(a.csv, line 2, a.csv, line 3, a.csv, line 4).")
 
 
-def test_noise_is_said_in_its_own_unit():
+def test_noise_is_stated_in_the_unit_of_its_sensor():
     stated = NoiseFigures(sensor="position", values=9, used_by_parameters=1.0, factor_on_stated_sigma=1.5)
     turning = NoiseFigures(sensor="rotation", values=9, used_by_parameters=1.0, sigma_deg=0.01)
-    assert "1.5 times the standard deviation" in sentences("calibration.txt.j2", "noise", stated)[0]
-    assert ": 0.01 deg per value" in sentences("calibration.txt.j2", "noise", turning)[0]
+    assert "1.5 times" in sentences("calibration.txt.j2", "noise", stated)[0]
+    assert "0.01 deg" in sentences("calibration.txt.j2", "noise", turning)[0]
 
 
 def test_a_card_ends_with_a_line(tmp_path):
