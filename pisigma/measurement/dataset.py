@@ -17,7 +17,15 @@ from torch import Tensor
 from pisigma.files.errors import MeasurementError
 from pisigma.measurement.csv.reading import read_fields
 from pisigma.measurement.csv.writing import write_fields
-from pisigma.measurement.fields import KINDS, Kind, LeftOut, MeasuredFields, OnBadRow, joined_fields
+from pisigma.measurement.fields import (
+    KINDS,
+    Kind,
+    LeftOut,
+    MeasuredFields,
+    OnBadRow,
+    RowPlace,
+    joined_fields,
+)
 from pisigma.measurement.readings import READINGS
 from pisigma.measurement.rules import check_fields
 from pisigma.robot import Robot
@@ -192,8 +200,12 @@ class Measurements:
             )
         return transform(self.rotation, self.position)
 
+    def at(self, row: int, column: str | None = None) -> RowPlace:
+        """Return the place of a row (from 0), for the `at` of an exception: file and line, or source and row."""
+        return self.as_fields().at(row, column)
+
     def place(self, row: int) -> str:
-        """Name a row as complaints do: by file and line, or by source and row counted from 0."""
+        """Return the place of a row as a text; see `at`."""
         return self.as_fields().label(row)
 
     def split_sets(self) -> "tuple[Measurements, Measurements | None]":

@@ -1,16 +1,17 @@
-"""The fields of a data set: which there are, and rows of them."""
+"""The fields of a data set, rows of them, and what is wrong with a row."""
 
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float64
 from torch import Tensor
 
+from pisigma.files.errors import MeasurementError, Place
 from pisigma.measurement.readings import READINGS
 
 NUMBERS: dict[str, tuple[int, ...]] = {
@@ -25,16 +26,72 @@ NUMBERS: dict[str, tuple[int, ...]] = {
     "anchor_place": (3,),
     "approach": (-1,),
 }
-"""Fields that are numbers, with the shape of a row; -1 stands for the number of joints."""
+"""Numeric fields and the shape of one row; -1 is the number of joints."""
 TEXTS = ("target", "frame", "split", "socket", "touch_axis", "anchor", "pair", "date", "image")
-"""Fields that are texts."""
+"""Text fields."""
 
 OnBadRow = Literal["error", "leave_out"]
 Kind = str
 """What a sensor measured in a row: "pose", "position", "rotation", "touch", "socket", "distance", or the name of a
-registered sensor. The orientation alone is "rotation"; together with a position it makes a "pose"."""
+registered sensor. An orientation alone is a "rotation"; with a position it is a "pose"."""
 KINDS = ("pose", "position", "rotation", "touch", "socket", "distance")
-"""The kinds that are always there."""
+"""The built-in kinds."""
+
+
+@dataclass(frozen=True)
+class RowPlace(Place):
+    """Where a row of measurements comes from.
+
+    Attributes:
+        row: its number, counted from 0, where it comes from no line of a file.
+        image: the image that it was measured in; "" where it was measured in none.
+    """
+
+    row: int | None = None
+    image: str = ""
+
+    def __str__(self) -> str:
+        parts = [str(Place(self.file, self.line))]
+        parts += [f"row {self.row}"] if self.row is not None else []
+        parts += [f"image '{self.image}'"] if self.image else []
+        column = f"'{self.column}'" if isinstance(self.column, str) else self.column
+        parts += [f"{'column' if self.row is None else 'field'} {column}"] if column is not None else []
+        return ", ".join(parts)
+
+
+@dataclass(frozen=True)
+class Fault:
+    """What is wrong with a row; see `PisigmaError` for the fields.
+
+    Attributes:
+        problem: a clause without a full stop; without it the message says ``expected ..., got ...``.
+        column: name of the (first) column at fault, or its number from 1; None where the whole row is meant.
+        expected: what was expected.
+        value: what was given instead.
+        remedy: what to do about it, an imperative clause without a full stop.
+    """
+
+    problem: str = ""
+    column: str | int | None = None
+    expected: str = ""
+    value: Any = None
+    remedy: str = ""
+
+    def error(self, at: Place) -> MeasurementError:
+        """Return the exception for a row at `at`."""
+        return MeasurementError(
+            self.problem,
+            expected=self.expected,
+            value=self.value,
+            at=replace(at, column=self.column),
+            remedy=self.remedy,
+        )
+
+    def __str__(self) -> str:
+        problem = str(MeasurementError(self.problem, expected=self.expected, value=self.value))
+        column = f"'{self.column}'" if isinstance(self.column, str) else self.column
+        at = "" if column is None else f" (column {column})"
+        return f"{problem.removesuffix('.')}{at}{'; ' if self.remedy else ''}{self.remedy}"
 
 
 @dataclass(frozen=True)
@@ -43,26 +100,38 @@ class LeftOut:
 
     Attributes:
         line: its line in the file.
-        reason: the column at fault, what stands there and what to do.
+        reason: what is wrong, in which column, and what to do.
+        fault: the same by field, where one value of the row is at fault.
     """
 
     line: int
     reason: str
+    fault: Fault | None = None
+
+    @staticmethod
+    def because(line: int, fault: Fault) -> "LeftOut":
+        """Return the row with the reason that a fault states."""
+        return LeftOut(line, str(fault), fault)
+
+    def error(self, file: str) -> MeasurementError:
+        """Return the exception for this row of a file."""
+        return (self.fault or Fault(self.reason)).error(Place(file, self.line))
 
 
 @dataclass(frozen=True, eq=False)
 class MeasuredFields:
-    """Rows of measurements field by field, in SI units; see `Measurements` for what the fields mean.
+    """Rows of measurements by field, in SI units; see `Measurements` for what the fields mean.
 
-    This is the form in which files are read and written, and in which rows are checked, chosen and joined.
+    Files are read and written, and rows are checked, selected and joined, in this form.
 
     Attributes:
-        numbers: "q" and the fields of `NUMBERS` and of registered sensors that are there, each with one entry a row.
-        texts: the fields of `TEXTS` and of registered sensors that are there, each with one entry a row.
-        line: per row, the line of the file it came from (0 where it came from none).
-        source: the file, or what made the rows.
-        left_out: rows of the file that are not here, and why.
-        origin: per row, the file it came from, where rows came from several; else nothing.
+        numbers: "q" and those of `NUMBERS` and of the registered sensors' columns that were measured, one entry per
+            row.
+        texts: those of `TEXTS` and of the registered sensors' columns that are given, one entry per row.
+        line: per row, the line of the file that it was read from; 0 for rows that were not read from a file.
+        source: the file, or a name of what made the rows.
+        left_out: rows of the file that could not be used, and why.
+        origin: per row, the file that it was read from, where rows come from several files; else empty.
     """
 
     numbers: Mapping[str, Tensor]
@@ -78,28 +147,31 @@ class MeasuredFields:
         return len(self.numbers["q"])
 
     def text(self, name: str) -> tuple[str, ...]:
-        """Return a field of texts, "" in every row where it is not there."""
+        """Return a text field; "" in every row if the data set does not have it."""
         return self.texts.get(name) or ("",) * self.rows
 
     def array(self, name: str, *shape: int) -> Float64[np.ndarray, "rows *shape"]:
-        """Return a field of numbers, NaN in every row where it is not there; `shape` is that of a row."""
+        """Return a numeric field; NaN in every row if the data set does not have it. `shape` is that of one row."""
         values = self.numbers.get(name)
         if values is None:
             return np.full((self.rows, *shape), np.nan)
         array: np.ndarray = values.detach().cpu().numpy()
         return array
 
-    def label(self, row: int) -> str:
-        """Name a row as complaints do: by file and line, or by source and row counted from 0, and by its image."""
+    def at(self, row: int, column: str | None = None) -> RowPlace:
+        """Return the place of a row (from 0) for messages: file and line, or source and row, and its image."""
         line = self.line[row] if row < len(self.line) else 0
         source, image = self.origin[row] if self.origin else self.source, self.text("image")[row]
-        where = f"{source}, line {line}" if line else f"{source}, row {row}"
-        return f"{where} (image '{image}')" if image else where
+        return RowPlace(source, line or None, column, None if line else row, image)
+
+    def label(self, row: int) -> str:
+        """Return the place of a row as a text; see `at`."""
+        return str(self.at(row))
 
     def measured(self, kind: Kind) -> Bool[Tensor, " rows"]:
-        """Say for every row whether it holds a measurement of a kind.
+        """Return which rows contain a measurement of a kind.
 
-        A row with position and orientation is of the kind "pose" and of no other.
+        A row with a position and an orientation is a "pose" only, neither a "position" nor a "rotation".
         """
         if kind == "socket":
             names = torch.tensor([bool(name) for name in self.text("socket")], dtype=torch.bool)
@@ -130,11 +202,11 @@ class MeasuredFields:
 
     @cached_property
     def _filled_rows(self) -> dict[str, Bool[Tensor, " rows"]]:
-        """By field of numbers, the rows in which it is filled, once that was asked for."""
+        """Which rows are filled, by numeric field; cached on first use."""
         return {}
 
     def select(self, rows: Tensor) -> "MeasuredFields":
-        """Return the rows of an int64 index, in its order."""
+        """Return the rows of an int64 index, in the order of the index."""
         chosen = rows.tolist()
         return replace(
             self,
@@ -146,10 +218,10 @@ class MeasuredFields:
 
 
 def joined_fields(data: Sequence[MeasuredFields]) -> MeasuredFields:
-    """Put the rows of several data sets behind each other; what one of them lacks is NaN or "" in its rows.
+    """Concatenate data sets; fields that one of them does not have are NaN or "" in its rows.
 
     Args:
-        data: one or more, of equally many joints.
+        data: one or more data sets with the same number of joints.
     """
 
     def filled(one: MeasuredFields, name: str, row: torch.Size) -> Tensor:

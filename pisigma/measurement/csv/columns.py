@@ -1,4 +1,4 @@
-"""The columns of measurement files: what they are called, what stands in them, and which fields they make up."""
+"""The columns of measurement files: their names, quantities and units, and the fields that they form."""
 
 import re
 from collections.abc import Iterable
@@ -19,13 +19,13 @@ _METRES = {"metres": 1.0, "millimetres": 1e-3, "centimetres": 1e-2, "inches": 0.
 MISNAMED_UNITS = tuple(
     (_METRES[are] / _METRES[named], are, named) for are in _METRES for named in _METRES if are != named
 )
-"""Factors on lengths, what they are, and what they are taken for."""
+"""Factors on lengths that are in one unit and labelled as another: factor, actual unit, stated unit."""
 
 CORNERS = ("corner", "u_px", "v_px")
 """Columns of files of corners, which `pisigma.measurement.camera` reads."""
 
 PLAN_COLUMNS = ("order", "candidate")
-"""What a plan says of its poses; measurements may keep it, and nothing reads it there."""
+"""Columns of a plan; measurement files may keep them, and they are ignored there."""
 
 _JOINT = re.compile(r"q([1-9][0-9]{0,2})_(deg|rad|mm|m)")
 _APPROACH = re.compile(r"approach([1-9][0-9]{0,2})")
@@ -36,9 +36,9 @@ class Column:
     """A column of a measurement file.
 
     Attributes:
-        name: as in the header, such as "q1_deg".
-        quantity: what stands in it, such as "q1"; no two columns of a file have the same.
-        unit: "" where there is none.
+        name: name in the header, such as "q1_deg".
+        quantity: its quantity, such as "q1"; unique within a file.
+        unit: unit of its values; "" for dimensionless ones and texts.
     """
 
     name: str
@@ -47,31 +47,31 @@ class Column:
 
     @property
     def is_number(self) -> bool:
-        """Whether its cells hold numbers."""
+        """Whether its cells are numbers."""
         return self.quantity not in (*TEXTS, *PLAN_COLUMNS, *reading_texts())
 
     @property
     def joint(self) -> int:
-        """Number of the joint, from 1; 0 where it is no joint column."""
+        """Number of the joint, from 1; 0 for other columns."""
         match = _JOINT.fullmatch(self.name)
         return int(match[1]) if match else 0
 
     @property
     def approach(self) -> int:
-        """Number of the joint whose direction of approach it holds, from 1; 0 where it holds none."""
+        """Number of the joint whose direction of approach it contains, from 1; 0 for other columns."""
         match = _APPROACH.fullmatch(self.name)
         return int(match[1]) if match else 0
 
 
 @dataclass(frozen=True)
 class FileField:
-    """A field of measurements that are numbers, and its columns in files.
+    """A numeric field of measurements, and its columns in files.
 
     Attributes:
-        name: of the field.
-        quantities: what stands in its columns, one for every value of a row.
-        units: that the columns may be in; they are written in the first.
-        column: name of its only column without the unit, where that is not the quantity.
+        name: name of the field.
+        quantities: quantities of its columns, one for every value of a row.
+        units: valid units of the columns; files are written in the first.
+        column: name of its only column without the unit, if it differs from the quantity.
     """
 
     name: str
@@ -81,7 +81,7 @@ class FileField:
 
     @property
     def columns(self) -> tuple[Column, ...]:
-        """All columns that it may have, those in the first unit first."""
+        """All columns that it may have, starting with those in the first unit."""
         return tuple(
             Column("_".join(filter(None, (self.column or quantity, unit))), quantity, unit)
             for unit in self.units
@@ -103,10 +103,10 @@ _FIELDS = (
 
 
 def number_fields(dof: int = 0) -> tuple[FileField, ...]:
-    """The fields behind the joint values, as they follow each other in a file; a rotation may be read as `RPY`, too.
+    """Return the numeric fields after the joint values, in the order of a file; rotations may also be read as `RPY`.
 
     Args:
-        dof: number of joints, whose directions of approach are among them.
+        dof: number of joints; with 0 the directions of approach are not included.
     """
     approach = FileField("approach", tuple(f"approach{number}" for number in range(1, dof + 1)), ("",))
     added = (
@@ -119,7 +119,7 @@ def number_fields(dof: int = 0) -> tuple[FileField, ...]:
 
 
 def find_column(name: str) -> Column | None:
-    """Return the column of a name, or None where there is no such column."""
+    """Return the column of a name, or None if there is no such column."""
     match = _JOINT.fullmatch(name)
     if match:
         unit = next(unit for unit in (*REVOLUTE_UNITS, *PRISMATIC_UNITS) if unit == match[2])
@@ -128,7 +128,7 @@ def find_column(name: str) -> Column | None:
 
 
 def _columns() -> dict[str, Column]:
-    """All columns by name but those of joints."""
+    """Return all columns by name, except those of joints."""
     columns = [column for field in number_fields() for column in field.columns]
     columns += [Column(f"{name}_deg", name, "deg") for name in RPY]
     columns += [Column(name, name, "") for name in PLAN_COLUMNS]
@@ -137,19 +137,19 @@ def _columns() -> dict[str, Column]:
 
 
 def column_choices(name: str) -> str:
-    """Say which columns there are and which is nearest to an unknown `name`.
+    """Return a text that lists the valid columns and the one nearest to an unknown `name`.
 
-    Joint columns are listed for one joint: the one that `name` seems to mean, else the first.
+    Joint columns are listed for one joint only: the one that `name` seems to mean, else the first.
     """
     number = re.match(r"[A-Za-z]+[ _]?([1-9][0-9]?)(?![0-9])", name)
     joint = number[1] if number else "1"
     joints = (f"q{joint}_{unit}" for unit in (*REVOLUTE_UNITS, *PRISMATIC_UNITS))
     meant = name.lower()
-    if re.fullmatch(r"q[1-9][0-9]?", meant):  # most joints turn
+    if re.fullmatch(r"q[1-9][0-9]?", meant):  # most joints are revolute
         meant += "_deg"
     return nearest_choice(meant, (*joints, *_columns(), f"approach{joint}"))
 
 
 def quoted(columns: Iterable[Column]) -> str:
-    """Names of columns as complaints list them."""
+    """Return the names of columns as messages list them."""
     return ", ".join(f"'{column.name}'" for column in columns)

@@ -1,9 +1,9 @@
-"""The header of a measurement file: what its columns mean, by their names alone, and whether they fit together."""
+"""The header of a measurement file: the meaning of its columns by name, and whether they fit together."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
-from pisigma.files.errors import MeasurementError
+from pisigma.files.errors import MeasurementError, Place
 from pisigma.measurement.csv.columns import (
     ANCHOR_PLACE,
     CORNERS,
@@ -24,11 +24,11 @@ from pisigma.robot import Robot
 
 @dataclass(frozen=True)
 class Layout:
-    """What stands where in the rows of a file.
+    """Meaning and order of the columns of a file.
 
     Attributes:
         columns: meaning of every column, in the file's order.
-        index: place of every quantity, such as {"q1": 0, "x": 6}.
+        index: index of the column of every quantity, such as {"q1": 0, "x": 6}.
         dof: number of joints.
         orientation: the quantities of the orientation: `RPY`, `QUATERNION` or none.
     """
@@ -45,9 +45,9 @@ class Layout:
 
     @property
     def lengths(self) -> tuple[str, ...]:
-        """The quantities beside position and orientation of which one is enough for a measurement.
+        """The quantities other than position and orientation of which one makes a row a measurement.
 
-        The names are among them, so that a name without its value is complained of as such.
+        They include the names (sockets, anchors), so that a name without a value is reported as such.
         """
         return tuple(name for name in ("socket", *_NEEDED, *reading_numbers()) if name in self.index)
 
@@ -62,34 +62,39 @@ class Layout:
         return tuple(column.quantity for column in self.columns if column.approach)
 
     def column(self, quantity: str) -> Column:
-        """The column of a quantity."""
+        """Return the column of a quantity."""
         return self.columns[self.index[quantity]]
 
 
 def read_header(table: Table, robot: Robot | None) -> Layout:
-    """Find out what the columns of a file mean.
+    """Determine the meaning of the columns of a file.
 
     Args:
         table: the file.
         robot: checks number and units of the joint columns; None checks neither.
 
     Raises:
-        MeasurementError: a column is unknown, missing or there twice, or units do not fit together.
+        MeasurementError: a column is unknown, missing or duplicate, or units do not fit together.
     """
-    place = f"{table.source}, line {table.header_line}"
+    place = table.header_place
     if set(CORNERS) <= set(table.header):
         raise MeasurementError(
-            f"{place}: these are corners of a board in images; state what they mean with --camera camera.yaml --board "
-            "board.yaml, which pisigma calibrate, recalibrate, evaluate, verify, monitor, compare and report read."
+            "the columns are those of corners of a board in images",
+            at=place,
+            value=",".join(CORNERS),
+            remedy="describe camera and board with --camera camera.yaml --board board.yaml (of pisigma calibrate, "
+            "recalibrate, evaluate, verify, monitor, compare and report)",
         )
     columns = tuple(_find(place, name, number) for number, name in enumerate(table.header, start=1))
     index: dict[str, int] = {}
     for number, column in enumerate(columns):
         if column.quantity in index:
             other = columns[index[column.quantity]]
-            raise MeasurementError(
-                f"{place}, column '{column.name}': '{other.name}' in column {index[column.quantity] + 1} "
-                "gives the same quantity already; remove one of them."
+            raise _fault(
+                place,
+                f"the quantity appears twice, first as '{other.name}' in column {index[column.quantity] + 1}",
+                column,
+                "remove one of them",
             )
         index[column.quantity] = number
     dof = _check_joints(place, columns)
@@ -102,35 +107,50 @@ def read_header(table: Table, robot: Robot | None) -> Layout:
     return Layout(columns, index, dof, _check_orientation(place, columns))
 
 
-def _find(place: str, name: str, number: int) -> Column:
-    """The column of a name in the header."""
+def _fault(place: Place, problem: str, column: Column | None, remedy: str) -> MeasurementError:
+    """Return the exception for a header, or for one of its columns."""
+    at = place if column is None else replace(place, column=column.name)
+    return MeasurementError(problem, at=at, remedy=remedy)
+
+
+def _find(place: Place, name: str, number: int) -> Column:
+    """Return the column of a name in the header."""
     column = find_column(name)
     if column is not None:
         return column
     if not name:
         raise MeasurementError(
-            f"{place}, column {number}: has no name; name it or remove the comma too many."
+            "the column has no name",
+            at=replace(place, column=number),
+            remedy="name it, or remove the extra comma",
         )
     check_separators(name, place)
     if _is_number(name):
         raise MeasurementError(
-            f"{place}, column {number}: a header was wanted, but there is the number {name}; begin the file "
-            "with the names of the columns, such as q1_deg,q2_deg,x_mm,y_mm,z_mm."
+            expected="the name of a column",
+            value=name,
+            at=replace(place, column=number),
+            remedy="start the file with the names of its columns, such as q1_deg,q2_deg,x_mm,y_mm,z_mm",
         )
-    raise MeasurementError(f"{place}, column '{name}': unknown column; {column_choices(name)}")
+    raise MeasurementError(
+        "unknown column", value=name, at=replace(place, column=name), remedy=column_choices(name)
+    )
 
 
-def check_separators(name: str, place: str) -> None:
+def check_separators(name: str, place: Place) -> None:
     """Refuse a header whose fields are not separated by commas.
 
     Raises:
         MeasurementError: see above.
     """
-    if ";" in name or "\t" in name:
-        raise MeasurementError(
-            f"{place}, column '{name}': fields are separated by semicolons or tabs; save the file with "
-            "commas between fields and points in numbers."
-        )
+    for separator, called in ((";", "semicolons"), ("\t", "tabs")):
+        if separator in name:
+            raise MeasurementError(
+                expected="commas between fields",
+                value=called,
+                at=replace(place, column=name),
+                remedy="save the file with commas between fields and points in numbers",
+            )
 
 
 def _is_number(name: str) -> bool:
@@ -140,78 +160,84 @@ def _is_number(name: str) -> bool:
         return False
 
 
-def _check_joints(place: str, columns: tuple[Column, ...]) -> int:
-    """Number of joints; q1 to the last are there, in one unit per kind of joint."""
+def _check_joints(place: Place, columns: tuple[Column, ...]) -> int:
+    """Check that joints are numbered from q1 without a gap, in one unit per type of joint; return their number."""
     joints = sorted((column for column in columns if column.joint), key=lambda column: column.joint)
     if not joints:
-        raise MeasurementError(
-            f"{place}: no joint column; add q1_deg or q1_rad (q1_mm or q1_m for a prismatic joint) and so on per joint."
-        )
+        remedy = "add q1_deg or q1_rad (q1_mm or q1_m for a prismatic joint) and so on for every joint"
+        raise _fault(place, "there is no joint column", None, remedy)
     for expected, column in enumerate(joints, start=1):
         if column.joint != expected:
-            raise MeasurementError(
-                f"{place}, column '{column.name}': the joint before it has no column; add "
-                f"q{expected}_{column.unit} or number the joints from q1 without a gap."
-            )
+            problem = f"the joint before it has no column 'q{expected}_{column.unit}'"
+            raise _fault(place, problem, column, "add it, or number the joints from q1 without a gap")
     for units in (REVOLUTE_UNITS, PRISMATIC_UNITS):
         _check_one_unit(place, [column for column in joints if column.unit in units])
     return len(joints)
 
 
-def _check_one_unit(place: str, columns: list[Column]) -> None:
+def _check_one_unit(place: Place, columns: list[Column]) -> None:
     for column in columns:
         if column.unit != columns[0].unit:
             raise MeasurementError(
-                f"{place}, column '{column.name}': is in {column.unit}, but '{columns[0].name}' is in "
-                f"{columns[0].unit}; use one unit for both."
+                expected=f"{columns[0].unit} as in '{columns[0].name}'",
+                value=column.unit,
+                at=replace(place, column=column.name),
+                remedy="use one unit for both",
             )
 
 
-def _check_robot(place: str, joints: list[Column], robot: Robot) -> None:
-    """The joint columns fit the robot's joints."""
+def _check_robot(place: Place, joints: list[Column], robot: Robot) -> None:
+    """Check that the joint columns fit the robot's joints."""
     if len(joints) != len(robot.axes):
         raise MeasurementError(
-            f"{place}, column '{joints[-1].name}': the file ends with joint {len(joints)}, but robot '{robot.name}' "
-            f"has {len(robot.axes)} joints; choose the robot that was measured or correct the columns."
+            expected=f"{len(robot.axes)} joints, as robot '{robot.name}' has",
+            value=len(joints),
+            at=replace(place, column=joints[-1].name),
+            remedy="choose the robot that was measured, or correct the columns",
         )
     for column, joint in zip(joints, robot.axes, strict=True):
         units = REVOLUTE_UNITS if joint.type == "revolute" else PRISMATIC_UNITS
         if column.unit not in units:
-            choices = " or ".join(f"{column.quantity}_{unit}" for unit in units)
             raise MeasurementError(
-                f"{place}, column '{column.name}': joint '{joint.name}' of robot '{robot.name}' is "
-                f"{joint.type} and cannot be in {column.unit}; give {choices}."
+                expected=f"{' or '.join(units)} for the {joint.type} joint '{joint.name}' of robot '{robot.name}'",
+                value=column.unit,
+                at=replace(place, column=column.name),
+                remedy=f"give {' or '.join(f'{column.quantity}_{unit}' for unit in units)}",
             )
 
 
-def _check_approaches(place: str, columns: tuple[Column, ...], dof: int) -> None:
-    """Directions of approach are those of joints that the file has."""
+def _check_approaches(place: Place, columns: tuple[Column, ...], dof: int) -> None:
+    """Check that directions of approach are those of joints in the file."""
     for column in columns:
         if column.approach > dof:
             raise MeasurementError(
-                f"{place}, column '{column.name}': the file has the joints q1 to q{dof}; correct its number or remove "
-                "the column."
+                expected=f"a joint from 1 to {dof}",
+                value=column.approach,
+                at=replace(place, column=column.name),
+                remedy="correct its number, or remove the column",
             )
 
 
-def _check_position(place: str, columns: tuple[Column, ...]) -> None:
-    """x, y and z are there, in one unit, unless the file has other lengths."""
+def _check_position(place: Place, columns: tuple[Column, ...]) -> None:
+    """Check that x, y and z are given in one unit, unless the file has other lengths."""
     present = [column for column in columns if column.quantity in POSITION]
     if not present and {column.quantity for column in columns} & {"socket", *_NEEDED, *reading_numbers()}:
         return
     unit = present[0].unit if present else "mm"
     for quantity in POSITION:
         if quantity not in {column.quantity for column in present}:
+            names = ",".join(f"{name}_{unit}" for name in POSITION)
             raise MeasurementError(
-                f"{place}: the column '{quantity}_{unit}' is missing; add the measured position as "
-                f"{','.join(f'{name}_{unit}' for name in POSITION)} (cells may be empty where it was not measured)."
+                "the column is missing",
+                at=replace(place, column=f"{quantity}_{unit}"),
+                remedy=f"add the measured position as {names} (leave cells empty where it was not measured)",
             )
     _check_one_unit(place, present)
 
 
 _NEEDED = {
     "touch": (("touch_axis",), "add the column touch_axis (x, y or z)"),
-    "touch_axis": (("touch",), "add the column touch_mm, the coordinate that was touched"),
+    "touch_axis": (("touch",), "add the column touch_mm, the coordinate of the touch"),
     "distance": (
         ("anchor", "pair"),
         "add the column anchor (name of a fixed point) or pair (name of two rows)",
@@ -221,8 +247,8 @@ _NEEDED = {
 }
 
 
-def _check_lengths(place: str, columns: tuple[Column, ...]) -> None:
-    """Columns that say nothing without another one have it."""
+def _check_lengths(place: Place, columns: tuple[Column, ...]) -> None:
+    """Check that columns which mean nothing without another one have it."""
     present = {column.quantity: column for column in columns}
     needed = dict(_NEEDED)
     for name in ANCHOR_PLACE:
@@ -233,19 +259,15 @@ def _check_lengths(place: str, columns: tuple[Column, ...]) -> None:
             needed[name] = (("anchor",), "add the column anchor, its name")
     for quantity, (others, remedy) in needed.items():
         if quantity in present and not set(others) & set(present):
-            raise MeasurementError(
-                f"{place}, column '{present[quantity].name}': says nothing without another column; {remedy}."
-            )
+            raise _fault(place, "the column needs another one", present[quantity], remedy)
     if "touch" in present and "frame" not in present:
-        raise MeasurementError(
-            f"{place}, column '{present['touch'].name}': says nothing without the frame of a jig; add the column "
-            "frame, which placement of the jig was touched."
-        )
+        remedy = "add the column frame, the placement of the jig that was touched"
+        raise _fault(place, "the column needs the frame of a jig", present["touch"], remedy)
     _check_one_unit(place, [present[name] for name in ANCHOR_PLACE if name in present])
 
 
-def _check_readings(place: str, columns: tuple[Column, ...]) -> None:
-    """All columns of a registered sensor are there, or none."""
+def _check_readings(place: Place, columns: tuple[Column, ...]) -> None:
+    """Check that all columns of a registered sensor are given, or none."""
     present = {column.quantity: column for column in columns}
     for readings in READINGS.values():
         there = [column for column in readings.columns if column.name in present]
@@ -253,32 +275,30 @@ def _check_readings(place: str, columns: tuple[Column, ...]) -> None:
             column for column in readings.columns if column.name not in present and not column.is_optional
         ]
         if there and missing:
-            wanted = ", ".join(f"{column.name}_{column.units[0]}".rstrip("_") for column in missing)
-            raise MeasurementError(
-                f"{place}, columns {quoted(present[column.name] for column in there)}: say nothing without the other "
-                f"columns of the sensor '{readings.sensor}'; add {wanted}."
-            )
+            names = ", ".join(f"{column.name}_{column.units[0]}".rstrip("_") for column in missing)
+            problem = f"the column needs the other columns of the sensor '{readings.sensor}'"
+            raise _fault(place, problem, present[there[0].name], f"add {names}")
 
 
-def _check_orientation(place: str, columns: tuple[Column, ...]) -> tuple[str, ...]:
-    """The form in which the file gives the orientation, whole and only once."""
+def _check_orientation(place: Place, columns: tuple[Column, ...]) -> tuple[str, ...]:
+    """Return the form in which the file gives the orientation, which must be complete and given once."""
     groups = {
         group: [column for column in columns if column.quantity in group] for group in (RPY, QUATERNION)
     }
     if groups[RPY] and groups[QUATERNION]:
-        raise MeasurementError(
-            f"{place}, columns {quoted(groups[RPY])} and {quoted(groups[QUATERNION])}: the orientation "
-            "stands twice; keep roll, pitch, yaw or the quaternion."
+        problem = (
+            f"the orientation appears twice, as {quoted(groups[RPY])} and as {quoted(groups[QUATERNION])}"
         )
+        remedy = "keep roll, pitch, yaw or the quaternion"
+        raise _fault(place, problem, groups[QUATERNION][0], remedy)
     for group, present in groups.items():
         if not present:
             continue
         missing = [name for name in group if name not in {column.quantity for column in present}]
         if missing:
             unit = "_deg" if group == RPY else ""
-            raise MeasurementError(
-                f"{place}, columns {quoted(present)}: the orientation is incomplete; add "
-                f"{', '.join(name + unit for name in missing)}."
-            )
+            problem = f"the orientation is incomplete, with {quoted(present)} only"
+            names = ", ".join(name + unit for name in missing)
+            raise _fault(place, problem, present[0], f"add {names}")
         return group
     return ()

@@ -1,8 +1,8 @@
-"""Wanted poses as a CSV file, of any length."""
+"""Read desired poses from CSV files of any length."""
 
 import os
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import chain, count, islice
 from typing import TextIO
 
@@ -11,34 +11,35 @@ import torch
 from jaxtyping import Bool, Float64
 from torch import Tensor
 
-from pisigma.files.errors import MeasurementError, nearest_choice
+from pisigma.files.errors import MeasurementError, Place, nearest_choice
 from pisigma.files.input_file import open_input
 from pisigma.measurement.csv.columns import POSITION, QUATERNION, RPY, Column, find_column, quoted
 from pisigma.measurement.csv.header import check_separators
 from pisigma.measurement.csv.rows import QUATERNION_TOLERANCE
 from pisigma.measurement.csv.table import content_lines, header_names, split_line
-from pisigma.measurement.fields import LeftOut
+from pisigma.measurement.fields import Fault, LeftOut
 from pisigma.measurement.readings import to_si
 from pisigma.robot.row import LARGEST
 from pisigma.robot.se3 import rotation_from_quaternion, rotation_from_rpy, transform
 
 CHUNK_ROWS = 20_000
-"""Rows that are in memory at a time."""
+"""Number of rows that are in memory at a time."""
 
 _RPY_COLUMNS = tuple(f"{name}_deg" for name in RPY)
 _POSITION_COLUMNS = tuple(f"{name}_mm" for name in POSITION)
-_LONGEST_CELL, _LONGEST_LINE = 40, 10_000_000
+_MAX_SHOWN, _MAX_LINE = 40, 10_000_000
+"""Number of characters of a cell that messages show, and that a line may have."""
 
 
 @dataclass(frozen=True, eq=False)
 class PoseChunk:
-    """Some rows of a file of poses, or all.
+    """Some or all rows of a file of poses.
 
     Attributes:
-        T: T_base_tool [m] of the rows that are poses.
-        line: their lines.
+        T: T_base_tool [m] of the valid rows.
+        line: lines of the valid rows.
         bad: the other rows and what is wrong with them.
-        share: of the file that has been read, 0 to 1; NaN where the file has no length.
+        share: fraction of the file that has been read, 0 to 1; NaN if the file has no length.
     """
 
     T: Float64[Tensor, "rows 4 4"]
@@ -48,31 +49,29 @@ class PoseChunk:
 
 
 def read_poses(path: str | os.PathLike[str]) -> PoseChunk:
-    """Read wanted poses: `x_mm,y_mm,z_mm` (or `_m`) with `roll_deg,pitch_deg,yaw_deg` or `qx,qy,qz,qw`.
+    """Read desired poses: `x_mm,y_mm,z_mm` (or `_m`) with `roll_deg,pitch_deg,yaw_deg` or `qx,qy,qz,qw`.
 
     Raises:
-        MeasurementError: the file, a column or a cell cannot be used; the message names file, line and
-            column.
+        MeasurementError: the file, a column or a cell cannot be used; `file`, `line` and `column` state which.
     """
     T: list[Tensor] = []
     lines: list[int] = []
     for chunk in read_pose_chunks(path):
         for bad in chunk.bad:
-            joined = ", " if bad.reason.startswith("column") else ": "
-            raise MeasurementError(f"{path}, line {bad.line}{joined}{bad.reason}.")
+            raise bad.error(str(path))
         T.append(chunk.T)
         lines.extend(chunk.line)
     return PoseChunk(torch.cat(T), tuple(lines), bad=(), share=1.0)
 
 
 def read_pose_chunks(path: str | os.PathLike[str], rows: int = CHUNK_ROWS) -> Iterator[PoseChunk]:
-    """Read wanted poses some rows at a time; a row that is no pose does not stop the others.
+    """Read desired poses in chunks of rows; invalid rows are reported and do not stop the others.
 
     For the columns see `read_poses`. Blank lines and lines that begin with # are skipped.
 
     Args:
         path: the file.
-        rows: at a time.
+        rows: number of rows per chunk.
 
     Raises:
         MeasurementError: the file cannot be read, its header cannot be used, or no row follows it.
@@ -81,38 +80,41 @@ def read_pose_chunks(path: str | os.PathLike[str], rows: int = CHUNK_ROWS) -> It
         with open(path, encoding="utf-8-sig", errors="surrogateescape", opener=open_input) as file:
             yield from _chunks(file, str(path), rows)
     except OSError as problem:
-        raise MeasurementError(f"{path}: cannot be read ({problem.strerror}); check the path.") from None
+        what = f"the file cannot be read: {problem.strerror}"
+        raise MeasurementError(what, at=Place(str(path)), remedy="check the path") from None
 
 
 def _chunks(file: TextIO, source: str, rows: int) -> Iterator[PoseChunk]:
     length = os.fstat(file.fileno()).st_size
     content = content_lines(_bounded_lines(file, source), source)
     header_line, header = next(content)
-    layout = _Layout.of(header, f"{source}, line {header_line}")
+    layout = _Layout.of(header, Place(source, header_line))
     any_row = False
     while some := list(islice(content, rows)):
         any_row = True
-        values, reasons = layout.values([line for _, line in some])
-        T, sound = layout.poses(values, reasons)
+        values, faults = layout.values([line for _, line in some])
+        T, sound = layout.poses(values, faults)
         yield PoseChunk(
             T=T[sound],
             line=tuple(number for (number, _), good in zip(some, sound.tolist(), strict=True) if good),
-            bad=tuple(LeftOut(some[row][0], reasons[row]) for row in sorted(reasons)),
+            bad=tuple(LeftOut.because(some[row][0], fault) for row, fault in sorted(faults.items())),
             share=file.buffer.tell() / length if length else float("nan"),
         )
     if not any_row:
         raise MeasurementError(
-            f"{source}, line {header_line}: the file ends after its header; add one row per pose."
+            "the file ends after its header", at=Place(source, header_line), remedy="add one row per pose"
         )
 
 
 def _bounded_lines(file: TextIO, source: str) -> Iterator[str]:
-    """The lines of a file, none of them so long that it fills the memory."""
+    """Yield the lines of a file, none of them so long that it fills the memory."""
     for number in count(1):
-        line = file.readline(_LONGEST_LINE)
-        if len(line) == _LONGEST_LINE:
+        line = file.readline(_MAX_LINE)
+        if len(line) == _MAX_LINE:
             raise MeasurementError(
-                f"{source}, line {number}: has more than {_LONGEST_LINE:,} characters; one line per pose was wanted."
+                expected=f"a line of less than {_MAX_LINE:,} characters",
+                at=Place(source, number),
+                remedy="write one line per pose",
             )
         if not line:
             return
@@ -124,9 +126,9 @@ class _Layout:
     """The header of a file of poses.
 
     Attributes:
-        names: of all columns, in order.
-        position: places and meanings of the columns of the position.
-        orientation: the same for the orientation, in the order of `QUATERNION` or `RPY`.
+        names: names of all columns, in order.
+        position: indices and meanings of the columns of the position.
+        orientation: those of the orientation, in the order of `QUATERNION` or `RPY`.
     """
 
     names: tuple[str, ...]
@@ -134,18 +136,18 @@ class _Layout:
     orientation: tuple[tuple[int, Column], ...]
 
     @staticmethod
-    def of(line: str, place: str) -> "_Layout":
-        """Read the header; all of a pose is there, once, and lengths are in one unit."""
+    def of(line: str, place: Place) -> "_Layout":
+        """Read the header, which must have every column of a pose once, with lengths in one unit."""
         if _is_foreign(line):
-            raise MeasurementError(f"{place}: is not UTF-8 text; save the file as CSV in UTF-8.")
+            raise _NOT_UTF8.error(place)
         names = header_names(line.rstrip("\n"), place)
         columns = _columns(names, place)
         orientation = RPY if RPY[0] in columns else QUATERNION
         position, angles = (tuple(columns[name] for name in group) for group in (POSITION, orientation))
         return _Layout(names, position, angles)
 
-    def values(self, lines: Sequence[str]) -> tuple[Float64[np.ndarray, "rows columns"], dict[int, str]]:
-        """The numbers of rows in the file's units, and what is wrong with which row."""
+    def values(self, lines: Sequence[str]) -> tuple[Float64[np.ndarray, "rows columns"], dict[int, Fault]]:
+        """Return the numbers of rows in the file's units, and what is wrong by row."""
         text = "".join(lines)
         if '"' not in text and "_" not in text:  # Python reads 1_000 as a number
             cells = [line.split(",") for line in lines]
@@ -159,61 +161,61 @@ class _Layout:
                         return numbers, {}
         return self._checked_values(lines)
 
-    def _checked_values(self, lines: Sequence[str]) -> tuple[np.ndarray, dict[int, str]]:
-        """The same row by row, for rows of which one is at fault."""
-        numbers, reasons = np.full((len(lines), len(self.names)), np.nan), {}
+    def _checked_values(self, lines: Sequence[str]) -> tuple[np.ndarray, dict[int, Fault]]:
+        """Return the same, row by row, for rows of which one is at fault."""
+        numbers, faults = np.full((len(lines), len(self.names)), np.nan), {}
         for row, line in enumerate(lines):
             fields, problem = split_line(line.rstrip("\n"))
-            if reason := self._fault(line, fields, problem):
-                reasons[row] = reason
+            if fault := self._fault(line, fields, problem):
+                faults[row] = fault
             else:
                 numbers[row] = [_number(cell) for cell in fields]
-        return numbers, reasons
+        return numbers, faults
 
-    def _fault(self, line: str, fields: Sequence[str], problem: str) -> str:
-        """What is wrong with a row; "" where nothing is."""
+    def _fault(self, line: str, fields: Sequence[str], problem: str) -> Fault | None:
+        """Return what is wrong with a row; None if nothing is."""
         if _is_foreign(line):
-            return "is not UTF-8 text; save the file as CSV in UTF-8"
+            return _NOT_UTF8
         if problem:
-            return f"is no valid CSV ({problem}); check the quotes"
+            return Fault(f"the row is not valid CSV: {problem}", remedy="check the quotes")
         if len(fields) != len(self.names):
-            return (
-                f"{len(self.names)} fields were wanted, got {len(fields)}; correct the row (numbers need a "
-                "decimal point, not a comma)"
-            )
+            remedy = "correct the row (numbers need a decimal point, not a comma)"
+            return Fault("", None, f"{len(self.names)} fields", len(fields), remedy)
         for name, cell in zip(self.names, fields, strict=True):
-            shown = cell.strip()[:_LONGEST_CELL]
+            shown = cell.strip()[:_MAX_SHOWN]
             if not np.isfinite(_number(cell)):
-                return f"column '{name}': '{shown}' is no finite number; write one such as -12.5"
+                return Fault("", name, "a finite number", shown, "write one such as -12.5")
             if abs(_number(cell)) > LARGEST:
-                return f"column '{name}': {shown} is more than any pose has; correct it"
-        return ""
+                return Fault("", name, f"a value of up to {LARGEST:g}", shown, "correct it")
+        return None
 
     def poses(
-        self, values: Float64[np.ndarray, "rows columns"], reasons: dict[int, str]
+        self, values: Float64[np.ndarray, "rows columns"], faults: dict[int, Fault]
     ) -> tuple[Float64[Tensor, "rows 4 4"], Bool[Tensor, " rows"]]:
-        """T_base_tool of rows, and which of them are poses; quaternions that are none get a reason."""
+        """Return T_base_tool of rows, and which are valid; quaternions of another norm than 1 are added to `faults`."""
         position, angles = (
             torch.from_numpy(np.stack([to_si(values[:, place], column.unit) for place, column in group], -1))
             for group in (self.position, self.orientation)
         )
         if len(self.orientation) == len(QUATERNION):
             length = angles.norm(dim=-1)
+            expected = f"a quaternion {', '.join(QUATERNION)} of norm 1"
             for row in ((length - 1).abs() > QUATERNION_TOLERANCE).nonzero()[:, 0].tolist():
-                reasons[row] = (
-                    f"columns 'qx' to 'qw': a quaternion of length 1 was wanted, got {float(length[row]):g}; "
-                    "normalise it"
-                )
+                norm = float(f"{float(length[row]):g}")
+                faults[row] = Fault("", QUATERNION[0], expected, norm, "normalise it")
             R = rotation_from_quaternion(angles)
         else:
             R = rotation_from_rpy(angles)
         sound = torch.ones(len(values), dtype=torch.bool)
-        sound[list(reasons)] = False
+        sound[list(faults)] = False
         return transform(R, position), sound
 
 
+_NOT_UTF8 = Fault(expected="UTF-8 text", remedy="save the file as CSV in UTF-8")
+
+
 def _is_foreign(line: str) -> bool:
-    """Whether bytes that are not UTF-8 stand in a line, which were read as lone surrogates."""
+    """Return whether a line contains bytes that are not UTF-8, which are read as lone surrogates."""
     return not line.isascii() and any("\ud800" <= letter <= "\udfff" for letter in line)
 
 
@@ -224,8 +226,8 @@ def _number(cell: str) -> float:
         return np.nan
 
 
-def _columns(header: Sequence[str], place: str) -> dict[str, tuple[int, Column]]:
-    """Place and meaning of every column."""
+def _columns(header: Sequence[str], place: Place) -> dict[str, tuple[int, Column]]:
+    """Return index and meaning of every column."""
     valid = (*_POSITION_COLUMNS, *_RPY_COLUMNS, *QUATERNION)
     columns: dict[str, tuple[int, Column]] = {}
     for index, name in enumerate(header):
@@ -233,27 +235,38 @@ def _columns(header: Sequence[str], place: str) -> dict[str, tuple[int, Column]]
         if column is None or column.quantity not in (*POSITION, *RPY, *QUATERNION):
             check_separators(name, place)
             raise MeasurementError(
-                f"{place}, column '{name}': no column of a wanted pose; {nearest_choice(name, valid)} Lengths "
-                "may be in m and angles in rad."
+                expected="a column of a pose",
+                value=name,
+                at=replace(place, column=name),
+                remedy=f"{nearest_choice(name, valid)} Lengths may be in m and angles in rad.",
             )
         if column.quantity in columns:
-            raise MeasurementError(f"{place}, column '{name}': '{column.quantity}' stands twice; remove one.")
+            raise MeasurementError(
+                f"'{column.quantity}' appears twice", at=replace(place, column=name), remedy="remove one"
+            )
         columns[column.quantity] = (index, column)
     _check_whole(columns, place)
     return columns
 
 
-def _check_whole(columns: dict[str, tuple[int, Column]], place: str) -> None:
+def _check_whole(columns: dict[str, tuple[int, Column]], place: Place) -> None:
     groups = [group for group in (RPY, QUATERNION) if set(group) & set(columns)]
     if len(groups) > 1:
         raise MeasurementError(
-            f"{place}: roll, pitch, yaw and a quaternion are both there; keep one of them."
+            expected="roll, pitch, yaw or a quaternion", value="both", at=place, remedy="keep one of them"
         )
     orientation = groups[0] if groups else RPY
     for name in (*POSITION, *orientation):
         if name not in columns:
-            wanted = ", ".join((*_POSITION_COLUMNS, *(_RPY_COLUMNS if orientation == RPY else QUATERNION)))
-            raise MeasurementError(f"{place}: the column of '{name}' is missing; a pose has {wanted}.")
+            names = ", ".join((*_POSITION_COLUMNS, *(_RPY_COLUMNS if orientation == RPY else QUATERNION)))
+            raise MeasurementError(
+                f"the column of '{name}' is missing", at=place, value=name, remedy=f"give {names}"
+            )
     lengths = [columns[name][1] for name in POSITION]
     if len({column.unit for column in lengths}) > 1:
-        raise MeasurementError(f"{place}, columns {quoted(lengths)}: mixed units; use mm or m for all three.")
+        raise MeasurementError(
+            expected=f"one unit for {quoted(lengths)}",
+            value=", ".join(column.unit for column in lengths),
+            at=place,
+            remedy="use mm or m for all three",
+        )

@@ -1,4 +1,4 @@
-"""Reading measurement files: whole with every row checked, or the joint values alone; and what to say of exports."""
+"""Read measurement files, completely with every row checked, or their joint values alone."""
 
 import math
 import os
@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
-from pisigma.files.errors import MeasurementError, nearest_choice
+from pisigma.files.errors import MeasurementError, check_choice, nearest_choice
 from pisigma.measurement.csv.columns import (
     CORNERS,
     PRISMATIC_UNITS,
@@ -19,7 +19,6 @@ from pisigma.measurement.csv.columns import (
     Column,
     find_column,
     number_fields,
-    quoted,
 )
 from pisigma.measurement.csv.header import Layout, read_header
 from pisigma.measurement.csv.rows import CheckedRows, check_cells
@@ -33,46 +32,42 @@ from pisigma.measurement.rules import Labels, group_faults, row_faults
 from pisigma.robot import Robot
 from pisigma.robot.se3 import rotation_from_quaternion, rotation_from_rpy
 
-_MOST_BYTES = 2**22
-"""Of a file that is looked at, so that a refusal does not take long."""
+_MAX_BYTES = 2**22
+"""Size up to which a refused file is checked for being an export, so that a refusal does not take long."""
 
 
 def read_fields(
     path: str | os.PathLike[str], robot: Robot | None = None, on_bad_row: OnBadRow = "error"
 ) -> MeasuredFields:
-    """Read a measurement file; the header says quantity and unit of every column, in any order.
+    """Read a measurement file, whose header states quantity and unit of every column, in any order.
 
-    `q1_deg` or `q1_rad` and so on (prismatic: `q3_mm` or `q3_m`) must be there, and at least one kind of
-    length (each also in `_m`), of which a row holds one: `x_mm,y_mm,z_mm`; `socket`, the name of the fixed
-    point that the ball sits in; `touch_axis` (x, y or z) and `touch_mm` with `frame`, the jig; `distance_mm`
-    with `anchor`, the name of a fixed point whose position `anchor_x_mm,anchor_y_mm,anchor_z_mm` may be stated,
-    or with `pair`, the name of the two rows it lies between, which stands in both.
+    Required are the joint values `q1_deg` or `q1_rad` and so on (prismatic: `q3_mm` or `q3_m`), and at least one kind
+    of length (each also in `_m`), of which every row contains at most one: `x_mm,y_mm,z_mm`; `socket`, the name of the
+    fixed point that the ball sits in; `touch_axis` (x, y or z) and `touch_mm` with `frame`, the jig; `distance_mm` with
+    `anchor`, the name of a fixed point whose position `anchor_x_mm,anchor_y_mm,anchor_z_mm` may be given, or with
+    `pair`, the name of the two rows that it lies between, given in both.
 
-    `roll_deg,pitch_deg,yaw_deg` (RotZ(roll) · RotY(pitch) · RotX(yaw)) or `qx,qy,qz,qw`, `target`, `frame`,
-    `sigma_mm` (of the length in the row), `sigma_deg`, `set`, `payload_kg` and `temperature_c` may be, and
-    `approach1` and so on: +1 where that joint's value grew before it stopped, -1 where it fell. Sensors that are
-    registered add columns of their own. An empty cell is what was not measured.
+    Optional are `roll_deg,pitch_deg,yaw_deg` (RotZ(roll) · RotY(pitch) · RotX(yaw)) or `qx,qy,qz,qw`, `target`,
+    `frame`, `sigma_mm` (of the row's length), `sigma_deg`, `set`, `payload_kg`, `temperature_c`, and `approach1` and so
+    on: +1 where that joint's value increased before it stopped, -1 where it decreased. Registered sensors add their
+    own columns. Cells of what was not measured are empty.
 
     Args:
         path: the file.
-        robot: checks number, units and limits of the joints and, where these are coupled, turns the controller's values
-            into theirs; None takes the values as they stand.
-        on_bad_row: "error" to raise at the first row that cannot be used, "leave_out" to go on without such
+        robot: checks number, units and limits of the joints and converts the controller's values of coupled joints to
+            joint values; None takes the values as they are.
+        on_bad_row: "error" to raise at the first row that cannot be used, "leave_out" to continue without such
             rows and to list them in `left_out`.
 
     Raises:
-        MeasurementError: the file, its header or a row cannot be used; the message names file, line and
-            column.
+        MeasurementError: the file, its header or a row cannot be used; `file`, `line` and `column` state which.
     """
-    if on_bad_row not in ("error", "leave_out"):
-        raise MeasurementError(
-            f"on_bad_row '{on_bad_row}': {nearest_choice(on_bad_row, ('error', 'leave_out'))}"
-        )
+    check_choice(MeasurementError, "on_bad_row", on_bad_row, ("error", "leave_out"))
     try:
         table = read_table(path)
         layout = read_header(table, robot)
     except MeasurementError as problem:
-        raise MeasurementError(f"{problem}{import_hint(path)}") from None
+        raise problem.followed_by(import_hint(path)) from None
     return _complete(_sound_rows(table, layout, robot), on_bad_row)
 
 
@@ -86,10 +81,10 @@ def fields_of(table: Table, robot: Robot | None = None) -> MeasuredFields:
 
 
 def sound_rows(table: Table, robot: Robot | None) -> MeasuredFields:
-    """Read the rows of a table that can be used, which may be none; all others are listed in `left_out`.
+    """Read the usable rows of a table, possibly none; all others are listed in `left_out`.
 
     Args:
-        table: of one row or more.
+        table: one row or more.
         robot: see `read_fields`.
 
     Raises:
@@ -99,7 +94,7 @@ def sound_rows(table: Table, robot: Robot | None) -> MeasuredFields:
 
 
 def _sound_rows(table: Table, layout: Layout, robot: Robot | None) -> MeasuredFields:
-    """Check all rows and turn those without a fault into fields."""
+    """Check all rows and convert those without a fault to fields."""
     rows = check_cells(table, layout, robot)
     data, labels, faults = _fields(table, layout, rows), _labels(layout), rows.faults
     faults.add(row_faults(data, labels))
@@ -115,34 +110,32 @@ def _sound_rows(table: Table, layout: Layout, robot: Robot | None) -> MeasuredFi
         numbers["q"] = robot.to_dh(numbers["q"])
         if "approach" in numbers:
             numbers["approach"] = robot.coupling.approach_to_dh(numbers["approach"])
-    left_out = tuple(LeftOut(table.lines[row], faults.reasons[row]) for row in sorted(faults.reasons))
+    left_out = tuple(LeftOut.because(table.lines[row], fault) for row, fault in sorted(faults.by_row.items()))
     return replace(sound, numbers=numbers, left_out=left_out)
 
 
 def _complete(data: MeasuredFields, on_bad_row: OnBadRow) -> MeasuredFields:
-    """Say what the first fault is, where, and how many rows more have one, unless such rows may be left out."""
+    """Raise for the first fault, with the number of further ones, unless rows at fault may be left out."""
     if not data.left_out or (on_bad_row == "leave_out" and data.rows):
         return data
-    more = len(data.left_out) - 1
-    others = f" ({more} more row{'s have' if more > 1 else ' has'} a fault)" if more else ""
-    first = data.left_out[0]
-    raise MeasurementError(f"{data.source}, line {first.line}, {first.reason}{others}.")
+    problem, more = data.left_out[0].error(data.source), len(data.left_out) - 1
+    raise problem.followed_by(f" {more} more row{'s have' if more > 1 else ' has'} a fault." if more else "")
 
 
 def _labels(layout: Layout) -> Labels:
-    """Columns as complaints call them, and their units."""
-    names = {quantity: f"column '{layout.column(quantity).name}'" for quantity in layout.index}
+    """Return the columns that messages name, the first one of a field of several, and their units."""
+    names = {quantity: layout.column(quantity).name for quantity in layout.index}
     groups = {field.name: field.quantities for field in number_fields() if len(field.quantities) > 1}
     groups |= {sensor: (*readings.numbers, *readings.texts) for sensor, readings in READINGS.items()}
     for name, group in groups.items():
         if set(group) <= set(layout.index):
-            names[name] = f"columns {quoted(layout.column(quantity) for quantity in group)}"
+            names[name] = layout.column(group[0]).name
     units = {quantity: layout.column(quantity).unit for quantity in layout.index}
-    return Labels("column '{}'", names, units)
+    return Labels(names, units)
 
 
 def _fields(table: Table, layout: Layout, rows: CheckedRows) -> MeasuredFields:
-    """All rows in SI units, those at fault too."""
+    """Return all rows in SI units, including those at fault."""
 
     def numbers(*quantities: str) -> Tensor:
         columns = [to_si(rows.values[:, layout.index[name]], layout.column(name).unit) for name in quantities]
@@ -166,14 +159,13 @@ def _fields(table: Table, layout: Layout, rows: CheckedRows) -> MeasuredFields:
 
 
 def read_joints(path: str | os.PathLike[str], robot: Robot) -> Float64[Tensor, "rows dof"]:
-    """Read the columns `q1_deg` or `q1_rad` and so on (prismatic: `q3_mm` or `q3_m`); other columns are not looked at.
+    """Read the columns `q1_deg` or `q1_rad` and so on (prismatic: `q3_mm` or `q3_m`), and ignore the others.
 
-    They hold the controller's values; what is given back are the joint values of the rows.
-
-    Files of measurements have these columns, and those that `pisigma ik` writes.
+    Measurement files and the files that `pisigma ik` writes have these columns. They contain the controller's values,
+    which are converted to joint values [rad or m].
 
     Raises:
-        MeasurementError: the file or a joint's cell cannot be used; the message names file, line and column.
+        MeasurementError: the file or a joint's cell cannot be used; `file`, `line` and `column` state which.
     """
     table = read_table(path)
     axes = len(robot.axes)
@@ -181,8 +173,10 @@ def read_joints(path: str | os.PathLike[str], robot: Robot) -> Float64[Tensor, "
     more = [name for name in table.header if (column := find_column(name)) and column.joint == axes + 1]
     if more:
         raise MeasurementError(
-            f"{table.source}, line {table.header_line}, column '{more[0]}': robot '{robot.name}' has {axes} "
-            "joints only; give joint values of this robot."
+            expected=f"{axes} joints, as robot '{robot.name}' has",
+            value=axes + 1,
+            at=replace(table.header_place, column=more[0]),
+            remedy="give joint values of this robot",
         )
     values = np.empty((len(table.lines), axes))
     for number, column in enumerate(columns):
@@ -191,7 +185,7 @@ def read_joints(path: str | os.PathLike[str], robot: Robot) -> Float64[Tensor, "
 
 
 def holds_measurements(path: str | os.PathLike[str]) -> bool:
-    """Whether a file holds measured values besides joint values; files that `pisigma ik` writes hold a status.
+    """Return whether a file contains measured values in addition to joint values, unlike those of `pisigma ik`.
 
     Raises:
         MeasurementError: the file cannot be used.
@@ -201,16 +195,17 @@ def holds_measurements(path: str | os.PathLike[str]) -> bool:
 
 
 def _joint_column(table: Table, number: int, robot: Robot) -> Column:
-    """The column of a joint."""
+    """Return the column of a joint."""
     axis = robot.axes[number]
     units = REVOLUTE_UNITS if axis.type == "revolute" else PRISMATIC_UNITS
-    wanted = [f"q{number + 1}_{unit}" for unit in units]
-    there = [name for name in table.header if name in wanted]
+    valid = [f"q{number + 1}_{unit}" for unit in units]
+    there = [name for name in table.header if name in valid]
     if len(there) != 1:
-        what = "is no column" if not there else "are two columns"
         raise MeasurementError(
-            f"{table.source}, line {table.header_line}: there {what} for joint '{axis.name}' of "
-            f"robot '{robot.name}'; give one, {' or '.join(wanted)}."
+            expected=f"one column for joint '{axis.name}' of robot '{robot.name}'",
+            value=" and ".join(there) or "none",
+            at=table.header_place,
+            remedy=f"give {' or '.join(valid)}",
         )
     column = find_column(there[0])
     assert column is not None
@@ -218,21 +213,20 @@ def _joint_column(table: Table, number: int, robot: Robot) -> Column:
 
 
 def number_column(table: Table, name: str) -> Float64[np.ndarray, " rows"]:
-    """Read a column of a table as numbers, every cell of which has to hold one.
+    """Read a column of a table as numbers, of which no cell may be empty.
 
     Raises:
-        MeasurementError: there is no such column, or a cell holds no number; the message names line and column.
+        MeasurementError: there is no such column, or a cell is not a number; `line` and `column` state which.
     """
     numbers = []
-    for line, cell in zip(table.lines, text_column(table, name), strict=True):
+    for row, cell in enumerate(text_column(table, name)):
         try:
             numbers.append(float(cell))
         except ValueError:
             numbers.append(math.nan)
         if not math.isfinite(numbers[-1]):
             raise MeasurementError(
-                f"{table.source}, line {line}, column '{name}': a number was wanted, got '{cell}'; give one or remove "
-                "the row."
+                expected="a number", value=cell, at=table.at(row, name), remedy="give one, or remove the row"
             )
     return np.array(numbers)
 
@@ -245,23 +239,24 @@ def text_column(table: Table, name: str) -> list[str]:
     """
     if name not in table.header:
         raise MeasurementError(
-            f"{table.source}, line {table.header_line}: there is no column '{name}'; "
-            f"{nearest_choice(name, table.header)}"
+            "the column is missing",
+            at=replace(table.header_place, column=name),
+            remedy=nearest_choice(name, table.header),
         )
-    place = table.header.index(name)
-    return [fields[place].strip() if place < len(fields) else "" for fields in table.records]
+    index = table.header.index(name)
+    return [fields[index].strip() if index < len(fields) else "" for fields in table.records]
 
 
 def import_hint(path: str | os.PathLike[str]) -> str:
-    """Give a sentence with the command that imports a file as an export; "" where none does.
+    """Return a sentence with the command that imports a file as an export; "" if no command does.
 
     Args:
-        path: a file whose table or header the reader of measurement files refused.
+        path: a file whose table or header was refused as a measurement file.
     """
     if _has_columns(path):
         return ""
     try:
-        mapping = map_columns(read_export(path, most=_MOST_BYTES), {}, None, {})
+        mapping = map_columns(read_export(path, most=_MAX_BYTES), {}, None, {})
     except MeasurementError:
         return ""
     is_half = (mapping.has_joints or mapping.has_measured) and set(KEYS) & set(mapping.quantities)
@@ -271,7 +266,7 @@ def import_hint(path: str | os.PathLike[str]) -> str:
 
 
 def _has_columns(path: str | os.PathLike[str]) -> bool:
-    """Whether the header of a file has the columns of measurement files or of corners; something else is wrong then."""
+    """Return whether a file's header has the columns of measurement files or of corners, so that it is no export."""
     try:
         header = read_table(path).header
         return set(CORNERS) <= set(header) or all(find_column(name) or name in CORNERS for name in header)

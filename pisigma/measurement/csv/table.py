@@ -1,4 +1,4 @@
-"""A CSV file as text: a header and the fields of every row, each with its line and with what is wrong with it."""
+"""A CSV file as text: a header and the fields of every row with their lines and faults."""
 
 import csv
 import os
@@ -8,26 +8,27 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool
 
-from pisigma.files.errors import MeasurementError, printable
+from pisigma.files.errors import MeasurementError, Place, printable
 from pisigma.files.input_file import read_text
+from pisigma.measurement.fields import Fault
 
 SPREADSHEET_ERRORS = frozenset(
     ("#N/A", "#NV", "#REF!", "#VALUE!", "#DIV/0!", "#NAME?", "#NUM!", "#NULL!", "#SPILL!", "#CALC!")
 )
-"""What spreadsheets write into cells that they cannot calculate."""
+"""What spreadsheets write to cells that they cannot calculate."""
 
 
 @dataclass(frozen=True, eq=False)
 class Table:
-    """The fields of a CSV file, before their meaning is looked at.
+    """The fields of a CSV file, uninterpreted.
 
     Attributes:
-        source: the file, as complaints call it.
+        source: the file, as messages call it.
         header: names of the columns, without surrounding blanks.
-        header_line: where the header stands.
-        records: the fields of every row; empty where the row is no valid CSV.
-        lines: where the rows stand.
-        broken: for rows that are no valid CSV, what is wrong with them, by row.
+        header_line: line of the header.
+        records: the fields of every row; empty for rows that are not valid CSV.
+        lines: lines of the rows.
+        broken: for rows that are not valid CSV, what is wrong with them, by row.
     """
 
     source: str
@@ -37,20 +38,29 @@ class Table:
     lines: tuple[int, ...]
     broken: dict[int, str]
 
+    @property
+    def header_place(self) -> Place:
+        """The line of the header, for messages."""
+        return Place(self.source, self.header_line)
+
+    def at(self, row: int, column: str | int | None = None) -> Place:
+        """Return the place of a row and a column, for messages."""
+        return Place(self.source, self.lines[row], column)
+
 
 def read_table(path: str | os.PathLike[str]) -> Table:
     """Read a CSV file: commas between fields, UTF-8 with or without byte order mark.
 
-    Blank lines and lines that begin with # are skipped. A field may stand in double quotes, but no field
-    goes on in the next line.
+    Blank lines and lines that begin with # are skipped. A field may be in double quotes, but must not contain a line
+    break.
 
     Raises:
-        MeasurementError: the file cannot be read, is too large, not UTF-8, empty, or holds nothing but a header.
+        MeasurementError: the file cannot be read, is too large, not UTF-8 or empty, or contains only a header.
     """
     table = table_of(read_text(path, MeasurementError, "CSV"), printable(str(path), cut=False))
     if not table.records:
         raise MeasurementError(
-            f"{table.source}, line {table.header_line}: the file ends after its header; add one row per measurement."
+            "the file ends after its header", at=table.header_place, remedy="add one row per measurement"
         )
     return table
 
@@ -59,11 +69,11 @@ def table_of(text: str, source: str) -> Table:
     """Split the text of a CSV file into a header and any number of rows.
 
     Raises:
-        MeasurementError: there is no header, or it is no valid CSV.
+        MeasurementError: there is no header, or it is not valid CSV.
     """
     lines = content_lines(text.replace("\r\n", "\n").replace("\r", "\n").split("\n"), source)
     header_line, line = next(lines)
-    header = header_names(line, f"{source}, line {header_line}")
+    header = header_names(line, Place(source, header_line))
     content = list(lines)
     split = [split_line(line) for _, line in content]
     return Table(
@@ -77,12 +87,12 @@ def table_of(text: str, source: str) -> Table:
 
 
 def content_lines(lines: Iterable[str], source: str) -> Iterator[tuple[int, str]]:
-    """The lines that are neither blank nor begin with #, the header first, each with its number.
+    """Yield the lines that are neither blank nor comments (#) with their numbers, the header first.
 
-    A line with as many fields as the header whose first one is an error of a spreadsheet is a row.
+    A line with as many fields as the header whose first field is an error of a spreadsheet (#N/A) is a row.
 
     Raises:
-        MeasurementError: there is none.
+        MeasurementError: there is no such line.
     """
     columns = 0
     for number, line in enumerate(lines, start=1):
@@ -90,29 +100,33 @@ def content_lines(lines: Iterable[str], source: str) -> Iterator[tuple[int, str]
             columns = columns or len(split_line(line)[0])
             yield number, line
     if not columns:
-        raise MeasurementError(f"{source}: the file is empty; a header and at least one row were wanted.")
+        raise MeasurementError(
+            "the file is empty", at=Place(source), remedy="write a header and at least one row"
+        )
 
 
 def _is_failed_row(line: str, columns: int) -> bool:
-    """Whether a line that begins with # is a row whose first cell a spreadsheet could not calculate."""
+    """Return whether a line that starts with # is a row whose first cell a spreadsheet could not calculate."""
     fields = split_line(line)[0]
     return len(fields) == columns and fields[0].strip() in SPREADSHEET_ERRORS
 
 
-def header_names(line: str, place: str) -> tuple[str, ...]:
-    """The names of the columns, without surrounding blanks.
+def header_names(line: str, place: Place) -> tuple[str, ...]:
+    """Return the names of the columns, without surrounding blanks.
 
     Raises:
-        MeasurementError: the line is no valid CSV.
+        MeasurementError: the line is not valid CSV.
     """
     names, problem = split_line(line)
     if problem:
-        raise MeasurementError(f"{place}: the header is no valid CSV ({problem}); check its quotes.")
+        raise MeasurementError(
+            f"the header is not valid CSV: {problem}", at=place, value=line, remedy="check its quotes"
+        )
     return tuple(name.strip() for name in names)
 
 
 def split_line(line: str) -> tuple[list[str], str]:
-    """The fields of a line, and what is wrong with its quotes ("" where nothing is)."""
+    """Return the fields of a line, and what is wrong with its quotes ("" if nothing is)."""
     if '"' not in line:
         return line.split(","), ""
     try:
@@ -122,24 +136,25 @@ def split_line(line: str) -> tuple[list[str], str]:
 
 
 class Faults:
-    """What is wrong with which row; the first fault of a row stays.
+    """What is wrong with which row; the first fault of a row is kept.
 
     Attributes:
-        reasons: column at fault, what stands there and what to do, by row.
+        by_row: what is wrong, by number of the row.
     """
 
     def __init__(self, broken: dict[int, str]):
-        self.reasons = {
-            row: f"all columns: no valid CSV ({what}); check the quotes" for row, what in broken.items()
+        self.by_row = {
+            row: Fault(f"the row is not valid CSV: {what}", remedy="check the quotes")
+            for row, what in broken.items()
         }
 
-    def add(self, faults: Iterable[tuple[int, str]]) -> None:
-        """Note rows at fault, and what is wrong with each."""
-        for row, what in faults:
-            self.reasons.setdefault(row, what)
+    def add(self, faults: Iterable[tuple[int, Fault]]) -> None:
+        """Add faults of rows, except of rows that have one already."""
+        for row, fault in faults:
+            self.by_row.setdefault(row, fault)
 
     def sound(self, rows: int) -> Bool[np.ndarray, " rows"]:
-        """The rows without a fault so far, of so many."""
+        """Return which of the `rows` rows have no fault so far."""
         sound = np.ones(rows, dtype=bool)
-        sound[list(self.reasons)] = False
+        sound[list(self.by_row)] = False
         return sound

@@ -1,4 +1,4 @@
-"""Writing a measurement file that reads back as it was, whole or not at all."""
+"""Write a measurement file that reads back the same, completely or not at all."""
 
 import csv
 import io
@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
-from pisigma.files.errors import MeasurementError
+from pisigma.files.errors import MeasurementError, Place
 from pisigma.files.output_file import write_whole
 from pisigma.measurement.csv.columns import number_fields
 from pisigma.measurement.fields import KINDS, TEXTS, MeasuredFields
@@ -24,15 +24,17 @@ def write_fields(data: MeasuredFields, path: str | os.PathLike[str], revolute: S
 
     Args:
         data: at least one row.
-        path: the file; one that is there is replaced.
-        revolute: per joint, whether it turns (degrees) or slides (millimetres).
+        path: the file; an existing one is replaced.
+        revolute: per joint, whether it is revolute (degrees) or prismatic (millimetres).
 
     Raises:
         MeasurementError: the measurements would not read back.
         OutputError: the file cannot be written there.
     """
     if data.rows == 0:
-        raise MeasurementError(f"{data.source}: holds no row to write; give at least one measurement.")
+        raise MeasurementError(
+            "there is no row to write", at=Place(data.source), remedy="give at least one measurement"
+        )
     numbers = _numbers(data, revolute)
     names = (*TEXTS, *reading_texts())
     texts = {"set" if name == "split" else name: data.text(name) for name in names if any(data.text(name))}
@@ -48,9 +50,10 @@ def write_fields(data: MeasuredFields, path: str | os.PathLike[str], revolute: S
 
 
 def _numbers(data: MeasuredFields, revolute: Sequence[bool]) -> dict[str, Float64[np.ndarray, " rows"]]:
-    """The columns of numbers in the file's units; one that would hold nothing is left away.
+    """Return the numeric columns in the file's units, without those that would be empty.
 
-    The columns of the position stand in a file without another length even so, as it could not be read without them.
+    The columns of the position are written even if empty where there is no other length, as the file could not be read
+    without them.
     """
     columns: dict[str, Float64[np.ndarray, " rows"]] = {}
 
@@ -58,8 +61,8 @@ def _numbers(data: MeasuredFields, revolute: Sequence[bool]) -> dict[str, Float6
         if needed or not bool(values.isnan().all()):
             columns[name] = from_si(values.detach().cpu().numpy(), unit)
 
-    for number, (q, turns) in enumerate(zip(data.numbers["q"].T, revolute, strict=True), start=1):
-        unit: Unit = "deg" if turns else "mm"
+    for number, (q, is_revolute) in enumerate(zip(data.numbers["q"].T, revolute, strict=True), start=1):
+        unit: Unit = "deg" if is_revolute else "mm"
         add(f"q{number}_{unit}", q, unit)
     nothing = torch.full((data.rows, 3), torch.nan, dtype=torch.float64)
     fields = {"position": nothing, **data.numbers}
@@ -79,21 +82,23 @@ def _check(data: MeasuredFields, texts: Mapping[str, Sequence[str]]) -> None:
     nothing = ~torch.stack([data.measured(kind) for kind in (*KINDS, *READINGS)]).any(0).cpu()
     if bool(nothing.any()):
         raise MeasurementError(
-            f"{data.label(int(nothing.nonzero()[0]))}: nothing was measured in this row; leave it out with select "
-            "before writing."
+            "nothing was measured in this row",
+            at=data.at(int(nothing.nonzero()[0])),
+            remedy="leave it out with select before writing",
         )
     for name, names in texts.items():
         for text in set(names):
             if not _fits_cell(text):
-                place = data.label(names.index(text))
                 raise MeasurementError(
-                    f"{place}, column '{name}': the name {text!r} cannot stand in a CSV cell; use one of a "
-                    "single line without blanks around it."
+                    expected="a name that a CSV cell can contain",
+                    value=text,
+                    at=data.at(names.index(text), name),
+                    remedy="use one of a single line without blanks around it",
                 )
 
 
 def _fits_cell(text: str) -> bool:
-    """Whether a name reads back as it is."""
+    """Return whether a name reads back the same."""
     try:
         text.encode("utf-8")
     except UnicodeEncodeError:

@@ -1,7 +1,6 @@
 """Corners that a growing file gets image by image, as measurements."""
 
 import os
-import re
 from dataclasses import replace
 
 import torch
@@ -11,7 +10,7 @@ from pisigma.measurement.camera.camera_files import CameraFiles
 from pisigma.measurement.camera.corner_file import corners_of
 from pisigma.measurement.csv.table import Table
 from pisigma.measurement.dataset import Measurements, join
-from pisigma.measurement.fields import LeftOut, MeasuredFields
+from pisigma.measurement.fields import Fault, LeftOut, MeasuredFields
 from pisigma.measurement.growing_file import GrowingFile
 from pisigma.planning.plan_settings import PlanSettings
 from pisigma.robot.description import Robot
@@ -56,7 +55,7 @@ class ImageReader:
             try:
                 self._read[key] = corners_of(image, self._robot, self._files)
             except MeasurementError as problem:
-                self._read[key] = _left_out(str(problem), image)
+                self._read[key] = _left_out(problem, image)
         return self._read[key]
 
 
@@ -78,8 +77,9 @@ def _images(table: Table) -> list[Table]:
     ]
 
 
-def _left_out(problem: str, image: Table) -> LeftOut:
-    """The line that a complaint names, and what it says of it."""
-    named = re.match(rf"{re.escape(image.source)}, line (\d+)[,:] ", problem)
-    line, said = (image.lines[0], problem) if named is None else (int(named[1]), problem[named.end() :])
-    return LeftOut(line, said.removesuffix("."))
+def _left_out(problem: MeasurementError, image: Table) -> LeftOut:
+    """Return the row at fault, the first of the image where the exception states none, and what is wrong with it."""
+    line = problem.line or image.lines[0]
+    if not problem.expected:
+        return LeftOut(line, str(problem).removesuffix("."))
+    return LeftOut.because(line, Fault("", problem.column, problem.expected, problem.value, problem.remedy))
