@@ -1,4 +1,4 @@
-"""Measurements: joint values commanded, and what a sensor measured there."""
+"""Measurements: commanded joint values, and what a sensor measured there."""
 
 import hashlib
 import json
@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Bool, Float64
 from torch import Tensor
 
-from pisigma.files.errors import MeasurementError
+from pisigma.files.errors import MeasurementError, Place
 from pisigma.measurement.csv.reading import read_fields
 from pisigma.measurement.csv.writing import write_fields
 from pisigma.measurement.fields import (
@@ -34,47 +34,47 @@ from pisigma.robot.se3 import transform
 
 @dataclass(frozen=True, eq=False)
 class Measurements:
-    """One row a measurement, in SI units.
+    """Rows of measurements, one per measurement, in SI units.
 
-    What was not measured in a row is NaN there, and "" where it is a name; a field that no row has is None.
-    A row holds one length at most: a position, a touch, a socket or a distance. The orientation may stand
-    beside any of them. What a second sensor measured at the same joint values is a second row.
+    Values that were not measured in a row are NaN, and names that are not given are ""; a field that no row has is
+    None. A row contains at most one length: a position, a touch, a socket or a distance. It may contain an orientation
+    in addition. A second sensor's reading at the same joint values is a second row.
 
     Attributes:
-        q: commanded joint values [rad or m], as the controller counts.
-        position: measured position of the target in its frame [m].
-        rotation: measured rotation of the tool in its frame.
-        frame: per row, the frame the sensor measures from; "" where the file names none.
-        target: per row, which reflector on the tool was measured; "" where the file names none.
-        sigma_position: per row, standard deviation of the length that was measured there (of every coordinate
-            of a position) [m]; NaN where it is not stated.
-        sigma_rotation: per row, standard deviation of a measured angle [rad]; NaN where it is not stated.
-        split: per row "train" or "test" (column `set`).
+        q: commanded joint values [rad or m], as the controller counts them.
+        position: measured position of the target in the row's frame [m].
+        rotation: measured rotation of the tool in the row's frame.
+        frame: per row, the frame in which the sensor measures; "" if the file names none.
+        target: per row, the reflector on the tool that was measured; "" if the file names none.
+        sigma_position: per row, standard deviation of the measured length (of every coordinate of a position) [m]; NaN
+            if not given.
+        sigma_rotation: per row, standard deviation of a measured angle [rad]; NaN if not given.
+        split: per row, "train" or "test" (column `set`).
         payload: per row [kg].
         temperature: per row [deg C].
-        socket: per row, the socket that the target's ball sits in; all rows of one share one unknown point.
-        touch_axis: per row, the axis ("x", "y" or "z") of the row's frame along which the target's tip
-            touched.
+        socket: per row, the socket in which the target's ball sits; all rows of a socket share one unknown point.
+        touch_axis: per row, the axis ("x", "y" or "z") of the row's frame along which the target's tip touched.
         touch: per row, the coordinate at which it touched [m].
-        distance: per row [m], from the anchor to the target, or between the targets of the two rows of a
-            pair, each of which holds it.
-        anchor: per row, the fixed point that the distance is from; its rows share one point and one zero
-            offset.
-        anchor_place: per row, where the anchor is in the row's frame [m]; NaN where that is to be identified.
-        pair: per row, the pair that it belongs to; a pair has exactly two rows, in one frame.
-        approach: per row and joint, from which side the joint came to its value: +1 as it grew, -1 as it fell,
-            NaN where that is not stated.
-        date: per row, the day it was measured (ISO 8601, such as "2026-11-22"); "" where it is not stated.
-        image: per row, the name of the image that it comes from; "" where it comes from none.
-        readings: what registered sensors measured (see `pisigma.measurement.sensors.register_sensor`), by column: one
-            number [SI] or one name a row.
-        line: per row, the line in the file it came from (0 where it came from none).
-        source: the file, or what made the rows.
-        left_out: rows of the file that are not here, and why.
-        origin: per row, the file it came from, where rows came from several; else nothing.
+        distance: per row [m], from the anchor to the target, or between the targets of the two rows of a pair, given in
+            both.
+        anchor: per row, the fixed point from which the distance is measured; all rows of an anchor share one point and
+            one zero offset.
+        anchor_place: per row, position of the anchor in the row's frame [m]; NaN if it is to be identified.
+        pair: per row, the pair to which it belongs; a pair has exactly two rows, in one frame.
+        approach: per row and joint, direction in which the joint moved to its value: +1 if the value increased, -1 if
+            it decreased, NaN if not given.
+        date: per row, the day of the measurement (ISO 8601, such as "2026-11-22"); "" if not given.
+        image: per row, the name of the image from which it was measured; "" if it was measured from none.
+        readings: readings of registered sensors (see `pisigma.measurement.sensors.register_sensor`), by column: one
+            number [SI] or one name per row.
+        line: per row, the line of the file that it was read from; 0 for rows that were not read from a file.
+        source: the file, or a name of what made the rows.
+        left_out: rows of the file that could not be used, and why.
+        origin: per row, the file that it was read from, where rows come from several files; else empty.
 
     Raises:
-        MeasurementError: the fields do not fit together, or a value cannot be one; the message names the row.
+        MeasurementError: the fields do not fit together, or a value is impossible; `column` is the field, `line` or the
+            message states the row.
     """
 
     q: Float64[Tensor, "rows dof"]
@@ -104,10 +104,13 @@ class Measurements:
     origin: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        """Fill in names that are missing and check that everything fits together."""
+        """Fill in missing names and check that everything fits together."""
         if self.q.ndim != 2 or self.q.shape[1] == 0:
             raise MeasurementError(
-                f"{self.source}: joint values of shape (rows, joints) were wanted, got {tuple(self.q.shape)}."
+                option="q",
+                expected="joint values of shape (rows, joints)",
+                value=tuple(self.q.shape),
+                at=Place(self.source),
             )
         for name, default in (("frame", ""), ("target", ""), ("line", 0)):
             object.__setattr__(self, name, tuple(getattr(self, name)) or (default,) * self.rows)
@@ -119,7 +122,7 @@ class Measurements:
         check_fields(self.as_fields())
 
     def as_fields(self) -> MeasuredFields:
-        """Return the rows field by field, without the fields that no row has."""
+        """Return the rows by field, without the fields that no row has."""
         return self._fields
 
     @cached_property
@@ -142,10 +145,10 @@ class Measurements:
 
     @staticmethod
     def from_fields(data: MeasuredFields) -> "Measurements":
-        """Make measurements of their fields; the inverse of `as_fields`.
+        """Build measurements from their fields; the inverse of `as_fields`.
 
         Raises:
-            MeasurementError: the fields do not fit together, or a value cannot be one; the message names the row.
+            MeasurementError: the fields do not fit together, or a value is impossible; see `Measurements`.
         """
         columns: dict[str, Any] = {**data.numbers, **data.texts}
         built_in = {item.name for item in fields(Measurements)}
@@ -160,7 +163,7 @@ class Measurements:
 
     @property
     def file_names(self) -> str:
-        """Names of the files, without their folders, with " + " between them; or the source in memory."""
+        """Names of the files without their folders, joined by " + "; the source of rows from no file."""
         return " + ".join(Path(name).name for name in dict.fromkeys(self.origin or (self.source,)))
 
     @property
@@ -174,20 +177,20 @@ class Measurements:
         return self.q.shape[1]
 
     def measured(self, kind: Kind) -> Bool[Tensor, " rows"]:
-        """Say for every row whether it holds a measurement of a kind; see `pisigma.measurement.fields.Kind`.
+        """Return which rows contain a measurement of a kind; see `pisigma.measurement.fields.Kind`.
 
-        A row with position and orientation is of the kind "pose" and of no other.
+        A row with a position and an orientation is a "pose" only, neither a "position" nor a "rotation".
         """
         return self.as_fields().measured(kind)
 
     @property
     def kinds(self) -> frozenset[Kind]:
-        """What was measured in any of the rows; empty where nothing was."""
+        """Kinds that were measured in any of the rows; empty if nothing was measured."""
         return frozenset(kind for kind in (*KINDS, *READINGS) if bool(self.measured(kind).any()))
 
     @property
     def T(self) -> Float64[Tensor, "rows 4 4"]:
-        """Measured poses in the frame of their row, NaN where a row has none.
+        """Measured poses in the frames of the rows; NaN in rows without one.
 
         Raises:
             MeasurementError: no row has both position and orientation.
@@ -195,8 +198,10 @@ class Measurements:
         if self.rotation is None or self.position is None:
             lacking = "orientation" if self.rotation is None else "position"
             raise MeasurementError(
-                f"{self.source}: poses were wanted, but no {lacking} was measured; use the other part alone "
-                "or measure poses."
+                expected="poses",
+                value=f"no {lacking}",
+                at=Place(self.source),
+                remedy="use the other part alone, or measure poses",
             )
         return transform(self.rotation, self.position)
 
@@ -209,60 +214,69 @@ class Measurements:
         return self.as_fields().label(row)
 
     def split_sets(self) -> "tuple[Measurements, Measurements | None]":
-        """Split the rows by the column `set`: those to train on, and those of the set "test", which are kept apart.
+        """Split the rows by the column `set` into training rows and held-out rows (the set "test").
 
         Returns:
-            The rows to train on, and the others; None where there are none.
+            The training rows, and the held-out rows or None if there are none.
 
         Raises:
-            MeasurementError: all rows are of the set "test", or the two rows of a pair are in different sets.
+            MeasurementError: all rows are in the set "test", or the two rows of a pair are in different sets.
         """
         test = torch.tensor([name == "test" for name in self.split or ()], dtype=torch.bool)
         if not test.any():
             return self, None
         if test.all():
             raise MeasurementError(
-                f"{self.source}: column 'set' marks all {self.rows} rows as 'test', so nothing is left to train on; "
-                "mark some as 'train' or remove the column."
+                f"all {self.rows} rows are marked as 'test', so none is left to train on",
+                value="test",
+                at=Place(self.source, column="set"),
+                remedy="mark some as 'train' or remove the column",
             )
         return self.select(~test), self.select(test)
 
     def select(self, index: Tensor) -> "Measurements":
-        """The rows of an index, in its order, or of a mask, with everything that belongs to them.
+        """Return the rows of an index, in the order of the index, or of a mask, with all their fields.
 
         Args:
             index: int64 numbers of rows, or one bool per row.
 
         Raises:
-            MeasurementError: the index is outside the rows, the mask has another length, or a pair is parted.
+            MeasurementError: the index is out of range, the mask has another length, or one row of a pair is missing.
         """
         if index.ndim != 1 or index.dtype not in (torch.int64, torch.bool):
             raise MeasurementError(
-                f"{self.source}: an int64 index or a boolean mask of one axis was wanted, got {index.dtype} "
-                f"of shape {tuple(index.shape)}."
+                option="index",
+                expected="a one-dimensional int64 index or boolean mask",
+                value=f"{index.dtype} of shape {tuple(index.shape)}",
+                at=Place(self.source),
             )
         if index.dtype == torch.bool:
             if index.shape[0] != self.rows:
                 raise MeasurementError(
-                    f"{self.source}: a mask of {self.rows} rows was wanted, got {index.shape[0]}."
+                    option="index",
+                    expected=f"a mask of {self.rows} rows",
+                    value=index.shape[0],
+                    at=Place(self.source),
                 )
             index = index.nonzero()[:, 0]
         if index.numel() and not 0 <= int(index.min()) <= int(index.max()) < self.rows:
             raise MeasurementError(
-                f"{self.source}: rows 0 to {self.rows - 1} were wanted, the index goes from "
-                f"{int(index.min())} to {int(index.max())}."
+                option="index",
+                expected=f"rows from 0 to {self.rows - 1}",
+                value=f"{int(index.min())} to {int(index.max())}",
+                at=Place(self.source),
             )
         return Measurements.from_fields(self.as_fields().select(index))
 
     def content_hash(self) -> str:
-        """SHA-256 (hexadecimal) of the values, wherever they came from: equal values, equal hash."""
+        """Return the SHA-256 (hexadecimal) of all values; it does not depend on source and lines."""
         digest = hashlib.sha256()
         data = self.as_fields()
         order = [item.name for item in fields(self)] + sorted(self.readings)
         for name in order:
             if name in data.numbers:
                 array = data.numbers[name].detach().cpu().numpy().astype("<f8") + 0.0  # -0.0 becomes 0.0
-                array[np.isnan(array)] = np.nan  # there are many NaN, one is enough
+                array[np.isnan(array)] = np.nan  # the bits of NaN differ between platforms
                 digest.update(f"{name} {array.shape}:".encode() + array.tobytes())
             elif name in data.texts:
                 digest.update(f"{name}:{json.dumps(data.texts[name])}".encode())
@@ -272,16 +286,16 @@ class Measurements:
     def read_csv(
         path: str | os.PathLike[str], robot: Robot | None = None, on_bad_row: OnBadRow = "error"
     ) -> "Measurements":
-        """Read a CSV file; units come from the column names. See `pisigma.measurement.csv.reading.read_fields`.
+        """Read a CSV file; the column names state the units. See `pisigma.measurement.csv.reading.read_fields`.
 
         Args:
             path: the file.
-            robot: checks number, units and limits of the joints and, where these are coupled, turns the controller's
-                values in the file into theirs; None takes the values as they stand.
-            on_bad_row: "error", or "leave_out" to go on without it and to report it in `left_out`.
+            robot: checks number, units and limits of the joints and converts the controller's values of coupled joints
+                to joint values; None takes the values as they are.
+            on_bad_row: "error", or "leave_out" to continue without such rows and to list them in `left_out`.
 
         Raises:
-            MeasurementError: the file or a row cannot be used; the message names file, line and column.
+            MeasurementError: the file or a row cannot be used; `file`, `line` and `column` state which.
         """
         return Measurements.from_fields(read_fields(path, robot, on_bad_row))
 
@@ -290,93 +304,108 @@ class Measurements:
     ) -> None:
         """Write a CSV file that `read_csv` reads back: degrees and millimetres with every digit, and quaternions.
 
-        The file is put in its place in one step when it is complete. Read back it gives the same values to 1e-12
-        relative (a rotation, where it is orthonormal to that).
+        The file is moved to its path in one step when it is complete. Values read back are equal to a relative 1e-12
+        (rotations if they are orthonormal to that).
 
         Args:
-            path: the file; written whole or not at all.
-            robot: says which joints turn (degrees) and which slide (millimetres); of coupled joints the controller's
-                values are written.
-            revolute: the same per joint, without a robot; with neither, all joints turn.
+            path: the file; written completely or not at all.
+            robot: states which joints are revolute (degrees) and prismatic (millimetres); the controller's values of
+                coupled joints are written.
+            revolute: the same per joint, without a robot; without both, all joints are revolute.
 
         Raises:
-            MeasurementError: the measurements would not read back: no row, a row in which nothing was measured,
-                a name that a CSV cell cannot hold, or joints that do not fit.
+            MeasurementError: the measurements would not read back: there is no row, nothing was measured in a row, a
+                CSV cell cannot contain a name, or the number of joints is another one.
             OutputError: the file cannot be written there.
         """
         origin = "'revolute'" if robot is None else f"robot '{robot.name}'"
-        turning = (True,) * self.dof if revolute is None else tuple(revolute)
-        turning = turning if robot is None else robot.revolute
+        is_revolute = (True,) * self.dof if revolute is None else tuple(revolute)
+        is_revolute = is_revolute if robot is None else robot.revolute
         written = self.as_fields()
-        if len(turning) != self.dof:
+        if len(is_revolute) != self.dof:
             raise MeasurementError(
-                f"{self.source}: has {self.dof} joints, but {origin} has {len(turning)}; give the robot that was "
-                "measured."
+                option="revolute" if robot is None else "robot",
+                expected=f"{origin} to have the {self.dof} joints of the measurements",
+                value=len(is_revolute),
+                at=Place(self.source),
+                remedy="give the robot that was measured",
             )
         if robot is not None and robot.coupling is not None:
             values = {"q": robot.to_controller(self.q)}
             if self.approach is not None:
                 values["approach"] = robot.coupling.approach_to_controller(self.approach)
             written = replace(written, numbers={**written.numbers, **values})
-            turning = tuple(axis.type == "revolute" for axis in robot.axes)
-        write_fields(written, path, turning)
+            is_revolute = tuple(axis.type == "revolute" for axis in robot.axes)
+        write_fields(written, path, is_revolute)
 
 
 def join(
     data: Sequence[Measurements], cleared: Callable[[MeasuredFields], MeasuredFields] = lambda rows: rows
 ) -> Measurements:
-    """Put the rows of several data sets behind each other; what one of them lacks is NaN or "" in its rows.
+    """Concatenate data sets; fields that one of them does not have are NaN or "" in its rows.
 
-    Frames, targets, sockets, anchors and pairs of one name are taken for the same.
+    Frames, targets, sockets, anchors and pairs of the same name are the same.
 
     Args:
-        data: one or more, of robots with equally many joints.
-        cleared: what is left of all rows, before it is checked that they fit together.
+        data: one or more data sets with the same number of joints.
+        cleared: returns the rows to keep of all rows, before it is checked that they fit together.
 
     Raises:
-        MeasurementError: there is no data set, numbers of joints differ, only some of them say which rows are for the
-            test, or rows contradict each other.
+        MeasurementError: there is no data set, the numbers of joints differ, only some data sets have a split, or rows
+            contradict each other.
     """
     if not data:
-        raise MeasurementError("join: one or more data sets were wanted, got none.")
+        raise MeasurementError(option="data", expected="one or more data sets", value="none")
     dofs = sorted({one.dof for one in data})
     if len(dofs) > 1:
         raise MeasurementError(
-            f"join: data sets of {dofs[0]} and of {dofs[-1]} joints cannot be joined; give those of one robot."
+            option="data",
+            expected="data sets with the same number of joints",
+            value=f"{dofs[0]} and {dofs[-1]}",
+            remedy="give those of one robot",
         )
     if len({one.split is None for one in data if one.rows}) > 1:
         raise MeasurementError(
-            "join: some data sets have a split and some have none; give it to all or to none."
+            "some data sets have a split (column 'set') and some have none",
+            option="data",
+            value="split",
+            remedy="give it in all or in none",
         )
     return Measurements.from_fields(cleared(joined_fields([one.as_fields() for one in data])))
 
 
 def with_new_frames(measurements: Measurements, lines: Sequence[int]) -> Measurements:
-    """Give the rows from some lines of their file on frames of their own.
+    """Start new frames at lines of the file, as after the instrument was moved.
 
-    The rows of a frame "A" from line 50 on are in the frame "A from line 50"; of the nameless one, in "from line 50".
+    From line 50, for example, rows of the frame "A" are in the frame "A from line 50", and rows of the frame "" in
+    "from line 50".
 
     Args:
-        measurements: read from a file.
-        lines: at which new frames begin, each up to the next one.
+        measurements: rows of one file.
+        lines: first lines of the new frames.
 
     Raises:
-        MeasurementError: a line lies before the second or behind the last row, or rows that belong together (of a pair,
-            a socket or an anchor) would be in two frames.
+        MeasurementError: a line is before the second or after the last row, or rows that belong together (of a pair, a
+            socket or an anchor) would be in two frames.
     """
     if not lines:
         return measurements
     if measurements.origin:
         raise MeasurementError(
-            f"{measurements.source}: lines at which new frames begin are those of one file, but there are several; "
-            "name the frames in a column 'frame'."
+            option="lines",
+            expected="rows of one file",
+            value=measurements.source,
+            remedy="name the frames in a column 'frame'",
         )
     rows = sorted(measurements.line)
     for line in lines:
         if not rows[0] < line <= rows[-1]:
             raise MeasurementError(
-                f"{measurements.source}: a new frame at line {line} was asked for, but the rows stand in the lines "
-                f"{rows[0]} to {rows[-1]}; give a line behind the first one, as an editor counts them."
+                option="lines",
+                expected=f"a line after the first of the lines {rows[0]} to {rows[-1]} that contain rows",
+                value=line,
+                at=Place(measurements.source),
+                remedy="give a line number as an editor counts",
             )
     starts = [max((start for start in lines if start <= line), default=0) for line in measurements.line]
     names = [

@@ -373,12 +373,13 @@ def _pair_fault(
             return Fault(problem, column, value=name, remedy="correct that row")
     frame = data.text("frame")
     if frame[first] != frame[second]:
-        problem = f"pair '{name}' is in the frames '{frame[first]}' and '{frame[second]}'"
-        return Fault(problem, column, value=name, remedy="measure it in one frame")
+        frames = f"'{frame[first]}' and '{frame[second]}'"
+        problem = f"expected one frame of pair '{name}', got {frames}"
+        return Fault(problem, column, value=frames, remedy="measure it in one frame")
     for quantity in ("distance", "sigma_position"):
         a, b = data.array(quantity)[rows].tolist()
         if a != b and not (np.isnan(a) and np.isnan(b)):
             shown = f"{labels.shown(quantity, a):g} and {labels.shown(quantity, b):g}"
             problem = f"expected one value of '{labels(quantity)}' in both rows of pair '{name}', got {shown}"
-            return Fault(problem, column, value=name, remedy="give the same value in both rows")
+            return Fault(problem, column, value=shown, remedy="give the same value in both rows")
     return None

@@ -1,10 +1,11 @@
-"""Data sets in memory with touches, sockets and distances; groups, folds and joining."""
+"""Data sets in memory with touches, sockets and distances; groups, folds and concatenation."""
 
 from dataclasses import replace
 
 import pytest
 import torch
 from testing.closeness import assert_close
+from testing.refusals import refused
 
 from pisigma.files.errors import MeasurementError
 from pisigma.measurement.dataset import Measurements, join
@@ -44,42 +45,43 @@ def test_kinds_say_what_was_measured():
 
 
 @pytest.mark.parametrize(
-    ("change", "message"),
+    ("change", "row", "column", "value"),
     [
-        ({"touch_axis": ("", "u", "", "", "")}, r"row 1: 'touch_axis': 'u' is no axis"),
-        ({"touch_axis": None}, r"row 1: 'touch_axis': the touch has no axis"),
-        ({"touch": None}, r"row 1: 'touch': the touch along y has no coordinate"),
-        ({"frame": ("",) * 5}, r"row 1: 'frame': the touch names no frame"),
-        ({"distance": column(NAN, NAN, -1.0, 0.5, 0.5)}, r"row 2: 'distance': -1 stands"),
-        (
-            {"distance": column(NAN, NAN, NAN, 0.5, 0.5)},
-            r"row 2: 'distance': the distance is missing for 'w'",
-        ),
-        ({"anchor": None, "anchor_place": None}, r"row 2: 'anchor': the distance is from nowhere"),
-        ({"anchor": None}, r"row 2: 'anchor'"),
-        ({"pair": ("", "", "p", "p", "p")}, r"row 2: 'anchor' and 'pair'"),
-        ({"pair": ("", "", "", "p", "r")}, r"row 3: 'pair': pair 'p' has 1 row where two were wanted"),
-        ({"distance": column(NAN, NAN, 1.0, 0.5, 0.6)}, r"row 3: 'pair': pair 'p' has 0.5 and 0.6"),
-        ({"frame": ("", "left", "", "", "b")}, r"row 3: 'pair': pair 'p' is in the frames '' and 'b'"),
-        ({"socket": ("s", "s", "", "", "")}, r"row 1: 'socket' and 'touch': a row holds one measured length"),
-        ({"socket": ("s",)}, r"'socket' has 1 entries for 5 rows"),
-        ({"touch": column(1.0)}, r"'touch' of shape \(5,\)"),
-        ({"distance": column(NAN, NAN, float("inf"), 0.5, 0.5)}, r"row 2: distance inf is infinite"),
-        (
-            {"anchor_place": torch.tensor([[NAN, 1.0, NAN]] * 5).double()},
-            r"row 0: 'anchor_place': is there in part",
-        ),
+        ({"touch_axis": ("", "u", "", "", "")}, 1, "touch_axis", "u"),
+        ({"touch_axis": None}, 1, "touch_axis", ""),
+        ({"touch": None}, 1, "touch", None),
+        ({"frame": ("",) * 5}, 1, "frame", ""),
+        ({"distance": column(NAN, NAN, -1.0, 0.5, 0.5)}, 2, "distance", -1.0),
+        ({"distance": column(NAN, NAN, NAN, 0.5, 0.5)}, 2, "distance", None),
+        ({"anchor": None, "anchor_place": None}, 2, "anchor", None),
+        ({"anchor": None}, 2, "anchor", None),
+        ({"pair": ("", "", "p", "p", "p")}, 2, "anchor", None),
+        ({"pair": ("", "", "", "p", "r")}, 3, "pair", "1 row"),
+        ({"distance": column(NAN, NAN, 1.0, 0.5, 0.6)}, 3, "pair", "0.5 and 0.6"),
+        ({"frame": ("", "left", "", "", "b")}, 3, "pair", "'' and 'b'"),
+        ({"socket": ("s", "s", "", "", "")}, 1, "socket", "socket and touch"),
+        ({"distance": column(NAN, NAN, float("inf"), 0.5, 0.5)}, 2, "distance", float("inf")),
+        ({"anchor_place": torch.tensor([[NAN, 1.0, NAN]] * 5).double()}, 0, "anchor_place", "1 of them"),
     ],
 )
-@pytest.mark.usefixtures("without_type_checker")
-def test_refuses_what_contradicts_itself(change: dict[str, object], message: str):
-    with pytest.raises(MeasurementError, match=message) as caught:
+def test_refuses_what_contradicts_itself(change: dict[str, object], row: int, column: str, value: object):
+    with refused(MeasurementError, file="memory", column=column, value=value) as caught:
         replace(make(), **change)
-    assert str(caught.value).endswith(".")
+    assert f"row {row}," in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("change", "option", "value"),
+    [({"socket": ("s",)}, "socket", 1), ({"touch": column(1.0)}, "touch", (1,))],
+)
+@pytest.mark.usefixtures("without_type_checker")
+def test_refuses_fields_of_other_sizes(change: dict[str, object], option: str, value: object):
+    with refused(MeasurementError, option=option, value=value):
+        replace(make(), **change)
 
 
 def test_a_pair_is_not_parted():
-    with pytest.raises(MeasurementError, match=r"pair 'p' has 1 row"):
+    with refused(MeasurementError, column="pair", value="1 row"):
         make().select(torch.tensor([0, 3]))
     chosen = make().select(torch.tensor([4, 2, 3]))
     assert (chosen.pair, chosen.anchor) == (("p", "", "p"), ("", "w", ""))
@@ -149,11 +151,11 @@ def test_joining_fills_what_a_part_lacks():
 
 def test_refuses_parts_that_do_not_fit():
     one = Measurements(q=torch.zeros(1, 3, dtype=torch.float64))
-    with pytest.raises(MeasurementError, match="one or more data sets"):
+    with refused(MeasurementError, option="data", value="none"):
         join([])
-    with pytest.raises(MeasurementError, match="of 2 and of 3 joints"):
+    with refused(MeasurementError, option="data", value="2 and 3"):
         join([make(), one])
-    with pytest.raises(MeasurementError, match="some have none"):
+    with refused(MeasurementError, option="data", value="split"):
         join([one, replace(one, split=("train",))])
-    with pytest.raises(MeasurementError, match=r"pair 'p' has 4 rows"):
+    with refused(MeasurementError, column="pair", value="4 rows"):
         join([make(), make()])
