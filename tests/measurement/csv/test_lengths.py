@@ -1,4 +1,4 @@
-"""Files with touches, sockets and distances: what is read, what reads back, every fault in a sentence."""
+"""Files with touches, sockets and distances: reading, reading back, and faults."""
 
 from dataclasses import fields, replace
 from pathlib import Path
@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 import torch
 from testing.closeness import assert_close
+from testing.refusals import refused
 
 from pisigma.files.errors import MeasurementError
 from pisigma.measurement.dataset import Measurements
@@ -97,103 +98,61 @@ def test_measured_sockets(shared_data: Path, tmp_path: Path):
 TOUCH = "q1_deg,frame,touch_axis,touch_mm"
 WIRE = "q1_deg,distance_mm,anchor,anchor_x_mm,anchor_y_mm,anchor_z_mm,pair,frame,sigma_mm"
 ALL = "q1_deg,x_mm,y_mm,z_mm,socket,frame,touch_axis,touch_mm,distance_mm,anchor"
-CASES: dict[str, tuple[str, tuple[str, ...]]] = {
-    "no axis": (f"{TOUCH}\n1,left,w,3\n", ("line 2", "column 'touch_axis'", "'w' is no axis", "x, y or z")),
-    "capital axis": (f"{TOUCH}\n1,left,X,3\n", ("line 2", "'X' is no axis")),
-    "touch without axis": (
-        f"{TOUCH}\n1,left,,3\n",
-        ("line 2", "column 'touch_axis'", "the touch has no axis"),
-    ),
-    "axis without touch": (f"{TOUCH}\n1,left,y,\n", ("line 2", "column 'touch_mm'", "along y")),
-    "touch without frame": (f"{TOUCH}\n1,,y,3\n", ("line 2", "column 'frame'", "which placement of the jig")),
-    "no axis column": (
-        "q1_deg,frame,touch_mm\n1,left,3\n",
-        ("line 1", "'touch_mm'", "touch_axis (x, y or z)"),
-    ),
-    "no touch column": (
-        "q1_deg,frame,touch_axis\n1,left,x\n",
-        ("line 1", "'touch_axis'", "add the column touch_mm"),
-    ),
-    "no frame column": ("q1_deg,touch_axis,touch_mm\n1,x,3\n", ("line 1", "column frame", "jig")),
-    "distance from nowhere": (f"{WIRE}\n1,3,,,,,,,\n", ("line 2", "column 'anchor'", "from nowhere")),
-    "no anchor column": ("q1_deg,distance_mm\n1,3\n", ("line 1", "'distance_mm'", "anchor", "or pair")),
-    "anchor without distance": (f"{WIRE}\n1,,wire,,,,,,\n", ("line 2", "column 'distance_mm'", "'wire'")),
-    "no distance column": ("q1_deg,pair\n1,a\n", ("line 1", "column 'pair'", "distance_mm")),
-    "anchor and pair": (f"{WIRE}\n1,3,wire,,,,bar,,\n", ("line 2", "'anchor' and column 'pair'", "keep one")),
-    "negative distance": (
-        f"{WIRE}\n1,-3,wire,,,,,,\n",
-        ("line 2", "column 'distance_mm'", "-3", "0 or more"),
-    ),
-    "half an anchor": (f"{WIRE}\n1,3,wire,1,,2,,,\n", ("line 2", "'anchor_x_mm'", "in part", "or none")),
+# name: (content, (line, column, value, *names that the remedy lists))
+CASES: dict[str, tuple[str, tuple[object, ...]]] = {
+    "no axis": (f"{TOUCH}\n1,left,w,3\n", (2, "touch_axis", "w")),
+    "capital axis": (f"{TOUCH}\n1,left,X,3\n", (2, "touch_axis", "X")),
+    "touch without axis": (f"{TOUCH}\n1,left,,3\n", (2, "touch_axis", "")),
+    "axis without touch": (f"{TOUCH}\n1,left,y,\n", (2, "touch_mm", None)),
+    "touch without frame": (f"{TOUCH}\n1,,y,3\n", (2, "frame", "")),
+    "no axis column": ("q1_deg,frame,touch_mm\n1,left,3\n", (1, "touch_mm", None, "touch_axis")),
+    "no touch column": ("q1_deg,frame,touch_axis\n1,left,x\n", (1, "touch_axis", None, "touch_mm")),
+    "no frame column": ("q1_deg,touch_axis,touch_mm\n1,x,3\n", (1, "touch_mm", None, "frame")),
+    "distance from nowhere": (f"{WIRE}\n1,3,,,,,,,\n", (2, "anchor", None)),
+    "no anchor column": ("q1_deg,distance_mm\n1,3\n", (1, "distance_mm", None, "anchor", "pair")),
+    "anchor without distance": (f"{WIRE}\n1,,wire,,,,,,\n", (2, "distance_mm", None)),
+    "no distance column": ("q1_deg,pair\n1,a\n", (1, "pair", None, "distance_mm")),
+    "anchor and pair": (f"{WIRE}\n1,3,wire,,,,bar,,\n", (2, "anchor", None)),
+    "negative distance": (f"{WIRE}\n1,-3,wire,,,,,,\n", (2, "distance_mm", -3.0)),
+    "half an anchor": (f"{WIRE}\n1,3,wire,1,,2,,,\n", (2, "anchor_x_mm", "2 of them")),
     "half an anchor in the header": (
         "q1_deg,distance_mm,anchor,anchor_x_mm\n1,3,w,1\n",
-        ("line 1", "'anchor_x_mm'", "anchor_y_mm, anchor_z_mm"),
+        (1, "anchor_x_mm", None, "anchor_y_mm", "anchor_z_mm"),
     ),
     "anchor in two units": (
         "q1_deg,distance_mm,anchor,anchor_x_mm,anchor_y_m,anchor_z_mm\n1,3,w,1,2,3\n",
-        ("line 1", "'anchor_y_m'", "one unit"),
+        (1, "anchor_y_m", "m"),
     ),
-    "place of no anchor": (
-        f"{WIRE}\n1,3,,1,2,3,bar,,\n2,3,,,,,bar,,\n",
-        ("line 2", "place of an anchor is stated"),
-    ),
-    "anchor in two places": (
-        f"{WIRE}\n1,3,wire,1,2,3,,,\n2,3,wire,1,2,4,,,\n",
-        ("line 2", "'wire' has not the same place", "1 more row"),
-    ),
-    "anchor known in one row": (f"{WIRE}\n1,3,wire,1,2,3,,,\n2,3,wire,,,,,,\n", ("line 2", "or in none")),
-    "anchor in two frames": (
-        f"{WIRE}\n1,3,wire,,,,,a,\n2,3,wire,,,,,b,\n",
-        ("line 2", "column 'frame'", "anchor 'wire'", "'a' and 'b'"),
-    ),
-    "socket in two frames": (
-        "q1_deg,socket,frame\n1,s,a\n2,s,b\n",
-        ("line 2", "socket 's'", "another name in each frame"),
-    ),
-    "pair of one": (
-        f"{WIRE}\n1,3,,,,,bar,,\n",
-        ("line 2", "column 'pair'", "'bar' has 1 row", "two were wanted"),
-    ),
-    "pair of three": (
-        f"{WIRE}\n1,3,,,,,bar,,\n2,3,,,,,bar,,\n3,3,,,,,bar,,\n",
-        ("line 2", "'bar' has 3 rows", "2 more rows"),
-    ),
-    "pair of two distances": (
-        f"{WIRE}\n1,3,,,,,bar,,\n2,4,,,,,bar,,\n",
-        ("line 2", "3 and 4", "the same in both"),
-    ),
-    "pair of two sigmas": (f"{WIRE}\n1,3,,,,,bar,,1\n2,3,,,,,bar,,2\n", ("line 2", "'sigma_mm'", "the same")),
-    "pair in two frames": (f"{WIRE}\n1,3,,,,,bar,a,\n2,3,,,,,bar,b,\n", ("line 2", "'a' and 'b'", "in one")),
-    "pair with a bad row": (f"{WIRE}\n1,3,,,,,bar,,\n2,3,,,,,bar,,0\n", ("line 2", "line 3 cannot be used")),
-    "two lengths": (
-        f"{ALL}\n1,1,2,3,s,,,,,\n",
-        ("line 2", "columns 'x_mm', 'y_mm', 'z_mm' and column 'socket'", "one measured length"),
-    ),
-    "touch and distance": (f"{ALL}\n1,,,,,left,x,2,3,w\n", ("line 2", "'touch_mm' and column 'distance_mm'")),
-    "nothing": (f"{ALL}\n1,,,,,left,,,,\n", ("line 2", "nothing was measured", "'socket'", "'touch_mm'")),
-    "no socket": ("q1_deg,socket\n1,a\n2,\n", ("line 3", "columns 'socket'", "nothing was measured")),
-    "no number": (f"{TOUCH}\n1,left,x,here\n", ("line 2", "column 'touch_mm'", "'here'")),
-    "touch of zero sigma": (
-        f"{TOUCH},sigma_mm\n1,left,x,1,0\n",
-        ("line 2", "'sigma_mm'", "1e-09 or more was wanted"),
-    ),
-    "misspelt": ("q1_deg,sokket\n1,a\n", ("line 1", "'sokket'", "did you mean 'socket'")),
-    "part of a position": ("q1_deg,x_mm,socket\n1,2,a\n", ("line 1", "'y_mm' is missing")),
+    "place of no anchor": (f"{WIRE}\n1,3,,1,2,3,bar,,\n2,3,,,,,bar,,\n", (2, "anchor", None)),
+    "anchor in two places": (f"{WIRE}\n1,3,wire,1,2,3,,,\n2,3,wire,1,2,4,,,\n", (2, "anchor_x_mm", "wire")),
+    "anchor known in one row": (f"{WIRE}\n1,3,wire,1,2,3,,,\n2,3,wire,,,,,,\n", (2, "anchor_x_mm", "wire")),
+    "anchor in two frames": (f"{WIRE}\n1,3,wire,,,,,a,\n2,3,wire,,,,,b,\n", (2, "frame", "a")),
+    "socket in two frames": ("q1_deg,socket,frame\n1,s,a\n2,s,b\n", (2, "frame", "a")),
+    "pair of one": (f"{WIRE}\n1,3,,,,,bar,,\n", (2, "pair", "1 row")),
+    "pair of three": (f"{WIRE}\n1,3,,,,,bar,,\n2,3,,,,,bar,,\n3,3,,,,,bar,,\n", (2, "pair", "3 rows")),
+    "pair of two distances": (f"{WIRE}\n1,3,,,,,bar,,\n2,4,,,,,bar,,\n", (2, "pair", "3 and 4")),
+    "pair of two sigmas": (f"{WIRE}\n1,3,,,,,bar,,1\n2,3,,,,,bar,,2\n", (2, "pair", "1 and 2")),
+    "pair in two frames": (f"{WIRE}\n1,3,,,,,bar,a,\n2,3,,,,,bar,b,\n", (2, "pair", "'a' and 'b'")),
+    "pair with a bad row": (f"{WIRE}\n1,3,,,,,bar,,\n2,3,,,,,bar,,0\n", (2, "pair", "bar")),
+    "two lengths": (f"{ALL}\n1,1,2,3,s,,,,,\n", (2, "x_mm", "x_mm and socket")),
+    "touch and distance": (f"{ALL}\n1,,,,,left,x,2,3,w\n", (2, "touch_mm", "touch_mm and distance_mm")),
+    "nothing": (f"{ALL}\n1,,,,,left,,,,\n", (2, None, None, "socket", "touch_mm")),
+    "no socket": ("q1_deg,socket\n1,a\n2,\n", (3, None, None, "socket")),
+    "no number": (f"{TOUCH}\n1,left,x,here\n", (2, "touch_mm", "here")),
+    "touch of zero sigma": (f"{TOUCH},sigma_mm\n1,left,x,1,0\n", (2, "sigma_mm", 0.0)),
+    "misspelt": ("q1_deg,sokket\n1,a\n", (1, "sokket", "sokket", "socket")),
+    "part of a position": ("q1_deg,x_mm,socket\n1,2,a\n", (1, "y_mm", None, "x_mm,y_mm,z_mm")),
 }
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_faults_are_one_sentence_with_file_line_and_column(tmp_path: Path, case: str):
-    text, parts = CASES[case]
-    with pytest.raises(MeasurementError) as caught:
+def test_faults_are_refused(tmp_path: Path, case: str):
+    text, (line, column, value, *names) = CASES[case]
+    path = tmp_path / "data.csv"
+    with refused(MeasurementError, file=path, line=line, column=column, value=value) as caught:
         read(tmp_path, text)
-    message = str(caught.value)
-    assert message.startswith(f"{tmp_path / 'data.csv'}, line")
-    assert message.endswith(".")
-    assert "\n" not in message
-    assert "column" in message
-    for part in parts:
-        assert part in message
+    assert "\n" not in str(caught.value)
+    assert all(str(name) in caught.value.remedy for name in names)
 
 
 def test_a_pair_is_left_out_whole(tmp_path: Path):
@@ -201,12 +160,12 @@ def test_a_pair_is_left_out_whole(tmp_path: Path):
     data = read(tmp_path, text, "leave_out")
     assert data.pair == ("rod", "rod")
     assert [left.line for left in data.left_out] == [2, 3]
-    assert "line 3 cannot be used" in data.left_out[0].reason
-    assert "sigma_mm" in data.left_out[1].reason
+    assert [left.fault.column for left in data.left_out] == ["pair", "sigma_mm"]
+    assert "line 3" in data.left_out[0].reason
 
 
 def test_refuses_to_write_a_row_without_a_measurement(tmp_path: Path):
     data = read(tmp_path, MIXED).select(torch.tensor([1, 3]))
     data = replace(data, socket=None)
-    with pytest.raises(MeasurementError, match=r"line 3: nothing was measured"):
+    with refused(MeasurementError, line=3, column=None, value=None):
         data.write_csv(tmp_path / "again.csv")

@@ -1,9 +1,10 @@
-"""Joint values of a file: those of the robot, whatever else stands there, or a sentence."""
+"""Joint values of a file: those of the robot, with other columns ignored, or a refusal."""
 
 import math
 
 import pytest
 from testing.closeness import assert_close
+from testing.refusals import refused
 
 from pisigma.files.errors import MeasurementError
 from pisigma.measurement.csv.reading import read_joints
@@ -29,30 +30,25 @@ def test_columns_come_in_any_order_and_unit(file):
 
 
 @pytest.mark.parametrize(
-    ("text", "complaint"),
+    ("text", "line", "column", "value"),
     [
-        (
-            "q1_deg,q2_deg,q3_mm\n1,2,3\n",
-            "line 1: there is no column for joint '.*' of robot 'kiro3'; give one, q4_deg",
-        ),
-        ("q1_deg,q2_deg,q3_deg,q4_deg\n1,2,3,4\n", "no column for joint '.*'; give one, q3_mm or q3_m"),
-        ("q1_deg,q1_rad,q2_deg,q3_mm,q4_deg\n1,1,2,3,4\n", "there are two columns for joint"),
-        (
-            "q1_deg,q2_deg,q3_mm,q4_deg,q5_deg\n1,2,3,4,5\n",
-            "column 'q5_deg': robot 'kiro3' has 4 joints only",
-        ),
-        (
-            "q1_deg,q2_deg,q3_mm,q4_deg\n1,2,3,4\n1,,3,4\n",
-            "line 3, column 'q2_deg': a number was wanted, got ''",
-        ),
-        (
-            "q1_deg,q2_deg,q3_mm,q4_deg\n1,2,3,nan\n",
-            "line 2, column 'q4_deg': a number was wanted, got 'nan'",
-        ),
-        ("q1_deg,q2_deg,q3_mm,q4_deg\n1,2\n", "line 2, column 'q3_mm'"),
-        ("", "the file is empty"),
+        ("q1_deg,q2_deg,q3_mm\n1,2,3\n", 1, None, "none"),
+        ("q1_deg,q2_deg,q3_deg,q4_deg\n1,2,3,4\n", 1, None, "none"),
+        ("q1_deg,q1_rad,q2_deg,q3_mm,q4_deg\n1,1,2,3,4\n", 1, None, "q1_deg and q1_rad"),
+        ("q1_deg,q2_deg,q3_mm,q4_deg,q5_deg\n1,2,3,4,5\n", 1, "q5_deg", 5),
+        ("q1_deg,q2_deg,q3_mm,q4_deg\n1,2,3,4\n1,,3,4\n", 3, "q2_deg", ""),
+        ("q1_deg,q2_deg,q3_mm,q4_deg\n1,2,3,nan\n", 2, "q4_deg", "nan"),
+        ("q1_deg,q2_deg,q3_mm,q4_deg\n1,2\n", 2, "q3_mm", ""),
+        ("", None, None, None),
     ],
 )
-def test_what_is_no_joint_value_is_told(file, text, complaint):
-    with pytest.raises(MeasurementError, match=complaint):
-        read_joints(file(text), Robot.load("kiro3"))
+def test_faults_are_refused(file, text, line, column, value):
+    path = file(text)
+    with refused(MeasurementError, file=path, line=line, column=column, value=value):
+        read_joints(path, Robot.load("kiro3"))
+
+
+def test_the_columns_of_a_missing_joint_are_listed(file):
+    with refused(MeasurementError, value="none") as caught:
+        read_joints(file("q1_deg,q2_deg,q3_deg,q4_deg\n1,2,3,4\n"), Robot.load("kiro3"))
+    assert all(name in caught.value.remedy for name in ("q3_mm", "q3_m"))

@@ -10,6 +10,7 @@ import torch
 from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 from testing.closeness import assert_close
+from testing.refusals import refused
 
 from pisigma.files.errors import MeasurementError, OutputError
 from pisigma.measurement.dataset import Measurements
@@ -127,7 +128,7 @@ def test_units_are_those_of_the_robot(tmp_path: Path):
     assert_same(Measurements.read_csv(path, robot), make())
 
 
-def test_all_joints_turn_where_nothing_is_said(tmp_path: Path):
+def test_joints_are_revolute_by_default(tmp_path: Path):
     make().write_csv(tmp_path / "data.csv")
     assert (tmp_path / "data.csv").read_text().startswith("q1_deg,q2_deg,q3_deg,q4_deg,")
 
@@ -140,33 +141,36 @@ def test_measured_poses_read_back(tmp_path: Path, shared_data: Path):
 
 
 @pytest.mark.parametrize(
-    ("change", "message"),
+    ("change", "row", "column", "value"),
     [
-        ({"position": None}, r"tracker, row 0: nothing was measured"),
-        ({"position": tensor([[1, 2, 3], [torch.nan] * 3])}, r"tracker, row 1: nothing was measured"),
-        ({"target": ("A", " B")}, r"row 1, column 'target': the name ' B'"),
-        ({"frame": ("A\nB", "A")}, r"row 0, column 'frame'"),
-        ({"frame": ("A", "\udc80")}, r"row 1, column 'frame'"),
+        ({"position": None}, 0, None, None),
+        ({"position": tensor([[1, 2, 3], [torch.nan] * 3])}, 1, None, None),
+        ({"target": ("A", " B")}, 1, "target", " B"),
+        ({"frame": ("A\nB", "A")}, 0, "frame", "A\nB"),
+        ({"frame": ("A", "\udc80")}, 1, "frame", "\udc80"),
     ],
 )
-def test_refuses_what_would_not_read_back(tmp_path: Path, change: dict[str, object], message: str):
+def test_refuses_what_would_not_read_back(
+    tmp_path: Path, change: dict[str, object], row: int, column: str | None, value: str | None
+):
     path = tmp_path / "data.csv"
     path.write_text("as it was")
-    with pytest.raises(MeasurementError, match=message):
+    with refused(MeasurementError, file="tracker", column=column, value=value) as caught:
         replace(make(), source="tracker", **change).write_csv(path)
+    assert f"row {row}" in str(caught.value)
     assert path.read_text() == "as it was"
     assert os.listdir(tmp_path) == ["data.csv"]
 
 
 def test_refuses_no_rows(tmp_path: Path):
-    with pytest.raises(MeasurementError, match="no row to write"):
+    with refused(MeasurementError, file="memory"):
         make(0).write_csv(tmp_path / "data.csv")
 
 
 def test_refuses_another_robot(tmp_path: Path):
-    with pytest.raises(MeasurementError, match="has 4 joints, but robot 'ur10' has 6"):
+    with refused(MeasurementError, option="robot", value=6):
         make().write_csv(tmp_path / "data.csv", Robot.load("ur10"))
-    with pytest.raises(MeasurementError, match="has 4 joints, but 'revolute' has 1"):
+    with refused(MeasurementError, option="revolute", value=1):
         make().write_csv(tmp_path / "data.csv", revolute=[True])
 
 
@@ -178,7 +182,7 @@ def test_an_interrupted_writing_leaves_the_old_file(tmp_path: Path, monkeypatch:
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(os, "fsync", fail)
-    with pytest.raises(OutputError, match=r"data\.csv: cannot be written \(No space left on device\)"):
+    with pytest.raises(OutputError):
         make().write_csv(path)
     assert path.read_text() == "as it was"
     assert os.listdir(tmp_path) == ["data.csv"]
@@ -194,7 +198,7 @@ def test_the_new_file_takes_the_place_of_the_old_one_in_one_step(tmp_path: Path)
 
 
 def test_refuses_a_folder_that_is_not_there(tmp_path: Path):
-    with pytest.raises(OutputError, match=r"there is no folder .*nowhere; make it or choose another --out"):
+    with pytest.raises(OutputError):
         make().write_csv(tmp_path / "nowhere" / "data.csv")
 
 
