@@ -1,4 +1,4 @@
-"""What differs from row to row besides the joint values: payload, temperature, and from which side joints came."""
+"""Conditions of a measurement in addition to the joint values: payload, temperature and direction of approach."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -10,22 +10,22 @@ from torch import Tensor
 from pisigma.measurement.dataset import Measurements
 
 CONDITIONS = ("payload_kg", "temperature_c")
-"""Columns of measurement files that may stand beside any row."""
-SMALLEST_SPREAD = 1e-9
-"""A condition that varies less shows nothing of what it does."""
+"""Columns of measurement files that any row may have."""
+MIN_SPREAD = 1e-9
+"""[kg or deg C] A condition that varies less has no effect that could be identified."""
 APPROACH = "approach"
-"""Of `JointState.stated`: `(*batch, dof)`, +1 where the joint's value grew before it stopped, -1 where it fell; 0 or
-NaN where that is not stated."""
+"""Key of `JointState.stated`: `(*batch, dof)`, +1 if the joint's value increased before it stopped, -1 if it decreased;
+0 or NaN if not given."""
 
 
 @dataclass(frozen=True, eq=False)
 class JointState:
-    """What features of a joint correction are functions of: joint values, and what is stated beside them.
+    """Inputs of the features of a joint correction: joint values and conditions.
 
     Attributes:
         q: joint values [rad or m].
-        stated: by name what is stated beside them: the conditions `(*batch,)` [kg, deg C], `APPROACH` `(*batch, dof)`.
-            What is missing, or NaN, is as usual.
+        stated: by name, conditions `(*batch,)` [kg, deg C] and `APPROACH` `(*batch, dof)`. Missing entries and NaN mean
+            the usual condition.
     """
 
     q: Float[Tensor, "*batch dof"]
@@ -33,7 +33,7 @@ class JointState:
 
     @staticmethod
     def of(measurements: Measurements) -> "JointState":
-        """Of measured rows: joint values and all that they state."""
+        """Return the joint values of measured rows with the conditions that they state."""
         columns = {
             "payload_kg": measurements.payload,
             "temperature_c": measurements.temperature,
@@ -44,25 +44,25 @@ class JointState:
         )
 
     def __getitem__(self, rows: slice | Tensor) -> "JointState":
-        """Some of the rows, by slice, index or mask of the first axis."""
+        """Return rows by slice, index or mask of the first axis."""
         return JointState(self.q[rows], {name: values[rows] for name, values in self.stated.items()})
 
     def split(self, size: int) -> Iterator["JointState"]:
-        """At most so many rows at a time."""
+        """Yield at most `size` rows at a time."""
         return (self[start : start + size] for start in range(0, len(self.q), size))
 
 
 def stated_conditions(measurements: Measurements) -> tuple[str, ...]:
-    """Names of the conditions that every row states and that are not always the same."""
+    """Return the names of the conditions that every row states and that vary."""
     stated = []
     for name, values in zip(CONDITIONS, conditions_of(measurements, CONDITIONS).t(), strict=True):
-        if bool(torch.isfinite(values).all()) and float(values.max() - values.min()) > SMALLEST_SPREAD:
+        if bool(torch.isfinite(values).all()) and float(values.max() - values.min()) > MIN_SPREAD:
             stated.append(name)
     return tuple(stated)
 
 
 def conditions_of(measurements: Measurements, names: Sequence[str]) -> Float64[Tensor, "rows _conditions"]:
-    """Conditions of every row [kg, deg C], NaN where a row does not state one."""
+    """Return the conditions of every row [kg, deg C]; NaN if a row does not state one."""
     columns = {"payload_kg": measurements.payload, "temperature_c": measurements.temperature}
     missing = torch.full((measurements.rows,), torch.nan, dtype=torch.float64, device=measurements.q.device)
     stacked = [values if (values := columns[name]) is not None else missing for name in names]
@@ -70,9 +70,9 @@ def conditions_of(measurements: Measurements, names: Sequence[str]) -> Float64[T
 
 
 def repeat_key(measurements: Measurements) -> Float64[Tensor, "rows _key"]:
-    """What rows agree in that repeat one pose: joint values, payload and approach (0 where not stated).
+    """Return the values in which repeats of one pose agree: joint values, payload and approach (0 if not given).
 
-    The payload counts where every row states one and it varies.
+    The payload is included if every row states one and it varies.
     """
     loaded = tuple(name for name in stated_conditions(measurements) if name == "payload_kg")
     columns = [measurements.q, conditions_of(measurements, loaded)]

@@ -1,4 +1,4 @@
-"""Rows that stand there twice: the same joint values and readings, perhaps rounded, in another unit or order."""
+"""Find duplicate rows: the same joint values and readings, perhaps rounded, in another unit or order."""
 
 import itertools
 import math
@@ -21,33 +21,33 @@ LENGTH_STEPS = sorted((*(10.0**-k for k in range(3, 10)), *(0.0254 * 10.0**-k fo
 """[m] Lengths are rounded to one of these: decimals of a metre and of an inch."""
 ANGLE_STEPS = sorted((*(DEGREE * 10.0**-k for k in range(1, 9)), *(10.0**-k for k in range(3, 10))))[::-1]
 """[rad] Angles are rounded to one of these: decimals of a degree and of a radian."""
-ON_GRID = 1e-3
-"""Share of a step by which rounded values may be beside it, as they were converted and rounded again."""
-UNKNOWN_TURN = 1e-3
-"""[rad] Orientations whose rounding cannot be known, as that of quaternions, are the same within this."""
-OF_IMAGE = 1e-5
-"""[m or rad] Poses that are found from corners are the same within this, as their pixels may have been rounded."""
+GRID_TOLERANCE = 1e-3
+"""Deviation of rounded values from a multiple of the step, as a share of it: they were converted and rounded again."""
+ROTATION_STEP = 1e-3
+"""[rad] Rounding assumed for orientations whose rounding is unknown, such as quaternions."""
+IMAGE_STEP = 1e-5
+"""[m or rad] Rounding assumed for poses from corners of images, whose pixels may have been rounded."""
 STANDING, RETURNING = 2e-6, 2e-5
-"""[m or rad] Least standard deviations of repeated readings: of a robot that stands still, and of one that has come
-back to a pose. Larger ones make equal readings less likely."""
-EVIDENCE = math.log(1e4)
-"""Logarithm of the odds against chance from which on equal rows are copies."""
-EXCESS, NEARLY_ALL = 10.0, 0.95
-"""So many times as often as by chance rows are equal where some are copies, or so large a share of them is."""
+"""[m or rad] Smallest standard deviations of repeated readings: of a robot that stands still, and of one that returned
+to a pose. Larger ones make equal readings less likely."""
+MIN_EVIDENCE = math.log(1e4)
+"""Logarithm of the odds against chance above which equal rows are copies."""
+MIN_EXCESS, MIN_SHARE = 10.0, 0.95
+"""Rows are copies only if rows are equal this many times as often as by chance, or if this share of them is equal."""
 ROW_READINGS, ROW_STEPS = 9, 4
-"""Numbers of a row behind the values of its axes, and of roundings."""
-NAMED = 5
-"""Rows that a sentence names, at most."""
+"""Number of values of a row after its joint values, and number of its roundings."""
+MAX_NAMED = 5
+"""Number of rows that a sentence names."""
 _CHUNK = 1 << 22
 
 
 @dataclass(frozen=True)
 class CopiedRow(LeftOut):
-    """A row that does not count, as another one is the same measurement.
+    """A row that is left out because another one is the same measurement.
 
     Attributes:
-        place: of the row.
-        original: place of the row that counts.
+        place: place of the row.
+        original: place of the row that is kept.
     """
 
     place: str = ""
@@ -56,13 +56,13 @@ class CopiedRow(LeftOut):
 
 @dataclass(frozen=True, eq=False)
 class RowValues:
-    """What is compared of rows, and what their numbers were rounded to.
+    """Values of rows that are compared, and the steps to which they were rounded.
 
     Attributes:
-        numbers: values of the controller's axes [rad or m]; the measured length, in three coordinates or fewer [SI];
-            and the first two columns of the measured rotation. NaN where there is none.
-        steps: what they were rounded to: axes that turn [rad], axes that slide [m], length [m], rotation [rad].
-        kind: of every number, its column of `steps`.
+        numbers: values of the controller's axes [rad or m]; the measured length in up to three coordinates [SI]; and
+            the first two columns of the measured rotation. NaN where nothing was measured.
+        steps: rounding steps of revolute axes [rad], prismatic axes [m], length [m] and rotation [rad].
+        kind: for every column of `numbers`, its column of `steps`.
         file: number of the file that a row comes from.
     """
 
@@ -73,18 +73,18 @@ class RowValues:
 
     @staticmethod
     def of(rows: MeasuredFields, robot: Robot) -> "RowValues":
-        """Take them from rows of a robot."""
+        """Return the values of a robot's rows."""
         q = torch.from_numpy(robot.to_controller(rows.numbers["q"].detach().cpu().double().numpy()))
         length = _lengths(rows)
         rotation = (
             rows.numbers.get("rotation", torch.full((rows.rows, 3, 3), torch.nan)).detach().cpu().double()
         )
-        turns = torch.tensor([axis.type == "revolute" for axis in robot.axes])
-        axes = _steps(q[:, turns], ANGLE_STEPS), _steps(q[:, ~turns], LENGTH_STEPS)
-        turn = _steps(rpy_from_rotation(rotation), ANGLE_STEPS, UNKNOWN_TURN)
-        steps = torch.stack([*axes, _steps(length, LENGTH_STEPS), turn], 1)
+        revolute = torch.tensor([axis.type == "revolute" for axis in robot.axes])
+        axes = _steps(q[:, revolute], ANGLE_STEPS), _steps(q[:, ~revolute], LENGTH_STEPS)
+        angle = _steps(rpy_from_rotation(rotation), ANGLE_STEPS, ROTATION_STEP)
+        steps = torch.stack([*axes, _steps(length, LENGTH_STEPS), angle], 1)
         if "corner" in READINGS:
-            steps[rows.measured("corner").cpu(), 2:] = OF_IMAGE
+            steps[rows.measured("corner").cpu(), 2:] = IMAGE_STEP
         numbers = torch.cat([q, length, rotation[:, :, :2].flatten(1)], 1)
         file = numbers_of_names(rows.origin or (rows.source,) * rows.rows)
         return RowValues(numbers, steps, _kinds(robot), file)
@@ -93,15 +93,15 @@ class RowValues:
     def kept(
         numbers: Float64[Tensor, "rows numbers"], steps: Float64[Tensor, "rows 4"], robot: Robot
     ) -> "RowValues":
-        """Take what was kept of rows of a robot, which are of one file."""
+        """Return the stored values of rows of one file."""
         return RowValues(numbers, steps, _kinds(robot), torch.zeros(len(numbers), dtype=torch.int64))
 
     def select(self, rows: Tensor) -> "RowValues":
-        """The rows of an index."""
+        """Return the rows of an index."""
         return RowValues(self.numbers[rows], self.steps[rows], self.kind, self.file[rows])
 
     def __add__(self, other: "RowValues") -> "RowValues":
-        """Put other rows, of other files, behind these."""
+        """Append rows of other files."""
         return RowValues(
             torch.cat([self.numbers, other.numbers]),
             torch.cat([self.steps, other.steps]),
@@ -126,12 +126,12 @@ class RowValues:
 
 
 def _kinds(robot: Robot) -> Int64[Tensor, " numbers"]:
-    """Of every number of a row of a robot, its column of the steps."""
+    """Return, for every number of a robot's row, its column of the steps."""
     return torch.tensor([0 if axis.type == "revolute" else 1 for axis in robot.axes] + 3 * [2] + 6 * [3])
 
 
 def _lengths(rows: MeasuredFields) -> Float64[Tensor, "rows 3"]:
-    """The measured length of every row, and where it has none what a registered sensor measured instead."""
+    """Return the measured length of every row, or the reading of a registered sensor in rows without one."""
     found = torch.full((rows.rows, 3), torch.nan, dtype=torch.float64)
     groups = [("position",), ("touch",), ("distance",), *(one.numbers for one in READINGS.values())]
     for names in groups:
@@ -151,29 +151,30 @@ def _lengths(rows: MeasuredFields) -> Float64[Tensor, "rows 3"]:
 def _steps(
     values: Float64[Tensor, "rows values"], steps: Sequence[float], otherwise: float = 0.0
 ) -> Float64[Tensor, " rows"]:
-    """What the values of every row were rounded to: the coarsest step of which all are multiples.
+    """Return the rounding of every row's values: the coarsest step of which all are multiples.
 
     Args:
-        values: NaN is a multiple of anything.
-        steps: the coarsest first.
-        otherwise: where they are multiples of none; 0 for the finest.
+        values: the values; NaN is a multiple of any step.
+        steps: the steps, coarsest first.
+        otherwise: result for values that are multiples of none; 0 for the finest step.
     """
     found = torch.full((len(values),), otherwise or steps[-1], dtype=torch.float64)
     for step in reversed(steps):
-        beside = (values / step - (values / step).round()).abs().nan_to_num(nan=0.0)
-        found = torch.where((beside <= ON_GRID).all(1), step, found)
+        deviation = (values / step - (values / step).round()).abs().nan_to_num(nan=0.0)
+        found = torch.where((deviation <= GRID_TOLERANCE).all(1), step, found)
     return found
 
 
 def originals(values: RowValues, known: int = 0) -> Int64[Tensor, " rows"]:
-    """For every row the row that it is a copy of; its own number where it is none.
+    """Return, for every row, the number of the row that it is a copy of, or its own number.
 
-    A copy has the joint values and all readings of another row to the coarser of both roundings. Which rows have so by
-    chance depends on how well a robot repeats: equal rows are copies where that has less than 1e-4 of chance.
+    A copy has the joint values and all readings of another row to the coarser of both roundings. How many rows agree by
+    chance depends on the repeatability of the robot: equal rows are copies if chance explains them with a probability
+    of less than 1e-4.
 
     Args:
-        values: of all rows.
-        known: so many rows stand first, and copies of these are looked for only.
+        values: values of all rows.
+        known: if not 0, only copies of the first `known` rows are searched for.
     """
     count = len(values.numbers)
     own = torch.arange(count)
@@ -202,12 +203,12 @@ def originals(values: RowValues, known: int = 0) -> Int64[Tensor, " rows"]:
 def _are_copies(
     equal: Bool[Tensor, " rows"], partners: Int64[Tensor, " rows"], chance: Float64[Tensor, " rows"]
 ) -> bool:
-    """Whether more rows equal another than do by chance (Chernoff's bound for independent trials).
+    """Return whether more rows are equal than by chance (Chernoff's bound for independent trials).
 
     Args:
-        equal: rows that do.
-        partners: rows at the same joint values that they might be equal to.
-        chance: that a row equals one of these.
+        equal: which rows equal another one.
+        partners: number of rows at the same joint values, to which a row might be equal.
+        chance: probability that a row equals one of these.
     """
     tried = equal | (partners > 0)
     found, count = int(equal.sum()), int(tried.sum())
@@ -216,10 +217,11 @@ def _are_copies(
     once = chance[tried].clamp(max=1 - 1e-12)
     expected = float(-torch.expm1(partners[tried].clamp(min=1) * torch.log1p(-once)).sum())
     share, usual = found / count, expected / count
-    if not (found >= EXCESS * expected or share >= max(NEARLY_ALL, usual)):
+    if not (found >= MIN_EXCESS * expected or share >= max(MIN_SHARE, usual)):
         return False
-    rest = 0.0 if share == 1 else (1 - share) * math.log((1 - share) / (1 - usual))
-    return count * (share * math.log(share / max(usual, 1e-300)) + rest) >= EVIDENCE
+    # the exponent of Chernoff's bound: Kullback-Leibler divergence of the observed from the expected share
+    different = 0.0 if share == 1 else (1 - share) * math.log((1 - share) / (1 - usual))
+    return count * (share * math.log(share / max(usual, 1e-300)) + different) >= MIN_EVIDENCE
 
 
 @dataclass(frozen=True, eq=False)
@@ -227,8 +229,8 @@ class _SameJoints:
     """Rows at the same joint values.
 
     Attributes:
-        group: number of the joint values of a row.
-        run: rows of one number were measured behind each other there.
+        group: number of a row's joint values.
+        run: number of the sequence of consecutive rows at the same joint values.
     """
 
     group: Int64[Tensor, " rows"]
@@ -238,12 +240,12 @@ class _SameJoints:
     def of(values: RowValues) -> "_SameJoints":
         coarsest = values.column_steps[:, : values.q.shape[1]].amax(0)
         group = torch.unique((values.q / coarsest).round() + 0.0, dim=0, return_inverse=True)[1]
-        goes_on = (group[1:] == group[:-1]) & (values.file[1:] == values.file[:-1])
-        run = torch.cat([torch.zeros(min(len(group), 1), dtype=torch.int64), (~goes_on).cumsum(0)])
+        continues = (group[1:] == group[:-1]) & (values.file[1:] == values.file[:-1])
+        run = torch.cat([torch.zeros(min(len(group), 1), dtype=torch.int64), (~continues).cumsum(0)])
         return _SameJoints(group, run)
 
     def partners(self, rank: Int64[Tensor, " rows"], known: int, standing: bool) -> Int64[Tensor, " rows"]:
-        """How many other rows a row might be equal to: of its own run, or of other ones."""
+        """Return to how many other rows a row might be equal: of its own run if `standing`, else of other runs."""
         if known:
             there = torch.bincount(self.group[:known], minlength=len(rank))[self.group]
             return torch.where(torch.arange(len(rank)) < known, 0, 0 if standing else there)
@@ -257,23 +259,26 @@ class _SameJoints:
         )
 
     def chance(self, values: RowValues, deviation: float) -> Float64[Tensor, " rows"]:
-        """That a repeated measurement reads the same as one at the same joint values, to the coarsest rounding there.
+        """Return the probability that a repeated measurement reads the same, to the coarsest rounding at these joints.
 
-        Where joint values alone were measured, as at sockets, these are what is read.
+        Rows without a reading, as at sockets, are compared by their joint values.
         """
         steps = torch.stack(
             [one.scatter_reduce(0, self.group, one, "amax")[self.group] for one in values.steps.unbind(1)], 1
         )
         logarithms = _chance_of_equal(steps, deviation * 2**0.5).log()
         axes = logarithms[:, values.kind[: values.q.shape[1]]].sum(1)
-        length, turn = logarithms[:, 2], logarithms[:, 3]
-        lengths, turned = values.length.isfinite().sum(1), values.numbers[:, -1].isfinite()
-        read = lengths * length + torch.where(turned, 3 * turn, 0.0)
-        return torch.where((lengths > 0) | turned, read, axes).exp()
+        length, angle = logarithms[:, 2], logarithms[:, 3]
+        lengths, has_rotation = values.length.isfinite().sum(1), values.numbers[:, -1].isfinite()
+        read = lengths * length + torch.where(has_rotation, 3 * angle, 0.0)
+        return torch.where((lengths > 0) | has_rotation, read, axes).exp()
 
 
 def _chance_of_equal(step: Float64[Tensor, "*shape"], deviation: float) -> Float64[Tensor, "*shape"]:
-    """Chance that two values round to the same multiple of a step, whose difference has a standard deviation."""
+    """Return the probability that two values round to the same multiple of a step.
+
+    `deviation` is the standard deviation of their difference.
+    """
     x = step / deviation
     within = torch.erf(x / 2**0.5)
     chance: Tensor = within + (2 / math.pi) ** 0.5 / x * torch.expm1(-x.square() / 2)
@@ -281,9 +286,9 @@ def _chance_of_equal(step: Float64[Tensor, "*shape"], deviation: float) -> Float
 
 
 def _equal_pairs(values: RowValues) -> tuple[Int64[Tensor, " pairs"], Int64[Tensor, " pairs"]]:
-    """Pairs of rows, the first one's number lower, whose numbers agree to the coarser of both roundings.
+    """Return the pairs of rows (lower number first) whose numbers agree to the coarser of both roundings.
 
-    Rows are sorted by one sum of their numbers, whose neighbours alone may be equal.
+    Rows are sorted by a weighted sum of their numbers, so that only neighbours need to be compared.
     """
     numbers, steps = values.numbers, values.column_steps
     scale = steps.amax(0)
@@ -306,21 +311,23 @@ def _equal_pairs(values: RowValues) -> tuple[Int64[Tensor, " pairs"], Int64[Tens
 
 
 def _agree(values: Float64[Tensor, "2 pairs"], steps: Float64[Tensor, "2 pairs"]) -> Bool[Tensor, " pairs"]:
-    """Whether two values may have been rounded from one: to the same step, or to two of which one is coarser."""
+    """Return whether two values may be roundings of one value, to the same or to two different steps."""
     fine, coarse = steps.amin(0), steps.amax(0)
-    most = torch.where(coarse - fine > ON_GRID * coarse, coarse + fine, coarse) * (0.5 + ON_GRID)
-    return ((values[0] - values[1]).abs() <= most) | values.isnan().all(0)
+    largest = torch.where(coarse - fine > GRID_TOLERANCE * coarse, coarse + fine, coarse) * (
+        0.5 + GRID_TOLERANCE
+    )
+    return ((values[0] - values[1]).abs() <= largest) | values.isnan().all(0)
 
 
 def _chunks(ahead: Int64[Tensor, " rows"]) -> list[tuple[int, int]]:
-    """Ranges of rows with so many neighbours together as fit into memory."""
+    """Return ranges of rows whose neighbours fit into memory."""
     part = (ahead.cumsum(0) // _CHUNK).numpy()
     borders = [0, *(np.flatnonzero(np.diff(part)) + 1).tolist(), len(part)]
     return list(itertools.pairwise(borders))
 
 
 def _whole_pairs(rows: MeasuredFields, copied: Bool[Tensor, " rows"]) -> Bool[Tensor, " rows"]:
-    """Copies but for those of pairs of which only one row is a copy."""
+    """Return the copies, except rows of a pair whose other row is not a copy."""
     pairs = numbers_of_names(list(zip(rows.origin or ("",) * rows.rows, rows.text("pair"), strict=True)))
     paired = torch.tensor([bool(name) for name in rows.text("pair")])
     half = torch.zeros(rows.rows, dtype=torch.bool)
@@ -329,7 +336,7 @@ def _whole_pairs(rows: MeasuredFields, copied: Bool[Tensor, " rows"]) -> Bool[Te
 
 
 def copies_of_known(rows: MeasuredFields, robot: Robot, known: RowValues) -> Bool[Tensor, " rows"]:
-    """Whether rows are copies of rows that are known, perhaps rounded otherwise, in another order or in part."""
+    """Return which rows are copies of known rows, perhaps rounded differently or in another order."""
     if rows.rows == 0 or not len(known.numbers) or rows.numbers["q"].shape[1] != robot.dof:
         return torch.zeros(rows.rows, dtype=torch.bool)
     count = len(known.numbers)
@@ -339,9 +346,9 @@ def copies_of_known(rows: MeasuredFields, robot: Robot, known: RowValues) -> Boo
 
 
 def without_copies(rows: MeasuredFields, robot: Robot) -> MeasuredFields:
-    """Leave out rows that are copies of others, of which the one with most digits stays; see `CopiedRow`.
+    """Leave out copies of other rows, keeping the one with the most digits; see `CopiedRow`.
 
-    A row of a pair is left out together with the other one.
+    The rows of a pair are left out together.
     """
     if rows.rows < 2 or rows.numbers["q"].shape[1] != robot.dof:
         return rows
@@ -350,7 +357,12 @@ def without_copies(rows: MeasuredFields, robot: Robot) -> MeasuredFields:
     if not copied.any():
         return rows
     left_out = tuple(
-        CopiedRow(rows.line[row], "a copy of another row", rows.label(row), rows.label(int(original[row])))
+        CopiedRow(
+            rows.line[row],
+            "the row is a copy of another one",
+            place=rows.label(row),
+            original=rows.label(int(original[row])),
+        )
         for row in copied.nonzero()[:, 0].tolist()
     )
     kept = rows.select((~copied).nonzero()[:, 0])
@@ -358,23 +370,21 @@ def without_copies(rows: MeasuredFields, robot: Robot) -> MeasuredFields:
 
 
 def places_text(rows: MeasuredFields, chosen: Bool[Tensor, " rows"]) -> str:
-    """Name some rows, the first of many."""
+    """Return the places of the chosen rows as a text, at most the first `MAX_NAMED`."""
     numbers = chosen.nonzero()[:, 0].tolist()
-    named = ", ".join(rows.label(number) for number in numbers[:NAMED])
-    return f"{named} and {len(numbers) - NAMED} more" if len(numbers) > NAMED else named
+    named = ", ".join(rows.label(number) for number in numbers[:MAX_NAMED])
+    return f"{named} and {len(numbers) - MAX_NAMED} more" if len(numbers) > MAX_NAMED else named
 
 
 def copy_warnings(left_out: Sequence[LeftOut]) -> tuple[str, ...]:
-    """Say which rows were left out as copies: a sentence, or nothing."""
+    """Return a warning of the rows that were left out as copies, or nothing."""
     copies = [one for one in left_out if isinstance(one, CopiedRow)]
     if not copies:
         return ()
-    named = ", ".join(f"{one.place} ({one.original})" for one in copies[:NAMED])
-    more = f" and {len(copies) - NAMED} more" if len(copies) > NAMED else ""
-    verb = (
-        "row is a copy of another, and counts" if len(copies) == 1 else "rows are copies of others, and count"
-    )
+    named = ", ".join(f"{one.place} (of {one.original})" for one in copies[:MAX_NAMED])
+    more = f" and {len(copies) - MAX_NAMED} more" if len(copies) > MAX_NAMED else ""
+    verb = "row is a copy of another one" if len(copies) == 1 else "rows are copies of other ones"
     return (
-        f"{len(copies)} {verb} once: all joint values and readings agree to the coarser rounding of both: "
-        f"{named}{more}; state every measurement once.",
+        f"{len(copies)} {verb}, with the same joint values and readings to the coarser rounding, and left out: "
+        f"{named}{more}. Give every measurement once.",
     )

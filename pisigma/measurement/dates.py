@@ -1,39 +1,39 @@
-"""Days on which something was measured: as ISO 8601 writes them, from 1970 to today."""
+"""Dates of measurements: ISO 8601, from 1970 to today."""
 
 import datetime
 import re
 
-from pisigma.files.errors import MeasurementError
+from pisigma.files.errors import MeasurementError, Place
 
 WANTED = "a day from 1970-01-01 to today, such as 2026-11-22"
-"""What is expected of a date, for messages."""
+"""Expected dates, for messages."""
 
 _FIRST = datetime.date(1970, 1, 1)
-"""Before it nobody logged joint values: such a year is a slip."""
-_CLOCKS_DIFFER = datetime.timedelta(days=1)
-"""Where the instrument is, it may be tomorrow already."""
+"""No joint values were logged before: an earlier year is a typing error."""
+_TIME_ZONES = datetime.timedelta(days=1)
+"""It may already be tomorrow in the time zone of the instrument."""
 _IN_NAME = re.compile(r"(?<!\d)(\d{4})([-_.]?)(\d{2})[-_.]?(\d{2})(?!\d)")
 _WRITTEN = re.compile(r"(?:19|20)\d\d")
-"""A year that, with signs behind it, can only be meant as one."""
+"""Digits that, followed by a separator, can only be a year."""
 
 
 def is_date(text: str, days_ahead: int = 0) -> bool:
-    """Whether a text is a day on which something can have been measured, such as "2026-11-22".
+    """Return whether a text is a possible date of a measurement, such as "2026-11-22".
 
     Args:
-        text: as ISO 8601 writes it.
+        text: date in the form of ISO 8601.
         days_ahead: how far in the future it may be [days].
     """
-    latest = datetime.date.today() + _CLOCKS_DIFFER + datetime.timedelta(days=days_ahead)
+    latest = datetime.date.today() + _TIME_ZONES + datetime.timedelta(days=days_ahead)
     day = _day(text)
     return day is not None and _FIRST <= day <= latest
 
 
 def date_in_name(name: str) -> str:
-    """The day in the name of a file; "" where no digits of it are a day.
+    """Return the date in the name of a file; "" if there is none.
 
     Raises:
-        MeasurementError: it is a day before 1970 or in the future, or one that no calendar has, such as 2026-02-30.
+        MeasurementError: the date is before 1970, in the future, or does not exist, such as 2026-02-30.
     """
     match = _IN_NAME.search(name)
     if match is None:
@@ -43,7 +43,10 @@ def date_in_name(name: str) -> str:
         return ""
     if not is_date(text):
         raise MeasurementError(
-            f"{name}: expected {WANTED} in the name of the file, got {text}; rename the file, or state the date."
+            expected=f"{WANTED}, in the name of the file",
+            value=text,
+            at=Place(name),
+            remedy="rename the file, or state the date",
         )
     return text
 

@@ -6,21 +6,21 @@ import torch
 from jaxtyping import Float64, Int64
 from torch import Tensor
 
-from pisigma.files.errors import MeasurementError
+from pisigma.files.errors import MeasurementError, Place
 from pisigma.measurement.dataset import Measurements
 
-FEWEST_GROUPS = 3
-"""Fewer placements, sockets or anchors than these are not held out whole, because too little would be left."""
+MIN_GROUPS = 3
+"""Number of placements, sockets or anchors below which they are not held out whole: too few rows would remain."""
 
 
 def groups_of_equal_joints(q: Float64[Tensor, "rows dof"]) -> Int64[Tensor, " rows"]:
     """Number the different joint vectors in the order of their first row.
 
     Args:
-        q: joint values [rad or m]; two rows belong together where they are exactly equal.
+        q: joint values [rad or m]; rows belong together if they are exactly equal.
 
     Returns:
-        For every row the number of its group, from 0.
+        For every row, the number of its group, from 0.
     """
     if q.shape[0] == 0:
         return torch.zeros(0, dtype=torch.int64, device=q.device)
@@ -31,7 +31,7 @@ def numbers_of_names(names: Sequence[Hashable]) -> Int64[Tensor, " rows"]:
     """Number the different names in the order of their first row.
 
     Returns:
-        For every row the number of its name, from 0.
+        For every row, the number of its name, from 0.
     """
     index = {name: number for number, name in enumerate(dict.fromkeys(names))}
     return torch.tensor([index[name] for name in names], dtype=torch.int64)
@@ -40,28 +40,28 @@ def numbers_of_names(names: Sequence[Hashable]) -> Int64[Tensor, " rows"]:
 def groups_to_keep_whole(measurements: Measurements) -> Int64[Tensor, " rows"]:
     """Number the groups of rows that a split must keep together, in the order of their first row.
 
-    Rows of equal joint values belong together, and so do the two rows of a pair and everything that either of
-    them belongs to.
+    Rows of equal joint values belong together, and so do the two rows of a pair with all rows that belong to either of
+    them.
 
     Args:
         measurements: the rows.
 
     Returns:
-        For every row the number of its group, from 0.
+        For every row, the number of its group, from 0.
     """
     group = groups_of_equal_joints(measurements.q)
     return group if measurements.pair is None else _joined(group, measurements.pair)
 
 
 def held_out_groups(measurements: Measurements) -> Int64[Tensor, " rows"]:
-    """Number the groups of rows that are held out together where models are chosen.
+    """Number the groups of rows that are held out together for model selection.
 
-    Rows of one socket or one anchor predict each other better than those of another, and so do the sockets of one
-    placement. So whole placements are groups where there are `FEWEST_GROUPS` of them; else whole sockets and anchors;
-    else the groups of `groups_to_keep_whole`.
+    Rows of one socket or anchor share its unknown position, so they predict each other better than other rows, and so
+    do the sockets of one placement. Groups are therefore whole placements if there are `MIN_GROUPS` of them, else
+    whole sockets and anchors, else those of `groups_to_keep_whole`.
 
     Returns:
-        For every row the number of its group, from 0.
+        For every row, the number of its group, from 0.
     """
     whole = groups_to_keep_whole(measurements)
     owners = [
@@ -76,32 +76,33 @@ def held_out_groups(measurements: Measurements) -> Int64[Tensor, " rows"]:
         named = torch.tensor(
             [bool(one or other) for one, other in zip(*names, strict=True)], dtype=torch.bool
         )
-        if len(torch.unique(group[named])) >= FEWEST_GROUPS:
+        if len(torch.unique(group[named])) >= MIN_GROUPS:
             return group
     return whole
 
 
 def placements(measurements: Measurements) -> tuple[str, ...]:
-    """Name the placement of every row: where the thing that was touched or the sensor stood.
+    """Return the placement of every row: the position of the touched object or of the sensor.
 
-    Sockets "plate/0" and "plate/1" are of the placement "plate", a socket without "/" is one by itself. Where
-    there are no sockets, every frame is a placement.
+    Sockets "plate/0" and "plate/1" belong to the placement "plate"; a socket without "/" is a placement by itself.
+    Without sockets, every frame is a placement.
 
     Returns:
-        Per row a name; "" in rows without a socket where others have one.
+        A name per row; "" in rows without a socket if others have one.
 
     Raises:
-        MeasurementError: there are not two placements.
+        MeasurementError: there are fewer than two placements.
     """
     names = measurements.frame
     if measurements.socket is not None:
         names = tuple(name.rpartition("/")[0] or name for name in measurements.socket)
     placed = list(dict.fromkeys(name for name in names if name))
     if len(placed) < 2:
-        what = f"'{placed[0]}' is the only one" if placed else "neither sockets nor frames have names"
         raise MeasurementError(
-            f"{measurements.source}: two placements or more were wanted, but {what}; name sockets by placement, "
-            "such as low/0 and low/1, or frames, or split by joints, time or space."
+            expected="two or more placements",
+            value=placed[0] if placed else "no names of sockets or frames",
+            at=Place(measurements.source),
+            remedy="name sockets by placement, such as low/0 and low/1, or frames, or split by joints, time or space",
         )
     return names
 
@@ -112,7 +113,7 @@ def placement_groups(measurements: Measurements) -> Int64[Tensor, " rows"]:
     Placements that share joint values or a pair of rows are one group.
 
     Raises:
-        MeasurementError: there are not two placements.
+        MeasurementError: there are fewer than two placements.
     """
     names = placements(measurements)
     group = _joined(groups_to_keep_whole(measurements), names)
@@ -123,7 +124,7 @@ def placement_groups(measurements: Measurements) -> Int64[Tensor, " rows"]:
 
 
 def _joined(group: Int64[Tensor, " rows"], names: Sequence[str]) -> Int64[Tensor, " rows"]:
-    """Join the groups of rows that have the same name."""
+    """Merge the groups of rows that have the same name."""
     numbers = group.tolist()
     leader = list(range(max(numbers, default=0) + 1))
 
@@ -143,7 +144,7 @@ def _joined(group: Int64[Tensor, " rows"], names: Sequence[str]) -> Int64[Tensor
 
 
 def _numbered(label: Int64[Tensor, " rows"]) -> Int64[Tensor, " rows"]:
-    """Equal labels as numbers from 0, in the order in which they appear."""
+    """Replace equal labels by numbers from 0, in the order in which they appear."""
     values, group = torch.unique(label, return_inverse=True)
     rows = torch.arange(len(label), device=label.device)
     first = torch.full((len(values),), len(label), device=label.device).scatter_reduce(0, group, rows, "amin")

@@ -1,4 +1,4 @@
-"""A measurement file that grows while it is read: every complete row once, as soon as it stands there."""
+"""Follow a measurement file while it grows, reading every complete row once."""
 
 import os
 from collections import Counter
@@ -8,7 +8,7 @@ from pathlib import Path
 
 import torch
 
-from pisigma.files.errors import MeasurementError, printable
+from pisigma.files.errors import MeasurementError, Place, printable
 from pisigma.files.input_file import read_text
 from pisigma.measurement.csv.header import read_header
 from pisigma.measurement.csv.reading import sound_rows
@@ -18,22 +18,22 @@ from pisigma.measurement.fields import LeftOut, MeasuredFields
 from pisigma.robot import Robot
 
 _DIGITS = 9
-"""Rows are the same where their values [SI] agree to so many decimals: programs that save a file anew round them."""
+"""Number of decimals [SI] to which values of equal rows agree: programs that save a file again round them."""
 
 
 Reader = Callable[[Table, bool], MeasuredFields]
-"""Turns rows of a table into measurements; the second argument says whether nothing comes any more."""
+"""Converts rows of a table to measurements; the second argument is true once the file is complete."""
 
 
 @dataclass(frozen=True, eq=False)
 class Growth:
-    """What came to a file since it was looked at last.
+    """What was appended to a file since it was last read.
 
     Attributes:
-        rows: new rows in the file's order; None where there are none.
+        rows: new rows in the file's order; None if there are none.
         left_out: new rows that cannot be used, and why.
-        notices: what happened to the file itself: it was truncated or replaced.
-        waiting: what is waited for: the file, its header, or the end of its last line; "" for nothing.
+        notices: sentences on a file that was truncated or replaced.
+        waiting: what is missing: the file, its header, or the end of its last line; "" if nothing is.
     """
 
     rows: Measurements | None = None
@@ -43,14 +43,14 @@ class Growth:
 
     @property
     def is_news(self) -> bool:
-        """Whether anything came, or happened to the file."""
+        """Whether there are new rows, or the file was truncated or replaced."""
         return self.rows is not None or bool(self.left_out or self.notices)
 
 
 class GrowingFile:
-    """Reads the rows that come to a measurement file, each once; see `Measurements.read_csv` for what a file holds.
+    """Reads the rows that are appended to a measurement file, each once; see `Measurements.read_csv` for its columns.
 
-    A line counts when its end is there. Where the file is truncated or replaced, rows that were read stay read, and
+    A line is read once its end is written. If the file is truncated or replaced, rows that were read still count, and
     rows of the new file that equal one of them are not read again.
     """
 
@@ -59,8 +59,8 @@ class GrowingFile:
 
         Args:
             path: the file, which need not exist yet.
-            robot: that is measured.
-            reader: of rows that mean something only together; None for measurement files.
+            robot: the measured robot.
+            reader: reads rows that are meaningful only together (corners of an image); None for measurement files.
         """
         self.path = Path(path)
         self._robot = robot
@@ -73,19 +73,21 @@ class GrowingFile:
         self._refused: set[LeftOut] = set()
 
     def read(self, final: bool = False) -> Growth:
-        """Read what is new.
+        """Read the new rows.
 
         Args:
-            final: whether nothing comes any more, so that the last line counts without its end, too.
+            final: whether the file is complete, so that the last line counts without its end.
 
         Raises:
-            MeasurementError: the file cannot be read or its header cannot be used; or, at the end, there is no file.
+            MeasurementError: the file cannot be read or its header cannot be used; or `final` and there is no file.
         """
         try:
             state = os.stat(self.path)
         except FileNotFoundError:
             if final:
-                raise MeasurementError(f"{self._source}: there is no such file; check the path.") from None
+                raise MeasurementError(
+                    "there is no such file", at=Place(self._source), remedy="check the path"
+                ) from None
             return Growth(waiting=f"{self._source} does not exist yet.")
         stamp = (state.st_ino, state.st_size, state.st_mtime_ns, final)
         if stamp == self._stamp:
@@ -110,17 +112,17 @@ class GrowingFile:
         return Growth(rows, left_out, notices, self._waiting)
 
     def _changes(self, text: str) -> tuple[str, ...]:
-        """Say what happened to the file where it does not go on as it was read."""
+        """Return a notice if the file does not continue the text that was read."""
         if text.startswith(self._text):
             return ()
         what = "truncated" if self._text.startswith(text) else "replaced"
         return (
-            f"{self._source} was {what}. The {self._accepted.total()} rows that were read so far still count, and none "
-            "of them is read again; start anew if they are no longer to count.",
+            f"{self._source} was {what}. The {self._accepted.total()} rows that were read so far still count and are "
+            "not read again; start again if they should no longer count.",
         )
 
     def _new_rows(self, data: MeasuredFields) -> list[int]:
-        """Find the rows that were not read before; now they are."""
+        """Return the numbers of the rows that were not read before, and record them as read."""
         in_file: Counter[str] = Counter()
         new = []
         for row in range(data.rows):
@@ -133,7 +135,7 @@ class GrowingFile:
 
 
 def _values(data: MeasuredFields, row: int) -> str:
-    """Everything that stands in a row, whichever columns the file has beside it."""
+    """Return all values of a row as a text, independent of empty columns."""
     numbers = {
         name: (values[row].round(decimals=_DIGITS) + 0.0).tolist()  # -0.0 becomes 0.0
         for name, values in sorted(data.numbers.items())

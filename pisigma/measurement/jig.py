@@ -1,4 +1,4 @@
-"""Jigs: stepped blocks whose faces, at known coordinates of the jig's frame, a tip touches."""
+"""Jigs: stepped blocks with faces at known coordinates of the jig's frame, which a tip touches."""
 
 import os
 from dataclasses import dataclass
@@ -18,17 +18,17 @@ Side = Literal["-x", "+x", "-y", "+y", "-z", "+z"]
 Millimetres = tuple[float, float, float]
 
 _SKIN = 1e-7
-"""[m] A point counts as outside of a block where it is farther than this from it."""
+"""[m] Distance from a block above which a point is outside of it."""
 
 
 class BlockSection(Section):
     """A block with edges along the axes of the jig's frame.
 
     Attributes:
-        name: unique in the jig.
-        corner_mm: its corner with the smallest coordinates [mm].
-        size_mm: its extent along x, y and z [mm].
-        faces: those that may be touched, by their outward direction.
+        name: name, unique in the jig.
+        corner_mm: corner with the smallest coordinates [mm].
+        size_mm: extent along x, y and z [mm].
+        faces: faces that may be touched, by their outward direction.
     """
 
     name: str = Field(min_length=1)
@@ -42,17 +42,17 @@ class BlockSection(Section):
     def _each_face_once(self) -> "BlockSection":
         for side in self.faces:
             if self.faces.count(side) > 1:
-                raise ValueError(f"the face {side} of block '{self.name}' stands twice; remove one")
+                raise ValueError(f"the face {side} of block '{self.name}' appears twice; remove one")
         return self
 
 
 class JigDocument(Section):
-    """The whole file.
+    """The jig file.
 
     Attributes:
-        name: of the jig.
-        source: where its sizes come from.
-        blocks: what it is made of; they may touch but not overlap.
+        name: name of the jig.
+        source: source of its dimensions.
+        blocks: its blocks, which may touch but not overlap.
     """
 
     name: str = Field(min_length=1)
@@ -64,7 +64,7 @@ class JigDocument(Section):
         names = [block.name for block in self.blocks]
         for name in names:
             if names.count(name) > 1:
-                raise ValueError(f"the block name '{name}' stands twice; names must differ")
+                raise ValueError(f"the block name '{name}' appears twice; rename one")
         if not any(block.faces for block in self.blocks):
             raise ValueError("no block has a face that may be touched; name at least one in 'faces'")
         jig = self.to_jig()
@@ -73,7 +73,7 @@ class JigDocument(Section):
         return self
 
     def to_jig(self) -> "Jig":
-        """The jig in SI units."""
+        """Return the jig in SI units."""
         corner = torch.tensor([block.corner_mm for block in self.blocks], dtype=torch.float64) / 1e3
         size = torch.tensor([block.size_mm for block in self.blocks], dtype=torch.float64) / 1e3
         faces = [(number, side) for number, block in enumerate(self.blocks) for side in block.faces]
@@ -91,20 +91,20 @@ class JigDocument(Section):
 
 @dataclass(frozen=True, eq=False)
 class Jig:
-    """Blocks and those of their faces that may be touched, in the frame of the jig [m].
+    """Blocks and the faces that may be touched, in the frame of the jig [m].
 
-    A touch on face i gives the coordinate `coordinate[i]` along axis `axis[i]`: x on y-z faces, y on x-z
+    A touch on face i measures the coordinate `coordinate[i]` along axis `axis[i]`: x on y-z faces, y on x-z
     faces, z on x-y faces (Lim et al., eqs 35 to 37).
 
     Attributes:
-        name: of the jig.
-        source: where its sizes come from.
-        block_names: of the blocks.
-        lower: corner of every block with the smallest coordinates.
-        upper: the opposite corner.
+        name: name of the jig.
+        source: source of its dimensions.
+        block_names: names of the blocks.
+        lower: corner of every block with the smallest coordinates [m].
+        upper: the opposite corner [m].
         block: index of every face's block.
-        axis: index of the axis that every face is square to.
-        sign: +1 or -1: outward direction along that axis.
+        axis: index of every face's normal axis.
+        sign: +1 or -1, outward direction along that axis.
     """
 
     name: str
@@ -118,11 +118,11 @@ class Jig:
 
     @staticmethod
     def load(jig: str | os.PathLike[str] = "stepped") -> "Jig":
-        """Load a jig that comes with pisigma by its name, or one from a YAML file.
+        """Load a jig of pisigma's catalogue by its name, or one from a YAML file.
 
         Raises:
-            MeasurementError: neither such a jig nor a file, or the file describes no jig; the message names
-                file, line and key.
+            MeasurementError: there is neither such a jig nor a file, or the file is not a valid jig; `file`, `line`
+                and `column` state which.
         """
         name = os.fspath(jig)
         if name in catalogue():
@@ -133,7 +133,10 @@ class Jig:
         if Path(name).suffix.lower() in (".yaml", ".yml"):
             return read_yaml(name, JigDocument, MeasurementError).to_jig()
         raise MeasurementError(
-            f"'{name}' is no jig that comes with pisigma and no .yaml file: {nearest_choice(name, catalogue())}"
+            option="jig",
+            expected="a jig of the catalogue or a .yaml file",
+            value=name,
+            remedy=nearest_choice(name, catalogue()),
         )
 
     @property
@@ -143,7 +146,7 @@ class Jig:
 
     @property
     def face_names(self) -> tuple[str, ...]:
-        """Such as "low/+z", for every face."""
+        """Name of every face, such as "low/+z"."""
         sides = zip(self.block.tolist(), self.sign.tolist(), self.axis.tolist(), strict=True)
         return tuple(
             f"{self.block_names[b]}/{'+' if sign > 0 else '-'}{'xyz'[axis]}" for b, sign, axis in sides
@@ -157,12 +160,12 @@ class Jig:
 
     @property
     def outward(self) -> Float64[Tensor, "faces 3"]:
-        """Unit vector out of every face."""
+        """Outward unit normal of every face."""
         return torch.nn.functional.one_hot(self.axis, 3) * self.sign[:, None]
 
     @property
     def extent(self) -> tuple[Float64[Tensor, "faces 3"], Float64[Tensor, "faces 3"]]:
-        """Smallest and largest coordinates on every face [m]; along its axis both are `coordinate`."""
+        """Smallest and largest coordinates on every face [m]; along its normal both are `coordinate`."""
         along = torch.nn.functional.one_hot(self.axis, 3).bool()
         coordinate = self.coordinate[:, None]
         return (
@@ -173,12 +176,12 @@ class Jig:
     def on_face(
         self, face: Int64[Tensor, "*batch"], point: Float64[Tensor, "*batch 3"], margin: float = 0.0
     ) -> Bool[Tensor, "*batch"]:
-        """Whether points lie on a face, away from its edges, and no other block covers them there.
+        """Return whether points are on a face, away from its edges, and not covered by another block.
 
         Args:
             face: index of the face.
-            point: in the frame of the jig [m]; the coordinate along the face's axis does not count.
-            margin: smallest distance [m] from the edges and from what stands on the face.
+            point: points in the frame of the jig [m]; the coordinate along the face's normal is ignored.
+            margin: smallest distance [m] from the edges and from other blocks on the face.
         """
         lower, upper = (bound[face] for bound in self.extent)
         along = torch.nn.functional.one_hot(self.axis[face], 3).bool()
@@ -194,7 +197,7 @@ class Jig:
     def is_hit(
         self, start: Float64[Tensor, "*batch 3"], end: Float64[Tensor, "*batch 3"]
     ) -> Bool[Tensor, "*batch"]:
-        """Whether a straight line from `start` to `end` [m] runs through a block.
+        """Return whether the straight line from `start` to `end` [m] intersects a block.
 
         Source: the slabs of Kay and Kajiya 1986, "Ray tracing complex scenes".
         """
@@ -224,10 +227,10 @@ class Jig:
             raise ValueError(f"the blocks '{a}' and '{b}' overlap; correct corner_mm or size_mm")
 
     def check_faces(self) -> None:
-        """Refuse faces that nothing can touch.
+        """Refuse faces that cannot be touched.
 
         Raises:
-            ValueError: a face is covered by one other block throughout.
+            ValueError: a face is completely covered by another block.
         """
         lower, upper = self.extent
         outside = 2 * _SKIN * self.outward
@@ -245,7 +248,7 @@ class Jig:
 
 
 def catalogue() -> tuple[str, ...]:
-    """Names of the jigs that come with pisigma, sorted."""
+    """Return the sorted names of the jigs that come with pisigma."""
     folder = resources.files("pisigma.measurement") / "jigs"
     return tuple(
         sorted(entry.name.removesuffix(".yaml") for entry in folder.iterdir() if entry.name.endswith(".yaml"))

@@ -1,4 +1,4 @@
-"""Joint values of rows beyond the limits of a drawing: warned of, and the limits widened; another unit is refused."""
+"""Warn of joint values beyond the nominal joint limits, and widen the limits to them."""
 
 from dataclasses import dataclass, replace
 
@@ -12,18 +12,18 @@ from pisigma.robot.description import Robot
 from pisigma.robot.kinematics.joint_limits import beyond_limits, grossly_beyond
 from pisigma.robot.row import Row
 
-_NAMED = 5
-"""Rows that are named."""
+_MAX_NAMED = 5
+"""Number of rows that a warning names."""
 
 
 @dataclass(frozen=True, eq=False)
 class JointRange:
-    """The values of one axis that lie beyond its limits.
+    """The values of one axis that are beyond its limits.
 
     Attributes:
-        axis: as drawn.
+        axis: the nominal axis.
         q: the values of all rows [rad or m].
-        rows: numbers of the rows outside.
+        rows: numbers of the rows beyond the limits.
     """
 
     axis: Row
@@ -32,35 +32,35 @@ class JointRange:
 
     @property
     def widened(self) -> Row:
-        """The axis with limits that hold the rows."""
+        """The axis with limits that include the rows."""
         outside = self.q[list(self.rows)]
         lower, upper = min(self.axis.lower, outside.min()), max(self.axis.upper, outside.max())
         return replace(self.axis, lower=float(lower), upper=float(upper))
 
     def sentence(self, rows: Measurements, robot: Robot) -> str:
-        """Name the joint, its limits, and the rows outside."""
+        """Return a warning with the joint, its limits, and the rows beyond them."""
         axis, unit = self.axis, self.axis.file_unit
         lower, upper = axis.in_file_unit(axis.lower), axis.in_file_unit(axis.upper)
         beyond = np.maximum(axis.lower - self.q, self.q - axis.upper)
         farthest = int(beyond.argmax())
-        named = ", ".join(rows.place(row) for row in self.rows[:_NAMED])
-        more = f" and {len(self.rows) - _NAMED} more" if len(self.rows) > _NAMED else ""
+        named = ", ".join(rows.place(row) for row in self.rows[:_MAX_NAMED])
+        more = f" and {len(self.rows) - _MAX_NAMED} more" if len(self.rows) > _MAX_NAMED else ""
         gross = bool(grossly_beyond(self.q, axis).any())
         meaning = (
-            "This is too far for the limits of a drawing: these are values of another joint or in another unit."
+            "This is too far for an inaccurate limit: the values belong to another joint or are in another unit."
             if gross
-            else "Measured rows show where the arm can go, so a calibration widens the limits to them; check the "
-            "limits of the robot file, and the order and unit of the joints."
+            else "The arm reached these values, so a calibration widens the limits to them; check the limits in the "
+            "robot file, and the order and unit of the joints."
         )
         return (
-            f"{len(self.rows)} of {rows.rows} rows are outside the limits {lower:.6g} to {upper:.6g} {unit} of joint "
+            f"{len(self.rows)} of {rows.rows} rows are beyond the limits {lower:.6g} to {upper:.6g} {unit} of joint "
             f"'{axis.name}' of robot '{robot.name}', by up to {axis.in_file_unit(beyond[farthest]):.3g} {unit} "
             f"({rows.place(farthest)}): {named}{more}. {meaning}"
         )
 
 
 def joint_ranges(robot: Robot, rows: Measurements) -> tuple[JointRange, ...]:
-    """The axes of a robot whose limits rows exceed."""
+    """Return the axes of a robot whose limits are exceeded by rows."""
     values = robot.to_controller(rows.q.detach().cpu().double().numpy())
     found = []
     for axis, q in zip(robot.axes, np.moveaxis(values, -1, 0), strict=True):
@@ -70,17 +70,17 @@ def joint_ranges(robot: Robot, rows: Measurements) -> tuple[JointRange, ...]:
 
 
 def limit_warnings(robot: Robot, rows: Measurements) -> tuple[str, ...]:
-    """A sentence for every joint whose limits rows exceed."""
+    """Return a warning for every joint whose limits are exceeded by rows."""
     return tuple(one.sentence(rows, robot) for one in joint_ranges(robot, rows))
 
 
 def row_warnings(robot: Robot, rows: Measurements) -> tuple[str, ...]:
-    """A sentence for rows that stand there twice, and one for every joint whose limits rows exceed."""
+    """Return a warning of duplicate rows, and one for every joint whose limits are exceeded by rows."""
     return (*copy_warnings(rows.left_out), *limit_warnings(robot, rows))
 
 
 def with_limits_of_rows(robot: Robot, rows: Measurements) -> Robot:
-    """The robot with limits that are wide enough for rows; the same where they are."""
+    """Return the robot with joint limits that include all rows; the robot itself if its limits do."""
     wider = {one.axis.name: one.widened for one in joint_ranges(robot, rows)}
     if not wider:
         return robot

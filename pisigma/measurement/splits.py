@@ -1,4 +1,4 @@
-"""Splits of measurements into training and test rows; rows of equal joint values, and of a pair, stay together."""
+"""Split measurements into training and held-out rows; rows of equal joint values, or of a pair, stay together."""
 
 import heapq
 from collections.abc import Sequence
@@ -9,36 +9,38 @@ import torch
 from jaxtyping import Bool, Float64, Int64
 from torch import Tensor
 
-from pisigma.files.errors import MeasurementError, nearest_choice
+from pisigma.files.errors import MeasurementError, Place, check_choice
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.groups import groups_of_equal_joints as groups_of_equal_joints
 from pisigma.measurement.groups import groups_to_keep_whole, placement_groups
 
 SplitBy = Literal["joints", "interleaved", "time", "space", "placement"]
-"""By joints: at random; interleaved: in turn, in the file's order; by time: blocks of that order; by space: blocks of
-the measured positions; by placement: all sockets of a placement together, or all rows of a frame."""
+"""Assignment to folds. By joints: at random; interleaved: alternating, in the file's order; by time: contiguous blocks
+of that order; by space: blocks of the measured positions; by placement: all sockets of a placement, or all rows of a
+frame, together."""
 
-AT_RANDOM: tuple[SplitBy, ...] = ("joints", "placement")
-"""Ways that put groups into folds at random, so that another repeat gives other folds."""
-JUDGED_GROUPS, MOST_REPEATS = 200, 10
-"""Groups held out, counted anew in every repeat, after which the luck of a single repeat hardly shows."""
+RANDOM_SPLITS: tuple[SplitBy, ...] = ("joints", "placement")
+"""Splits that assign groups to folds at random, so that repeats differ."""
+HELD_OUT_GROUPS, MAX_REPEATS = 200, 10
+"""Number of held-out groups, summed over repeats, at which the random assignment has little influence; and the largest
+number of repeats."""
 
 FOLDS = 5
-"""Of a cross-validation that is not by placement."""
+"""Number of folds of a cross-validation that is not by placement."""
 
 TrainTest = tuple[Int64[Tensor, " _train"], Int64[Tensor, " _test"]]
-"""Rows to train on and rows to test on, each in the order of the measurements."""
+"""Training rows and held-out rows, both in the order of the measurements."""
 
 
 @dataclass(frozen=True)
 class Splitting:
-    """How rows are split into those to train on and those to judge on.
+    """Settings of a split into training and held-out rows.
 
     Attributes:
-        by: what stays together, see `SplitBy`.
-        seed: of all draws.
-        folds: of a cross-validation; 0 for none, None for `FOLDS` or one for every placement.
-        hold_out: share of the rows that are held out once, instead of folds.
+        by: how rows are assigned, see `SplitBy`.
+        seed: random seed.
+        folds: number of folds of a cross-validation; 0 for none, None for `FOLDS` or one per placement.
+        hold_out: share of the rows that is held out once, instead of folds.
     """
 
     by: SplitBy
@@ -49,15 +51,15 @@ class Splitting:
     def of(
         self, measurements: Measurements, times: int | None, train_rows: int | None
     ) -> Sequence[Sequence[TrainTest]]:
-        """Give training and test rows of every fold, per repeat; nothing without a validation.
+        """Return training and held-out rows of every fold, per repeat; empty without a validation.
 
         Args:
             measurements: the rows.
             times: see `repeats`.
-            train_rows: so many training rows are drawn in every fold; None for all.
+            train_rows: number of training rows that are drawn in every fold; None for all.
 
         Raises:
-            MeasurementError: the measurements cannot be split like that.
+            MeasurementError: the measurements cannot be split in this way.
         """
         if self.hold_out is not None:
             splits: Sequence[Sequence[TrainTest]] = [
@@ -69,9 +71,10 @@ class Splitting:
             folds = FOLDS if self.folds is None and self.by != "placement" else self.folds
             if folds is not self.folds and len(set(groups_to_keep_whole(measurements).tolist())) < FOLDS:
                 raise MeasurementError(
-                    f"{measurements.source}: {FOLDS} different poses or more were wanted, so that each can be left out "
-                    "once to judge the others; measure more, about 50 for a good calibration, or leave that out "
-                    "(--folds 0)."
+                    expected=f"{FOLDS} or more different poses for a cross-validation",
+                    value=len(set(groups_to_keep_whole(measurements).tolist())),
+                    at=Place(measurements.source),
+                    remedy="measure more, about 50 for a good calibration, or do not cross-validate (--folds 0)",
                 )
             splits = repeats(measurements, folds, self.seed, self.by, times)
         if train_rows is None:
@@ -82,24 +85,23 @@ class Splitting:
 def k_folds(
     measurements: Measurements, folds: int | None, seed: int | torch.Generator, by: SplitBy = "joints"
 ) -> tuple[TrainTest, ...]:
-    """Split the measurements into folds, each of which is the test once.
+    """Split the measurements into folds, each of which is held out once.
 
     Args:
-        measurements: what to split.
-        folds: how many, 2 or more; None for as many as there are groups to keep whole.
-        seed: decides which groups come together by joints and by placement; unused otherwise.
-        by: "joints": groups of equal joints, shuffled and assigned such that folds are as equal as the groups
-            allow; "interleaved": the same unshuffled, so that groups of one size go to the folds in turn, as
-            with scikit-learn's GroupKFold; "time": contiguous blocks of the rows' order, a group counting
-            where its first row stands; "space": blocks from cutting the measured positions again and again
-            across their widest axis; "placement": assigned like joints, but whole placements (see `placements`);
-            rows of none are in no test.
+        measurements: the rows to split.
+        folds: number of folds, 2 or more; None for as many as there are groups to keep whole.
+        seed: random seed by joints and by placement; unused otherwise.
+        by: "joints": groups of equal joint values, shuffled and assigned such that folds are as equal as the groups
+            allow; "interleaved": the same unshuffled, so that groups of one size alternate between the folds, as in
+            scikit-learn's GroupKFold; "time": contiguous blocks in the order of the groups' first rows; "space":
+            blocks from cutting the measured positions recursively across their widest axis; "placement": assigned
+            like joints, but whole placements (see `placements`); rows of none are never held out.
 
     Returns:
-        Per fold the rows to train on and the rows to test on.
+        The training rows and the held-out rows of every fold.
 
     Raises:
-        MeasurementError: there are fewer groups than folds, or positions or names that are needed are not there.
+        MeasurementError: there are fewer groups than folds, or positions or names that are needed are missing.
     """
     group, sizes = _groups(measurements, by)
     _check_several(measurements, sizes, by)
@@ -107,8 +109,11 @@ def k_folds(
     if folds < 2 or folds > len(sizes):
         more = "placements" if by == "placement" else "poses"
         raise MeasurementError(
-            f"{measurements.source}: {folds} folds were wanted from {len(sizes)} {_kind(by)}; "
-            f"ask for 2 to {len(sizes)} folds or measure more {more}."
+            option="folds",
+            expected=f"2 to {len(sizes)} folds of {len(sizes)} {_kind(by)}",
+            value=folds,
+            at=Place(measurements.source),
+            remedy=f"choose a number of this range, or measure more {more}",
         )
     fold = torch.zeros(len(sizes), dtype=torch.int64)
     if by in ("joints", "placement", "interleaved"):
@@ -123,37 +128,40 @@ def k_folds(
 def repeats(
     measurements: Measurements, folds: int | None, seed: int, by: SplitBy = "joints", times: int | None = None
 ) -> tuple[tuple[TrainTest, ...], ...]:
-    """Split the measurements into folds several times over, differently each time.
+    """Split the measurements into folds several times, differently each time.
 
-    With few groups the error of held-out rows depends on which of them came together; over several repeats that
-    averages out (Burman 1989, Biometrika 76(3), 503-514).
+    With few groups, the error of held-out rows depends on which of them share a fold; several repeats average this out
+    (Burman 1989, Biometrika 76(3), 503-514).
 
     Args:
-        measurements: what to split.
-        folds: how many, 2 or more; None for as many as there are groups.
-        seed: of the first repeat; the others follow from it.
+        measurements: the rows to split.
+        folds: number of folds, 2 or more; None for as many as there are groups.
+        seed: random seed of the first repeat; the others follow from it.
         by: see `k_folds`.
-        times: how many repeats; None for as many as it takes to hold out `JUDGED_GROUPS` groups, `MOST_REPEATS` at
-            most, and one where groups are not assigned at random, by placement, or one by one.
+        times: number of repeats; None for as many as hold out `HELD_OUT_GROUPS` groups, at most `MAX_REPEATS`, and one
+            if groups are held out one by one or not assigned at random by joints.
 
     Returns:
-        Per repeat its folds, as from `k_folds`; the first one as with `k_folds`.
+        The folds of every repeat, see `k_folds`; the first repeat is that of `k_folds` with the same seed.
 
     Raises:
-        MeasurementError: several repeats were wanted where they do not differ; see `k_folds` too.
+        MeasurementError: several repeats would be equal; see `k_folds` for others.
     """
     generator = torch.Generator().manual_seed(seed)
     first = k_folds(measurements, folds, generator, by)
     groups = len(_groups(measurements, by)[1])
-    differ = by in AT_RANDOM and len(first) < groups
+    differ = by in RANDOM_SPLITS and len(first) < groups
     if times is None:
-        usual = min(JUDGED_GROUPS // groups, MOST_REPEATS)
+        usual = min(HELD_OUT_GROUPS // groups, MAX_REPEATS)
         times = max(usual, 1) if by == "joints" and differ else 1
     if times > 1 and not differ:
-        what = f"{groups} folds of {groups} {_kind(by)}" if by in AT_RANDOM else f"folds by {by}"
+        what = f"{groups} folds of {groups} {_kind(by)}" if by in RANDOM_SPLITS else f"folds by {by}"
         raise MeasurementError(
-            f"{measurements.source}: {times} repeats were wanted, but {what} are the same every time; ask for one "
-            "repeat, or for fewer folds by joints or placement."
+            option="repeats",
+            expected=f"one repeat, as {what} are the same every time",
+            value=times,
+            at=Place(measurements.source),
+            remedy="choose one repeat, or fewer folds by joints or placement",
         )
     return first, *(k_folds(measurements, folds, generator, by) for _ in range(times - 1))
 
@@ -161,23 +169,26 @@ def repeats(
 def holdout(
     measurements: Measurements, share: float, seed: int | torch.Generator, by: SplitBy = "joints"
 ) -> TrainTest:
-    """Keep a share of the measurements for the test.
+    """Hold out a share of the measurements.
 
     Args:
-        measurements: what to split.
-        share: of the rows for the test, between 0 and 1; met as closely as the groups allow.
-        seed: decides which rows by joints and by placement; unused otherwise.
-        by: "joints": groups of equal joints at random; "interleaved": every so many groups one; "time": the last
-            rows; "space": the far end of the widest axis of the measured positions; "placement": whole placements
+        measurements: the rows to split.
+        share: share of the rows to hold out, between 0 and 1; met as closely as the groups allow.
+        seed: random seed by joints and by placement; unused otherwise.
+        by: "joints": groups of equal joint values at random; "interleaved": groups at regular intervals; "time": the
+            last rows; "space": the far end of the widest axis of the measured positions; "placement": whole placements
             at random.
 
     Raises:
-        MeasurementError: the share is not between 0 and 1, there is one group only, or positions or names that are
-            needed are not there.
+        MeasurementError: the share is not between 0 and 1, there is only one group, or positions or names that are
+            needed are missing.
     """
     if not 0 < share < 1:
         raise MeasurementError(
-            f"{measurements.source}: a test share between 0 and 1 was wanted, got {share:g}."
+            option="hold_out",
+            expected="a share between 0 and 1",
+            value=float(share),
+            at=Place(measurements.source),
         )
     group, sizes = _groups(measurements, by)
     _check_several(measurements, sizes, by)
@@ -196,25 +207,27 @@ def holdout(
 
 
 def draw_rows(measurements: Measurements, rows: int, seed: int) -> Int64[Tensor, " _drawn"]:
-    """Draw rows at random; those of equal joint values, and of a pair, come together.
+    """Draw rows at random; those of equal joint values, or of a pair, are drawn together.
 
-    With one seed a smaller draw is part of every larger one.
+    With the same seed, a smaller draw is a subset of every larger one.
 
     Args:
-        measurements: to draw from.
-        rows: how many are wanted; it is met as closely as whole configurations allow.
-        seed: of the draw.
+        measurements: the rows to draw from.
+        rows: number of rows to draw; met as closely as whole configurations allow.
+        seed: random seed.
 
     Returns:
         Numbers of the rows in the order of the measurements.
 
     Raises:
-        MeasurementError: there are fewer rows, or less than one is wanted.
+        MeasurementError: `rows` is less than 1 or more than there are.
     """
     if not 1 <= rows <= measurements.rows:
         raise MeasurementError(
-            f"{measurements.source}: {rows} training rows were wanted, but there are {measurements.rows} to draw "
-            f"from; ask for 1 to {measurements.rows}."
+            option="train_rows",
+            expected=f"1 to {measurements.rows} training rows",
+            value=rows,
+            at=Place(measurements.source),
         )
     group = groups_to_keep_whole(measurements).cpu()
     sizes = torch.bincount(group)
@@ -226,10 +239,10 @@ def draw_rows(measurements: Measurements, rows: int, seed: int) -> Int64[Tensor,
 def with_fewer(
     measurements: Measurements, splits: Sequence[TrainTest], rows: int, seed: int
 ) -> tuple[TrainTest, ...]:
-    """Draw the training rows of every split of a cross-validation; its test rows stay. See `draw_rows`.
+    """Draw training rows in every fold of a cross-validation, and keep its held-out rows. See `draw_rows`.
 
     Raises:
-        MeasurementError: a split has fewer training rows.
+        MeasurementError: a fold has fewer training rows.
     """
     return tuple((train[draw_rows(measurements.select(train), rows, seed)], test) for train, test in splits)
 
@@ -237,9 +250,8 @@ def with_fewer(
 def _groups(
     measurements: Measurements, by: SplitBy
 ) -> tuple[Int64[Tensor, " rows"], Int64[Tensor, " groups"]]:
-    """The number of every row's group, -1 for rows that are in no test, and how many rows each has."""
-    if by not in get_args(SplitBy):
-        raise MeasurementError(f"split by '{by}' is unknown; {nearest_choice(by, get_args(SplitBy))}")
+    """Return the number of every row's group, -1 for rows that are never held out, and the groups' sizes."""
+    check_choice(MeasurementError, "by", by, get_args(SplitBy))
     group = (placement_groups if by == "placement" else groups_to_keep_whole)(measurements).cpu()
     return group, torch.bincount(group[group >= 0])
 
@@ -251,10 +263,13 @@ def _check_several(measurements: Measurements, sizes: Int64[Tensor, " groups"], 
         MeasurementError: see above.
     """
     if len(sizes) < 2:
-        what = "placement" if by == "placement" else "joint vector, so they are one pose"
+        what = "placement" if by == "placement" else "pose, with equal joint values"
         raise MeasurementError(
-            f"{measurements.source}: all {measurements.rows} rows are of one {what}, which cannot be split into "
-            "training and test; measure at other joint values, spread over the workspace."
+            f"all {measurements.rows} rows are of one {what}, so they cannot be split into training and held-out rows",
+            option="by",
+            value=by,
+            at=Place(measurements.source),
+            remedy="measure at other joint values, spread over the workspace",
         )
 
 
@@ -283,7 +298,7 @@ def _assign(
 
 
 def _interleaved(sizes: Int64[Tensor, " groups"], share: float) -> Bool[Tensor, " groups"]:
-    """Which groups are the test, so that of the rows up to any group it holds the share as closely as may be."""
+    """Choose held-out groups such that their share of the rows up to any group is as close as possible to `share`."""
     is_test, passed, held = [], 0, 0
     for size in sizes.tolist():
         passed += size
@@ -302,7 +317,7 @@ def _cut_into_folds(
     first: int,
     folds: int,
 ) -> None:
-    """Give `members` the folds from `first` on: halve them and go on with the halves."""
+    """Assign folds from `first` to `members` by recursive bisection."""
     if folds == 1:
         fold[members] = first
         return
@@ -315,7 +330,7 @@ def _cut_into_folds(
 
 
 def _cut(sizes: Int64[Tensor, " _members"], share: float, least_before: int, least_after: int) -> int:
-    """Number of groups before the cut, such that they hold a share of the rows as closely as may be."""
+    """Return the number of groups before the cut, such that their share of the rows is as close as possible."""
     rows_before = sizes.cumsum(0)
     deviation = (rows_before - share * rows_before[-1]).abs()
     allowed = deviation[least_before - 1 : len(sizes) - least_after]
@@ -325,7 +340,7 @@ def _cut(sizes: Int64[Tensor, " _members"], share: float, least_before: int, lea
 def _along_widest_axis(
     positions: Float64[Tensor, "groups 3"], members: Int64[Tensor, " members"]
 ) -> Int64[Tensor, " members"]:
-    """The members in order of the coordinate in which they are farthest apart."""
+    """Return the members in order of the coordinate with the largest range."""
     points = positions[members]
     axis = int((points.amax(0) - points.amin(0)).argmax())
     return members[points[:, axis].argsort(stable=True)]
@@ -334,11 +349,14 @@ def _along_widest_axis(
 def _group_positions(
     measurements: Measurements, group: Int64[Tensor, " rows"], groups: int
 ) -> Float64[Tensor, "groups 3"]:
-    """Mean measured position of every group [m]."""
+    """Return the mean measured position of every group [m]."""
     if len(set(measurements.frame)) > 1:
         raise MeasurementError(
-            f"{measurements.source}: positions in {len(set(measurements.frame))} frames cannot be compared; "
-            "split by joints or by time."
+            option="by",
+            expected="positions in one frame, to split them by space",
+            value=f"{len(set(measurements.frame))} frames",
+            at=Place(measurements.source),
+            remedy="split by joints or by time",
         )
     position = torch.full((measurements.rows, 3), torch.nan, dtype=torch.float64)
     if measurements.position is not None:
@@ -348,8 +366,10 @@ def _group_positions(
     if (count == 0).any():
         row = int((group == int((count == 0).nonzero()[0])).nonzero()[0])
         raise MeasurementError(
-            f"{measurements.place(row)}: no position was measured, so it cannot be split by space; split by "
-            "joints or by time."
+            "no position was measured, so that the rows cannot be split by space",
+            option="by",
+            at=measurements.at(row),
+            remedy="split by joints or by time",
         )
     total = torch.zeros(groups, 3, dtype=torch.float64).index_add(0, group[measured], position[measured])
     return total / count[:, None]

@@ -1,4 +1,4 @@
-"""Rows that stand there twice count once, and repeated measurements as often as they were made."""
+"""Duplicate rows are left out, and repeated measurements are kept."""
 
 import math
 from dataclasses import replace
@@ -51,7 +51,7 @@ VARIANTS = {
 
 @pytest.mark.parametrize("variant", VARIANTS)
 @pytest.mark.parametrize("copy_first", [False, True])
-def test_copies_count_once_and_the_row_with_most_digits_stays(variant, copy_first):
+def test_copies_count_once_and_the_row_with_the_most_digits_is_kept(variant, copy_first):
     rows = measured()
     copy = VARIANTS[variant](rows)
     both = join([copy, rows] if copy_first else [rows, copy])
@@ -91,12 +91,12 @@ def test_both_rows_of_a_pair_are_copies_or_none():
 
 @pytest.mark.parametrize("noise", [5e-6, 3e-5])
 @pytest.mark.parametrize("step", [1e-3, 1e-4, 1e-5, 1e-6])
-@pytest.mark.parametrize("in_turn", [False, True])
-def test_repeats_are_no_copies(noise, step, in_turn):
-    if in_turn and noise < 2e-5:
-        return  # no robot comes back so well
+@pytest.mark.parametrize("interleaved", [False, True])
+def test_repeats_are_not_copies(noise, step, interleaved):
+    if interleaved and noise < 2e-5:
+        return  # no robot is so repeatable
     rows = measured(30)
-    repeats = join([rows] * 10) if in_turn else rows.select(torch.arange(30).repeat_interleave(10))
+    repeats = join([rows] * 10) if interleaved else rows.select(torch.arange(30).repeat_interleave(10))
     draw = torch.Generator().manual_seed(4)
     position = repeats.position + noise * torch.randn(300, 3, generator=draw, dtype=torch.float64)
     repeats = rounded(replace(repeats, position=position), step)
@@ -104,7 +104,7 @@ def test_repeats_are_no_copies(noise, step, in_turn):
 
 
 @pytest.mark.parametrize("step", [None, 1e-5, 1e-4])
-def test_measured_repeats_are_no_copies(step, shared_data):
+def test_measured_repeats_are_not_copies(step, shared_data):
     rows = Measurements.read_csv(shared_data / "fanuc_r2000/positions.csv")
     rows = rows if step is None else rounded(rows, step, 1e-9)
     assert without_copies(rows.as_fields(), ROBOT).rows == 720

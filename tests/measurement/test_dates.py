@@ -1,8 +1,9 @@
-"""Days on which something can have been measured, wherever one is stated."""
+"""Dates of measurements, wherever they are stated."""
 
 import datetime
 
 import pytest
+from testing.refusals import refused
 
 from pisigma.files.errors import FleetError, MeasurementError
 from pisigma.lifetime.fleet.members import read_fleet
@@ -29,14 +30,14 @@ def test_a_day_is_read_from_the_name_of_a_file():
 
 
 @pytest.mark.parametrize("name", ["2026-02-30", "robot_2026-13-05", "2026_00_01"])
-def test_a_day_that_no_calendar_has_is_refused_in_the_name_of_a_file(name):
-    with pytest.raises(MeasurementError, match="in the name of the file"):
+def test_a_day_that_does_not_exist_is_refused_in_the_name_of_a_file(name):
+    with refused(MeasurementError, file=f"{name}.csv", value=name[-10:].replace("_", "-")):
         date_in_name(f"{name}.csv")
     assert date_in_name(f"{name.replace('-', '').replace('_', '')}.csv") == ""  # may be a serial number
 
 
 @pytest.mark.parametrize("slip", SLIPS)
-def test_a_mistyped_year_is_refused_where_it_is_stated(slip, tmp_path):
+def test_a_mistyped_year_is_refused(slip, tmp_path):
     with pytest.raises(MeasurementError):
         date_in_name(f"cell_{slip}.csv")
     with pytest.raises(MeasurementError):

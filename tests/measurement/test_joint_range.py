@@ -39,10 +39,11 @@ def test_limits_are_widened_to_the_rows_and_no_farther(robot):
         (robot.axes[1].name, (1,)),
         (robot.axes[2].name, (2,)),
     ]
-    said = row_warnings(robot, rows)
+    warnings = row_warnings(robot, rows)
+    assert len(warnings) == 2
     assert all(
-        robot.axes[1 + i].name in sentence and rows.place(1 + i) in sentence
-        for i, sentence in enumerate(said)
+        robot.axes[1 + i].name in warning and rows.place(1 + i) in warning
+        for i, warning in enumerate(warnings)
     )
     wide = with_limits_of_rows(robot, rows)
     change = wide.axis_limits - robot.axis_limits

@@ -1,4 +1,4 @@
-"""Folds part the rows, keep equal joints together, and are as equal as they can be."""
+"""Folds partition the rows, keep equal joints together, and are as equal as possible."""
 
 from pathlib import Path
 
@@ -6,6 +6,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from testing.refusals import refused
 
 from pisigma.files.errors import MeasurementError
 from pisigma.measurement.dataset import Measurements
@@ -137,34 +138,34 @@ def test_by_space_gives_boxes_that_do_not_overlap():
 
 @pytest.mark.parametrize("folds", [-1, 0, 1, 4])
 def test_refuses_more_folds_than_joint_vectors(folds: int):
-    with pytest.raises(
-        MeasurementError, match=rf"{folds} folds were wanted from 3 different .* 2 to 3 folds"
-    ):
+    with refused(MeasurementError, option="folds", value=folds):
         k_folds(repeated([1, 1, 2, 3]), folds, seed=0)
 
 
-def test_refuses_to_part_a_single_pose():
-    with pytest.raises(MeasurementError, match="all 3 rows are of one joint vector, so they are one pose"):
+def test_refuses_to_split_a_single_pose():
+    with refused(MeasurementError, option="by", value="joints"):
         k_folds(repeated([1, 1, 1]), 2, seed=0)
-    with pytest.raises(MeasurementError, match="all 3 rows are of one joint vector, so they are one pose"):
+    with refused(MeasurementError, option="by", value="joints"):
         holdout(repeated([1, 1, 1]), 0.5, seed=0)
 
 
 @pytest.mark.parametrize("share", [0.0, 1.0, -0.5, float("nan")])
-def test_refuses_a_share_that_is_none(share: float):
-    with pytest.raises(MeasurementError, match="between 0 and 1"):
+def test_refuses_a_share_that_is_not_between_0_and_1(share: float):
+    with refused(MeasurementError, option="hold_out"):
         holdout(repeated([1, 2, 3]), share, seed=0)
 
 
 def test_refuses_space_without_positions_to_compare():
     q = torch.arange(4.0).double()[:, None]
     position = torch.ones(4, 3, dtype=torch.float64)
-    with pytest.raises(MeasurementError, match="row 0: no position was measured"):
+    with refused(MeasurementError, option="by", file="memory") as caught:
         k_folds(Measurements(q=q), 2, 0, by="space")
+    assert "row 0" in str(caught.value)
     position[2] = torch.nan
-    with pytest.raises(MeasurementError, match="row 2: no position was measured"):
+    with refused(MeasurementError, option="by", file="memory") as caught:
         holdout(Measurements(q=q, position=position), 0.5, 0, by="space")
-    with pytest.raises(MeasurementError, match="2 frames cannot be compared"):
+    assert "row 2" in str(caught.value)
+    with refused(MeasurementError, option="by", value="2 frames"):
         k_folds(Measurements(q=q, position=position, frame=("a", "a", "b", "b")), 2, 0, by="space")
 
 
@@ -174,7 +175,7 @@ def in_sockets(names: list[str], **more: object) -> Measurements:
     return Measurements(q=q, socket=tuple(names), **more)  # type: ignore[arg-type]
 
 
-def test_placements_are_what_stands_before_the_last_slash():
+def test_placements_are_named_before_the_last_slash():
     data = in_sockets(["a/b/0", "a/b/1", "a/c/0", "lone", "lone"], frame=("one", "two", "one", "two", "two"))
     assert placements(data) == ("a/b", "a/b", "a/c", "lone", "lone")
     touches = Measurements(
@@ -207,30 +208,29 @@ def test_placements_that_share_joints_stay_together():
 
 
 @pytest.mark.parametrize(
-    ("names", "complaint"),
-    [(["low/0", "low/1"], "'low' is the only one"), (["", ""], "neither sockets nor frames have names")],
+    ("names", "value"), [(["low/0", "low/1"], "low"), (["", ""], "no names of sockets or frames")]
 )
-def test_refuses_to_split_by_placements_that_are_not_there(names: list[str], complaint: str):
+def test_refuses_to_split_by_fewer_than_two_placements(names: list[str], value: str):
     position = torch.zeros(2, 3, dtype=torch.float64)
     data = in_sockets(names) if names[0] else Measurements(q=in_sockets(["a", "b"]).q, position=position)
-    with pytest.raises(MeasurementError, match=complaint):
+    with refused(MeasurementError, value=value):
         k_folds(data, None, seed=0, by="placement")
 
 
 def test_refuses_more_folds_than_placements():
-    with pytest.raises(MeasurementError, match="3 folds were wanted from 2 placements; ask for 2 to 2 folds"):
+    with refused(MeasurementError, option="folds", value=3):
         k_folds(in_sockets(["a/0", "b/0", "b/1"]), 3, seed=0, by="placement")
 
 
-def test_dealings_differ_and_start_with_the_folds_of_the_seed():
+def test_repeats_differ_and_start_with_the_folds_of_the_seed():
     measurements = repeated([row // 3 for row in range(72)])
     found = repeats(measurements, 6, seed=4)
     assert len(found) == 8  # 200 of 24 groups
     first = [test.tolist() for _, test in k_folds(measurements, 6, seed=4)]
     assert [test.tolist() for _, test in found[0]] == first
-    assert len({tuple(tuple(test.tolist()) for _, test in dealt) for dealt in found}) == 8
-    for dealt in found:
-        assert sorted(torch.cat([test for _, test in dealt]).tolist()) == list(range(72))
+    assert len({tuple(tuple(test.tolist()) for _, test in folds) for folds in found}) == 8
+    for folds in found:
+        assert sorted(torch.cat([test for _, test in folds]).tolist()) == list(range(72))
 
 
 @pytest.mark.parametrize(
@@ -245,13 +245,13 @@ def test_dealings_differ_and_start_with_the_folds_of_the_seed():
         (12, 3, "time", 1),
     ],
 )
-def test_as_many_dealings_as_there_are_few_poses(groups: int, folds: int | None, by: SplitBy, times: int):
+def test_few_poses_get_several_repeats(groups: int, folds: int | None, by: SplitBy, times: int):
     assert len(repeats(repeated(list(range(groups))), folds, seed=0, by=by)) == times
 
 
 @pytest.mark.parametrize(("folds", "by"), [(4, "time"), (4, "interleaved"), (12, "joints")])
-def test_refuses_to_deal_what_cannot_be_dealt_anew(folds: int, by: SplitBy):
+def test_refuses_repeats_that_would_be_equal(folds: int, by: SplitBy):
     measurements = repeated(list(range(12)))
     assert len(repeats(measurements, folds, seed=0, by=by, times=1)) == 1
-    with pytest.raises(MeasurementError, match=r"3 repeats were wanted, but .* are the same every time"):
+    with refused(MeasurementError, option="repeats", value=3):
         repeats(measurements, folds, seed=0, by=by, times=3)
