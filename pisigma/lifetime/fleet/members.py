@@ -106,7 +106,7 @@ def _in_manifest(path: Path, robot: str | None) -> list[Member]:
     """The robots of a manifest."""
     table = read_table(path)
     for name in table.header:
-        check_separators(name, f"{path}, line {table.header_line}")
+        check_separators(name, table.header_place)
         if name not in COLUMNS:
             raise FleetError(
                 f"{path}, line {table.header_line}: column '{name}' is unknown; {nearest_choice(name, COLUMNS)}"
