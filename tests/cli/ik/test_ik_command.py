@@ -173,11 +173,11 @@ def test_poses_that_fail_are_named_by_their_lines(run, models, tmp_path):
 
 
 BAD_ROWS = {
-    4: ("1,2,three,4,5,6", "column 'z_mm': 'three' is no finite number"),
-    5: ("1,2,,4,5,6", "column 'z_mm': '' is no finite number"),
-    8: ("nan,2,3,4,5,6", "column 'x_mm': 'nan' is no finite number"),
-    9: ("1,2,3", "6 fields were wanted, got 3"),
-    11: ('1,2,3,4,5,"6', "is no valid CSV"),
+    4: ("1,2,three,4,5,6", "got 'three' (column 'z_mm')"),
+    5: ("1,2,,4,5,6", "got '' (column 'z_mm')"),
+    8: ("nan,2,3,4,5,6", "got 'nan' (column 'x_mm')"),
+    9: ("1,2,3", "6 fields, got 3"),
+    11: ('1,2,3,4,5,"6', "CSV"),
     14: ("400000,100000,200000,0,0,0", "times the reach of robot"),
 }
 """By line of the file: a row that is no pose, and why."""
@@ -212,7 +212,7 @@ def test_rows_that_are_no_poses_do_not_stop_the_others(
         assert row["status"] == "bad_row"
         assert reason in row["reason"]
         assert reason in result.stderr
-    assert result.stderr.startswith(f"pisigma: {path}, line 4: bad_row. column 'z_mm': 'three'")
+    assert result.stderr.startswith(f"pisigma: {path}, line 4: bad_row. ")
     written = list(csv.DictReader(out.read_text().splitlines()))
     assert [int(row["line"]) for row in written] == list(range(2, 2 + len(good) + len(BAD_ROWS)))
     solved = [row for row in written if row["status"] != "bad_row"]

@@ -75,8 +75,7 @@ def test_an_image_counts_when_the_next_one_begins(plan: StoredPlan, lines: list[
     assert growth.rows.line == (2,)
     (left_out,) = growth.left_out
     assert left_out.line == 2 + CORNERS + 4
-    assert "whole number from 0 to 53 was wanted" in left_out.reason
-    assert left_out.reason.startswith("column 'corner'")
+    assert "column 'corner'" in left_out.reason
     last = file.read(final=True)
     assert last.rows is not None
     assert last.rows.line == (2 + 2 * CORNERS,)
