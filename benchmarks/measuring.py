@@ -131,7 +131,7 @@ def session(arm: Arm, how: str) -> tuple[int, float]:
         )
         measuring.add(row)
         if measuring.is_due:
-            measuring.work_out()
+            measuring.update()
     rows = measuring.rows
     assert rows is not None
     errors = fit_where_it_helps(HybridCalibrator(arm.drawn), rows, lambda what: None).errors_of(arm.test)

@@ -17,21 +17,21 @@ if TYPE_CHECKING:
 SensorKind = Literal["position", "pose", "distance", "camera"]
 Criterion = Literal["D", "I"]
 Box = tuple[float, float, float, float, float, float]
-SHORTEST_MM, LONGEST_MM = 1e-3, 1e3
-"""Of a standard deviation of an instrument, and of an error of a robot: others are slips of the unit."""
+MIN_LENGTH_MM, MAX_LENGTH_MM = 1e-3, 1e3
+"""Range of instruments' standard deviations and robots' errors [mm]; other values are in the wrong unit."""
 FILES = ("candidates_from", "task", "measured")
 """Settings that are files."""
 
 
 def box(stated: str) -> tuple[float, ...]:
-    """Lowest and highest x, y, z [mm], from "X,Y,Z,X,Y,Z"."""
+    """Return the lowest and the highest x, y, z [mm] from "X,Y,Z,X,Y,Z"."""
     try:
         numbers = tuple(map(float, stated.split(",")))
     except ValueError:
         numbers = ()
     if len(numbers) != 6:
         raise PlanningError(
-            f"--box: six numbers such as -500,200,100,500,900,800 were wanted, got '{stated}'."
+            expected="six numbers, such as -500,200,100,500,900,800", value=stated, option="--box"
         )
     return numbers
 
@@ -84,47 +84,51 @@ class PlanSettings:
     settling_s: float = 3.0
 
     def __post_init__(self) -> None:
-        """Refuse settings that are none."""
+        """Check choices and ranges."""
         from pisigma.files.yaml_file import MAX_POSES
 
         check_choice(PlanningError, "sensor", self.sensor, get_args(SensorKind))
         check_choice(PlanningError, "criterion", self.criterion, get_args(Criterion))
         if (self.sensor == "camera") != (self.camera is not None):
             raise PlanningError(
-                f"sensor '{self.sensor}': files of a camera and of a board were wanted for the sensor 'camera', and "
-                "for no other one."
+                expected="files of a camera and of a board for the sensor camera only",
+                value=self.sensor,
+                option="sensor",
             )
         for name, least in (("count", 1), ("check", 0), ("candidates", 1), ("seed", 0)):
             most = 2**63 - 1 if name == "seed" else MAX_POSES
             if not least <= getattr(self, name) <= most:
-                raise PlanningError(f"{name}: {least} to {most:,} was wanted, got {getattr(self, name):,}.")
+                raise PlanningError(
+                    expected=f"an integer from {least} to {most:,}", value=getattr(self, name), option=name
+                )
         for name in ("sigma_mm", "limit_mm"):
             value = getattr(self, name)
-            if value is not None and not SHORTEST_MM <= value <= LONGEST_MM:
+            if value is not None and not MIN_LENGTH_MM <= value <= MAX_LENGTH_MM:
                 raise PlanningError(
-                    f"{name}: {SHORTEST_MM:g} to {LONGEST_MM:g} mm was wanted, got {value:g}."
+                    expected=f"{MIN_LENGTH_MM:g} to {MAX_LENGTH_MM:g} mm", value=value, option=name
                 )
         box = self.box_mm
         if box is not None and not all(lower < upper for lower, upper in zip(box[:3], box[3:], strict=True)):
             raise PlanningError(
-                "box: the lowest x, y, z and then the highest were wanted [mm], got "
-                f"{', '.join(f'{value:g}' for value in box)}."
+                expected="the lowest x, y, z and then the highest [mm]",
+                value=", ".join(f"{value:g}" for value in box),
+                option="box_mm",
             )
         _ = self.pace
 
     @property
     def pace(self) -> "Pace":
-        """How fast the robot goes from pose to pose."""
+        """Joint speed [rad/s] and settling time [s] between poses."""
         from pisigma.planning.tour import Pace
 
         return Pace(speed=math.radians(self.speed_deg_s), settling=self.settling_s)
 
     def with_files_from(self, folder: Path) -> "PlanSettings":
-        """The same with the paths of its files seen from the working directory instead of a folder."""
+        """Return the settings with file paths relative to the working directory instead of `folder`."""
         return self.with_files(lambda path: os.path.normpath(folder / path))
 
     def with_files(self, path_of: Callable[[str], str]) -> "PlanSettings":
-        """The same with other paths of its files."""
+        """Return the settings with `path_of` applied to every file path."""
         stated: dict[str, Any] = {
             name: path_of(file) for name in FILES if (file := getattr(self, name)) is not None
         }

@@ -1,4 +1,4 @@
-"""Calibrate a robot from measurements: typed settings in, a typed result out that writes itself as a model folder."""
+"""Calibrate a robot from measurements."""
 
 import os
 import time
@@ -44,27 +44,27 @@ from pisigma.workflow.result import AbstractModelResult
 from pisigma.workflow.settings.calibration import CalibrationSettings, ModelKind
 
 ONLY_GEOMETRY = (
-    "The geometry alone was calibrated, and nothing was cross-validated: errors that a fault of the setup or of the "
-    "file explains are not for a joint correction to learn."
+    "Only the geometry was calibrated, without cross-validation: a joint correction must not learn errors that a fault "
+    "of the setup or of the file explains."
 )
 
 
 @dataclass(frozen=True, eq=False)
 class Calibration(AbstractModelResult):
-    """A calibrated robot, how well it was judged, and all figures of it.
+    """Result of `calibrate`: the model, its validation and all figures.
 
     Attributes:
-        model: what `pisigma.load` would read, with all figures as its metrics.
-        result: the geometric or hybrid calibration that the model was made of.
-        rows: what it was calibrated with.
-        validation: errors of rows under calibrations without them; None without one.
-        test: errors of the rows that the data mark as test; None without such rows.
-        held_out: every held-out row with its errors, as the folder keeps them; None without.
+        model: the calibrated model, with all figures as its metrics, as `pisigma.load` would read it.
+        result: the geometric or hybrid calibration that the model was built from.
+        rows: measurements that it was calibrated with.
+        validation: errors of held-out rows; None without a validation.
+        test: errors of the rows of the set "test"; None without such rows.
+        held_out: all held-out rows with their errors, as in the model folder; None without a validation.
         summary: all figures.
         texts: description, and what was not validated.
-        settings: what it was calibrated with; None for a recipe.
-        seconds: time it took [s].
-        figures: whether the card has pictures.
+        settings: settings of the calibration; None for a recipe.
+        seconds: computing time [s].
+        figures: whether the card has figures.
     """
 
     model: CalibratedModel
@@ -81,7 +81,7 @@ class Calibration(AbstractModelResult):
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """What to check or to measure next, a sentence each."""
+        """Warnings, such as what to check or to measure next, one sentence each."""
         return self.summary.warnings
 
     def _describe(self, model: CalibratedModel, summary: CalibrationSummary, folder: Path) -> None:
@@ -100,18 +100,22 @@ def calibrate(
     settings: CalibrationSettings = CalibrationSettings(),
     progress: Progress = lambda what: None,
 ) -> Calibration:
-    """Calibrate a robot, and judge the calibration on rows that it did not see.
+    """Calibrate a robot, and validate the calibration on held-out rows.
 
     Args:
-        robot: as drawn: a robot, a name of the catalogue, or a robot file (YAML or URDF).
-        data: measurements, or CSV files of them; rows of the set "test" are kept apart and judged in the end.
+        robot: the nominal robot, or its catalogue name or robot file (YAML or URDF).
+        data: measurements, or CSV files of them. Rows of the set "test" are not calibrated with; the final model is
+            tested on them.
         settings: see `CalibrationSettings`.
-        progress: called with what is being done.
+        progress: called with the current step.
+
+    Returns:
+        The calibrated model with its validation; `save` writes it as a model folder.
 
     Raises:
         RobotError: there is no such robot.
         MeasurementError: the data cannot be read, or cannot be split as the settings say.
-        IdentificationError: the data do not determine what is asked for.
+        IdentificationError: the data do not determine the free parameters.
     """
     started = time.perf_counter()
     nominal = robot if isinstance(robot, Robot) else Robot.load(os.fspath(robot))
@@ -145,7 +149,7 @@ def calibrate(
     )
     texts = CardTexts(
         _description("geometric" if faulty else settings.model, nominal),
-        "Judged on rows of the same measurement only, not on other days, payloads or temperatures.",
+        "Validated on rows of the same measurement only, not on other days, payloads or temperatures.",
     )
     calibration = compose(calibrator, result, rows, summary, texts, validation, test, training)
     return replace(calibration, settings=settings, seconds=time.perf_counter() - started)
@@ -162,21 +166,21 @@ def compose(
     held_out: Measurements | None = None,
     recipe: tuple[str, str] = ("", ""),
 ) -> Calibration:
-    """Check a calibration, make a model of it, and put everything together.
+    """Check a calibration, and build its model and summary.
 
     Args:
-        calibrator: what calibrated.
-        result: the calibration.
-        rows: what it was calibrated with.
-        summary: all figures.
-        texts: for the card.
+        calibrator: the calibrator.
+        result: its calibration.
+        rows: measurements that it was calibrated with.
+        summary: figures so far.
+        texts: texts of the card.
         validation: errors of held-out rows.
-        test: errors of rows that were kept apart.
-        held_out: the rows of the validation, where the folder is to keep their errors.
-        recipe: name and SHA-256 of the recipe, where there was one.
+        test: errors of the rows of the set "test".
+        held_out: rows of the validation whose errors the model folder keeps; None keeps none.
+        recipe: name and SHA-256 of the recipe; empty without one.
 
     Raises:
-        IdentificationError: the measurements cannot be of this robot at all.
+        IdentificationError: the measurements cannot be of this robot.
     """
     checked = CheckedCalibration(
         geometric_of(calibrator), rows, trained(calibrator, rows, result=result), validation
@@ -203,7 +207,7 @@ def compose(
 
 
 def _call(robot: Robot, measurements: Measurements, settings: CalibrationSettings) -> str:
-    """The call that gives this calibration again, with the settings that are not the default."""
+    """Return the call that repeats this calibration, with the settings that differ from the defaults."""
     usual = CalibrationSettings()
     named = {item.name: getattr(settings, item.name) for item in fields(settings)}
     stated = [
@@ -224,19 +228,19 @@ def _description(model: ModelKind, nominal: Robot) -> str:
         )
     return (
         f"Hybrid calibration of robot {nominal.name} ({nominal.maker}): DH and Hayati parameters, base and tool, and "
-        "with them, where the data are for it, a Pi-Sigma network that corrects the joint values."
+        "with them, where the data support it, a Pi-Sigma network that corrects the joint values."
     )
 
 
 def calibrator_of(
     settings: CalibrationSettings, robot: Robot, distances: Mapping[PairOfSockets, float]
 ) -> Calibrator:
-    """Give the calibrator of a robot.
+    """Build the calibrator of a robot.
 
     Args:
         settings: see `CalibrationSettings`.
-        robot: as drawn.
-        distances: stated ones [m] between sockets of the data.
+        robot: the nominal robot.
+        distances: known distances between pairs of sockets of the data [m].
 
     Raises:
         IdentificationError: a setting does not fit the robot.

@@ -1,4 +1,4 @@
-"""Compare two models of one robot: parameters, positions of the tool, rows that they predict, and programs."""
+"""Compare two models of one robot: parameters, tool positions, errors on rows, and programs."""
 
 import os
 import time
@@ -40,19 +40,18 @@ from pisigma.workflow.settings.comparison import ComparisonSettings
 
 @dataclass(frozen=True, eq=False)
 class ComparedModels:
-    """Two models of one robot beside each other.
+    """Result of `compare`: two models of one robot side by side.
 
     Attributes:
-        models: by the names that tables use, the first model and the second.
-        settings: how they were compared.
-        parameters: side by side, and which of them differ.
-        workspace: distances between both models' poses there.
-        rows: errors of both models on the same rows; None where none were given.
-        program: the same along a program that was taught with the first: what it misses under the second; None where
-            none was given.
-        diagnostics: why nothing is to be concluded from the rows; see `pisigma.validation.gate`.
-        warnings: what to heed, a sentence each.
-        seconds: that it took [s].
+        models: the first and the second model by their names in tables.
+        settings: settings of the comparison.
+        parameters: all parameters side by side, and those that differ.
+        workspace: distances between the tool poses of both models over the workspace.
+        rows: errors of both models on the same rows; None without rows.
+        program: distances along a program that was taught with the first model; None without a program.
+        diagnostics: why the rows must not be trusted; see `pisigma.validation.gate`.
+        warnings: warnings, one sentence each.
+        seconds: computing time [s].
     """
 
     models: dict[str, CalibratedModel]
@@ -67,7 +66,7 @@ class ComparedModels:
 
     @property
     def better(self) -> str | None:
-        """Name of the model that predicts trusted rows better, by more than chance; None where neither does."""
+        """Name of the model that predicts the rows significantly better; None for neither, or untrusted rows."""
         difference = self._difference
         interval = None if difference is None else difference.intervals["rms"]
         if interval is None or interval[0] <= 0.0 <= interval[1] or self.diagnostics:
@@ -77,13 +76,13 @@ class ComparedModels:
 
     @property
     def displacements(self) -> dict[str, Displacement]:
-        """Distances of the tool by where they are: over the workspace, and along the program where there is one."""
+        """Distances of the tool over the workspace and, if there is one, along the program."""
         along = {} if self.program is None else {f"along {self.program.source}": self.program}
         return {f"over {self.workspace.source}": self.workspace, **along}
 
     @property
     def sentences(self) -> tuple[str, ...]:
-        """What the comparison says."""
+        """Results of the comparison in sentences."""
         return (
             *_parameters_in_words(self.parameters, *self.models),
             *self._displacements_in_words(),
@@ -115,7 +114,7 @@ class ComparedModels:
         """Write the comparison as one HTML page.
 
         Raises:
-            OutputError: the page is no .html file or cannot be written.
+            OutputError: the page is not an .html file, or cannot be written.
         """
         from pisigma.reporting.page.lifetime import comparison_page  # matplotlib takes a second
 
@@ -129,24 +128,24 @@ class ComparedModels:
         return None if self.rows is None else self.rows.models[1].position.difference
 
     def _displacements_in_words(self) -> tuple[str, ...]:
-        """Say by how much tools differ over the workspace and along a program."""
+        """Return how far the tools are apart over the workspace and along a program."""
         first, second = self.models
         figures = self.workspace.errors.figures.by_name
         where = " with base and tool fitted" if self.settings.frames == "fitted" else ""
         lines = [
-            f"Over the workspace {second} has the tool {figures['rms_mm']:.3f} mm (RMS) from where {first} has it"
-            f"{where}, at most {figures['max_mm']:.3f} mm."
+            f"Over the workspace, the tool positions of {second} and {first} differ by {figures['rms_mm']:.3f} mm (RMS)"
+            f"{where}, at most by {figures['max_mm']:.3f} mm."
         ]
         if self.program is not None:
             figures, largest = self.program.errors.figures.by_name, self.program.largest
             lines.append(
-                f"{self.program.source}, taught with {first}, misses by {figures['rms_mm']:.3f} mm (RMS) under "
-                f"{second}, at most by {figures['max_mm']:.3f} mm at its pose {int(self.program.number[largest])}."
+                f"The poses of {self.program.source}, taught with {first}, are off by {figures['rms_mm']:.3f} mm (RMS) "
+                f"under {second}, at most by {figures['max_mm']:.3f} mm at pose {int(self.program.number[largest])}."
             )
         return tuple(lines)
 
     def _rows_in_words(self) -> tuple[str, ...]:
-        """Say which model predicts the rows better."""
+        """Return which model predicts the rows better."""
         difference = self._difference
         if difference is None or self.rows is None:
             return ()
@@ -155,9 +154,11 @@ class ComparedModels:
         )
         if self.diagnostics:
             doubts = " ".join(one.sentence for one in self.diagnostics)
-            return (f"The RMS error of {self.rows.rows} rows is {errors}, which shows nothing: {doubts}",)
+            return (f"The RMS error of {self.rows.rows} rows is {errors}, which is not conclusive: {doubts}",)
         which = (
-            f"{self.better} predicts them better" if self.better else "neither predicts them clearly better"
+            f"{self.better} predicts them better"
+            if self.better
+            else "neither predicts them significantly better"
         )
         return (
             f"The RMS error of {self.rows.rows} rows is {errors}: {which} (Wilcoxon's p {difference.test.p:.2g}).",
@@ -171,14 +172,15 @@ def compare(
     program: str | os.PathLike[str] | None = None,
     settings: ComparisonSettings = ComparisonSettings(),
 ) -> ComparedModels:
-    """Say in what two models of one robot differ, and what that means for the tool.
+    """Compare the parameters of two models of one robot, and what the differences mean for the tool.
 
     Args:
-        first: a model or its folder, or "nominal" (the robot as drawn) or "geometric" (what a hybrid builds upon) of
-            the other.
-        second: what it is compared with, likewise.
-        rows: measurements, or their file, that both models predict; where rows are marked, those of the set "test".
-        program: a file of joint values, or of poses in the base frame, that was taught with the first model.
+        first: a model or its folder, or "nominal" (the nominal robot) or "geometric" (the geometric part of a hybrid)
+            of the other model.
+        second: the model to compare it with, likewise.
+        rows: measurements, or their file, to compare both models on. Where rows are marked, only those of the set
+            "test" are used.
+        program: file of joint values, or of poses in the base frame, that was taught with the first model.
         settings: see `ComparisonSettings`.
 
     Raises:
@@ -196,7 +198,7 @@ def compare(
         second = replace(second, name=f"{second.name}-2")
     sources = labelled([first, second])
     loaded = load_models(sources)
-    models = with_references(list(sources), loaded, turned=True)
+    models = with_references(list(sources), loaded, with_orientation=True)
     one, other = models.values()
     pair = ModelPair.of(one, other, settings.frames)
     compared, warnings = None, _warnings(pair, list(sources.values()))
@@ -214,7 +216,7 @@ def compare(
         found = [
             check_rows(right.rows, model, fitted, {"joint_zero"}).implausible for model in loaded.values()
         ]
-        diagnostics = found[0] if all(found) else ()  # what one model predicts is of this robot
+        diagnostics = found[0] if all(found) else ()  # rows that one model predicts are of this robot
     return ComparedModels(
         models=models,
         settings=settings,
@@ -231,13 +233,13 @@ def compare(
 
 
 def _parameters_in_words(differences: ParameterDifferences, first: str, second: str) -> tuple[str, ...]:
-    """Say which parameters differ, and whether more does."""
+    """Return which parameters differ, and whether the remaining differences are significant."""
     if differences.remainder is None:
         return (
-            "A model holds no posterior of its parameters, so that their differences cannot be compared with chance; "
-            "make it with `pisigma calibrate`, which keeps one.",
+            "A model has no posterior of its parameters, so that the significance of their differences is unknown; "
+            "make it with `pisigma calibrate`.",
         )
-    level = f"at a level of {differences.level:.2g} for all parameters together"
+    level = f"at a significance level of {differences.level:.2g} for all parameters together"
     lines = [f"No parameter of {second} differs from {first} beyond its uncertainty, {level}."]
     if differences.differing:
         shifts = "; ".join(one.sentence for one in differences.differing)
@@ -246,7 +248,7 @@ def _parameters_in_words(differences: ParameterDifferences, first: str, second: 
         ]
     if differences.remainder.significant:
         lines.append(
-            "What is left of the differences is more than chance: the joint corrections differ, or several parameters."
+            "The remaining differences are significant: the joint corrections or several parameters differ."
         )
     pairs = zip(differences.frames[::2], differences.frames[1::2], strict=True)
     clauses = [f"the {length.what} {length.size} and {angle.size} away" for length, angle in pairs]
@@ -254,7 +256,7 @@ def _parameters_in_words(differences: ParameterDifferences, first: str, second: 
 
 
 def _parameter_json(one: ParameterDifference) -> dict[str, Any]:
-    """A parameter with the unit in the names of its figures."""
+    """Return a parameter as plain values, with the unit in the names of its figures."""
     figures = {
         "first": one.first,
         "second": one.second,
@@ -269,7 +271,7 @@ def _parameter_json(one: ParameterDifference) -> dict[str, Any]:
 
 
 def _warnings(pair: ModelPair, sources: Sequence[ModelSource]) -> tuple[str, ...]:
-    """What to heed, a sentence each."""
+    """Return warnings about models that share information."""
     warnings = []
     models = (pair.first, pair.second)
     for child, parent, source in zip(models, models[::-1], reversed(sources), strict=True):
@@ -277,13 +279,13 @@ def _warnings(pair: ModelPair, sources: Sequence[ModelSource]) -> tuple[str, ...
             continue
         if (child.metrics.get("parent") or {}).get("sha256") == model_hash(source):
             warnings.append(
-                f"{child.name} was made from {parent.name}, so that what is unknown is partly the same in both: "
-                "differences are surer than stated."
+                f"{child.name} was made from {parent.name}, so that their errors are partly the same: differences are "
+                "more certain than stated."
             )
     data = [model.provenance.data_sha256 for model in models]
     if data[0] and data[0] == data[1]:
         warnings.append(
-            "Both models were made of the same rows, so that their errors are partly the same: differences are surer "
-            "than stated."
+            "Both models were made from the same rows, so that their errors are partly the same: differences are more "
+            "certain than stated."
         )
     return tuple(warnings)

@@ -1,7 +1,7 @@
 """Distil a calibrated model into a small Pi-Sigma network on nominal joint values.
 
-Jeong et al. 1998 learn `Δθ = θ_measured - θ_analytic` from measurements; here the full solution of a model takes the
-role of θ_measured, for poses of a region.
+Jeong et al. 1998 learn `Δθ = θ_measured - θ_analytic` from measurements; here the full inverse kinematics solution of a
+model takes the role of θ_measured, for poses of a region.
 """
 
 import os
@@ -47,31 +47,31 @@ from pisigma.workflow.settings.distillation import DistillationSettings
 from pisigma.workflow.solved_poses import SINGULAR_BELOW, Region, SolvedPoses, draw_solved_poses
 
 CHOICE_SHARE, HELD_OUT_SHARE = 0.2, 0.4
-"""Poses that sizes are chosen by, and poses that the chosen one is judged by, beside one that is fitted to."""
+"""Numbers of poses for model selection and for testing, relative to the number of poses to fit to."""
 
-USEFUL = 0.2
-"""A distilled model whose error against the full solution is larger than this share of the nominal one is warned of."""
+MAX_ERROR_SHARE = 0.2
+"""Error of a distilled model against the full solution, relative to the nominal error, above which a warning is given."""
 
 DOMAIN_SAMPLES = 512
-FEWEST = 100
-"""Fewer poses are refused."""
+MIN_POSES = 100
+"""Minimum number of poses to fit to."""
 
-_FEW_ROWS = 20
-"""Rows per joint from which a region is taken as filled."""
+_MIN_ROWS_PER_JOINT = 20
+"""Rows per joint below which a region is sparsely covered."""
 
 
 @dataclass(frozen=True, eq=False)
 class Distillation(AbstractModelResult):
-    """A distilled model and how well it follows the full solution.
+    """Result of `distill`: a distilled model, and how well it approximates the full solution.
 
     Attributes:
         model: the distilled model, with all figures as its metrics.
-        parent: the model it was distilled from.
-        region: where.
-        held_out: poses that were neither fitted to nor chosen by.
-        predicted: what the network adds to their nominal joint values [rad or m].
+        parent: the model that it was distilled from.
+        region: region of the poses.
+        held_out: poses that were used neither for fitting nor for model selection.
+        predicted: corrections of their nominal joint values by the network [rad or m].
         summary: all figures.
-        seconds: time it took [s].
+        seconds: computing time [s].
     """
 
     model: CalibratedModel
@@ -84,7 +84,7 @@ class Distillation(AbstractModelResult):
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Why the model should perhaps not be used, a sentence each."""
+        """Reasons not to use the model, one sentence each."""
         return self.summary.warnings
 
     def _describe(self, model: CalibratedModel, summary: DistillationSummary, folder: Path) -> None:
@@ -99,13 +99,13 @@ def distill(
     """Fit a small network on nominal joint values to the full solutions of a model.
 
     Args:
-        model: with an identified geometry, or the folder of such a model.
-        settings: region, number of poses, sizes, seed.
-        progress: called with what is being done.
+        model: a model with an identified geometry, or its folder.
+        settings: region, number of poses, sizes and seed.
+        progress: called with the current step.
 
     Raises:
-        ModelError: the folder holds no model, or the model has nothing that could be distilled.
-        IdentificationError: the robot takes too few poses of the region, or they are too few for the size.
+        ModelError: the folder is not that of a model, or the model cannot be distilled.
+        IdentificationError: the robot reaches too few poses of the region, or they are too few for the network's size.
     """
     started, sha256 = time.perf_counter(), ""
     if isinstance(model, CalibratedModel):
@@ -114,9 +114,9 @@ def distill(
         parent = load_model(model)
         sha256 = model_hash(model)
     _check_parent(parent)
-    if settings.poses < FEWEST:
+    if settings.poses < MIN_POSES:
         raise IdentificationError(
-            f"{settings.poses} poses are too few to distil from; give {FEWEST} or more."
+            expected=f"{MIN_POSES} poses or more", value=settings.poses, option="--poses"
         )
     sizes = (settings.size,) if settings.size is not None else sizes_for(parent, settings.poses)
     region = settings.region or Region(parent.starts.double())
@@ -154,18 +154,25 @@ def distill(
 def _check_parent(parent: CalibratedModel) -> None:
     if parent.network is not None:
         raise ModelError(
-            f"model '{parent.name}' corrects nominal joint values by a network already, so there is nothing to "
-            "distil; export it as it is."
+            f"model '{parent.name}' already corrects nominal joint values by a network",
+            expected="a model without a network",
+            value=parent.name,
+            remedy="export it as it is",
         )
     if parent.calibrated is None or not len(parent.starts):
         raise ModelError(
-            f"model '{parent.name}' has no identified geometry with joint values it was measured at, so there is "
-            "nothing to distil; give a model of `pisigma calibrate`."
+            f"model '{parent.name}' has no identified geometry with measured joint values",
+            expected="a model with an identified geometry",
+            value=parent.name,
+            remedy="give a model of `pisigma calibrate`",
         )
     if parent.robot.coupling is not None:
         raise ModelError(
-            f"model '{parent.name}': its joints are coupled, and networks of nominal joint values do not know the "
-            "controller's; use the model as it is."
+            f"the joints of model '{parent.name}' are coupled, and a network on nominal joint values does not model "
+            "this coupling",
+            expected="a model without coupled joints",
+            value=parent.name,
+            remedy="use the model as it is",
         )
 
 
@@ -188,7 +195,7 @@ def _summary(
     poses: SolvedPoses,
     predicted: Float64[Tensor, "poses dof"],
 ) -> DistillationSummary:
-    """Figures of held-out poses, whose errors are those of the tool under the full calibrated model."""
+    """Return the figures of held-out poses, with errors of the tool under the full calibrated model."""
     assert model.network is not None
     assert model.domain is not None
     scaled = model.network.scaled_inputs(poses.T, poses.q_nominal)
@@ -218,20 +225,20 @@ def _summary(
 
 
 def _warnings(held_out: DistilledErrors, rows: int, joints: int) -> tuple[str, ...]:
-    """Why the distilled model should perhaps not be used; empty where nothing speaks against it."""
+    """Return reasons not to use the distilled model, one sentence each."""
     sentences = []
     distilled, nominal = held_out.distilled.by_name, held_out.nominal.by_name
     for key, what, unit in (("rms_mm", "position", "mm"), ("rms_deg", "orientation", "deg")):
-        if distilled[key] > USEFUL * nominal[key]:
+        if distilled[key] > MAX_ERROR_SHARE * nominal[key]:
             sentences.append(
-                f"It takes only {max(1 - distilled[key] / nominal[key], 0):.0%} off the nominal error in {what} "
-                f"({distilled[key]:.3g} of {nominal[key]:.3g} {unit} RMS are left): the region is too large for so "
-                "small a network; give a smaller --region, more --poses, or use the parent."
+                f"It removes only {max(1 - distilled[key] / nominal[key], 0):.0%} of the nominal {what} error "
+                f"({distilled[key]:.3g} of {nominal[key]:.3g} {unit} RMS remain): the region is too large for this "
+                "network; give a smaller --region, more --poses, or use the parent."
             )
-    if rows < _FEW_ROWS * joints:
+    if rows < _MIN_ROWS_PER_JOINT * joints:
         sentences.append(
-            f"Only {rows} rows of joint values describe the region, {_FEW_ROWS * joints} or more fill it: between "
-            "few rows it is thin, and the errors hold in there only."
+            f"Only {rows} rows of joint values describe the region, which needs {_MIN_ROWS_PER_JOINT * joints} or more: "
+            "it is sparsely covered, and the errors hold only near these rows."
         )
     return tuple(sentences)
 
@@ -239,36 +246,36 @@ def _warnings(held_out: DistilledErrors, rows: int, joints: int) -> tuple[str, .
 def _limitations(
     parent: CalibratedModel, errors: ErrorFigures, sizes: tuple[SizeFigures, ...]
 ) -> tuple[str, ...]:
-    """What the full solution has and the distilled one lacks."""
+    """Return the properties of the full solution that the distilled model does not have, one sentence each."""
     sentences = [
         f"Exactness: on held-out poses of the region the tool is {errors.rms_mm:.4f} mm RMS (95 % within "
-        f"{errors.p95_mm:.4f} mm, at most {errors.max_mm:.4f} mm) from where the full solution brings it. "
-        "The errors that the parent itself has come on top."
+        f"{errors.p95_mm:.4f} mm, at most {errors.max_mm:.4f} mm) from the position of the full solution. "
+        "The parent's errors are added to this."
     ]
     features = () if parent.hybrid is None else parent.hybrid.correction.features
     harmonics = max((one.fastest for one in features), default=1)
     inputs = next(size.harmonics for size in sizes if size.kept)
     if harmonics > inputs:
         sentences.append(
-            f"Fast ripple: the parent corrects joints with up to {harmonics} cycles a turn, this "
-            f"network sees {'sine and cosine' if inputs == 1 else f'up to {inputs} cycles'} of the joint's nominal "
-            f"value and follows what is slower{_without_overtones(sizes)}."
+            f"Fast ripple: the parent corrects joints with up to {harmonics} cycles per turn, while this network uses "
+            f"{'sine and cosine' if inputs == 1 else f'up to {inputs} cycles'} of the joint's nominal value and only "
+            f"reproduces slower ripple{_without_overtones(sizes)}."
         )
     conditions = None if parent.hybrid is None else learned_conditions(parent.hybrid.correction)
     if conditions is not None:
         names = " and ".join(conditions.names)
-        sentences.append(f"Conditions: {names} are taken as usual when the parent was measured.")
+        sentences.append(f"Conditions: {names} are assumed to be as usual when the parent was measured.")
     return (
         *sentences,
-        "Reach: poses that only the calibrated robot can take have no nominal joint values to correct, and poses near "
+        "Reach: poses that only the calibrated robot can reach have no nominal joint values to correct, and poses near "
         f"a singularity (measure below {SINGULAR_BELOW}) were not learned.",
-        "Validity: it holds in its region and on its branches only; beyond, the status is OUTSIDE_DOMAIN. It predicts "
-        "no accuracy; ask the parent for it.",
+        "Validity: it is valid in its region and on its branches only; elsewhere the status is OUTSIDE_DOMAIN. It does "
+        "not predict its accuracy; the parent does.",
     )
 
 
 def _without_overtones(sizes: tuple[SizeFigures, ...]) -> str:
-    """What sines and cosines of the joints alone would give, where that was tried and something else taken."""
+    """Return the error with sines and cosines of the joints only, where that was tried but not chosen."""
     smooth = [size for size in sizes if size.harmonics == 1]
     if not smooth or any(size.kept for size in smooth):
         return ""
@@ -277,7 +284,7 @@ def _without_overtones(sizes: tuple[SizeFigures, ...]) -> str:
 
 
 def _region(region: Region, poses: SolvedPoses, robot: Robot) -> RegionFigures:
-    """Bounds of the joint values and of the positions."""
+    """Return the bounds of the joint values and of the positions."""
     low, high = poses.q_nominal.amin(0).tolist(), poses.q_nominal.amax(0).tolist()
     bounds = torch.stack(poses.T[:, :3, 3].aminmax(dim=0), 1).flatten().tolist()
     return RegionFigures(
@@ -299,7 +306,7 @@ def _region(region: Region, poses: SolvedPoses, robot: Robot) -> RegionFigures:
 def _tool_errors(
     parent: CalibratedModel, T: Float64[Tensor, "poses 4 4"], q: Float64[Tensor, "poses dof"]
 ) -> ErrorFigures:
-    """Errors of the tool at joint values q under the full model, from the poses T."""
+    """Return the errors of the tool at joint values q under the full model, relative to the poses T."""
     error = pose_error(T, parent.forward(q))
     return PoseErrors(error[:, :3].norm(dim=-1), error[:, 3:].norm(dim=-1)).figures
 
@@ -307,10 +314,10 @@ def _tool_errors(
 def _joint_errors(
     robot: Robot, correction: Float64[Tensor, "poses dof"], predicted: Float64[Tensor, "poses dof"]
 ) -> tuple[DistilledJoint, ...]:
-    """Per joint what the full solution adds, and how far the distilled model is from it."""
+    """Return, for every joint, the correction of the full solution and the error of the distilled model."""
     joints = []
-    for joint, full, rest in zip(robot.joints, correction.T, (correction - predicted).T, strict=True):
-        sizes = {"correction": _absolute(full, joint), "error": _absolute(rest, joint)}
+    for joint, full, residual in zip(robot.joints, correction.T, (correction - predicted).T, strict=True):
+        sizes = {"correction": _absolute(full, joint), "error": _absolute(residual, joint)}
         joints.append(DistilledJoint(name=joint.name, unit=joint.file_unit, **sizes))
     return tuple(joints)
 

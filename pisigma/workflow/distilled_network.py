@@ -1,4 +1,4 @@
-"""The network that a calibrated model is distilled into: sizes, fitting one, and choosing among them."""
+"""The network that a calibrated model is distilled into: sizes, fitting, and model selection."""
 
 from dataclasses import dataclass
 
@@ -23,28 +23,28 @@ from pisigma.workflow.solved_poses import SolvedPoses
 VALIDATION_SHARE = 0.1
 
 OVERTONE_SCALE = 1e4
-"""Overtones are scaled down by so much after the fit, and their weights up: they do not say where a joint is, and the
-domain is measured in scaled inputs."""
+"""Factor by which overtones are scaled down after the fit, and their weights up. The domain is measured in scaled inputs,
+and overtones do not tell where in its range a joint is."""
 
-ENOUGH = 5e-6
-"""[m] RMS of the tool's error below which no larger size is tried: no robot repeats so well."""
-AS_GOOD = 1.1
-"""A smaller size is taken where its error is not larger than the best one's times this."""
-ROWS_PER_UNKNOWN = 4
-"""A size is tried where there are so many poses for each of its unknowns."""
+NEGLIGIBLE_ERROR = 5e-6
+"""RMS error of the tool's position [m] below which no larger size is tried: no robot repeats better."""
+ABOUT_AS_GOOD = 1.1
+"""Largest ratio of a smaller size's error to the best error at which the smaller size is chosen."""
+MIN_POSES_PER_UNKNOWN = 4
+"""Minimum number of poses for each unknown of a size."""
 
-_STILL = 1e-6
-"""[rad or m] A joint that moves less over the region is no input."""
+_MIN_MOTION = 1e-6
+"""Motion over the region [rad or m] below which a joint is not an input."""
 
 
 @dataclass(frozen=True)
 class Size:
-    """A network: the same for every joint.
+    """Size of a network, which is the same for every joint.
 
     Attributes:
         orders: number of summing units of every product unit.
-        harmonics: sines and cosines of up to so many times the corrected joint's own value are inputs, besides those of
-            all joints' own values.
+        harmonics: highest multiple of the corrected joint's value whose sine and cosine are inputs, in addition to the
+            sine and cosine of every joint's value.
     """
 
     orders: tuple[int, ...]
@@ -52,18 +52,18 @@ class Size:
 
     def unknowns(self, robot: Robot) -> int:
         """Number of weights and biases per joint."""
-        inputs = sum(2 if turns else 1 for turns in robot.revolute) + 2 * (self.harmonics - 1)
+        inputs = sum(2 if revolute else 1 for revolute in robot.revolute) + 2 * (self.harmonics - 1)
         return sum(self.orders) * (inputs + 1)
 
 
 SMOOTH = (Size((1, 2)), Size((1, 2, 3)), Size((1, 2, 3, 4)))
-"""Sizes for what varies slowly with the joints: geometry, and arms that sag."""
+"""Sizes for errors that vary slowly with the joints: geometry and sag."""
 RIPPLED = (Size((1, 2)), Size((1, 2, 3)), Size((1, 2, 3), 8), Size((1, 2, 3), 24))
-"""Sizes where gears and encoders run out of true as well."""
+"""Sizes for models with ripple of gears and encoders as well."""
 
 
 def sizes_for(model: CalibratedModel, poses: int) -> tuple[Size, ...]:
-    """Give the sizes to try for a model with so many poses to fit, small ones first.
+    """Return the sizes to try for a model, given the number of poses to fit to, small ones first.
 
     Raises:
         IdentificationError: the poses are too few for any size.
@@ -73,12 +73,14 @@ def sizes_for(model: CalibratedModel, poses: int) -> tuple[Size, ...]:
     sizes = tuple(
         size
         for size in (RIPPLED if rippled else SMOOTH)
-        if size.unknowns(model.robot) * ROWS_PER_UNKNOWN <= poses
+        if size.unknowns(model.robot) * MIN_POSES_PER_UNKNOWN <= poses
     )
     if not sizes:
         raise IdentificationError(
-            f"{poses} poses are too few for any size of network for robot '{model.robot.name}'; give "
-            "more, or the orders of a small one."
+            f"{poses} poses are too few for any size of network for robot '{model.robot.name}'",
+            value=poses,
+            option="--poses",
+            remedy="give more, or the orders of a small network",
         )
     return sizes
 
@@ -91,15 +93,15 @@ def choose_network(
     search: tuple[int, int],
     progress: Progress,
 ) -> tuple[CorrectionNetwork, tuple[SizeFigures, ...]]:
-    """Give the smallest network that is about as good as the best, and all that were tried.
+    """Return the smallest network that is about as good as the best, and the figures of all that were tried.
 
     Args:
         parent: the model that is distilled.
-        poses: with its full solutions.
-        chosen: which of them to fit to, and which to choose by.
-        sizes: to fit, small ones first.
-        search: seed, and largest number of iterations for a joint.
-        progress: called with what is being done.
+        poses: poses with its full solutions.
+        chosen: slices of the poses to fit to, and of those for model selection.
+        sizes: sizes to fit, small ones first.
+        search: random seed, and maximum number of iterations for a joint.
+        progress: called with the current step.
     """
     pairs = _pairs(poses, chosen[0])
     fits: list[tuple[CorrectionNetwork, Size, float]] = []
@@ -111,10 +113,11 @@ def choose_network(
             reached = parent.forward(q + network(T, q))
         error = float((reached[:, :3, 3] - T[:, :3, 3]).square().sum(-1).mean().sqrt())
         fits.append((network, size, error))
-        if error < ENOUGH:
+        if error < NEGLIGIBLE_ERROR:
             break
     best = min(error for *_, error in fits)
-    kept = next(k for k, (*_, error) in enumerate(fits) if error <= max(AS_GOOD * best, ENOUGH))
+    bound = max(ABOUT_AS_GOOD * best, NEGLIGIBLE_ERROR)
+    kept = next(k for k, (*_, error) in enumerate(fits) if error <= bound)
     sizes_tried = tuple(
         SizeFigures(
             orders=size.orders,
@@ -141,11 +144,11 @@ def _fit_size(
 
     Args:
         robot: the nominal robot.
-        size: of the network.
+        size: size of the network.
         pairs: nominal joint values and their corrections.
-        seed: of start and validation rows.
-        epochs: largest number of iterations for a joint.
-        progress: called with what is being done.
+        seed: random seed of the start and of the validation rows.
+        epochs: maximum number of iterations for a joint.
+        progress: called with the names of the joints that are fitted.
 
     Raises:
         IdentificationError: no joint moves in the region, or there are too few poses.
@@ -172,22 +175,28 @@ def _fit_size(
 
 
 def _sections(robot: Robot, size: Size, q: Float64[Tensor, "poses dof"]) -> list[NetworkSection]:
-    """One group of all joints, or one of each joint where its overtones are inputs."""
+    """Return one group of all joints, or one group for each joint where its overtones are inputs.
+
+    Raises:
+        IdentificationError: no joint moves in the region.
+    """
     names = [joint.name for joint in robot.joints]
-    moves = ((q.amax(0) - q.amin(0)) > _STILL).tolist()
+    moves = ((q.amax(0) - q.amin(0)) > _MIN_MOTION).tolist()
     shared: list[str] = []
-    for name, turns, moving in zip(names, robot.revolute, moves, strict=True):
+    for name, revolute, moving in zip(names, robot.revolute, moves, strict=True):
         if moving:
-            shared += [f"sin({name})", f"cos({name})"] if turns else [name]
+            shared += [f"sin({name})", f"cos({name})"] if revolute else [name]
     if not shared:
         raise IdentificationError(
-            "no joint moves among the poses to distil from; give a larger region, or joint values that differ."
+            "no joint moves among the poses to distil from",
+            expected="poses with different joint values",
+            remedy="give a larger region, or joint values that differ",
         )
     if size.harmonics == 1:
         return [NetworkSection(joints=tuple(names), inputs=tuple(shared), orders=size.orders)]
     sections = []
-    for name, turns, moving in zip(names, robot.revolute, moves, strict=True):
-        multiples = range(2, size.harmonics + 1) if turns and moving else ()
+    for name, revolute, moving in zip(names, robot.revolute, moves, strict=True):
+        multiples = range(2, size.harmonics + 1) if revolute and moving else ()
         overtones = [f"{function}({k}*{name})" for k in multiples for function in ("sin", "cos")]
         sections.append(NetworkSection(joints=(name,), inputs=(*shared, *overtones), orders=size.orders))
     return sections
@@ -195,7 +204,7 @@ def _sections(robot: Robot, size: Size, q: Float64[Tensor, "poses dof"]) -> list
 
 @torch.no_grad()
 def _shrink_overtones(network: PiSigma, inputs: Inputs) -> None:
-    """Scale inputs of multiples of a joint's value down and their weights up, which changes no output."""
+    """Scale inputs with multiples of a joint's value down and their weights up, which leaves the output unchanged."""
     overtone = [max(inputs.combination(name)[1]) > 1 for name in inputs.names]
     factor = torch.where(torch.tensor(overtone), OVERTONE_SCALE, 1.0).double()
     network.input_scale.mul_(factor)

@@ -1,4 +1,4 @@
-"""Evaluate models on measurements that they were not trained on, and accept them or not."""
+"""Evaluate models on measurements that they were not trained on, and accept or reject them."""
 
 import os
 import time
@@ -8,7 +8,7 @@ from pathlib import Path
 
 import torch
 
-from pisigma.files.errors import MeasurementError, ModelError
+from pisigma.files.errors import MeasurementError, ModelError, Place
 from pisigma.measurement.camera.corner_file import MeasurementFiles, read_rows
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.joint_range import row_warnings
@@ -31,18 +31,18 @@ from pisigma.validation.setup_faults.setup_faults import is_implausible, unexpla
 from pisigma.workflow.settings.evaluation import EvaluationSettings
 
 REFERENCES = ("nominal", "geometric")
-"""Names of what a model is compared with: the robot as drawn, and the geometry under a hybrid. Neither has to meet
-limits."""
+"""Names of the models for comparison: the nominal robot, and the geometric part of a hybrid. Limits do not apply to
+them."""
 
 
 @dataclass(frozen=True)
 class EvaluatedModel:
-    """What an evaluated model is, beside its figures.
+    """An evaluated model, without its figures.
 
     Attributes:
         model: its folder, or its name.
-        kind: of model.
-        trained_on: whether the rows are those that it was made of.
+        kind: its kind.
+        trained_on: whether it was trained on the same rows.
     """
 
     model: str
@@ -52,18 +52,18 @@ class EvaluatedModel:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Models compared on the same rows.
+    """Result of `evaluate`: models compared on the same rows.
 
     Attributes:
         data: file of the rows.
-        rows: number of rows that were judged.
-        settings: how.
+        rows: number of evaluated rows.
+        settings: settings of the evaluation.
         comparison: figures of every model, with confidence intervals and differences to the first.
-        evaluated: by name in the comparison, what each model is; references are not among them.
-        missed: limits that are missed, in sentences without their ends.
-        diagnostics: why errors of a model are not those of a calibrated robot, where they are not.
-        warnings: what else should be known, in sentences.
-        seconds: that it took.
+        evaluated: the models by their names in the comparison, without the references.
+        missed: limits that are missed, as clauses without a full stop.
+        diagnostics: why errors of a model cannot be those of a calibrated robot; empty where they can.
+        warnings: further remarks, one sentence each.
+        seconds: computing time [s].
     """
 
     data: str
@@ -78,7 +78,7 @@ class Evaluation:
 
     @property
     def models(self) -> tuple[ModelFigures, ...]:
-        """Figures of every model, in the order in which they were given."""
+        """Figures of all models, in the order in which they were given."""
         return self.comparison.models
 
     @property
@@ -106,7 +106,7 @@ class Evaluation:
         return values | self._single() | {"warnings": list(self.warnings), "seconds": self.seconds}
 
     def _single(self) -> dict[str, object]:
-        """Repeat the figures of a single model beside nominal, so that programs need not search for them."""
+        """Return the figures of a single model and of nominal again at top level, where programs find them easily."""
         if len(self.models) != 2 or len(self.evaluated) != 1 or self.models[0].name != "nominal":
             return {}
         model, what = self.models[1], self.evaluated[self.models[1].name]
@@ -125,15 +125,14 @@ def evaluate(
     data: Measurements | MeasurementFiles,
     settings: EvaluationSettings | None = None,
 ) -> Evaluation:
-    """Compare models on measurements, with confidence intervals, and hold them against limits.
+    """Compare models on measurements, with confidence intervals, and check limits of acceptance.
 
     Args:
-        models: one or several folders or models, and the words "nominal" (the robot as drawn, base and tool fitted)
-            and "geometric" (what a hybrid builds upon) of the first that has it. A single model is compared with
-            nominal.
+        models: one or several models or their folders. Also the words "nominal" (the nominal robot with base and tool
+            fitted) and "geometric" (the geometric part of the first hybrid). A single model is compared with nominal.
         data: measurements, or their files, in the frames that the models were fitted in. Where rows are marked, only
-            those of the set "test" are judged.
-        settings: how. None: no limits, 2000 resamples.
+            those of the set "test" are used.
+        settings: see `EvaluationSettings`. None: no limits, 2000 resamples.
 
     Raises:
         ModelError: a folder cannot be used, or no model is given.
@@ -192,7 +191,7 @@ def evaluate(
 
 
 def test_rows(measurements: Measurements) -> Measurements:
-    """Select the rows that are marked as test; all where none is marked.
+    """Select the rows of the set "test"; all rows where there are no sets.
 
     Raises:
         MeasurementError: all rows are marked as train.
@@ -202,7 +201,10 @@ def test_rows(measurements: Measurements) -> Measurements:
     test = torch.tensor([name == "test" for name in measurements.split])
     if not test.any():
         raise MeasurementError(
-            f"{measurements.source}: column 'set' marks all rows as 'train'; mark some as 'test' or remove the column."
+            "all rows are marked as 'train'",
+            value="train",
+            at=Place(measurements.source, column="set"),
+            remedy="mark some as 'test', or remove the column",
         )
     return measurements.select(test)
 
@@ -212,7 +214,7 @@ def _text(source: ModelSource) -> str:
 
 
 def labelled(stated: Sequence[ModelSource | HoldsModel]) -> dict[str, ModelSource]:
-    """Name models for tables: by the folder's last name, or by all that was given where two have the same.
+    """Return the models by their names in tables: the last part of the folder, or the whole path where two are equal.
 
     Raises:
         ModelError: a model is given twice.
@@ -221,7 +223,7 @@ def labelled(stated: Sequence[ModelSource | HoldsModel]) -> dict[str, ModelSourc
     texts = [_text(source) for source in sources]
     twice = next((text for text in texts if texts.count(text) > 1), None)
     if twice is not None:
-        raise ModelError(f"{twice} is given twice; give every model once.")
+        raise ModelError(f"model '{twice}' is given twice", value=twice, remedy="give every model once")
     short = [text if text in REFERENCES else Path(text).resolve().name for text in texts]
     taken = [*short, *(name for name in REFERENCES if name not in texts)]
     labels = [name if taken.count(name) == 1 else text for name, text in zip(short, texts, strict=True)]
@@ -229,31 +231,44 @@ def labelled(stated: Sequence[ModelSource | HoldsModel]) -> dict[str, ModelSourc
 
 
 def load_models(sources: Mapping[str, ModelSource]) -> dict[str, CalibratedModel]:
-    """Load all models but the references."""
+    """Load all models except the references.
+
+    Raises:
+        ModelError: a folder cannot be used, or there are only references.
+    """
     loaded = {
         label: source if isinstance(source, CalibratedModel) else load_model(source)
         for label, source in sources.items()
         if source not in REFERENCES
     }
     if not loaded:
+        only = " ".join(sources)
         raise ModelError(
-            f"'{' '.join(sources)}' is not enough, as it is derived from a model; give a model folder besides (a "
-            f"folder of that name as ./{next(iter(sources), 'model')})."
+            f"expected a model folder in addition to '{only}', which is derived from a model; give one (a folder of "
+            f"that name as ./{next(iter(sources), 'model')}).",
+            value=only,
         )
     return loaded
 
 
 def with_references(
-    labels: Sequence[str], loaded: Mapping[str, CalibratedModel], turned: bool
+    labels: Sequence[str], loaded: Mapping[str, CalibratedModel], with_orientation: bool
 ) -> dict[str, CalibratedModel]:
-    """Add the references to the models, in the order in which they were given; nominal before a single one."""
+    """Add the references to the models, in the order in which they were given; nominal before a single model.
+
+    Args:
+        labels: names of models and references.
+        loaded: the models without the references.
+        with_orientation: whether orientations were measured, so that the nominal robot's tool is fitted to them.
+    """
     first = next(iter(loaded.values()))
     identified = next((model for model in loaded.values() if model.calibrated is not None), first)
     models = {}
     for label in ["nominal", *labels] if len(labels) == 1 else labels:
         model = loaded.get(label)
         if model is None:
-            model = nominal_model(first, turned) if label == "nominal" else geometric_model(identified)
+            is_nominal = label == "nominal"
+            model = nominal_model(first, with_orientation) if is_nominal else geometric_model(identified)
         models[label] = model
     return models
 
@@ -261,7 +276,7 @@ def with_references(
 def _diagnostics(
     model: CalibratedModel, figures: ModelFigures, rows: Measurements, fitted: Sequence[FrameKind]
 ) -> Iterator[Diagnostic]:
-    """Say why errors are too large to be those of a calibrated robot, or those of a base or a tool that has moved."""
+    """Return why errors are too large for a calibrated robot, or whether a moved base or tool explains them."""
     implausible = is_implausible(figures, model)
     nominal = nominal_model(model, rows.rotation is not None) if implausible else None
     found = check_rows(rows, model, fitted, nominal=nominal).implausible
@@ -275,13 +290,13 @@ def _warnings(comparison: ModelComparison) -> list[str]:
     warnings = []
     if comparison.rows_without_position:
         warnings.append(
-            f"{comparison.rows_without_position} rows hold no position, or are alone in their socket, and are not "
-            "judged."
+            f"{comparison.rows_without_position} rows were not evaluated, as they have no position or are alone in "
+            "their socket."
         )
     for model in comparison.models:
         if model.rows_not_predicted:
             warnings.append(
-                f"{model.rows_not_predicted} rows lie so far outside the domain of {model.name} that it predicts "
-                "nothing; they are left out for all models."
+                f"{model.rows_not_predicted} rows are so far outside the domain of {model.name} that it cannot predict "
+                "them; they are left out for all models."
             )
     return warnings

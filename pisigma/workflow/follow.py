@@ -1,4 +1,4 @@
-"""Follow a file of measurements while it grows: rows are judged at once, the accuracy is worked out beside."""
+"""Follow a growing file of measurements: rows are checked at once, and the accuracy is updated in the background."""
 
 import time
 from collections.abc import Iterator, Sequence
@@ -15,21 +15,21 @@ from pisigma.robot.description import Robot
 from pisigma.workflow.measure import MeasuringSession
 
 REST_SUFFIX = ".rest.csv"
-"""What is left of the plan `poses.csv` is written to `poses.rest.csv`."""
+"""Suffix of the remaining plan: that of `poses.csv` is written to `poses.rest.csv`."""
 PAUSE = 0.2
-"""[s] Between two looks at the file."""
+"""Time between two reads of the file [s]."""
 
 
 @dataclass(frozen=True, eq=False)
 class SessionStep:
-    """What is new in a session.
+    """News of a session.
 
     Attributes:
-        growth: what came to the file.
-        alarms: what is wrong with that, or with earlier rows in its light.
-        state: of the session.
-        points: accuracies that were worked out since.
-        replanned: whether other poses are left than those that are planned, or that were left before.
+        growth: new rows of the file.
+        alarms: faults of the new rows, or of earlier rows in the light of the new ones.
+        state: state of the session.
+        points: accuracies that were computed since the last step.
+        replanned: whether the remaining poses differ from the planned ones, or from those of the last step.
     """
 
     growth: Growth
@@ -40,15 +40,15 @@ class SessionStep:
 
 
 def follow(session: MeasuringSession, file: GrowingFile, once: bool = False) -> Iterator[SessionStep]:
-    """Judge what comes to a file, until the session ends.
+    """Check the rows of a growing file until the session ends.
 
     Args:
         session: the session.
-        file: the rows.
-        once: whether to judge what is there, and end.
+        file: the growing file.
+        once: whether to check only the rows that exist, and end.
 
     Yields:
-        A step for everything that is new: rows, a file that is waited for, or the accuracy; the first at once.
+        A step at the start and whenever there are new rows, a new accuracy, or a file to wait for.
 
     Raises:
         MeasurementError: the file cannot be used.
@@ -56,7 +56,7 @@ def follow(session: MeasuringSession, file: GrowingFile, once: bool = False) -> 
     if once:
         growth = file.read(final=True)
         alarms = session.add(growth.rows, growth.left_out)
-        alarms += session.work_out()
+        alarms += session.update()
         yield SessionStep(growth, alarms, session.state, session.state.reached, session.replanned)
         return
     waiting, plan, state, ending = "", session.plan, session.state, False
@@ -88,10 +88,10 @@ def follow(session: MeasuringSession, file: GrowingFile, once: bool = False) -> 
 
 
 def check_programs(programs: Sequence[Path], robot: Robot, inputs: Sequence[Path]) -> None:
-    """Make sure that programs of the poses that are left can be written.
+    """Check that programs of the remaining poses can be written.
 
     Raises:
-        OutputError: a file is no program of a language that is known, is an input, or cannot be written.
+        OutputError: a file's suffix is not that of a known language, a file is an input, or it cannot be written.
     """
     for program in programs:
         check_output(program, tuple(LANGUAGES), "a program", inputs)
@@ -99,15 +99,15 @@ def check_programs(programs: Sequence[Path], robot: Robot, inputs: Sequence[Path
 
 
 def rest_file(plan: Path, rows: Path, stated: Path | None) -> Path:
-    """Where the poses that are left are written.
+    """Return the file for the remaining poses.
 
     Args:
-        plan: the plan, by its CSV or the YAML beside it.
-        rows: the file that is followed.
-        stated: another place; None for beside the plan.
+        plan: CSV or YAML file of the plan.
+        rows: the growing file of measurements.
+        stated: file for the remaining poses. None: next to the plan.
 
     Raises:
-        OutputError: they cannot be written there.
+        OutputError: the file cannot be written.
     """
     poses = plan.with_name(plan.name.removesuffix(YAML_SUFFIX).removesuffix(".csv") + ".csv")
     rest = stated or poses.with_suffix(REST_SUFFIX)

@@ -1,15 +1,16 @@
-"""Import what instruments and controllers export as measurements."""
+"""Import exports of instruments and controllers as measurements."""
 
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from pisigma.files.errors import MeasurementError
+from pisigma.files.errors import MeasurementError, Place
 from pisigma.files.output_file import check_output, write_whole
 from pisigma.measurement.csv.reading import fields_of
 from pisigma.measurement.dataset import Measurements
-from pisigma.measurement.foreign.accounting import FileAccount, LeftOutRow, Place, account, sentences
+from pisigma.measurement.foreign import accounting
+from pisigma.measurement.foreign.accounting import FileAccount, LeftOutRow, account, sentences
 from pisigma.measurement.foreign.conversion import ConvertedRows, MeasurementTable, convert, measurement_table
 from pisigma.measurement.foreign.export_file import read_export
 from pisigma.measurement.foreign.joining import JoinedRows, append_rows, join_rows
@@ -22,11 +23,11 @@ from pisigma.workflow.settings.importing import ImportSettings
 
 @dataclass(frozen=True, eq=False)
 class ImportProposal:
-    """What the columns of exports are, before their rows are imported.
+    """Meaning of the columns of exports, before their rows are imported.
 
     Attributes:
-        mappings: of the files, in their order.
-        settings: how they are read.
+        mappings: column mappings of the files, in their order.
+        settings: settings of the import.
     """
 
     mappings: tuple[FileMapping, ...]
@@ -34,11 +35,11 @@ class ImportProposal:
 
     @property
     def is_stated(self) -> bool:
-        """Whether the caller said of every column what it is, so that there is nothing to ask."""
+        """Whether the caller stated the meaning of every column, so that there is nothing to ask."""
         return all(column.is_stated for mapping in self.mappings for column in mapping.columns)
 
     def columns_json(self) -> list[dict[str, object]]:
-        """Give the mapping of every column as plain values."""
+        """Return the mapping of every column as plain values."""
         return [
             {
                 "file": mapping.file.source,
@@ -62,13 +63,13 @@ class ImportProposal:
 
 @dataclass(frozen=True, eq=False)
 class ImportedRows:
-    """Measurements that were imported.
+    """Result of `import_rows`: imported measurements.
 
     Attributes:
-        proposal: what the columns are.
+        proposal: meaning of the columns.
         content: the measurement file.
-        accounts: of every file, what became of its rows.
-        warnings: what else should be known, each a sentence.
+        accounts: for every file, which rows were imported and which were left out.
+        warnings: further remarks, one sentence each.
     """
 
     proposal: ImportProposal
@@ -83,17 +84,17 @@ class ImportedRows:
 
     @property
     def left_out(self) -> tuple[LeftOutRow, ...]:
-        """The rows of all files that were not imported."""
+        """Rows of all files that were not imported."""
         return tuple(row for file in self.accounts for row in file.left_out)
 
     @property
     def sentences(self) -> tuple[str, ...]:
-        """What is to be said of the rows: which are left out and why, and warnings."""
+        """Rows that are left out and why, and warnings."""
         return (*sentences(self.left_out), *self.warnings)
 
     @property
     def measurements(self) -> Measurements:
-        """The measurements."""
+        """The imported measurements."""
         return Measurements.from_fields(fields_of(self.content.table))
 
     def save(self, path: str | os.PathLike[str]) -> None:
@@ -107,7 +108,7 @@ class ImportedRows:
         write_whole(Path(path), self.content.text())
 
     def to_json(self) -> dict[str, object]:
-        """Give what was read and left out as plain values."""
+        """Return what was imported and left out as plain values."""
         return {
             "rows": self.rows,
             "files": [file.to_json() for file in self.accounts],
@@ -120,14 +121,14 @@ class ImportedRows:
 def propose_import(
     files: Sequence[str | os.PathLike[str]], settings: ImportSettings | None = None
 ) -> ImportProposal:
-    """Find out what the columns of exports are; nothing is imported yet.
+    """Recognise the columns of exports, without importing their rows.
 
     Args:
-        files: one or more.
-        settings: how they are read. None: `ImportSettings()`.
+        files: one or more exports.
+        settings: see `ImportSettings`. None: the defaults.
 
     Raises:
-        MeasurementError: a file is no table of numbers, or a setting does not fit the files.
+        MeasurementError: a file is not a table of numbers, or a setting does not fit the files.
     """
     settings = settings or ImportSettings()
     units = parse_units(settings.units)
@@ -141,33 +142,33 @@ def propose_import(
 
 
 def _check_different(files: Sequence[str | os.PathLike[str]]) -> None:
-    """Refuse a file that is given twice, whose rows would count twice.
+    """Check that no file is given twice, as its rows would count twice.
 
     Raises:
-        MeasurementError: see above.
+        MeasurementError: a file is given twice.
     """
     paths = [os.path.realpath(path) for path in files]
     for number, path in enumerate(paths):
         if path in paths[:number]:
             raise MeasurementError(
-                f"{files[number]}: expected different files, got this one twice; give it once."
+                "expected different files, got this one twice", at=Place(files[number]), remedy="give it once"
             )
 
 
 def import_rows(
     files: Sequence[str | os.PathLike[str]] | ImportProposal, settings: ImportSettings | None = None
 ) -> ImportedRows:
-    """Import what instruments and controllers export as measurements.
+    """Import exports of instruments and controllers as measurements.
 
-    Numbers keep all of their digits: lengths are written in mm, angles in deg or rad as they are, rotations that are
-    neither quaternions nor RotZ(roll)·RotY(pitch)·RotX(yaw) as quaternions.
+    Numbers keep all of their digits. Lengths are written in mm, and angles in deg or rad as in the export. Rotations
+    are written as quaternions, unless they are RotZ(roll)·RotY(pitch)·RotX(yaw) already.
 
     Args:
-        files: one or more, or what `propose_import` gave.
-        settings: how they are read. None: `ImportSettings()`.
+        files: one or more exports, or the result of `propose_import`.
+        settings: see `ImportSettings`. None: the defaults.
 
     Raises:
-        MeasurementError: a unit or the way of a rotation is not stated, or rows are no measurements; the message names
+        MeasurementError: a unit or a rotation convention is not stated, or rows are not measurements. The message names
             file, line and column, and the option that helps.
     """
     proposal = files if isinstance(files, ImportProposal) else propose_import(files, settings)
@@ -176,7 +177,7 @@ def import_rows(
     content = measurement_table(rows)
     exports = [mapping.file for mapping in proposal.mappings]
     left_out = [*(row for file in exports for row in file.skipped), *content.left_out]
-    used: list[Place] = list(content.places)
+    used: list[accounting.Place] = list(content.places)
     if joined is not None:
         left_out += (*joined.unmatched, *joined.unused)
         used += joined.used
@@ -192,18 +193,25 @@ def import_rows(
 def _joined(
     converted: Sequence[tuple[FileMapping, ConvertedRows]], settings: ImportSettings
 ) -> tuple[ConvertedRows, JoinedRows | None]:
-    """All rows, and how they were joined."""
+    """Return all rows, and how they were joined; None where the files were concatenated.
+
+    Raises:
+        MeasurementError: files are to be joined, but all or none have joint values.
+    """
     if settings.join is None:
         for _, rows in converted if len(converted) > 1 else ():
-            measurement_table(rows)  # so that a fault is named with its file
+            measurement_table(rows)  # fails here with the name of the file at fault
         return append_rows([rows for _, rows in converted]), None
     joints = [rows for mapping, rows in converted if mapping.has_joints]
     measured = [rows for mapping, rows in converted if not mapping.has_joints]
     if not joints or not measured:
         missing = "without joint values" if joints else "with joint values"
         raise MeasurementError(
-            f"--join {settings.join}: a file with joint values and one without are put together, but there is none "
-            f"{missing}; give both, or name the columns with --map."
+            f"expected a file with joint values and one without, but there is none {missing}",
+            expected=f"a file {missing}",
+            value=settings.join,
+            option="--join",
+            remedy="give both, or name the columns with --map",
         )
     joined = join_rows(append_rows(measured), append_rows(joints), settings.join, settings.within)
     return joined.rows, joined

@@ -1,4 +1,4 @@
-"""Measure with a plan: rows in as they come; what is wrong with them, the next pose, and when to stop out."""
+"""Measure with a plan: takes rows as they are measured, and returns their faults, the next pose and when to stop."""
 
 import contextlib
 import os
@@ -39,27 +39,28 @@ from pisigma.robot.se3 import transform_from_xyzrpy
 from pisigma.workflow.settings.measuring import MeasureSettings
 
 STEP = 5
-"""Poses between two points of the curve."""
+"""Poses between two points of the accuracy curve."""
 
 
 class OutdatedError(Exception):
-    """Rows came that a calculation does not know."""
+    """New rows have arrived that a running calculation does not use."""
 
 
 class MeasuringSession:
     """A robot that is being measured with a plan.
 
-    `add` judges new rows at once. `work_out` looks for faults that all rows have in common, calibrates with those
-    so far and plans the rest again, which takes some seconds; `next_step` and `idle_step` give the same in short steps,
-    the most urgent one first. They may run in another thread than `add`, and what they find shows in the next `state`.
+    `add` checks new rows at once. `update` looks for faults of the setup that all rows share, calibrates with the rows
+    so far and replans the remaining poses, which takes some seconds. `next_step` and `idle_step` return the same work
+    in short steps, the most urgent one first. They may run in another thread than `add`; their results are in the next
+    `state`.
 
     Attributes:
-        plan: the poses that hold now.
-        replanned: whether they are others than those that the session began with.
+        plan: the current plan.
+        replanned: whether it differs from the plan that the session started with.
     """
 
     def __init__(self, plan: StoredPlan, settings: MeasureSettings = MeasureSettings()) -> None:
-        """Begin.
+        """Start a session.
 
         Args:
             plan: the poses, and what they were planned with.
@@ -91,23 +92,23 @@ class MeasuringSession:
     def read(
         path: str | os.PathLike[str], settings: MeasureSettings = MeasureSettings()
     ) -> "MeasuringSession":
-        """Begin with the plan in a file.
+        """Start a session with the plan in a file.
 
         Raises:
-            PlanningError: the file is no plan.
+            PlanningError: the file is not a plan.
             MeasurementError: its poses cannot be used.
         """
         return MeasuringSession(read_plan(path), settings)
 
     def add(self, rows: Measurements | None, left_out: Sequence[LeftOut] = ()) -> tuple[Alarm, ...]:
-        """Judge rows that were measured since, each by the others.
+        """Add new rows, and check every row against the others.
 
         Args:
-            rows: the rows in their order; None where there are none.
-            left_out: rows that cannot be read.
+            rows: the new rows in their order; None for none.
+            left_out: new rows that cannot be read.
 
         Returns:
-            What is wrong with them, or with earlier ones in the light of them, in the order of the file.
+            Faults of the new rows, or of earlier rows in the light of the new ones, in the order of the file.
         """
         with self._lock:
             alarms = self._judged.add(rows, left_out, self._planned, self._names)
@@ -115,20 +116,20 @@ class MeasuringSession:
 
     @property
     def is_due(self) -> bool:
-        """Whether enough rows came since the accuracy was worked out: one, as long as there is none or none is left."""
+        """Whether there are enough new rows to update the accuracy: one, before the first update and after the plan."""
         with self._lock:
             new = self._training_rows - self._worked_out
             soon = self._so_far is None or not len(self._open)
             return new >= (1 if soon else self._settings.every)
 
-    def work_out(self, progress: Progress = lambda what: None) -> tuple[Alarm, ...]:
-        """Judge all rows together, calibrate with those so far, judge that, and plan the rest again.
+    def update(self, progress: Progress = lambda what: None) -> tuple[Alarm, ...]:
+        """Check the setup, calibrate with the rows so far, cross-validate, and replan the remaining poses.
 
         Args:
-            progress: called with what is being done; what it raises ends the work.
+            progress: called with the current step. An exception that it raises ends the work.
 
         Returns:
-            What is wrong with all rows alike, where that is new.
+            New faults that all rows share.
         """
         alarms = self._calibrate(progress)
         if self._so_far is not self._ahead_of:
@@ -138,22 +139,22 @@ class MeasuringSession:
         return alarms
 
     def next_step(self) -> Callable[[], tuple[Alarm, ...]] | None:
-        """Give the most urgent part of the work, rows that are left out aside; None where that is done."""
+        """Return the most urgent step of `update`, except the cross-validation; None where all is done."""
         if self.is_due:
             return self._calibrate
         if self._so_far is not self._ahead_of:
             return self._look_ahead
         if self._rows is not None and self._looked_at < self._rows.rows:
-            return self.judge_together
+            return self.check_setup
         return None
 
     def idle_step(self) -> Callable[[], tuple[Alarm, ...]] | None:
-        """Give what is worth doing while no rows come, and ends when some do; None where that is done."""
+        """Return the cross-validation, which ends when new rows arrive; None where it is done."""
         return None if self._so_far is self._validated else self._cross_validate_idle
 
     def _calibrate(self, progress: Progress = lambda what: None) -> tuple[Alarm, ...]:
-        """Judge all rows together, and say how accurate a calibration with those so far is."""
-        alarms = self.judge_together()
+        """Check the setup, and compute the accuracy of a calibration with the rows so far."""
+        alarms = self.check_setup()
         with self._lock:
             worked_out, self._worked_out = self._worked_out, self._training_rows
             if self._rows is None or self._setup or worked_out == self._worked_out:
@@ -161,7 +162,7 @@ class MeasuringSession:
             counting, check, rows = self._counting, self._check, self._rows
         training = rows.select(counting & ~check)
         kept_apart = rows.select(counting & check) if bool((counting & check).any()) else None
-        # a session that begins with rows has the figure before its first one, too, as if it had gone on
+        # a session that starts with rows also gets the point before its first one, like an uninterrupted session
         counts = [training.rows] if self._reached else [training.rows - self._settings.every, training.rows]
         parts = [training.select(torch.arange(max(count, 0))) for count in counts]
         found = [reached(self.plan, self._before, some, kept_apart, self._task, progress) for some in parts]
@@ -171,8 +172,8 @@ class MeasuringSession:
                 self._reached += [one.point for one in found if one is not None]
         return alarms
 
-    def judge_together(self) -> tuple[Alarm, ...]:
-        """Look for a fault that all rows have in common, and say it where it is new."""
+    def check_setup(self) -> tuple[Alarm, ...]:
+        """Look for a fault of the setup that all rows share, and return it where it is new."""
         with self._lock:
             rows, usable, before = self._rows, self._judged.usable, self._setup
             counts = self._judged.judgement.counts
@@ -186,12 +187,12 @@ class MeasuringSession:
         return tuple(new)
 
     def _look_ahead(self, progress: Progress = lambda what: None) -> tuple[Alarm, ...]:
-        """Plan what is left again, and say what it would bring."""
+        """Replan the remaining poses, and compute the accuracy that they are expected to add."""
         with self._lock:
             so_far, remaining, measured = self._so_far, self._open, self.rows
         assert so_far is not None
         assert measured is not None
-        progress("planning what is left")
+        progress("planning the remaining poses")
         again = None
         if self._settings.replan:
             again = self._further.planned_again(self.plan, self._poses, so_far, measured.q, remaining)
@@ -206,7 +207,7 @@ class MeasuringSession:
         return ()
 
     def _cross_validate(self, progress: Progress = lambda what: None) -> tuple[Alarm, ...]:
-        """Judge the calibration so far by rows that are left out."""
+        """Cross-validate the calibration so far."""
         so_far = self._so_far
         assert so_far is not None
         point = cross_validated(self.plan.arm.robot, so_far, progress)
@@ -215,7 +216,7 @@ class MeasuringSession:
         return ()
 
     def _cross_validate_idle(self) -> tuple[Alarm, ...]:
-        """The same; ends without a result when rows come."""
+        """Cross-validate, and end without a result when new rows arrive."""
         judged = len(self._judged.usable)
 
         def unless_outdated(what: str) -> None:
@@ -228,12 +229,12 @@ class MeasuringSession:
 
     @property
     def rows(self) -> Measurements | None:
-        """The rows that count; None where there are none."""
+        """The rows that are used; None where there are none."""
         return None if self._rows is None else self._rows.select(self._counting)
 
     @property
     def state(self) -> SessionState:
-        """What the session has come to."""
+        """Current state of the session."""
         with self._lock:
             return self._state()
 
@@ -268,19 +269,27 @@ class MeasuringSession:
 
     @property
     def _names(self) -> list[str]:
-        """What sentences call the poses that are, or were, planned."""
+        """Names in sentences of the poses that are, or were, planned."""
         return [f"pose {number} of the plan" for number in self._numbers]
 
-    def write_rest(self, path: Path, programs: Sequence[Path] = ()) -> None:
-        """Write the poses that are left as a plan of its own, and programs; raises OutputError where that fails."""
+    def write_remaining(self, path: Path, programs: Sequence[Path] = ()) -> None:
+        """Write the remaining poses as a plan, and as robot programs.
+
+        Args:
+            path: CSV file of the plan.
+            programs: files of robot programs; not written where no poses remain.
+
+        Raises:
+            OutputError: a file cannot be written.
+        """
         with self._lock:
-            rest = self.plan.part(self._open)
-        rest.write(path)
-        for program in programs if len(rest.q) else ():
-            write_whole(program, planned_program(rest, program))
+            remaining = self.plan.part(self._open)
+        remaining.write(path)
+        for program in programs if len(remaining.q) else ():
+            write_whole(program, planned_program(remaining, program))
 
     def _adopt(self, plan: StoredPlan) -> None:
-        """Go on with another plan, whose poses keep the numbers that they had; new ones get further numbers."""
+        """Continue with another plan: known poses keep their numbers, and new ones get the next numbers."""
         is_known = (plan.q[:, None] - self._planned).abs().amax(-1) <= 1e-9
         numbers = [self._numbers[int(row.int().argmax())] if bool(row.any()) else 0 for row in is_known]
         further = counting_from(1 + max(self._numbers))
@@ -297,22 +306,22 @@ class MeasuringSession:
 
     @property
     def _rows(self) -> Measurements | None:
-        """All rows that could be read."""
+        """All readable rows."""
         return self._judged.rows
 
     @property
     def _alarms(self) -> tuple[Alarm, ...]:
-        """What is wrong with all rows, or with which."""
+        """Faults of the setup, and of single rows."""
         return (*self._setup_alarms, *self._judged.alarms)
 
     @property
     def _counting(self) -> Bool[Tensor, " rows"]:
-        """Rows that count."""
+        """Which rows are used."""
         return self._judged.counting
 
     @property
     def _check(self) -> Bool[Tensor, " rows"]:
-        """Rows that check the calibration: of the set "test"; without sets in the file, at such poses of the plan."""
+        """Rows that test the calibration: those of the set "test" or, without sets, at test poses of the plan."""
         assert self._rows is not None
         if self._rows.split is not None:
             return torch.tensor([name == "test" for name in self._rows.split])
@@ -322,9 +331,9 @@ class MeasuringSession:
 
     @property
     def _open(self) -> Int64[Tensor, " remaining"]:
-        """Poses of the plan that no row that counts was measured at, from the last one on in their order.
+        """Remaining poses of the plan, in its order and starting from the pose that was measured last.
 
-        A pose that has to be measured again comes first as long as nothing else was measured; later it comes last.
+        A pose that has to be measured again comes first until another one is measured, and last afterwards.
         """
         if self._rows is None:
             return torch.arange(len(self.plan.q))
@@ -345,7 +354,7 @@ class MeasuringSession:
         return RowsSoFar(rows.line, rows.q.numpy(), *self._judged.errors(), *flags)
 
     def _advice(self, left: int) -> Advice:
-        """Whether to go on: not while all rows are wrong; a pose to be measured again comes before anything else."""
+        """What to do next: correct a fault of the setup, else repeat a wrong row, else measure on or stop."""
         if self._setup:
             return Advice("correct", of_all_rows(self._setup).sentence)
         last = None if self._rows is None else self._rows.line[-1]

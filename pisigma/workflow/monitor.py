@@ -1,4 +1,4 @@
-"""Monitor a robot: sessions of few rows against its model, one by one and over the months."""
+"""Monitor a robot: compare sessions of few rows with its model, one by one and over the months."""
 
 import datetime
 import os
@@ -10,7 +10,7 @@ from typing import Any
 
 import torch
 
-from pisigma.files.errors import MeasurementError, ModelError
+from pisigma.files.errors import MeasurementError, ModelError, Place
 from pisigma.files.model_files import model_hash
 from pisigma.files.output_file import check_page, write_whole
 from pisigma.files.progress import Progress
@@ -53,18 +53,18 @@ from pisigma.workflow.recalibrate import may_move, right_rows
 from pisigma.workflow.settings.monitoring import MonitorSettings
 from pisigma.workflow.settings.recalibration import RecalibrationSettings
 
-FEWEST_ROWS = 5
-"""Rows of a session below which it says little."""
+MIN_ROWS = 5
+"""Number of rows of a session below which a warning is given."""
 
 
 @dataclass(frozen=True)
 class UntrustedSession:
-    """A session of which nothing is concluded, so that it is in no chart and no history.
+    """A session that must not be trusted, and is therefore in no chart and no history.
 
     Attributes:
-        file: that the rows came from.
-        date: of the measurement, as ISO 8601 writes it.
-        diagnostics: why.
+        file: file of the rows.
+        date: date of the measurement (ISO 8601).
+        diagnostics: why the session must not be trusted.
     """
 
     file: str
@@ -73,11 +73,11 @@ class UntrustedSession:
 
     @property
     def sentence(self) -> str:
-        """Which session it is, and why it is left out."""
+        """File and date of the session, and why it is left out."""
         return f"{self.file} of {self.date} is left out: {' '.join(one.sentence for one in self.diagnostics)}"
 
     def to_json(self) -> dict[str, Any]:
-        """Return it as plain values."""
+        """Return the session as plain values."""
         return {
             "file": self.file,
             "date": self.date,
@@ -87,20 +87,20 @@ class UntrustedSession:
 
 @dataclass(frozen=True, eq=False)
 class Monitoring:
-    """Sessions of a robot, and what they say over the months.
+    """Result of `monitor`: sessions of a robot, and how it changes over the months.
 
     Attributes:
-        model: that they were compared with.
-        sessions: of this call.
-        records: all sessions of the model, those of its history among them, by their dates.
-        charts: of the zeros of all joints and of the error, over all sessions.
-        trends: of the zeros of all joints.
-        jumps: of these between two sessions.
-        forecast: of the error; None where no limit was stated.
-        warnings: what to heed, a sentence each.
-        cameras: what the pixels of its files of corners mean.
-        untrusted: sessions of this call of which nothing is concluded.
-        seconds: time it took [s].
+        model: the model that the sessions were compared with.
+        sessions: sessions of this call.
+        records: all sessions of the model, including those of its history, in the order of their dates.
+        charts: control charts of the joint zeros and of the error, over all sessions.
+        trends: trends of the joint zeros.
+        jumps: jumps of the joint zeros between two sessions.
+        forecast: forecast of the error; None without a limit.
+        warnings: warnings, one sentence each.
+        cameras: cameras and boards of files of detected board corners.
+        untrusted: sessions of this call that must not be trusted.
+        seconds: computing time [s].
     """
 
     model: CalibratedModel
@@ -117,7 +117,7 @@ class Monitoring:
 
     @property
     def action(self) -> bool:
-        """Whether something is to be done: rows are implausible, recalibrating pays, or a limit is passed."""
+        """Whether action is needed: rows are implausible, recalibrating pays, or a limit is exceeded."""
         alarmed = any(chart.alarm is not None for chart in self.charts)
         passed = self.forecast is not None and self.forecast.passed
         return (
@@ -126,9 +126,9 @@ class Monitoring:
 
     @property
     def advised(self) -> Record | None:
-        """The session that a recalibration pays with: the last one, as frames and arm stand today.
+        """The last session with which a recalibration pays.
 
-        None where none pays, or where a later one that shows as many joints is as the model says.
+        None where there is none, or where a later session that observes as many joints agrees with the model.
         """
         paying = [one for one in self.sessions if one.session.recalibrate]
         if not paying:
@@ -140,7 +140,7 @@ class Monitoring:
 
     @property
     def sentences(self) -> tuple[str, ...]:
-        """What the sessions say together: alarms, clear trends, the forecast, and what to do."""
+        """Results of all sessions in sentences: alarms, clear trends, the forecast, and what to do."""
         alarms = (
             f"{'the RMS error' if chart.one_sided else chart.what} has been outside the limits "
             f"({' and '.join(chart.kinds)}) since {self.records[chart.alarm].date}."
@@ -187,7 +187,7 @@ class Monitoring:
         """Write the sessions and charts as one HTML page.
 
         Raises:
-            OutputError: the page is no .html file or cannot be written.
+            OutputError: the page is not an .html file, or cannot be written.
         """
         from pisigma.reporting.page.lifetime import monitoring_page  # matplotlib takes a second
 
@@ -202,18 +202,19 @@ def monitor(
     settings: MonitorSettings = MonitorSettings(),
     progress: Progress = lambda what: None,
 ) -> Monitoring:
-    """Say of every session whether the robot is unchanged or what moved, and chart all sessions.
+    """Find out for every session whether the robot is unchanged or what moved, and chart all sessions.
 
     Args:
-        model: of `pisigma calibrate` or `pisigma recalibrate`, or what holds it, or its folder, which has a history.
-        sessions: rows of any sensors, or their files; one with several days in the column `date` is several sessions.
+        model: model of `pisigma calibrate` or `pisigma recalibrate`, an object that contains one, or its folder. Only
+            a folder has a history.
+        sessions: rows of any sensors, or their files. Rows of several days (column `date`) are several sessions.
         settings: see `MonitorSettings`.
-        progress: called with what is being done.
+        progress: called with the current step.
 
     Raises:
-        ModelError: the folder holds no model, or the model holds no posterior, or is the prior of a fleet.
+        ModelError: the folder is not that of a model, the model has no posterior, or it is the prior of a fleet.
         MeasurementError: the rows cannot be read, or there are more or fewer dates than sessions.
-        IdentificationError: the rows do not determine where something stands.
+        IdentificationError: the rows do not determine a base or a tool.
         PoseError: the joint values do not fit the robot.
         OutputError: the history cannot be used.
     """
@@ -222,8 +223,9 @@ def monitor(
     loaded = source if isinstance(source, CalibratedModel) else load_model(source)
     if loaded.kind == FLEET_PRIOR:
         raise ModelError(
-            f"model '{loaded.name}' is what the robots of a fleet have in common, and a model of one robot was wanted; "
-            "make it with `pisigma calibrate ROBOT ROWS --prior MODEL --out DIR`."
+            f"expected the model of one robot, got the prior of a fleet, '{loaded.name}'",
+            value=loaded.name,
+            remedy="make a model with `pisigma calibrate ROBOT ROWS --prior MODEL --out DIR`",
         )
     posterior = ModelPosterior.of(loaded)
     rows = [read_rows(one, posterior.space.robot, settings.cameras) for one in sessions]
@@ -248,21 +250,21 @@ def monitor(
         judged.append(record)
         warnings += [f"{judged[-1].file}: {one}" for one in condition_warnings(loaded, day)]
         warnings += [
-            f"{place} was left out: it does not go with the other rows of its session; measure it again."
+            f"{place} was left out: it contradicts the other rows of its session; measure it again."
             for place in judged[-1].session.outliers
         ]
-        if day.rows < FEWEST_ROWS:
+        if day.rows < MIN_ROWS:
             warnings.append(
-                f"{judged[-1].file}: {day.rows} rows say little of what moved; measure {FEWEST_ROWS} poses or more."
+                f"{judged[-1].file}: {day.rows} rows show little of what moved; measure {MIN_ROWS} poses or more."
             )
     if not (judged or untrusted):
-        raise MeasurementError(f"expected new rows, got none: {' '.join(warnings)}")
+        raise MeasurementError(f"expected new rows, got none: {' '.join(warnings)}", expected="new rows")
     records = new = in_order(judged)
     if folder is not None:
         records = remember(history_path(folder), model_hash(folder), new)
         warnings += [
             f"{one.file}: its session in the history was left out: expected {WANTED}, got {one.date}; monitor its rows "
-            "again with --dates, and its date is corrected."
+            "again with --dates to correct the date."
             for one in records
             if not is_date(one.date)
         ]
@@ -283,10 +285,12 @@ def monitor(
 
 
 def _by_day(sessions: Sequence[Measurements], dates: Sequence[str]) -> list[tuple[str, Measurements]]:
-    """Every session with its day; rows of several days are several sessions."""
+    """Split sessions by day, in the order of the sessions and then of the days."""
     if dates and len(dates) != len(sessions):
         raise MeasurementError(
-            f"dates: {len(sessions)} were wanted, one for every file, but there are {len(dates)}."
+            f"expected {len(sessions)} dates, one for every file, got {len(dates)}",
+            value=len(dates),
+            option="dates",
         )
     days: list[tuple[str, Measurements]] = []
     for number, rows in enumerate(sessions):
@@ -300,14 +304,19 @@ def _by_day(sessions: Sequence[Measurements], dates: Sequence[str]) -> list[tupl
 
 
 def _date_of_file(source: str) -> str:
-    """The day in the name of a file, or that of its last change; today for rows that come from no file."""
+    """Return the day in a file's name, else that of its last modification; today for rows that are not from a file."""
     path = Path(source)
     if date := date_in_name(path.name):
         return date
     moment = path.stat().st_mtime if path.is_file() else time.time()
     date = datetime.date.fromtimestamp(moment).isoformat()
     if not is_date(date):
-        raise MeasurementError(f"{source}: expected {WANTED} as the file's change, got {date}; give --dates.")
+        raise MeasurementError(
+            expected=f"{WANTED} as the file's time of modification",
+            value=date,
+            at=Place(source),
+            remedy="give --dates",
+        )
     return date
 
 
@@ -318,7 +327,7 @@ def _record(
     date: str,
     settings: MonitorSettings,
 ) -> Record | UntrustedSession:
-    """Judge a session."""
+    """Compare a session with the model."""
     stated = RecalibrationSettings(settings.moved)
     file = Path(rows.source).name
     if implausible := check_rows(rows, model, stated.fitted, may_move(stated)).implausible:

@@ -1,4 +1,4 @@
-"""Plan which poses to measure: typed settings in, a typed plan out that writes itself as a table, and as programs."""
+"""Plan which poses to measure; a plan is written as a table, and as robot programs."""
 
 import math
 import os
@@ -15,7 +15,7 @@ from torch import Tensor
 from pisigma.deployment.export.programs.languages import LANGUAGES, check_program
 from pisigma.deployment.export.programs.planned import planned_program
 from pisigma.files.conflicts import Input
-from pisigma.files.errors import MeasurementError
+from pisigma.files.errors import MeasurementError, Place
 from pisigma.files.output_file import check_output, write_whole
 from pisigma.files.progress import Progress
 from pisigma.measurement.joint_range import row_warnings
@@ -48,31 +48,31 @@ from pisigma.validation.checks.rows.row_check import MOVES
 from pisigma.validation.gate import check_rows
 
 STEP = 10
-"""Poses between two points of the curve."""
-WEAK = 0.1
-"""Share of the variance that remains from which on what causes it is named."""
-LITTLE = 0.1
-"""Share of its range by which candidates move a joint at least, so that they stand for the workspace."""
-ROUNDS = 4
-"""So often poses that cannot be reached are replaced."""
+"""Poses between two points of the accuracy curve."""
+MIN_WEAK_SHARE = 0.1
+"""Share of the remaining variance above which its cause is named."""
+MIN_RANGE_SHARE = 0.1
+"""Share of a joint's range that the candidates have to cover in order to represent the workspace."""
+MAX_ROUNDS = 4
+"""Maximum number of times that unreachable poses are replaced."""
 
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """Poses to measure, and what is expected of them.
+    """Result of `plan`: poses to measure, and the accuracy that they are expected to give.
 
     Attributes:
-        stored: the poses in their order, and what was planned.
-        candidates: what they were chosen from.
-        curve: errors of the tool's position over the task that are expected against the number of poses; 0 poses
-            where something is known already.
-        needed: number of poses with which the limit is expected to be reached; None where there is no limit, or it
-            is not reached.
-        remaining: what the error that remains is expected to come from, the largest first.
-        travel: time that all of it takes [s].
-        warnings: what else should be known, a sentence each.
+        stored: the poses in their order, and the settings of the plan.
+        candidates: poses that they were chosen from.
+        curve: expected errors of the tool's position over the task against the number of poses, from 0 poses where
+            there are earlier measurements.
+        needed: number of poses with which the limit is expected to be reached; None without a limit, or where it is
+            not reached.
+        remaining: sources of the expected remaining error, the largest first.
+        travel: time of the measurement [s].
+        warnings: further remarks, one sentence each.
         camera: what limits a calibration with images; None without a camera.
-        seconds: time that planning took [s].
+        seconds: computing time [s].
     """
 
     stored: StoredPlan
@@ -92,16 +92,16 @@ class Plan:
 
     @property
     def checks(self) -> int:
-        """Number of poses that are measured besides."""
+        """Number of poses to test the calibration with."""
         return int(self.stored.check.sum())
 
     @property
     def weak(self) -> tuple[str, ...]:
-        """What will still be uncertain: groups of unknowns, and what each does to the expected error."""
+        """Groups of unknowns that will remain uncertain, and the contribution of each to the expected error."""
         return tuple(
             f"{error.name}: {error.rms * 1e3:.3f} mm, {100 * error.share:.0f} % of the variance"
             for error in self.remaining
-            if error.share >= WEAK
+            if error.share >= MIN_WEAK_SHARE
         )
 
     def to_json(self) -> dict[str, object]:
@@ -135,14 +135,14 @@ class Plan:
         }
 
     def save(self, path: str | os.PathLike[str], programs: Sequence[str | os.PathLike[str]] = ()) -> None:
-        """Write the poses as a CSV, the plan's YAML beside it, and programs that go to the poses.
+        """Write the poses as a CSV file, the settings as a YAML file next to it, and robot programs.
 
         Args:
             path: the CSV file.
-            programs: files of controllers, by their suffixes.
+            programs: files of robot programs, whose suffixes choose the languages.
 
         Raises:
-            OutputError: a file cannot be written, or a controller's language does not go with the robot.
+            OutputError: a file cannot be written, or a language does not support the robot.
         """
         files = [Path(program) for program in programs]
         texts = [planned_program(self.stored, file) for file in files]
@@ -154,7 +154,7 @@ class Plan:
 def check_files(
     path: Path, programs: Sequence[Path], settings: PlanSettings, robot: Robot, inputs: Sequence[Input]
 ) -> None:
-    """Make sure that a plan can be written where it is asked for: before the work.
+    """Check that a plan can be written, before it is computed.
 
     Raises:
         OutputError: see `Plan.save`.
@@ -174,22 +174,22 @@ def plan(
     cell: Cell | str | os.PathLike[str] | None = None,
     progress: Progress = lambda what: None,
 ) -> Plan:
-    """Plan which poses to measure, in which order, and say what accuracy they are expected to give.
+    """Plan which poses to measure and in which order, and predict the accuracy of a calibration with them.
 
     Args:
-        subject: the robot as drawn, or a model of it: a robot, a name of the catalogue, a robot file (YAML or URDF),
-            a model, what holds it (a `CorrectedIK`, a `Calibration`), or its folder.
-        settings: how. None: `PlanSettings()`.
-        cell: what stands around the robot, or its YAML file; None for nothing.
-        progress: called with what is being done.
+        subject: the nominal robot (a robot, a catalogue name, a robot file in YAML or URDF), or a model of it (a model,
+            an object that contains one, such as a `CorrectedIK` or a `Calibration`, or a folder).
+        settings: see `PlanSettings`. None: the defaults.
+        cell: surroundings of the robot, or their YAML file. None: no obstacles.
+        progress: called with the current step.
 
     Raises:
         RobotError: there is no such robot.
         ModelError: there is no such model.
-        MeasurementError: a file of joint values or of measurements cannot be used, or a mistake explains what was
-            measured.
-        IdentificationError: no calibration error explains what was measured.
-        PlanningError: the cell cannot be used, or allows too few poses.
+        MeasurementError: a file of joint values or of measurements cannot be used, or a fault of the setup explains
+            the measurements.
+        IdentificationError: no calibration error explains the measurements.
+        PlanningError: the cell cannot be used, or too few poses are possible in it.
     """
     started, settings = time.perf_counter(), settings or PlanSettings()
     subject = subject if isinstance(subject, Subject) else Subject.of(subject)
@@ -199,7 +199,7 @@ def plan(
     progress("candidates")
     candidates = find_candidates(settings, arm)
     candidates.check_count(settings.count + settings.check)
-    progress("what is known")
+    progress("prior knowledge")
     repeated = _check_measured(subject.model, settings, arm.robot)
     knowledge = subject.knowledge(arm, settings)
     task = task_poses(arm, settings, candidates.workspace, subject.model)
@@ -214,7 +214,13 @@ def plan(
         problem.needed(chosen, points),
         remaining_errors(knowledge.informed(candidates.q[chosen]), task),
         way.seconds,
-        (*repeated, *_warnings(way), *arm.too_thick, *problem.still_joints, *problem.view_warnings(chosen)),
+        (
+            *repeated,
+            *_warnings(way),
+            *arm.too_thick,
+            *problem.unexcited_joints,
+            *problem.view_warnings(chosen),
+        ),
         problem.prospects(chosen),
         time.perf_counter() - started,
     )
@@ -222,15 +228,15 @@ def plan(
 
 @dataclass(frozen=True, eq=False)
 class _Problem:
-    """What is planned for, where, and what is known.
+    """The planning problem: robot, cell, candidates, task and prior knowledge.
 
     Attributes:
         subject: the robot or the model.
-        settings: how.
+        settings: settings of the plan.
         arm: the robot in its cell.
         candidates: poses to choose from.
-        knowledge: before the first of them is measured.
-        task: joint values [rad or m] where the robot shall be accurate.
+        knowledge: knowledge of the unknowns before the first pose is measured.
+        task: joint values [rad or m] where the robot has to be accurate.
     """
 
     subject: Subject
@@ -242,33 +248,33 @@ class _Problem:
 
     @cached_property
     def views(self) -> BoardViews | None:
-        """From where the camera has to see its board; None without a camera."""
+        """Constraints on the views of the board; None without a camera."""
         return views_of(self.settings, self.arm)
 
     @cached_property
     def measured(self) -> Float64[Tensor, "candidates values directions"]:
-        """What measuring the candidates says; see `Knowledge.measured`."""
+        """Sensitivities of the candidates' measurements; see `Knowledge.measured`."""
         return self.knowledge.measured(self.candidates.q)
 
     @cached_property
     def tool(self) -> Float64[Tensor, "tasks 3 directions"]:
-        """How uncertain the tool is over the task; see `Knowledge.tool`."""
+        """Uncertainty of the tool's position over the task; see `Knowledge.tool`."""
         return self.knowledge.tool(self.task)
 
     @property
-    def anything_known(self) -> bool:
-        """Whether something was measured already."""
+    def has_measurements(self) -> bool:
+        """Whether there are earlier measurements."""
         return self.subject.model is not None or self.settings.measured is not None
 
     def choose(self, progress: Progress) -> tuple[Int64[Tensor, " chosen"], StoredPlan, Tour]:
-        """Choose poses to calibrate with and poses to check with, and order them.
+        """Choose poses to calibrate with and poses to test with, and order them.
 
-        Poses that no free motion leads to are replaced by others. The most useful ones come first, in stages, so that
+        Poses without a collision-free path are replaced. The most informative poses come first, in stages, so that
         measuring may end early.
         """
         q, count = self.candidates.q, self.settings.count
         free, motions = torch.arange(len(q)), Motions(self.arm, self.candidates.workspace)
-        for _ in range(ROUNDS):
+        for _ in range(MAX_ROUNDS):
             progress(f"{count} of {len(free):,} candidates")
             chosen = free[choose(self.measured[free], self.tool, count, self.settings.criterion)]
             others = free[~torch.isin(free, chosen)]
@@ -292,13 +298,13 @@ class _Problem:
         )
 
     def curve(self, chosen: Int64[Tensor, " chosen"]) -> tuple[ExpectedAccuracy, ...]:
-        """Expected accuracy against the number of poses, 0 poses where something is known already."""
-        first, count = 0 if self.anything_known else STEP, len(chosen)
+        """Return the expected accuracy against the number of poses, from 0 where there are earlier measurements."""
+        first, count = 0 if self.has_measurements else STEP, len(chosen)
         return self._curve(chosen, [*range(first, count, STEP), count])
 
     def needed(self, chosen: Int64[Tensor, " chosen"], points: Sequence[ExpectedAccuracy]) -> int | None:
-        """The least number of the chosen poses with which the limit is expected to be reached."""
-        limit = (self.settings.limit_mm or 0.0) / 1e3  # without a limit one that nothing reaches
+        """Return the smallest number of the chosen poses with which the limit is expected to be reached."""
+        limit = (self.settings.limit_mm or 0.0) / 1e3  # without a limit, 0 m, which is never reached
         reached = next((index for index, point in enumerate(points) if point.p95 <= limit), None)
         if reached is None:
             return None
@@ -311,14 +317,14 @@ class _Problem:
         return high
 
     def prospects(self, chosen: Int64[Tensor, " chosen"]) -> CameraProspects | None:
-        """What limits a calibration with the chosen images; None without a camera."""
+        """Return what limits a calibration with the chosen images; None without a camera."""
         if self.views is None:
             return None
         return CameraProspects.of(self.knowledge, self.candidates, chosen, self.task, self.views, self.arm)
 
     @property
-    def still_joints(self) -> tuple[str, ...]:
-        """Which joints hardly move among the candidates of a file, a sentence; mostly none."""
+    def unexcited_joints(self) -> tuple[str, ...]:
+        """Warning about joints that the candidates of a file hardly move; empty where there are none."""
         arm, q = self.arm, self.candidates.q
         if self.settings.candidates_from is None:
             return ()
@@ -327,7 +333,7 @@ class _Problem:
             arm.robot.axes, (values.amax(0) - values.amin(0)).tolist(), arm.limits.tolist(), strict=True
         ):
             room = min(upper - lower, 2 * math.pi) if axis.type == "revolute" else upper - lower
-            if math.isfinite(room) and moved < LITTLE * room:
+            if math.isfinite(room) and moved < MIN_RANGE_SHARE * room:
                 unit = axis.file_unit
                 still.append(
                     f"{axis.name} by {axis.in_file_unit(moved):.3g} of {axis.in_file_unit(room):.4g} {unit}"
@@ -335,12 +341,12 @@ class _Problem:
         if not still:
             return ()
         return (
-            f"The candidates move joint {', '.join(still)} only, and the expected errors are of poses like them unless "
-            "--task names others; check the units of their columns.",
+            f"The candidates move joint {', '.join(still)} only, and without --task the expected errors are those of "
+            "such poses; check the units of their columns.",
         )
 
     def view_warnings(self, chosen: Int64[Tensor, " chosen"]) -> tuple[str, ...]:
-        """Where the chosen images are too frontal or of one branch of the arm, a sentence each."""
+        """Return warnings about images that are too frontal, or of one configuration of the arm."""
         if self.views is None:
             return ()
         q = self.candidates.q[chosen]
@@ -351,24 +357,31 @@ class _Problem:
 
 
 def _check_measured(model: CalibratedModel | None, settings: PlanSettings, robot: Robot) -> tuple[str, ...]:
-    """Refuse rows that a mistake in the setup or in the file explains, and those that a model was made of already.
+    """Refuse measurements with a fault of the setup, and those that the model was made from.
 
     Returns:
-        A warning where the model may have been made of some of them.
+        Warnings, such as where the model may have been made from some of them.
 
     Raises:
-        MeasurementError: they cannot be used; the message names the mistake.
+        MeasurementError: they cannot be used; the message names the fault.
     """
     if settings.measured is None:
         return ()
     rows = read_planned_rows(settings, settings.measured, robot).split_sets()[0]
     against = robot if model is None else model
     if implausible := check_rows(rows, against, may_move=MOVES).implausible:
-        raise MeasurementError(f"{settings.measured}: {implausible[0].sentence}")
+        raise MeasurementError(
+            f"{settings.measured}: {implausible[0].sentence}",
+            at=Place(settings.measured),
+            option="--measured",
+        )
     if model is not None and bool(known_rows(model, rows).all()):
         raise MeasurementError(
-            f"{settings.measured}: rows that model '{model.name}' does not know yet were wanted; it was made of these, "
-            "and they would count twice. Plan with the model alone."
+            f"expected rows that model '{model.name}' was not made from, as these would count twice",
+            value=model.name,
+            at=Place(settings.measured),
+            option="--measured",
+            remedy="plan with the model alone",
         )
     twice = "they count twice, and the expected errors are too small"
     known = () if model is None else training_row_warnings(model, rows, consequence=twice)
@@ -376,8 +389,8 @@ def _check_measured(model: CalibratedModel | None, settings: PlanSettings, robot
 
 
 def _warnings(way: Tour) -> tuple[str, ...]:
-    """What else should be known of a plan."""
+    """Return a warning about poses without a collision-free path; empty where there are none."""
     if not len(way.left_out):
         return ()
-    left_out = f"{len(way.left_out)} poses were left out, as no motion that touches nothing leads to them"
+    left_out = f"{len(way.left_out)} poses were left out, as there is no collision-free path to them"
     return (f"{left_out}; give more candidates.",)

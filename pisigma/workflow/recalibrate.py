@@ -1,4 +1,4 @@
-"""Recalibrate a model with few new rows: typed settings in, a typed result out that writes itself as a model folder."""
+"""Recalibrate a model with few new rows."""
 
 import datetime
 import math
@@ -58,24 +58,24 @@ from pisigma.workflow.settings.recalibration import RecalibrationSettings
 if TYPE_CHECKING:
     from pisigma.lifetime.fleet.prior import Likeness
 
-FEW_ROWS = 5
-"""Different poses below which nothing can be said of left-out rows."""
-UNBELIEVABLE = "What has moved cannot be said: the recalibrated model does not predict left-out rows."
-NOT_TRUSTED = "What has moved cannot be said: these rows must not be trusted."
+MIN_ROWS = 5
+"""Number of held-out rows below which a warning is given."""
+UNBELIEVABLE = "What has moved is unknown: the recalibrated model does not predict held-out rows."
+NOT_TRUSTED = "What has moved is unknown: these rows must not be trusted."
 
 
 @dataclass(frozen=True, eq=False)
 class Recalibration(AbstractModelResult):
-    """A model after new rows: the candidate that predicts left-out rows best.
+    """Result of `recalibrate`: the candidate that predicts held-out rows best.
 
     Attributes:
-        model: what `pisigma.load` would read, with all figures as its metrics.
+        model: the recalibrated model, with all figures as its metrics, as `pisigma.load` would read it.
         parent: the model that the rows were added to.
-        adaptation: of the parent to all rows.
-        gate: the errors of left-out rows under every candidate.
-        moved: what has moved clearly.
+        adaptation: adaptation of the parent to all rows.
+        gate: errors of held-out rows under every candidate.
+        moved: what has moved significantly.
         summary: all figures.
-        seconds: time it took [s].
+        seconds: computing time [s].
     """
 
     model: CalibratedModel
@@ -88,7 +88,7 @@ class Recalibration(AbstractModelResult):
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """What to heed, a sentence each."""
+        """Warnings, one sentence each."""
         return self.summary.warnings
 
     def _describe(self, model: CalibratedModel, summary: RecalibrationSummary, folder: Path) -> None:
@@ -102,20 +102,26 @@ def recalibrate(
     progress: Progress = lambda what: None,
     drawn: Robot | None = None,
 ) -> Recalibration:
-    """Add new rows to what a model knows, and keep whichever model predicts left-out rows best.
+    """Update a model with new rows, and keep the candidate that predicts held-out rows best.
+
+    The candidates are the old model, the model updated with the rows, and a calibration from scratch.
 
     Args:
-        model: of `pisigma calibrate`, `pisigma recalibrate` or `pisigma fleet prior`, or what holds it (a
-            `CorrectedIK`, a `Calibration`), or its folder.
-        data: new rows of any sensors, or CSV files of them; those of the set "test" are left out.
+        model: model of `pisigma calibrate`, `pisigma recalibrate` or `pisigma fleet prior`, an object that contains one
+            (a `CorrectedIK`, a `Calibration`), or its folder.
+        data: new rows of any sensors, or CSV files of them. Rows of the set "test" are not used.
         settings: see `RecalibrationSettings`.
-        progress: called with what is being done.
-        drawn: the robot whose fleet the model has to be the prior of; None for any model.
+        progress: called with the current step.
+        drawn: nominal robot; the model then has to be the prior of its fleet. None: any model.
+
+    Returns:
+        The kept model with its figures; `save` writes it as a model folder.
 
     Raises:
-        ModelError: the folder holds no model, it is of another robot or no fleet prior, or holds no posterior.
+        ModelError: the folder is not that of a model, or the model is of another robot, has no posterior, or is not
+            the prior of a fleet although `drawn` is given.
         MeasurementError: the data cannot be read.
-        IdentificationError: the rows do not determine where something stands.
+        IdentificationError: the rows do not determine a base or a tool.
         PoseError: the joint values do not fit the robot.
     """
     started = time.perf_counter()
@@ -127,8 +133,10 @@ def recalibrate(
     posterior = ModelPosterior.of(parent)
     if drawn is not None and not np.array_equal(drawn.dh, posterior.space.robot.dh):
         raise ModelError(
-            f"model '{parent.name}' is of robot '{posterior.space.robot.name}' and not of '{drawn.name}'; choose the "
-            "model of this robot."
+            f"expected a model of robot '{drawn.name}', got model '{parent.name}' of robot "
+            f"'{posterior.space.robot.name}'",
+            value=parent.name,
+            remedy="choose a model of this robot",
         )
     drawn = posterior.space.robot
     measurements = read_rows(data, drawn, settings.cameras)
@@ -175,7 +183,7 @@ def _adapted(
     elsewhere: frozenset[Owner],
     far: Sequence[int],
 ) -> tuple[Measurements, Adaptation, tuple[WrongRowFigures, ...]]:
-    """The rows that are not wrong, the model adapted to them, and the wrong ones, those that are far off among them."""
+    """Return the rows without wrong ones, the model adapted to them, and the wrong rows including `far`."""
     left = [row for row in range(rows.rows) if row not in far]
     right = rows.select(torch.tensor(left)) if far else rows
     adaptation = adapt(recalibration_problem(parent, posterior, right, elsewhere), posterior.noise)
@@ -195,12 +203,15 @@ def _kept(
     calibrator: HybridCalibrator,
     progress: Progress,
 ) -> tuple[Gate, CalibratedModel]:
-    """The candidate that is kept, and its model; of a robot unlike its fleet the calibration from scratch."""
+    """Return the candidate that is kept, and its model.
+
+    A robot unlike its fleet keeps the calibration from scratch, if its rows are enough for one.
+    """
     if odd:
         alone = replace(judged, kept="scratch")
         try:
             return alone, _kept_model(alone, parent, adaptation, rows, calibrator, progress)
-        except IdentificationError:  # the rows are too few for it
+        except IdentificationError:  # too few rows
             judged = judged.with_least_error
     return judged, _kept_model(judged, parent, adaptation, rows, calibrator, progress)
 
@@ -213,7 +224,7 @@ def _kept_model(
     calibrator: HybridCalibrator,
     progress: Progress,
 ) -> CalibratedModel:
-    """The model of the candidate that is kept."""
+    """Return the model of the candidate that is kept."""
     if judged.kept == "scratch":
         fitted = fit_where_it_helps if judged.rms["scratch"] is None else fit
         result = fitted(calibrator, rows, progress)
@@ -227,7 +238,7 @@ def _kept_model(
 def _outliers(
     adaptation: Adaptation, rows: Measurements, wrong: Sequence[int]
 ) -> tuple[WrongRowFigures, ...]:
-    """The rows that were left out, and how far they are off what the others say."""
+    """Return the rows that were left out as wrong, with their residuals under the others' calibration."""
     errors = errors_under(adaptation, rows)
     sizes = {"residual_mm": (errors.position, 1e3), "residual_deg": (errors.rotation, math.degrees(1.0))}
     outliers = []
@@ -242,7 +253,7 @@ def _outliers(
 
 
 def _believable(judged: Gate, robot: Robot) -> bool:
-    """Whether the recalibrated model predicts left-out rows so well that what it says of the arm may be true."""
+    """Whether the recalibrated model predicts held-out rows well enough for its changes of the arm to be credible."""
     error, kept = judged.rms["recalibrated"], judged.rms[judged.kept]
     if error is None or kept is None:
         return not judged.rows
@@ -256,7 +267,7 @@ def _summary(
     judged: Gate,
     moved: tuple[Movement, ...] | None,
 ) -> RecalibrationSummary:
-    """All figures; `moved` is None where nothing can be said of it."""
+    """Return all figures; `moved` is None where it is unknown."""
     return RecalibrationSummary(
         command=f"pisigma.recalibrate({parent.name!r}, {rows.file_names!r})",
         parent=ParentFigures(name=parent.name, kind=parent.kind, sha256=""),
@@ -279,10 +290,10 @@ def _summary(
 
 
 def _likeness(model: CalibratedModel, rows: Measurements) -> "Likeness | None":
-    """How like its fleet the robot of some rows is; None where the model is not the prior of a fleet."""
+    """Return how similar the robot of the rows is to its fleet; None where the model is not the prior of a fleet."""
     if model.kind != FLEET_PRIOR:
         return None
-    from pisigma.lifetime.fleet.prior import Likeness  # brings statistics that take half a second
+    from pisigma.lifetime.fleet.prior import Likeness  # imports statistics, which takes half a second
 
     return Likeness.of(model, rows)
 
@@ -290,9 +301,9 @@ def _likeness(model: CalibratedModel, rows: Measurements) -> "Likeness | None":
 def _elsewhere(
     model: CalibratedModel, posterior: ModelPosterior, rows: Measurements, settings: RecalibrationSettings
 ) -> frozenset[Owner]:
-    """Bases and tools that stand elsewhere: those of the rows that are stated to, or what the evidence says.
+    """Return the bases and tools that have moved: those that are stated to, or else those that the evidence shows.
 
-    Every robot of a fleet has its own.
+    With the prior of a fleet, all of them: every robot has its own base and tool.
     """
     if model.kind == FLEET_PRIOR:
         return owners_in(rows, ("base", "tool"))
@@ -302,25 +313,25 @@ def _elsewhere(
 
 
 def _warnings(model: CalibratedModel, judged: Gate, rows: Measurements) -> tuple[str, ...]:
-    """What to heed, a sentence each."""
+    """Return warnings, one sentence each."""
     warnings = [*row_warnings(model.robot, rows), *condition_warnings(model, rows)]
-    if judged.rows < FEW_ROWS:
+    if judged.rows < MIN_ROWS:
         warnings.append(
-            f"Only {judged.rows} of {rows.rows} rows could be left out and predicted, which says little of the "
-            f"candidates; measure {2 * FEW_ROWS} poses or more."
+            f"Only {judged.rows} of {rows.rows} rows could be held out and predicted, too few to compare the "
+            f"candidates; measure {2 * MIN_ROWS} poses or more."
         )
     return tuple(warnings)
 
 
 def may_move(settings: RecalibrationSettings) -> frozenset[Move]:
-    """What may have moved without being stated: a joint, and base and tool where nothing is stated of them."""
+    """Return what may have moved without being stated: a joint zero, and base and tool where `moved` is None."""
     return MOVES if settings.moved is None else frozenset({"joint_zero"})
 
 
 def right_rows(
     settings: RecalibrationSettings, model: CalibratedModel, rows: Measurements
 ) -> WithoutWrongRows:
-    """The rows without single ones that are wrong, wherever base and tool may stand by now."""
+    """Return the rows without single wrong ones, also with base and tool fitted where these may have moved."""
     right = without_wrong_rows([model], rows, settings.fitted)
     if right.warnings or settings.moved is not None:
         return right

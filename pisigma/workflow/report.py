@@ -26,13 +26,13 @@ from pisigma.validation.held_out.diagnostic import Diagnostic
 
 @dataclass(frozen=True, eq=False)
 class Report:
-    """A report on a calibration: what it says, and its figures.
+    """Result of `report`: text and figures of a report on a calibration.
 
     Attributes:
-        content: figures and sentences.
-        figures: drawings of them.
-        diagnostics: why nothing is to be concluded from the rows; see `pisigma.validation.gate`.
-        seconds: that it took.
+        content: numbers and sentences.
+        figures: drawn figures.
+        diagnostics: why the rows must not be trusted; see `pisigma.validation.gate`.
+        seconds: computing time [s].
     """
 
     content: ReportContent
@@ -42,22 +42,22 @@ class Report:
 
     @property
     def verdict(self) -> str:
-        """How accurate the model is, how much better than nominal, where it is worst and what limits it."""
+        """Accuracy of the model, its improvement over nominal, where it is worst and what limits it, in a sentence."""
         return self.content.verdict.sentence
 
     def to_json(self) -> dict[str, Any]:
-        """Return figures and sentences as plain values, without single rows."""
+        """Return numbers and sentences as plain values, without the single rows."""
         diagnostics = [one.model_dump() for one in self.diagnostics]
         return self.content.to_json() | {"diagnostics": diagnostics, "seconds": self.seconds}
 
     def save(
         self, page: str | os.PathLike[str], figures: str | os.PathLike[str] | None = None
     ) -> tuple[Path, ...]:
-        """Write the page, and every figure as PNG and SVG into a folder where one is named.
+        """Write the page and, if a folder is given, every figure as PNG and SVG.
 
         Args:
             page: file of the page (.html); replaced whole or not at all.
-            figures: folder, made where missing.
+            figures: folder of the figures, created if missing.
 
         Returns:
             The files of the figures.
@@ -75,15 +75,15 @@ def check_report_outputs(
     figures: str | os.PathLike[str] | None = None,
     inputs: Sequence[Input] = (),
 ) -> None:
-    """Make sure that a report may be written: before the work, not after it.
+    """Check that a report can be written, before it is computed.
 
     Args:
         page: file of the page.
-        figures: folder of the figures, if they are wanted.
+        figures: folder of the figures; None for no files of figures.
         inputs: files and folders that are read.
 
     Raises:
-        OutputError: the page is no .html file, a file or folder cannot be written, or lies in an input or a model.
+        OutputError: the page is not an .html file, or an output cannot be written or is inside an input or a model.
     """
     check_output(Path(page), (".html", ".htm"), "a report", inputs)
     if figures is not None:
@@ -96,21 +96,21 @@ def report(
     progress: Progress = lambda what: None,
     cameras: CameraFiles | None = None,
 ) -> Report:
-    """Work out a report on a calibration: how accurate, where worst, what limits it, what to measure next.
+    """Report on a calibration: its accuracy, where it is worst, what limits it and what to measure next.
 
     Args:
         model: folder of the model.
-        data: rows to judge it on, or their file, in the frame that the model was fitted in. None: the held-out rows
-            that the folder keeps.
-        progress: called with what is being done.
-        cameras: what the pixels mean where the rows are corners of boards in images.
+        data: rows to evaluate it on, or their file, in the frame that the model was fitted in. None: the held-out rows
+            of the folder.
+        progress: called with the current step.
+        cameras: cameras and boards, for files of detected board corners.
 
     Raises:
         ModelError: the folder cannot be used.
-        MeasurementError: the rows cannot be judged.
+        MeasurementError: the model cannot be evaluated on the rows.
     """
     begin, loaded = time.perf_counter(), load_model(model)
-    progress("judging rows")
+    progress("evaluating rows")
     rows: Measurements | None = None
     remarks: tuple[str, ...] = ()
     diagnostics: tuple[Diagnostic, ...] = ()
@@ -124,7 +124,7 @@ def report(
 
 
 def _right_rows(model: CalibratedModel, rows: Measurements) -> tuple[Measurements, tuple[str, ...]]:
-    """Rows without single ones that are wrong, unless the model was made of just these, and what to heed."""
+    """Return the rows without single wrong ones, unless the model was made from exactly these, and warnings."""
     remarks = limit_warnings(model.robot, rows)
     if model.provenance.data_sha256 == rows.content_hash():
         return rows, remarks

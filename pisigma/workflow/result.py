@@ -1,4 +1,4 @@
-"""What the results that hold a model have in common: they are JSON, and write themselves as model folders."""
+"""Base of the results that contain a model: conversion to JSON, and writing of the model folder."""
 
 import os
 from abc import ABC, abstractmethod
@@ -6,7 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from pisigma.files.errors import AcceptanceError, printable
+from pisigma.files.errors import AcceptanceError, Place, printable
 from pisigma.files.output_folder import staged_folder
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.inverse.written_model import write_model
@@ -15,12 +15,12 @@ from pisigma.validation.held_out.summary import AbstractSummary
 
 
 class AbstractModelResult(ABC):
-    """A model with all figures of it.
+    """A model with all of its figures.
 
     Attributes:
-        model: what `pisigma.load` would read, with all figures as its metrics.
+        model: the model, with all figures as its metrics, as `pisigma.load` would read it.
         summary: the figures.
-        seconds: time it took [s].
+        seconds: computing time [s].
     """
 
     model: CalibratedModel
@@ -28,12 +28,12 @@ class AbstractModelResult(ABC):
     seconds: float
 
     def to_json(self) -> dict[str, Any]:
-        """Give all figures as JSON values, in mm and deg."""
+        """Return all figures as JSON values, in mm and deg."""
         return {"seconds": round(self.seconds, 3), **self.summary.to_json()}
 
     @property
     def diagnostics(self) -> tuple[Diagnostic, ...]:
-        """What is wrong with the result, those first that make it implausible."""
+        """Faults of the result, first those that make it implausible."""
         return self.summary.diagnostics
 
     @property
@@ -52,24 +52,26 @@ class AbstractModelResult(ABC):
         """Write the model folder with card and figures, whole or not at all.
 
         Args:
-            folder: to write.
-            name: of the model; None for the name of the folder.
-            command: what made the model, for the card; None for the call.
-            accept_implausible: write also what a check found implausible; the card says why.
-            overwrite: whether a model that is there may be replaced.
+            folder: folder to write.
+            name: name of the model. None: the name of the folder.
+            command: command that made the model, for the card. None: the Python call.
+            accept_implausible: also write a result that a check found implausible; the card says why.
+            overwrite: whether to replace an existing model.
 
         Returns:
             The model as written.
 
         Raises:
             AcceptanceError: a check found the result implausible.
-            OutputError: the folder holds a model and is not to be overwritten, it is none of ours (see
-                `pisigma.files.output_folder.check_folder`), or it cannot be written.
+            OutputError: the folder contains a model and `overwrite` is False, contains something else (see
+                `pisigma.files.output_folder.check_folder`), or cannot be written.
         """
         if not (self.trusted or accept_implausible):
             raise AcceptanceError(
-                f"{folder} was not written, because the result must not be trusted; correct what the diagnostics "
-                "name, or accept implausible results explicitly (accept_implausible, --accept-implausible)."
+                "the result must not be trusted and was not written",
+                at=Place(folder),
+                remedy="correct what the diagnostics name, or accept implausible results explicitly "
+                "(accept_implausible, --accept-implausible)",
             )
         summary = self.summary.having(command=command)
         name = printable(name or Path(folder).resolve().name, cut=False)
@@ -81,4 +83,4 @@ class AbstractModelResult(ABC):
 
     @abstractmethod
     def _describe(self, model: CalibratedModel, summary: Any, folder: Path) -> None:
-        """Write card, figures and tables beside the model."""
+        """Write card, figures and tables into the model folder."""

@@ -1,4 +1,4 @@
-"""Poses drawn in a region and solved by a calibrated model: what its distilled form learns from."""
+"""Random poses in a region with the inverse kinematics solutions of a calibrated model: training data to distil it."""
 
 from dataclasses import dataclass
 
@@ -18,16 +18,16 @@ from pisigma.robot.kinematics.tolerances import LIMIT_TOLERANCE
 from pisigma.robot.se3 import wrap_to_pi
 
 SINGULAR_BELOW = 0.05
-"""Poses whose nominal `singularity_measure` is below this are not drawn: corrections are steep there."""
+"""Nominal `singularity_measure` below which poses are refused: corrections are steep there."""
 
-CHUNK = 2_000
+POSES_PER_CHUNK = 2_000
 """Poses solved between two reports of progress."""
 
-TRIES = 20
-"""So many poses are drawn for one that the robot takes; a region where that is not enough is refused."""
+MAX_TRIES = 20
+"""Number of random poses per reachable one above which a region is refused."""
 
-_MOVED = 0.05
-"""[rad or m] The nominal solution of a drawn pose lies this near to the joint values drawn, or on another branch."""
+_SAME_BRANCH = 0.05
+"""Largest distance [rad or m] of a pose's nominal solution from the joint values drawn; beyond, it is another branch."""
 
 Box = tuple[float, float, float, float, float, float]
 """x_min, x_max, y_min, y_max, z_min, z_max [m] in the base frame."""
@@ -35,12 +35,11 @@ Box = tuple[float, float, float, float, float, float]
 
 @dataclass(frozen=True, eq=False)
 class Region:
-    """Where poses are drawn.
+    """Region in which poses are drawn.
 
     Attributes:
-        q: joint values [rad or m] around which they are drawn: between a row and its neighbours.
-        box: bounds of the tool's position, orientations still being those at joint values around `q`; None where the
-            joint values alone say it.
+        q: joint values [rad or m]; poses are drawn between a row and its neighbours.
+        box: bounds of the tool's position, with orientations of joint values around `q`. None: no bounds.
     """
 
     q: Float64[Tensor, "rows dof"]
@@ -49,16 +48,16 @@ class Region:
 
 @dataclass(frozen=True, eq=False)
 class SolvedPoses:
-    """Poses with the full solution of a model.
+    """Poses with the full inverse kinematics solution of a model.
 
     Attributes:
         T: poses T_base_tool.
         q_nominal: joint values of the nominal robot [rad or m].
-        correction: what the full solution adds to them [rad or m].
+        correction: correction of these by the full solution [rad or m].
         branch: index of the branch of every pose.
-        status: of the full solution: REACHED, or OUTSIDE_DOMAIN beyond the joint values that were measured.
-        drawn: how many poses were drawn for them.
-        refused: why the other ones were not taken, and how many for each reason.
+        status: status of the full solution, REACHED, or OUTSIDE_DOMAIN beyond the measured joint values.
+        drawn: number of poses that were drawn.
+        refused: number of poses that were refused, by reason.
     """
 
     T: Float64[Tensor, "poses 4 4"]
@@ -70,7 +69,7 @@ class SolvedPoses:
     refused: dict[str, int]
 
     def select(self, rows: slice) -> "SolvedPoses":
-        """Give some of the poses; the counts stay those of all."""
+        """Select some of the poses; `drawn` and `refused` remain those of all."""
         T, q_nominal, correction = self.T[rows], self.q_nominal[rows], self.correction[rows]
         return SolvedPoses(
             T, q_nominal, correction, self.branch[rows], self.status[rows], self.drawn, self.refused
@@ -84,29 +83,29 @@ def draw_solved_poses(
     generator: torch.Generator,
     progress: Progress = lambda what: None,
 ) -> SolvedPoses:
-    """Draw poses until as many as wanted could be solved.
+    """Draw poses until enough of them are solved.
 
     Args:
-        ik: of the model.
-        region: where.
-        count: how many are wanted.
-        generator: draws them.
-        progress: called with what is being done.
+        ik: corrected inverse kinematics of the model.
+        region: region of the poses.
+        count: number of solved poses.
+        generator: random generator.
+        progress: called with the number of solved poses.
 
     Raises:
-        IdentificationError: the robot takes too few of the poses of the region; the message says why not.
+        IdentificationError: the robot reaches too few poses of the region; the message says why.
     """
     kept: list[tuple[Tensor, ...]] = []
     refused: dict[str, int] = {}
     drawn = have = 0
     while have < count:
-        some = min(CHUNK, 2 * count)
+        some = min(POSES_PER_CHUNK, 2 * count)
         parts, reasons = _solve(ik, region, some, generator)
         kept.append(parts)
         drawn, have = drawn + some, have + len(parts[0])
         refused = {name: refused.get(name, 0) + number for name, number in reasons.items()}
-        if TRIES * have < drawn:
-            raise IdentificationError(_complaint(ik, region, have, drawn, refused))
+        if MAX_TRIES * have < drawn:
+            raise _too_few(ik, region, have, drawn, refused)
         progress(f"{min(have, count)} of {count} poses solved")
     T, q_nominal, correction, branch, status = (torch.cat(part)[:count] for part in zip(*kept, strict=True))
     return SolvedPoses(T, q_nominal, correction, branch, status, drawn, refused)
@@ -115,10 +114,10 @@ def draw_solved_poses(
 def draw_between(
     robot: Robot, q: Float64[Tensor, "rows dof"], count: int, generator: torch.Generator
 ) -> Float64[Tensor, "drawn dof"]:
-    """Joint values between a row of q and rows near it: their mean with random weights.
+    """Draw joint values between a row of q and its neighbours, as means with random weights.
 
-    Neighbours are as many of the nearest as the robot has joints, drawn from twice as many; a joint that turns is
-    compared, and followed, the short way round.
+    The neighbours are `dof` rows, drawn from the 2 `dof` nearest ones. Revolute joints are compared and interpolated
+    the short way round.
     """
     first = torch.randint(len(q), (count,), generator=generator)
     nearby = min(2 * robot.dof, len(q) - 1)
@@ -141,7 +140,7 @@ def draw_between(
 def _solve(
     ik: CorrectedIK, region: Region, count: int, generator: torch.Generator
 ) -> tuple[tuple[Tensor, ...], dict[str, int]]:
-    """Some poses with their solutions, and why others were refused."""
+    """Draw `count` poses, and return the solved ones and how many were refused for which reason."""
     robot = ik.model.robot
     q = draw_between(robot, region.q, count, generator)
     T = forward_kinematics(robot, q)
@@ -156,7 +155,7 @@ def _solve(
     safe = torch.where(lost[:, None], q, nominal)
     limits = torch.from_numpy(robot.limits)
     outside = (safe < limits[:, 0] - LIMIT_TOLERANCE) | (safe > limits[:, 1] + LIMIT_TOLERANCE)
-    away = (safe - q).abs().amax(-1) > _MOVED if region.box is None else torch.zeros_like(lost)
+    away = (safe - q).abs().amax(-1) > _SAME_BRANCH if region.box is None else torch.zeros_like(lost)
     reasons = {
         "unreachable": lost,
         "outside the joint limits": outside.any(-1) | (solution.status == Status.OUTSIDE_JOINT_LIMITS),
@@ -172,14 +171,18 @@ def _solve(
     return tuple(part[good] for part in parts), counts
 
 
-def _complaint(ik: CorrectedIK, region: Region, have: int, drawn: int, refused: dict[str, int]) -> str:
-    """Say that the region is not one for the robot."""
+def _too_few(
+    ik: CorrectedIK, region: Region, have: int, drawn: int, refused: dict[str, int]
+) -> IdentificationError:
+    """Return the error that the robot reaches too few poses of the region."""
     reasons = ", ".join(f"{number} {name}" for name, number in refused.items() if number)
     where = "around the stated joint values"
     if region.box is not None:
         low, high = (", ".join(f"{value * 1e3:g}" for value in region.box[i::2]) for i in (0, 1))
         where = f"between ({low}) and ({high}) mm"
-    return (
-        f"of {drawn} poses drawn {where} robot '{ik.model.robot.name}' takes only {have} ({reasons}); choose a region "
-        "that it reaches, in the base frame of the model, with the orientations of the measured poses."
+    return IdentificationError(
+        f"robot '{ik.model.robot.name}' reaches only {have} of {drawn} poses drawn {where} ({reasons})",
+        value={name: number for name, number in refused.items() if number},
+        remedy="choose a region that it reaches, in the base frame of the model, with the orientations of the measured "
+        "poses",
     )

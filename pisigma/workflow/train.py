@@ -1,4 +1,4 @@
-"""Train the model of a recipe, its networks too: settings in, a result out that writes itself as a model folder."""
+"""Train the model of a recipe."""
 
 import os
 import time
@@ -50,14 +50,14 @@ from pisigma.workflow.settings.training import TrainSettings
 
 @dataclass(frozen=True, eq=False)
 class InverseTraining(AbstractModelResult):
-    """Networks on nominal joint values, trained and judged.
+    """Result of `train` for an inverse calibration: networks on nominal joint values, and their validation.
 
     Attributes:
-        model: what `pisigma.load` would read, with all figures as its metrics.
-        recipe: what was trained.
-        run: what training gave: history, pairs, joint errors.
+        model: the trained model, with all figures as its metrics, as `pisigma.load` would read it.
+        recipe: the recipe.
+        run: history, training pairs and joint errors of the training.
         summary: all figures.
-        seconds: time it took [s].
+        seconds: computing time [s].
     """
 
     model: CalibratedModel
@@ -68,17 +68,17 @@ class InverseTraining(AbstractModelResult):
 
     @property
     def validation(self) -> ComparisonFigures | None:
-        """Errors of rows under trainings without them, for measured data; None for simulated ones."""
+        """Errors of held-out rows in the cross-validation of measured data; None for simulated data."""
         return self.summary.cross_validation
 
     @property
     def test(self) -> ComparisonFigures | None:
-        """Errors of the rows that the data mark as test; None without such rows."""
+        """Errors of the rows of the set "test"; None without such rows."""
         return self.summary.test
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """What to heed, a sentence each."""
+        """Warnings, one sentence each."""
         rows = self.summary.rows
         return (f"{rows.left_out} rows were left out of the training: {rows.rule}.",) if rows.rule else ()
 
@@ -96,22 +96,22 @@ def train(
     settings: TrainSettings = TrainSettings(),
     progress: Progress = lambda what: None,
 ) -> Training:
-    """Train the model of a recipe, and judge it on rows that it did not see.
+    """Train the model of a recipe, and validate it on held-out rows.
 
     Args:
-        recipe: of whatever kind, or its file.
-        data: measured data or a CSV file of them, for a recipe that asks for them.
+        recipe: a recipe of any kind, or its file.
+        data: measurements or their CSV file, for a recipe that uses measured data.
         settings: see `TrainSettings`.
-        progress: called with what is being done.
+        progress: called with the current step.
 
     Returns:
         `InverseTraining` for a recipe of inverse calibration, else a `Calibration`.
 
     Raises:
-        RecipeError: the recipe cannot be read, or has no use for data or settings.
+        RecipeError: the recipe cannot be read, or does not use `data` or `settings`.
         RobotError: its robot cannot be used.
         MeasurementError: the data cannot be used.
-        IdentificationError: the data do not determine what is asked for.
+        IdentificationError: the data do not determine the free parameters.
         TrainingError: the training diverged, or there is no checkpoint of this recipe and data to resume.
         OutputError: checkpoints cannot be written.
     """
@@ -132,13 +132,16 @@ def train(
 
 
 def _call(recipe: Recipe) -> str:
-    """The call that gives such a training again, for the card."""
+    """Return the call that repeats the training, for the card."""
     return f"pisigma.train({recipe.name!r})"
 
 
 def _refuse_resume(recipe: Recipe) -> None:
     raise RecipeError(
-        f"recipe '{recipe.name}': a recipe of kind {recipe.kind} has no use for --resume; leave it out."
+        f"a recipe of kind {recipe.kind} ('{recipe.name}') cannot be resumed",
+        value=recipe.kind,
+        option="--resume",
+        remedy="leave it out",
     )
 
 
@@ -232,16 +235,16 @@ def train_networks(
     settings: TrainSettings = TrainSettings(),
     recipe_sha256: str = "",
 ) -> TrainingRun:
-    """Train the networks of a recipe, without judging them.
+    """Train the networks of a recipe, without validating them.
 
     Args:
         recipe: the recipe.
         data: its robot and rows.
         settings: checkpoints, progress and logs.
-        recipe_sha256: of the recipe file, for provenance.
+        recipe_sha256: SHA-256 of the recipe file, for provenance.
 
     Raises:
-        PisigmaError: the data or the recipe do not allow it; the message says what to do.
+        PisigmaError: the data or the recipe cannot be used; the message says what to do.
     """
     from pisigma.network.networks import fit_networks  # imports lightning, which takes seconds
     from pisigma.network.trainer import Checkpoints
@@ -292,12 +295,12 @@ def cross_validate(
     progress: Progress = lambda what: None,
     jobs: int | None = None,
 ) -> ComparisonFigures:
-    """Train the recipe once per fold, on the other folds, and judge it on the fold.
+    """Cross-validate a recipe: train it without each fold, and compute the errors of that fold.
 
     Args:
-        recipe: for measured data.
-        data: its robot and rows; every row to train on is held out once.
-        progress: called before every fold, but for those in other processes.
+        recipe: a recipe for measured data.
+        data: its robot and rows. Every row is held out once.
+        progress: called before every fold, except with `jobs`.
         jobs: see `TrainSettings`.
 
     Raises:
@@ -305,10 +308,13 @@ def cross_validate(
         MeasurementError: there are fewer different joint vectors than folds.
     """
     if data.folds is None:
-        raise RecipeError(f"recipe '{recipe.name}' simulates its data; it has held-out rows of its own.")
+        raise RecipeError(
+            f"expected a recipe for measured data, got '{recipe.name}', which simulates training and held-out rows",
+            value=recipe.name,
+        )
     measurements, folds = data.splits()
-    turned, not_predicted = measurements.rotation is not None, 0
-    nominal, corrected = (PoseErrors.none(measurements.rows, turned) for _ in range(2))
+    with_orientation, not_predicted = measurements.rotation is not None, 0
+    nominal, corrected = (PoseErrors.none(measurements.rows, with_orientation) for _ in range(2))
     tasks = [
         partial(
             _compared_fold,
@@ -328,36 +334,44 @@ def cross_validate(
 
 
 def _compared_fold(
-    recipe: InverseRecipe, data: RecipeData, test: Measurements, begin: Callable[[], None]
+    recipe: InverseRecipe, data: RecipeData, test: Measurements, report_start: Callable[[], None]
 ) -> Comparison:
-    """Train on some rows, and compare on others."""
-    begin()
+    """Train without a fold, and compare the model with the nominal robot on that fold."""
+    report_start()
     return compare_on(train_networks(recipe, data).model, test)
 
 
 def _check_one_pose(measurements: Measurements) -> None:
-    """Refuse rows of several frames or targets: the poses of a correction are those of one tool in one frame.
+    """Check that all rows are of one frame and one target, as an inverse calibration has one base and one tool.
 
     Raises:
-        MeasurementError: there are several; the message names the first row of another.
+        MeasurementError: there are several; the message names the first row of another one.
     """
     for what, names in (("frame", measurements.frame), ("target", measurements.target)):
         other = next((row for row, name in enumerate(names) if name != names[0]), None)
         if other is not None:
             raise MeasurementError(
-                f"{measurements.place(other)}: {what} '{names[other]}' stands there, but "
-                f"{measurements.place(0)} has '{names[0]}'; inverse calibration wants the rows of one {what}, "
-                "so give a file for each, or use `pisigma calibrate`."
+                f"expected rows of one {what} for an inverse calibration, got '{names[other]}' in "
+                f"{measurements.place(other)}, and '{names[0]}' in {measurements.place(0)}",
+                value=names[other],
+                option=what,
+                remedy="give one file for each, or use `pisigma calibrate`",
             )
 
 
 def _held_out_pairs(name: str, robot: Robot, held_out: Measurements) -> TrainingPairs:
-    """Fresh simulated poses, all of which must have a joint error to judge by."""
+    """Return pairs of held-out simulated poses, all of which must have a joint error.
+
+    Raises:
+        RecipeError: the nominal robot cannot reach some of the poses.
+    """
     pairs = build_pairs(robot, held_out, None)
     if not pairs.used.all():
+        unreached = int((~pairs.used).sum())
         raise RecipeError(
-            f"recipe '{name}': {int((~pairs.used).sum())} of {len(pairs.used)} poses of data.held_out "
-            "cannot be reached by the nominal robot and have no joint error; change their region."
+            f"recipe '{name}': the nominal robot cannot reach {unreached} of {len(pairs.used)} poses of data.held_out, "
+            "so that they have no joint error; change their region.",
+            value=unreached,
         )
     return pairs
 

@@ -38,56 +38,57 @@ from pisigma.workflow.evaluate import test_rows
 from pisigma.workflow.settings.recalibration import RecalibrationSettings
 from pisigma.workflow.settings.verification import VerificationSettings
 
-FEWEST_CONFIGURATIONS = 6
-"""With fewer different joint values nothing is concluded."""
-MOST_DRAWN = 2 * 10**7
-"""Numbers drawn for confidence intervals at most; of many rows fewer resamples are enough."""
+MIN_CONFIGURATIONS = 6
+"""Minimum number of different joint vectors for a verdict."""
+MAX_DRAWN = 2 * 10**7
+"""Maximum number of random draws for confidence intervals: with many rows, fewer resamples are enough."""
 RESAMPLES = (200, 2000)
+"""Minimum and maximum number of resamples."""
 
 NOMINAL, GEOMETRIC, CORRECTED = "nominal", "geometric", "corrected"
 
 HALVED = 0.5
-"""Where a setup fault is found, errors must at least be halved for the corrected model to count as better."""
+"""Largest ratio of the errors at which the corrected model counts as better although a setup fault was found."""
 
 MOTIONS = {"joint_zero", "frame", "tool"}
-"""Setup faults of which the posterior of a model says more."""
+"""Setup faults that the posterior of a model explains in more detail."""
 
 Verdict = Literal["better", "not_better", "undecided", "moved", "setup_fault", "implausible"]
 
 NOTHING_SHOWN = "These measurements do not show whether the correction is right"
 
-_BEGIN: dict[Verdict, str] = {
+_STARTS: dict[Verdict, str] = {
     "better": "The corrected model explains these measurements better than the nominal robot",
     "not_better": "The nominal robot explains these measurements at least as well as the corrected model",
-    "undecided": "These measurements do not show whether the corrected model or the nominal robot is nearer",
+    "undecided": "These measurements do not show whether the corrected model or the nominal robot is more accurate",
     "implausible": f"{NOTHING_SHOWN}, as their errors are too large to be those of a calibration",
 }
 
 
 @dataclass(frozen=True)
 class Verification:
-    """What new measurements say about a model.
+    """Result of `verify`: what new measurements show about a model.
 
     Attributes:
         model: its folder, or its name.
         data: file of the rows.
-        rows: number of rows that were judged.
-        settings: how.
-        verdict: "better" where the corrected model explains the rows better than the nominal robot, which the
-            confidence interval of the mean difference has to show; "undecided" where it shows nothing; "moved" where
-            the posterior of the model says that the arm has moved and recalibrating pays; "setup_fault" where a setup
-            fault explains the errors, so that neither counts; "implausible" where they are too large for a calibration
-            and nothing explains them.
+        rows: number of evaluated rows.
+        settings: settings of the verification.
+        verdict: "better" or "not_better" where the confidence interval of the mean difference shows that the corrected
+            model explains the rows better than the nominal robot, or not; "undecided" where it shows neither; "moved"
+            where the arm has moved according to the model's posterior and recalibrating pays; "setup_fault" where a
+            setup fault explains the errors, so that they prove nothing; "implausible" where they are too large for a
+            calibrated robot and nothing explains them.
         sentence: the verdict with figures.
         ratio: mean position error of the corrected model over that of the nominal robot; NaN where that is 0.
-        better_share: share of the configurations in which the corrected model is nearer.
+        better_share: fraction of the configurations in which the corrected model has the smaller error.
         comparison: figures of "nominal", "geometric" (of a hybrid) and "corrected".
-        diagnostics: why nothing is to be concluded from the rows, see `pisigma.validation.gate`.
-        setup_faults: what explains large errors; nothing where `motion` explains them.
-        motion: what has moved since the model was made; None where the model or the rows do not say.
-        recalibration: the command that brings the model up to date; empty where that does not pay.
-        warnings: what else should be known, each a sentence.
-        seconds: that it took.
+        diagnostics: why the rows must not be trusted; see `pisigma.validation.gate`.
+        setup_faults: setup faults that explain large errors; empty where `motion` explains them.
+        motion: what has moved since the model was made; None where the model or the rows do not show it.
+        recalibration: command that updates the model; empty where that does not pay.
+        warnings: further remarks, one sentence each.
+        seconds: computing time [s].
     """
 
     model: str
@@ -137,7 +138,7 @@ class Verification:
 def read_for_verification(
     path: MeasurementFiles, model: CalibratedModel, cameras: CameraFiles | None = None
 ) -> Measurements:
-    """Read measurements whose joint values may lie outside the limits, as those of swapped columns do.
+    """Read measurements without checking joint limits, as swapped columns exceed them.
 
     Rows of the set "train" are left out where the file has a column "set".
 
@@ -159,16 +160,16 @@ def verify(
     data: str | os.PathLike[str] | Measurements,
     settings: VerificationSettings | None = None,
 ) -> Verification:
-    """Judge whether a correction is active and right, and what is wrong with the setup where errors are large.
+    """Verify that a correction is active and right, and find faults of the setup where errors are large.
 
     Args:
         model: the model or its folder.
         data: new rows, or their file, in frames and of targets that the model has.
-        settings: how. None: `VerificationSettings()`.
+        settings: see `VerificationSettings`. None: the defaults.
 
     Raises:
-        MeasurementError: the file cannot be used, or no lengths were measured, or in a frame or of a target that the
-            model lacks.
+        MeasurementError: the file cannot be used, no lengths were measured, or the model does not have a frame or a
+            target of the rows.
         ModelError: the folder cannot be used, or the model does not keep enough joint values to fit base and tool of
             the nominal robot.
         PoseError: the joint values do not fit the robot.
@@ -181,7 +182,7 @@ def verify(
     right = without_wrong_rows([loaded], rows, settings.fitted)
     rows = right.rows
     models = _compared_models(loaded, rows.rotation is not None)
-    resamples = int(np.clip(MOST_DRAWN // max(rows.rows, 1), *RESAMPLES))
+    resamples = int(np.clip(MAX_DRAWN // max(rows.rows, 1), *RESAMPLES))
     bootstrap = Bootstrap(resamples, settings.seed)
     comparison = compare_models(models, rows, bootstrap, settings.fitted, distances)
     gate = check_rows(rows, loaded, settings.fitted, {"joint_zero"}, models[NOMINAL])
@@ -228,16 +229,16 @@ def verify(
     )
 
 
-def _compared_models(model: CalibratedModel, turned: bool) -> dict[str, CalibratedModel]:
-    """The nominal robot, the geometry of a hybrid, and the corrected model."""
-    models = {NOMINAL: nominal_model(model, turned)}
+def _compared_models(model: CalibratedModel, with_orientation: bool) -> dict[str, CalibratedModel]:
+    """Return the nominal robot, the geometric part of a hybrid, and the corrected model."""
+    models = {NOMINAL: nominal_model(model, with_orientation)}
     if model.hybrid is not None:
         models[GEOMETRIC] = geometric_model(model)
     return models | {CORRECTED: model}
 
 
 def _recalibration(name: str, data: str, settings: VerificationSettings, motion: Session | None) -> str:
-    """The command that brings a model up to date, where that pays."""
+    """Return the command that updates a model; empty where recalibrating does not pay."""
     if motion is None or not motion.recalibrate:
         return ""
     return RecalibrationSettings(settings.fitted or None, settings.cameras).command(name, data)
@@ -250,7 +251,7 @@ def _motion(
     comparison: ModelComparison,
     faults: Sequence[SetupFault],
 ) -> Session | None:
-    """Say what has moved, where no other setup fault and not the nominal robot explains the rows better."""
+    """Return what has moved; None where another setup fault or the nominal robot explains the rows better."""
     if any(not MOTIONS.issuperset(fault.kinds) for fault in faults):
         return None
     motion = judged_motion(model, rows, fitted)
@@ -268,20 +269,22 @@ def _verdict(
     too_large = all(is_implausible(comparison.models[i], model) for i in (0, -1))
     interval = difference.intervals["mean"]
     verdict: Verdict = "undecided"
-    if comparison.configurations >= FEWEST_CONFIGURATIONS and interval is not None:
+    if comparison.configurations >= MIN_CONFIGURATIONS and interval is not None:
         low, high = interval
         if high < 0:
             verdict = "better"
         elif low > 0 or low == high == 0:
             verdict = "not_better"
-    turned = any(fault.explains_orientation for fault in faults) and not _turn_ratio(comparison) <= HALVED
-    if faults and (too_large or turned or (verdict != "not_better" and not ratio <= HALVED)):
+    misoriented = (
+        any(fault.explains_orientation for fault in faults) and not _orientation_ratio(comparison) <= HALVED
+    )
+    if faults and (too_large or misoriented or (verdict != "not_better" and not ratio <= HALVED)):
         return "setup_fault"
     return "implausible" if too_large else verdict
 
 
-def _turn_ratio(comparison: ModelComparison) -> float:
-    """Divide the mean orientation error of the corrected model by that of the nominal robot; NaN without any."""
+def _orientation_ratio(comparison: ModelComparison) -> float:
+    """Divide the mean orientation error of the corrected model by that of the nominal robot; NaN where undefined."""
     nominal, corrected = (comparison.models[i].orientation for i in (0, -1))
     if nominal is None or corrected is None or not nominal.statistics["mean"] > 0:
         return float("nan")
@@ -300,28 +303,28 @@ def _sentence(
     figures = f"the mean error is {means[0]} instead of {means[1]}"
     if np.isfinite(ratio):
         figures += f" (ratio {ratio:.3g})"
-    turns = [comparison.models[i].orientation for i in (-1, 0)]
-    if verdict in ("setup_fault", "implausible") and None not in turns:
-        degrees = [turn.statistics["mean"] for turn in turns if turn is not None]
-        figures += f", that of orientations {degrees[0]:.3g} deg instead of {degrees[1]:.3g} deg"
+    orientations = [comparison.models[i].orientation for i in (-1, 0)]
+    if verdict in ("setup_fault", "implausible") and None not in orientations:
+        degrees = [one.statistics["mean"] for one in orientations if one is not None]
+        figures += f", the mean orientation error {degrees[0]:.3g} deg instead of {degrees[1]:.3g} deg"
     if verdict == "setup_fault":
         fault = next((fault for fault in faults if np.isfinite(fault.after_nominal)), None)
         if fault is not None:
             after = [length_text(length) for length in (fault.after, fault.after_nominal)]
-            figures += f"; with this set right, the errors are {after[0]} RMS instead of {after[1]}"
+            figures += f"; with this corrected, the errors are {after[0]} RMS instead of {after[1]}"
         clauses = ", or ".join(dict.fromkeys(fault.clause for fault in faults))
         return (
             f"{clauses[:1].upper()}{clauses[1:]}, so these measurements do not show whether the correction is right: "
             f"{figures}."
         )
-    begin, count = _BEGIN[verdict], comparison.configurations
+    start, count = _STARTS[verdict], comparison.configurations
     interval = difference.intervals["mean"]
     if verdict == "implausible":
-        return f"{begin}: {figures}."
-    if count < FEWEST_CONFIGURATIONS or interval is None:
-        return f"{begin}: {figures}, but {FEWEST_CONFIGURATIONS} or more different joint values are needed."
+        return f"{start}: {figures}."
+    if count < MIN_CONFIGURATIONS or interval is None:
+        return f"{start}: {figures}, but {MIN_CONFIGURATIONS} or more different joint values are needed."
     return (
-        f"{begin}: {figures}, it differs by {interval[0]:.3g} to {interval[1]:.3g} mm with "
+        f"{start}: {figures}, it differs by {interval[0]:.3g} to {interval[1]:.3g} mm with "
         f"{comparison.bootstrap.confidence:.0%} confidence, and it is smaller in {difference.better_share:.0%} of "
         f"{count} configurations."
     )
@@ -342,8 +345,8 @@ def _warnings(
     corrected = comparison.models[-1]
     if corrected.rows_not_predicted:
         warnings.append(
-            f"{corrected.rows_not_predicted} rows lie so far outside the domain that nothing is predicted; they do "
-            "not count."
+            f"{corrected.rows_not_predicted} rows are so far outside the domain that they cannot be predicted; they "
+            "are left out."
         )
     if not faults and motion is None and is_implausible(corrected, model):
         warnings.append(unexplained(model))

@@ -19,7 +19,7 @@ from pisigma.robot import Robot
 from pisigma.workflow.calibrate import calibrate
 from pisigma.workflow.compare import compare
 from pisigma.workflow.evaluate import evaluate
-from pisigma.workflow.fleet.one_robot import settings_for, work_out
+from pisigma.workflow.fleet.one_robot import process_robot, settings_for
 from pisigma.workflow.measure import MeasuringSession
 from pisigma.workflow.monitor import monitor
 from pisigma.workflow.plan import plan
@@ -94,7 +94,7 @@ def _measure(rows: Measurements, folder: Path) -> Answer:
     document.write_text(f"{document.read_text()}\nmodel: {model_folder(folder).name}\n")
     session = MeasuringSession.read(folder / "plan.csv")
     session.add(rows)
-    session.judge_together()
+    session.check_setup()
     state = session.state
     return _of(state.advice.action != "correct", state.advice.sentence)
 
@@ -105,7 +105,7 @@ def _fleet(rows: Measurements, folder: Path) -> Answer:
         "one", ROBOT, (SessionFile("s1", "", folder / "session.csv"),), model=model_folder(folder)
     )
     settings = FleetSettings(task="recalibrate")
-    record = work_out(
+    record = process_robot(
         member, settings, folder / "fleet", {"one": "k"}, {"one": settings_for(settings, member)}
     )
     last = record.sessions[-1]

@@ -4,7 +4,7 @@ from hostile.fleet_kills import BAD, faults_of, write_plant
 from testing.models import no_type_checker
 
 from pisigma.lifetime.fleet.members import read_fleet
-from pisigma.workflow.fleet.one_robot import settings_for, work_out
+from pisigma.workflow.fleet.one_robot import process_robot, settings_for
 from pisigma.workflow.settings.calibration import CalibrationSettings
 from pisigma.workflow.settings.fleet import FleetSettings
 
@@ -15,5 +15,5 @@ def test_every_bad_file_is_named_with_its_reason(tmp_path):
     settings = FleetSettings(calibration=CalibrationSettings(model="geometric"))
     keys, plans = {one.id: "" for one in members}, {one.id: settings_for(settings, one) for one in members}
     with no_type_checker():
-        records = [work_out(one, settings, tmp_path / "out", keys, plans) for one in members]
+        records = [process_robot(one, settings, tmp_path / "out", keys, plans) for one in members]
     assert not faults_of({one.robot: one.reason for one in records if one.reason is not None})

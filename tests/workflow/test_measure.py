@@ -30,7 +30,7 @@ def session():
     assert session.state.advice.action == "repeat"
     session.add(rows.select(torch.arange(15, 18)))
     with no_type_checker():
-        session.work_out()
+        session.update()
     return session
 
 
@@ -60,7 +60,7 @@ def test_the_state_says_what_counts_and_what_is_next(session):
 def test_the_rest_is_planned_again_with_as_many_poses(session, tmp_path):
     assert session.replanned
     assert len(session.state.remaining) == 24 - 17
-    session.write_rest(tmp_path / "rest.csv")
+    session.write_remaining(tmp_path / "rest.csv")
     rest = read_plan(tmp_path / "rest.csv")
     assert len(rest.q) == 7
     assert int(rest.check.sum()) == 1
@@ -109,9 +109,9 @@ def test_a_session_with_a_wrong_unit_says_so_once_and_does_not_advise_to_go_on()
     session, rows = MeasuringSession(PLAN.stored), PLAN.rows(5)
     rows = replace(rows, position=rows.position * 1000)
     session.add(rows.select(torch.arange(4)))
-    assert [(alarm.line, alarm.kind) for alarm in session.judge_together()] == [(1, "setup")]
+    assert [(alarm.line, alarm.kind) for alarm in session.check_setup()] == [(1, "setup")]
     session.add(rows.select(torch.tensor([4])))
-    assert session.work_out() == ()
+    assert session.update() == ()
     assert session.state.accuracy is None
     assert session.state.advice.action == "correct"
     assert "named metres" in session.state.advice.sentence
@@ -154,7 +154,7 @@ def test_the_expected_accuracy_comes_first_and_left_out_rows_while_no_rows_come(
         outdated()
     assert isnan(session.state.accuracy.cross_validated_rms)
     with no_type_checker():
-        session.judge_together()
+        session.check_setup()
         assert session.next_step() is None
         session.idle_step()()
     assert session.state.accuracy.cross_validated_rms > 0

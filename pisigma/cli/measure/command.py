@@ -145,7 +145,7 @@ def measure(
                 show(step)
                 show_page(step.state)
                 if step.replanned:
-                    session.write_rest(rest, program or [])
+                    session.write_remaining(rest, program or [])
     except KeyboardInterrupt:
         pass
     _print_summary(session, rest, as_json)

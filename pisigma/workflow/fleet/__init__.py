@@ -1,1 +1,1 @@
-"""Many robots at once: what is done with each, what all have in common."""
+"""Calibration of a fleet: every robot by itself, and the prior of all robots."""

@@ -1,4 +1,4 @@
-"""What is done with one robot of a fleet: settings, its sessions one after the other, and its record."""
+"""Process one robot of a fleet: its settings, its sessions one after the other, and its record."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
@@ -26,80 +26,92 @@ from pisigma.workflow.settings.monitoring import MonitorSettings
 from pisigma.workflow.settings.recalibration import RecalibrationSettings
 
 OPTIONS = ("model", "free", "split", "robust", "prior_length", "prior_angle", "train_rows", "seed")
-"""Settings of a calibration that a manifest may state for one robot."""
+"""Settings of a calibration that a manifest can state for one robot."""
 KINDS = get_type_hints(CalibrationSettings, localns={"SplitBy": SplitBy, "ClassName": ClassName})
 UNKNOWN = SessionFile("description", "", Path())
-"""Stands for the sessions of a robot whose description is wrong."""
+"""Placeholder for the sessions of a robot whose description is not valid."""
 
 
 def settings_for(settings: FleetSettings, member: Member) -> CalibrationSettings:
-    """Settings of the calibration of one robot.
+    """Return the settings of the calibration of one robot.
 
     Raises:
-        FleetError: the description of the robot is wrong, an option of it is unknown or has no such value, or the
-            task needs another model than it chooses.
-        PisigmaError: the settings make no sense together.
+        FleetError: the description of the robot is not valid, an option is unknown or its value is not valid, or the
+            task needs another kind of model.
+        PisigmaError: the settings contradict each other.
     """
     if member.fault:
         raise FleetError(member.fault)
     for name, value in member.options:
         if not value:
             raise FleetError(
-                f"robot '{member.id}': expected options as name=value; name=value, got '{name}'."
+                f"robot '{member.id}': expected options as name=value; name=value, got '{name}'",
+                expected="options as name=value; name=value",
+                value=name,
             )
         if name not in OPTIONS:
             raise FleetError(
-                f"robot '{member.id}': option '{name}' is unknown; {nearest_choice(name, OPTIONS)}"
+                f"robot '{member.id}': unknown option '{name}'",
+                value=name,
+                remedy=nearest_choice(name, OPTIONS),
             )
         if [one for one, _ in member.options].count(name) > 1:
-            raise FleetError(f"robot '{member.id}': option '{name}' appears twice; state it once.")
+            raise FleetError(
+                f"robot '{member.id}': option '{name}' appears twice", value=name, remedy="state it once"
+            )
     stated: dict[str, Any] = {}
     for name, value in member.options:
         try:
             stated[name] = TypeAdapter(KINDS[name]).validate_python(_read(name, value))
         except ValidationError as problem:
             what = problem.errors()[0]["msg"]
-            raise FleetError(f"robot '{member.id}': option '{name}': {what}, got '{value}'.") from None
+            raise FleetError(
+                f"robot '{member.id}': option '{name}': {what}, got '{value}'.", value=value
+            ) from None
     try:
         calibration = replace(settings.calibration, cameras=member.cameras, **stated)
     except PisigmaError as problem:
-        raise FleetError(f"robot '{member.id}': {problem}") from None
+        located = FleetError(f"robot '{member.id}': {problem}")
+        located.__dict__.update(problem.__dict__)
+        raise located from None
     if settings.prior is not None:
         calibration.check_unused()
     elif settings.task != "calibrate" and member.model is None and calibration.model == "geometric":
         raise FleetError(
-            f"robot '{member.id}': the task {settings.task} adds rows to the model of the first session, which only a "
-            "hybrid can take; leave out --model geometric, or state a model folder in the column 'model'."
+            f"robot '{member.id}': the task {settings.task} adds rows to the model of the first session, which has to "
+            "be a hybrid",
+            value=settings.task,
+            remedy="leave out --model geometric, or state a model folder in the column 'model'",
         )
     return calibration if settings.validate else replace(calibration, folds=0, hold_out=None, repeats=None)
 
 
-def work_out(
+def process_robot(
     member: Member,
     settings: FleetSettings,
     out: Path,
     keys: Mapping[str, str],
     plans: Mapping[str, CalibrationSettings | str],
 ) -> RobotRecord:
-    """Work out one robot, and write its models and its record.
+    """Process the sessions of one robot, and write its models and its record.
 
     Args:
         member: the robot.
-        settings: what is done.
+        settings: settings of the fleet.
         out: folder of the fleet.
-        keys: of all robots, by id.
-        plans: settings of their calibrations, or what is wrong with the options of a robot.
+        keys: keys of all robots by id; see `RobotRecord`.
+        plans: settings of their calibrations by id, or why a robot's options cannot be used.
     """
     sessions: list[SessionRecord] = []
     try:
         plan = plans[member.id]
         if isinstance(plan, str):
             raise FleetError(plan)
-        for record in _worked_out(member, settings, plan, out):
+        for record in _session_records(member, settings, plan, out):
             sessions.append(record)
         result = RobotRecord(member.id, keys[member.id], tuple(sessions))
         write_record(out, result)
-    except Exception as problem:  # what ends one robot does not end the others; a later call tries it again
+    except Exception as problem:  # one robot must not stop the others; a later call tries it again
         known = isinstance(problem, PisigmaError | OSError | MemoryError)
         what = (
             str(problem)
@@ -111,10 +123,10 @@ def work_out(
     return result
 
 
-def _worked_out(
+def _session_records(
     member: Member, settings: FleetSettings, plan: CalibrationSettings, out: Path
 ) -> Iterator[SessionRecord]:
-    """The records of the sessions of a robot, one after the other, up to one that is refused.
+    """Yield the records of the sessions of a robot, one after the other, until one is refused.
 
     Raises:
         OutputError: a model cannot be written.
@@ -153,7 +165,7 @@ def _worked_out(
 
 
 def _calibrated(calibration: Calibration, session: SessionFile) -> SessionRecord:
-    """What came of a calibration."""
+    """Return the record of a calibration."""
     summary = calibration.summary
     kind = "hybrid" if summary.hybrid is not None else "geometric"
     return SessionRecord(
@@ -175,12 +187,12 @@ def _calibrated(calibration: Calibration, session: SessionFile) -> SessionRecord
 
 
 def _best_rms(figures: AbstractValidationFigures | None) -> float | None:
-    """RMS error of the last of the calibrations that are compared [mm]."""
+    """Return the RMS error of the last one of the compared calibrations [mm]."""
     return None if figures is None else list(figures.models.values())[-1].rms_mm
 
 
 def _recalibrated(recalibration: Recalibration, session: SessionFile) -> SessionRecord:
-    """What came of a recalibration."""
+    """Return the record of a recalibration."""
     summary = recalibration.summary
     return SessionRecord(
         session=session.name,
@@ -197,7 +209,7 @@ def _recalibrated(recalibration: Recalibration, session: SessionFile) -> Session
 
 
 def _parameters_of(model: CalibratedModel) -> tuple[ParameterValue, ...]:
-    """The geometric parameters of which a model has a posterior."""
+    """Return the geometric parameters of which a model has a posterior."""
     known = model.uncertainty
     if known is None:
         return ()
@@ -214,7 +226,7 @@ def _parameters_of(model: CalibratedModel) -> tuple[ParameterValue, ...]:
 def _monitored(
     model: Path, sessions: tuple[SessionFile, ...], cameras: CameraFiles | None
 ) -> Iterator[SessionRecord]:
-    """What the sessions say of the robot of a model, as one chart of all of them."""
+    """Yield the records of sessions that are monitored together, in one chart."""
     files = [one.data for one in sessions]
     dates = tuple(one.date for one in sessions) if all(one.date for one in sessions) else ()
     monitoring = monitor(model, files, MonitorSettings(dates=dates, history=False, cameras=cameras))
@@ -243,5 +255,5 @@ def _refusal(session: SessionFile, sentence: str) -> SessionRecord:
 
 
 def _read(name: str, value: str) -> str | tuple[str, ...]:
-    """An option of a manifest: free parameters have commas or blanks between them."""
+    """Return the value of an option of a manifest; free parameters are separated by commas or blanks."""
     return free_parameters(",".join(value.replace(",", " ").split())) if name == "free" else value

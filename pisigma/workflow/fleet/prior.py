@@ -1,4 +1,4 @@
-"""Estimate what the robots of a fleet have in common, as a model that calibrations of few rows begin with."""
+"""Estimate the prior of a fleet of robots, as a model from which calibrations with few rows start."""
 
 import os
 import time
@@ -27,13 +27,13 @@ from pisigma.workflow.result import AbstractModelResult
 
 @dataclass(frozen=True, eq=False)
 class FleetPriorResult(AbstractModelResult):
-    """What a fleet has in common, and all figures of it.
+    """Result of `estimate_fleet_prior`: the prior of a fleet, and all figures.
 
     Attributes:
-        model: the mean robot, uncertain by the scatter between robots.
-        prior: the same in numbers.
+        model: the mean robot, with the covariance between robots as its uncertainty.
+        prior: means and covariances.
         summary: all figures.
-        seconds: time it took [s].
+        seconds: computing time [s].
     """
 
     model: CalibratedModel
@@ -54,13 +54,13 @@ def estimate_fleet_prior(
 
     Args:
         source: manifest (CSV) or folder; see `pisigma.lifetime.fleet.members.read_fleet`.
-        robot: as drawn, of those robots that state none.
-        progress: called with what is being done.
+        robot: nominal robot of those robots that do not state one.
+        progress: called with the current step.
 
     Raises:
-        FleetError: the fleet cannot be used, its robots are of several types, or too few have files that can be read;
-            others are named by the figures.
-        IdentificationError: the rows of a robot do not determine where it stands.
+        FleetError: the fleet cannot be used, its robots are of several types, or too few have readable files. Single
+            unreadable files are listed in the figures.
+        IdentificationError: the rows of a robot do not determine its base.
     """
     started = time.perf_counter()
     members = read_fleet(source, robot)
@@ -82,8 +82,9 @@ def estimate_fleet_prior(
             rows[one.id] = some
     if refused and len(rows) < FEWEST_ROBOTS:
         raise FleetError(
-            f"{FEWEST_ROBOTS} robots or more were wanted, got {len(rows)} with files that can be read; correct, among "
-            f"others: {next(iter(refused.values()))}"
+            f"expected {FEWEST_ROBOTS} robots or more, got {len(rows)} with readable files; correct, among others: "
+            f"{next(iter(refused.values()))}",
+            value=len(rows),
         )
     remarks = tuple(f"Robot '{one}': {said}" for one in rows for said in row_warnings(drawn, rows[one]))
     wide = drawn
@@ -98,7 +99,7 @@ def estimate_fleet_prior(
 
 
 def _robots(members: tuple[Member, ...]) -> tuple[dict[str, Robot], dict[str, str]]:
-    """The drawings of the robots by their ids, and why others cannot be read.
+    """Return the nominal robots by their ids, and why others cannot be read.
 
     Raises:
         FleetError: none can be read.
@@ -118,7 +119,7 @@ def _robots(members: tuple[Member, ...]) -> tuple[dict[str, Robot], dict[str, st
 
 
 def _common_robot(robots: Mapping[str, Robot]) -> Robot:
-    """The drawing that all robots have.
+    """Return the nominal robot that all robots share.
 
     Raises:
         FleetError: there are several.
@@ -127,7 +128,8 @@ def _common_robot(robots: Mapping[str, Robot]) -> Robot:
     for other_name, other in others:
         if other.dh.shape != first.dh.shape or not np.array_equal(other.dh, first.dh):
             raise FleetError(
-                f"robots '{name}' and '{other_name}' are of different types ({first.name} and {other.name}); "
-                "estimate what robots of one type have in common from a manifest of these alone."
+                f"expected robots of one type, got '{name}' ({first.name}) and '{other_name}' ({other.name})",
+                value=other_name,
+                remedy="give a manifest of the robots of one type only",
             )
     return first

@@ -1,4 +1,4 @@
-"""Calibrate, recalibrate or monitor many robots: typed settings in, records, model folders and one table out."""
+"""Calibrate, recalibrate or monitor the robots of a fleet; the results are records, model folders and one table."""
 
 import functools
 import hashlib
@@ -15,7 +15,7 @@ from typing import Any
 from pisigma.files.conflicts import check_conflicts
 from pisigma.files.engines.engine import AbstractEngine
 from pisigma.files.engines.processes import ProcessEngine
-from pisigma.files.errors import OutputError, PisigmaError
+from pisigma.files.errors import OutputError, PisigmaError, Place
 from pisigma.files.model_files import is_model, model_hash
 from pisigma.files.plugins import loaded
 from pisigma.files.progress import Progress
@@ -32,26 +32,26 @@ from pisigma.lifetime.fleet.record import (
 )
 from pisigma.model.folder.model_folder import load_model
 from pisigma.model.model_posterior import check_fleet_prior
-from pisigma.workflow.fleet.one_robot import settings_for, work_out
+from pisigma.workflow.fleet.one_robot import process_robot, settings_for
 from pisigma.workflow.settings.calibration import CalibrationSettings
 from pisigma.workflow.settings.fleet import FleetSettings
 
-ROBOTS_A_CHUNK = 4
-"""Calibrations that a worker gets at once: some seconds of work."""
+ROBOTS_PER_CHUNK = 4
+"""Robots that a worker processes at once, which takes some seconds."""
 
-_LOST = "the process that worked on it ended twice; look at memory and at its files."
+_LOST = "the process that worked on it ended twice; check the memory and its files."
 
 
 @dataclass(frozen=True)
 class FleetRun:
-    """What came of a call.
+    """Result of `run_fleet`.
 
     Attributes:
-        records: of the robots of this call, by their ids.
-        refused: ids and reasons of those whose results are missing.
-        resumed: how many an earlier call had worked out already.
-        results: the table of all robots in the folder.
-        seconds: time it took [s].
+        records: records of the robots of this call, in the order of the fleet.
+        refused: ids of the robots without results, and reasons.
+        resumed: number of robots that an earlier call had already processed.
+        results: file of the table of all robots in the folder.
+        seconds: computing time [s].
     """
 
     records: tuple[RobotRecord, ...]
@@ -62,7 +62,7 @@ class FleetRun:
 
     @property
     def done(self) -> int:
-        """How many robots have results for all of their sessions."""
+        """Number of robots with results for all of their sessions."""
         return len(self.records) - len(self.refused)
 
     def to_json(self) -> dict[str, Any]:
@@ -84,23 +84,23 @@ def run_fleet(
     robot: str | None = None,
     progress: Progress = lambda what: None,
 ) -> FleetRun:
-    """Work out all robots of a fleet; what an earlier call into the same folder came to is kept.
+    """Process all robots of a fleet, and keep the results of earlier calls with the same folder.
 
-    A robot whose files or options are bad is reported and does not stop the others. Every robot has a record of its
-    own, written whole when the robot is done; a robot is worked out again where its files or the settings have changed,
-    its model is gone, or it was refused for want of space.
+    A robot with bad files or options is reported and does not stop the others. Every robot has a record, which is
+    written whole when the robot is done. A robot is processed again where its files or the settings have changed, its
+    model is missing, or it was refused because the disk was full.
 
     Args:
         source: manifest (CSV) or folder; see `pisigma.lifetime.fleet.members.read_fleet`.
         out: folder to write: `results.parquet`, `records/ID.json` and `models/ID/SESSION`.
-        settings: what is done, and where; None for the usual.
-        robot: as drawn, of those robots that state none.
-        progress: called with what is being done.
+        settings: see `FleetSettings`. None: the defaults.
+        robot: nominal robot of those robots that do not state one.
+        progress: called with the number of processed robots.
 
     Raises:
         FleetError: the fleet cannot be used, or the options of none of its robots can.
-        MeasurementError: the manifest is no CSV file.
-        ModelError: the prior is no model of `pisigma fleet prior`.
+        MeasurementError: the manifest is not a CSV file.
+        ModelError: the prior is not a model of `pisigma fleet prior`.
         OutputError: the folder is not that of a fleet, or cannot be written to.
         ImportError: the extra of the engine or of the table is not installed.
     """
@@ -118,9 +118,9 @@ def run_fleet(
     records = {record.robot: record for record in finished if record is not None}
     resumed, waiting = len(records), [member for member in members if member.id not in records]
     lost: dict[str, str] = {}
-    work = functools.partial(work_out, settings=settings, out=folder.absolute(), keys=keys, plans=plans)
+    work = functools.partial(process_robot, settings=settings, out=folder.absolute(), keys=keys, plans=plans)
     with _engine(settings, len(waiting)) as engine:
-        for member, record in engine.results(work, waiting, ROBOTS_A_CHUNK) if waiting else ():
+        for member, record in engine.results(work, waiting, ROBOTS_PER_CHUNK) if waiting else ():
             if record is None:
                 lost[member.id] = _LOST
                 record = RobotRecord(member.id, keys[member.id], ())
@@ -139,7 +139,7 @@ def run_fleet(
 
 
 def _plans(members: Sequence[Member], settings: FleetSettings) -> dict[str, CalibrationSettings | str]:
-    """Settings of the calibration of every robot, or what is wrong with its options.
+    """Return the settings of every robot's calibration, or why its options cannot be used.
 
     Raises:
         PisigmaError: the options of no robot can be used.
@@ -172,10 +172,10 @@ def _engine(settings: FleetSettings, items: int) -> Iterator[AbstractEngine]:
 
 
 def _prepare(folder: Path, source: Path, members: tuple[Member, ...]) -> None:
-    """Make the folder of a fleet, or make sure that it is one.
+    """Create the folder of a fleet, or check that an existing one is that of a fleet.
 
     Raises:
-        OutputError: it is something else, holds an input, lies in one, or cannot be written to.
+        OutputError: it is something else, contains an input or is inside one, or cannot be written to.
     """
     inputs = [source, *(one.data for member in members for one in member.sessions)]
     inputs += [member.model for member in members if member.model is not None]
@@ -184,15 +184,17 @@ def _prepare(folder: Path, source: Path, members: tuple[Member, ...]) -> None:
     try:
         check_conflicts(folder, inputs)
         if folder.exists() and not folder.is_dir():
-            raise OutputError(f"{folder}: is no folder; choose another --out.")
+            raise OutputError(expected="a folder", at=Place(folder), remedy="choose another --out")
         if folder.is_dir() and any(folder.iterdir()) and not mark.is_file():
             raise OutputError(
-                f"{folder}: holds files that are not those of a fleet; choose another --out, or an empty folder."
+                expected="the folder of a fleet, or an empty one",
+                at=Place(folder),
+                remedy="choose another --out",
             )
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as problem:
         raise OutputError(
-            f"{folder}: cannot be written ({problem.strerror}); choose another --out."
+            f"cannot be written: {problem.strerror}", at=Place(folder), remedy="choose another --out"
         ) from None
     expect_robots(folder, [member.id for member in members])
 
@@ -206,7 +208,7 @@ def _finished(out: Path, member: Member, key: str) -> RobotRecord | None:
 
 
 def _key(member: Member, settings: FleetSettings, plan: CalibrationSettings | str) -> str:
-    """SHA-256 of all that a robot is worked out from: files, settings and the version of pisigma."""
+    """Return the SHA-256 of all that a robot's results depend on: files, settings and the version of pisigma."""
     from pisigma import __version__
 
     drawn, model = Path(member.robot), member.model
@@ -226,7 +228,7 @@ def _key(member: Member, settings: FleetSettings, plan: CalibrationSettings | st
 
 
 def _hash_of(path: Path) -> str:
-    """SHA-256 of a file; what is wrong with it where it cannot be read, which the work on the robot then reports."""
+    """Return the SHA-256 of a file; the system's message where it cannot be read, which the robot's record reports."""
     try:
         return hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else "no file"
     except OSError as problem:

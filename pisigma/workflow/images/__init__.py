@@ -1,1 +1,1 @@
-"""What is done with images of boards: corners for a calibration of the robot, and intrinsics of a camera."""
+"""Images of boards: detection of corners for a calibration of the robot, and calibration of a camera."""

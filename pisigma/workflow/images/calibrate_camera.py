@@ -1,4 +1,4 @@
-"""Calibrate the intrinsics of a camera by images of a board."""
+"""Calibrate the intrinsics of a camera with images of a board."""
 
 import math
 import os
@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pisigma.files.errors import MeasurementError
+from pisigma.files.errors import MeasurementError, Place
 from pisigma.files.output_file import check_page, write_whole
 from pisigma.measurement.camera.board import Board
 from pisigma.measurement.camera.camera import INTRINSICS
@@ -25,10 +25,11 @@ from pisigma.reporting.tables import Table
 from pisigma.workflow.settings.images import IntrinsicsSettings
 
 OBLIQUE = np.deg2rad(15.0)
-"""Where fewer than a third of the images are more oblique, focal length and distance go together."""
-MANY_IMAGES = 10
+"""Angle [rad] that a third of the images have to exceed, as frontal views do not separate focal length and distance."""
+MIN_IMAGES = 10
+"""Number of images below which a warning is given."""
 CORNER = 2
-"""Cells of a corner of the image along each axis, a quarter of its width and height."""
+"""Number of cells of a corner of the image along each axis, a quarter of its width and height."""
 CORNERS = {
     "upper left": (slice(None, CORNER), slice(None, CORNER)),
     "upper right": (slice(None, CORNER), slice(-CORNER, None)),
@@ -39,11 +40,11 @@ CORNERS = {
 
 @dataclass(frozen=True, eq=False)
 class CameraCalibration:
-    """A calibrated camera.
+    """Result of `calibrate_camera`: a calibrated camera.
 
     Attributes:
-        calibration: intrinsics and what the images are like.
-        detection: the boards in the images, and where the calibrated camera predicts their corners.
+        calibration: intrinsics, and coverage and tilts of the images.
+        detection: the boards in the images, with the corners that the calibrated camera predicts.
     """
 
     calibration: IntrinsicCalibration
@@ -51,7 +52,7 @@ class CameraCalibration:
 
     @property
     def parameters(self) -> list[tuple[str, float, float, str]]:
-        """Name, value, standard deviation, and unit of every number of the camera."""
+        """Name, value, standard deviation and unit of every intrinsic parameter."""
         camera = self.calibration.camera
         sigma = camera.sigma or (0.0,) * len(INTRINSICS)
         units = CAMERA_UNITS.values()
@@ -59,44 +60,45 @@ class CameraCalibration:
 
     @property
     def sentences(self) -> tuple[str, ...]:
-        """What the images show of the board and the camera."""
+        """Detected boards, and coverage and tilts of the images, in sentences."""
         tilts = np.rad2deg(self.calibration.tilts)
         return (
             *self.detection.sentences,
-            f"Corners lie in {self.calibration.covered.mean():.0%} of the cells of the image; views are "
+            f"Corners are in {self.calibration.covered.mean():.0%} of the cells of the image; views are "
             f"{np.median(tilts):.0f} deg oblique (median), from {tilts.min():.0f} to {tilts.max():.0f} deg.",
         )
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """What to heed, a sentence each."""
+        """Warnings, one sentence each."""
         calibration, warnings = self.calibration, list[str]()
         empty = [name for name, cells in CORNERS.items() if not calibration.covered[cells].any()]
         if empty:
             warnings.append(
-                f"No corner of the board lies in the {' and '.join(empty)} of the image, where the distortion is "
+                f"No corner of the board is in the {' and '.join(empty)} of the image, where the distortion is "
                 "extrapolated; take images with the board there."
             )
         if np.quantile(calibration.tilts, 2 / 3) < OBLIQUE:
             warnings.append(
-                f"Most images look straight at the board (two thirds of them less than {np.rad2deg(OBLIQUE):.0f} deg "
-                "oblique), so that focal lengths hardly differ from distances; take images 20 to 40 deg oblique."
+                f"Most images are frontal (two thirds of them less than {np.rad2deg(OBLIQUE):.0f} deg oblique), so that "
+                "focal lengths can hardly be distinguished from distances; take images 20 to 40 deg oblique."
             )
         if calibration.disagrees:
             warnings.append(
                 f"Images disagree on the camera by {calibration.disagreement:.2f} times the noise of corners: the "
-                "board is not flat, or the lens needs --k3. Standard deviations are enlarged so much, which does not "
-                "cover what all images have in common; glue the board onto something flat."
+                "board is not flat, or the lens needs --k3. Standard deviations are enlarged by this factor, which does "
+                "not cover errors that all images share; glue the board onto something flat."
             )
-        if len(calibration.tilts) < MANY_IMAGES:
+        if len(calibration.tilts) < MIN_IMAGES:
             warnings.append(
-                f"{len(calibration.tilts)} images are few, so that one can lead astray; take {MANY_IMAGES} or more."
+                f"With only {len(calibration.tilts)} images, a single bad one distorts the result; take {MIN_IMAGES} or "
+                "more."
             )
         return tuple(warnings)
 
     @property
     def tables(self) -> tuple[tuple[str, Table], ...]:
-        """The intrinsics, one row a number of the camera."""
+        """Table of the intrinsics, one row per parameter."""
         columns = ("parameter", "value", "standard deviation", "unit")
         return (("Intrinsics", Table(columns, tuple(_row(*one) for one in self.parameters))),)
 
@@ -119,7 +121,7 @@ class CameraCalibration:
         }
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the file of the camera.
+        """Write the camera's file.
 
         Raises:
             OutputError: it cannot be written.
@@ -130,7 +132,7 @@ class CameraCalibration:
         """Write intrinsics and images with the residuals of their corners as one HTML page.
 
         Raises:
-            OutputError: the page is no .html file or cannot be written.
+            OutputError: the page is not an .html file, or cannot be written.
         """
         from pisigma.reporting.page.images import images_page  # matplotlib takes a second
 
@@ -146,11 +148,11 @@ def calibrate_camera(
     settings: IntrinsicsSettings = IntrinsicsSettings(),
     progress: Callable[[str], None] = lambda what: None,
 ) -> CameraCalibration:
-    """Calibrate the intrinsics of a camera by images of a board, with their standard deviations.
+    """Calibrate the intrinsics of a camera with images of a board, including standard deviations.
 
     Args:
-        images: files, or folders of them, of one size.
-        board: its file, see `Board.load`.
+        images: image files of one size, or folders of them.
+        board: file of the board; see `Board.load`.
         settings: see `IntrinsicsSettings`.
         progress: called with the name of every image.
 
@@ -164,8 +166,10 @@ def calibrate_camera(
     for one in read:
         if one.size != size:
             raise MeasurementError(
-                f"{one.file}: an image of {size[0]} x {size[1]} px as {read[0].file} was wanted, "
-                f"got {one.size[0]} x {one.size[1]}; give images of one camera."
+                expected=f"an image of {size[0]} x {size[1]} px like {read[0].file}",
+                value=f"{one.size[0]} x {one.size[1]} px",
+                at=Place(one.file),
+                remedy="give images of one camera",
             )
     boards = [one.board for one in detected if isinstance(one.board, DetectedBoard)]
     views = [BoardView(of_board.corners[one.corners], one.pixels) for one in boards]
@@ -174,6 +178,6 @@ def calibrate_camera(
 
 
 def _row(name: str, value: float, sigma: float, unit: str) -> tuple[str, ...]:
-    """Cells of a number of the camera, to two digits of its standard deviation (0 where it is held)."""
+    """Return the cells of a parameter, with two digits of its standard deviation (0 where it is fixed)."""
     decimals = max(1 - math.floor(math.log10(sigma)), 0) if sigma > 0 else 0
     return (name, f"{value:.{decimals}f}", f"{sigma:.{decimals}f}" if sigma > 0 else "held", unit)

@@ -1,4 +1,4 @@
-"""Find the corners of a board in images, as a file that `pisigma.calibrate` takes."""
+"""Detect the corners of a board in images, and write them as a file for `pisigma.calibrate`."""
 
 import csv
 import io
@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from pisigma.files.errors import MeasurementError
+from pisigma.files.errors import MeasurementError, Place
 from pisigma.files.output_file import check_page, write_whole
 from pisigma.measurement.camera.board import Board
 from pisigma.measurement.camera.camera import Camera
@@ -20,12 +20,12 @@ from pisigma.workflow.settings.images import DetectionSettings
 
 @dataclass(frozen=True, eq=False)
 class DetectedCorners:
-    """Corners of a board in images, with the joint values of the images.
+    """Result of `detect`: corners of a board in images, with the joint values of the images.
 
     Attributes:
         detection: the boards in the images.
-        joints: of the images; None where no log was stated.
-        names: of the camera and of the board, which every row states.
+        joints: joint values of the images; None without a file of joint values.
+        names: names of the camera and of the board, for every row.
     """
 
     detection: DetectedBoards
@@ -34,7 +34,7 @@ class DetectedCorners:
 
     @property
     def rows(self) -> list[list[str]]:
-        """The file of corners: its header, and a row a corner."""
+        """Rows of the file of corners: the header, and one row per corner."""
         columns = () if self.joints is None else self.joints.columns
         rows = [["image", "camera", "board", "corner", "u_px", "v_px", *columns]]
         for name, board in self.detection.boards.items():
@@ -49,17 +49,17 @@ class DetectedCorners:
 
     @property
     def sentences(self) -> tuple[str, ...]:
-        """What the images show, and which are left out and why."""
+        """Detected boards, and which images are left out and why, in sentences."""
         return self.detection.sentences
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """What to heed, a sentence each."""
+        """Warnings, one sentence each."""
         return () if self.joints is None else self.joints.remarks
 
     @property
     def tables(self) -> tuple[tuple[str, Table], ...]:
-        """None, as there is a row a corner."""
+        """No tables, as there is one row per corner."""
         return ()
 
     def to_json(self) -> dict[str, object]:
@@ -85,7 +85,7 @@ class DetectedCorners:
         """Write the images with the residuals of their corners as one HTML page.
 
         Raises:
-            OutputError: the page is no .html file or cannot be written.
+            OutputError: the page is not an .html file, or cannot be written.
         """
         from pisigma.reporting.page.images import images_page  # matplotlib takes a second
 
@@ -102,13 +102,13 @@ def detect(
     settings: DetectionSettings = DetectionSettings(),
     progress: Callable[[str], None] = lambda what: None,
 ) -> DetectedCorners:
-    """Find the corners of a board in images.
+    """Detect the corners of a board in images.
 
     Args:
-        images: files, or folders of them.
-        board: its file, see `Board.load`.
-        camera: its file, see `Camera.load`.
-        joints: CSV file of the joint values of the images, see `join_joints`; None where they are added later.
+        images: image files, or folders of them.
+        board: file of the board; see `Board.load`.
+        camera: file of the camera; see `Camera.load`.
+        joints: CSV file of the joint values of the images; see `join_joints`. None: added later.
         settings: see `DetectionSettings`.
         progress: called with the name of every image.
 
@@ -118,9 +118,11 @@ def detect(
     files, of_board, of_camera = image_files(images), Board.load(board), Camera.load(camera)
     if of_board.is_symmetric:
         raise MeasurementError(
-            f"{board}: a checkerboard of {of_board.rows} x {of_board.columns} corners looks the same turned by 180 "
-            "deg, so that no image says which corner is the first; use one with an odd sum of rows and columns, or a "
-            "ChArUco board."
+            f"a checkerboard of {of_board.rows} x {of_board.columns} corners looks the same rotated by 180 deg, so that "
+            "its first corner is ambiguous",
+            value=f"{of_board.rows} x {of_board.columns}",
+            at=Place(board),
+            remedy="use a board with an odd sum of rows and columns, or a ChArUco board",
         )
     joined = None if joints is None else join_joints([file.stem for file in files], joints, settings.within)
     detected = detect_boards(files, of_board, settings.most_blur, progress)
@@ -128,5 +130,10 @@ def detect(
         predict_boards(detected, of_camera, of_board), joined, (of_camera.name, of_board.name)
     )
     if len(result.rows) == 1:
-        raise MeasurementError(f"{joints}: the images with a board lack joint values; complete the file.")
+        raise MeasurementError(
+            "the images with a board have no joint values",
+            expected="joint values of the images",
+            at=None if joints is None else Place(joints),
+            remedy="complete the file",
+        )
     return result

@@ -22,15 +22,15 @@ Seeded = TypeVar("Seeded", bound=Section)
 
 @dataclass(frozen=True, eq=False)
 class RecipeData:
-    """What a recipe is trained and judged on.
+    """Data that a recipe is trained and validated on.
 
     Attributes:
-        robot: as drawn.
+        robot: the nominal robot.
         training: rows to train on.
-        test: rows that a file of measurements marks as test; None without such rows.
-        simulations: training and held-out rows of every repeat of a simulation, those of the model first; none for
+        test: rows of the set "test" of measured data; None without such rows.
+        simulations: training and held-out rows of every repeat of a simulation, first those of the model; empty for
             measured data.
-        folds: how measured rows are split for a cross-validation; None for simulated ones.
+        folds: how measured rows are split for a cross-validation; None for simulated data.
     """
 
     robot: Robot
@@ -41,11 +41,11 @@ class RecipeData:
 
     @property
     def held_out(self) -> Measurements | None:
-        """Rows of the simulation that the training never sees; None for measured data."""
+        """Held-out rows of the simulation; None for measured data."""
         return self.simulations[0][1] if self.simulations else None
 
     def splits(self) -> tuple[Measurements, tuple[TrainTest, ...]]:
-        """Rows to judge on, and which of them are training and held-out rows of every fold, or of every simulation.
+        """Return all rows, and the training and held-out rows among them of every fold or simulation.
 
         Raises:
             MeasurementError: there are fewer different joint vectors than folds.
@@ -59,35 +59,42 @@ class RecipeData:
 
 
 def load_data(recipe: Recipe, data: Measurements | str | os.PathLike[str] | None = None) -> RecipeData:
-    """Simulate the rows of a recipe, or take the measured ones.
+    """Simulate the rows of a recipe, or read the measured ones.
 
     Args:
         recipe: the recipe.
-        data: for measured data: these, or a CSV file of them.
+        data: measurements or their CSV file, for a recipe that uses measured data.
 
     Raises:
-        RecipeError: a simulated recipe got data, or a measured one none.
+        RecipeError: `data` is given for a recipe that simulates its data, or missing for one that does not.
         RobotError: the robot of the recipe cannot be used.
         MeasurementError: the file cannot be used.
     """
     if isinstance(recipe, GeometricRecipe) or isinstance(recipe.data, SimulatedData):
         if data is not None:
             raise RecipeError(
-                f"recipe '{recipe.name}' simulates its data and has no use for --data; leave it out."
+                f"recipe '{recipe.name}' simulates its data",
+                value=recipe.name,
+                option="--data",
+                remedy="leave it out",
             )
         return simulate(recipe, recipe.repeats if isinstance(recipe, HybridRecipe) else 1)
     if data is None:
-        raise RecipeError(f"recipe '{recipe.name}' is for measured data; give the file with --data FILE.csv.")
+        raise RecipeError(
+            f"recipe '{recipe.name}' needs measured data",
+            value=recipe.name,
+            remedy="give the file with --data FILE.csv",
+        )
     robot = Robot.load(recipe.robot)
     return RecipeData(robot, *read_rows(data, robot).split_sets(), folds=recipe.data)
 
 
 def simulate(recipe: Recipe, repeats: int = 1) -> RecipeData:
-    """Measure training and held-out rows of a recipe on its true robot.
+    """Simulate training and held-out rows of a recipe on its true robot.
 
     Args:
-        recipe: for simulated data.
-        repeats: how often, with other seeds each time.
+        recipe: a recipe for simulated data.
+        repeats: number of repeats, each with other seeds.
 
     Raises:
         RecipeError: the recipe is for measured data.
@@ -112,13 +119,15 @@ def write_recipe_images(recipe: Recipe, folder: str | os.PathLike[str]) -> int:
     data = simulated_data(recipe)
     if not isinstance(data.training, SimulatedImages):
         raise RecipeError(
-            f"recipe '{recipe.name}' simulates no images but a tracker; write its measurements with --out."
+            f"recipe '{recipe.name}' simulates a tracker instead of images",
+            value=recipe.name,
+            remedy="write its measurements with --out",
         )
     return write_images(data.training, TrueRobot(Robot.load(recipe.robot), data.errors), folder)
 
 
 def simulated_data(recipe: Recipe) -> SimulatedData:
-    """What a recipe simulates; a geometric one states it beside its other settings.
+    """Return the simulated data of a recipe, which a geometric recipe states at top level.
 
     Raises:
         RecipeError: the recipe is for measured data.
@@ -127,22 +136,26 @@ def simulated_data(recipe: Recipe) -> SimulatedData:
         errors, training, held_out = recipe.errors, recipe.measurements, recipe.held_out
         return SimulatedData(kind="simulated", errors=errors, training=training, held_out=held_out)
     if not isinstance(recipe.data, SimulatedData):
-        raise RecipeError(f"recipe '{recipe.name}' is for measured data and simulates nothing; use another.")
+        raise RecipeError(
+            f"expected a recipe that simulates its data, got '{recipe.name}', which needs measured data",
+            expected="a recipe that simulates its data",
+            value=recipe.name,
+        )
     return recipe.data
 
 
 def repeated(data: SimulatedData, repeat: int) -> SimulatedData:
-    """A simulation with everything that is random drawn anew: all its seeds higher by the number of the repeat."""
+    """Return a simulation with other random numbers: all of its seeds plus the number of the repeat."""
     return data.model_copy(
         update={
             "errors": tuple(_reseeded(source, repeat) for source in data.errors),
-            "training": _measured_anew(data.training, repeat),
-            "held_out": _measured_anew(data.held_out, repeat),
+            "training": _remeasured(data.training, repeat),
+            "held_out": _remeasured(data.held_out, repeat),
         }
     )
 
 
-def _measured_anew(section: SimulatedPoses, repeat: int) -> SimulatedPoses:
+def _remeasured(section: SimulatedPoses, repeat: int) -> SimulatedPoses:
     noise = None if section.noise is None else _reseeded(section.noise, repeat)
     return section.model_copy(update={"poses": _reseeded(section.poses, repeat), "noise": noise})
 

@@ -1,4 +1,4 @@
-"""Reading a recipe of whatever kind, and checking it against its robot."""
+"""Read a recipe of any kind, and check it against its robot."""
 
 import hashlib
 import os
@@ -31,7 +31,7 @@ from pisigma.workflow.recipes.recipe import (
 
 Key = tuple[str | int, ...]
 Check = tuple[Key, Callable[[], object]]
-"""The keys that lead to what is checked, and the check."""
+"""The keys that lead to the checked value, and the check."""
 
 
 class _KindOnly(Section):
@@ -45,8 +45,8 @@ def read_recipe(path: str | os.PathLike[str]) -> Recipe:
     """Read a recipe of the kind that it states, and check it against its robot.
 
     Raises:
-        RecipeError: the file cannot be read or does not fit; the message names file, line and key.
-        RobotError: its robot cannot be used; the message names file, line and key too.
+        RecipeError: the file cannot be read, or a value is not valid; it names file, line and key.
+        RobotError: its robot cannot be used; it also names file, line and key.
     """
     kinds: dict[str, tuple[type[Recipe], Callable[[Any, Robot], Iterator[Check]]]] = {
         "inverse_calibration": (InverseRecipe, _network_checks),
@@ -68,7 +68,7 @@ def read_recipe(path: str | os.PathLike[str]) -> Recipe:
 
 
 def recipe_hash(path: str | os.PathLike[str]) -> str:
-    """SHA-256 (hexadecimal) of the recipe file, for provenance."""
+    """Return the SHA-256 (hexadecimal) of the recipe file, for provenance."""
     return hashlib.sha256(Path(path).read_bytes()).hexdigest()
 
 
@@ -97,7 +97,9 @@ def _geometric_checks(recipe: GeometricRecipe, robot: Robot) -> Iterator[Check]:
 def _check_frames(calibrated: str, judged: str) -> None:
     if judged != calibrated:
         raise RecipeError(
-            f"the frame '{judged}' is not calibrated, the measurements are in '{calibrated}'; name the same frame."
+            expected=f"the calibrated frame '{calibrated}'",
+            value=judged,
+            remedy="name the same frame in both",
         )
 
 
@@ -119,19 +121,23 @@ def _network_checks(recipe: InverseRecipe, robot: Robot) -> Iterator[Check]:
 
 
 def _where_checks(keys: Key, section: SimulatedPoses, robot: Robot) -> Iterator[Check]:
-    """What to try with a section that says where to measure."""
+    """Yield the checks of a section of simulated poses."""
     if isinstance(section, SimulatedImages):
         yield (*keys, "poses"), partial(section.poses.check, robot)
     elif isinstance(section.poses, JointsRandom):
         yield (*keys, "poses"), partial(section.poses.joints, robot)
     elif section.branch is not None:
-        none = torch.zeros(0, 4, 4, dtype=torch.float64)  # no poses: only the names are looked at
+        none = torch.zeros(0, 4, 4, dtype=torch.float64)  # no poses: checks the names only
         yield (*keys, "branch"), partial(section.branch.start, robot, none)
 
 
 def _check_joints(names: Sequence[str], valid: Sequence[str], taken: Sequence[str]) -> None:
     for index, name in enumerate(names):
         if name not in valid:
-            raise RecipeError(f"there is no joint '{name}' to correct; {nearest_choice(name, valid)}")
+            raise RecipeError(
+                f"there is no joint '{name}' to correct", value=name, remedy=nearest_choice(name, valid)
+            )
         if name in taken or name in names[:index]:
-            raise RecipeError(f"joint '{name}' stands twice in the network; name each joint once.")
+            raise RecipeError(
+                f"joint '{name}' appears twice in the network", value=name, remedy="name each joint once"
+            )

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from pisigma.measurement.splits import SplitBy
     from pisigma.robot.robot_class import ClassName
 
-LARGEST_REPEATS = 1000
+MAX_REPEATS = 1000
 
 ModelKind = Literal["hybrid", "geometric"]
 
@@ -31,7 +31,7 @@ def direction(stated: str) -> tuple[float, ...]:
         numbers = ()
     if len(numbers) != 3:
         raise IdentificationError(
-            f"the direction of gravity as X,Y,Z was wanted, such as 0,0,-1, got '{stated}'."
+            expected="three numbers X,Y,Z, such as 0,0,-1", value=stated, option="--gravity"
         )
     return numbers
 
@@ -43,8 +43,10 @@ def socket_distances(stated: Iterable[str]) -> dict[tuple[str, str], float]:
         sockets, distance = _socket_distance(one)
         if sockets in distances:
             raise IdentificationError(
-                f"expected one distance of the sockets {' and '.join(sockets)}, got a second one in '{one}'; remove "
-                "one of them."
+                f"expected one distance between the sockets {' and '.join(sockets)}, got a second one, '{one}'",
+                value=one,
+                option="--socket-distance",
+                remedy="remove one of them",
             )
         distances[sockets] = distance
     return distances
@@ -58,7 +60,9 @@ def _socket_distance(stated: str) -> tuple[tuple[str, str], float]:
         distance = 0.0
     if len(words) != 3 or not 0 < distance < float("inf"):
         raise IdentificationError(
-            f"expected a known socket distance as A,B,MM, such as */0,*/1,50, got '{stated}'."
+            expected="A,B,MM with a distance > 0 mm, such as */0,*/1,50",
+            value=stated,
+            option="--socket-distance",
         )
     return (words[0], words[1]), distance / 1e3
 
@@ -126,7 +130,7 @@ class CalibrationSettings:
     cameras: CameraFiles | None = None
 
     def __post_init__(self) -> None:
-        """Refuse settings that are no choice or exclude each other."""
+        """Check choices and ranges, and that no settings exclude each other."""
         from pisigma.measurement.splits import SplitBy
 
         check_choice(IdentificationError, "model", self.model, get_args(ModelKind))
@@ -134,42 +138,55 @@ class CalibrationSettings:
         once = self.hold_out is not None or self.folds == 0
         if self.repeats is not None and self.repeats > 1 and once:
             raise MeasurementError(
-                f"repeats {self.repeats}: only folds can be repeated; leave out hold-out, and folds 0."
+                "only folds can be repeated",
+                value=self.repeats,
+                option="repeats",
+                remedy="leave out hold_out, and folds 0",
             )
         if self.hold_out is not None and self.folds is not None:
             raise MeasurementError(
-                f"folds {self.folds} and hold-out {self.hold_out:g} exclude each other; leave one out."
+                f"folds {self.folds} and hold_out {self.hold_out:g} exclude each other",
+                value=self.hold_out,
+                option="hold_out",
+                remedy="leave one out",
             )
-        if not 0 <= self.seed < 2**63 or (self.repeats or 0) > LARGEST_REPEATS:
+        if not 0 <= self.seed < 2**63:
+            raise MeasurementError(expected="an integer from 0 to 2^63 - 1", value=self.seed, option="seed")
+        if (self.repeats or 0) > MAX_REPEATS:
             raise MeasurementError(
-                f"a seed from 0 to 2^63 - 1 and at most {LARGEST_REPEATS:,} repeats were wanted, got {self.seed} and "
-                f"{self.repeats or 'the usual'}."
+                expected=f"at most {MAX_REPEATS:,} repeats", value=self.repeats, option="repeats"
             )
         if self.jobs is not None and self.jobs < 1:
-            raise MeasurementError(f"jobs: 1 or more were wanted, got {self.jobs}.")
+            raise MeasurementError(expected="an integer >= 1", value=self.jobs, option="jobs")
         for name in ("features", "gravity"):
             if (value := getattr(self, name)) is not None and self.model != "hybrid":
                 raise IdentificationError(
-                    f"{name} {value}: a geometric calibration has no use for it; leave it out, or take the hybrid."
+                    f"a geometric calibration does not use it, got {value}",
+                    value=value,
+                    option=name,
+                    remedy="leave it out, or choose the model hybrid",
                 )
         prior = (self.prior_length, self.prior_angle)
         if not all(map(math.isfinite, prior)) or min(prior) < 0 or (prior[0] == 0) != (prior[1] == 0):
             raise IdentificationError(
-                f"the prior's standard deviations were wanted above 0, or both 0 for none, got {prior[0] * 1e3:g} mm "
-                f"and {prior[1] * 1e3:g} mrad."
+                "expected prior standard deviations > 0, or both 0 for no prior, got "
+                f"{prior[0] * 1e3:g} mm and {prior[1] * 1e3:g} mrad",
+                value=prior,
+                option="prior_length and prior_angle",
             )
 
     def check_unused(self) -> None:
-        """Refuse what says how to calibrate or to validate: with the prior of a fleet it would not count.
+        """Refuse settings that a calibration with the prior of a fleet does not use.
 
         Raises:
-            IdentificationError: something is stated besides cameras and jobs.
+            IdentificationError: a setting other than `cameras` and `jobs` is stated.
         """
         usual = CalibrationSettings(cameras=self.cameras, jobs=self.jobs)
         stated = [name for name in self.__dataclass_fields__ if getattr(self, name) != getattr(usual, name)]
         if stated:
             raise IdentificationError(
-                f"{', '.join(name.replace('_', ' ') for name in stated)}: a calibration that begins with the prior of "
-                "a fleet is a hybrid of all its parameters, and every row is left out in turn; leave this out, or "
-                "the prior."
+                "a calibration with the prior of a fleet is a hybrid of all its parameters, and is cross-validated "
+                "row by row",
+                option=", ".join(stated),
+                remedy="leave this out, or the prior",
             )

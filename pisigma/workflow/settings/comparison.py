@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Annotated, get_args
 
-from pisigma.files.errors import IdentificationError, nearest_choice
+from pisigma.files.errors import IdentificationError, check_choice
 from pisigma.files.setting import HIDDEN, Option
 from pisigma.measurement.camera.camera_files import CameraFiles
 from pisigma.validation.resampling import Bootstrap
@@ -36,14 +36,11 @@ class ComparisonSettings:
     cameras: CameraFiles | None = None
 
     def __post_init__(self) -> None:
-        """Refuse what is no choice, and a level that no test has."""
+        """Check `frames` and the level."""
         from pisigma.lifetime.comparison.model_pair import FrameChoice
 
-        if self.frames not in get_args(FrameChoice):
-            raise IdentificationError(
-                f"frames: '{self.frames}' is no choice; {nearest_choice(self.frames, get_args(FrameChoice))}"
-            )
+        check_choice(IdentificationError, "frames", self.frames, get_args(FrameChoice))
         if not 0.0 < self.level < 1.0:
             raise IdentificationError(
-                f"level: a probability between 0 and 1 was wanted, got {self.level:g}; 0.01 is usual."
+                expected="a probability between 0 and 1, such as 0.01", value=self.level, option="level"
             )

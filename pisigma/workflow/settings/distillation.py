@@ -33,6 +33,6 @@ class DistillationSettings:
     epochs: Annotated[int, HIDDEN] = 80
 
     def __post_init__(self) -> None:
-        """Refuse a seed that is none."""
+        """Check the seed."""
         if not 0 <= self.seed < 2**63:
-            raise RecipeError(f"--seed {self.seed}: a whole number from 0 to 2^63 - 1 was wanted.")
+            raise RecipeError(expected="an integer from 0 to 2^63 - 1", value=self.seed, option="--seed")

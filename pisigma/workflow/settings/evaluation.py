@@ -42,10 +42,12 @@ class Limits:
     mean_deg: Annotated[float | None, Option("--max-mean-deg")] = None
 
     def __post_init__(self) -> None:
-        """Refuse limits that no figure could be held against."""
+        """Check that limits are positive and finite."""
         for name, limit in self.stated.items():
             if not (limit > 0 and math.isfinite(limit)):
-                raise MeasurementError(f"--{_LIMITED[name][0]} {limit:g}: a limit above 0 was wanted.")
+                raise MeasurementError(
+                    expected="a finite limit > 0", value=limit, option=f"--{_LIMITED[name][0]}"
+                )
 
     @property
     def stated(self) -> dict[str, float]:
@@ -53,12 +55,12 @@ class Limits:
         return {name: limit for name, limit in asdict(self).items() if limit is not None}
 
     def missed_by(self, model: "ModelFigures") -> list[str]:
-        """Say which limits a model misses, in sentences without their ends; nothing where it meets all.
+        """Return the limits that a model misses, as clauses without a full stop; empty where it meets all.
 
-        A model that predicts nothing for a row meets no limit.
+        A model that cannot predict some of the rows misses every limit.
 
         Raises:
-            MeasurementError: there is a limit on the orientation, but none was measured.
+            MeasurementError: there is a limit of the orientation error, but no orientations were measured.
         """
         from pisigma.reporting.tables import figure_text
 
@@ -69,7 +71,10 @@ class Limits:
             errors = model.position if unit == "mm" else model.orientation
             if errors is None:
                 raise MeasurementError(
-                    f"--{option} {limit:g}: no orientations were measured; leave the limit out or give poses."
+                    "no orientations were measured",
+                    value=limit,
+                    option=f"--{option}",
+                    remedy="leave the limit out, or give rows with orientations",
                 )
             value = errors.statistics[statistic]
             if not value <= limit:

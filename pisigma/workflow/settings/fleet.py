@@ -42,12 +42,15 @@ class FleetSettings:
     prior: Path | None = None
 
     def __post_init__(self) -> None:
-        """Refuse what is no choice."""
+        """Check choices and ranges."""
         check_choice(FleetError, "task", self.task, get_args(Task))
         check_choice(FleetError, "engine", self.engine, get_args(EngineName))
         if self.jobs is not None and self.jobs < 1:
-            raise FleetError(f"jobs: 1 or more were wanted, got {self.jobs}.")
+            raise FleetError(expected="an integer >= 1", value=self.jobs, option="jobs")
         if self.address is not None and self.engine != "ray":
             raise FleetError(
-                f"address {self.address}: only the engine ray has one; choose it, or leave it out."
+                f"only the engine ray has an address, got '{self.address}'",
+                value=self.address,
+                option="address",
+                remedy="choose the engine ray, or leave the address out",
             )

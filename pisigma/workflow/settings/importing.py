@@ -26,7 +26,7 @@ def seconds(stated: str) -> float:
     """Return the seconds of a duration such as "0.2s" or "200ms"."""
     match = re.fullmatch(r"\s*([0-9]*\.?[0-9]+)\s*(s|ms)?\s*", stated)
     if match is None:
-        raise MeasurementError(f"--within {stated}: a duration was wanted, such as 0.2s or 200ms.")
+        raise MeasurementError(expected="a duration such as 0.2s or 200ms", value=stated, option="--within")
     return float(match[1]) * (1e-3 if match[2] == "ms" else 1.0)
 
 
@@ -59,7 +59,7 @@ class ImportSettings:
     within: Annotated[float, Option(kind=str, read=seconds, default="0.2s")] = 0.2
 
     def __post_init__(self) -> None:
-        """Refuse what is no way to join."""
+        """Check `join`."""
         from pisigma.measurement.foreign.joining import JoinBy
 
         if self.join is not None:

@@ -26,12 +26,12 @@ class MeasureSettings:
     replan: bool = True
 
     def __post_init__(self) -> None:
-        """Refuse settings that are none."""
+        """Check ranges."""
         if self.limit_mm is not None and not 0 < self.limit_mm < math.inf:
-            raise PlanningError(f"limit: a length above 0 was wanted, got {self.limit_mm:g} mm.")
+            raise PlanningError(expected="a finite length > 0 mm", value=self.limit_mm, option="limit_mm")
         if not 0 <= self.least_gain_mm < math.inf:
             raise PlanningError(
-                f"least gain: a length of 0 or more was wanted, got {self.least_gain_mm:g} mm."
+                expected="a finite length >= 0 mm", value=self.least_gain_mm, option="least_gain_mm"
             )
         if self.every < 1:
-            raise PlanningError(f"every: 1 row or more was wanted, got {self.every}.")
+            raise PlanningError(expected="1 row or more", value=self.every, option="every")

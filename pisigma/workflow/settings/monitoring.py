@@ -36,12 +36,10 @@ class MonitorSettings:
     cameras: CameraFiles | None = None
 
     def __post_init__(self) -> None:
-        """Refuse what makes no sense."""
+        """Check `moved`, the dates and the limit."""
         RecalibrationSettings(self.moved)
         for date in self.dates:
             if not is_date(date):
-                raise MeasurementError(f"dates: expected {WANTED}, got '{date}'; correct it.")
+                raise MeasurementError(expected=WANTED, value=date, option="dates", remedy="correct it")
         if self.limit_mm is not None and not self.limit_mm > 0:
-            raise IdentificationError(
-                f"limit_mm: a length above 0 was wanted, got {self.limit_mm:g}; give the RMS error to stay below."
-            )
+            raise IdentificationError(expected="an RMS error > 0 mm", value=self.limit_mm, option="limit_mm")

@@ -4,7 +4,7 @@ import shlex
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated
 
-from pisigma.files.errors import IdentificationError, nearest_choice
+from pisigma.files.errors import IdentificationError, check_choice
 from pisigma.files.setting import NAMES
 from pisigma.measurement.camera.camera_files import CameraFiles
 
@@ -44,9 +44,6 @@ class RecalibrationSettings:
         return fitted_kinds("base" in (self.moved or ()), "tool" in (self.moved or ()))
 
     def __post_init__(self) -> None:
-        """Refuse what cannot stand elsewhere."""
+        """Check `moved`."""
         for name in self.moved or ():
-            if name not in ("base", "tool"):
-                raise IdentificationError(
-                    f"moved: '{name}' is no choice; {nearest_choice(name, ('base', 'tool'))}"
-                )
+            check_choice(IdentificationError, "moved", name, ("base", "tool"))

@@ -32,6 +32,6 @@ class TrainSettings:
     jobs: int | None = None
 
     def __post_init__(self) -> None:
-        """Refuse to work nowhere."""
+        """Check the number of processes."""
         if self.jobs is not None and self.jobs < 1:
-            raise RecipeError(f"jobs: 1 or more were wanted, got {self.jobs}.")
+            raise RecipeError(expected="an integer >= 1", value=self.jobs, option="jobs")

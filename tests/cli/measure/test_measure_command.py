@@ -110,6 +110,6 @@ def test_programs_of_the_poses_that_are_left(run, refuses, tmp_path):
     assert not (tmp_path / "poses.script").exists()  # nothing was planned again with two rows
     session = MeasuringSession(plan.stored)
     session.add(plan.rows(2))
-    session.write_rest(tmp_path / "rest.csv", [tmp_path / "rest.script"])
+    session.write_remaining(tmp_path / "rest.csv", [tmp_path / "rest.script"])
     text = (tmp_path / "rest.script").read_text()
     assert [f"pose {number}" in text for number in (2, 3, 9)] == [False, True, True]

@@ -88,7 +88,7 @@ def test_a_session_finds_swapped_joints_and_the_accuracy(plan: StoredPlan, lines
     growth = growing_file(tmp_path / "corners.csv", plan.arm.robot, plan.settings).read(final=True)
     with no_type_checker():
         session.add(growth.rows, growth.left_out)
-        session.work_out()
+        session.update()
     state = session.state
     wrong = [alarm for alarm in state.alarms if not alarm.counts]
     assert [alarm.line for alarm in wrong] == [2 + CORNERS * SWAPPED]
