@@ -50,7 +50,7 @@ CHOICE_SHARE, HELD_OUT_SHARE = 0.2, 0.4
 """Numbers of poses for model selection and for testing, relative to the number of poses to fit to."""
 
 MAX_ERROR_SHARE = 0.2
-"""Error of a distilled model against the full solution, relative to the nominal error, above which a warning is given."""
+"""Error against the full solution, relative to the nominal error, above which a warning is given."""
 
 DOMAIN_SAMPLES = 512
 MIN_POSES = 100
@@ -237,7 +237,7 @@ def _warnings(held_out: DistilledErrors, rows: int, joints: int) -> tuple[str, .
             )
     if rows < _MIN_ROWS_PER_JOINT * joints:
         sentences.append(
-            f"Only {rows} rows of joint values describe the region, which needs {_MIN_ROWS_PER_JOINT * joints} or more: "
+            f"Only {rows} rows of joint values describe the region, instead of {_MIN_ROWS_PER_JOINT * joints} or more: "
             "it is sparsely covered, and the errors hold only near these rows."
         )
     return tuple(sentences)

@@ -23,8 +23,8 @@ from pisigma.workflow.solved_poses import SolvedPoses
 VALIDATION_SHARE = 0.1
 
 OVERTONE_SCALE = 1e4
-"""Factor by which overtones are scaled down after the fit, and their weights up. The domain is measured in scaled inputs,
-and overtones do not tell where in its range a joint is."""
+"""Factor by which overtones are scaled down after the fit, and their weights up. Overtones do not show where in its
+range a joint is, and the domain is measured in scaled inputs."""
 
 NEGLIGIBLE_ERROR = 5e-6
 """RMS error of the tool's position [m] below which no larger size is tried: no robot repeats better."""

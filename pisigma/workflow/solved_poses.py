@@ -27,7 +27,7 @@ MAX_TRIES = 20
 """Number of random poses per reachable one above which a region is refused."""
 
 _SAME_BRANCH = 0.05
-"""Largest distance [rad or m] of a pose's nominal solution from the joint values drawn; beyond, it is another branch."""
+"""Largest distance [rad or m] of a nominal solution from the joint values drawn; beyond, it is on another branch."""
 
 Box = tuple[float, float, float, float, float, float]
 """x_min, x_max, y_min, y_max, z_min, z_max [m] in the base frame."""

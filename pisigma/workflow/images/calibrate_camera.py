@@ -80,19 +80,18 @@ class CameraCalibration:
             )
         if np.quantile(calibration.tilts, 2 / 3) < OBLIQUE:
             warnings.append(
-                f"Most images are frontal (two thirds of them less than {np.rad2deg(OBLIQUE):.0f} deg oblique), so that "
-                "focal lengths can hardly be distinguished from distances; take images 20 to 40 deg oblique."
+                f"Most images are frontal (two thirds less than {np.rad2deg(OBLIQUE):.0f} deg oblique), so that focal "
+                "lengths can hardly be distinguished from distances; take images 20 to 40 deg oblique."
             )
         if calibration.disagrees:
             warnings.append(
                 f"Images disagree on the camera by {calibration.disagreement:.2f} times the noise of corners: the "
-                "board is not flat, or the lens needs --k3. Standard deviations are enlarged by this factor, which does "
-                "not cover errors that all images share; glue the board onto something flat."
+                "board is not flat, or the lens needs --k3. Standard deviations are enlarged by this factor, but errors "
+                "that all images share are not covered; glue the board onto something flat."
             )
         if len(calibration.tilts) < MIN_IMAGES:
             warnings.append(
-                f"With only {len(calibration.tilts)} images, a single bad one distorts the result; take {MIN_IMAGES} or "
-                "more."
+                f"With {len(calibration.tilts)} images, a single bad one distorts the result; take {MIN_IMAGES} or more."
             )
         return tuple(warnings)
 
