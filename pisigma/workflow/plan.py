@@ -370,11 +370,7 @@ def _check_measured(model: CalibratedModel | None, settings: PlanSettings, robot
     rows = read_planned_rows(settings, settings.measured, robot).split_sets()[0]
     against = robot if model is None else model
     if implausible := check_rows(rows, against, may_move=MOVES).implausible:
-        raise MeasurementError(
-            f"{settings.measured}: {implausible[0].sentence}",
-            at=Place(settings.measured),
-            option="--measured",
-        )
+        raise MeasurementError(f"{settings.measured}: {implausible[0].sentence}", value=implausible[0].kind)
     if model is not None and bool(known_rows(model, rows).all()):
         raise MeasurementError(
             f"expected rows that model '{model.name}' was not made from, as these would count twice",

@@ -1,4 +1,4 @@
-"""A calibration of rows that the drawing's limits do not allow."""
+"""A calibration with rows outside the nominal joint limits."""
 
 import dataclasses
 
@@ -14,7 +14,7 @@ from pisigma.workflow.calibrate import calibrate
 from pisigma.workflow.settings.calibration import CalibrationSettings
 
 
-def test_limits_of_the_model_hold_the_rows_so_that_corrected_ik_reaches_them(tmp_path):
+def test_limits_of_the_model_include_the_rows_so_that_corrected_ik_reaches_them(tmp_path):
     arm = Robot.load("ur10")
     narrow = (*arm.rows[:2], dataclasses.replace(arm.rows[2], lower=-1.0, upper=1.0), *arm.rows[3:])
     drawn = dataclasses.replace(arm, rows=narrow)

@@ -1,4 +1,4 @@
-"""A calibration that no left-out row judged says what it predicts of its own errors."""
+"""A calibration without held-out rows predicts its errors."""
 
 import pytest
 import torch
@@ -10,7 +10,7 @@ from pisigma.workflow.settings.calibration import CalibrationSettings
 
 
 @pytest.mark.parametrize("model", ["geometric", "hybrid"])
-def test_a_calibration_without_left_out_rows_predicts_its_error_at_other_poses(model):
+def test_a_calibration_without_held_out_rows_predicts_its_error_at_other_poses(model):
     arm = simulate("ur5", rows=220, noise=5e-5)
     few, others = (arm.measurements.select(torch.arange(*part)) for part in ((0, 20), (20, 220)))
     calibration = calibrate(arm.nominal, few, CalibrationSettings(model=model, folds=0))
@@ -22,7 +22,7 @@ def test_a_calibration_without_left_out_rows_predicts_its_error_at_other_poses(m
     assert predicted > 1.5 * fitted.models[model].rms_mm
 
 
-def test_left_out_rows_say_it_better():
+def test_with_held_out_rows_no_error_is_predicted():
     arm = simulate("ur5", rows=40, noise=5e-5)
     settings = CalibrationSettings(model="geometric", hold_out=0.3)
     assert calibrate(arm.nominal, arm.measurements, settings).summary.predicted_rms_mm is None

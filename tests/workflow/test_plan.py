@@ -1,5 +1,6 @@
-"""Plans from a robot to its files: every pose is allowed by a check of its own, and the measured plan calibrates."""
+"""Plans from a robot to its files: every pose passes an independent check, and the measured plan can be read."""
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,9 +10,10 @@ import torch
 from testing.cells import CELL, is_collision_free, is_visible
 from testing.closeness import assert_close
 from testing.models import no_type_checker
+from testing.refusals import refused
 from testing.report import hybrid_under_test
 
-from pisigma.files.errors import PisigmaError, PlanningError
+from pisigma.files.errors import MeasurementError, PlanningError
 from pisigma.measurement.dataset import Measurements
 from pisigma.planning.plan_file import read_plan
 from pisigma.planning.plan_settings import PlanSettings
@@ -57,7 +59,7 @@ def test_every_motion_is_free(planned: Plan):
     assert bool(is_free(planned.stored.arm, path[:-1], path[1:]).all())
 
 
-def test_more_poses_are_expected_to_err_less(planned: Plan):
+def test_more_poses_lower_the_expected_error(planned: Plan):
     assert [point.poses for point in planned.curve] == [10, 11]
     assert planned.curve[0].rms > planned.curve[1].rms > 0
     assert planned.curve[1].random_rms > planned.curve[1].rms
@@ -70,7 +72,7 @@ def test_more_poses_are_expected_to_err_less(planned: Plan):
     assert planned.weak
 
 
-def test_the_measured_plan_is_measurements(planned: Plan, tmp_path: Path):
+def test_the_measured_plan_is_a_measurement_file(planned: Plan, tmp_path: Path):
     planned.save(tmp_path / "poses.csv", [tmp_path / "poses.src", tmp_path / "poses.script"])
     robot = Robot.load("fanuc_r2000")
     header, *rows = (tmp_path / "poses.csv").read_text().splitlines()
@@ -86,7 +88,7 @@ def test_the_measured_plan_is_measurements(planned: Plan, tmp_path: Path):
     assert "WAIT SEC 3.0" in (tmp_path / "poses.src").read_text()
 
 
-def test_what_is_measured_already_counts(planned: Plan, tmp_path: Path):
+def test_existing_measurements_are_used(planned: Plan, tmp_path: Path):
     planned.save(tmp_path / "poses.csv")
     header, *rows = (tmp_path / "poses.csv").read_text().splitlines()
     measured = [f"{row},0.0,0.0,0.0" for row in rows]
@@ -99,15 +101,15 @@ def test_what_is_measured_already_counts(planned: Plan, tmp_path: Path):
 
 
 @pytest.mark.parametrize(
-    ("rows", "scale", "word"),
+    ("rows", "scale", "kind"),
     [
-        (6, 1.0, "metres that are named millimetres"),
-        (20, 1e3, "Robot 'ur5e'"),
-        (60, 1e3, "Robot 'rb5'"),
+        (6, 1.0, "setup_fault"),
+        (20, 1e3, "setup_fault"),
+        (60, 1e3, "setup_fault"),
     ],
 )
-def test_measured_rows_that_cannot_be_of_the_robot_are_no_knowledge(
-    rows: int, scale: float, word: str, tmp_path: Path
+def test_measurements_that_cannot_be_of_the_robot_are_refused(
+    rows: int, scale: float, kind: str, tmp_path: Path
 ):
     """Few rows in another unit, and many of another robot."""
     robot = Robot.load("ur5")
@@ -118,32 +120,28 @@ def test_measured_rows_that_cannot_be_of_the_robot_are_no_knowledge(
     header = ",".join([*(f"q{joint}_deg" for joint in range(1, 7)), "x_mm", "y_mm", "z_mm"])
     (tmp_path / "rows.csv").write_text("\n".join([header, *(",".join(map(repr, line)) for line in lines)]))
     settings = PlanSettings(count=2, check=0, candidates=12, measured=str(tmp_path / "rows.csv"))
-    with no_type_checker(), pytest.raises(PisigmaError, match=word):
+    with no_type_checker(), refused(MeasurementError, value=kind):
         plan(robot, settings)
 
 
-def test_rows_that_a_model_was_made_of_do_not_count_twice(tmp_path: Path):
+def test_rows_that_a_model_was_made_from_do_not_count_twice(tmp_path: Path):
     """All of them, a part, and some among others."""
     arm, model = hybrid_under_test()
     rows = tmp_path / "rows.csv"
     settings = PlanSettings(count=2, check=0, candidates=12, measured=str(rows))
     for some in (arm.measurements, arm.measurements.select(torch.arange(30))):
         some.write_csv(rows)
-        with (
-            no_type_checker(),
-            pytest.raises(PisigmaError, match="made of these, and they would count twice"),
-        ):
+        with no_type_checker(), refused(MeasurementError, file=rows, option="--measured", value=model.name):
             plan(model, settings)
     moved = some.position.clone()
     moved[20:] += 5e-5
     replace(some, position=moved).write_csv(rows)
     with no_type_checker():
-        warning = plan(model, settings).warnings[0]
-    assert warning.startswith("20 of 30 rows")
-    assert "they count twice, and the expected errors are too small" in warning
+        warnings = plan(model, settings).warnings
+    assert "20 of 30" in warnings[0]
 
 
-def test_candidates_that_hardly_move_a_joint_do_not_stand_for_the_workspace(tmp_path: Path):
+def test_candidates_that_hardly_move_a_joint_are_warned_of(tmp_path: Path):
     q = torch.rand(20, 6, dtype=torch.float64, generator=torch.Generator().manual_seed(1)) * 2 - 1
     header = ",".join(f"q{joint}_deg" for joint in range(1, 7))
     scale = torch.tensor([50.0, 50, 50, 50, 50, 0.8])  # the last joint in rad
@@ -152,12 +150,12 @@ def test_candidates_that_hardly_move_a_joint_do_not_stand_for_the_workspace(tmp_
     settings = PlanSettings(count=2, check=0, candidates_from=str(tmp_path / "some.csv"))
     with no_type_checker():
         (warning,) = plan("ur5", settings).warnings
-    assert "joint theta_6 by 1.27 of 360 deg only" in warning
-    assert "check the units" in warning
+    assert "theta_6 by 1.27 of 360 deg" in warning
+    assert "theta_5" not in warning
 
 
-def test_a_model_says_what_to_measure_next():
-    """It is planned with the tool that it identified, and for poses of it."""
+def test_a_plan_for_a_model_uses_its_identified_tool():
+    """Poses are planned with the identified tool, and for it."""
     with no_type_checker():
         _, model = hybrid_under_test()
         more = plan(model, PlanSettings(count=3, check=1, candidates=30))
@@ -167,8 +165,9 @@ def test_a_model_says_what_to_measure_next():
 
 
 def test_too_few_candidates_are_refused():
-    with pytest.raises(PlanningError, match="30 poses were wanted, but 20 of"):
+    with pytest.raises(PlanningError) as caught:
         plan("fanuc_r2000", PlanSettings(count=30, check=0, candidates=20), CELL)
+    assert {"30", "20"} <= set(re.findall(r"\d+", str(caught.value)))
 
 
 def test_plans_are_the_same_at_every_call():

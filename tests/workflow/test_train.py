@@ -1,4 +1,4 @@
-"""`pisigma.train`: recipes of every kind in, typed results out that write themselves as model folders."""
+"""`pisigma.train`: from recipes of every kind to results, which are written as model folders."""
 
 import json
 from dataclasses import replace
@@ -6,6 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 from testing.models import no_type_checker, shipped_training, small_recipe_text, trained_run
+from testing.refusals import refused
 
 import pisigma
 from pisigma.files.errors import MeasurementError, RecipeError
@@ -54,8 +55,8 @@ def test_a_recipe_of_geometric_calibration(tmp_path):
         ("rb5_hybrid", TrainSettings(resume=True), None, "--resume"),
     ],
 )
-def test_what_a_kind_of_recipe_has_no_use_for_is_refused(repository, recipe, settings, data, option):
-    with pytest.raises(RecipeError, match=f"has no use for {option}; leave it out"):
+def test_options_that_a_recipe_does_not_use_are_refused(repository, recipe, settings, data, option):
+    with refused(RecipeError, option=option):
         pisigma.train(repository / "training" / f"{recipe}.yaml", data, settings)
 
 
@@ -70,13 +71,12 @@ def test_rows_that_are_left_out_are_a_warning():
     assert training.summary.verdict == training.validation.verdict
     left_out = training.summary.rows.left_out
     assert 0 < left_out < 50
-    assert training.warnings == (
-        f"{left_out} rows were left out of the training: {left_out} near a singularity.",
-    )
+    (warning,) = training.warnings
+    assert str(left_out) in warning
 
 
 def test_no_jobs_are_refused():
-    with pytest.raises(RecipeError, match="jobs: 1 or more were wanted, got 0"):
+    with refused(RecipeError, option="jobs", value=0):
         TrainSettings(jobs=0)
 
 
@@ -84,11 +84,11 @@ def test_rows_of_two_frames_are_refused():
     recipe, run = trained_run("kiro3")
     measured = recipe.model_copy(update={"data": MeasuredData(kind="measured")})
     rows = replace(run.measurements, frame=("left",) * 50 + ("right",) * 50)
-    with pytest.raises(MeasurementError, match="frame 'right' stands there"):
+    with refused(MeasurementError, option="frame", value="right"):
         train_networks(measured, load_data(measured, rows))
 
 
-def test_the_correction_helps_on_rows_that_it_never_saw():
+def test_the_correction_improves_held_out_rows():
     recipe, run = trained_run("kiro4")
     measured = recipe.model_copy(update={"data": MeasuredData(kind="measured", folds=3, seed=1)})
     steps: list[str] = []
@@ -98,16 +98,15 @@ def test_the_correction_helps_on_rows_that_it_never_saw():
     assert (result.folds, result.rows_not_predicted) == (3, 0)
     assert result.corrected.rms_mm < result.nominal.rms_mm / 3
     assert result.nominal.rms_deg > 0
-    assert result.verdict.startswith("On held-out rows the correction lowers the position error (")
 
 
 def test_a_simulated_recipe_has_held_out_rows_of_its_own():
     recipe, _ = trained_run("kiro3")
-    with pytest.raises(RecipeError, match="simulates its data"):
+    with refused(RecipeError, value=recipe.name):
         cross_validate(recipe, simulate(recipe))
 
 
-def test_rows_of_the_test_set_change_nothing_that_is_learned():
+def test_rows_of_the_test_set_do_not_change_the_model():
     recipe, run = trained_run("kiro3")
     measured = recipe.model_copy(update={"data": MeasuredData(kind="measured", folds=2, seed=0)})
     everything = run.measurements

@@ -86,12 +86,12 @@ class CameraCalibration:
         if calibration.disagrees:
             warnings.append(
                 f"Images disagree on the camera by {calibration.disagreement:.2f} times the noise of corners: the "
-                "board is not flat, or the lens needs --k3. Standard deviations are enlarged by this factor, but errors "
-                "that all images share are not covered; glue the board onto something flat."
+                "board is not flat, or the lens needs --k3. Standard deviations are enlarged by this factor, not for "
+                "errors that all images share; glue the board onto something flat."
             )
         if len(calibration.tilts) < MIN_IMAGES:
             warnings.append(
-                f"With {len(calibration.tilts)} images, a single bad one distorts the result; take {MIN_IMAGES} or more."
+                f"With {len(calibration.tilts)} images, one bad image distorts the result; take {MIN_IMAGES} or more."
             )
         return tuple(warnings)
 
