@@ -1,4 +1,4 @@
-"""`pisigma.compare`: two models in, differences, distances and a verdict on rows out."""
+"""`pisigma.compare`: differences and distances between two models, and which one predicts rows better."""
 
 from dataclasses import replace
 
@@ -8,6 +8,7 @@ from testing.aged import rows_later
 from testing.closeness import assert_close
 from testing.compared import COLLISION, joints_of, model_of
 from testing.models import no_type_checker
+from testing.refusals import refused
 
 from pisigma.files.errors import IdentificationError
 from pisigma.measurement.dataset import Measurements
@@ -28,7 +29,6 @@ def compared(tmp_path_factory):
 
 def test_the_model_of_the_robot_as_it_is_predicts_its_rows_better(compared):
     assert compared.better == "rows_61"
-    assert any("rows_61 predicts them better" in line for line in compared.sentences)
 
 
 def test_a_program_misses_about_what_the_joint_moved_by(compared):
@@ -45,31 +45,28 @@ def test_the_report_is_whole(compared):
     theta = next(one for one in report["parameters"] if one["name"] == "theta_3")
     assert_close(theta["shift_deg"], 0.1, atol=0.005)
     assert theta["p"] < 1e-6
-    assert report["says"][0].startswith("rows_61 differs from rows_50 in joint 3 by ")
+    assert "joint 3" in report["says"][0]
     assert report["rows"]["better"] == "rows_61"
 
 
-def test_models_of_the_same_name_and_rows_are_told_apart_and_warned_of():
+def test_models_of_the_same_name_and_rows_get_different_names_and_a_warning():
     model = model_of(50)
     result = compare(model, replace(model))
     assert list(result.models) == ["rows_50", "rows_50-2"]
     assert result.parameters.differing == ()
     assert_close(result.to_json()["workspace"]["max_mm"], 0.0, atol=1e-6)
-    assert any("same rows" in line for line in result.warnings)
+    assert len(result.warnings) == 1
 
 
-def test_rows_that_one_of_both_was_made_of_are_no_even_test(compared):
-    assert not any("made of" in line for line in compared.warnings)
+def test_rows_that_one_of_the_models_was_made_from_are_warned_of(compared):
+    assert compared.warnings == ()
     models = [model_of(50), model_of(61, COLLISION)]
     some = rows_later(80, 61, COLLISION).select(torch.arange(8))
-    result = compare(*models, some)
-    (warning,) = (line for line in result.warnings if "was made of these rows" in line)
+    (warning,) = compare(*models, some).warnings
     assert warning.startswith("rows_61 ")
 
 
-@pytest.mark.parametrize(
-    ("settings", "hint"), [({"level": 0.0}, "between 0 and 1"), ({"frames": "fixd"}, "did you mean 'fixed'")]
-)
-def test_settings_that_make_no_sense_are_refused(settings, hint):
-    with no_type_checker(), pytest.raises(IdentificationError, match=hint):
-        ComparisonSettings(**settings)
+@pytest.mark.parametrize(("option", "value"), [("level", 0.0), ("frames", "fixd")])
+def test_settings_out_of_range_are_refused(option, value):
+    with no_type_checker(), refused(IdentificationError, option=option, value=value):
+        ComparisonSettings(**{option: value})

@@ -1,4 +1,4 @@
-"""A single row that is far off is named, and the others are judged, whether the instrument moved or not."""
+"""A single row that is far off is named, and the others are used, whether or not the instrument moved."""
 
 import dataclasses
 import math
@@ -17,14 +17,14 @@ WRONG = 5
 
 
 def with_one_far_off(rows: Measurements) -> Measurements:
-    """The rows, one of them logged with 162 deg more of the first joint."""
+    """Return the rows with 162 deg added to the first joint of one row."""
     q = rows.q.clone()
     q[WRONG, 0] += math.radians(162)
     return dataclasses.replace(rows, q=q, source="rows.csv", line=tuple(range(2, rows.rows + 2)))
 
 
 @pytest.mark.parametrize("base", [(0.0,) * 6, (0.4, 0.2, 0.0, 0.0, 0.0, 0.3)], ids=["there", "moved"])
-def test_monitor_judges_the_others(base):
+def test_monitor_uses_the_other_rows(base):
     rows = rows_later(24, 3, base=base)
     with no_type_checker():
         done = monitor(model_before(), [with_one_far_off(rows)])
@@ -37,7 +37,7 @@ def test_monitor_judges_the_others(base):
     assert sum("rows.csv, line 7" in one for one in done.warnings) == 1
 
 
-def test_report_judges_the_others(tmp_path):
+def test_report_uses_the_other_rows(tmp_path):
     save_model(model_before(), tmp_path)
     with no_type_checker():
         done = report(tmp_path, with_one_far_off(rows_later(24, 3)))
@@ -47,7 +47,7 @@ def test_report_judges_the_others(tmp_path):
     assert sum("rows.csv, line 7" in one for one in done.content.remarks) == 1
 
 
-def test_recalibrate_judges_the_others():
+def test_recalibrate_uses_the_other_rows():
     with no_type_checker():
         done = recalibrate(model_before(), with_one_far_off(rows_later(24, 3)))
     assert done.trusted

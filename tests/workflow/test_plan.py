@@ -104,8 +104,8 @@ def test_existing_measurements_are_used(planned: Plan, tmp_path: Path):
     ("rows", "scale", "kind"),
     [
         (6, 1.0, "setup_fault"),
-        (20, 1e3, "setup_fault"),
-        (60, 1e3, "setup_fault"),
+        (20, 1e3, "other_robot"),
+        (60, 1e3, "other_robot"),
     ],
 )
 def test_measurements_that_cannot_be_of_the_robot_are_refused(
