@@ -5,6 +5,7 @@ import json
 import pytest
 from testing.closeness import assert_close
 from testing.models import shipped_training
+from testing.refusals import refused
 
 from elimination_cases import report_correlations, report_eliminations
 from pisigma.files.errors import RecipeError
@@ -53,5 +54,5 @@ def test_correlations_are_json_with_none_where_there_is_no_effect(recipe, calibr
 
 
 def test_a_case_that_names_no_parameter_is_refused(recipe, calibrated):
-    with pytest.raises(RecipeError, match=r"there is no parameter 'd_33' of the arm.*did you mean 'd_3'"):
+    with refused(RecipeError, value="d_33"):
         report_eliminations(recipe, [["d_33"]], *calibrated, calibrated[1])

@@ -5,6 +5,7 @@ import math
 import pytest
 import torch
 from testing.closeness import assert_close
+from testing.refusals import refused
 
 from jig_recipe import (
     JIGS,
@@ -110,7 +111,7 @@ def test_the_workspace_is_within_reach(recipe):
 def test_touches_on_no_jig_are_refused(recipe):
     stated = small(recipe)
     measurements = stated.measure(stated.draw_touches(0), 0)
-    with pytest.raises(IdentificationError, match=r"touches on jig_3 .* the jigs are jig_1, jig_2"):
+    with refused(IdentificationError, option="frames", value="touches on jig_1, jig_2"):
         calibrate_on(stated, measurements, ("jig_3",))
 
 

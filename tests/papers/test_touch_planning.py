@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 from testing.closeness import assert_close
+from testing.refusals import refused
 
 from pisigma.calibration.geometric.problem.parameters import ParameterSpace, Prior
 from pisigma.files.errors import IdentificationError
@@ -152,13 +153,11 @@ def test_what_cannot_be_planned_is_refused():
     problem, found = random_problem(5, 2, 0), candidates(3)
     Ts = torch.stack([placement.T_jig_base for placement in PLACEMENTS])
     for count in (0, 6):
-        with pytest.raises(
-            IdentificationError, match=r"1 to 5 measurements can be planned from 5 candidates"
-        ):
+        with refused(IdentificationError, option="count", value=count):
             plan_measurements(problem, count)
-    with pytest.raises(IdentificationError, match="got none; state some poses"):
+    with refused(IdentificationError, option="workspace"):
         build_planning_problem(ROBOT, found, Ts, found.q[:0], FREE)
-    with pytest.raises(IdentificationError, match="'tool_x' is no parameter of the arm"):
+    with refused(IdentificationError, option="free", value="tool_x"):
         build_planning_problem(ROBOT, found, Ts, found.q, ("a_1", "tool_x"))
     with pytest.raises(IdentificationError, match="no parameter 'a_9'"):
         build_planning_problem(ROBOT, found, Ts, found.q, ("a_9",))

@@ -1,4 +1,4 @@
-"""`python training/papers`: make the page of the recipes again, or run one of them and store its result."""
+"""`python training/papers`: generate the page of the recipes, or run one of them and store its result."""
 
 import sys
 

@@ -1,4 +1,4 @@
-"""The command `python training/papers`: make the page of the recipes again, or run one of them and store its result."""
+"""The command `python training/papers`: generate the page of the recipes, or run one of them and store its result."""
 
 import argparse
 import sys
@@ -22,10 +22,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command.
 
     Args:
-        arguments: of the command line; None takes the process's.
+        arguments: Arguments of the command line; None: those of the process.
 
     Returns:
-        The exit status: 0 done, 2 something is missing or does not fit.
+        The exit status: 0 done, 2 a file is missing or invalid.
     """
     chosen = _parser().parse_args(arguments)
     try:
@@ -46,14 +46,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="python training/papers",
-        description="Write README.md and figures/ of the recipes from their stored results, or do one of these:",
+        description="Write README.md and figures/ of the recipes from their stored results, or run a command:",
     )
-    parser.add_argument("--folder", type=Path, default=FOLDER, help="the folder of the recipes")
+    parser.add_argument("--folder", type=Path, default=FOLDER, help="folder of the recipes")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND")
     run = commands.add_parser("run", help="run a recipe and store its result")
     run.add_argument("name", help="name of the recipe, such as kiro3 or jigs")
-    run.add_argument("--data", type=Path, metavar="CSV", help="measured data, where the recipe asks for them")
-    run.add_argument("--out", type=Path, metavar="DIR", help="model folder to write [runs/NAME]")
+    run.add_argument("--data", type=Path, metavar="CSV", help="measured data, if the recipe needs them")
+    run.add_argument("--out", type=Path, metavar="DIR", help="model folder to write (default: runs/NAME)")
     touches = commands.add_parser("touches", help="write the simulated touches of the recipe jigs")
     touches.add_argument("--out", type=Path, metavar="CSV", required=True, help="file to write")
     return parser
@@ -63,10 +63,10 @@ def write_page(folder: Path) -> None:
     """Write the page and its pictures.
 
     Args:
-        folder: the folder of the recipes.
+        folder: The folder of the recipes.
 
     Raises:
-        PisigmaError: something is missing or does not fit; the page is as it was.
+        PisigmaError: A file is missing or invalid; the page is unchanged.
     """
     text = page_text(folder)
     draw_pictures(folder, read_published(folder), read_results(folder))
@@ -77,11 +77,11 @@ def write_touches(folder: Path, out: Path) -> None:
     """Write the touches of the first seed on both jigs as a measurement file.
 
     Args:
-        folder: the folder of the recipes.
-        out: the CSV file to write.
+        folder: The folder of the recipes.
+        out: The CSV file to write.
 
     Raises:
-        PisigmaError: the recipe does not fit, or the file cannot be written.
+        PisigmaError: The recipe is invalid, or the file cannot be written.
     """
     recipe = read_jig_recipe(folder / JIGS)
     rows = recipe.measure(recipe.draw_touches(0), 0)

@@ -1,4 +1,4 @@
-"""Pictures that set errors side by side: joints before and after, jigs, numbers of training rows."""
+"""Pictures that compare errors: joints before and after, jigs, numbers of training rows."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -13,7 +13,7 @@ from pisigma.reporting.figures import save_figure
 from stored_results import Result
 
 BARS = (("0.85", ""), ("0.65", "////"), ("0.95", "...."), ("0.4", ""))
-"""Shade and hatch of bars that stand beside each other."""
+"""Shade and hatch of adjacent bars."""
 MODELS = (("nominal", ":", "o"), ("geometric", "--", "s"), ("hybrid", "-", "^"))
 
 _JIG_BARS = {"nominal": "nominal", "jig_1": "jig 1 alone", "jig_2": "jig 2 alone", "both": "both jigs"}
@@ -25,8 +25,8 @@ def draw_joint_errors(
     """Draw the average joint errors before and after, the paper's and ours.
 
     Args:
-        robots: by name, `joints` of the results of the paper's way and of the default.
-        path: the PNG to write.
+        robots: By name, `joints` of the results of the paper's method and of the default.
+        path: The PNG file to write.
     """
     figure = Figure(figsize=(12.4, 4.8), layout="constrained")
     counts = [len(paper) for paper, _ in robots.values()]
@@ -35,7 +35,9 @@ def draw_joint_errors(
         averages = {
             "before": [joint["training"]["before"]["average_deg"] for joint in paper],
             "after, paper": [joint["paper"]["after"]["average_deg"] for joint in paper],
-            "after, ours, the paper's way": [joint["training"]["after"]["average_deg"] for joint in paper],
+            "after, ours, method of the paper": [
+                joint["training"]["after"]["average_deg"] for joint in paper
+            ],
             "after, ours, default": [joint["training"]["after"]["average_deg"] for joint in default],
         }
         _bars(axes, averages, [joint["name"] for joint in paper], "{:.2g}", rotation=90.0)
@@ -50,8 +52,8 @@ def draw_jigs(result: Result, path: Path) -> None:
     """Draw RMS error and deviation at the test points, ours over the seeds and the paper's.
 
     Args:
-        result: of the recipe of jigs.
-        path: the PNG to write.
+        result: Result of the recipe of jigs.
+        path: The PNG file to write.
     """
     figure = Figure(figsize=(11.4, 4.6), layout="constrained")
     published, seeds = result["paper"]["absolute_error_mm"], result["seeds"]
@@ -74,11 +76,11 @@ def draw_jigs(result: Result, path: Path) -> None:
 
 
 def draw_learning_curves(robots: Mapping[str, Result], path: Path) -> None:
-    """Draw the position errors of held-out rows by the number of training rows.
+    """Draw the position errors of held-out rows over the number of training rows.
 
     Args:
-        robots: by title, results of hybrid recipes.
-        path: the PNG to write.
+        robots: Results of hybrid recipes, by title.
+        path: The PNG file to write.
     """
     figure = Figure(figsize=(12.4, 4.2), layout="constrained")
     panels = figure.subplots(1, len(robots))
@@ -114,7 +116,7 @@ def _bars(
     rotation: float = 0.0,
     spreads: Sequence[Sequence[float] | None] | None = None,
 ) -> None:
-    """Bars side by side with their values above them."""
+    """Draw adjacent bars with their values above them."""
     width = 0.84 / len(groups)
     fills = BARS if len(groups) > 2 else BARS[:2]
     for place, ((label, values), (shade, hatch)) in enumerate(zip(groups.items(), fills, strict=False)):

@@ -1,4 +1,4 @@
-"""Pictures of how trainings and calibrations went: energies, errors at every point, RMSE by iteration."""
+"""Pictures of the course of trainings and calibrations: energies, errors at every point, RMSE over iterations."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -18,15 +18,15 @@ STYLES = ("-", "--", "-.", ":", (0, (5, 1, 1, 1, 1, 1)), (0, (1, 1)))
 MARKERS = ("o", "s", "^", "v", "D", "P")
 
 _LEAST = 1e-32
-"""What 0 is drawn as on a logarithmic axis."""
+"""Value drawn for 0 on a logarithmic axis."""
 
 
 def draw_energies(ways: Mapping[str, Mapping[str, Any]], path: Path) -> None:
-    """Draw energy curves (Jeong et al. 1998, Figs 5 and 8), every joint with a line and a mark of its own.
+    """Draw energy curves (Jeong et al. 1998, Figs 5 and 8), with a separate line style and marker per joint.
 
     Args:
-        ways: by name of the way, `energies` of its result.
-        path: the PNG to write.
+        ways: `energies` of each method's result, by the name of the method.
+        path: The PNG file to write.
     """
     figure = Figure(figsize=(10.0, 4.2), layout="constrained")
     for axes, (title, energies) in zip(figure.subplots(1, len(ways)), ways.items(), strict=True):
@@ -50,20 +50,20 @@ def draw_energies(ways: Mapping[str, Mapping[str, Any]], path: Path) -> None:
 
 
 def draw_errors_on_grid(points: Mapping[str, Any], path: Path) -> None:
-    """Draw the error at every point of a polar grid, before and after, the value in every cell (Figs 4 and 6).
+    """Draw the error at every point of a polar grid, before and after, with the value in every cell (Figs 4 and 6).
 
     Args:
         points: `points` of a result.
-        path: the PNG to write.
+        path: The PNG file to write.
 
     Raises:
-        RecipeError: the points are no polar grid.
+        RecipeError: The points do not form a polar grid.
     """
     x, y = np.array(points["x_mm"]), np.array(points["y_mm"])
     radius, row = np.unique(np.hypot(x, y).round(1), return_inverse=True)
     angle, column = np.unique(np.rad2deg(np.arctan2(y, x)).round(2), return_inverse=True)
     if len(radius) * len(angle) != len(x):
-        raise RecipeError(f"the {len(x)} training points are no polar grid, which this picture is drawn for.")
+        raise RecipeError(expected="training points on a polar grid", value=f"{len(x)} points that are not")
     joints = points["errors"]
     figure = Figure(figsize=(11.4, 4.9 * len(joints)), layout="constrained")
     grid = figure.subplots(len(joints), 2, squeeze=False)
@@ -85,7 +85,7 @@ def draw_errors_on_grid(points: Mapping[str, Any], path: Path) -> None:
 
 
 def _cells(axes: Axes, values: np.ndarray, decimals: int) -> None:
-    """Cells as dark as the error is large, with its value."""
+    """Draw cells with a shade and a value according to the error."""
     size = np.abs(values)
     top = float(size.max()) or 1.0
     axes.imshow(size, cmap="Greys", vmin=0.0, vmax=1.6 * top, origin="lower", aspect="auto")
@@ -96,11 +96,11 @@ def _cells(axes: Axes, values: np.ndarray, decimals: int) -> None:
 
 
 def draw_rmse(robots: Mapping[str, tuple[Convergence, Result]], path: Path) -> None:
-    """Draw the RMSE by iteration, ours and the paper's (Park et al. 2022, Figs 10 and 11).
+    """Draw the RMSE over iterations, ours and the paper's (Park et al. 2022, Figs 10 and 11).
 
     Args:
-        robots: by name, what was published and our result.
-        path: the PNG to write.
+        robots: Published convergence and our result, by the name of the robot.
+        path: The PNG file to write.
     """
     figure = Figure(figsize=(11.0, 4.6), layout="constrained")
     for axes, (title, (published, result)) in zip(
@@ -119,7 +119,9 @@ def draw_rmse(robots: Mapping[str, tuple[Convergence, Result]], path: Path) -> N
                 label=label,
             )
         paper = [row[-1] for row in published.rmse_mm]
-        axes.plot(published.iterations, paper, "k:", marker="x", label="paper, none eliminated (cases alike)")
+        axes.plot(
+            published.iterations, paper, "k:", marker="x", label="paper, none eliminated (cases are similar)"
+        )
         axes.set_xscale("symlog", linthresh=10, linscale=1.2)
         axes.set_xticks(
             [0, 2, 4, 6, 8, 10, 100, 300, 1000], ["0", "2", "4", "6", "8", "10", "100", "300", "1000"]
@@ -127,7 +129,7 @@ def draw_rmse(robots: Mapping[str, tuple[Convergence, Result]], path: Path) -> N
         axes.xaxis.set_minor_locator(NullLocator())
         axes.set(
             yscale="log",
-            xlabel="iteration (even to 10, then logarithmic)",
+            xlabel="iteration (linear up to 10, then logarithmic)",
             ylabel="RMSE [mm]",
             ylim=(3e-14, 200),
         )

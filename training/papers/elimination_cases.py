@@ -1,4 +1,4 @@
-"""The same calibration with different parameters left out, and the correlations that tell which may be."""
+"""The same calibration with different parameters eliminated, and the correlations that show which can be."""
 
 import math
 from collections.abc import Sequence
@@ -27,22 +27,22 @@ def report_eliminations(
     rows: Measurements,
     held_out: Measurements,
 ) -> dict[str, Any]:
-    """Calibrate without the parameters of every case, and with all (Park et al. 2022, Tables 7 to 10).
+    """Calibrate without the parameters of each case, and with all parameters (Park et al. 2022, Tables 7 to 10).
 
     Args:
-        recipe: what is calibrated.
-        cases: parameters of the arm that are left out; a last case leaves out none.
-        result: the recipe's own calibration, for its redundant sets.
-        rows: what to calibrate on.
-        held_out: what to judge on.
+        recipe: Recipe of the calibration.
+        cases: Parameters of the arm to eliminate; a last case without elimination is added.
+        result: Calibration of the recipe, for its redundant sets.
+        rows: Measurements to calibrate with.
+        held_out: Measurements to judge with.
 
     Returns:
-        ``{"elimination_cases": [...], "true_values": {...}}``: per case what was left out, how many parameters
-        were estimated, the RMS error after every iteration, that of held-out rows, and the values of all members
+        ``{"elimination_cases": [...], "true_values": {...}}``: per case the eliminated parameters, the number of
+        estimated parameters, the RMS error after every iteration, that of held-out rows, and the values of all members
         of redundant sets [mm, deg].
 
     Raises:
-        RecipeError: a case names no parameter of the arm.
+        RecipeError: A case names something other than a parameter of the arm.
     """
     names = [name.removeprefix("-") for members in result.pairwise.sets for name in members]
     space = ParameterSpace(result.robot, (recipe.measurements.frame,), ("",))
@@ -67,11 +67,11 @@ def report_eliminations(
 def calibrate_without(
     recipe: GeometricRecipe, removed: Sequence[str], rows: Measurements
 ) -> CalibrationResult:
-    """Calibrate all parameters of the arm but those removed, however redundant the others are.
+    """Calibrate all parameters of the arm except those removed, even if the others are redundant.
 
     Raises:
-        RecipeError: what is removed is no parameter of the arm.
-        IdentificationError: the rows do not determine what is asked for.
+        RecipeError: A removed name is not a parameter of the arm.
+        IdentificationError: The rows do not determine the parameters.
     """
     robot = Robot.load(recipe.robot)
     space = ParameterSpace(robot, (recipe.measurements.frame,), ("",))
@@ -79,7 +79,9 @@ def calibrate_without(
     for name in removed:
         if name not in arm:
             raise RecipeError(
-                f"there is no parameter '{name}' of the arm to leave out; {nearest_choice(name, arm)}"
+                f"there is no parameter '{name}' of the arm to eliminate; {nearest_choice(name, arm)}",
+                option="cases",
+                value=name,
             )
     calibrator = recipe.calibration.calibrator(robot)
     free = tuple(name for name in arm if name not in removed)
@@ -87,7 +89,7 @@ def calibrate_without(
 
 
 def report_correlations(result: CalibrationResult) -> dict[str, Any]:
-    """Pearson correlations of lengths and of angles (Park et al. 2022, Tables 3 to 6); None where there is none."""
+    """Return Pearson correlations of lengths and of angles (Park et al. 2022, Tables 3 to 6); None if undefined."""
     pairwise = result.pairwise
     return {"correlations": {"lengths": _table(pairwise.lengths), "angles": _table(pairwise.angles)}}
 
@@ -100,7 +102,7 @@ def _table(table: CorrelationTable) -> dict[str, Any]:
 
 
 def _values(robot: Robot, names: list[str], space: ParameterSpace) -> dict[str, float]:
-    """Parameters of the arm by name [mm, deg]."""
+    """Return parameters of the arm by name [mm, deg]."""
     values = robot.dh.reshape(-1)
     found = {}
     for name in names:

@@ -1,4 +1,4 @@
-"""How far off a robot is that was calibrated on jigs: at test points and over the workspace."""
+"""Position errors of a robot that was calibrated on jigs, at test points and over the workspace."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -16,32 +16,35 @@ from straight_lines import Controller
 
 DEFINITIONS = (
     "absolute error, robot frame: the controller solves the inverse kinematics of a test point with its "
-    "parameters; the error is where the true tool then is minus the test point, in the robot's frame",
-    "absolute error, seen from a jig: the same tool position measured in the frame of the jig as it really "
-    "stands, minus where the test point should be in it by the parameters; so it holds the error of the "
-    "jig's base too",
-    "RMS: over the x, y and z errors of all test points; deviation: the mean over x, y and z of the errors' "
-    "standard deviation over the test points (both give the paper's figures from its Tables 3 to 7)",
-    "Move-L: both ends are taught with the true robot, so they are met; the deviation is where the true tool is "
-    "minus where it should be on the straight line between them, per axis the largest of the line",
-    "I-Move: only the start is taught, direction and distance are commanded; dL is the distance of the true ends "
-    "minus the distance commanded",
-    "nominal, one jig, both: the paper's parameters by plain least squares; default: all that the touches on both "
-    "jigs can tell, with pisigma's prior; planned and random: the paper's parameters from touches that were chosen "
-    "from many candidates, and from as many drawn from them",
-    "workspace: distance of the true tool from where the parameters put it at the same joint values, over "
-    "poses of the workspace, in the robot's frame",
+    "parameters; the error is the resulting position of the true tool minus the test point, in the robot's "
+    "frame",
+    "absolute error, seen from a jig: the same tool position measured in the true frame of the jig, minus "
+    "the position of the test point in it according to the parameters; this includes the error of the jig's"
+    " base",
+    "RMS: over the x, y and z errors of all test points; deviation: the mean over x, y and z of the errors'"
+    " standard deviation over the test points (both reproduce the paper's figures from its Tables 3 to 7)",
+    "Move-L: both ends are taught with the true robot, so they are reached exactly; the deviation is the "
+    "position of the true tool minus that on the straight line between them, for each axis the largest "
+    "along the line",
+    "I-Move: only the start is taught, direction and distance are commanded; dL is the true distance "
+    "between the ends minus the commanded one",
+    "nominal, one jig, both: the paper's parameters by plain least squares; default: everything "
+    "identifiable from the touches on both jigs, with pisigma's prior; planned and random: the paper's "
+    "parameters from touches chosen from many candidates, and from the same number drawn at random from "
+    "them",
+    "workspace: distance between the true tool and its position according to the parameters at the same "
+    "joint values, over poses of the workspace, in the robot's frame",
 )
-"""What the figures mean, in sentences."""
+"""Definitions of the figures, as sentences."""
 
 
 @dataclass(frozen=True, eq=False)
 class Bench:
-    """The true robot and where it is looked at; the same for all calibrations of a recipe.
+    """The true robot and the poses at which it is evaluated; the same for all calibrations of a recipe.
 
     Attributes:
-        recipe: what is simulated.
-        true_robot: the robot as it really is.
+        recipe: Recipe of the simulation.
+        true_robot: The simulated true robot.
         workspace: joint values over the workspace [rad or m].
     """
 
@@ -51,7 +54,7 @@ class Bench:
 
     @staticmethod
     def of(recipe: JigRecipe) -> "Bench":
-        """The bench of a recipe.
+        """Return the bench of a recipe.
 
         Raises:
             RecipeError: the recipe names a robot, joint or branch that does not exist.
@@ -60,27 +63,27 @@ class Bench:
 
     @cached_property
     def true_positions(self) -> Float64[Tensor, "poses 3"]:
-        """Where the true tool is over the workspace [m]."""
+        """Positions of the true tool over the workspace [m]."""
         return self.true_robot.forward(self.workspace)[:, :3, 3]
 
     @cached_property
     def T_test_points(self) -> Float64[Tensor, "points 4 4"]:
-        """The test points [m]."""
+        """Poses of the test points [m]."""
         return torch.stack([point.T_base_tool for point in self.recipe.test_points])
 
     def controller(self, arm: Robot) -> Controller:
-        """A controller with these parameters."""
+        """Return a controller with these parameters."""
         return Controller(self.true_robot.nominal, arm, self.recipe.branch)
 
 
 @dataclass(frozen=True, eq=False)
 class Accuracy:
-    """Errors of one calibration, see `DEFINITIONS`.
+    """Errors of one calibration; see `DEFINITIONS`.
 
     Attributes:
-        points: at the test points, in the robot's frame [m].
-        seen_from: the same as seen from every jig whose base the calibration knows [m].
-        workspace: distances over the workspace [m].
+        points: Errors at the test points, in the robot's frame [m].
+        seen_from: The same in the frame of each jig whose base was calibrated [m].
+        workspace: Distances over the workspace [m].
     """
 
     points: Float64[Tensor, "points 3"]
@@ -89,7 +92,7 @@ class Accuracy:
 
 
 def measure_accuracy(bench: Bench, calibration: JigCalibration) -> Accuracy:
-    """Drive to the test points with a calibration's parameters, and compare positions over the workspace.
+    """Move to the test points with the parameters of a calibration, and compare positions over the workspace.
 
     Raises:
         UnreachablePoseError: a test point cannot be reached.
@@ -108,17 +111,17 @@ def measure_accuracy(bench: Bench, calibration: JigCalibration) -> Accuracy:
 
 
 def rms(errors: Float64[Tensor, "points 3"]) -> float:
-    """Root mean square over all coordinates, as the paper has it [m]."""
+    """Return the root mean square over all coordinates, as in the paper [m]."""
     return float(errors.square().mean().sqrt())
 
 
 def deviation(errors: Float64[Tensor, "points 3"]) -> float:
-    """Mean over the axes of the standard deviation over the points, as the paper has it [m]."""
+    """Return the mean over the axes of the standard deviation over the points, as in the paper [m]."""
     return float(errors.std(0, correction=0).mean())
 
 
 def accuracy_figures(accuracy: Accuracy) -> dict[str, object]:
-    """The figures in millimetres."""
+    """Return the figures in millimetres."""
     return {
         "robot_frame": _figures(accuracy.points),
         "seen_from": {name: _figures(errors) for name, errors in accuracy.seen_from.items()},

@@ -1,4 +1,4 @@
-"""The card of a model that was calibrated on jigs: the paper's tables beside ours, and pictures."""
+"""The card of a model that was calibrated on jigs: comparison with the tables of the paper, and pictures."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -28,11 +28,11 @@ def write_jig_card(
     """Write the card and the pictures into a model folder.
 
     Args:
-        model: the model of the folder.
-        run: what was done.
-        report: from `report_jigs`.
-        texts: "description", "command" and "not_validated".
-        folder: where to write.
+        model: The model of the folder.
+        run: The run of the recipe.
+        report: Report from `report_jigs`.
+        texts: Texts "description", "command" and "not_validated".
+        folder: Folder to write to.
     """
     recipe = run.bench.recipe
     alone = {frame: f"{frame} alone" for frame in recipe.frames}
@@ -59,16 +59,16 @@ def _text(model: CalibratedModel, report: Mapping[str, Any], texts: Mapping[str,
     parts = [
         f"# {model.name}",
         texts["description"].strip(),
-        f"Made by `{texts['command']}`, on {provenance.rows} simulated touches. The model's parameters are those of "
-        f"pisigma's default on all jigs. Noise: {_noise(report['noise'])}.",
-        "## What the figures mean",
+        f"Made by `{texts['command']}` from {provenance.rows} simulated touches. The model's parameters are those "
+        f"of pisigma's default with all jigs. Noise: {_noise(report['noise'])}.",
+        "## Definitions",
         "\n".join(f"- {sentence}." for sentence in report["definitions"]),
         *(f"## {title}\n\n{_markdown(table)}" for title, table in tables.items()),
         f"![errors at the test points and over the workspace]({ERRORS_PNG})",
         "## Seed by seed",
-        f"{seeds['count']} seeds draw touches and noise anew. On single seeds either can win: both jigs were "
-        f"better than the mean of the single ones in {seeds['share_of_seeds_won_by_both']:.0%}; only the averages are "
-        "claimed.",
+        f"Touches and noise are drawn with {seeds['count']} seeds. For single seeds either can be better: both jigs "
+        f"were better than the mean of the single jigs for {seeds['share_of_seeds_won_by_both']:.0%}; only the "
+        "averages are significant.",
         f"![errors of every seed]({SEEDS_PNG})",
     ]
     if lines:
@@ -79,9 +79,9 @@ def _text(model: CalibratedModel, report: Mapping[str, Any], texts: Mapping[str,
         f"over the workspace ({planning['predicted_rms_mm']:.3f} mm RMS; {planning['exchanges']} exchanges). "
         f"{per_jig}.",
         f"![the chosen touches on the jigs]({TOUCHES_PNG})",
-        "## What stays weak",
+        "## Weakly determined directions",
         "\n".join(f"- {sentence.rstrip('.')}." for sentence in report["weak_directions"])
-        or "No direction that the data hardly see.",
+        or "No direction is weakly determined.",
         "## Not validated",
         texts["not_validated"].strip(),
         "## Provenance",

@@ -1,4 +1,4 @@
-"""Pictures of touched jigs: the touches, the errors, the straight lines, and how seeds differ."""
+"""Pictures of the recipe of jigs: touches, errors, straight lines, and differences between seeds."""
 
 from collections.abc import Mapping
 from itertools import product
@@ -28,19 +28,19 @@ SEEDS_PNG = "seeds.png"
 
 AXES = (("x", "tab:red", "o"), ("y", "tab:green", "s"), ("z", "tab:blue", "^"))
 TORCH = 0.06
-"""[m] How much of the torch is drawn at a touch."""
+"""Length of the torch that is drawn at a touch [m]."""
 
 
 def draw_touches(
     jigs: Mapping[str, Jig], candidates: TouchCandidates, chosen: Int64[Tensor, " chosen"], path: Path
 ) -> None:
-    """Draw every jig in its frame, the candidates as dots, and the chosen touches with the end of the torch.
+    """Draw every jig in its frame, the candidates as dots, and the chosen touches with the tip of the torch.
 
     Args:
-        jigs: by placement.
-        candidates: all.
-        chosen: index of those that were chosen.
-        path: the PNG to write.
+        jigs: Jigs by placement.
+        candidates: All candidates.
+        chosen: Indices of the chosen candidates.
+        path: The PNG file to write.
     """
     figure = Figure(figsize=(6.6 * len(jigs), 6.4), layout="constrained")
     picked = candidates.select(chosen)
@@ -73,12 +73,12 @@ def draw_touches(
 
 
 def draw_errors(accuracies: Mapping[str, Accuracy], labels: Mapping[str, str], path: Path) -> None:
-    """Draw the errors at the test points and how those over the workspace are spread.
+    """Draw the errors at the test points and the distribution of those over the workspace.
 
     Args:
-        accuracies: by set-up.
-        labels: what the legend calls them.
-        path: the PNG to write.
+        accuracies: Accuracies by set-up.
+        labels: Labels in the legend.
+        path: The PNG file to write.
     """
     figure = Figure(figsize=(10.4, 5.2), layout="constrained")
     points, spread = figure.subplots(1, 2)
@@ -113,12 +113,12 @@ def draw_errors(accuracies: Mapping[str, Accuracy], labels: Mapping[str, str], p
 def draw_lines(
     lines: Mapping[str, Mapping[str, tuple[TrackedLine, TrackedLine]]], labels: Mapping[str, str], path: Path
 ) -> None:
-    """Draw how far the true tool is from where it should be along every line, per axis.
+    """Draw the deviation of the true tool along every line, per axis.
 
     Args:
-        lines: by set-up and line, Move-L and I-Move.
-        labels: what the titles call the set-ups.
-        path: the PNG to write.
+        lines: Move-L and I-Move, by set-up and line.
+        labels: Labels of the set-ups in the titles.
+        path: The PNG file to write.
     """
     names = list(next(iter(lines.values())))
     columns = [(setup, kind) for kind in (0, 1) for setup in lines]
@@ -145,9 +145,9 @@ def draw_lines(
                 axes.text(
                     0.03, 0.05, f"dL {line.length_error * 1e3:+.2f} mm", transform=axes.transAxes, fontsize=8
                 )
-        grid[row][0].set_ylabel("off by [mm]", fontsize=9)
+        grid[row][0].set_ylabel("deviation [mm]", fontsize=9)
     for axes in grid[-1]:
-        axes.set_xlabel("way along the line [mm]", fontsize=9)
+        axes.set_xlabel("distance along the line [mm]", fontsize=9)
     figure.legend(*grid[0][0].get_legend_handles_labels(), loc="outside upper right", ncols=3, fontsize=9)
     save_figure(figure, path)
 
@@ -161,10 +161,10 @@ def draw_seeds(
     """Draw every seed's RMS error at the test points, and the ratio of all jigs to the mean of single ones.
 
     Args:
-        seeds: by set-up and figure [m].
-        labels: what the axis calls the set-ups; those without a label are not drawn.
-        single: set-ups of single jigs.
-        path: the PNG to write.
+        seeds: Values by set-up and figure [m].
+        labels: Labels of the set-ups; those without a label are not drawn.
+        single: Set-ups with single jigs.
+        path: The PNG file to write.
     """
     figure = Figure(figsize=(11.4, 4.6), layout="constrained")
     values, ratio = figure.subplots(1, 2, width_ratios=(2, 1))
@@ -177,7 +177,7 @@ def draw_seeds(
         values.text(place + 0.37, errors.mean(), f"{errors.mean():.2f}", va="center", fontsize=8)
     values.set_xticks(range(len(shown)), [labels[name] for name in shown], fontsize=8)
     values.set(ylim=(0, None), xlim=(-0.5, len(shown) - 0.2), ylabel="RMS error at the test points [mm]")
-    values.set_title("one dot a seed, line: mean", fontsize=10)
+    values.set_title("one dot per seed, line: mean", fontsize=10)
     values.grid(alpha=0.3, axis="y")
     mean = np.mean([seeds[name]["rms"] for name in single], axis=0)
     ratios = np.sort(seeds["both"]["rms"] / mean)
@@ -192,14 +192,14 @@ def draw_seeds(
 
 
 def _tips(candidates: TouchCandidates, placement: str) -> Float64[np.ndarray, "touches 3"]:
-    """Tips on one placement in its frame [mm]."""
+    """Return tips on one placement in its frame [mm]."""
     own = torch.tensor([frame == placement for frame in candidates.frame], dtype=torch.bool)
     tips: np.ndarray = candidates.T_jig_tool[own, :3, 3].numpy() * 1e3
     return tips
 
 
 def _faces(jig: Jig) -> Float64[np.ndarray, "faces 4 3"]:
-    """Corners of all faces of all blocks [m]."""
+    """Return corners of all faces of all blocks [m]."""
     found = []
     for low, high in zip(jig.lower.numpy(), jig.upper.numpy(), strict=True):
         bounds = np.stack([low, high])

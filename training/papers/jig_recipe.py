@@ -1,4 +1,4 @@
-"""Recipes of a robot that touches jigs: what is wrong, what is touched, and what is looked at afterwards."""
+"""Recipes of a robot that touches jigs: its errors, the touches, and the evaluation."""
 
 import os
 from collections.abc import Sequence
@@ -39,11 +39,11 @@ Triple = tuple[float, float, float]
 Free = Literal["paper", "default"]
 
 CLEAR_OF_SINGULARITIES = 0.05
-"""Least `singularity_measure` of the poses of the workspace."""
+"""Minimum `singularity_measure` of the poses of the workspace."""
 
 
 JIGS = Path("papers") / "jigs.yaml"
-"""The recipe in the folder of the recipes."""
+"""File name of the recipe in the folder of the recipes."""
 
 
 class PointSection(Section):
@@ -63,10 +63,10 @@ class LineSection(Section):
     """A straight line in the robot's frame.
 
     Attributes:
-        name: what the table calls it.
-        from_mm: its start [mm].
-        to_mm: its end [mm].
-        rpy_deg: orientation of the tool on it [deg].
+        name: Name in the table.
+        from_mm: Start [mm].
+        to_mm: End [mm].
+        rpy_deg: Orientation of the tool along the line [deg].
     """
 
     name: str
@@ -81,11 +81,11 @@ class LineSection(Section):
 
 
 class PlanningSection(Section):
-    """Which touches are planned.
+    """Planning of touches.
 
     Attributes:
-        candidates: of which touches are chosen; the count is per placement.
-        touches: how many are chosen.
+        candidates: Candidates to choose from; the count is per placement.
+        touches: Number of touches to choose.
     """
 
     candidates: TouchCandidatesSection
@@ -93,27 +93,27 @@ class PlanningSection(Section):
 
 
 class JigRecipe(Section):
-    """A simulated robot that touches the faces of jigs and is calibrated by that.
+    """A simulated robot that is calibrated by touching the faces of jigs.
 
     Attributes:
         kind: "jig_calibration".
-        name: of the recipe and, by default, of the model.
-        description: what it shows, for the model's card.
-        not_validated: what a reader must not take from it, for the card.
-        robot: catalogue name or robot file of the nominal robot.
-        errors: what is wrong with the true robot, completely.
-        placements: of the jigs; each is a frame.
-        touches: on every jig; seed k takes the stated seed + k.
-        noise: of the touches; seed k takes the stated seed + k.
-        paper_parameters: names of the arm's parameters that the paper estimates, next to the tool's position and
-            every base.
-        branch: on which the controller works at the test points and on the lines.
-        test_points: where the absolute error is looked at.
-        workspace: poses over the workspace; those out of reach are not counted.
-        lines: straight lines to drive.
-        planning: of touches.
-        seeds: how often everything random is drawn anew for averages and ratios.
-        paper: published figures to stand beside ours.
+        name: Name of the recipe and, by default, of the model.
+        description: Purpose of the recipe, for the model's card.
+        not_validated: Conclusions that the result does not support, for the card.
+        robot: Catalogue name or robot file of the nominal robot.
+        errors: All errors of the true robot.
+        placements: Placements of the jigs; each is a frame.
+        touches: Touches on every jig; seed k uses the stated seed + k.
+        noise: Noise of the touches; seed k uses the stated seed + k.
+        paper_parameters: Names of the arm's parameters that the paper estimates, in addition to the tool's position
+            and every base.
+        branch: Branch of the inverse kinematics at the test points and on the lines.
+        test_points: Points at which the absolute error is evaluated.
+        workspace: Poses over the workspace; those out of reach are ignored.
+        lines: Straight lines to move along.
+        planning: Planning of touches.
+        seeds: Number of seeds for averages and ratios.
+        paper: Published figures for comparison.
     """
 
     kind: Literal["jig_calibration"]
@@ -148,26 +148,26 @@ class JigRecipe(Section):
         return tuple(placement.name for placement in self.placements)
 
     def true_robot(self) -> TrueRobot:
-        """The robot as it really is."""
+        """Return the true robot."""
         return TrueRobot(Robot.load(self.robot), self.errors)
 
     def draw_touches(self, seed: int) -> TouchCandidates:
-        """The touches of one seed, drawn at random."""
+        """Return the random touches of one seed."""
         section = self.touches.model_copy(update={"seed": self.touches.seed + seed})
         return section.find(Robot.load(self.robot), self.placements)
 
     def measure(self, candidates: TouchCandidates, seed: int) -> Measurements:
-        """Touch these with the true robot, with the noise of one seed.
+        """Measure these touches with the true robot, with the noise of one seed.
 
         Raises:
-            UnreachablePoseError: a touch misses its face.
+            UnreachablePoseError: A touch misses its face.
         """
         noise = self.noise.model_copy(update={"seed": self.noise.seed + seed})
         travel = self.touches.travel_mm / 1e3
         return simulate_touches(self.true_robot(), self.placements, candidates, noise, travel)
 
     def calibrator(self, free: Free, jigs: Sequence[str]) -> GeometricCalibrator:
-        """The calibrator for some jigs: the paper's parameters by plain least squares, or pisigma's default."""
+        """Return the calibrator for some jigs: the paper's parameters by plain least squares, or pisigma's default."""
         robot = Robot.load(self.robot)
         frames = {name: base.tolist() for name, base in self.believed_bases().items() if name in jigs}
         if free == "default":
@@ -183,17 +183,17 @@ class JigRecipe(Section):
         )
 
     def believed_bases(self) -> dict[str, Float64[np.ndarray, " 6"]]:
-        """Where the operator believes that the robot stands, by jig: x, y, z [m], roll, pitch, yaw [rad]."""
+        """Assumed base of the robot in the frame of each jig: x, y, z [m], roll, pitch, yaw [rad]."""
         return {placement.name: placement.base.to_si() for placement in self.placements}
 
     def workspace_joints(self) -> Float64[Tensor, "poses dof"]:
-        """Joint values [rad or m] of the nominal robot at those poses of the workspace that it reaches."""
+        """Return joint values [rad or m] of the nominal robot at the reachable poses of the workspace."""
         robot = Robot.load(self.robot)
         q, reached = BranchSection(near_deg={}).find(robot, self.workspace.transforms())
         return q[reached & (singularity_measure(robot, q) >= CLEAR_OF_SINGULARITIES)]
 
     def planning_problem(self, candidates: TouchCandidates, prior: Prior | None = None) -> PlanningProblem:
-        """What the candidates tell of the paper's parameters."""
+        """Return the planning problem: the information of the candidates about the paper's parameters."""
         return build_planning_problem(
             Robot.load(self.robot),
             candidates,
@@ -209,19 +209,19 @@ def read_jig_recipe(path: str | os.PathLike[str]) -> JigRecipe:
     """Read a recipe of a robot that touches jigs.
 
     Raises:
-        RecipeError: the file cannot be read or does not fit; the message names file, line and key.
+        RecipeError: The file cannot be read or is invalid; it names file, line and key.
     """
     return read_yaml(path, JigRecipe, RecipeError)
 
 
 @dataclass(frozen=True, eq=False)
 class JigCalibration:
-    """A calibration in the robot's own frame.
+    """A calibration in the robot's frame.
 
     Attributes:
-        arm: the calibrated robot; its base is the robot's frame.
-        bases: by jig x, y, z [m], roll, pitch, yaw [rad] of T_jig_base; of all jigs, or of those touched.
-        result: what the calibrator gave; None for the nominal robot.
+        arm: The calibrated robot; its base is the robot's frame.
+        bases: x, y, z [m], roll, pitch, yaw [rad] of T_jig_base by jig; for all jigs, or for those touched.
+        result: Result of the calibrator; None for the nominal robot.
     """
 
     arm: Robot
@@ -230,7 +230,7 @@ class JigCalibration:
 
 
 def nominal_calibration(recipe: JigRecipe) -> JigCalibration:
-    """The robot as drawn and the jigs where the operator believes them."""
+    """Return the nominal robot with the assumed placements of the jigs."""
     return JigCalibration(Robot.load(recipe.robot), recipe.believed_bases())
 
 
@@ -243,13 +243,14 @@ def calibrate_on(
     """Calibrate with the touches on some of the jigs.
 
     Raises:
-        IdentificationError: the touches do not determine what is asked for, or there are none on these jigs.
+        IdentificationError: The touches do not determine the parameters, or there are none on these jigs.
     """
     rows = torch.tensor([name in frames for name in measurements.frame]).nonzero()[:, 0]
     if not len(rows):
         raise IdentificationError(
-            f"touches on {', '.join(frames)} were wanted, but there are none; the jigs are "
-            f"{', '.join(recipe.frames)}."
+            expected=f"touches on {', '.join(frames)}",
+            value=f"touches on {', '.join(recipe.frames)}",
+            option="frames",
         )
     result = recipe.calibrator(free, frames).fit(measurements.select(rows))
     return JigCalibration(result.robot.with_geometry(base=np.zeros(6)), dict(result.bases), result)

@@ -1,4 +1,4 @@
-"""What a recipe of touched jigs gives: the paper's tables beside ours, averages over seeds, planned touches."""
+"""Results of the recipe of jigs: comparison with the tables of the paper, averages over seeds, planned touches."""
 
 import math
 from collections.abc import Callable
@@ -35,19 +35,19 @@ FIGURES = ("rms", "deviation", "mean", "workspace_median", "workspace_rms")
 
 @dataclass(frozen=True, eq=False)
 class JigRun:
-    """Everything that report, card and pictures are made of.
+    """Data of the report, the card and the pictures.
 
     Attributes:
-        bench: the true robot and where it is looked at.
-        candidates: touches of the first seed.
-        measurements: what they gave.
-        calibrations: of the first seed, by set-up: "nominal", every jig alone, "both", "default".
-        accuracies: theirs.
-        lines: by set-up and line, Move-L and I-Move.
-        problem: what all candidates of the plan tell.
-        planned_from: those candidates.
-        plan: which were chosen.
-        seeds: by set-up and figure, one value per seed [m].
+        bench: The true robot and the poses at which it is evaluated.
+        candidates: Touches of the first seed.
+        measurements: Their measurements.
+        calibrations: Calibrations with the first seed, by set-up: "nominal", every jig alone, "both", "default".
+        accuracies: Their accuracies.
+        lines: Move-L and I-Move, by set-up and line.
+        problem: Planning problem of all candidates.
+        planned_from: The candidates of the plan.
+        plan: The chosen touches.
+        seeds: One value per seed [m], by set-up and figure.
     """
 
     bench: Bench
@@ -63,16 +63,16 @@ class JigRun:
 
 
 def run_jigs(recipe: JigRecipe, progress: Progress = lambda text: None) -> JigRun:
-    """Touch, calibrate, plan, and do it all again for every seed.
+    """Touch, calibrate and plan, and repeat this for every seed.
 
     Args:
-        recipe: what to simulate.
-        progress: is told what is being done.
+        recipe: Recipe to simulate.
+        progress: Called with the name of each step.
 
     Raises:
-        IdentificationError: touches do not determine what is asked for.
-        UnreachablePoseError: a touch, a test point or a line cannot be reached.
-        RecipeError: the recipe does not fit together.
+        IdentificationError: The touches do not determine the parameters.
+        UnreachablePoseError: A touch, a test point or a line cannot be reached.
+        RecipeError: The recipe is inconsistent.
     """
     _check_jigs(recipe)
     bench = Bench.of(recipe)
@@ -112,7 +112,7 @@ def run_jigs(recipe: JigRecipe, progress: Progress = lambda text: None) -> JigRu
 
 
 def report_jigs(run: JigRun) -> dict[str, Any]:
-    """Everything that is said of a run, in millimetres and degrees."""
+    """Return all figures of a run, in millimetres and degrees."""
     recipe = run.bench.recipe
     return {
         "definitions": list(DEFINITIONS),
@@ -151,7 +151,7 @@ def report_jigs(run: JigRun) -> dict[str, Any]:
 
 
 def parameter_table(run: JigRun) -> list[dict[str, Any]]:
-    """Table 2: the paper's parameters as drawn, as they are, as estimated, and as the paper estimated them."""
+    """Return Table 2: nominal, true and estimated values of the parameters, and the paper's estimates."""
     recipe = run.bench.recipe
     published = recipe.paper.get("parameters", {})
     truth = {p.name: (p.true_base or p.base).to_si() for p in recipe.placements}
@@ -175,7 +175,7 @@ def parameter_table(run: JigRun) -> list[dict[str, Any]]:
 def seed_figures(
     seeds: dict[str, dict[str, Float64[np.ndarray, " seeds"]]], frames: tuple[str, ...]
 ) -> dict[str, Any]:
-    """Averages over the seeds, their standard deviations (divided by n), and the promised ratios [mm]."""
+    """Return averages over the seeds, their standard deviations (divided by n), and their ratios [mm]."""
     averages = {
         setup: {f"{name}_mm": float(values.mean()) * 1e3 for name, values in figures.items()}
         for setup, figures in seeds.items()
@@ -199,7 +199,7 @@ def seed_figures(
 
 
 def _calibrations(recipe: JigRecipe, measurements: Measurements) -> dict[str, JigCalibration]:
-    """The robot as drawn, with every jig alone, with all, and all that these can tell."""
+    """Return the nominal robot and the calibrations with each jig, with all jigs, and of everything identifiable."""
     found = {"nominal": nominal_calibration(recipe)}
     for frame in recipe.frames:
         found[frame] = calibrate_on(recipe, measurements, (frame,))
@@ -211,7 +211,7 @@ def _calibrations(recipe: JigRecipe, measurements: Measurements) -> dict[str, Ji
 def _planned_and_random(
     recipe: JigRecipe, candidates: TouchCandidates, plan: MeasurementPlan, seed: int
 ) -> dict[str, JigCalibration]:
-    """With the planned touches, and with as many others drawn from the same candidates."""
+    """Return calibrations with the planned touches, and with the same number drawn at random from the candidates."""
     generator = torch.Generator().manual_seed(recipe.planning.candidates.seed + seed)
     drawn = torch.randperm(candidates.count, generator=generator)[: len(plan.chosen)].sort().values
     found = {}
@@ -235,7 +235,7 @@ def _append(figures: dict[str, list[float]], accuracy: Accuracy) -> None:
 
 
 def _drive(bench: Bench, calibration: JigCalibration) -> dict[str, tuple[TrackedLine, TrackedLine]]:
-    """Every line by Move-L and by I-Move."""
+    """Return every line by Move-L and by I-Move."""
     controller, found = bench.controller(calibration.arm), {}
     for line in bench.recipe.lines:
         T = line.T_ends
@@ -255,7 +255,7 @@ def _line(line: TrackedLine) -> dict[str, Any]:
 
 
 def _counts(run: JigRun, chosen: torch.Tensor) -> dict[str, dict[str, int]]:
-    """How many touches of every axis on every jig."""
+    """Return the number of touches along every axis on every jig."""
     touched = run.planned_from.select(chosen)
     pairs = list(zip(touched.frame, touched.touch_axis, strict=True))
     return {frame: {axis: pairs.count((frame, axis)) for axis in "xyz"} for frame in run.bench.recipe.frames}
@@ -264,12 +264,12 @@ def _counts(run: JigRun, chosen: torch.Tensor) -> dict[str, dict[str, int]]:
 def _ratios(
     of: dict[str, Float64[np.ndarray, " seeds"]], to: dict[str, Float64[np.ndarray, " seeds"]]
 ) -> dict[str, float]:
-    """Average over average."""
+    """Return the ratio of two averages."""
     return {name: float(of[name].mean() / to[name].mean()) for name in FIGURES}
 
 
 def _values(arm: Robot, bases: dict[str, Float64[np.ndarray, " 6"]]) -> dict[str, float]:
-    """Parameters by name [mm, deg]."""
+    """Return parameters by name [mm, deg]."""
     found = {}
     for row, parameters in enumerate(arm.dh.tolist(), start=1):
         for column, value in zip(("theta", "d", "a", "alpha", "beta"), parameters, strict=True):
@@ -289,4 +289,4 @@ def _is_length(name: str) -> bool:
 
 def _check_jigs(recipe: JigRecipe) -> None:
     if len(recipe.placements) < 2:
-        raise RecipeError("jig_calibration: two placements or more were wanted, to compare them; got one.")
+        raise RecipeError(expected="two or more placements, to compare them", value=1, option="placements")

@@ -1,4 +1,4 @@
-"""Running the recipe of touched jigs: its model folder with card and pictures, and the tables on the terminal."""
+"""Running the recipe of jigs: model folder with card and pictures, and tables on the terminal."""
 
 import shlex
 import time
@@ -29,14 +29,14 @@ def run_jigs_recipe(path: Path, out: Path) -> dict[str, Any]:
     """Calibrate the simulated robot of the recipe with touches, write the model folder and print the tables.
 
     Args:
-        path: the recipe.
-        out: model folder to write.
+        path: The recipe.
+        out: Model folder to write.
 
     Returns:
         The report of `report_jigs`, with "model" and "seconds".
 
     Raises:
-        PisigmaError: the recipe does not fit, or the folder cannot be written.
+        PisigmaError: The recipe is invalid, or the folder cannot be written.
     """
     started = time.perf_counter()
     recipe = read_jig_recipe(path)

@@ -1,4 +1,4 @@
-"""A robot that touches jigs beside Lim et al., Tables 1 to 10."""
+"""A robot that touches jigs, compared with Lim et al., Tables 1 to 10."""
 
 from jig_recipe import JigRecipe
 from jig_tables import (
@@ -23,37 +23,37 @@ SET_UPS = {
     "jig_1": "paper's {jig_1}, jig 1 alone",
     "jig_2": "paper's {jig_2}, jig 2 alone",
     "both": "paper's {both}, both jigs",
-    "default": "default: all that can be identified, both jigs",
-    "planned": "paper's {both}, {touches} planned of {candidates} candidates",
-    "random": "paper's {both}, {touches} random ones",
+    "default": "default: everything identifiable, both jigs",
+    "planned": "paper's {both}, {touches} planned from {candidates} candidates",
+    "random": "paper's {both}, {touches} random touches",
 }
-"""What the set-ups are called; numbers are filled in."""
+"""Labels of the set-ups, with placeholders for numbers."""
 
 
 def jig_sections(published: Published, results: StoredResults, recipe: JigRecipe) -> list[str]:
-    """The sections of the recipe."""
+    """Return the sections of the recipe."""
     result = results["jigs"]
     return [
         command_block("jigs"),
         published.notes["jigs"],
         picture(JIG_COMPARISON, "RMS error and deviation at the test points, ours and the paper's"),
-        "RMS error and deviation at the test points: ours are averages over the seeds with one standard deviation, the "
-        "paper's those of Tables 3 to 7 (both jigs: the mean of Tables 6 and 7, as in Table 8).",
+        "RMS error and deviation at the test points: ours are averages over the seeds ± one standard deviation; the "
+        "paper's are from Tables 3 to 7 (both jigs: the mean of Tables 6 and 7, as in Table 8).",
         _averages(result),
-        "What the figures mean:",
+        "Definitions:",
         "\n".join(f"- {sentence}." for sentence in result["definitions"]),
         "### Nominal parameters of the welding robot",
         *dh_lines("welding", "welding robot", published.dh_tables["welding"]),
         _frames(published, recipe),
         "### Estimated parameters",
-        "Table 2. The column `true` is what our robot is made with: the paper's result with both jigs.",
+        "Table 2. The column `true` contains the parameters of our true robot: the paper's result with both jigs.",
         _rendered(parameter_table(result)),
         "### Errors at the test points",
-        "Tables 3 to 7, first seed. Of Tables 3 to 5 the paper does not say in which frame they are seen.",
+        "Tables 3 to 7, first seed. For Tables 3 to 5 the paper does not state the frame.",
         _rendered(error_table(result)),
-        folded("The same error by error", _rendered(component_table(result))),
-        "### One jig against both",
-        "Table 8. Its ratio is both jigs over the mean of the single ones.",
+        folded("The same for every coordinate", _rendered(component_table(result))),
+        "### One jig compared with both",
+        "Table 8. Its ratio is the error with both jigs over the mean error with single jigs.",
         _rendered(seed_table(result)),
         _said(result),
         "### Straight lines",
@@ -121,9 +121,10 @@ def _said(result: Result) -> str:
     paper = {key: table["both"][key] / table["one_jig"][key] for key in ("mean", "deviation")}
     change = 100 * (ratios["default_over_paper"]["rms"] - 1)
     return (
-        f"Both jigs against the mean of the single ones: {both['rms']:.2f} of the error, {both['deviation']:.2f} of "
-        f"the deviation (paper: {paper['mean']:.2f} and {paper['deviation']:.2f}); both jigs win with "
-        f"{100 * seeds['share_of_seeds_won_by_both']:.0f} % of the seeds. The default against the paper's parameters: "
-        f"{change:+.1f} % of the error at the test points. Planned touches against random ones: "
-        f"{ratios['planned_over_random']['rms']:.2f} of the error."
+        f"Both jigs compared with the mean of the single jigs: {both['rms']:.2f} times the error, "
+        f"{both['deviation']:.2f} times the deviation "
+        f"(paper: {paper['mean']:.2f} and {paper['deviation']:.2f}); both jigs are better for "
+        f"{100 * seeds['share_of_seeds_won_by_both']:.0f} % of the seeds. The default compared with the "
+        f"paper's parameters: {change:+.1f} % error at the test points. Planned touches compared with random ones: "
+        f"{ratios['planned_over_random']['rms']:.2f} times the error."
     )

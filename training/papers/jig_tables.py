@@ -1,4 +1,4 @@
-"""The paper's Tables 2 to 10 beside ours, as rows of text."""
+"""Tables 2 to 10 of the paper compared with ours, as rows of text."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -10,9 +10,9 @@ class Table:
     """A table ready to print.
 
     Attributes:
-        title: what it shows, and which of the paper's tables it stands beside.
-        columns: their heads.
-        rows: cells.
+        title: What it shows, and the tables of the paper that it reproduces.
+        columns: Headings.
+        rows: Cells.
     """
 
     title: str
@@ -21,7 +21,7 @@ class Table:
 
 
 def all_tables(report: Mapping[str, Any]) -> tuple[Table, ...]:
-    """All tables of a report from `report_jigs`."""
+    """Return all tables of a report from `report_jigs`."""
     tables = [parameter_table(report), error_table(report), component_table(report), seed_table(report)]
     if any(report["lines"].values()):
         tables.append(line_table(report))
@@ -29,7 +29,7 @@ def all_tables(report: Mapping[str, Any]) -> tuple[Table, ...]:
 
 
 def parameter_table(report: Mapping[str, Any]) -> Table:
-    """Table 2: estimated parameters."""
+    """Return Table 2: estimated parameters."""
     rows = report["parameters"]
     ours = [name for name in rows[0] if name not in ("name", "unit", "paper")]
     published = list(rows[0]["paper"])
@@ -45,11 +45,11 @@ def parameter_table(report: Mapping[str, Any]) -> Table:
         for row in rows
     )
     columns = ("parameter", "unit", *heads, *(f"paper, {name}" for name in published))
-    return Table("Estimated parameters (Table 2; in brackets how many were estimated)", columns, cells)
+    return Table("Estimated parameters (Table 2; number of estimated parameters in brackets)", columns, cells)
 
 
 def error_table(report: Mapping[str, Any]) -> Table:
-    """Tables 3 to 7: RMS and deviation at the test points, and the workspace."""
+    """Return Tables 3 to 7: RMS and deviation at the test points, and over the workspace."""
     published = report["paper"].get("absolute_error_mm", {})
     rows = []
     for name, figures in report["accuracy"].items():
@@ -85,7 +85,7 @@ def error_table(report: Mapping[str, Any]) -> Table:
 
 
 def component_table(report: Mapping[str, Any]) -> Table:
-    """Tables 3 to 7 in full: x, y and z errors at every test point."""
+    """Return Tables 3 to 7 in full: x, y and z errors at every test point."""
     published = report["paper"].get("absolute_error_mm", {})
     rows, points = [], 0
     for name, figures in report["accuracy"].items():
@@ -104,7 +104,7 @@ def component_table(report: Mapping[str, Any]) -> Table:
 
 
 def seed_table(report: Mapping[str, Any]) -> Table:
-    """Table 8: averages over the seeds, and ratios."""
+    """Return Table 8: averages over the seeds, and their ratios."""
     seeds = report["seeds"]
     figures = ("rms", "deviation", "mean", "workspace_median", "workspace_rms")
     rows = [
@@ -128,12 +128,12 @@ def seed_table(report: Mapping[str, Any]) -> Table:
         "workspace: RMS",
         "paper",
     )
-    title = f"Averages over {seeds['count']} seeds [mm], robot frame, and ratios of them (Table 8)"
+    title = f"Averages over {seeds['count']} seeds [mm], robot frame, and their ratios (Table 8)"
     return Table(title, columns, tuple(rows))
 
 
 def line_table(report: Mapping[str, Any]) -> Table:
-    """Tables 9 and 10: straight lines."""
+    """Return Tables 9 and 10: straight lines."""
     published = report["paper"].get("lines_mm", {})
     rows = []
     for setup, lines in report["lines"].items():

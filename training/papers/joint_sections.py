@@ -1,4 +1,4 @@
-"""Inverse calibration of KIRO-3 and KIRO-4 beside Jeong et al. 1998, Tables 1 and 2."""
+"""Inverse calibration of KIRO-3 and KIRO-4 compared with Jeong et al. 1998, Tables 1 and 2."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -17,27 +17,28 @@ _STATISTICS = ("average", "deviation", "maximum")
 
 
 def joint_sections(published: Published, results: StoredResults) -> list[str]:
-    """The sections of the five recipes."""
+    """Return the sections of the five recipes."""
     return [
-        "### KIRO-3, the paper's way",
+        "### KIRO-3, the method of the paper",
         *_recipe("kiro3_paper", published, results, "Table 1"),
-        picture(KIRO3_ENERGY, "energy curves of the KIRO-3, the paper's way and pisigma's default"),
-        "Fig. 5: the training energy over the epochs, in scaled units. The default ends when it has converged.",
+        picture(KIRO3_ENERGY, "energy curves of the KIRO-3, the method of the paper and pisigma's default"),
+        "Fig. 5: the training energy over the epochs, in scaled units. The default stops at convergence.",
         picture(KIRO3_ERRORS, "joint errors of the KIRO-3 at the 100 training points, before and after"),
-        "Figs 4 and 6: the joint error at every training point, radius against angle, in degrees in every cell.",
+        "Figs 4 and 6: the joint error at every training point, over radius and angle, in degrees.",
         "### KIRO-3, default",
         *_recipe("kiro3", published, results, "Table 1"),
-        "### KIRO-3 with wrong link lengths, base and joint zeros",
+        "### KIRO-3 with wrong link lengths, base and joint offsets",
         *_recipe("kiro3_physical", published, results, "Table 1"),
-        "### KIRO-4, the paper's way",
+        "### KIRO-4, the method of the paper",
         *_recipe("kiro4_paper", published, results, "Table 2"),
-        picture(KIRO4_ENERGY, "energy curves of the KIRO-4, the paper's way and pisigma's default"),
+        picture(KIRO4_ENERGY, "energy curves of the KIRO-4, the method of the paper and pisigma's default"),
         "Fig. 8: the training energy over the epochs, in scaled units.",
         "### KIRO-4, default",
         *_recipe("kiro4", published, results, "Table 2"),
         "### All joints before and after",
         picture(
-            JOINT_ERRORS, "average joint errors of KIRO-3 and KIRO-4: before, paper, paper's way, default"
+            JOINT_ERRORS,
+            "average joint errors of KIRO-3 and KIRO-4: before, paper, method of the paper, default",
         ),
         "Averages over the training points, from the tables above.",
     ]
@@ -54,7 +55,7 @@ def _recipe(name: str, published: Published, results: StoredResults, table: str)
 
 
 def joint_comparison(joints: Sequence[dict[str, Any]]) -> str:
-    """A table of joint errors: ours, the paper's, and ours at new poses."""
+    """Return a table of joint errors: ours, the paper's, and ours at new poses."""
     head = ["joint", *(f"{when}: {name}" for when in ("before", "after") for name in _STATISTICS)]
     rows = []
     for joint in joints:
@@ -69,11 +70,11 @@ def joint_comparison(joints: Sequence[dict[str, Any]]) -> str:
 
 
 def _said(joints: Sequence[dict[str, Any]]) -> str:
-    """How averages and maxima after calibration compare, worked out."""
+    """Return a sentence on the ratios of averages and maxima after calibration."""
     parts = []
     for statistic in ("average", "maximum"):
         key = f"{statistic}_deg"
         ratios = {j["name"]: j["training"]["after"][key] / j["paper"]["after"][key] for j in joints}
         best, worst = (pick(ratios, key=lambda name: ratios[name]) for pick in (min, max))
         parts.append(f"the {statistic} is {ratios[best]:.2g} ({best}) to {ratios[worst]:.2g} ({worst})")
-    return f"At the training points after calibration, {' and '.join(parts)} of the paper's."
+    return f"At the training points after calibration, {' and '.join(parts)} times the paper's."

@@ -1,4 +1,4 @@
-"""Recipes that stand beside no paper: mini-batches, a camera, measured robots, and the hybrid."""
+"""Recipes that reproduce no paper: mini-batches, a camera, measured robots, and the hybrid."""
 
 from markdown_text import command_block, picture
 from pisigma.reporting.tables import joint_table, markdown_table, pose_table
@@ -10,16 +10,16 @@ from stored_results import Result, StoredResults
 LEARNING_CURVES = "learning_curves.png"
 
 HYBRIDS = {
-    "rb5_hybrid": "RB5 with every source of errors, hybrid",
-    "ur10_hybrid": "UR10, measured, hybrid",
-    "ur5_hybrid": "UR5, measured, hybrid",
+    "rb5_hybrid": "RB5 with all error sources, hybrid",
+    "ur10_hybrid": "Measured UR10, hybrid",
+    "ur5_hybrid": "Measured UR5, hybrid",
 }
 OTHERS = ("kiro3_mini_batches", "ur5_camera", "ur10_inverse", *HYBRIDS)
-"""Recipes of this part."""
+"""Recipes of this section."""
 
 
 def measured_sections(published: Published, results: StoredResults) -> list[str]:
-    """The sections of these recipes."""
+    """Return the sections of these recipes."""
     found = results["ur10_inverse"]
     rows, figures = found["rows"], found["cross_validation"]
     joints = [JointFigures.model_validate(joint) for joint in results["kiro3_mini_batches"]["joints"]]
@@ -27,22 +27,22 @@ def measured_sections(published: Published, results: StoredResults) -> list[str]
     text = [
         "### KIRO-3 at 4000 poses, mini-batches",
         command_block("kiro3_mini_batches"),
-        "Absolute joint errors at the training poses and at 2000 new ones:",
+        "Absolute joint errors at the training poses and at 2000 new poses:",
         joint_table(joints),
         published.notes["kiro3_mini_batches"],
-        "### UR5 with a camera on its flange",
+        "### UR5 with a camera on the flange",
         command_block("ur5_camera"),
-        "Errors of the camera's pose in the frame of the board, in 2000 other postures of the whole joint space:",
+        "Errors of the camera's pose in the frame of the board, at 2000 other postures over the whole joint space:",
         pose_table({"geometric": camera}),
         published.notes["ur5_camera"],
-        "### UR10, measured, inverse calibration",
+        "### Measured UR10, inverse calibration",
         command_block("ur10_inverse"),
-        f"Errors of held-out rows, {figures['folds']}-fold cross-validated; {rows['left_out']} of "
-        f"{rows['used'] + rows['left_out']} rows are left out of the training.",
+        f"Errors of held-out rows in {figures['folds']}-fold cross-validation; {rows['left_out']} of "
+        f"{rows['used'] + rows['left_out']} rows are not used for training.",
         pose_table({name: ErrorFigures.model_validate(figures[name]) for name in ("nominal", "corrected")}),
         published.notes["ur10_inverse"],
         picture(
-            LEARNING_CURVES, "position error of held-out rows by the number of training rows, three robots"
+            LEARNING_CURVES, "position error of held-out rows over the number of training rows, three robots"
         ),
     ]
     for name, heading in HYBRIDS.items():
@@ -78,9 +78,9 @@ def _learning_curve(result: Result) -> str:
 
 def _said(result: Result) -> str:
     whole, fit = result["seconds"], result["fit_seconds"]
-    seconds = f"{whole:.0f} s in all, {fit:.0f} s for the model itself, at the load of that run."
+    seconds = f"The run took {whole:.0f} s, of which {fit:.0f} s for the model itself."
     if "held_out" not in result:
         return seconds
     means = result["held_out"]["mean_rms_mm"]
     of = ", ".join(f"{name} {value:.4f}" for name, value in means.items())
-    return f"Mean of the RMS errors of the simulations with all rows: {of} mm. {seconds}"
+    return f"Mean over the simulations of the RMS error with all rows: {of} mm. {seconds}"

@@ -14,21 +14,21 @@ from stored_results import StoredResults
 
 
 def draw_pictures(folder: Path, published: Published, results: StoredResults) -> None:
-    """Draw them into the folder `figures` beside the page.
+    """Draw all pictures into the folder `figures` next to the page.
 
     Args:
-        folder: the folder of the recipes.
-        published: the papers' figures.
-        results: ours.
+        folder: The folder of the recipes.
+        published: Figures of the papers.
+        results: Our results.
 
     Raises:
-        RecipeError: a result is missing.
+        RecipeError: A result is missing.
     """
     target = folder / FIGURES
     target.mkdir(exist_ok=True)
     for robot, file in (("kiro3", KIRO3_ENERGY), ("kiro4", KIRO4_ENERGY)):
         ways = {
-            "the paper's way": results[f"{robot}_paper"]["energies"],
+            "method of the paper": results[f"{robot}_paper"]["energies"],
             "default": results[robot]["energies"],
         }
         draw_energies(ways, target / file)

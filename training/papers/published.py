@@ -1,4 +1,4 @@
-"""What the papers published: `training/papers/published.yaml`."""
+"""Published figures of the papers: `training/papers/published.yaml`."""
 
 from pathlib import Path
 from typing import Literal
@@ -9,17 +9,17 @@ from pisigma.files.errors import RecipeError
 from pisigma.files.yaml_file import Section, read_yaml
 
 PUBLISHED = Path("papers") / "published.yaml"
-"""Where it stands in the folder of the recipes."""
+"""File name in the folder of the recipes."""
 
 
 class Item(Section):
     """A table or figure of a paper.
 
     Attributes:
-        number: its number there.
-        shows: what.
-        section: heading under which it stands beside ours.
-        absent: why it does not.
+        number: Number in the paper.
+        shows: What it shows.
+        section: Heading of the section that compares it with ours.
+        absent: Reason why there is none.
     """
 
     number: int
@@ -30,7 +30,7 @@ class Item(Section):
     @model_validator(mode="after")
     def _one_of_both(self) -> "Item":
         if (self.section is None) == (self.absent is None):
-            raise ValueError("either section or absent was wanted")
+            raise ValueError("expected either section or absent")
         return self
 
 
@@ -38,13 +38,13 @@ class Paper(Section):
     """A paper.
 
     Attributes:
-        key: short name.
-        heading: of its part of the page.
-        citation: authors, title, journal.
-        recipes: names of those that repeat it.
-        tables: all of them.
-        figures: all of them.
-        differences: what differs from ours and why, in sentences.
+        key: Short name.
+        heading: Heading of its section.
+        citation: Authors, title, journal.
+        recipes: Names of the recipes that reproduce it.
+        tables: All tables.
+        figures: All figures.
+        differences: Sentences on the differences from our results, and why.
     """
 
     key: str
@@ -76,8 +76,8 @@ class CorrelationTriangle(Section):
 
     Attributes:
         table: its number.
-        names: the parameters.
-        lower: the lower triangle with its diagonal; None where NaN is printed.
+        names: The parameters.
+        lower: Lower triangle with its diagonal; None where NaN is printed.
     """
 
     table: int
@@ -87,7 +87,7 @@ class CorrelationTriangle(Section):
     @model_validator(mode="after")
     def _triangle(self) -> "CorrelationTriangle":
         if [len(row) for row in self.lower] != list(range(1, len(self.names) + 1)):
-            raise ValueError("a lower triangle with one row a name was wanted")
+            raise ValueError("expected a lower triangle with one row per name")
         return self
 
 
@@ -99,12 +99,12 @@ class Correlations(Section):
 
 
 class Convergence(Section):
-    """RMSE by iteration.
+    """RMSE over iterations.
 
     Attributes:
         table: its number.
-        iterations: the rows.
-        rmse_mm: a row an iteration, a column an elimination case; without elimination last [mm].
+        iterations: Iterations of the rows.
+        rmse_mm: One row per iteration, one column per elimination case, without elimination last [mm].
     """
 
     table: int
@@ -117,12 +117,12 @@ class RedundantSums(Section):
 
     Attributes:
         table: its number.
-        members: the parameters.
-        unit: of the figures.
-        parameters: how many were estimated, per case.
-        cases: parameters of the arm that are left out; a last case leaves out none.
-        values: per case, of the members.
-        sums: per case.
+        members: The parameters.
+        unit: Unit of the figures.
+        parameters: Number of estimated parameters, per case.
+        cases: Eliminated parameters of the arm; a last case has none.
+        values: Values of the members, per case.
+        sums: Their sums, per case.
     """
 
     table: int
@@ -135,16 +135,16 @@ class RedundantSums(Section):
 
 
 class Published(Section):
-    """All of it; what stands in a recipe's `paper` section is not repeated.
+    """All published figures except those in the `paper` sections of the recipes.
 
     Attributes:
-        papers: the papers.
-        dh_tables: by robot.
-        correlations: by robot.
-        convergence: by robot.
-        redundant_sums: by robot.
-        nominal_frames: base per jig and tool, as printed.
-        notes: by recipe, what to say of its figures.
+        papers: The papers.
+        dh_tables: DH tables by robot.
+        correlations: Correlations by robot.
+        convergence: Convergence by robot.
+        redundant_sums: Redundant sums by robot.
+        nominal_frames: Base per jig and tool, as printed.
+        notes: Notes on the figures, by recipe.
     """
 
     papers: tuple[Paper, ...]
@@ -156,17 +156,17 @@ class Published(Section):
     notes: dict[str, str]
 
     def paper(self, key: str) -> Paper:
-        """The paper with that key."""
+        """Return the paper with that key."""
         return next(paper for paper in self.papers if paper.key == key)
 
 
 def read_published(recipes: Path) -> Published:
-    """Read what was published.
+    """Read the published figures.
 
     Args:
-        recipes: the folder of the recipes.
+        recipes: The folder of the recipes.
 
     Raises:
-        RecipeError: the file is missing or does not fit; the message names file, line and key.
+        RecipeError: The file is missing or invalid; it names file, line and key.
     """
     return read_yaml(recipes / PUBLISHED, Published, RecipeError)

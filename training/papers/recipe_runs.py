@@ -1,4 +1,4 @@
-"""Running a recipe: its model folder, and the result that the page is made of."""
+"""Running a recipe: its model folder, and the stored result for the page."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -23,16 +23,16 @@ from training_course import report_course
 
 
 def run_recipe(folder: Path, name: str, data: Path | None, out: Path | None) -> None:
-    """Run a recipe, write its model folder and store its result, one value a line.
+    """Run a recipe, write its model folder and store its result, one value per line.
 
     Args:
-        folder: the folder of the recipes.
-        name: of the recipe.
-        data: measured data, where it asks for them.
-        out: model folder to write; None: runs/NAME.
+        folder: The folder of the recipes.
+        name: Name of the recipe.
+        data: Measured data, if the recipe needs them.
+        out: Model folder to write; None: runs/NAME.
 
     Raises:
-        PisigmaError: the recipe, the data or the folder do not fit; nothing is stored.
+        PisigmaError: The recipe, the data or the folder are invalid; nothing is stored.
     """
     out = out or Path("runs") / name
     if name == JIGS.stem:
@@ -49,22 +49,22 @@ def run_recipe(folder: Path, name: str, data: Path | None, out: Path | None) -> 
 
 
 def figures_of(training: Training) -> dict[str, Any]:
-    """All figures of a training; the command stands on the page."""
+    """Return all figures of a training, without the command."""
     figures = training.to_json()
     del figures["command"]
     return figures
 
 
 def extra_figures(folder: Path, name: str, training: Training) -> dict[str, Any]:
-    """Figures that only the page shows: the course of a training, and what leaving out parameters changes.
+    """Return figures that only the page shows: the course of a training, and the effect of eliminating parameters.
 
     Args:
-        folder: the folder of the recipes.
-        name: of the recipe.
-        training: what training it gave.
+        folder: The folder of the recipes.
+        name: Name of the recipe.
+        training: The training.
 
     Raises:
-        PisigmaError: a parameter to leave out does not exist, or the rows do not determine the others.
+        PisigmaError: A parameter to eliminate does not exist, or the rows do not determine the others.
     """
     if isinstance(training, InverseTraining):
         return report_course(training.run) if training.recipe.paper else {}

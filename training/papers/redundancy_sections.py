@@ -1,4 +1,4 @@
-"""Redundant parameters of the RB5 and the Panda beside Park et al. 2022, Tables 1 to 10."""
+"""Redundant parameters of the RB5 and the Panda compared with Park et al. 2022, Tables 1 to 10."""
 
 import math
 from typing import Any
@@ -18,17 +18,17 @@ ROBOTS = {"rb5": "RB5", "panda": "Panda"}
 _REDUNDANT = 1 - 1e-6
 _SUMMARY = (
     "parameters",
-    "left after the pairwise way",
+    "remaining after pairwise elimination",
     "exact rank",
     "without effect",
-    "iterations to converge (ours: steps tried)",
+    "iterations to convergence (ours: steps tried)",
     "RMSE after [mm]",
 )
 _COLUMNS = ("theta_deg", "d_mm", "a_mm", "alpha_deg", "beta_deg")
 
 
 def redundancy_sections(published: Published, results: StoredResults) -> list[str]:
-    """The sections of both recipes."""
+    """Return the sections of both recipes."""
     text = [
         command_block(*(f"{robot}_redundancy" for robot in ROBOTS)),
         _summary(published, results),
@@ -40,7 +40,7 @@ def redundancy_sections(published: Published, results: StoredResults) -> list[st
         found = results[f"{robot}_redundancy"]
         text += [f"### Correlations of the {title}", *_correlations(robot, title, published, found)]
     text.append(
-        picture(RMSE_BY_ITERATION, "RMSE by iteration of the RB5 and the Panda, ours and the paper's")
+        picture(RMSE_BY_ITERATION, "RMSE over iterations of the RB5 and the Panda, ours and the paper's")
     )
     for robot, title in ROBOTS.items():
         found = results[f"{robot}_redundancy"]
@@ -50,7 +50,7 @@ def redundancy_sections(published: Published, results: StoredResults) -> list[st
 
 
 def _summary(published: Published, results: StoredResults) -> str:
-    """What is redundant and how fast it converges, both robots, ours and the paper's."""
+    """Return a table of redundancy and convergence of both robots, ours and the paper's."""
     columns = []
     for robot in ROBOTS:
         found, sums = results[f"{robot}_redundancy"], published.redundant_sums[robot]
@@ -75,7 +75,7 @@ def _summary(published: Published, results: StoredResults) -> str:
                 scientific(paper["rmse_after_mm"]),
             )
         )
-    head = ["what", *(f"{title}, {whose}" for title in ROBOTS.values() for whose in ("ours", "paper"))]
+    head = ["quantity", *(f"{title}, {whose}" for title in ROBOTS.values() for whose in ("ours", "paper"))]
     rows = [(what, *map(str, cells)) for what, *cells in zip(_SUMMARY, *columns, strict=True)]
     return markdown_table(head, rows)
 
@@ -85,7 +85,7 @@ def _sets(sets: list[list[str]]) -> str:
 
 
 def dh_lines(robot: str, title: str, table: DhTable) -> list[str]:
-    """A published DH table beside the catalogue's: one value a cell where both are equal."""
+    """Return a published DH table compared with the catalogue's: one value per cell if both are equal."""
     found = Robot.load(robot)
     factors = [1e3 if column.endswith("_mm") else math.degrees(1.0) for column in _COLUMNS]
     ours = found.dh * np.array(factors)
@@ -98,10 +98,10 @@ def dh_lines(robot: str, title: str, table: DhTable) -> list[str]:
             different += not same
             cells.append(plain(paper) if same else f"{plain(paper)} / {plain(own)}")
         rows.append(tuple(cells))
-    verdict = "no value differs" if different == 0 else f"{different} values differ (paper / ours)"
+    verdict = "all values agree" if different == 0 else f"{different} values differ (paper / ours)"
     head = ["row", *(column.replace("_deg", " [deg]").replace("_mm", " [mm]") for column in _COLUMNS)]
     return [
-        f"Table {table.table}, {title}, beside `pisigma/robot/catalogue/{robot}.yaml`: {verdict}.",
+        f"Table {table.table}, {title}, compared with `pisigma/robot/catalogue/{robot}.yaml`: {verdict}.",
         markdown_table(head, rows),
     ]
 
@@ -114,13 +114,13 @@ def _correlations(robot: str, title: str, published: Published, result: Result) 
     for kind, table in (("lengths", stated.lengths), ("angles", stated.angles)):
         ours = result["correlations"][kind]
         lines.append(_compared(table, ours, kind))
-        summary = f"Table {table.table}, {title}, {kind}: above the diagonal the paper's, below it ours"
+        summary = f"Table {table.table}, {title}, {kind}: the paper's above the diagonal, ours below"
         lines.append(folded(summary, _both_triangles(table, ours)))
     return lines
 
 
 def _compared(table: CorrelationTriangle, ours: dict[str, Any], kind: str) -> str:
-    """What agrees and by how much the rest differs."""
+    """Return sentences on which correlations agree and how far the others differ."""
     assert list(table.names) == ours["names"]
     paper = np.full((len(table.names),) * 2, np.nan)
     for index, row in enumerate(table.lower):
@@ -139,10 +139,11 @@ def _compared(table: CorrelationTriangle, ours: dict[str, Any], kind: str) -> st
     largest = [float(np.abs(part[known][other]).max()) for part in (theirs, values)]
     return (
         f"Table {table.table}, {kind}: {int(pairs[0].sum())} pairs at ±1 in the paper and {int(pairs[1].sum())} here, "
-        f"{'the same with the same signs' if same_pairs else 'not the same'}; parameters without effect "
+        f"{'which are the same, with the same signs' if same_pairs else 'which are not the same'}; the parameters "
+        f"without effect are "
         f"{'the same' if same_none else 'not the same'}; the other {int(other.sum())} pairs depend on the poses and "
-        f"differ by {np.median(apart):.3f} in the median, {apart.max():.3f} at most; the largest of "
-        f"them is {largest[0]:.3f} in the paper and {largest[1]:.3f} here."
+        f"differ by {np.median(apart):.3f} (median) and {apart.max():.3f} at most; the largest is "
+        f"{largest[0]:.3f} in the paper and {largest[1]:.3f} here."
     )
 
 
@@ -172,9 +173,9 @@ def _convergence(robot: str, published: Published, result: Result) -> list[str]:
     head = ["iteration", *(f"paper: {name}" for name in names), *(f"ours: {name}" for name in names)]
     held_out = max(case["held_out_rms_mm"] for case in cases)
     return [
-        f"Table {table.table}, RMSE [mm] at the 40 poses after so many accepted steps; ours stop when they have "
-        f"converged. The cases are those of Table {published.redundant_sums[robot].table} below. At 2000 "
-        f"other poses ours err by {scientific(held_out)} mm RMS at most, whichever case.",
+        f"Table {table.table}, RMSE [mm] at the 40 poses by the number of accepted steps; our fits stop at "
+        f"convergence. The cases are those of Table {published.redundant_sums[robot].table} below. At 2000 "
+        f"other poses our errors are {scientific(held_out)} mm RMS at most, in all cases.",
         markdown_table(head, rows),
     ]
 
@@ -199,7 +200,7 @@ def _sums(robot: str, published: Published, result: Result) -> list[str]:
     head = ["eliminated", *(f"paper: {name}" for name in names), *(f"ours: {name}" for name in names)]
     true = sum(result["true_values"][name] for name in table.members) * factor
     return [
-        f"Table {table.table}, values after calibration [{table.unit}]; the sum does not depend on which is kept. "
-        f"In our true robot it is {true:{digits}}, in the paper's another.",
+        f"Table {table.table}, values after calibration [{table.unit}]; the sum does not depend on which parameter is "
+        f"kept. In our true robot it is {true:{digits}}; the paper's true robot has another value.",
         markdown_table(head, rows),
     ]

@@ -1,41 +1,42 @@
-"""What the recipes gave, as stored: `training/results/NAME.json`."""
+"""Stored results of the recipes: `training/results/NAME.json`."""
 
 import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from pisigma.files.errors import RecipeError
+from pisigma.files.errors import Place, RecipeError
 
 PAPERS = "papers"
 RESULTS = "results"
-"""Folders within that of the recipes."""
+"""Folders in the folder of the recipes."""
 
 Result = dict[str, Any]
 
 
 @dataclass(frozen=True)
 class StoredResults:
-    """Results by the names of their recipes.
+    """Results by the name of their recipe.
 
     Attributes:
-        folder: the folder of the recipes.
-        by_name: what the recipes gave.
+        folder: The folder of the recipes.
+        by_name: Results of the recipes.
     """
 
     folder: Path
     by_name: dict[str, Result]
 
     def __getitem__(self, name: str) -> Result:
-        """The result of a recipe.
+        """Return the result of a recipe.
 
         Raises:
-            RecipeError: there is none.
+            RecipeError: There is none.
         """
         if name not in self.by_name:
             raise RecipeError(
-                f"{self.folder / RESULTS / name}.json: there is no such result; make it with "
-                f"`python {self.folder / PAPERS} run {name}`."
+                "there is no such result",
+                at=Place(self.folder / RESULTS / f"{name}.json"),
+                remedy=f"create it with `python {self.folder / PAPERS} run {name}`",
             )
         return self.by_name[name]
 
@@ -44,22 +45,24 @@ def read_results(folder: Path) -> StoredResults:
     """Read all stored results.
 
     Args:
-        folder: the folder of the recipes.
+        folder: The folder of the recipes.
 
     Raises:
-        RecipeError: a file is no JSON object.
+        RecipeError: A file does not contain a JSON object.
     """
     found = {}
     for path in sorted((folder / RESULTS).glob("*.json")):
         try:
             found[path.stem] = _object(path.read_text(encoding="utf-8"))
         except ValueError as problem:
-            raise RecipeError(f"{path}: one JSON object was wanted ({problem}); make it again.") from None
+            raise RecipeError(
+                expected="one JSON object", value=str(problem), at=Place(path), remedy="create it again"
+            ) from None
     return StoredResults(folder, found)
 
 
 def result_text(result: Result) -> str:
-    """A result as it is stored: lists of plain values on one line, everything else on lines of its own."""
+    """Return a result as stored: lists of plain values on one line, everything else on separate lines."""
     return _text(result, "") + "\n"
 
 
@@ -76,5 +79,5 @@ def _text(value: Any, indent: str) -> str:
 def _object(text: str) -> Result:
     found = json.loads(text)
     if not isinstance(found, dict):
-        raise ValueError("it holds no object")
+        raise ValueError("something else than an object")
     return found

@@ -1,4 +1,4 @@
-"""Straight lines: how far the true tool leaves them when the controller's parameters are not quite right."""
+"""Deviation of the true tool from straight lines, caused by errors of the controller's parameters."""
 
 from dataclasses import dataclass
 
@@ -19,12 +19,12 @@ from pisigma.simulation.true_robot import TrueRobot
 
 @dataclass(frozen=True, eq=False)
 class Controller:
-    """A controller that turns poses into joint values with the parameters it was given.
+    """A controller that computes joint values of poses with given parameters.
 
     Attributes:
-        nominal: the robot as drawn.
-        robot: the same with the parameters that the controller has; its base is the robot's frame.
-        branch: on which branch of the inverse kinematics it works.
+        nominal: The nominal robot.
+        robot: The same with the parameters of the controller; its base is the robot's frame.
+        branch: Branch of the inverse kinematics.
     """
 
     nominal: Robot
@@ -33,17 +33,17 @@ class Controller:
 
     @property
     def is_closed_form(self) -> bool:
-        """Whether the nominal inverse kinematics takes these parameters, as those of Lim et al. were chosen to."""
+        """Whether the nominal inverse kinematics supports these parameters, as it does those of Lim et al."""
         return closed_form_solver(self.robot) is not None
 
     def joints(self, T: Float64[Tensor, "poses 4 4"]) -> Float64[Tensor, "poses dof"]:
-        """Joint values [rad or m] that the controller commands for T_base_tool [m].
+        """Return the joint values [rad or m] that the controller commands for T_base_tool [m].
 
         By the nominal, closed-form inverse kinematics where that takes the parameters, else numerically from the
         nominal solution.
 
         Raises:
-            UnreachablePoseError: a pose cannot be reached on this branch.
+            UnreachablePoseError: A pose cannot be reached on this branch.
         """
         arm = self.robot if self.is_closed_form else self.nominal
         q, reached = self.branch.find(arm, T)
@@ -55,19 +55,19 @@ class Controller:
             x, y, z = (1e3 * T[index, :3, 3]).tolist()
             raise UnreachablePoseError(
                 f"robot '{self.nominal.name}' does not reach pose {index} (counted from 0) at {x:.1f}, {y:.1f}, "
-                f"{z:.1f} mm on the branch that was asked for; move the pose or turn the tool."
+                f"{z:.1f} mm on the requested branch; move the pose or rotate the tool."
             )
         return q
 
 
 @dataclass(frozen=True, eq=False)
 class TrackedLine:
-    """What the true tool did on a line.
+    """Positions of the true tool along a line.
 
     Attributes:
-        wanted: positions on the straight line [m], in the robot's frame.
-        reached: the true tool's positions for them [m].
-        length_error: distance of the true ends minus the length that was asked for [m].
+        wanted: Requested positions on the straight line [m], in the robot's frame.
+        reached: Corresponding positions of the true tool [m].
+        length_error: True distance between the ends minus the requested length [m].
     """
 
     wanted: Float64[Tensor, "steps 3"]
@@ -76,18 +76,18 @@ class TrackedLine:
 
     @property
     def deviation(self) -> Float64[Tensor, "steps 3"]:
-        """Reached minus wanted [m]."""
+        """Reached minus requested positions [m]."""
         return self.reached - self.wanted
 
     @property
     def largest(self) -> Float64[Tensor, " 3"]:
-        """Per axis of the robot's frame the deviation that is largest in size, with its sign [m]."""
+        """Return the deviation with the largest magnitude, with its sign, per axis of the robot's frame [m]."""
         deviation = self.deviation
         return deviation.take_along_dim(deviation.abs().argmax(0, keepdim=True), 0)[0]
 
     @property
     def largest_across(self) -> float:
-        """Largest distance of the true tool from the straight line through the wanted ends [m]."""
+        """Return the largest distance of the true tool from the straight line through the requested ends [m]."""
         along = self.wanted[-1] - self.wanted[0]
         along = along / along.norm()
         away = self.reached - self.wanted[0]
@@ -104,13 +104,13 @@ def move_l(
     solves the inverse kinematics of every pose.
 
     Args:
-        true_robot: the robot.
-        controller: with the parameters to judge.
-        T_ends: true poses of the ends [m], in the robot's frame.
-        steps: poses on the line, with the ends.
+        true_robot: The true robot.
+        controller: Controller with the parameters to evaluate.
+        T_ends: True poses of the ends [m], in the robot's frame.
+        steps: Number of poses on the line, including the ends.
 
     Raises:
-        UnreachablePoseError: the robot does not reach a pose.
+        UnreachablePoseError: The robot does not reach a pose.
     """
     taught = _taught(true_robot, controller, T_ends)
     believed = forward_kinematics(controller.robot, taught)
@@ -132,19 +132,19 @@ def i_move(
     shift: Float64[Tensor, " 3"],
     steps: int = 101,
 ) -> TrackedLine:
-    """Move from a taught pose by a shift, keeping the orientation.
+    """Move from a taught pose by a translation, keeping the orientation.
 
     Only the start is taught; direction and distance are what the controller believes them to be.
 
     Args:
-        true_robot: the robot.
-        controller: with the parameters to judge.
-        T_start: true pose of the start [m], in the robot's frame.
-        shift: how far to go [m], in the robot's frame.
-        steps: poses on the line, with the ends.
+        true_robot: The true robot.
+        controller: Controller with the parameters to evaluate.
+        T_start: True pose of the start [m], in the robot's frame.
+        shift: Translation [m], in the robot's frame.
+        steps: Number of poses on the line, including the ends.
 
     Raises:
-        UnreachablePoseError: the robot does not reach a pose.
+        UnreachablePoseError: The robot does not reach a pose.
     """
     taught = _taught(true_robot, controller, T_start[None])
     believed = forward_kinematics(controller.robot, taught)[0]
@@ -157,7 +157,7 @@ def i_move(
 def _taught(
     true_robot: TrueRobot, controller: Controller, T: Float64[Tensor, "poses 4 4"]
 ) -> Float64[Tensor, "poses dof"]:
-    """Joint values at which the true tool is at T."""
+    """Return joint values at which the true tool is at T."""
     near = Controller(controller.nominal, controller.nominal, controller.branch).joints(T)
     return true_robot.inverse(T, near)
 

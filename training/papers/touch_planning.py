@@ -1,4 +1,4 @@
-"""Which touches to make: those after which the robot's position is known best over its workspace."""
+"""Planning of touches that minimise the predicted position error over the workspace."""
 
 import math
 from collections.abc import Sequence
@@ -16,26 +16,26 @@ from pisigma.robot.kinematics.parameter_jacobian import identification_jacobian
 from pisigma.simulation.touch_candidates import TouchCandidates
 
 VAGUE = 300.0
-"""Standard deviation of what nothing is known about, in mm and mrad: so wide that it does not matter."""
+"""Standard deviation of unknowns without prior, in mm and mrad: large enough to have no effect."""
 LEAST_GAIN = 1e-4
-"""Share of the criterion that an exchange must gain; below it the search ends."""
+"""Minimum relative gain of an exchange; the search ends below it."""
 DROPPED = 0.02
-"""Share of the measurements that is dropped at a time while there are too many."""
+"""Share of the measurements that is dropped per step while there are too many."""
 MOST_EXCHANGES = 500
-"""Exchanges after which the search ends in any case."""
+"""Maximum number of exchanges."""
 
 
 @dataclass(frozen=True, eq=False)
 class PlanningProblem:
-    """What measurements tell of the parameters, and what the parameters do to the tool over the workspace.
+    """Information of measurements about the parameters, and effect of the parameters on the tool over the workspace.
 
     Parameters are in millimetres and milliradians, so that rows, weight and precision are of similar size.
 
     Attributes:
-        rows: derivative of every candidate's measured value over its standard deviation.
-        weight: mean over the workspace of J^T J, J the derivative of the tool's position in the robot's frame
+        rows: Derivative of every candidate's measured value, divided by its standard deviation.
+        weight: Mean over the workspace of J^T J, with J the derivative of the tool's position in the robot's frame
             [mm].
-        precision: 1 / variance of every parameter before anything is measured.
+        precision: Prior precision, 1 / variance, of every parameter.
     """
 
     rows: Float64[Tensor, "candidates parameters"]
@@ -43,27 +43,27 @@ class PlanningProblem:
     precision: Float64[Tensor, " parameters"]
 
     def covariance(self, chosen: Int64[Tensor, " chosen"]) -> Float64[Tensor, "parameters parameters"]:
-        """Covariance of the parameters after these measurements: `(P + Σ a aᵀ)⁻¹`."""
+        """Return the covariance of the parameters after these measurements: `(P + Σ a aᵀ)⁻¹`."""
         rows = self.rows[chosen]
         return torch.cholesky_inverse(torch.linalg.cholesky(torch.diag(self.precision) + rows.mT @ rows))
 
     def criterion(self, chosen: Int64[Tensor, " chosen"]) -> float:
-        """Mean over the workspace of the predicted squared position error, `tr(C W)` [mm²]."""
+        """Return the mean over the workspace of the predicted squared position error, `tr(C W)` [mm²]."""
         return float((self.covariance(chosen) * self.weight).sum())
 
     def predicted_error(self, chosen: Int64[Tensor, " chosen"]) -> float:
-        """Predicted RMS position error over the workspace after these measurements [m]."""
+        """Return the predicted RMS position error over the workspace after these measurements [m]."""
         return math.sqrt(self.criterion(chosen)) / 1e3
 
 
 @dataclass(frozen=True, eq=False)
 class MeasurementPlan:
-    """The measurements that were chosen.
+    """The chosen measurements.
 
     Attributes:
-        chosen: index of every chosen candidate, ascending.
-        predicted_error: RMS position error over the workspace that is predicted for them [m].
-        path: the same after dropping and after every exchange [m].
+        chosen: Indices of the chosen candidates, ascending.
+        predicted_error: Their predicted RMS position error over the workspace [m].
+        path: The same after dropping and after every exchange [m].
     """
 
     chosen: Int64[Tensor, " chosen"]
@@ -82,30 +82,34 @@ def build_planning_problem(
 ) -> PlanningProblem:
     """Linearise touches and workspace at the nominal robot.
 
-    The row of a touch is `e_axis · R_jig_base · ∂p/∂x` (Lim et al., eqs 35 to 37), next to the derivative by
-    the base of its own placement (eq. 34).
+    The row of a touch is `e_axis · R_jig_base · ∂p/∂x` (Lim et al., eqs 35 to 37), followed by the derivative with
+    respect to the base of its placement (eq. 34).
 
     Args:
-        robot: the nominal robot.
-        candidates: what could be touched.
-        Ts_jig_base: where the jigs are believed to stand [m], in the order of `candidates.placements`.
-        workspace: joint values [rad or m] where the robot shall be accurate.
-        free: names of the arm's parameters that the calibration will estimate, such as "theta_2".
-        prior: standard deviations of their errors; None for none.
-        sigma: standard deviation of a touch [m].
+        robot: The nominal robot.
+        candidates: Candidate touches.
+        Ts_jig_base: Assumed placements of the jigs [m], in the order of `candidates.placements`.
+        workspace: Joint values [rad or m] where the robot should be accurate.
+        free: Names of the arm's parameters that the calibration will estimate, such as "theta_2".
+        prior: Standard deviations of their errors; None: no prior.
+        sigma: Standard deviation of a touch [m].
 
     Raises:
-        IdentificationError: a name is no parameter of the arm, or there is no workspace.
-        PoseError: the workspace's joint values do not fit the robot.
+        IdentificationError: A name is not a parameter of the arm, or the workspace is empty.
+        PoseError: The joint values of the workspace do not fit the robot.
     """
     if not len(workspace):
-        raise IdentificationError("joint values over the workspace were wanted, got none; state some poses.")
+        raise IdentificationError(
+            expected="joint values over the workspace", value="none", option="workspace"
+        )
     space = ParameterSpace(robot)
     arm = [space.index(name) for name in free]
     if wrong := [name for name, index in zip(free, arm, strict=True) if index >= space.arm_size]:
         raise IdentificationError(
-            f"'{wrong[0]}' is no parameter of the arm; the tool's position and every base are planned for anyway, "
-            "so leave it out."
+            f"'{wrong[0]}' is not a parameter of the arm; the tool's position and every base are always planned for",
+            option="free",
+            value=wrong[0],
+            remedy="omit it",
         )
     tool = space.arm_size + 6
     columns = [*arm, tool, tool + 1, tool + 2]
@@ -130,14 +134,14 @@ def _rows_of_touches(
     columns: list[int],
     usual: Float64[Tensor, " columns"],
 ) -> Float64[Tensor, "candidates parameters"]:
-    """Give the derivatives of touches by arm and tool, then by the base of every placement, in units of usual errors.
+    """Return derivatives of touches by arm and tool, then by the base of each placement, in units of typical errors.
 
     Args:
-        robot: with its base at the origin.
-        candidates: what could be touched.
+        robot: Robot with its base at the origin.
+        candidates: Candidate touches.
         Ts_jig_base: where the jigs are believed to stand [m].
-        columns: of the identification Jacobian, of arm and tool.
-        usual: usual errors of their parameters [m or rad].
+        columns: Columns of the identification Jacobian, of arm and tool.
+        usual: Typical errors of their parameters [m or rad].
     """
     usual_base = torch.tensor([USUAL_LENGTH] * 3 + [USUAL_ANGLE] * 3, dtype=torch.float64)
     rows = torch.zeros(candidates.count, len(columns) + 6 * len(Ts_jig_base), dtype=torch.float64)
@@ -147,8 +151,8 @@ def _rows_of_touches(
         along = T_jig_base[candidates.axis[chosen], :3]
         start = len(columns) + 6 * number
         rows[chosen, : len(columns)] = torch.einsum("ni,nip->np", along, J[:, :3, columns]) * usual
-        # By a small shift and turn of the base in its own frame: they span what x, y, z, roll, pitch and yaw span, so
-        # the predicted error is the same.
+        # Derivatives by a small translation and rotation in the frame of the base: they span the same space as x, y, z,
+        # roll, pitch and yaw, so the predicted error is the same.
         by_base = torch.cat([along, torch.linalg.cross(T[:, :3, 3], along)], -1)
         rows[chosen, start : start + 6] = by_base * usual_base
     return rows
@@ -158,27 +162,29 @@ def plan_measurements(problem: PlanningProblem, count: int) -> MeasurementPlan:
     """Choose measurements that lower the predicted error over the workspace.
 
     The criterion is `tr(C W)`, the mean variance of the tool's position over the workspace (V- or
-    I-optimality), which says how far off the robot will be; a condition number does not. Starting with all
-    candidates, those that are missed least are dropped, and then measurements are exchanged, each time the pair that
-    gains most. The changes for all candidates and all pairs come at once from rank-one updates of the covariance
-    (Sherman and Morrison 1950). No candidate is chosen twice, and the same problem gives the same plan.
+    I-optimality), which predicts the error of the robot; a condition number does not. Starting with all
+    candidates, those whose loss is smallest are dropped, and then measurements are exchanged, each time the pair with
+    the largest gain. The changes for all candidates and all pairs are computed together by rank-one updates of the
+    covariance (Sherman and Morrison 1950). No candidate is chosen twice, and the same problem results in the same plan.
 
     Source: exchange of Fedorov 1972, "Theory of Optimal Experiments", section 3.3; dropping of
     Mitchell 1974, "An algorithm for the construction of D-optimal experimental designs" (DETMAX). For robots Borm
     and Menq 1991 and Daney, Papegay and Madeline 2005 choose poses, by observability instead.
 
     Args:
-        problem: what the candidates tell.
-        count: measurements to choose.
+        problem: Planning problem of the candidates.
+        count: Number of measurements to choose.
 
     Raises:
-        IdentificationError: there are not as many candidates.
+        IdentificationError: There are fewer candidates.
     """
     total = len(problem.rows)
     if not 1 <= count <= total:
         raise IdentificationError(
-            f"1 to {total} measurements can be planned from {total} candidates, {count} were wanted; "
-            "ask for fewer or draw more candidates."
+            expected=f"1 to {total} measurements, the number of candidates",
+            value=count,
+            option="count",
+            remedy="choose fewer or draw more candidates",
         )
     chosen = _thinned(problem, count)
     best = problem.criterion(chosen)
@@ -199,11 +205,11 @@ def plan_measurements(problem: PlanningProblem, count: int) -> MeasurementPlan:
 
 
 def _thinned(problem: PlanningProblem, count: int) -> Int64[Tensor, " chosen"]:
-    """Start with all candidates and drop those that are missed least, some percent at a time.
+    """Start with all candidates and repeatedly drop some percent of them, those with the smallest loss.
 
-    Adding from nothing would never leave the first frame, as the first measurements in another one only tell where it
-    stands. Without the row a the covariance becomes `C + C a aᵀ C / (1 - aᵀ C a)`, so the criterion rises by
-    `aᵀ C W C a / (1 - aᵀ C a)`.
+    Starting without measurements would never leave the first frame, as the first measurements in another frame only
+    determine its base. Without the row a the covariance becomes `C + C a aᵀ C / (1 - aᵀ C a)`, so the criterion rises
+    by `aᵀ C W C a / (1 - aᵀ C a)`.
     """
     chosen = torch.arange(len(problem.rows))
     while (surplus := len(chosen) - count) > 0:
@@ -216,7 +222,7 @@ def _thinned(problem: PlanningProblem, count: int) -> Int64[Tensor, " chosen"]:
 
 
 def _best_exchange(problem: PlanningProblem, chosen: Int64[Tensor, " chosen"]) -> tuple[float, int, int]:
-    """The exchange that gains most: its gain [mm²], the place in `chosen`, the candidate that comes there.
+    """Return the best exchange: its gain [mm²], the position in `chosen`, and the candidate to put there.
 
     Adding j and then dropping i are two rank-one updates. With `d_ij = a_iᵀ C a_j` and `e_ij = a_iᵀ C W C
     a_j`, and d', e' those of i after j was added, the criterion falls by

@@ -1,4 +1,4 @@
-"""How a training went, epoch by epoch and point by point: what the papers' figures are drawn from."""
+"""Course of a training by epochs and by points, for the figures of the papers."""
 
 from typing import Any
 
@@ -9,16 +9,16 @@ from torch import Tensor
 from pisigma.validation.held_out.training_summary import TrainingRun
 
 EPOCHS_SHOWN = 80
-"""At most so many epochs are given, close together at the start."""
+"""Maximum number of stored epochs, on a logarithmic scale."""
 
 _DIGITS = 6
 
 
 def report_course(run: TrainingRun) -> dict[str, Any]:
-    """Energies over the epochs, and of simulated data every training point with its joint errors.
+    """Return energies over the epochs and, for simulated data, every training point with its joint errors.
 
     Args:
-        run: what came out.
+        run: The training.
 
     Returns:
         ``{"energies": {"epoch": [...], JOINT: [...]}}`` in scaled units (Jeong et al. 1998, eq. (3)), and for
@@ -36,7 +36,7 @@ def report_course(run: TrainingRun) -> dict[str, Any]:
 
 
 def epochs_shown(epochs: int) -> Int64[np.ndarray, " shown"]:
-    """Epochs, counted from 1, spread evenly on a logarithmic axis; the first and the last are among them."""
+    """Return epochs, counted from 1, evenly spaced on a logarithmic axis, including the first and the last."""
     if epochs == 0:
         return np.zeros(0, dtype=np.int64)
     return np.unique(np.geomspace(1, epochs, EPOCHS_SHOWN).round().astype(np.int64))
