@@ -1,10 +1,10 @@
-"""What series C of the measured UR10 tells of series B, far outside its joint values, and what it could tell at best.
+"""Error of a hybrid far outside its measured joint values: from series C to series B of the measured UR10.
 
 Run `OMP_NUM_THREADS=2 python benchmarks/beyond_measured.py` with the measured files in `PISIGMA_DATA`. Every line is
-the root mean square of the position errors of series B [mm] under a hybrid that is fitted to series C, with the base
-and the tool of series B fitted to it. Prior sizes are estimated from series C; or from both series together; or those
-of both and, in their place, the amplitude that both have of every harmonic of every joint, so that only its phase is
-left to find: no rule that estimates sizes from series C knows more.
+the root mean square of the position errors of series B [mm] for a hybrid fitted to series C, with base and tool fitted
+to series B. The prior sizes are estimated from series C; or from both series together; or replaced by the amplitude of
+every harmonic of every joint in both series, so that only its phase is unknown. The last is a bound for every rule that
+estimates sizes from series C.
 """
 
 import os
@@ -37,12 +37,12 @@ ROUNDS = 3
 
 
 def named(rows: Measurements, name: str) -> Measurements:
-    """Rows in a frame of their own, with a tool of their own."""
+    """Return rows with a new frame and a new target."""
     return replace(rows, frame=(name,) * rows.rows, target=(name,) * rows.rows)
 
 
 def together(first: Measurements, second: Measurements) -> Measurements:
-    """All poses of two series."""
+    """Return all poses of two series."""
     q, position, rotation, temperature = (
         torch.cat([getattr(rows, name) for rows in (first, second)])
         for name in ("q", "position", "rotation", "temperature")
@@ -54,7 +54,7 @@ def together(first: Measurements, second: Measurements) -> Measurements:
 def fitted(
     solved: SolvedCalibration, features: tuple[AbstractFeature, ...], prior: GaussianPrior | None = None
 ) -> Refined:
-    """The hybrid with some features, its prior sizes estimated or given."""
+    """Return the hybrid with some features, with prior sizes estimated or given."""
     problem, group = solved.problem, held_out_groups(solved.setup.measurements)
     view, design = view_of(solved.solution.linearisation), Design(problem, features)
     x = torch.zeros(design.unknowns, dtype=torch.float64)
@@ -78,9 +78,9 @@ def fitted(
 
 
 def amplitudes(both: Refined, prior: GaussianPrior) -> GaussianPrior:
-    """The prior of series C with the amplitude that both series have of every harmonic of every joint."""
+    """Return the prior of series C with the amplitude of every harmonic of every joint in both series."""
     design, precision = both.design, prior.precision.clone()
-    # base and tool of the other series are unknowns of both that stand before the weights
+    # base and tool of the other series are unknowns of both and precede the weights
     shift = len(prior.base) - design.unknowns
     for number, feature in enumerate(design.features):
         if feature.name == "series":
@@ -94,7 +94,7 @@ def amplitudes(both: Refined, prior: GaussianPrior) -> GaussianPrior:
 
 
 def error(solved: SolvedCalibration, refined: Refined, rows: Measurements) -> float:
-    """Error of other rows in base and tool that are fitted to them [mm]."""
+    """Return the RMS error of other rows, with base and tool fitted to them [mm]."""
     geometry = identified_geometry(solved.setup, refined.point)
     rows = named(rows, "c")
     with torch.no_grad():
@@ -107,7 +107,7 @@ def error(solved: SolvedCalibration, refined: Refined, rows: Measurements) -> fl
 
 
 def main() -> None:
-    """Print one line a prior."""
+    """Print one line per prior."""
     robot = Robot.load("ur10")
     files = (("c", "series_c_train.csv"), ("b", "series_b.csv"))
     c, b = (named(Measurements.read_csv(DATA / file, robot), name) for name, file in files)
@@ -123,7 +123,7 @@ def main() -> None:
     at_best = fitted(solved, features, known)
     print(f"prior sizes from both series               {error(solved, at_best, b):.3f}", flush=True)
     at_best = fitted(solved, features, amplitudes(both, known))
-    print(f"the amplitude of every harmonic from both  {error(solved, at_best, b):.3f}")
+    print(f"amplitude of every harmonic from both      {error(solved, at_best, b):.3f}")
 
 
 if __name__ == "__main__":

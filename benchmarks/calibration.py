@@ -1,11 +1,11 @@
-"""Geometric calibration against peers: one data set, one process, time and held-out error as ratios.
+"""Geometric calibration compared with other packages: one data set, one process, ratios of time and held-out error.
 
-Install with `pip install -e ".[bench]"` in an environment of its own (pybotics wants an older numpy), then run
-`OMP_NUM_THREADS=1 python benchmarks/calibration.py`. A 6R arm (UR10) with 0.5 mm and 1 mrad errors in all DH
-and Hayati parameters, base and tool unknown, position noise 0.05 mm per axis; errors are those of the true tool
-position on 2000 new poses. The peers start from the true base and tool with 10 mm and 10 mrad of error; pisigma
-is given no start. Every fit runs several times and the fastest counts. pybotics is stopped after 3000
-evaluations, which is where it stands after about a minute, and runs once.
+Install with `pip install -e ".[bench]"` in a separate environment (pybotics needs an older numpy), then run
+`OMP_NUM_THREADS=1 python benchmarks/calibration.py`. A 6R arm (UR10) has errors of 0.5 mm and 1 mrad in all DH
+and Hayati parameters, unknown base and tool, and position noise of 0.05 mm per axis; errors are those of the true tool
+position at 2000 new poses. The peers start from the true base and tool with errors of 10 mm and 10 mrad; pisigma
+has no initial guess. Every fit runs several times and the fastest counts. pybotics is stopped after 3000
+evaluations, which take about a minute, and runs once.
 """
 
 import argparse
@@ -30,13 +30,13 @@ LENGTH, ANGLE, NOISE = 0.5e-3, 1e-3, 0.05e-3
 
 
 def make_true_robot(nominal: Robot, generator: np.random.Generator) -> Robot:
-    """The nominal robot with errors in every parameter, on a base and with a tool."""
+    """Return the nominal robot with errors in every parameter, on a base and with a tool."""
     sizes = np.array([ANGLE, LENGTH, LENGTH, ANGLE, ANGLE])
     return nominal.with_geometry(nominal.dh + sizes * generator.standard_normal(nominal.dh.shape), POSE, TOOL)
 
 
 def calibrate_pisigma(nominal: Robot, q: np.ndarray, p: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
-    """Pisigma's default calibration."""
+    """Calibrate with pisigma's default."""
     result = GeometricCalibrator(nominal).fit(Measurements(torch.from_numpy(q), torch.from_numpy(p)))
 
     def predict(joints: np.ndarray) -> np.ndarray:
@@ -47,7 +47,7 @@ def calibrate_pisigma(nominal: Robot, q: np.ndarray, p: np.ndarray) -> Callable[
 
 
 def calibrate_scipy(nominal: Robot, q: np.ndarray, p: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
-    """Scipy's least_squares on the same parameters, Jacobian by finite differences."""
+    """Calibrate with scipy's least_squares, with the same parameters and a Jacobian by finite differences."""
     from scipy.optimize import least_squares
 
     start = np.concatenate([nominal.dh.ravel(), POSE + 0.01, TOOL[:3] + 0.01])
@@ -61,7 +61,7 @@ def calibrate_scipy(nominal: Robot, q: np.ndarray, p: np.ndarray) -> Callable[[n
 
 
 def calibrate_pybotics(nominal: Robot, q: np.ndarray, p: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
-    """pybotics: modified DH without Hayati's angle, its own error function, scipy's least_squares."""
+    """Calibrate with pybotics: modified DH without Hayati's angle, its error function, scipy's least_squares."""
     from pybotics.geometry import vector_2_matrix
     from pybotics.kinematic_chain import MDHKinematicChain
     from pybotics.optimization import OptimizationHandler, optimize_accuracy
@@ -94,7 +94,7 @@ def calibrate_pybotics(nominal: Robot, q: np.ndarray, p: np.ndarray) -> Callable
 def calibrate_robotkinecal(
     nominal: Robot, q: np.ndarray, p: np.ndarray
 ) -> Callable[[np.ndarray], np.ndarray]:
-    """robotkinecal: screw axes by Gauss-Newton (Li, Wu, Loewe and Li 2016), from their places at zero."""
+    """Calibrate with robotkinecal: screw axes by Gauss-Newton (Li, Wu, Loewe and Li 2016), from nominal values."""
     import roboticstoolbox as rtb
     from robotkinecal import SerialRobotKineCal
     from spatialmath import SE3
@@ -106,7 +106,7 @@ def calibrate_robotkinecal(
     points = T[:3, 3] + np.cross(axes, J[:3].T)
     links = [rtb.PoERevolute(axis, point) for axis, point in zip(axes, points, strict=True)]
     peer = SerialRobotKineCal(rtb.PoERobot(links, SE3(T, check=False)))
-    peer.joint_screw_axis = peer.joint_screw_axis[1:-1]  # its first and last link are frames, no joints
+    peer.joint_screw_axis = peer.joint_screw_axis[1:-1]  # its first and last link are frames, not joints
     peer.N_JOINTS = nominal.dof
     peer.set_observations(list(q), list(p))
     peer.solve()
@@ -120,15 +120,15 @@ PEERS = {
     "pybotics": calibrate_pybotics,
 }
 REPEATS = 7
-"""Fits of every peer that takes less than `QUICK`, of which the fastest counts."""
+"""Number of fits of peers faster than `QUICK`, of which the fastest counts."""
 QUICK = 2.0
-"""[s]"""
+"""Duration [s]."""
 
 
 def timed(
     calibrate: Calibrate, nominal: Robot, q: np.ndarray, p: np.ndarray
 ) -> tuple[float, Callable[[np.ndarray], np.ndarray]]:
-    """Seconds of the fastest fit, and what predicts positions with it."""
+    """Return the time of the fastest fit [s] and its prediction of positions."""
     seconds: list[float] = []
     while len(seconds) < (REPEATS if not seconds or seconds[0] < QUICK else 1):
         started = time.perf_counter()
@@ -138,7 +138,7 @@ def timed(
 
 
 def main() -> None:
-    """Run every peer that is installed on the same rows and print the figures."""
+    """Run all installed peers on the same rows and print the figures."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -153,7 +153,7 @@ def main() -> None:
         forward_kinematics(true_robot, torch.from_numpy(joints))[:, :3, 3].numpy() for joints in (q, fresh)
     )
     measured = truth + NOISE * generator.standard_normal(truth.shape)
-    calibrate_pisigma(nominal, q, measured)  # warm
+    calibrate_pisigma(nominal, q, measured)  # warm up
     reference: tuple[float, float] | None = None
     print(f"{options.poses} poses; held-out: mean true error of 2000 new poses")
     for name, calibrate in PEERS.items():

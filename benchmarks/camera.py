@@ -1,14 +1,14 @@
-"""A UR5 calibrated by a camera on its flange: true error over the workspace, with the Cramér-Rao bound beside it.
+"""Calibration of a UR5 with a camera on its flange: true error over the workspace, compared with the Cramér-Rao bound.
 
     OMP_NUM_THREADS=1 python benchmarks/camera.py [--draws 20] [--images 50]
 
-True arms have errors of 1 mm and 0.3 deg on every parameter. The camera (1920 x 1200 px, f = 1400 px) looks from 0.3 to
-0.7 m, up to 40 deg oblique, at a board of 9 x 6 corners 30 mm apart; corners have 0.3 px, the robot repeats to 0.02 mm
-and 0.01 deg. Its intrinsics are known, or stated by a usual calibration (fx, fy 0.5 px; cx, cy 1 px; k1 0.002; k2 0.01;
-p1, p2 2e-4) that misses them by so much and is then their prior, not looked at (free), or taken for the truth (held).
-Errors are those of the camera centre's position after the best rigid alignment, over other views of the board (region)
-and over 400 postures of the whole joint space (workspace), pooled over draws. The bound knows the prior of the
-intrinsics, but not that of the arm.
+True arms have errors of 1 mm and 0.3 deg in every parameter. The camera (1920 x 1200 px, f = 1400 px) views a board of
+9 x 6 corners 30 mm apart from 0.3 to 0.7 m, up to 40 deg oblique; the noise of the corners is 0.3 px, the repeatability
+of the robot 0.02 mm and 0.01 deg. The intrinsics are known, or stated by a typical calibration (fx, fy 0.5 px; cx, cy
+1 px; k1 0.002; k2 0.01; p1, p2 2e-4) with errors of that size; then they are used as prior, ignored (free), or
+taken as true (held). Errors are those of the camera centre's position after the best rigid alignment, over other views
+of the board (region) and over 400 postures of the whole joint space (workspace), pooled over draws. The bound includes
+the prior of the intrinsics, but not that of the arm.
 """
 
 import argparse
@@ -52,7 +52,7 @@ PRIOR = Prior(theta=ANGLE, d=LENGTH, a=LENGTH, alpha=ANGLE, beta=ANGLE)
 
 
 def views(robot: Robot, count: int, rng: np.random.Generator) -> Tensor:
-    """Joint values [rad] of random views of the board, each by a random branch of the arm."""
+    """Return joint values [rad] of random views of the board, each with a random branch of the arm."""
     solver, chosen = closed_form_solver(robot), list[Tensor]()
     assert solver is not None
     while len(chosen) < count:
@@ -70,7 +70,7 @@ def views(robot: Robot, count: int, rng: np.random.Generator) -> Tensor:
 
 @dataclass(frozen=True, eq=False)
 class Draw:
-    """A true arm, its images, and the camera as a usual calibration of it states it."""
+    """A true arm, its images, and the camera as stated by a typical calibration."""
 
     true: Robot
     images: Images
@@ -79,14 +79,14 @@ class Draw:
     def rows(
         self, intrinsics: IntrinsicsChoice, repeatability: Repeatability = NOISE.repeatability
     ) -> Measurements:
-        """The images as measurements, the intrinsics exact where they are fixed."""
+        """Return the images as measurements, with exact intrinsics if they are fixed."""
         camera = CAMERA if intrinsics == "fixed" else self.stated
         return image_measurements(self.images, camera, BOARD, False, repeatability, intrinsics)
 
 
 @dataclass(frozen=True, eq=False)
 class Cell:
-    """A robot as drawn, joint values of its images, and by name the postures at which it is judged."""
+    """A nominal robot, joint values of its images, and the postures for evaluation by name."""
 
     nominal: Robot
     q: Tensor
@@ -94,7 +94,7 @@ class Cell:
 
     @staticmethod
     def of(count: int) -> "Cell":
-        """The cell with so many images."""
+        """Return the cell with a number of images."""
         nominal, rng = Robot.load("ur5"), np.random.default_rng(0)
         q = far_apart(views(nominal, CANDIDATES * count, rng), count)
         everywhere = rng.uniform(-np.pi, np.pi, (POSTURES, nominal.dof))
@@ -103,7 +103,7 @@ class Cell:
         )
 
     def draw(self, number: int) -> Draw:
-        """A true arm with errors of 1 mm and 0.3 deg, and intrinsics that their calibration misses as it states."""
+        """Return a true arm with errors of 1 mm and 0.3 deg, and intrinsics with errors as their calibration states."""
         rng = np.random.default_rng(number)
         errors = rng.standard_normal(self.nominal.dh.shape) * [ANGLE, LENGTH, LENGTH, ANGLE, ANGLE]
         base = xyzrpy_from_transform(invert(transform_from_xyzrpy(IN_BASE))).numpy()
@@ -114,26 +114,26 @@ class Cell:
 
 
 def positions(robot: Robot, q: Tensor) -> Tensor:
-    """Where the camera's centre is [m]."""
+    """Return the position of the camera's centre [m]."""
     return forward_kinematics(robot, q)[:, :3, 3]
 
 
 def rigid_motions(points: Tensor) -> Tensor:
-    """Orthonormal basis `(3 * points, 6)` of what a rigid motion of all points moves."""
+    """Return an orthonormal basis `(3 * points, 6)` of the rigid motions of all points."""
     centred = points - points.mean(0)
     shifts = torch.eye(3, dtype=torch.float64).expand(len(points), 3, 3)
     return torch.linalg.qr(torch.cat([shifts, skew(centred)], -1).flatten(0, 1)).Q
 
 
 def aligned_error(true: Tensor, estimated: Tensor) -> float:
-    """Root mean square distance [m] of points after the best rigid alignment; errors are small against the arm."""
+    """Return the RMS distance [m] of points after the best rigid alignment, for errors small compared with the arm."""
     off, basis = (true - estimated).flatten(), rigid_motions(true)
     off = off - basis @ (basis.T @ off)
     return float((off.square().sum() / len(true)).sqrt())
 
 
 def bound(true: Robot, rows: Measurements, q: Tensor) -> float:
-    """Cramér-Rao bound [m] of the same figure: no prior, the noise of corners and repeatability known."""
+    """Return the Cramér-Rao bound [m] of the same figure: no prior, noise of corners and repeatability known."""
     setup = GeometricCalibrator(true, prior=None).build(rows)
     problem, point = setup.problem, setup.start
     unknown = [*range(problem.space.of("tool").stop), *setup.free_unknowns]

@@ -1,12 +1,12 @@
-"""Calibration by a camera against scipy's `least_squares` on the same unknowns and OpenCV's hand-eye calibration.
+"""Calibration with a camera compared with scipy's `least_squares` and OpenCV's hand-eye calibration.
 
     OMP_NUM_THREADS=1 python benchmarks/camera_peers.py [--draws 20] [--images 50]
 
-Set-up and errors as in `benchmarks/camera.py`, the intrinsics under their prior. scipy's unknowns are the arm, where
-camera and board are, the pose error of every image, and the intrinsics; its residuals are pixels and priors, in units
-of their standard deviations, its Jacobian by finite differences with the sparsity that the pose errors of the other
-images leave. It starts where pisigma does and stops at 1e-8. OpenCV's five methods have the nominal robot and the exact
-intrinsics; they are in opencv-python-headless 4, no more in 5:
+Set-up and errors are those of `benchmarks/camera.py`, with the intrinsics under their prior. scipy's unknowns are the
+arm, the poses of camera and board, the pose error of every image, and the intrinsics; its residuals are pixels and
+priors in units of their standard deviations, its Jacobian is computed by finite differences with the sparsity due to
+the separate pose error of each image. It starts from the same values as pisigma and stops at 1e-8. OpenCV's five
+methods use the nominal robot and the exact intrinsics; they are part of opencv-python-headless 4, not of 5:
 
     pip install --target cv4 "opencv-python-headless<5" && PYTHONPATH=cv4:$PYTHONPATH python benchmarks/camera_peers.py
 """
@@ -46,7 +46,7 @@ FREE = np.flatnonzero(USUAL_DEVIATIONS)
 
 
 class WholeProblem:
-    """All unknowns in one vector, in units of their prior standard deviations (of base and tool 1 mm and 1 mrad)."""
+    """All unknowns in one vector, in units of their prior standard deviations (1 mm and 1 mrad for base and tool)."""
 
     def __init__(self, start: Robot, draw: Draw) -> None:
         self.robot, self.draw = start, draw
@@ -62,7 +62,7 @@ class WholeProblem:
         return self.shared + 6 * self.count
 
     def split(self, x: np.ndarray) -> tuple[Robot, Camera, np.ndarray]:
-        """The robot, the camera and the pose errors of all images [m, rad]."""
+        """Return the robot, the camera and the pose errors of all images [m, rad]."""
         arm, start = self.robot.dh.size, self.robot
         dh = start.dh + x[:arm].reshape(-1, 5) * [ANGLE, LENGTH, LENGTH, ANGLE, ANGLE]
         base, tool = start.base + 1e-3 * x[arm : arm + 6], start.tool + 1e-3 * x[arm + 6 : arm + 12]
@@ -73,7 +73,7 @@ class WholeProblem:
         return start.with_geometry(dh, base, tool), self.draw.stated.with_intrinsics(intrinsics), errors
 
     def residual(self, x: np.ndarray) -> np.ndarray:
-        """Pixels and priors, in standard deviations."""
+        """Return residuals of pixels and priors, in standard deviations."""
         robot, camera, errors = self.split(x)
         T = forward_kinematics(robot, self.draw.images.q).numpy()
         R = rotation_from_vector(torch.from_numpy(errors[:, 3:])).numpy() @ T[:, :3, :3]
@@ -85,7 +85,7 @@ class WholeProblem:
         )
 
     def sparsity(self) -> csr_matrix:
-        """Which residual depends on which unknown."""
+        """Return the sparsity of the Jacobian."""
         values, arm = 2 * len(self.pixels), self.robot.dh.size
         pattern = lil_matrix((values + arm + self.size - arm - 12, self.size), dtype=np.int8)
         pattern[:values, : self.shared] = 1
@@ -97,7 +97,7 @@ class WholeProblem:
 
 
 def by_scipy(start: Robot, draw: Draw) -> Robot:
-    """The robot that scipy finds."""
+    """Return the robot that scipy estimates."""
     whole = WholeProblem(start, draw)
     solution = least_squares(
         whole.residual, np.zeros(whole.size), jac_sparsity=whole.sparsity(), x_scale="jac", tr_solver="lsmr"
@@ -106,7 +106,7 @@ def by_scipy(start: Robot, draw: Draw) -> Robot:
 
 
 def by_opencv(cell: Cell, draw: Draw) -> list[Robot]:
-    """The nominal robot with the hand-eye calibration of every method."""
+    """Return the nominal robot with the hand-eye calibration of every method."""
     rows = image_measurements(draw.images, CAMERA, BOARD, False, Repeatability(0.0, 0.0), "fixed")
     flange = forward_kinematics(
         cell.nominal.with_geometry(base=np.zeros(6), tool=np.zeros(6)), rows.q
@@ -126,12 +126,12 @@ def by_opencv(cell: Cell, draw: Draw) -> list[Robot]:
 
 
 def robot_with_hand_eye(nominal: Robot, R: np.ndarray, t: np.ndarray) -> Robot:
-    """A robot whose camera stands at a pose on its flange; only its centre counts here."""
+    """Return a robot with the camera at a pose on its flange; only the centre of the camera is used here."""
     return nominal.with_geometry(base=np.zeros(6), tool=np.concatenate([t, np.zeros(3)]))
 
 
 def main(draws: int, count: int) -> None:
-    """Print accuracies over the workspace, times, and the worst ratio to hand-eye alone."""
+    """Print accuracies over the workspace, times, and the lowest ratio to hand-eye calibration alone."""
     cell = Cell.of(count)
     q, methods = cell.judged["workspace"], hasattr(cv2, "calibrateHandEye")
     errors, seconds, ratios = {"pisigma": 0.0, "scipy": 0.0}, {"pisigma": 0.0, "scipy": 0.0}, []
@@ -156,9 +156,9 @@ def main(draws: int, count: int) -> None:
         print(
             f"{name}: {1e3 * square**0.5:.4f} mm over the workspace, {seconds[name] / draws:.2f} s of processor time"
         )
-    print(f"scipy needs {seconds['scipy'] / seconds['pisigma']:.1f} times as long")
+    print(f"scipy takes {seconds['scipy'] / seconds['pisigma']:.1f} times as long")
     if methods:
-        print(f"the best of OpenCV's methods is {min(ratios):.0f} times as far off or more in every draw")
+        print(f"the best of OpenCV's methods is {min(ratios):.0f} times as inaccurate or more in every draw")
     else:
         print("OpenCV 5 has no hand-eye calibration for Python; see above for how to run it with OpenCV 4")
 

@@ -1,11 +1,11 @@
-"""From rendered pixels to a calibrated UR5, beside the same with the exact corners.
+"""Calibration of a UR5 from rendered images, compared with ideal corners.
 
     OMP_NUM_THREADS=1 python benchmarks/camera_pixels.py [--draws 5] [--images 40]
 
-The arms, camera, board and repeatability of `camera.py`. Every image is drawn pixel by pixel (through a lens with
-distortion, with blur, defocus, uneven light and noise), its corners are detected, and the arm is calibrated with them;
-beside it the arm calibrated with the corners that the same images ideally have: with a normal noise as large as that of
-the detected ones, with the noise of `camera.py`, and without. Intrinsics are taken as they are.
+Arms, camera, board and repeatability are those of `camera.py`. Every image is rendered pixel by pixel (with lens
+distortion, blur, defocus, uneven light and noise), its corners are detected, and the arm is calibrated with them.
+For comparison the arm is calibrated with the ideal corners of the same images: with normal noise of the size of
+the detection errors, with the noise of `camera.py`, and without noise. Intrinsics are fixed.
 Errors are those of the camera's position over 400 postures of the whole joint space after the best rigid alignment,
 pooled over draws.
 """
@@ -35,7 +35,7 @@ from pisigma.simulation.camera.true_board import TrueBoard
 
 LENS = replace(CAMERA, k1=-0.1, k2=0.05, p1=1e-4, p2=-2e-4)
 IN_BASE = torch.tensor([0.42, 0.08, 0.05, 0.0, 0.0, np.pi], dtype=torch.float64)
-"""The board lies flat in front with its print up, so that its z axis points down."""
+"""Pose of the board: flat in front of the arm with its print up, so that its z axis points down."""
 
 
 def main(draws: int, count: int) -> None:

@@ -1,13 +1,13 @@
-"""Cameras in other set-ups than one camera on the flange, with wrong corners and images, and with gears.
+"""Other set-ups than one camera on the flange, wrong corners and images, and transmission errors.
 
     OMP_NUM_THREADS=1 python benchmarks/camera_setups.py [mixed] [wrong] [bent] [gears] [--draws 10]
 
-The arms, cameras, boards and noise of `camera.py`, with intrinsics taken as they are. mixed: a fixed camera with the
-board on the flange, two cameras, and a camera with 10 positions of a tracker (0.02 mm), each beside its parts alone.
-wrong: 5 % of the corners off by 5 px and three images with two joint values swapped. bent: a board bowed by 0.3 mm,
-taken as flat and with its flatness stated. gears: joints that wobble by two harmonics of 0.015 deg, 150 images, the
-hybrid against the geometry alone. Errors are those of the target's position over 400 postures of the whole joint space
-after the best rigid alignment, pooled over draws.
+Arms, cameras, boards and noise are those of `camera.py`, with fixed intrinsics. mixed: a fixed camera with the
+board on the flange, two cameras, and a camera with 10 positions of a tracker (0.02 mm), each compared with its parts.
+wrong: 5 % of the corners off by 5 px and three images with two joint values exchanged. bent: a board bowed by 0.3 mm,
+taken as flat and with its flatness stated. gears: joints with two harmonics of 0.015 deg, 150 images, the
+hybrid compared with the geometry alone. Errors are those of the target's position over 400 postures of the whole joint
+space after the best rigid alignment, pooled over draws.
 """
 
 import argparse
@@ -44,14 +44,14 @@ from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.robot.se3 import invert, transform_from_xyzrpy, xyzrpy_from_transform
 from pisigma.simulation.camera.simulated_images import far_apart, simulate_images
 
-BESIDE = replace(CAMERA, name="beside", is_fixed=True)
+FIXED_CAMERA = replace(CAMERA, name="fixed", is_fixed=True)
 HAND = replace(BOARD, name="hand")
 CAMERA_IN_BASE = torch.tensor([0.45, -0.1, 0.9, 0.0, 0.0, np.pi], dtype=torch.float64)
 REFLECTOR = np.array([0.05, -0.04, 0.1, 0.0, 0.0, 0.0])
 TRACKER_NOISE = 2e-5
 WRONG_SHARE, WRONG_BY, SWAPPED = 0.05, 5.0, 3
 BOW = np.array([1e-4, 0.0, 1e-4])
-"""[m] Heights of the three shapes: the surface lies between planes 0.3 mm apart."""
+"""Heights of the three shapes [m]: the surface is between planes 0.3 mm apart."""
 CHOICES: tuple[IntrinsicsChoice, ...] = ("fixed", "prior", "free")
 GEAR = np.deg2rad(0.015)
 HARMONICS = (1, 2)
@@ -59,7 +59,7 @@ GEAR_IMAGES = 150
 
 
 class Arm:
-    """A true arm of a draw, and what instruments measure of it."""
+    """A random true arm and its instruments."""
 
     def __init__(self, nominal: Robot, draw: int):
         errors = np.random.default_rng(draw).standard_normal(nominal.dh.shape)
@@ -68,44 +68,44 @@ class Arm:
         self.rng = np.random.default_rng(1000 + draw)
 
     def with_frames(self, in_base: Tensor | None, on_flange: np.ndarray) -> Robot:
-        """The true arm as measured from something in its base, with something on its flange."""
+        """Return the true arm with a base and a tool."""
         base = None if in_base is None else xyzrpy_from_transform(invert(transform_from_xyzrpy(in_base)))
         return self.nominal.with_geometry(
             self.dh, base=None if base is None else base.numpy(), tool=on_flange
         )
 
     def images(self, q: Tensor, is_fixed: bool = False, wobble: Tensor | float = 0.0) -> Images:
-        """Corners in the images of the camera on the flange, or of that beside it."""
+        """Return corners in the images of the camera on the flange, or of the fixed one."""
         true = self.with_frames(CAMERA_IN_BASE if is_fixed else IN_BASE, ON_FLANGE.numpy())
         generator = torch.Generator().manual_seed(self.draw)
         images = simulate_images(true, q + wobble, CAMERA, BOARD, NOISE, generator, is_fixed)
         return replace(images, q=q)
 
     def rows(self, q: Tensor, is_fixed: bool = False) -> Measurements:
-        """What these images measure."""
-        camera, board = (BESIDE, HAND) if is_fixed else (CAMERA, BOARD)
+        """Return the measurements of these images."""
+        camera, board = (FIXED_CAMERA, HAND) if is_fixed else (CAMERA, BOARD)
         return solved(self.images(q, is_fixed), camera, board)
 
     def tracked(self, q: Tensor) -> Measurements:
-        """Positions of a reflector on the flange."""
+        """Return positions of a reflector on the flange."""
         position = forward_kinematics(self.with_frames(None, REFLECTOR), q)[:, :3, 3]
         noise = TRACKER_NOISE * torch.from_numpy(self.rng.standard_normal((len(q), 3)))
         names = {"frame": ("tracker",) * len(q), "target": ("reflector",) * len(q)}
         return Measurements(q, position + noise, **names)
 
     def error(self, estimated: Robot, postures: Tensor, on_flange: np.ndarray) -> float:
-        """Error of the position of something on the flange [m]; an arm's tool is measured from its estimate."""
+        """Return the position error of a target on the flange [m], with the estimated tool of an arm."""
         true = self.with_frames(None, on_flange)
         return aligned_error(*(forward_kinematics(one, postures)[:, :3, 3] for one in (true, estimated)))
 
 
 def solved(images: Images, camera=CAMERA, board=BOARD) -> Measurements:
-    """Rows of images, the intrinsics taken as they are."""
+    """Return rows of images with fixed intrinsics."""
     return image_measurements(images, camera, board, camera.is_fixed, NOISE.repeatability, "fixed")
 
 
 def fixed_views(robot: Robot, count: int, rng: np.random.Generator) -> Tensor:
-    """Joint values [rad] at which the camera beside the robot sees the board on its flange."""
+    """Return joint values [rad] at which the fixed camera sees the board on the flange."""
     solver, chosen = closed_form_solver(robot), list[Tensor]()
     T_base_board = transform_from_xyzrpy(IN_BASE)
     for q in views(robot, 3 * count, rng):
@@ -121,23 +121,23 @@ def fixed_views(robot: Robot, count: int, rng: np.random.Generator) -> Tensor:
 
 
 def fitted(arm: Arm, rows: Measurements, target: str) -> Robot:
-    """The calibrated arm with the tool of a target."""
+    """Return the calibrated arm with the tool of a target."""
     result = GeometricCalibrator(arm.nominal, prior=PRIOR).fit(rows)
     return result.robot.with_geometry(base=np.zeros(6), tool=result.tools[target])
 
 
 def mixed(arm: Arm, q: Tensor, q_fixed: Tensor, postures: Tensor) -> Iterator[tuple[str, float]]:
-    """Errors of set-ups with several instruments, and of each of them alone."""
-    wrist, beside, tracker = arm.rows(q), arm.rows(q_fixed, True), arm.tracked(postures[-10:])
-    few, few_beside = arm.rows(q[:25]), arm.rows(q_fixed[:25], True)
+    """Return errors of set-ups with several instruments, and with each of them alone."""
+    wrist, fixed, tracker = arm.rows(q), arm.rows(q_fixed, True), arm.tracked(postures[-10:])
+    few, few_fixed = arm.rows(q[:25]), arm.rows(q_fixed[:25], True)
     on_flange = ON_FLANGE.numpy()
     for name, rows, target, point in (
         ("camera on the flange, 50 images", [wrist], "wrist", on_flange),
-        ("fixed camera, board on the flange, 50 images", [beside], "hand", on_flange),
+        ("fixed camera, board on the flange, 50 images", [fixed], "hand", on_flange),
         ("camera on the flange, 25 images", [few], "wrist", on_flange),
-        ("fixed camera, 25 images", [few_beside], "hand", on_flange),
-        ("both cameras, 25 images each: that on the flange", [few, few_beside], "wrist", on_flange),
-        ("both cameras, 25 images each: the board on the flange", [few, few_beside], "hand", on_flange),
+        ("fixed camera, 25 images", [few_fixed], "hand", on_flange),
+        ("both cameras, 25 images each: that on the flange", [few, few_fixed], "wrist", on_flange),
+        ("both cameras, 25 images each: the board on the flange", [few, few_fixed], "hand", on_flange),
         ("tracker, 10 positions", [tracker], "reflector", REFLECTOR),
         ("camera, 50 images, and tracker, 10 positions", [wrist, tracker], "wrist", on_flange),
     ):
@@ -145,7 +145,7 @@ def mixed(arm: Arm, q: Tensor, q_fixed: Tensor, postures: Tensor) -> Iterator[tu
 
 
 def wrong(arm: Arm, q: Tensor, postures: Tensor) -> Iterator[tuple[str, float]]:
-    """Errors with good and with wrong corners and images, and whether other images are named than the wrong ones."""
+    """Return errors with and without wrong corners and images, and whether exactly the wrong images are named."""
     clean, rng = arm.images(q), arm.rng
     faulty = rng.choice(len(q), SWAPPED, replace=False)
     swapped, pixels = q.clone(), []
@@ -172,7 +172,7 @@ def wrong(arm: Arm, q: Tensor, postures: Tensor) -> Iterator[tuple[str, float]]:
 
 
 def bent(arm: Arm, q: Tensor, postures: Tensor) -> Iterator[tuple[str, float]]:
-    """Errors with a bowed board that is taken as flat, and whose flatness is stated."""
+    """Return errors with a bowed board that is taken as flat, and with its flatness stated."""
     images, pixels = arm.images(q), []
     true = arm.with_frames(IN_BASE, ON_FLANGE.numpy())
     bowed = bent_corners(BOARD, BOW)
@@ -194,7 +194,7 @@ def bent(arm: Arm, q: Tensor, postures: Tensor) -> Iterator[tuple[str, float]]:
 
 
 def gears(arm: Arm, q: Tensor, postures: Tensor) -> Iterator[tuple[str, float]]:
-    """Errors of the geometry alone and of the hybrid where gears wobble."""
+    """Return errors of the geometry alone and of the hybrid with transmission errors."""
     phase = torch.from_numpy(arm.rng.uniform(0, 2 * np.pi, (len(HARMONICS), q.shape[1])))
 
     def wobble(q: Tensor) -> Tensor:
@@ -211,7 +211,7 @@ def gears(arm: Arm, q: Tensor, postures: Tensor) -> Iterator[tuple[str, float]]:
 
 
 def at(rows: Measurements, q: Tensor) -> Measurements:
-    """Other joint values in the frame of some rows."""
+    """Return other joint values in the frame of some rows."""
     return Measurements(
         q, torch.zeros(len(q), 3).to(q), frame=rows.frame[:1] * len(q), target=rows.target[:1] * len(q)
     )
@@ -245,7 +245,7 @@ def main(chosen: list[str], draws: int) -> None:
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser()
-    parser.add_argument("parts", nargs="*", help="mixed, wrong, bent, gears; all where none is named")
+    parser.add_argument("parts", nargs="*", help="mixed, wrong, bent, gears (default: all)")
     parser.add_argument("--draws", type=int, default=10)
     arguments = parser.parse_args()
     main(arguments.parts, arguments.draws)

@@ -1,11 +1,11 @@
-"""How true predicted errors of a calibration by a camera are, and how one known distance corrects the board's scale.
+"""Coverage of predicted errors of a calibration with a camera, and correction of the board's scale by one distance.
 
     OMP_NUM_THREADS=1 python benchmarks/camera_uncertainty.py [--draws 30]
 
-Set-up and errors as in `benchmarks/camera.py`. Coverage is the share of the coordinates of positions over the whole
-joint space, pooled over draws, whose error is within the predicted 95 %, as `pisigma calibrate` predicts it. Then the
+Set-up and errors are those of `benchmarks/camera.py`. Coverage is the share of the position coordinates over the whole
+joint space, pooled over draws, with errors within the 95 % intervals that `pisigma calibrate` predicts. Then the
 board is 0.1 % larger than stated, and a ball on the flange sits six times in each of two sockets whose distance of
-600 mm is known to 0.01 mm; the robot repeats to 0.02 mm.
+600 mm is known to 0.01 mm; the repeatability of the robot is 0.02 mm.
 """
 
 import argparse
@@ -34,11 +34,11 @@ CHOICES: tuple[IntrinsicsChoice, ...] = ("fixed", "prior", "free")
 WITHIN_95 = 1.959964
 SCALE, APART, TIMES = 1e-3, 0.6, 6
 BALL = torch.tensor([0.0, 0.08, 0.1, 0.0, 0.0, 0.0], dtype=torch.float64)
-"""On the flange."""
+"""Target on the flange."""
 
 
 def inside(cell: Cell, draw: Draw, choice: IntrinsicsChoice) -> Tensor:
-    """Whether every coordinate over the workspace is within its predicted 95 %."""
+    """Return whether every coordinate over the workspace is within its predicted 95 % interval."""
     rows, q = draw.rows(choice), cell.judged["workspace"]
     result = HybridCalibrator(GeometricCalibrator(cell.nominal, prior=PRIOR)).fit(rows)
     model = model_of_hybrid("ur5", cell.nominal, result, rows)
@@ -48,7 +48,7 @@ def inside(cell: Cell, draw: Draw, choice: IntrinsicsChoice) -> Tensor:
 
 
 def in_sockets(nominal: Robot, true: Robot, rng: np.random.Generator) -> Measurements:
-    """Rows with the ball of a true robot in two sockets, by random orientations and branches."""
+    """Return rows with the ball of a true robot in two sockets, with random orientations and branches."""
     solver, rows, names = closed_form_solver(nominal), list[Tensor](), list[str]()
     assert solver is not None
     ball = true.with_geometry(base=np.zeros(6), tool=BALL.numpy())
@@ -74,7 +74,7 @@ def in_sockets(nominal: Robot, true: Robot, rng: np.random.Generator) -> Measure
 
 
 def main(draws: int) -> None:
-    """Print coverages, and how well the scale is found."""
+    """Print coverages, and errors of the estimated scale."""
     cell = Cell.of(50)
     for choice in CHOICES:
         share = torch.stack(

@@ -1,11 +1,11 @@
-"""True error of calibrated arms with coupled joints or a rail, over that of the same arm without.
+"""True error of calibrated arms with coupled joints or a rail, relative to that of the same arm without.
 
 Run `OMP_NUM_THREADS=1 python benchmarks/coupling.py [SEEDS]`. Every arm is simulated with random errors of its
 geometry, gears (harmonics 1, 2 and 7, before the coupling), gravity, 0.03 mm noise and 0.02 mm repeatability,
-calibrated by 120 positions, and judged by the positions of 2,000 other poses without noise. Its coupling is off too:
-factors by 0.1 %, bars of a parallelogram by some 0.3 mm; the rail bends by 0.3 mm sideways and up and yaws by 0.02 deg.
-The figures are medians over the seeds of the root mean square of the true error of the hybrid. Single seeds scatter
-widely (the first two of the first arm: 1.98 and 0.82), so few of them say little.
+calibrated with 120 positions, and evaluated at 2,000 other poses without noise. Its coupling has errors too: 0.1 % in
+factors, some 0.3 mm in the bars of a parallelogram; the rail bends by 0.3 mm sideways and vertically and yaws by 0.02
+deg. The figures are medians over the seeds of the root mean square of the true error of the hybrid. Single seeds
+scatter widely (the first two of the first arm: 1.98 and 0.82), so a few of them are not conclusive.
 """
 
 import statistics
@@ -29,7 +29,7 @@ from pisigma.simulation.true_robot import TrueRobot, TrueRobotSection
 
 ROWS, JUDGED = 120, 2_000
 NOISE_MM = 0.036
-"""Of the tracker and of the robot together."""
+"""Standard deviation of tracker and robot together [m]."""
 
 ARM = """
 - {name: theta_1, type: revolute, limits_deg: [-170, 170], d_mm: 670, a_mm: 312, alpha_deg: -90}
@@ -74,7 +74,7 @@ FOLLOWERS = """
 
 @dataclass(frozen=True)
 class Case:
-    """An arm as drawn, what is wrong with its coupling, and how its gears' angles follow from joint angles."""
+    """A nominal arm, the errors of its coupling, and its gear angles as functions of the joint angles."""
 
     rows: str
     coupling: str = "[]"
@@ -82,13 +82,13 @@ class Case:
     gears: str = "{}"
 
     def robot(self) -> Robot:
-        """As drawn."""
+        """Return the nominal arm."""
         values = {"name": "arm", "maker": "made up", "source": "benchmark", "tool": {"x_mm": 60, "z_mm": 150}}
         values |= {"rows": yaml.safe_load(self.rows), "coupling": yaml.safe_load(self.coupling)}
         return Robot(*parse_yaml(yaml.safe_dump(values), RobotDocument, RobotError, "arm.yaml").drawing())
 
     def true(self, seed: int) -> TrueRobot:
-        """With all its errors."""
+        """Return the arm with all errors."""
         robot, draw = self.robot(), torch.Generator().manual_seed(seed)
         gears: dict[str, dict[str, int]] = yaml.safe_load(self.gears)
         terms: list[dict[str, Any]] = []
@@ -163,7 +163,7 @@ CASES: dict[str, tuple[Case, Case]] = {
 
 
 def true_error(case: Case, seed: int) -> float:
-    """Root mean square of the true position error [mm] of the calibrated arm at other poses."""
+    """Return the RMS of the true position error [mm] of the calibrated arm at other poses."""
     true = case.true(seed)
     train, test = (
         JointsRandom(kind="joints_random", count=count, seed=1_000 * seed + index, share=0.9).joints(
@@ -178,7 +178,7 @@ def true_error(case: Case, seed: int) -> float:
 
 
 def main(seeds: Sequence[int]) -> None:
-    """Print a line an arm."""
+    """Print one line per arm."""
     for name, (case, without) in CASES.items():
         errors = [[true_error(one, seed) for seed in seeds] for one in (case, without)]
         with_it, alone = map(statistics.median, errors)

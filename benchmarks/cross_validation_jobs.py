@@ -1,4 +1,4 @@
-"""Time of a cross-validated hybrid of the UR10 with `--jobs 1` and `--jobs 2`, whose figures are the same.
+"""Time of a cross-validated hybrid of the UR10 with `--jobs 1` and `--jobs 2`, with the same figures.
 
 Run `OMP_NUM_THREADS=1 python benchmarks/cross_validation_jobs.py` with the public data sets in `PISIGMA_DATA`.
 """
@@ -15,7 +15,7 @@ ROWS = Path(os.environ.get("PISIGMA_DATA", "../shared/data")) / "ur10" / "series
 
 
 def timed(out: Path, jobs: int) -> tuple[float, float]:
-    """Seconds of calibration and cross-validation, and those of the whole command."""
+    """Return the seconds of calibration and cross-validation, and of the whole command."""
     command = [sys.executable, "-m", "pisigma", "calibrate", "ur10", str(ROWS), "--out", str(out)]
     started = time.monotonic()
     done = subprocess.run([*command, "--jobs", str(jobs), "--json"], capture_output=True, check=True)
@@ -23,7 +23,7 @@ def timed(out: Path, jobs: int) -> tuple[float, float]:
 
 
 def main() -> None:
-    """Print both times, their ratios, and whether models and held-out errors are the same to the bit."""
+    """Print both times, their ratios, and whether models and held-out errors are identical to the bit."""
     with TemporaryDirectory() as folder:
         outs = [Path(folder) / name for name in ("one", "two")]
         one, two = (timed(out, jobs) for jobs, out in enumerate(outs, 1))
@@ -33,7 +33,7 @@ def main() -> None:
             )
         for name in ("model.safetensors", "held_out.csv"):
             same = (outs[0] / name).read_bytes() == (outs[1] / name).read_bytes()
-            print(f"{name}: {'the same to the bit' if same else 'different'}")
+            print(f"{name}: {'identical to the bit' if same else 'different'}")
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
-"""Time and memory of a fleet of simulated robots, with processes and with Ray, and what kills leave of it.
+"""Time and memory of a fleet of simulated robots, with processes and with Ray, and recovery from killed runs.
 
 Run `OMP_NUM_THREADS=1 python benchmarks/fleet.py [PART ...]` with the simulator of arms (`sim.py`) in
-`PISIGMA_SIMULATED`. Every robot is a kr10 with errors of its own, measured in 100 poses.
+`PISIGMA_SIMULATED`. Every robot is a kr10 with individual errors, measured at 100 poses.
 """
 
 import argparse
@@ -20,7 +20,7 @@ SIMULATED = Path(os.environ.get("PISIGMA_SIMULATED", "../shared/simulated"))
 
 
 def write_fleet(folder: Path, robots: int) -> None:
-    """Measure the robots; the manifest is `fleet.csv`."""
+    """Simulate measurements of the robots, with the manifest `fleet.csv`."""
     sys.path.insert(0, str(SIMULATED))
     import sim  # type: ignore[import-not-found]
 
@@ -39,12 +39,12 @@ def write_fleet(folder: Path, robots: int) -> None:
 
 
 def command(out: str, *options: str) -> list[str]:
-    """The command line of a run."""
+    """Return the command line of a run."""
     return [sys.executable, "-m", "pisigma", "fleet", "run", "fleet.csv", "--out", out, "--json", *options]
 
 
 def timed(out: str, *options: str) -> tuple[float, float]:
-    """Seconds of a run, and the most memory of the processes below this one [GB]."""
+    """Return the seconds of a run, and the peak memory of its child processes [GB]."""
     started = time.monotonic()
     process = subprocess.Popen(command(out, *options), stdout=subprocess.PIPE, text=True)
     most = 0.0
@@ -58,14 +58,14 @@ def timed(out: str, *options: str) -> tuple[float, float]:
 
 
 def memory_below(pid: int) -> float:
-    """Resident memory of a process and of those it started, shared pages counted once [GB]."""
+    """Return the resident memory of a process and its children, with shared pages counted once [GB]."""
     total, waiting = 0.0, [pid]
     while waiting:
         one = waiting.pop()
         try:
             sums = Path(f"/proc/{one}/smaps_rollup").read_text(encoding="utf-8")
             children = Path(f"/proc/{one}/task/{one}/children").read_text(encoding="utf-8")
-        except OSError:  # it has ended
+        except OSError:  # the process has ended
             continue
         total += sum(int(line.split()[1]) for line in sums.splitlines() if line.startswith("Pss:")) / 1e6
         waiting += map(int, children.split())
@@ -73,7 +73,7 @@ def memory_below(pid: int) -> float:
 
 
 def engines(robots: int) -> None:
-    """Two processes beside two workers of Ray."""
+    """Compare two processes with two workers of Ray."""
     seconds, most = timed("processes", "--jobs", "2")
     print(f"{robots} robots, 2 processes: {seconds:.1f} s, {most:.2f} GB", flush=True)
     on_ray, most = timed("ray", "--jobs", "2", "--engine", "ray")
@@ -81,11 +81,11 @@ def engines(robots: int) -> None:
         f"{robots} robots, Ray with 2 workers: {on_ray:.1f} s ({on_ray / seconds:.2f} times), {most:.2f} GB"
     )
     same = Path("processes/results.parquet").read_bytes() == Path("ray/results.parquet").read_bytes()
-    print(f"results are {'the same to the bit' if same else 'different'}", flush=True)
+    print(f"results are {'identical to the bit' if same else 'different'}", flush=True)
 
 
 def kills(robots: int, count: int) -> None:
-    """End runs at random moments; what the last comes to is what one run comes to."""
+    """Kill runs at random moments, and compare the final result with that of a single run."""
     seconds, _ = timed("whole", "--jobs", "2")
     rng, killed = np.random.default_rng(0), 0
     for _ in range(count):
@@ -97,14 +97,14 @@ def kills(robots: int, count: int) -> None:
     same = Path("whole/results.parquet").read_bytes() == Path("killed/results.parquet").read_bytes()
     left = [path.name for path in Path("killed").rglob(".*") if path.is_file()]
     print(
-        f"{robots} robots, killed {killed} times: {'the same to the bit' if same else 'different'}, {left} left"
+        f"{robots} robots, killed {killed} times: {'identical to the bit' if same else 'different'}, {left} left"
     )
 
 
 def main() -> None:
-    """Run the parts that are asked for."""
+    """Run the requested parts."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("parts", nargs="*", help="engines, kills; both by default")
+    parser.add_argument("parts", nargs="*", help="engines, kills (default: both)")
     parser.add_argument("--robots", type=int, default=200)
     parser.add_argument("--kills", type=int, default=20)
     wanted = parser.parse_args()

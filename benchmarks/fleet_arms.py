@@ -1,10 +1,10 @@
-"""Ten poses of a simulated arm with what its fleet has in common, beside ten and thirty poses without.
+"""Ten poses of a simulated arm with the prior of its fleet, compared with ten and thirty poses without it.
 
 Run `OMP_NUM_THREADS=1 python benchmarks/fleet_arms.py [--fleets 11] [--robots 30] [--judged 10]` with the simulator of
-arms (`sim.py`) in `PISIGMA_SIMULATED`. Every arm is a kr10 with errors that all share and individual ones; 60 positions
-of each make the prior. All figures are root mean squares of position errors of 300 other poses without noise [mm].
-"exact" is what ten positions leave to who knows the distribution of the arms, in the mean of as many draws of poses:
-nothing that is linear in the measured values errs less.
+arms (`sim.py`) in `PISIGMA_SIMULATED`. Every arm is a kr10 with common and individual errors; 60 positions of each make
+the prior. All figures are root mean squares of position errors at 300 other poses without noise [mm]. "exact" is the
+expected error after ten positions if the distribution of the arms is known, averaged over the same number of draws of
+poses: the minimum for all estimates that are linear in the measured values.
 """
 
 import argparse
@@ -36,10 +36,10 @@ sys.path.insert(0, os.environ.get("PISIGMA_SIMULATED", "../shared/simulated"))
 import sim  # type: ignore[import-not-found]
 
 USUAL_NOISE = 3.6e-5
-"""[m] Of a coordinate: that of the tracker and the repeatability of the simulated arms."""
+"""Standard deviation of a coordinate [m], of the tracker and the repeatability of the simulated arms."""
 SHARED_SEED = 777
 STEP = 1e-5
-"""[m or rad] Of finite differences."""
+"""Step of finite differences [m or rad]."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ class Fleet:
 
     @cached_property
     def drawn(self) -> Robot:
-        """The robot of the drawing."""
+        """Return the nominal robot."""
         with TemporaryDirectory() as folder:
             with contextlib.chdir(folder):
                 sim.write_urdf("kr10")
@@ -68,12 +68,12 @@ class Fleet:
 
     @property
     def instrument(self) -> Instrument:
-        """What measures."""
+        """Return the sensor."""
         usual = Instrument()
         return Instrument(self.kind, self.noise, usual.sigma_rotation * self.noise / usual.sigma)
 
     def arm(self, number: int) -> Any:
-        """One of the true arms."""
+        """Return one of the true arms."""
         arm, individual = sim.True_("kr10", SHARED_SEED), sim.True_("kr10", number)
         for name in ("do", "dr", "off"):
             setattr(arm, name, getattr(arm, name) + self.errors * getattr(individual, name))
@@ -83,7 +83,7 @@ class Fleet:
         return arm
 
     def rows(self, arm: Any, q: np.ndarray, seed: int, exact: bool = False) -> Measurements:
-        """What is measured at joint values [rad]."""
+        """Return the measurements at joint values [rad]."""
         rng = np.random.default_rng(seed)
         position, rotation = arm.measure(q, noise=0.0 if exact else self.noise, rng=rng, rep=0.0)
         turned = None
@@ -93,11 +93,11 @@ class Fleet:
         return Measurements(torch.from_numpy(q), torch.from_numpy(position), turned)
 
     def alone(self, rows: Measurements) -> Any:
-        """The calibration of an arm without a prior."""
+        """Return the calibration of an arm without a prior."""
         return calibrate(self.drawn, rows, CalibrationSettings(folds=0)).result
 
     def planned(self, prior: CalibratedModel, count: int) -> np.ndarray:
-        """Poses chosen by what the prior leaves open [rad]."""
+        """Return poses [rad] chosen for the remaining uncertainty of the prior."""
         arm = self.arm(0)
         q, task = (torch.from_numpy(arm.sample(many, 4242 + many)) for many in (1000, 200))
         base = np.array([*arm.base[1], *np.deg2rad([130.0, 2.0, 1.0])])
@@ -107,7 +107,7 @@ class Fleet:
         return chosen.numpy()
 
     def exact(self, judged: int) -> float:
-        """Expected error after 10 poses for who knows the distribution of the individual errors [mm]."""
+        """Return the expected error after 10 poses if the distribution of the individual errors is known [mm]."""
         test = self._derivative(sim.True_("kr10", SHARED_SEED).sample(300, 9000))
         draws = []
         for number in range(500, 500 + judged):
@@ -117,16 +117,16 @@ class Fleet:
         return float(np.mean(draws))
 
     def _derivative(self, q: np.ndarray) -> np.ndarray:
-        """Derivative of positions [m] by all that differs from arm to arm, in units of its standard deviation."""
+        """Return the derivative of positions [m] by all individual errors, in units of their standard deviations."""
         arm = sim.True_("kr10", SHARED_SEED)
-        harmonic = self.gears * np.deg2rad(0.015) / np.sqrt(2)  # of its cosine and of its sine
+        harmonic = self.gears * np.deg2rad(0.015) / np.sqrt(2)  # of its cosine and its sine
         sizes = np.concatenate(
             [
                 np.full(arm.do.size, self.errors * 0.3e-3),
                 np.full(arm.dr.size, self.errors * 0.4e-3),
                 np.full(arm.off.size, self.errors * np.deg2rad(0.05)),
                 np.full(2 * arm.amp.size, harmonic),
-                np.full(9, 0.1),  # base and tool may be anywhere
+                np.full(9, 0.1),  # base and tool are unknown
             ]
         )
         steps = np.diag(np.minimum(sizes, STEP))
@@ -135,7 +135,7 @@ class Fleet:
 
     @staticmethod
     def _positions(q: np.ndarray, change: np.ndarray) -> np.ndarray:
-        """Positions [m] of the common arm with changes of frames, joint offsets, harmonics, base and tool."""
+        """Return positions [m] of the common arm with changes of frames, joint offsets, harmonics, base and tool."""
         arm = sim.True_("kr10", SHARED_SEED)
         stretches = np.cumsum([arm.do.size, arm.dr.size, arm.off.size, arm.amp.size, arm.amp.size, 3, 3])
         shift, turn, offset, cosine, sine, base_turn, base_shift, tool = np.split(change, stretches)
@@ -147,7 +147,7 @@ class Fleet:
         return arm.measure(q, noise=0.0, rep=0.0)[0]
 
     def figures(self, robots: int, judged: int) -> np.ndarray:
-        """Errors after 10 poses with the prior, 10 planned ones, 10 and 30 without it, and 30 with it [mm]."""
+        """Return errors after 10 poses with the prior, 10 planned ones, 10 and 30 without, and 30 with it [mm]."""
         arms = [self.arm(number) for number in range(robots)]
         rows = [self.rows(arm, arm.sample(60, number), number) for number, arm in enumerate(arms)]
         prior = fleet_prior("fleet", self.drawn, rows).model
@@ -175,9 +175,9 @@ FLEETS = (
 
 
 def main() -> None:
-    """Print a line for every fleet."""
+    """Print one line per fleet."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--fleets", type=int, default=len(FLEETS), help="so many lines of the table")
+    parser.add_argument("--fleets", type=int, default=len(FLEETS), help="number of lines of the table")
     parser.add_argument("--robots", type=int, default=30)
     parser.add_argument("--judged", type=int, default=10)
     wanted = parser.parse_args()

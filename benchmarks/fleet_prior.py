@@ -1,8 +1,8 @@
-"""Calibrations of few poses that begin with what a fleet has in common, beside those without, and odd robots.
+"""Calibrations with few poses, with and without the prior of a fleet, and robots that differ from the fleet.
 
 Run `OMP_NUM_THREADS=1 python benchmarks/fleet_prior.py [--fleets 7] [--robots 50] [--odd 5] [--judged 10]`. Robots
-share errors of 1 mm and 1 mrad and have individual ones; 60 poses of each make the prior. All figures are root mean
-squares of position errors of 400 other poses without noise [mm].
+have common errors of 1 mm and 1 mrad, and individual ones; 60 poses of each make the prior. All figures are root mean
+squares of position errors at 400 other poses without noise [mm].
 """
 
 import argparse
@@ -31,25 +31,25 @@ from pisigma.workflow.recalibrate import recalibrate
 from pisigma.workflow.settings.calibration import CalibrationSettings
 
 FLEETS = ((2e-4, 1.0), (1e-4, 1.0), (5e-5, 1.0), (2e-5, 1.0), (2e-5, 0.1), (2e-5, 0.01), (1e-5, 0.0))
-"""Individual errors [m or rad], and the share of the variance of harmonics that is individual; the first is usual."""
+"""Individual errors [m or rad], and the individual share of the variance of harmonics; the first is the typical one."""
 NOTHING = 1e-8
-"""[m or rad] Instead of an error of no size, so that covariances have factors."""
+"""Error [m or rad] used instead of 0, so that covariances have Cholesky factors."""
 
 
 def rms(predicts: Any, test: Measurements) -> float:
-    """Root mean square of the errors of anything with `errors_of` [mm]."""
+    """Return the RMS error of a result with `errors_of` [mm]."""
     return float(predicts.errors_of(test)["position"].square().sum(1).mean().sqrt()) * 1e3
 
 
 def true_prior(individual: float, gears: float) -> CalibratedModel:
-    """The prior of the distribution that the robots are drawn from."""
+    """Return the distribution that the robots are drawn from, as a prior."""
     knowledge = Knowledge.of_robot(DRAWN)
     size = knowledge.uncertainty.space.arm_size
     means, deviations = [common_errors().flatten()], [torch.full((size,), individual, dtype=torch.float64)]
     for feature in knowledge.uncertainty.features:
         mean, deviation = torch.zeros(2, *feature.used.shape, dtype=torch.float64)
         if feature.name == "series":
-            count, half = len(GEARS), feature.used.shape[1] // 2  # sines, and then cosines
+            count, half = len(GEARS), feature.used.shape[1] // 2  # first sines, then cosines
             columns = [*range(count), *range(half, half + count)]
             mean[:, columns] = (1 - gears) ** 0.5 * common_gears()
             deviation[:, columns] = gears**0.5 * torch.tensor(GEARS * 2, dtype=torch.float64)
@@ -61,7 +61,7 @@ def true_prior(individual: float, gears: float) -> CalibratedModel:
 
 
 def begun_with(prior: CalibratedModel, rows: Measurements) -> Adaptation:
-    """The posterior of a robot."""
+    """Return the posterior of a robot."""
     posterior = ModelPosterior.of(prior)
     rows = posterior.renamed(rows)
     problem = recalibration_problem(prior, posterior, rows, owners_in(rows, ("base", "tool")))
@@ -69,12 +69,12 @@ def begun_with(prior: CalibratedModel, rows: Measurements) -> Adaptation:
 
 
 def alone(rows: Measurements) -> Any:
-    """The calibration of a robot without a prior."""
+    """Return the calibration of a robot without a prior."""
     return calibrate(DRAWN, rows, CalibrationSettings(folds=0)).result
 
 
 def fleet_table(fleets: int, robots: int, odd: int, judged: int) -> FleetPrior:
-    """Print a line for every fleet: estimated priors beside the true distribution; return the usual one's prior."""
+    """Print one line per fleet, with estimated priors and the true distribution; return the typical fleet's prior."""
     print("errors  gears | 10 poses: true  estimated  without | 30 poses: true  estimated  without")
     priors = []
     for individual, gears in FLEETS[:fleets]:
@@ -94,7 +94,7 @@ def fleet_table(fleets: int, robots: int, odd: int, judged: int) -> FleetPrior:
 
 
 def gated(prior: FleetPrior, number: int, odd: bool) -> list[float]:
-    """What `pisigma calibrate --prior` keeps, and the calibration without it, of 10 and 30 poses."""
+    """Return what `pisigma calibrate --prior` keeps, and the calibration without prior, for 10 and 30 poses."""
     test, figures = rows_of(number, 400, 9000 + number, odd, noise=0.0), []
     for count in (10, 30):
         rows = rows_of(number, count, 7000 + number, odd)
@@ -111,9 +111,9 @@ def gated(prior: FleetPrior, number: int, odd: bool) -> list[float]:
 
 
 def main() -> None:
-    """Print the table of fleets, and what is kept for robots like the usual fleet and for odd ones."""
+    """Print the table of fleets, and what is kept for robots like the typical fleet and for different ones."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--fleets", type=int, default=len(FLEETS), help="so many lines of the table")
+    parser.add_argument("--fleets", type=int, default=len(FLEETS), help="number of lines of the table")
     parser.add_argument("--robots", type=int, default=50)
     parser.add_argument("--odd", type=int, default=5)
     parser.add_argument("--judged", type=int, default=10)

@@ -1,10 +1,10 @@
-"""Held-out accuracy of the hybrid on measured robots: at random, with few rows, and beyond what was measured.
+"""Held-out accuracy of the hybrid on measured robots: random folds, few rows, and outside the measured joint values.
 
 Run `OMP_NUM_THREADS=1 python benchmarks/hybrid_accuracy.py [PART ...]` with the measured files in `PISIGMA_DATA`. A
 part is one of the names in `PARTS`. Every line is one fit: root mean square of the position error of the held-out rows
-under the geometric and the hybrid calibration, their ratio, and the share of held-out coordinates inside the predicted
-95 %. A box is trained on the rows whose joints all lie within their 4 % and 96 % quantiles and judged on all
-others; a half is trained on one side of a joint's median and judged on the other side.
+with the geometric and the hybrid calibration, their ratio, and the share of held-out coordinates within the predicted
+95 % intervals. A box is trained on the rows with all joints within their 4 % and 96 % quantiles and evaluated on all
+others; a half is trained on one side of a joint's median and evaluated on the other side.
 """
 
 import argparse
@@ -32,7 +32,7 @@ FEW = (300, 100, 50, 30)
 
 @dataclass(frozen=True)
 class Case:
-    """One split: rows to fit to, and rows to judge on."""
+    """One split: rows to fit, and rows to judge."""
 
     name: str
     robot: Robot
@@ -42,7 +42,7 @@ class Case:
 
 @dataclass(frozen=True)
 class Judged:
-    """Squared position errors of the held-out rows [m²] and what was predicted of them."""
+    """Return squared position errors of the held-out rows [m²] and their predicted values."""
 
     geometric: Tensor
     hybrid: Tensor
@@ -50,20 +50,20 @@ class Judged:
 
 
 def folds(name: str, robot: Robot, data: Measurements) -> Iterator[Case]:
-    """Five folds of rows at random."""
+    """Return five random folds of rows."""
     for k, (train, test) in enumerate(k_folds(data, 5, 0)):
         yield Case(f"{name} fold {k + 1}", robot, data.select(train), data.select(test))
 
 
 def few(name: str, robot: Robot, data: Measurements) -> Iterator[Case]:
-    """Fewer and fewer of the training rows of the five folds, the UR10 only."""
+    """Return decreasing numbers of the training rows of the five folds, for the UR10 only."""
     for rows in FEW if name == "ur10" else ():
         for train, test in with_fewer(data, k_folds(data, 5, 0), rows, 0):
             yield Case(f"{name} {rows} rows", robot, data.select(train), data.select(test))
 
 
 def boxes(name: str, robot: Robot, data: Measurements) -> Iterator[Case]:
-    """Joints within their 4 % and 96 % quantiles; all others."""
+    """Return rows with all joints within their 4 % and 96 % quantiles, and all other rows."""
     low, high = (torch.quantile(data.q, share, 0) for share in (0.04, 0.96))
     inside = ((data.q >= low) & (data.q <= high)).all(1)
     yield Case(
@@ -72,7 +72,7 @@ def boxes(name: str, robot: Robot, data: Measurements) -> Iterator[Case]:
 
 
 def halves(name: str, robot: Robot, data: Measurements) -> Iterator[Case]:
-    """One side of a joint's median; the other."""
+    """Return the rows on each side of a joint's median."""
     for joint in HALVED[name]:
         below = data.q[:, joint - 1] < data.q[:, joint - 1].median()
         for side, mask in (("below", below), ("above", ~below)):
@@ -84,7 +84,7 @@ PARTS = {"folds": folds, "few": few, "boxes": boxes, "halves": halves}
 
 
 def judged(case: Case) -> Judged:
-    """Fit and judge."""
+    """Fit and judge one split."""
     began = time.perf_counter()
     result = HybridCalibrator(case.robot).fit(case.train)
     seconds = time.perf_counter() - began
@@ -97,7 +97,7 @@ def judged(case: Case) -> Judged:
 
 
 def print_line(name: str, one: Judged, more: str) -> None:
-    """One line of the table."""
+    """Print one line of the table."""
     before, after = (float(square.mean().sqrt()) * 1e3 for square in (one.geometric, one.hybrid))
     print(
         f"{name:20s} {before:7.4f} {after:7.4f} {after / before:6.3f} {one.spread.coverage:6.1%}  {more}",
@@ -106,7 +106,7 @@ def print_line(name: str, one: Judged, more: str) -> None:
 
 
 def main() -> None:
-    """Print one line a fit, and a line for what belongs together."""
+    """Print one line per fit, and one per group of splits."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("parts", nargs="*", default=list(PARTS), metavar="PART")
     parser.add_argument("--robot", choices=FILES, action="append")

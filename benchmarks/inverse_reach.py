@@ -1,11 +1,10 @@
-"""How many reachable poses the corrected inverse kinematics reaches, and how exactly, by both routes.
+"""How many reachable poses the corrected inverse kinematics reaches, and how exactly, in kernels and in torch.
 
-Run `OMP_NUM_THREADS=1 python benchmarks/inverse_reach.py`, and with `--tasks` for tasks in which not all axes of the
-tool count and for arms with fewer or more joints than six. Poses are those of random joint values, inside the joint
-limits and where the model says that its correction holds. kiro3 and kiro4 are the trained models of this repository,
-which correct nominal joint values; the others are catalogue robots with the errors and the correction of
-`inverse_speed.py`, and a UR5 as a URDF file whose right angles are rounded to 1.5708. Residuals are those of the
-calibrated model.
+Run `OMP_NUM_THREADS=1 python benchmarks/inverse_reach.py`, and with `--tasks` for tasks in which some axes of the tool
+are ignored and for arms with fewer or more than six joints. Poses are those of random joint values within the joint
+limits and the domain of the correction. kiro3 and kiro4 are the trained models of this repository, which correct
+nominal joint values; the others are catalogue robots with the errors and the correction of `inverse_speed.py`, and a
+UR5 as a URDF file whose right angles are rounded to 1.5708. Residuals are those of the calibrated model.
 """
 
 import argparse
@@ -32,7 +31,7 @@ from pisigma.robot.row import Row
 
 MODELS = Path(__file__).parents[1] / "models"
 NEAR = 0.3
-"""[rad or, a tenth, m] How far joint values to be near to are off the truth at most."""
+"""Maximum distance of `near` from the true joint values [rad, or a tenth of it in m]."""
 
 ORIGINS = (
     ("0 0 0.089159", "0 0 0"),
@@ -45,7 +44,7 @@ ORIGINS = (
 
 
 def rounded_urdf(folder: Path) -> str:
-    """Write a UR5 as URDF with rounded angles, and give the file."""
+    """Write a UR5 as URDF with rounded angles, and return the file."""
     parts = ['<robot name="rounded"><link name="link_0"/>']
     for i, (xyz, rpy) in enumerate(ORIGINS):
         parts.append(
@@ -59,7 +58,7 @@ def rounded_urdf(folder: Path) -> str:
 
 
 def joints_in_domain(model: CalibratedModel, rows: int, rng: np.random.Generator) -> torch.Tensor:
-    """Random joint values [rad or m] where the correction holds."""
+    """Return random joint values [rad or m] within the domain of the correction."""
     if model.network is None:
         return draw_joints(model.robot, rows, rng)
     lower, upper = model.starts.aminmax(dim=0)
@@ -79,8 +78,8 @@ def report(name: str, model: CalibratedModel, rows: int) -> None:
     q = joints_in_domain(model, rows, rng)
     T = model.forward(q)
     width = torch.tensor([NEAR if revolute else NEAR / 10 for revolute in model.robot.revolute])
-    beside = q + width * torch.from_numpy(rng.uniform(-1, 1, q.shape))
-    for label, near in (("no near", None), (f"near within {NEAR} rad", beside)):
+    nearby = q + width * torch.from_numpy(rng.uniform(-1, 1, q.shape))
+    for label, near in (("no near", None), (f"near within {NEAR} rad", nearby)):
         found = NumericIK(model).solve_batch(T, near=near)
         line = figures(found.status.numpy(), found.position_residual.numpy(), found.rotation_residual.numpy())
         print(f"{name:9s} {label:20s} torch     {len(T):6d} poses, {line}", flush=True)
@@ -94,7 +93,7 @@ def report(name: str, model: CalibratedModel, rows: int) -> None:
 
 
 def figures(status: np.ndarray, position: np.ndarray, rotation: np.ndarray) -> str:
-    """Share reached and largest residuals."""
+    """Return the share of reached poses and the largest residuals."""
     reached = (status != Status.UNREACHABLE) & (status != Status.OUTSIDE_JOINT_LIMITS)
     return (
         f"reached inside the limits {100 * reached.mean():7.3f} %, largest residual "
@@ -123,7 +122,7 @@ FIVE = Robot(
 
 
 def on_rail(name: str) -> Robot:
-    """A robot of the catalogue on a rail of 3 m."""
+    """Return a robot of the catalogue on a rail of 3 m."""
     arm = Robot.load(name)
     rows = (Row("rail", "prismatic", lower=0.0, upper=3.0), Row("upright", "fixed"), *arm.rows)
     dh = np.array([(0, 0, 0, -math.pi / 2, 0), (0, 0, 0, math.pi / 2, 0), *arm.dh.tolist()])
@@ -137,11 +136,11 @@ TASKS: tuple[tuple[str, Robot | str, tuple[str, ...] | None], ...] = (
     ("rail + six", on_rail("ur10"), None),
     ("seven axes", "panda", None),
 )
-"""What the task is, the robot, and the axes of the tool that do not count; None for the default."""
+"""Name of the task, the robot, and the ignored axes of the tool; None for the default."""
 
 
 def report_tasks(rows: int) -> None:
-    """Print how many poses are reached in the axes that count, and how long one takes on one thread."""
+    """Print how many poses are reached in the axes that count, and the time per pose on one thread."""
     for label, robot, ignored in TASKS:
         rng = np.random.default_rng(0)
         model = make_model(robot, 24, rng)
@@ -158,11 +157,11 @@ def report_tasks(rows: int) -> None:
         found = kernels.solve_batch(T, axes=axes, threads=1)
         took = (time.perf_counter() - start) / rows * 1e6
         line = figures(found.status, found.position_residual, found.rotation_residual)
-        print(f"{label:24s} {rows} poses, {line}, {took:.0f} us a pose", flush=True)
+        print(f"{label:24s} {rows} poses, {line}, {took:.0f} us per pose", flush=True)
 
 
 def report_branches(rows: int, starts: int = 40) -> None:
-    """Print how many solutions of a calibrated UR10 that a search from random starts gives are among its branches."""
+    """Print how many solutions that a search from random starts finds for a calibrated UR10 are among its branches."""
     rng = np.random.default_rng(0)
     model = make_model("ur10", 24, rng)
     kernels = CompiledIK.of(model)
@@ -178,7 +177,7 @@ def report_branches(rows: int, starts: int = 40) -> None:
     searched = reached.numpy().reshape(rows, starts)
     print(
         f"all branches of a UR10: {100 * (1 - (missed & searched).sum() / searched.sum()):.2f} % of {searched.sum()} "
-        f"solutions found by search are among them, {took:.0f} us a pose"
+        f"solutions found by search are among them, {took:.0f} us per pose"
     )
 
 
@@ -189,7 +188,9 @@ def main() -> None:
         "robots", nargs="*", default=["kiro3", "kiro4", "rb5", "panda", "ur5", "ur10", "urdf"]
     )
     parser.add_argument("--poses", type=int, default=10_000)
-    parser.add_argument("--tasks", action="store_true", help="tasks with fewer freedoms, 1,000 poses each")
+    parser.add_argument(
+        "--tasks", action="store_true", help="tasks with fewer degrees of freedom, 1,000 poses each"
+    )
     options = parser.parse_args()
     if options.tasks:
         report_tasks(1_000)

@@ -1,12 +1,12 @@
-"""Corrected inverse kinematics: poses a second and microseconds a call, for arrays and tensors, and as ratios to scipy.
+"""Speed of the corrected inverse kinematics: poses per second and microseconds per call, compared with scipy.
 
 Run `OMP_NUM_THREADS=1 python benchmarks/inverse_speed.py` (scipy comes with `pip install -e ".[bench]"`). The arm has
-errors of 0.5 mm and 1 mrad in every row, base and tool, and a correction of a Fourier series, gravity torques and
-product units; every joint value counts as measured. With a model folder instead of a robot it is that model, between
-its measured joint values, or with `--anywhere` all over the limits, mostly outside its domain. scipy solves the same
-poses of the arm without its correction, from the joint values themselves with 0.05 rad added. Poses are those of
+errors of 0.5 mm and 1 mrad in every row, base and tool, and a correction from a Fourier series, gravity torques and
+product units; every joint value counts as measured. With a model folder instead of a robot, that model is used within
+its measured joint values, or with `--anywhere` over the whole limits, mostly outside its domain. scipy solves the same
+poses of the arm without its correction, starting 0.05 rad from the solution. Poses are those of
 uniformly drawn joint values; they are checked before solving and the residual is computed after it. The kernels are
-compiled before anything is timed.
+compiled before the measurement starts.
 """
 
 import argparse
@@ -45,17 +45,17 @@ CompiledIK.load({file!r}).solve(np.load({pose!r}))
 print(time.perf_counter() - start, time.process_time() - began)
 """
 REPEATS = 5
-"""The best of so many counts: other programs can only make it slower."""
+"""Number of runs, of which the fastest counts: other programs can only slow them down."""
 
 
 def draw_joints(robot: Robot, rows: int, rng: np.random.Generator) -> torch.Tensor:
-    """Joint values [rad or m] over the limits, at most a turn."""
+    """Return joint values [rad or m] over the limits, within one turn at most."""
     limits = np.clip(robot.limits, -math.pi, math.pi)
     return torch.from_numpy(rng.uniform(limits[:, 0], limits[:, 1], (rows, robot.dof)))
 
 
 def draw_between(starts: torch.Tensor, rows: int, rng: np.random.Generator) -> torch.Tensor:
-    """Joint values [rad or m] between two measured ones each, every joint for itself."""
+    """Return joint values [rad or m], each between two measured values of its joint."""
     first, second = (
         starts.double()[torch.from_numpy(rng.integers(len(starts), size=rows))] for _ in range(2)
     )
@@ -63,7 +63,7 @@ def draw_between(starts: torch.Tensor, rows: int, rng: np.random.Generator) -> t
 
 
 def make_model(name: str | Robot, harmonics: int, rng: np.random.Generator) -> CalibratedModel:
-    """A calibrated arm with a correction of about 1 mrad; of the catalogue, a file, or another."""
+    """Return a calibrated arm with a correction of about 1 mrad, from the catalogue, a file, or another robot."""
     robot = (Robot.load(name) if isinstance(name, str) else name).with_geometry(base=BASE, tool=TOOL)
     geometric = robot.with_geometry(dh=robot.dh + ERRORS * rng.normal(size=robot.dh.shape))
     features = [FourierSeries(robot, harmonics), GravityTorques(robot)]
@@ -80,7 +80,7 @@ def make_model(name: str | Robot, harmonics: int, rng: np.random.Generator) -> C
 
 
 def time_scipy(kernels: object, T: np.ndarray, q: np.ndarray) -> float:
-    """Seconds a pose by least squares on the arm without its correction."""
+    """Return the seconds per pose of least squares on the arm without its correction."""
     from pisigma.robot.kernels.arrays import IDENTIFIED
 
     def residual(joints: np.ndarray, wanted: np.ndarray) -> np.ndarray:
@@ -95,13 +95,13 @@ def time_scipy(kernels: object, T: np.ndarray, q: np.ndarray) -> float:
 def main() -> None:
     """Print the figures of one robot."""
     parser = argparse.ArgumentParser()
-    parser.add_argument("robot", nargs="?", default="ur10", help="of the catalogue, or a model folder")
+    parser.add_argument("robot", nargs="?", default="ur10", help="catalogue name or model folder")
     parser.add_argument("--poses", type=int, default=100_000)
     parser.add_argument("--harmonics", type=int, default=24)
     parser.add_argument(
         "--anywhere",
         action="store_true",
-        help="of a model folder: joint values all over their limits, not only between measured ones",
+        help="for a model folder: joint values over the whole limits, not only between measured ones",
     )
     options = parser.parse_args()
     torch.set_num_threads(1)
@@ -142,7 +142,7 @@ def main() -> None:
     print(f"one call: median {median:.1f} us, 99 % {high:.1f} us")
     few = min(200, len(T))
     scipy = time_scipy(kernels, T[:few], q[:few])
-    print(f"scipy: {scipy * 1e6:,.0f} us a pose, {scipy * 1e6 / median:,.0f} times a compiled call")
+    print(f"scipy: {scipy * 1e6:,.0f} us per pose, {scipy * 1e6 / median:,.0f} times a compiled call")
     solver, tensors, rate = CorrectedIK(model), torch.from_numpy(T), 0.0
     for _ in range(REPEATS):
         start = time.perf_counter()
@@ -159,7 +159,7 @@ def main() -> None:
             for _ in range(REPEATS)
         ]
         wall, used = (min(float(run.stdout.split()[i]) for run in done) for i in range(2))
-        print(f"new process, import to first solution: {wall:.2f} s, {used:.2f} s of processor")
+        print(f"new process, import to first solution: {wall:.2f} s, {used:.2f} s of processor time")
 
 
 if __name__ == "__main__":

@@ -1,11 +1,11 @@
-"""Poses per second of forward kinematics and joint Jacobian, pisigma against pytorch-kinematics, in one run.
+"""Poses per second of forward kinematics and joint Jacobian, compared with pytorch-kinematics in one run.
 
-Both compute in float64 on one thread, on the same joint values, alternately, and the best round of each
-counts. The peer's chain is built in float64 from the robot's own rows (a chain converted with
-``.to(torch.float64)`` is off by 2e-8 m), and the two are compared before anything is timed.
+Both compute in float64 on one thread, on the same joint values, alternately, and the fastest round of each
+counts. The peer's chain is built in float64 from the rows of the robot (a chain converted with
+``.to(torch.float64)`` has errors of 2e-8 m), and the results are compared before the measurement starts.
 
-Then the same of NumPy arrays, which go through compiled kernels, against Robotics Toolbox's ``ets.eval`` (C++)
-where ``roboticstoolbox`` can be imported.
+Then forward kinematics of NumPy arrays, which uses compiled kernels, is compared with Robotics Toolbox's
+``ets.eval`` (C++) if ``roboticstoolbox`` can be imported.
 
 Run with ``python benchmarks/kinematics_speed.py [--poses 10000] [--rounds 30]``.
 """
@@ -69,7 +69,7 @@ def _frame(name: str, offset: Tensor, joint_type: str, direction: int) -> Frame:
 def time_alternately(
     first: Callable[[], object], second: Callable[[], object], rounds: int
 ) -> tuple[float, float]:
-    """Shortest time [s] of each of two functions, called in turn after one call to warm up."""
+    """Return the shortest time [s] of two functions, called alternately after one call to warm up."""
     best = [float("inf"), float("inf")]
     first(), second()
     for _ in range(rounds):
@@ -110,7 +110,7 @@ def compare(name: str, poses: int, rounds: int) -> None:
 
 
 def toolbox_chain(robot: Robot) -> Any:
-    """The same robot as Robotics Toolbox's elementary transforms, between base and tool."""
+    """Return the same robot as elementary transforms of Robotics Toolbox, between base and tool."""
     from roboticstoolbox import ET, ETS
 
     chain = ETS()
@@ -137,16 +137,16 @@ def compare_arrays(name: str, poses: int, rounds: int) -> None:
             lambda q=q: None if chain is None else chain.eval(q),  # type: ignore[misc]
             times,
         )
-        beside = (
+        peer_time = (
             ""
             if chain is None
             else f"; Robotics Toolbox {peer * 1e6:,.1f} us, {peer / own:.1f} times as long"
         )
-        print(f"{name:12s} array of {np.size(q) // robot.dof} poses: {own * 1e6:,.1f} us{beside}")
+        print(f"{name:12s} array of {np.size(q) // robot.dof} poses: {own * 1e6:,.1f} us{peer_time}")
 
 
 def main() -> None:
-    """Print the table for every robot of the catalogue, or those named."""
+    """Print the table for all robots of the catalogue, or those named."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

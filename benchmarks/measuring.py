@@ -1,10 +1,10 @@
-"""Sessions of measuring simulated arms: wrong rows that are called so, and poses until the limit is reached.
+"""Measuring sessions of simulated arms: detection of wrong rows, and poses until the limit is reached.
 
 Run `OMP_NUM_THREADS=1 python benchmarks/measuring.py [PART ...] [--seeds N]` with the simulator of arms (`sim.py`) in
-`PISIGMA_SIMULATED`. "alarms": among 40 random rows one is 5 mm off, or the points of two are swapped; printed are the
-share that is called wrong at once, the same from the seventh row on and in the end, and the share of right rows that
-are called wrong at once. "sessions": poses until 95 % of the errors are expected below the limit, planned and at
-random, and what 95 % of the errors truly stay below.
+`PISIGMA_SIMULATED`. "alarms": among 40 random rows one has an error of 5 mm, or the points of two are exchanged;
+printed are the share that is detected at once, the same from the seventh row on and at the end, and the share of
+correct rows that are called wrong at once. "sessions": poses until 95 % of the errors are expected below the limit,
+planned and random, and the true 95 % quantile of the errors.
 """
 
 import argparse
@@ -31,7 +31,7 @@ POSES = {"planned": 80, "random": 150}
 
 
 def alarms(names: list[str], seeds: range) -> None:
-    """Print the shares of wrong and right rows that are called wrong."""
+    """Print the shares of wrong and correct rows that are called wrong."""
     wrong: list[tuple[int, bool, bool]] = []
     false = total = 0
     slowest = 0.0
@@ -62,7 +62,7 @@ def alarms(names: list[str], seeds: range) -> None:
 
 
 def with_error(rows: Measurements, kind: str, rng: np.random.Generator) -> tuple[Measurements, list[int]]:
-    """Rows of which one is 5 mm off, or two are swapped, and which."""
+    """Return rows with one error of 5 mm or two exchanged rows, and their indices."""
     assert rows.position is not None
     position = rows.position.clone()
     one, other = rng.choice(ROWS, 2, replace=False).tolist()
@@ -75,12 +75,12 @@ def with_error(rows: Measurements, kind: str, rng: np.random.Generator) -> tuple
 
 
 def share(flags: list[bool]) -> str:
-    """Write a share in per cent."""
+    """Format a share in per cent."""
     return f"{100 * np.mean(flags):.0f} %" if flags else "none"
 
 
 def sessions(names: list[str], seeds: range) -> None:
-    """Print poses and true errors of sessions that stop at the limit, one arm after the other with every seed."""
+    """Print poses and true errors of sessions that stop at the limit, for every arm and seed."""
     poses: dict[str, list[int]] = {how: [] for how in POSES}
     errors: dict[str, list[float]] = {how: [] for how in POSES}
     for seed in seeds:
@@ -104,7 +104,7 @@ def sessions(names: list[str], seeds: range) -> None:
 
 
 def session(arm: Arm, how: str) -> tuple[int, float]:
-    """Measure until the session says stop; gives the number of poses and what 95 % of the errors stay below [mm]."""
+    """Measure until the session recommends stopping; return the poses and the 95 % quantile of the errors [mm]."""
     count = POSES[how]
     settings = PlanSettings(count=count, check=0, candidates=1000, sigma_mm=NOISE * 1e3)
     if how == "planned":
@@ -142,7 +142,7 @@ PARTS = {"alarms": alarms, "sessions": sessions}
 
 
 def main() -> None:
-    """Run the parts that are asked for."""
+    """Run the requested parts."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("parts", nargs="*", default=list(PARTS), metavar="PART", help=", ".join(PARTS))
     parser.add_argument("--arms", default=",".join(ARMS))

@@ -1,7 +1,7 @@
-"""How often `pisigma monitor` names the joint that moved, and how often it raises a false alarm, on measured robots.
+"""How often `pisigma monitor` names the joint that moved, and its false alarms, on measured robots.
 
 Run `OMP_NUM_THREADS=1 python benchmarks/monitoring.py [--draws N]` with the measured files in `PISIGMA_DATA`. A model
-is made of 600 random rows of a series; sessions are drawn from its other rows, with 0.05 deg added to the zero of one
+is fitted to 600 random rows of a series; sessions are drawn from its other rows, with 0.05 deg added to the zero of one
 joint or none. In some cases the tracker is moved as well. Then ten simulated arms (`PISIGMA_SIMULATED`) are monitored
 for two years with ten rows a month, with and without a drift of joint 2. The last lines time twelve sessions of ten
 rows.
@@ -31,7 +31,7 @@ FILES = {"ur10": "ur10/series_b.csv", "ur5": "ur5/grid.csv"}
 ROWS = 600
 MOVED = math.radians(0.05)
 ARMS, ARM_ROWS, MONTHS = 10, 120, 24
-"""Simulated arms, rows of their calibrations, and months that they are monitored."""
+"""Number of simulated arms, of rows of their calibrations, and of monitored months."""
 ELSEWHERE = (0.3, -0.2, 0.1, 0.5, 0.2, -0.3)
 CASES = (
     ("ur10", 5, (0, 1, 2, 3, 4, 5, 6), False),
@@ -43,7 +43,7 @@ CASES = (
 
 
 def model_and_rest(name: str) -> tuple[CalibratedModel, Measurements]:
-    """A model of some rows of a series, and its other rows."""
+    """Return a model of some rows of a series, and its other rows."""
     robot = pisigma.Robot.load(name)
     data = pisigma.Measurements.read_csv(DATA / FILES[name], robot)
     order = torch.randperm(data.rows, generator=torch.Generator().manual_seed(1))
@@ -53,7 +53,7 @@ def model_and_rest(name: str) -> tuple[CalibratedModel, Measurements]:
 
 
 def moved(rows: Measurements, joint: int, tracker: bool) -> Measurements:
-    """Rows as measured after a joint's zero and the tracker have moved."""
+    """Return rows as measured after a joint's zero and the tracker have moved."""
     q = rows.q.clone()
     if joint:
         q[:, joint - 1] -= MOVED
@@ -66,13 +66,13 @@ def moved(rows: Measurements, joint: int, tracker: bool) -> Measurements:
 
 
 def is_right(session: Session, joint: int) -> bool:
-    """Whether the joint that moved, and nothing else of the arm, is named; of no joint whether there is no alarm."""
+    """Return whether exactly the moved joint is named; for no joint, whether there is no alarm."""
     named = [one.what for one in session.moved if not is_frame(one.what)]
     return named == ([f"joint {joint}"] if joint else []) and session.verdict != "unclear"
 
 
 def months() -> None:
-    """Print when a drift of 0.01 deg a month raises the first alarm, and how many alarms there are without one."""
+    """Print when a drift of 0.01 deg a month causes the first alarm, and the number of alarms without a drift."""
     firsts, alarms = [], 0
     settings = pisigma.MonitorSettings(
         dates=tuple(f"{2026 + month // 12}-{month % 12 + 1:02d}-01" for month in range(MONTHS))
@@ -99,17 +99,17 @@ def months() -> None:
 
 
 def _alarmed(monitoring: pisigma.Monitoring) -> list[bool]:
-    """Per session, whether a chart is outside its limits or something is said to have moved."""
+    """Return, per session, whether a chart is outside its limits or a motion is reported."""
     outside = torch.stack([one for chart in monitoring.charts for one in chart.outside.values()]).any(0)
     moved = [one.session.verdict != "unchanged" for one in monitoring.sessions]
     return [one or other for one, other in zip(outside.tolist(), moved, strict=True)]
 
 
 def main() -> None:
-    """Print one line a robot, number of rows and joint."""
+    """Print one line per robot, number of rows and joint."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--draws", type=int, default=100, help="Sessions of every line.")
-    parser.add_argument("--months", action="store_true", help="Only the simulated arms over the months.")
+    parser.add_argument("--draws", type=int, default=100, help="number of sessions per line")
+    parser.add_argument("--months", action="store_true", help="only the simulated arms over the months")
     wanted = parser.parse_args()
     draws = wanted.draws
     if wanted.months:
@@ -142,8 +142,8 @@ def main() -> None:
                 files.append(Path(folder) / f"2026-{month + 1:02d}-01.csv")
                 rows = rest.select(torch.arange(10 * month, 10 * month + 10))
                 moved(rows, 0, tracker).write_csv(files[-1], model.robot)
-            seconds, stands = pisigma.monitor(model, files).seconds, "moved" if tracker else "fixed"
-            print(f"12 sessions of 10 rows, tracker {stands}: {seconds:.2f} s")
+            seconds, state = pisigma.monitor(model, files).seconds, "moved" if tracker else "fixed"
+            print(f"12 sessions of 10 rows, tracker {state}: {seconds:.2f} s")
 
 
 if __name__ == "__main__":

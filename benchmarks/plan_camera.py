@@ -1,12 +1,12 @@
-"""Calibrations from planned images of a board beside as many random views: true errors, and what was predicted.
+"""Calibrations from planned images of a board compared with random views: true and predicted errors.
 
     OMP_NUM_THREADS=1 python benchmarks/plan_camera.py [--draws 5] [--candidates 3000] [--images 25 50]
 
-A UR5 with errors of 1 mm and 0.3 deg on every parameter carries a camera (1920 x 1200 px, f = 1400 px, 0.3 px a corner,
-intrinsics known) that sees a board of 9 x 6 corners 30 mm apart, sharp from 0.3 to 0.7 m, up to 45 deg oblique; the
-robot repeats to 0.02 mm and 0.01 deg. Errors are those of the camera centre's position over 400 postures of the whole
-joint space, after the best rigid alignment. Random views are drawn from the candidates of which the planned ones are
-chosen, by either criterion, for the geometry alone or for the hybrid, as `pisigma plan` does it.
+A UR5 with errors of 1 mm and 0.3 deg in every parameter carries a camera (1920 x 1200 px, f = 1400 px, 0.3 px per
+corner, intrinsics known) that views a board of 9 x 6 corners 30 mm apart, sharp from 0.3 to 0.7 m, up to 45 deg
+oblique; its repeatability is 0.02 mm and 0.01 deg. Errors are those of the camera centre's position over 400 postures
+of the whole joint space, after the best rigid alignment. Random views are drawn from the same candidates as the planned
+ones, which are chosen by either criterion, for the geometry alone or for the hybrid, as by `pisigma plan`.
 """
 
 import argparse
@@ -57,7 +57,7 @@ BOARD = {"name": "board", "rows": 6, "columns": 9, "square_mm": 30}
 
 @dataclass(frozen=True, eq=False)
 class Bench:
-    """The arm, what can be measured, and what is known by model before."""
+    """The arm, the candidates, and the prior."""
 
     arm: ArmInCell
     settings: PlanSettings
@@ -90,7 +90,7 @@ class Bench:
         return Bench(arm, settings, drawn.q, drawn.workspace[:TASK_POSES], knowledge, camera, board)
 
     def figures(self, draw: int, q: Tensor, judged: Tensor) -> tuple[float, float]:
-        """True and predicted error [mm] of a calibration of one true arm with images at joint values."""
+        """Return true and predicted error [mm] of a calibration of one true arm with images at joint values."""
         nominal, rng = self.knowledge["geometric"].uncertainty.geometry.robot, np.random.default_rng(draw)
         errors = rng.standard_normal(nominal.dh.shape) * [ANGLE, LENGTH, LENGTH, ANGLE, ANGLE]
         true, noise = nominal.with_geometry(nominal.dh + errors), ImageNoise()
@@ -103,7 +103,7 @@ class Bench:
 
 
 def aligned_error(true: Tensor, estimated: Tensor) -> float:
-    """Root mean square distance [m] of points after the best rigid alignment; errors are small against the arm."""
+    """Return the RMS distance [m] of points after the best rigid alignment, for errors small compared with the arm."""
     shifts = torch.eye(3, dtype=torch.float64).expand(len(true), 3, 3)
     basis = torch.linalg.qr(torch.cat([shifts, skew(true - true.mean(0))], -1).flatten(0, 1)).Q
     off = (true - estimated).flatten()

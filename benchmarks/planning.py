@@ -1,9 +1,9 @@
-"""Accuracy of calibrations from chosen poses beside random ones, and what was predicted of it.
+"""Accuracy of calibrations from chosen and from random poses, and its prediction.
 
 Run `OMP_NUM_THREADS=1 python benchmarks/planning.py [PART ...]` with the measured files in `PISIGMA_DATA`, and the
-simulator of arms (`sim.py`) in `PISIGMA_SIMULATED`. Measured: pools of 400 random rows, of which some are chosen; all
-other rows judge. Simulated: candidates are drawn in the joint limits; 400 poses without noise judge. Every figure is a
-root mean square of position errors [mm].
+simulator of arms (`sim.py`) in `PISIGMA_SIMULATED`. Measured: some rows are chosen from pools of 400 random ones, and
+all other rows judge. Simulated: candidates are drawn within the joint limits; 400 poses without noise judge. Every
+figure is a root mean square of position errors [mm].
 """
 
 import argparse
@@ -38,15 +38,15 @@ SIMULATED = Path(os.environ.get("PISIGMA_SIMULATED", "../shared/simulated"))
 POOL = 400
 ARMS = ("kr10", "irb120", "arm7")
 NOISE = 3.6e-5
-"""[m] Of the simulated sensor and the robot's repeatability together."""
+"""Standard deviation of the simulated sensor and the robot's repeatability together [m]."""
 LIMIT = 0.1
-"""[mm] Accuracy to which poses are counted."""
+"""Accuracy up to which poses are counted [mm]."""
 STEPS = (14, 18, 22, 26, 30, 34, 38, 42, 46, 50, 56, 62, 70, 80)
 
 
 @dataclass(frozen=True)
 class Figures:
-    """Of one choice: true RMS, the one predicted before anything is measured, and the calibration's [mm]."""
+    """Result of one choice: true RMS, RMS predicted before measuring, and RMS predicted by the calibration [mm]."""
 
     true: float
     predicted: float
@@ -54,12 +54,12 @@ class Figures:
 
 
 def rms_mm(result: Result, test: Measurements) -> float:
-    """Root mean square of the position errors of a calibration [mm]."""
+    """Return the RMS of the position errors of a calibration [mm]."""
     return float(result.errors_of(test)["position"].square().sum(1).mean().sqrt()) * 1e3
 
 
 def pools(name: str, draws: range) -> Iterator[tuple[Measurements, Measurements]]:
-    """Pools of measured rows, and all others."""
+    """Return pools of measured rows, each with all other rows."""
     file = {"ur10": "ur10/series_c_train.csv", "ur5": "ur5/grid.csv"}[name]
     data = Measurements.read_csv(DATA / file, Robot.load(name))
     for draw in draws:
@@ -70,7 +70,7 @@ def pools(name: str, draws: range) -> Iterator[tuple[Measurements, Measurements]
 def measured(
     name: str, counts: tuple[int, ...], hybrid: bool, draws: range, criteria: tuple[Criterion, ...]
 ) -> None:
-    """Random rows of a pool beside chosen ones."""
+    """Compare random rows of a pool with chosen ones."""
     robot = Robot.load(name)
     knowledge = Knowledge.of_robot(robot, hybrid=hybrid)
     calibrator: Calibrator = HybridCalibrator(robot) if hybrid else GeometricCalibrator(robot)
@@ -89,7 +89,7 @@ def measured(
 
 
 def sequential(name: str, counts: tuple[int, ...], draws: range) -> None:
-    """Poses chosen in rounds, with what a hybrid of those before them knows."""
+    """Choose poses in rounds, with the posterior of a hybrid of the earlier ones."""
     robot = Robot.load(name)
     table: dict[tuple[int, str], list[float]] = {}
     for pool, test in pools(name, draws):
@@ -115,7 +115,7 @@ def show(name: str, table: dict[tuple[int, str], list[float]]) -> None:
 
 
 class Arm:
-    """A simulated arm: what is drawn, what can be measured, and what is true."""
+    """A simulated arm: the nominal robot, the candidates, and the true robot."""
 
     def __init__(self, name: str, seed: int) -> None:
         sys.path.insert(0, str(SIMULATED))
@@ -132,17 +132,17 @@ class Arm:
         self.test = self.rows(joints, 0.0)
 
     def rows(self, q: Tensor, noise: float = 3e-5) -> Measurements:
-        """What a tracker measures; the repeatability of the robot is 0.02 mm."""
+        """Return positions measured by a tracker; the repeatability of the robot is 0.02 mm."""
         rng, repeatability = np.random.default_rng(self.seed + 5), 2e-5 if noise else 0.0
         position, _ = self.true.measure(q.numpy(), noise=noise, rng=rng, rep=repeatability)
         return Measurements(q=q, position=torch.from_numpy(position))
 
     def candidates(self, count: int) -> Tensor:
-        """Joint values that the tool stays above the floor with."""
+        """Return joint values with the tool above the floor."""
         return torch.from_numpy(self.true.sample(count, 1000 + self.seed))
 
     def figures(self, q: Tensor, knowledge: Knowledge) -> Figures:
-        """Of poses that are measured."""
+        """Return the result for measured poses."""
         result = fit_where_it_helps(HybridCalibrator(self.drawn), self.rows(q), lambda what: None)
         assert isinstance(result, HybridResult)
         both = knowledge.informed(q), Knowledge.of_result(result, knowledge.instrument)
@@ -150,7 +150,7 @@ class Arm:
 
 
 def predicted(seeds: range) -> None:
-    """Predicted over true RMS at 15, 30 and 60 chosen poses, of the plan and of the calibration."""
+    """Print predicted over true RMS at 15, 30 and 60 chosen poses, for the plan and the calibration."""
     ratios: dict[tuple[int, str], list[float]] = {}
     for seed in seeds:
         arm = Arm(ARMS[seed % len(ARMS)], seed)
@@ -169,7 +169,7 @@ def predicted(seeds: range) -> None:
 
 
 def needed(seeds: range) -> None:
-    """Poses to 0.1 mm, chosen over random."""
+    """Print the ratio of chosen to random poses that reach 0.1 mm."""
     ratios = []
     for name in ARMS:
         for seed in seeds:
@@ -183,7 +183,7 @@ def needed(seeds: range) -> None:
 
 
 def first(arm: Arm, q: Tensor, knowledge: Knowledge) -> float:
-    """The number of poses with which errors pass the limit, between two of `STEPS` on a logarithmic line."""
+    """Return the number of poses at which errors pass the limit, by logarithmic interpolation between `STEPS`."""
     before: tuple[float, float] | None = None
     for count in STEPS:
         error = arm.figures(q[:count], knowledge).true
@@ -197,7 +197,7 @@ def first(arm: Arm, q: Tensor, knowledge: Knowledge) -> float:
 
 
 def speed() -> None:
-    """100 of 5,000 candidates."""
+    """Time the choice of 100 of 5,000 candidates."""
     robot = Robot.load("ur10")
     generator = torch.Generator().manual_seed(0)
     q = (torch.rand(5000, robot.dof, generator=generator, dtype=torch.float64) * 2 - 1) * np.pi
@@ -214,12 +214,14 @@ def speed() -> None:
 
 
 def main() -> None:
-    """Print the figures of the parts that are asked for."""
+    """Print the figures of the requested parts."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parts = ("ur10", "rounds", "ur5", "predicted", "needed", "speed")
     parser.add_argument("parts", nargs="*", default=list(parts), metavar="PART", help=", ".join(parts))
-    parser.add_argument("--draws", type=int, default=10, help="pools, or simulated arms of a kind")
-    parser.add_argument("--first", type=int, default=0, help="seed of the first of them")
+    parser.add_argument(
+        "--draws", type=int, default=10, help="number of pools, or of simulated arms of a kind"
+    )
+    parser.add_argument("--first", type=int, default=0, help="seed of the first one")
     arguments = parser.parse_args()
     seeds = range(arguments.first, arguments.first + arguments.draws)
     both: tuple[Criterion, ...] = ("D", "I")

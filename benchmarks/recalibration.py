@@ -1,8 +1,8 @@
-"""Recalibration with few rows: accuracy from one series to another, the gate, a collision, a chain, and its time.
+"""Recalibration with few rows: accuracy from one series to another, choice of the model, a collision, a chain, time.
 
 Run `OMP_NUM_THREADS=1 python benchmarks/recalibration.py [PART ...]` with the measured files in `PISIGMA_DATA` and the
 simulator in `PISIGMA_SIMULATED`. A part is one of the names in `PARTS`. Errors are RMS of the positions of all rows
-that were not recalibrated with [mm]; a draw is a random choice of rows.
+that were not used for the recalibration [mm]; a draw is a random choice of rows.
 """
 
 import argparse
@@ -46,36 +46,36 @@ COLLISION_SEEDS = range(10)
 
 @cache
 def series(name: str) -> Measurements:
-    """All rows of a series of the UR10."""
+    """Return all rows of a series of the UR10."""
     return Measurements.read_csv(DATA / SERIES[name], Robot.load("ur10"))
 
 
 @cache
 def model_of(name: str) -> CalibratedModel:
-    """The hybrid calibration of a series."""
+    """Return the hybrid calibration of a series."""
     robot, rows = Robot.load("ur10"), series(name)
     return model_of_hybrid(name, robot, HybridCalibrator(robot).fit(rows), rows)
 
 
 def drawn(rows: Measurements, count: int, draw: int) -> tuple[Measurements, Measurements]:
-    """So many rows at random, and all others."""
+    """Return a number of random rows, and all other rows."""
     order = torch.randperm(rows.rows, generator=torch.Generator().manual_seed(draw))
     return rows.select(order[:count].sort().values), rows.select(order[count:].sort().values)
 
 
 def rms_mm(errors: torch.Tensor) -> float:
-    """Root mean square of the lengths of errors [m], in mm."""
+    """Return the root mean square of the lengths of errors [m], in mm."""
     return float(errors.square().sum(1).mean().sqrt()) * 1e3
 
 
 def error_of(model: CalibratedModel, rows: Measurements) -> float:
-    """RMS position error of a model [mm]."""
+    """Return the RMS position error of a model [mm]."""
     assert rows.position is not None
     return rms_mm(rows.position - poses_of_rows(model, rows)[:, :3, 3])
 
 
 def accuracy() -> None:
-    """From series B to few rows of series C."""
+    """Recalibrate from series B to few rows of series C."""
     for moved in (None, ("base", "tool")):
         for count, asked in ASKED.items():
             errors = []
@@ -91,7 +91,7 @@ def accuracy() -> None:
 
 
 def planned() -> None:
-    """The same with rows that `pisigma plan` chooses with the model of series B, from all of series C."""
+    """Do the same with rows that `pisigma plan` chooses from all of series C with the model of series B."""
     rows, every = series("C"), np.arange(series("C").rows)
     with tempfile.TemporaryDirectory() as folder:
         candidates = Path(folder) / "candidates.csv"
@@ -109,7 +109,7 @@ def planned() -> None:
 
 
 def candidates_of(result: Recalibration, few: Measurements, others: Measurements) -> dict[str, float]:
-    """RMS position errors of every candidate [mm]; infinite where so few rows do not determine it."""
+    """Return RMS position errors of every candidate [mm]; infinite if the rows do not determine it."""
     adaptation, errors = result.adaptation, {}
     errors["recalibrated"] = rms_mm(adaptation.errors_of(others)["position"])
     old = adapt(adaptation.problem.without_arm(), adaptation.noise)
@@ -123,7 +123,7 @@ def candidates_of(result: Recalibration, few: Measurements, others: Measurements
 
 
 def gate() -> None:
-    """How much worse than the best candidate the kept one is, in the mean over the draws and at most."""
+    """Print the ratio of the kept candidate's error to the best one's, mean and maximum over the draws."""
     for before, after in (("B", "C"), ("C", "B")):
         for count in GATE_ROWS:
             kept, best, ratios, chosen = 0.0, 0.0, [], []
@@ -144,7 +144,7 @@ def gate() -> None:
 
 @cache
 def simulator() -> tuple[ModuleType, Robot]:
-    """The independent simulator, and the robot that it simulates as drawn."""
+    """Return the independent simulator, and the nominal robot that it simulates."""
     spec = importlib.util.spec_from_file_location("sim", SIMULATED / "sim.py")
     assert spec is not None
     assert spec.loader is not None
@@ -156,14 +156,14 @@ def simulator() -> tuple[ModuleType, Robot]:
 
 
 def simulated_rows(arm: Any, q: np.ndarray, seed: int | None = None) -> Measurements:
-    """Positions that a simulated arm is measured at, with noise and repeatability where there is a seed."""
+    """Return measured positions of a simulated arm, with noise and repeatability if there is a seed."""
     sigma, repeatability = (0.0, 0.0) if seed is None else (3e-5, 2e-5)
     position, _ = arm.measure(q, sigma, rng=np.random.default_rng(seed), rep=repeatability)
     return Measurements(torch.from_numpy(q), torch.from_numpy(position))
 
 
 def simulated_arm(rows: int, seed: int) -> tuple[Any, CalibratedModel]:
-    """A simulated arm, and its calibration with so many rows."""
+    """Return a simulated arm, and its calibration with a number of rows."""
     sim, robot = simulator()
     arm = sim.True_("kr10", seed)
     before = simulated_rows(arm, arm.sample(rows, 1000 + seed), seed)
@@ -171,7 +171,7 @@ def simulated_arm(rows: int, seed: int) -> tuple[Any, CalibratedModel]:
 
 
 def collision() -> None:
-    """Joint 3 of the simulated kr10 collides: the error after ten poses over that before."""
+    """Print the ratio of the error after ten poses to that before a collision of joint 3 of the simulated kr10."""
     for rows in (60, 120, 300):
         ratios, joints = [], []
         for seed in COLLISION_SEEDS:
@@ -190,7 +190,7 @@ def collision() -> None:
 
 
 def chain() -> None:
-    """Ten recalibrations with twenty rows each against one with all of them, and a calibration of all rows."""
+    """Compare ten recalibrations with twenty rows each with one with all rows, and with a calibration of all rows."""
     robot, rows = Robot.load("ur10"), series("C")
     order = torch.randperm(rows.rows, generator=torch.Generator().manual_seed(0))
     first, test = rows.select(order[:300]), rows.select(order[500:])
@@ -206,7 +206,7 @@ def chain() -> None:
 
 
 def seconds() -> None:
-    """Time of a recalibration of the UR10 with ten rows, without start and files."""
+    """Time a recalibration of the UR10 with ten rows, without start and files."""
     few, _ = drawn(series("C"), 10, 0)
     model = model_of("B")
     for moved in (None, ("base", "tool")):

@@ -1,15 +1,15 @@
-"""How long clients of `pisigma serve` wait: two of them, 1,000 requests a second in all, over loopback.
+"""Response times of `pisigma serve`: two clients with 1,000 requests per second in total, over loopback.
 
-Run `OMP_NUM_THREADS=1 python benchmarks/serve.py models/my_ur10 --seconds 600` on a machine that does nothing else.
-Every client sends a pose of the model's training rows with the joint values to be near to, waits for the answer,
-compares it with that of Python, and sleeps until its next turn, which comes half a period after the other client's. It
-waits awake for 100 µs, as the loop of a real-time controller does, then asleep; with `--awake-us 0` the system wakes
-it for every answer, and the times then contain how long that takes, which on some machines is more than the answer
-itself. Printed are the times from before a request is sent until its answer is read, per protocol; how many answers
-were lost or wrong; and the memory of the server at the begin and the end. For comparison the same clients first ask
-two bare loops, for a minute at most each, that stay awake for the next request as long as the server does: one sends
-answers that it worked out before, the other reads, solves once and sends. The first tells what the sockets and the
-clients cost, the second what the server adds to a solve.
+Run `OMP_NUM_THREADS=1 python benchmarks/serve.py models/my_ur10 --seconds 600` on an otherwise idle machine.
+Every client sends a pose of the model's training rows with joint values near it, waits for the answer,
+compares it with that of Python, and sleeps until its next request, half a period after that of the other client. It
+polls for 100 µs, as the loop of a real-time controller does, then sleeps; with `--awake-us 0` the system wakes
+it for every answer, and the times then include the wake-up, which takes longer than the answer itself on some machines.
+Printed are the times from before a request is sent until its answer is read, per protocol; how many answers
+were lost or wrong; and the memory of the server at the start and at the end. For comparison the same clients first use
+two minimal loops, for at most a minute each, that poll for the next request as long as the server does: one sends
+stored answers, the other reads, solves once and sends. The first shows the cost of sockets and
+clients, the second what the server adds to a solve.
 """
 
 import argparse
@@ -32,15 +32,15 @@ import pisigma
 
 REQUEST, ANSWER = struct.Struct("<4sIQII16d8d"), struct.Struct("<4sIQII8d2d")
 CLIENTS, RATE = 2, 1000.0
-"""How many there are, and their requests a second in all."""
+"""Number of clients, and their requests per second in total."""
 POSES = 1000
 BARE_SECONDS, IDLE_SECONDS = 60.0, 5.0
 UNITS = np.array([1e3] * 3 + [180 / np.pi] * 3)
-"""Of poses in files, in a metre and a radian."""
+"""Units of poses in files per metre and per radian."""
 
 
 def poses_of(ik: pisigma.CorrectedIK) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Poses `(POSES, 6)` [mm, deg] at training rows, joint values near them, and those that Python gives [rad or m]."""
+    """Return poses `(POSES, 6)` [mm, deg] of training rows, joint values near them, and Python's answers [rad or m]."""
     from pisigma.robot.kernels.array_kinematics import transform_of, xyzrpy_of
 
     starts = ik.model.starts.double().numpy()
@@ -51,15 +51,15 @@ def poses_of(ik: pisigma.CorrectedIK) -> tuple[np.ndarray, np.ndarray, np.ndarra
 
 
 def messages(kind: str, ik: pisigma.CorrectedIK, poses: np.ndarray, near: np.ndarray) -> list[bytes]:
-    """The requests, as a client would make them."""
+    """Return the requests of a client."""
     from pisigma.robot.kernels.array_kinematics import transform_of
 
     if kind == "binary":
-        beside = np.full((len(near), 8), np.nan)
-        beside[:, : near.shape[1]] = near
+        padded = np.full((len(near), 8), np.nan)
+        padded[:, : near.shape[1]] = near
         return [
             REQUEST.pack(b"PSI1", REQUEST.size, i, 0, 0, *transform_of(pose / UNITS).ravel(), *q)
-            for i, (pose, q) in enumerate(zip(poses, beside, strict=True))
+            for i, (pose, q) in enumerate(zip(poses, padded, strict=True))
         ]
     per_unit = np.where(ik.revolute, 180 / np.pi, 1e3)
     key = "near_deg" if ik.revolute.all() else "near"
@@ -70,7 +70,7 @@ def messages(kind: str, ik: pisigma.CorrectedIK, poses: np.ndarray, near: np.nda
 
 
 def right(kind: str, answer: bytes, index: int, wanted: np.ndarray, per_unit: np.ndarray) -> bool:
-    """Whether an answer is that of Python to the request that was sent."""
+    """Return whether an answer agrees with that of Python."""
     if kind == "binary":
         _, _, name, _, dof, *q = ANSWER.unpack(answer)
         return bool(name == index and np.abs(np.array(q[:dof]) - wanted).max() < 1e-12)
@@ -80,7 +80,7 @@ def right(kind: str, answer: bytes, index: int, wanted: np.ndarray, per_unit: np
 
 
 def received(stream: socket.socket, kind: str, awake: float) -> bytes:
-    """The next answer, whole; waits awake for some seconds, then asleep."""
+    """Return the next complete answer; poll for some time, then sleep."""
     answer, end = b"", time.perf_counter() + awake
     while not (answer.endswith(b"\n") if kind == "json" else len(answer) == ANSWER.size):
         try:
@@ -104,7 +104,7 @@ def ask(
     number: int,
     queue: object,
 ) -> None:
-    """Client `number`; puts its times [µs] and how many answers were lost or wrong."""
+    """Run client `number`; put its times [µs] and the number of lost or wrong answers into the queue."""
     times, bad = [], 0
     with socket.create_connection(("127.0.0.1", port)) as stream:
         stream.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
@@ -125,7 +125,7 @@ def ask(
 
 
 def measure(kind: str, port: int, options: argparse.Namespace, seconds: float) -> tuple[np.ndarray, str]:
-    """Have all clients ask; gives the median and what 99 % stay below [µs], and a sentence."""
+    """Run all clients; return the median and 99 % quantile of their times [µs], and a sentence."""
     ik = pisigma.load(options.model)
     poses, near, wanted = poses_of(ik)
     sent, per_unit = messages(kind, ik, poses, near), np.where(ik.revolute, 180 / np.pi, 1e3)
@@ -145,7 +145,7 @@ def measure(kind: str, port: int, options: argparse.Namespace, seconds: float) -
 
 
 def answer_frame(ik: pisigma.CorrectedIK, message: bytes) -> bytes:
-    """One solve between two frames."""
+    """Solve one binary frame."""
     _, _, name, _, _, *numbers = REQUEST.unpack(message)
     dof = len(ik.joints)
     solution = ik(np.array(numbers[:16]).reshape(4, 4), near=np.array(numbers[16 : 16 + dof]), throw=False)
@@ -154,7 +154,7 @@ def answer_frame(ik: pisigma.CorrectedIK, message: bytes) -> bytes:
 
 
 def answer_line(ik: pisigma.CorrectedIK, message: bytes) -> bytes:
-    """One solve between two lines of JSON."""
+    """Solve one line of JSON."""
     from pisigma.robot.kernels.array_kinematics import transform_of
 
     request, per_unit = json.loads(message), np.where(ik.revolute, 180 / np.pi, 1e3)
@@ -167,7 +167,7 @@ def answer_line(ik: pisigma.CorrectedIK, message: bytes) -> bytes:
 
 
 def bare_loop(model: str, kind: str, stored: bool, polling: float, queue: object) -> None:
-    """Answer all clients and nobody else, without any check, by a solve or what was stored before; puts the port."""
+    """Answer all clients by a solve or a stored answer, without any check; put the port into the queue."""
     ik = pisigma.load(model)
     answer = functools.partial(answer_frame if kind == "binary" else answer_line, ik)
     if stored:
@@ -191,7 +191,7 @@ def bare_loop(model: str, kind: str, stored: bool, polling: float, queue: object
 
 
 def cost(pid: int) -> tuple[float, float]:
-    """Memory of a process [MB] and the processor time that it has used [s]."""
+    """Return the memory of a process [MB] and the processor time that it has used [s]."""
     status = Path(f"/proc/{pid}/status").read_text()
     memory = next(int(line.split()[1]) / 1e3 for line in status.splitlines() if line.startswith("VmRSS"))
     used = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[11:13]
@@ -199,7 +199,7 @@ def cost(pid: int) -> tuple[float, float]:
 
 
 def inside(json_port: int) -> str:
-    """How long the server took for its last answers, from when a request was read."""
+    """Return the time that the server took for its last answers, from reading the request."""
     with socket.create_connection(("127.0.0.1", json_port)) as stream, stream.makefile("rb") as file:
         stream.sendall(b'{"ask": "health"}\n')
         health = json.loads(file.readline())
@@ -207,7 +207,7 @@ def inside(json_port: int) -> str:
 
 
 def compare(kind: str, ports: dict[str, int], pid: int, options: argparse.Namespace) -> None:
-    """Measure a protocol of the server, and the bare loops before it."""
+    """Measure a protocol of the server, after the minimal loops."""
     for name, stored in (("stored answers", True), ("one solve", False)):
         queue = multiprocessing.Queue()
         arguments = options.model, kind, stored, options.poll_ms / 1e3, queue
@@ -215,7 +215,7 @@ def compare(kind: str, ports: dict[str, int], pid: int, options: argparse.Namesp
         bare.start()
         least, said = measure(kind, queue.get(), options, min(options.seconds, BARE_SECONDS))
         bare.join()
-        print(f"bare loop, {name}, {kind}: {said}", flush=True)
+        print(f"minimal loop, {name}, {kind}: {said}", flush=True)
     before, used = cost(pid)
     times, said = measure(kind, ports[f"{kind}_port"], options, options.seconds)
     after, total = cost(pid)
@@ -233,8 +233,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("model", nargs="?", default="models/kiro4")
     parser.add_argument("--seconds", type=float, default=10.0)
-    parser.add_argument("--poll-ms", type=float, default=2.5, help="of the server and the bare loop alike")
-    parser.add_argument("--awake-us", type=float, default=100.0, help="that clients wait awake for an answer")
+    parser.add_argument(
+        "--poll-ms", type=float, default=2.5, help="polling time of the server and the minimal loops [ms]"
+    )
+    parser.add_argument("--awake-us", type=float, default=100.0, help="polling time of the clients [us]")
     options = parser.parse_args()
     command = [sys.executable, "-m", "pisigma", "serve", options.model, "--poll-ms", str(options.poll_ms)]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as server:

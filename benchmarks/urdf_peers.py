@@ -1,8 +1,8 @@
-"""Where MuJoCo, pinocchio and Drake have the tool of a URDF file.
+"""Poses of the tool of a URDF file in MuJoCo, pinocchio and Drake.
 
 `python urdf_peers.py PEER FILE BASE TOOL < joint_values.json` reads joint values [[q_1, ...], ...] [rad or m] and
-prints the poses of the link TOOL in the link BASE as JSON. It imports nothing of pisigma, so that the peers can be
-installed in an environment of their own:
+prints the poses of the link TOOL in the link BASE as JSON. It does not import pisigma, so the peers can be
+installed in a separate environment:
 `pip install mujoco pin drake==1.51.1` (the last Drake for Python 3.11).
 """
 
@@ -13,7 +13,7 @@ import numpy as np
 
 
 def mujoco_poses(path: str, q: np.ndarray, *links: str) -> list[np.ndarray]:
-    """Poses by MuJoCo, which compiles the file as it is."""
+    """Return poses by MuJoCo, which compiles the unmodified file."""
     import mujoco
 
     spec = mujoco.MjSpec.from_file(path)
@@ -35,7 +35,7 @@ def mujoco_poses(path: str, q: np.ndarray, *links: str) -> list[np.ndarray]:
 
 
 def pinocchio_poses(path: str, q: np.ndarray, *links: str) -> list[np.ndarray]:
-    """Poses by pinocchio, whose continuous joints take cosine and sine."""
+    """Return poses by pinocchio, whose continuous joints take cosine and sine."""
     import pinocchio
 
     model = pinocchio.buildModelFromUrdf(path)
@@ -51,7 +51,7 @@ def pinocchio_poses(path: str, q: np.ndarray, *links: str) -> list[np.ndarray]:
 
 
 def drake_poses(path: str, q: np.ndarray, *links: str) -> list[np.ndarray]:
-    """Poses by Drake, the base welded to the world."""
+    """Return poses by Drake, with the base welded to the world."""
     from pydrake.multibody.parsing import Parser
     from pydrake.multibody.plant import MultibodyPlant
 

@@ -55,7 +55,9 @@ class Controller:
             x, y, z = (1e3 * T[index, :3, 3]).tolist()
             raise UnreachablePoseError(
                 f"robot '{self.nominal.name}' does not reach pose {index} (counted from 0) at {x:.1f}, {y:.1f}, "
-                f"{z:.1f} mm on the requested branch; move the pose or rotate the tool."
+                f"{z:.1f} mm on the requested branch",
+                value=index,
+                remedy="move the pose or rotate the tool",
             )
         return q
 
