@@ -1,6 +1,6 @@
-"""What stands between messages of MoveIt and the server, without any of ROS.
+"""Conversion between MoveIt messages and the server, without ROS.
 
-Messages are those of moveit_msgs/srv/GetPositionIK, or whatever has their fields.
+Messages are those of moveit_msgs/srv/GetPositionIK, or any objects with the same fields.
 """
 
 import math
@@ -12,13 +12,13 @@ REACHED, OUTSIDE_JOINT_LIMITS, OUTSIDE_DOMAIN, INVALID_POSE = 0, 2, 3, 6
 
 @dataclass(frozen=True)
 class Arm:
-    """What the messages are about.
+    """The arm that the messages refer to.
 
     Attributes:
-        joints: names of the joints in ROS, in the order of the model.
-        base_frame: name in ROS of the frame that the model's poses are given in.
-        model: index of the model on the server.
-        accept_outside_domain: whether joint values count whose correction is extrapolated.
+        joints: Names of the joints in ROS, in the order of the model.
+        base_frame: Name in ROS of the frame of the model's poses.
+        model: Index of the model on the server.
+        accept_outside_domain: Whether to accept joint values with an extrapolated correction.
     """
 
     joints: tuple[str, ...]
@@ -28,7 +28,7 @@ class Arm:
 
 
 def matrix_of(pose):
-    """The 16 numbers, row by row, of a geometry_msgs/Pose; NaN where its quaternion is none."""
+    """Return the 16 numbers, row by row, of a geometry_msgs/Pose; NaN if its quaternion is invalid."""
     q, p = pose.orientation, pose.position
     norm = math.sqrt(q.x**2 + q.y**2 + q.z**2 + q.w**2)
     if not 0.99 < norm < 1.01:
@@ -43,19 +43,21 @@ def matrix_of(pose):
 
 
 def near_of(joint_state, joints):
-    """Joint values of a sensor_msgs/JointState in the order of `joints`; None where one of them is missing."""
+    """Return joint values of a sensor_msgs/JointState in the order of `joints`; None if one is missing."""
     stated = dict(zip(joint_state.name, joint_state.position, strict=False))
     return [stated[name] for name in joints] if all(name in stated for name in joints) else None
 
 
 def answer(request, response, arm, solve):
-    """Fill the response of a GetPositionIK service, and give it back.
+    """Fill the response of a GetPositionIK service, and return it.
 
     Args:
-        request: with `ik_request.pose_stamped` and, for the joint values to be near to, `ik_request.robot_state`.
-        response: gets `solution.joint_state` and `error_code`; where the pose is not reached, an error code alone.
-        arm: the arm.
-        solve: asks the server, such as `FrameClient.solve`; its OSError becomes COMMUNICATION_FAILURE.
+        request: Request with `ik_request.pose_stamped` and, for joint values to stay near to,
+            `ik_request.robot_state`.
+        response: Response that gets `solution.joint_state` and `error_code`; only an error code if the pose is not
+            reached.
+        arm: The arm.
+        solve: Function that asks the server, such as `FrameClient.solve`; an OSError becomes COMMUNICATION_FAILURE.
     """
     wanted, code = request.ik_request, response.error_code
     frame = wanted.pose_stamped.header.frame_id

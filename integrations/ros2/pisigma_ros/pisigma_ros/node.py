@@ -36,7 +36,7 @@ class CorrectedIk(Node):
         return answer(request, response, self.arm, self._solve)
 
     def _solve(self, *arguments):
-        """Ask the server; a connection that fails is made anew with the next request."""
+        """Ask the server; after a failure, the next request opens a new connection."""
         if self.client is None:
             self.client = FrameClient(self._value("port"), self._value("host"), self._value("token") or None)
         try:
