@@ -1,6 +1,6 @@
 /* A client of `pisigma serve` for C on systems with POSIX sockets: binary frames, in this one header.
  *
- * Lengths in metres, angles in radians. It wants a little-endian processor with IEEE 754 doubles.
+ * Lengths in metres, angles in radians. It needs a little-endian processor with IEEE 754 doubles.
  *
  *     int server = pisigma_connect("127.0.0.1", 5006);
  *     int status = pisigma_ask(server, 0, pose, q_now, 6, q);

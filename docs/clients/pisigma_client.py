@@ -1,4 +1,4 @@
-"""A client of `pisigma serve` in Python's standard library alone: one class for lines of JSON, one for frames."""
+"""Clients of `pisigma serve` that need only Python's standard library: for lines of JSON and for binary frames."""
 
 import json
 import math
@@ -22,11 +22,11 @@ class JsonClient:
                 raise
 
     def ask(self, **request):
-        """Send a request and give the answer; raises RuntimeError where the server refuses it."""
+        """Send a request and return the answer; raise RuntimeError if the server refuses it."""
         self._id += 1
         answer = self._exchange({"id": self._id, **request})
         if answer["id"] != self._id:
-            raise ConnectionError(f"an answer to request {answer['id']} came, not to {self._id}")
+            raise ConnectionError(f"expected the answer to request {self._id}, got that to {answer['id']}")
         return answer
 
     def _exchange(self, request):
@@ -70,8 +70,10 @@ class FrameClient:
         """
         self._id += 1
         near = () if near is None else near
-        beside = [*near, *[math.nan] * (8 - len(near))]
-        self._socket.sendall(REQUEST.pack(b"PSI1", REQUEST.size, self._id, model, 0, *T_base_tool, *beside))
+        near_values = [*near, *[math.nan] * (8 - len(near))]
+        self._socket.sendall(
+            REQUEST.pack(b"PSI1", REQUEST.size, self._id, model, 0, *T_base_tool, *near_values)
+        )
         _, _, answered, status, joints, *values = self._receive()
         if answered != self._id:
             raise ConnectionError(f"an answer to request {answered} came, not to {self._id}")

@@ -1,4 +1,4 @@
-"""Formulas as MathML, made while the pages are built, so that they need neither network nor scripts to be read."""
+"""Convert formulas to MathML when the pages are built, so that reading them needs neither network nor scripts."""
 
 import html
 import re
@@ -10,7 +10,7 @@ _FORMULA = re.compile(r'<(span|div) class="arithmatex">(?:\\\((.+?)\\\)|\\\[(.+?
 
 
 def on_page_content(content: str, **_: Any) -> str:
-    """Put MathML in the place of every formula; mkdocs calls this for every page."""
+    """Replace every formula by MathML; mkdocs calls this for every page."""
     return _FORMULA.sub(_mathml, content)
 
 

@@ -1,6 +1,6 @@
-"""Tables of all keys of recipes, from the models that check them.
+"""Generate the tables of all keys of recipes from the classes that validate them.
 
-`python docs/hooks/recipe_tables.py` renews the page.
+`python docs/hooks/recipe_tables.py` updates the page.
 """
 
 import re
@@ -32,18 +32,18 @@ _PLAIN = {
 
 
 def tables() -> str:
-    """All tables as Markdown, the kinds of recipes first and then what they are made of."""
+    """Return all tables as Markdown, first the kinds of recipes, then their sections."""
     return "\n".join(_table(section) for section in _sections())
 
 
 def page_with(text: str, new: str) -> str:
-    """A page with what stands between its marks replaced."""
+    """Return a page with the text between its markers replaced."""
     head, _, rest = text.partition(BEGIN)
     return f"{head}{BEGIN}\n\n{new}\n{END}{rest.partition(END)[2]}"
 
 
 def _sections() -> list[type[BaseModel]]:
-    """The kinds of recipes and every section that they lead to, each once."""
+    """Return the kinds of recipes and all sections that they refer to, each once."""
     found: list[type[BaseModel]] = list(KINDS)
     for section in found:
         for field in section.model_fields.values():
@@ -59,7 +59,7 @@ def _inner(annotation: Any) -> Iterator[type[BaseModel]]:
 
 
 def _closed(annotation: Any) -> Any:
-    """The annotation, or the union of all sections of a registry that it names."""
+    """Return the annotation, or the union of all sections of a registry that it names."""
     for choice in getattr(annotation, "__metadata__", ()):
         if isinstance(choice, OneOf):
             return typing.Union[tuple(choice.registry.values())]  # noqa: UP007
@@ -77,7 +77,7 @@ def _table(section: type[BaseModel]) -> str:
 
 
 def _name(section: type[BaseModel]) -> str:
-    """How a section is called on the page: by its `kind` or `method`, else by its class."""
+    """Return the title of a section: its `kind` or `method`, otherwise its class."""
     for key in ("kind", "method"):
         if key in section.model_fields:
             values = typing.get_args(section.model_fields[key].annotation)

@@ -1,6 +1,6 @@
-"""Tables of all settings that command lines and Python share, from the classes that both are made of.
+"""Generate the tables of all settings shared by command line and Python from their classes.
 
-`python docs/hooks/setting_tables.py` renews the page.
+`python docs/hooks/setting_tables.py` updates the page.
 """
 
 import inspect
@@ -19,7 +19,7 @@ PAGE = Path(__file__).parent.parent / "reference" / "settings.md"
 
 
 def tables() -> str:
-    """A table for every class of settings, those of commands first and then what they are made of."""
+    """Return a table for every class of settings, first those of commands, then their groups."""
     commands: dict[type, list[str]] = {}
     for name, group in _groups(get_command(app)):
         commands.setdefault(group, []).append(name)
@@ -30,7 +30,7 @@ def tables() -> str:
 
 
 def _groups(command: Any, path: tuple[str, ...] = ("pisigma",)) -> Iterator[tuple[str, type]]:
-    """Every command with every class of settings that it takes."""
+    """Yield every command with every class of settings that it takes."""
     for name, one in getattr(command, "commands", {}).items():
         yield from _groups(one, (*path, name))
     if not hasattr(command, "commands"):
