@@ -25,8 +25,8 @@ from torch import Tensor
 from pisigma.lifetime.fleet.prior import fleet_prior
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel
-from pisigma.planning.choice import choose
-from pisigma.planning.knowledge import Instrument, Knowledge
+from pisigma.planning.pose_selection import choose
+from pisigma.planning.robot_posterior import Instrument, RobotPosterior
 from pisigma.robot import Robot
 from pisigma.robot.se3 import rotation_from_vector
 from pisigma.workflow.calibrate import calibrate
@@ -102,8 +102,8 @@ class Fleet:
         q, task = (torch.from_numpy(arm.sample(many, 4242 + many)) for many in (1000, 200))
         base = np.array([*arm.base[1], *np.deg2rad([130.0, 2.0, 1.0])])
         tool = np.array([*arm.tool, 0.0, 0.0, 0.0])
-        knowledge = Knowledge.of_model(prior, self.instrument).seen_anew(base, tool)
-        chosen: Tensor = q[choose(knowledge.measured(q), knowledge.tool(task), count)]
+        posterior = RobotPosterior.of_model(prior, self.instrument).with_unknown_base_and_tool(base, tool)
+        chosen: Tensor = q[select_poses(posterior.measured(q), posterior.tool(task), count)]
         return chosen.numpy()
 
     def exact(self, judged: int) -> float:

@@ -21,11 +21,11 @@ from testing.fleet_robots import DRAWN, GEARS, NOISE, common_errors, common_gear
 from pisigma.estimation.population import Population
 from pisigma.lifetime.fleet.prior import FleetPrior, fleet_prior, mean_robot
 from pisigma.lifetime.recalibration.adaptation import Adaptation, adapt
-from pisigma.lifetime.recalibration.recalibration_problem import owners_in, recalibration_problem
+from pisigma.lifetime.recalibration.recalibration_problem import frame_keys, recalibration_problem
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.model_posterior import ModelPosterior
-from pisigma.planning.knowledge import Knowledge
+from pisigma.planning.robot_posterior import RobotPosterior
 from pisigma.workflow.calibrate import calibrate
 from pisigma.workflow.recalibrate import recalibrate
 from pisigma.workflow.settings.calibration import CalibrationSettings
@@ -43,10 +43,10 @@ def rms(predicts: Any, test: Measurements) -> float:
 
 def true_prior(individual: float, gears: float) -> CalibratedModel:
     """Return the distribution that the robots are drawn from, as a prior."""
-    knowledge = Knowledge.of_robot(DRAWN)
-    size = knowledge.uncertainty.space.arm_size
+    posterior = RobotPosterior.of_robot(DRAWN)
+    size = posterior.uncertainty.space.arm_size
     means, deviations = [common_errors().flatten()], [torch.full((size,), individual, dtype=torch.float64)]
-    for feature in knowledge.uncertainty.features:
+    for feature in posterior.uncertainty.features:
         mean, deviation = torch.zeros(2, *feature.used.shape, dtype=torch.float64)
         if feature.name == "series":
             count, half = len(GEARS), feature.used.shape[1] // 2  # first sines, then cosines
@@ -57,14 +57,14 @@ def true_prior(individual: float, gears: float) -> CalibratedModel:
         deviations.append(deviation[feature.used])
     variance = torch.cat(deviations).square() + NOTHING**2
     population = Population(torch.cat(means), variance.diag(), size)
-    return mean_robot("true", knowledge, population, [rows_of(0, 60, 0)], {"position": NOISE})
+    return mean_robot("true", posterior, population, [rows_of(0, 60, 0)], {"position": NOISE})
 
 
 def begun_with(prior: CalibratedModel, rows: Measurements) -> Adaptation:
     """Return the posterior of a robot."""
     posterior = ModelPosterior.of(prior)
     rows = posterior.renamed(rows)
-    problem = recalibration_problem(prior, posterior, rows, owners_in(rows, ("base", "tool")))
+    problem = recalibration_problem(prior, posterior, rows, frame_keys(rows, ("base", "tool")))
     return adapt(problem, posterior.noise)
 
 

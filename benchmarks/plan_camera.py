@@ -26,11 +26,11 @@ from pisigma.measurement.camera.board import Board
 from pisigma.measurement.camera.camera import Camera
 from pisigma.measurement.camera.image_rows import image_measurements
 from pisigma.planning.camera_settings import CameraSettings
-from pisigma.planning.choice import choose
 from pisigma.planning.expected_accuracy import rms_of
-from pisigma.planning.knowledge import Knowledge
 from pisigma.planning.plan_inputs import find_candidates, instrument_of, views_of
 from pisigma.planning.plan_settings import Criterion, PlanSettings
+from pisigma.planning.pose_selection import choose
+from pisigma.planning.robot_posterior import RobotPosterior
 from pisigma.planning.surroundings.arm_in_cell import ArmInCell
 from pisigma.planning.surroundings.cell import Cell
 from pisigma.planning.task import TASK_POSES
@@ -63,7 +63,7 @@ class Bench:
     settings: PlanSettings
     q: Tensor
     task: Tensor
-    knowledge: dict[str, Knowledge]
+    posterior: dict[str, RobotPosterior]
     camera: Camera
     board: Board
 
@@ -82,23 +82,23 @@ class Bench:
         assert views is not None
         base = xyzrpy_from_transform(invert(views.T_cell_frame)).numpy()
         robot = arm.robot.with_geometry(base=base)
-        knowledge = {
-            name: Knowledge.of_robot(robot, instrument, hybrid=name == "hybrid")
+        posterior = {
+            name: RobotPosterior.of_robot(robot, instrument, hybrid=name == "hybrid")
             for name in ("geometric", "hybrid")
         }
         camera, board = views.sight.camera, views.sight.board
-        return Bench(arm, settings, drawn.q, drawn.workspace[:TASK_POSES], knowledge, camera, board)
+        return Bench(arm, settings, drawn.q, drawn.workspace[:TASK_POSES], posterior, camera, board)
 
     def figures(self, draw: int, q: Tensor, judged: Tensor) -> tuple[float, float]:
         """Return true and predicted error [mm] of a calibration of one true arm with images at joint values."""
-        nominal, rng = self.knowledge["geometric"].uncertainty.geometry.robot, np.random.default_rng(draw)
+        nominal, rng = self.posterior["geometric"].uncertainty.geometry.robot, np.random.default_rng(draw)
         errors = rng.standard_normal(nominal.dh.shape) * [ANGLE, LENGTH, LENGTH, ANGLE, ANGLE]
         true, noise = nominal.with_geometry(nominal.dh + errors), ImageNoise()
         images = simulate_images(true, q, self.camera, self.board, noise, torch.Generator().manual_seed(draw))
         rows = image_measurements(images, self.camera, self.board, False, noise.repeatability, "fixed")
         robot = GeometricCalibrator(self.arm.robot, prior=PRIOR).fit(rows).robot
         points, estimated = (forward_kinematics(one, judged)[:, :3, 3] for one in (true, robot))
-        predicted = rms_of(self.knowledge["geometric"].informed(q).tool(judged))
+        predicted = rms_of(self.posterior["geometric"].informed(q).tool(judged))
         return 1e3 * aligned_error(points, estimated), 1e3 * predicted
 
 
@@ -122,9 +122,9 @@ def main(draws: int, candidates: int, counts: list[int]) -> None:
                 for draw in range(draws)
             ]
         }
-        for name, knowledge in bench.knowledge.items():
+        for name, posterior in bench.posterior.items():
             for criterion in get_args(Criterion):
-                chosen = choose(knowledge.measured(bench.q), knowledge.tool(bench.task), count, criterion)
+                chosen = select_poses(posterior.measured(bench.q), posterior.tool(bench.task), count, criterion)
                 ways[f"{criterion}, {name}"] = [chosen] * draws
         pooled = {}
         for way, choices in ways.items():

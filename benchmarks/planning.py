@@ -25,10 +25,10 @@ from pisigma.calibration.geometric.calibrator import GeometricCalibrator
 from pisigma.calibration.hybrid.calibrator import HybridCalibrator
 from pisigma.calibration.hybrid.result import HybridResult
 from pisigma.measurement.dataset import Measurements
-from pisigma.planning.choice import choose
 from pisigma.planning.expected_accuracy import rms_of
-from pisigma.planning.knowledge import Instrument, Knowledge
 from pisigma.planning.plan_settings import Criterion
+from pisigma.planning.pose_selection import choose
+from pisigma.planning.robot_posterior import Instrument, RobotPosterior
 from pisigma.robot import Robot
 from pisigma.validation.held_out.few_rows import fit_where_it_helps
 from pisigma.validation.held_out.trained_calibrations import Calibrator, Result
@@ -72,14 +72,14 @@ def measured(
 ) -> None:
     """Compare random rows of a pool with chosen ones."""
     robot = Robot.load(name)
-    knowledge = Knowledge.of_robot(robot, hybrid=hybrid)
+    posterior = RobotPosterior.of_robot(robot, hybrid=hybrid)
     calibrator: Calibrator = HybridCalibrator(robot) if hybrid else GeometricCalibrator(robot)
     table: dict[tuple[int, str], list[float]] = {}
     for pool, test in pools(name, draws):
         for count in counts:
             rows: dict[str, Tensor] = {"random": torch.arange(count)}
             rows |= {
-                one: choose(knowledge.measured(pool.q), knowledge.tool(pool.q[:300]), count, one)
+                one: select_poses(posterior.measured(pool.q), posterior.tool(pool.q[:300]), count, one)
                 for one in criteria
             }
             for how, chosen in rows.items():
@@ -93,15 +93,15 @@ def sequential(name: str, counts: tuple[int, ...], draws: range) -> None:
     robot = Robot.load(name)
     table: dict[tuple[int, str], list[float]] = {}
     for pool, test in pools(name, draws):
-        knowledge, chosen = Knowledge.of_robot(robot), torch.arange(0)
+        posterior, chosen = RobotPosterior.of_robot(robot), torch.arange(0)
         for count in counts:
             free = torch.arange(POOL)[~torch.isin(torch.arange(POOL), chosen)]
-            more = choose(
-                knowledge.measured(pool.q[free]), knowledge.tool(pool.q[:300]), count - len(chosen), "I"
+            more = select_poses(
+                posterior.measured(pool.q[free]), posterior.tool(pool.q[:300]), count - len(chosen), "I"
             )
             chosen = torch.cat([chosen, free[more]])
             result = HybridCalibrator(robot).fit(pool.select(chosen))
-            knowledge = Knowledge.of_result(result, knowledge.instrument)
+            posterior = RobotPosterior.of_result(result, posterior.instrument)
             table.setdefault((count, "rounds"), []).append(rms_mm(result, test))
     show(name, table)
 
@@ -141,11 +141,11 @@ class Arm:
         """Return joint values with the tool above the floor."""
         return torch.from_numpy(self.true.sample(count, 1000 + self.seed))
 
-    def figures(self, q: Tensor, knowledge: Knowledge) -> Figures:
+    def figures(self, q: Tensor, posterior: RobotPosterior) -> Figures:
         """Return the result for measured poses."""
         result = fit_where_it_helps(HybridCalibrator(self.drawn), self.rows(q), lambda what: None)
         assert isinstance(result, HybridResult)
-        both = knowledge.informed(q), Knowledge.of_result(result, knowledge.instrument)
+        both = posterior.informed(q), RobotPosterior.of_result(result, posterior.instrument)
         return Figures(rms_mm(result, self.test), *(rms_of(one.tool(self.test.q)) * 1e3 for one in both))
 
 
@@ -154,10 +154,10 @@ def predicted(seeds: range) -> None:
     ratios: dict[tuple[int, str], list[float]] = {}
     for seed in seeds:
         arm = Arm(ARMS[seed % len(ARMS)], seed)
-        knowledge, q = Knowledge.of_robot(arm.planned, Instrument(sigma=NOISE)), arm.candidates(1000)
+        posterior, q = RobotPosterior.of_robot(arm.planned, Instrument(sigma=NOISE)), arm.candidates(1000)
         for count in (15, 30, 60):
-            chosen = q[choose(knowledge.measured(q), knowledge.tool(q[:300]), count, "I")]
-            one = arm.figures(chosen, knowledge)
+            chosen = q[select_poses(posterior.measured(q), posterior.tool(q[:300]), count, "I")]
+            one = arm.figures(chosen, posterior)
             ratios.setdefault((count, "plan"), []).append(one.predicted / one.true)
             ratios.setdefault((count, "calibration"), []).append(one.after / one.true)
     for (count, who), values in ratios.items():
@@ -174,19 +174,19 @@ def needed(seeds: range) -> None:
     for name in ARMS:
         for seed in seeds:
             arm = Arm(name, seed)
-            knowledge, q = Knowledge.of_robot(arm.planned, Instrument(sigma=NOISE)), arm.candidates(1000)
-            order = choose(knowledge.measured(q), knowledge.tool(q[:300]), STEPS[-1], "I")
-            poses = [first(arm, rows, knowledge) for rows in (q, q[order])]
+            posterior, q = RobotPosterior.of_robot(arm.planned, Instrument(sigma=NOISE)), arm.candidates(1000)
+            order = select_poses(posterior.measured(q), posterior.tool(q[:300]), STEPS[-1], "I")
+            poses = [first(arm, rows, posterior) for rows in (q, q[order])]
             ratios.append(poses[1] / poses[0])
             print(f"{name} seed {seed}: {poses[0]:.0f} random, {poses[1]:.0f} chosen", flush=True)
     print(f"poses to {LIMIT} mm, chosen over random: {np.mean(ratios):.2f} ({len(ratios)} arms)")
 
 
-def first(arm: Arm, q: Tensor, knowledge: Knowledge) -> float:
+def first(arm: Arm, q: Tensor, posterior: RobotPosterior) -> float:
     """Return the number of poses at which errors pass the limit, by logarithmic interpolation between `STEPS`."""
     before: tuple[float, float] | None = None
     for count in STEPS:
-        error = arm.figures(q[:count], knowledge).true
+        error = arm.figures(q[:count], posterior).true
         if error <= LIMIT:
             if before is None:
                 return float(count)
@@ -201,12 +201,12 @@ def speed() -> None:
     robot = Robot.load("ur10")
     generator = torch.Generator().manual_seed(0)
     q = (torch.rand(5000, robot.dof, generator=generator, dtype=torch.float64) * 2 - 1) * np.pi
-    knowledge = Knowledge.of_robot(robot)
+    posterior = RobotPosterior.of_robot(robot)
     for criterion in ("D", "I"):
         began = time.perf_counter()
-        choose(knowledge.measured(q), knowledge.tool(q[:300]), 100, criterion)  # type: ignore[arg-type]
+        select_poses(posterior.measured(q), posterior.tool(q[:300]), 100, criterion)  # type: ignore[arg-type]
         seconds = time.perf_counter() - began
-        unknowns = len(knowledge.uncertainty.root)
+        unknowns = len(posterior.uncertainty.root)
         print(
             f"100 of 5,000 candidates, {unknowns} unknowns, criterion {criterion}: {seconds:.1f} s",
             flush=True,

@@ -1,1 +1,1 @@
-"""Which poses to measure."""
+"""Planning of measurements: which poses to measure, in which order, and when to stop."""

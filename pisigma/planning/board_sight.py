@@ -1,4 +1,4 @@
-"""A camera that sees a board: what an image says of a pose, before it is taken."""
+"""A camera that sees a board: the covariance of a pose from an image, before the image is taken."""
 
 from dataclasses import dataclass
 
@@ -14,14 +14,14 @@ from pisigma.robot.se3 import invert, skew
 
 @dataclass(frozen=True, eq=False)
 class BoardSight:
-    """A camera and the board that it sees; one of them is on the flange (the target), the other one is the frame.
+    """A camera and the board that it sees: one is on the flange (the target), the other is the measuring frame.
 
     Attributes:
-        camera: its intrinsics are taken as they are.
-        board: all corners of which an image shows.
-        is_fixed: whether the camera stands beside the robot and the board is on the flange; else the other way round.
+        camera: camera with known intrinsics.
+        board: board, of which every image shows all corners.
+        is_fixed: whether the camera is fixed and the board is on the flange; otherwise the other way round.
         corner_noise: standard deviation of u and v of a corner [px].
-        repeatability: of the robot.
+        repeatability: repeatability of the robot.
     """
 
     camera: Camera
@@ -31,16 +31,17 @@ class BoardSight:
     repeatability: Repeatability
 
     def board_in_camera(self, T_frame_target: Float64[Tensor, "poses 4 4"]) -> Float64[Tensor, "poses 4 4"]:
-        """T_camera_board [m]."""
+        """Return T_camera_board of T_frame_target [m]."""
         return T_frame_target if self.is_fixed else invert(T_frame_target)
 
     def weight(self, T_frame_target: Float64[Tensor, "poses 4 4"]) -> Float64[Tensor, "poses 6 6"]:
-        """Return lower triangular W with `W^T W` the inverse covariance of the poses that images give.
+        """Compute lower triangular W such that `W^T W` is the inverse covariance of poses measured by images.
 
-        The covariance is that of (shift [m], turn [rad]) of the target in the axes of the frame: `(Σ J^T J)^-1 noise²`
-        of all corners plus the repeatability, as `CornerSensor` has it of measured corners. A corner X of the frame
-        moves in the camera by `F (δ + ω × (X - t))` with the target at t and F from the frame's axes to those of the
-        camera, and in the opposite direction where the camera is the target.
+        The covariance is that of (translation [m], rotation vector [rad]) of the target in the axes of the measuring
+        frame: `(Σ J^T J)^-1 noise²` over all corners plus the repeatability, as in `CornerSensor` for measured corners.
+        For a small motion (δ, ω) of the target at t, a corner X moves in the camera by `F (δ + ω × (X - t))`, where F
+        rotates from the axes of the frame to those of the camera; in the opposite direction where the camera is the
+        target.
         """
         T = self.board_in_camera(T_frame_target)
         corners = torch.from_numpy(self.board.corners).to(T)

@@ -1,4 +1,4 @@
-"""Poses from which a camera sees the whole board: which they are, and how to draw some."""
+"""Poses from which a camera sees the whole board: tests for given poses, and random ones."""
 
 import math
 from dataclasses import dataclass
@@ -10,37 +10,37 @@ from torch import Tensor
 
 from pisigma.measurement.camera.pattern import board_sheet
 from pisigma.planning.board_sight import BoardSight
-from pisigma.planning.surroundings.arm_in_cell import CHUNK, ArmInCell
+from pisigma.planning.surroundings.arm_in_cell import POSES_PER_CHUNK, ArmInCell
 from pisigma.planning.surroundings.cell import ViewSection
 from pisigma.robot.kinematics.closed_form.registry import closed_form_solver
 from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.robot.kinematics.numeric import solve_numeric
 from pisigma.robot.se3 import invert, rotation_from_rpy, transform
 
-WHOLE_POSE = 6
-"""Joints with which an arm reaches every pose that is near enough, in a closed form."""
-MIDDLE = 0.5
-"""Share of the image's width and height in which the middle of the board is drawn."""
-STEPS = 30
-"""Of the numeric inverse."""
-SMALLEST = 8.0
-"""Boards are not drawn farther away than this many times the depth at which they fill the image."""
-LINE = (0.1, 0.8)
-"""Share of the way from the camera to the board from and to which lines of sight are looked at: camera and board may
-stand on a box."""
+FULL_POSE_DOF = 6
+"""Joints of an arm that reaches any pose in its workspace, so that a closed form can be used."""
+CENTRE_SHARE = 0.5
+"""Share of the image's width and height in which the centre of a random board lies."""
+MAX_ITERATIONS = 30
+"""Iterations of the numeric inverse kinematics."""
+MAX_DEPTH_RATIO = 8.0
+"""Largest depth of random boards, as a multiple of the depth at which they fill the image."""
+SIGHT_LINE_SHARES = (0.1, 0.8)
+"""Start and end of the checked part of a line of sight, as shares of the way from the camera to the board: camera and
+board may be mounted on a box."""
 
 
 @dataclass(frozen=True, eq=False)
 class BoardViews:
-    """Poses of a robot from which a camera sees a board whole, sharp, and not too obliquely.
+    """Conditions under which a camera sees a whole board, sharply and not too obliquely.
 
     Attributes:
         sight: camera and board.
-        T_cell_frame: where the board is in the frame of the cell, or the fixed camera [m].
-        nearest: depth of a corner in front of the camera at least [m].
-        farthest: and at most [m].
-        oblique: angle between the board's normal and the line of sight to its middle at most [rad].
-        margin: that the board keeps from the edge of the image [px].
+        T_cell_frame: pose of the measuring frame (the board, or the fixed camera) in the frame of the cell [m].
+        nearest: smallest depth of a corner in front of the camera [m].
+        farthest: largest depth of a corner [m].
+        oblique: largest angle between the normal of the board and the line of sight to its centre [rad].
+        margin: distance that the board keeps from the edge of the image [px].
     """
 
     sight: BoardSight
@@ -52,62 +52,62 @@ class BoardViews:
 
     @staticmethod
     def of(sight: BoardSight, T_cell_frame: Float64[Tensor, "4 4"], view: ViewSection) -> "BoardViews":
-        """Views as the cell states them."""
+        """Read the conditions from the section `view` of a cell."""
         nearest, farthest = view.depths(sight.camera.fx)
         return BoardViews(
             sight, T_cell_frame, nearest, farthest, math.radians(view.oblique_deg), view.margin_px
         )
 
     def draw(self, arm: ArmInCell, count: int, generator: torch.Generator) -> Float64[Tensor, "count dof"]:
-        """Draw joint values [rad or m], each from a view and a branch of the arm at random; NaN where it reaches none.
+        """Draw joint values [rad or m] of random views, each in a random branch; NaN where a view is not reached.
 
-        Depth, obliqueness, its direction, the turn about the line of sight and the board's place in the image are
-        uniform. An arm without closed form, or with fewer joints than a pose has freedoms, comes as near to a view as
-        the numeric inverse gets from random joint values.
+        Depth, obliqueness, its direction, the rotation about the line of sight and the position in the image are
+        uniform. An arm without a closed form, or with fewer than six joints, comes as near to a view as the numeric
+        inverse kinematics does from random joint values.
         """
         T_board = self._drawn_boards(count, generator)
         T_frame_target = T_board if self.sight.is_fixed else invert(T_board)
         T = self.T_cell_frame @ T_frame_target
-        solver = closed_form_solver(arm.robot) if arm.robot.dof == WHOLE_POSE else None
+        solver = closed_form_solver(arm.robot) if arm.robot.dof == FULL_POSE_DOF else None
         if solver is None:
             limits = torch.from_numpy(arm.robot.limits).nan_to_num(posinf=math.pi, neginf=-math.pi)
             start = torch.rand(count, len(limits), generator=generator, dtype=T.dtype)
             start = limits[:, 0] + (limits[:, 1] - limits[:, 0]) * start
-            return solve_numeric(arm.robot, T, start, max_iterations=STEPS).q
+            return solve_numeric(arm.robot, T, start, max_iterations=MAX_ITERATIONS).q
         branches = solver.solve(T).q
         rank = torch.rand(branches.shape[:2], generator=generator, dtype=T.dtype)
         values, (lower, upper) = arm.robot.to_controller(branches), arm.limits.t()
-        rank += ((values >= lower) & (values <= upper)).all(-1)  # those inside the limits first
+        rank += ((values >= lower) & (values <= upper)).all(-1)  # branches within the limits come first
         rank = torch.where(branches.isfinite().all(-1), rank, -1.0)
         chosen: Tensor = branches[torch.arange(count), rank.argmax(1)]
         return chosen
 
     def faults(self, arm: ArmInCell, q: Float64[Tensor, "poses dof"]) -> dict[str, Bool[Tensor, " poses"]]:
-        """Say for what poses fail, by reason."""
-        chunks = [self._faults(arm, chunk) for chunk in torch.split(q, CHUNK)]
+        """Return which poses fail, by reason."""
+        chunks = [self._faults(arm, chunk) for chunk in torch.split(q, POSES_PER_CHUNK)]
         return {reason: torch.cat([chunk[reason] for chunk in chunks]) for reason in chunks[0]}
 
     def obliqueness(self, arm: ArmInCell, q: Float64[Tensor, "poses dof"]) -> Float64[Tensor, " poses"]:
-        """Angle between the board's normal and the line of sight to its middle [rad]; above π / 2 from behind."""
+        """Compute the angle between board normal and line of sight to its centre [rad]; from behind > π / 2."""
         return self._obliqueness(self._boards(arm, q)[0])
 
     def room(self, arm: ArmInCell, q: Float64[Tensor, "poses dof"]) -> Float64[Tensor, " poses"]:
-        """By how much the board may stand aside of where it is stated before it leaves the image [m]."""
+        """Compute how far the board may be from its stated place before it leaves the image [m]."""
         points, pixels, _ = self._shown(self._boards(arm, q)[0])
         edge = pixels.new_tensor([self.sight.camera.width, self.sight.camera.height])
         room = torch.minimum(pixels, edge - pixels).amin(-1) * points[..., 2] / self.sight.camera.fx
         return room.amin(1)
 
     def _drawn_boards(self, count: int, generator: torch.Generator) -> Float64[Tensor, "count 4 4"]:
-        """T_camera_board of random views."""
+        """Return T_camera_board of random views [m]."""
         camera = self.sight.camera
         draws = torch.rand(count, 6, generator=generator, dtype=torch.float64)
         size = draws.new_tensor([camera.width, camera.height])
-        pixels = size * (0.5 + MIDDLE * (draws[:, :2] - 0.5))
+        pixels = size * (0.5 + CENTRE_SHARE * (draws[:, :2] - 0.5))
         rays = torch.from_numpy(camera.undistort(pixels.numpy()))
         left, top, right, bottom = board_sheet(self.sight.board)
         fills = camera.fx * min(right - left, bottom - top) / min(camera.width, camera.height)
-        least, most = max(self.nearest, fills), min(self.farthest, SMALLEST * fills)
+        least, most = max(self.nearest, fills), min(self.farthest, MAX_DEPTH_RATIO * fills)
         depth = least + (most - least) * draws[:, 2:3]
         middle = depth * torch.cat([rays, torch.ones_like(depth)], 1)
         direction, turn = 2 * math.pi * draws[:, 3:5].t()
@@ -124,7 +124,7 @@ class BoardViews:
         inside = ((pixels >= self.margin) & (pixels <= edge)).all(-1) & is_regular & (points[..., 2] > 0)
         faults = {
             "the camera is behind the board": oblique > math.pi / 2,
-            "the board is not whole in the image": ~inside.all(1),
+            "the board is not completely in the image": ~inside.all(1),
             "a part of the board is too near to be sharp": points[..., 2].amin(1) < self.nearest,
             "a part of the board is too far away to be sharp": points[..., 2].amax(1) > self.farthest,
             "the board is seen too obliquely": oblique > self.oblique,
@@ -132,13 +132,13 @@ class BoardViews:
         corners = self._sheet @ T_cell_board[:, :3, :3].mT + T_cell_board[:, None, :3, 3]
         T_cell_camera = T_cell_board @ invert(T)
         eye = T_cell_camera[:, None, :3, 3]
-        lines = torch.stack([eye + share * (corners - eye) for share in LINE], -2)
+        lines = torch.stack([eye + share * (corners - eye) for share in SIGHT_LINE_SHARES], -2)
         return faults | arm.hidden(q, lines, "the board from the camera")
 
     def _boards(
         self, arm: ArmInCell, q: Float64[Tensor, "poses dof"]
     ) -> tuple[Float64[Tensor, "poses 4 4"], Float64[Tensor, "poses 4 4"]]:
-        """T_camera_board and T_cell_board [m]."""
+        """Return T_camera_board and T_cell_board [m]."""
         T_cell_target = forward_kinematics(arm.robot, q)
         T = self.sight.board_in_camera(invert(self.T_cell_frame) @ T_cell_target)
         return T, T_cell_target if self.sight.is_fixed else self.T_cell_frame.expand_as(T)
@@ -148,9 +148,9 @@ class BoardViews:
     ) -> tuple[
         Float64[Tensor, "poses points 3"], Float64[Tensor, "poses points 2"], Bool[Tensor, "poses points"]
     ]:
-        """The sheet's corners in the camera's frame [m] and their pixels, and whether the lens shows them there only.
+        """Return points of the sheet in the camera's frame [m], their pixels, and whether the projection is regular.
 
-        Far outside of the image the polynomials of a distortion turn back.
+        Far outside the image the polynomials of a distortion model fold back, so that a pixel has several points.
         """
         points = self._sheet @ T_camera_board[:, :3, :3].mT + T_camera_board[:, None, :3, 3]
         in_front = points.clone()
@@ -167,9 +167,9 @@ class BoardViews:
 
     @property
     def _sheet(self) -> Float64[Tensor, "9 3"]:
-        """Corners, middles of the edges, and middle of the printed sheet, in the board's frame [m].
+        """Corners, edge centres and centre of the printed sheet in the board's frame [m].
 
-        No link is so thin that it stands between the lines of sight to them only.
+        Links are too thick to fit between the lines of sight to these points.
         """
         left, top, right, bottom = board_sheet(self.sight.board)
         x, y = (np.linspace(*ends, 3) for ends in ((left, right), (top, bottom)))

@@ -1,4 +1,4 @@
-"""Which camera measures, as it is asked for: files, and numbers in their units."""
+"""Settings of a camera that measures: files, and numbers in the units of files."""
 
 import math
 from dataclasses import dataclass
@@ -8,8 +8,8 @@ from pisigma.files.errors import PlanningError
 from pisigma.files.setting import FILE, Option
 from pisigma.measurement.camera.camera_files import CameraFiles, Repeatability
 
-FINEST_PX, COARSEST_PX = 1e-3, 100.0
-"""Of the noise of a corner."""
+MIN_SIGMA_PX, MAX_SIGMA_PX = 1e-3, 100.0
+"""Valid range of the noise of a corner [px]; other values are slips of the unit."""
 
 
 @dataclass(frozen=True)
@@ -25,7 +25,7 @@ class CameraSettings:
         repeatability_deg: standard deviation of the robot's orientation repeatability, per axis [deg].
 
     Raises:
-        PlanningError: a number is none that it can be.
+        PlanningError: the noise is outside its valid range.
     """
 
     camera: Annotated[str, FILE]
@@ -36,19 +36,18 @@ class CameraSettings:
     repeatability_deg: float = 0.01
 
     def __post_init__(self) -> None:
-        """Refuse noise that is none."""
-        if not FINEST_PX <= self.sigma_px <= COARSEST_PX:
-            raise PlanningError(
-                f"sigma_px: {FINEST_PX:g} to {COARSEST_PX:g} px was wanted, got {self.sigma_px:g}."
-            )
+        """Refuse values outside their valid range."""
+        if not MIN_SIGMA_PX <= self.sigma_px <= MAX_SIGMA_PX:
+            expected = f"{MIN_SIGMA_PX:g} to {MAX_SIGMA_PX:g} px"
+            raise PlanningError(expected=expected, value=self.sigma_px, option="sigma_px")
         _ = self.repeatability
 
     @property
     def repeatability(self) -> Repeatability:
-        """Of the robot."""
+        """Repeatability of the robot [m, rad]."""
         return Repeatability(self.repeatability_mm / 1e3, math.radians(self.repeatability_deg))
 
     @property
     def files(self) -> CameraFiles:
-        """What reads the corners that are measured."""
+        """Camera files by which measured corners are read."""
         return CameraFiles((self.camera,), (self.board,), self.is_fixed, self.repeatability)

@@ -1,4 +1,4 @@
-"""Poses that could be measured: drawn in the joint limits or read from a file, and allowed by the cell."""
+"""Candidate poses for a measurement: drawn within the joint limits or read from a file, and allowed by the cell."""
 
 import math
 import os
@@ -18,14 +18,14 @@ from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.robot.kinematics.joint_limits import nearest_turn
 from pisigma.robot.se3 import wrap_to_pi
 
-MOST_DRAWS = 40
-"""So many times as many poses are drawn at most as candidates are wanted."""
-WINDOW, SELDOM = 0.25, 0.5
-"""[rad] Width in which angles of a joint are counted, and the share of their mean number that is few."""
-LEAST_VIEWS = 100
-"""Of a board are drawn together, as a robot reaches few of them."""
-SAME = 1e-6
-"""[rad or m] Rows of a file whose joint values differ by less are of one pose."""
+MAX_DRAWS = 40
+"""Blocks of random poses, each with the requested number of candidates."""
+KERNEL_WIDTH, RARE_SHARE = 0.25, 0.5
+"""Width of the kernel for the density of joint angles [rad], and the share of its mean below which it is low."""
+MIN_VIEWS = 100
+"""Views of a board that are drawn together, because a robot reaches few of them."""
+SAME_JOINTS = 1e-6
+"""[rad or m] Difference of joint values below which rows of a file are the same pose."""
 OUTSIDE_WORKSPACE = "the reflector is outside the box of the workspace"
 REPEATED = "an earlier row has the same joint values"
 UNREACHED = "the robot does not reach a view of the board"
@@ -36,15 +36,16 @@ Workspace = Float64[Tensor, "2 3"]
 
 @dataclass(frozen=True, eq=False)
 class Candidates:
-    """Poses of which some are chosen.
+    """Poses from which a plan is selected.
 
     Attributes:
         q: joint values [rad or m].
-        number: which row of the file each of them is, or which of the poses that were drawn; from 1.
-        looked_at: how many poses were drawn or read.
-        refused: how many of them were refused for what.
-        workspace: where the robot is to be accurate, and by way of which it may go: the candidates, but with a camera,
-            which sees its board from a small part of the workspace only, poses that the cell alone allows [rad or m].
+        number: number of each in the file, or among the poses that were drawn; from 1.
+        looked_at: number of poses that were drawn or read.
+        refused: number of refused poses by reason.
+        workspace: joint values where the robot shall be accurate, and that may be way points [rad or m]: the candidates
+            themselves; with a camera, which sees its board from a small part of the workspace only, poses that the cell
+            allows.
     """
 
     q: Float64[Tensor, "candidates dof"]
@@ -55,22 +56,24 @@ class Candidates:
 
     @property
     def sentence(self) -> str:
-        """How many poses were refused for what."""
+        """Number of allowed poses, and of refused ones by reason."""
         reasons = "; ".join(f"{count:,}: {reason}" for reason, count in self.refused.most_common())
         return f"{len(self.q):,} of {self.looked_at:,} poses are allowed" + (
             f" ({reasons})." if reasons else "."
         )
 
     def check_count(self, wanted: int) -> None:
-        """Refuse to choose more poses than there are.
+        """Refuse to select more poses than there are.
 
         Raises:
-            PlanningError: there are not as many; the message says what poses were refused for.
+            PlanningError: there are fewer candidates; the message says why poses were refused.
         """
         if len(self.q) < wanted:
             raise PlanningError(
-                f"{wanted:,} poses were wanted, but {self.sentence} Ask for fewer, give more candidates or make the "
-                "cell wider."
+                f"expected {wanted:,} candidates or more, but {self.sentence.removesuffix('.')}",
+                expected=f"{wanted:,} candidates or more",
+                value=len(self.q),
+                remedy="plan fewer poses, give more candidates or enlarge the cell",
             )
 
 
@@ -83,26 +86,26 @@ def draw_candidates(
 ) -> Candidates:
     """Draw candidates until enough are allowed or too many were refused.
 
-    They are uniform in the joint values: joints that turn by more than a full turn are drawn within half a turn of the
-    middle of their limits, and of 0 where they have none, and then unwrapped (`with_workspace`). Where a camera has
-    to see a board, views are drawn instead.
+    They are uniform in the joint values. Joints with a range of more than one revolution are drawn within half a
+    revolution of the centre of their range, or of 0 without limits, and then unwrapped (`with_workspace`). Where a
+    camera has to see a board, views are drawn instead.
 
     Args:
         arm: the robot in its cell.
-        count: of candidates.
-        seed: of the generator.
-        workspace: in which the reflector has to be; None for anywhere.
-        views: from where a camera has to see its board; None without a camera.
+        count: number of candidates.
+        seed: random seed.
+        workspace: box in which the reflector has to be; None for anywhere.
+        views: conditions under which the camera sees its board; None without a camera.
 
     Raises:
-        PlanningError: a joint that slides has no limits.
+        PlanningError: a prismatic joint has no limits.
     """
     generator = torch.Generator().manual_seed(seed)
     limits = None if views is not None else _drawn_range(arm)
     blocks: list[tuple[Tensor, Faults]] = []
-    while len(blocks) < MOST_DRAWS and sum(int(faults.allowed.sum()) for _, faults in blocks) < count:
+    while len(blocks) < MAX_DRAWS and sum(int(faults.allowed.sum()) for _, faults in blocks) < count:
         if views is not None:
-            q = views.draw(arm, max(count, LEAST_VIEWS), generator)
+            q = views.draw(arm, max(count, MIN_VIEWS), generator)
         else:
             assert limits is not None
             draws = torch.rand(count, len(limits), generator=generator, dtype=torch.float64)
@@ -110,29 +113,27 @@ def draw_candidates(
         blocks.append((q, _faults(arm, q, workspace, views)))
     q = torch.cat([drawn for drawn, _ in blocks])
     faults = Faults(blocks[0][1].reasons, torch.cat([one.failed for _, one in blocks]))
-    enough = (
-        int((faults.allowed.cumsum(0) < count).sum()) + 1
-    )  # poses, of which the last is the last that is needed
+    enough = int((faults.allowed.cumsum(0) < count).sum()) + 1  # poses up to the last one that is needed
     candidates = _allowed(q[:enough], replace(faults, failed=faults.failed[:enough]))
     return candidates if views is not None else with_workspace(arm, candidates, candidates)
 
 
 def with_workspace(arm: ArmInCell, candidates: Candidates, others: Candidates) -> Candidates:
-    """Give candidates that lie in a small part of the workspace the rest of it.
+    """Add the whole workspace to candidates that cover a part of it, and unwrap the joint values of both.
 
-    A joint that is seldom free at some angles, such as a shoulder above a floor, is unwrapped about the middle of the
-    others: between values on both sides of half a turn there would be no free motion.
+    A joint that is rarely free at some angles, such as a shoulder above a floor, is unwrapped about the centre of the
+    other angles: between values on both sides of ±180 deg there would be no free motion.
 
     Args:
         arm: the robot in its cell.
-        candidates: in that part.
-        others: in the whole workspace.
+        candidates: candidates.
+        others: poses in the whole workspace.
     """
     angles = torch.arange(-180, 180, 5).to(others.q).deg2rad()
-    density = ((others.q[:, None] - angles[:, None]).cos() / WINDOW**2).softmax(1).mean(0)
+    density = ((others.q[:, None] - angles[:, None]).cos() / KERNEL_WIDTH**2).softmax(1).mean(0)
     rarest = density.min(0)
     middle = torch.where(
-        rarest.values < SELDOM / len(angles), wrap_to_pi(angles[rarest.indices] + math.pi), 0.0
+        rarest.values < RARE_SHARE / len(angles), wrap_to_pi(angles[rarest.indices] + math.pi), 0.0
     )
 
     def unwrapped(q: Float64[Tensor, "poses dof"]) -> Float64[Tensor, "poses dof"]:
@@ -149,13 +150,13 @@ def read_candidates(
     workspace: Workspace | None = None,
     views: BoardViews | None = None,
 ) -> Candidates:
-    """Take candidates from the joint values of a file, of measurements or of others, those that repeat once.
+    """Read candidates from the joint values of a file; repeated joint values count once.
 
     Args:
         arm: the robot in its cell.
-        path: the CSV file.
-        workspace: in which the reflector has to be; None for anywhere.
-        views: from where a camera has to see its board; None without a camera.
+        path: CSV file with joint values, of measurements or without.
+        workspace: box in which the reflector has to be; None for anywhere.
+        views: conditions under which the camera sees its board; None without a camera.
 
     Raises:
         MeasurementError: the file or a joint's cell cannot be used; the message names file, line and column.
@@ -167,33 +168,33 @@ def read_candidates(
 
 
 def _repeats(q: Float64[Tensor, "poses dof"]) -> Bool[Tensor, " poses"]:
-    """Poses that are the same as one before them, which would be planned twice, or checked where they are measured."""
-    steps = (q / SAME).round().numpy()
+    """Return which poses equal an earlier one, and would be planned twice or checked where they are calibrated with."""
+    steps = (q / SAME_JOINTS).round().numpy()
     _, first, group = np.unique(steps, axis=0, return_index=True, return_inverse=True)
     return torch.from_numpy(first[group.reshape(-1)] < np.arange(len(q)))
 
 
 def spread(
-    arm: ArmInCell, q: Float64[Tensor, "poses dof"], count: int, beside: Float64[Tensor, "others dof"]
+    arm: ArmInCell, q: Float64[Tensor, "poses dof"], count: int, others: Float64[Tensor, "others dof"]
 ) -> Int64[Tensor, " chosen"]:
-    """Choose poses that are spread over the workspace: always the one farthest from those chosen and the others.
+    """Select poses spread over the workspace: each time the one farthest from all that are selected or given.
 
     Distances are those of the reflector's positions and of the joint values, each over its standard deviation (Kennard
     and Stone 1969, Technometrics 11(1)).
 
     Args:
         arm: the robot.
-        q: joint values [rad or m] to choose from.
-        count: how many.
-        beside: poses that are measured besides.
+        q: joint values [rad or m] to select from.
+        count: number of poses to select.
+        others: joint values of poses that are measured anyway [rad or m].
     """
-    both = torch.cat([q, beside])
+    both = torch.cat([q, others])
     position = forward_kinematics(arm.robot, both)[:, :3, 3]
     groups = [values / values.std(0).norm().clamp(min=1e-9) for values in (position, both)]
     features = torch.cat(groups, 1)
-    points, others = features[: len(q)], features[len(q) :]
+    points, given = features[: len(q)], features[len(q) :]
     nearest = (
-        torch.cdist(points, others).min(1).values if len(others) else (points - points.mean(0)).norm(dim=1)
+        torch.cdist(points, given).min(1).values if len(given) else (points - points.mean(0)).norm(dim=1)
     )
     chosen: list[int] = []
     for _ in range(count):
@@ -206,7 +207,7 @@ def spread(
 def _faults(
     arm: ArmInCell, q: Float64[Tensor, "poses dof"], workspace: Workspace | None, views: BoardViews | None
 ) -> Faults:
-    """Why poses are not allowed: by the cell, by the workspace, and by what a camera has to see."""
+    """Return why poses are not allowed by the cell, the workspace, or the camera."""
     failed = {} if views is None else {UNREACHED: q.isnan().any(1)}
     q = q.nan_to_num()
     faults = arm.faults(q)
@@ -220,13 +221,13 @@ def _faults(
 
 
 def _allowed(q: Float64[Tensor, "poses dof"], faults: Faults) -> Candidates:
-    """Keep the poses that fail for nothing."""
+    """Return the poses without faults."""
     allowed = q[faults.allowed]
     return Candidates(allowed, faults.allowed.nonzero()[:, 0] + 1, len(q), faults.counts(), allowed)
 
 
 def _drawn_range(arm: ArmInCell) -> Float64[Tensor, "axes 2"]:
-    """Lowest and highest of the controller's values that are drawn [rad or m]."""
+    """Return the range of the controller's values that are drawn [rad or m]."""
     limits = arm.limits.clone()
     for index, (joint, (lower, upper)) in enumerate(zip(arm.robot.axes, arm.limits.tolist(), strict=True)):
         if joint.type == "revolute" and upper - lower > 2 * np.pi:
@@ -234,7 +235,8 @@ def _drawn_range(arm: ArmInCell) -> Float64[Tensor, "axes 2"]:
             limits[index] = torch.tensor([max(lower, middle - np.pi), min(upper, middle + np.pi)])
         elif not np.isfinite([lower, upper]).all():
             raise PlanningError(
-                f"joint '{joint.name}' of robot '{arm.robot.name}' slides without limits; state them in the cell "
-                "(joints: limits_mm), or give candidates in a file."
+                f"prismatic joint '{joint.name}' of robot '{arm.robot.name}' has no limits",
+                value=joint.name,
+                remedy="state them in the cell (joints: limits_mm), or give candidates in a file",
             )
     return limits

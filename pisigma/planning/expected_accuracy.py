@@ -1,4 +1,4 @@
-"""How accurate a robot will be after so many poses, what will remain uncertain, and what limits planned images."""
+"""Expected accuracy after measuring poses, the sources of the remaining error, and what limits planned images."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -11,29 +11,29 @@ from pisigma.estimation.covariance_root import after_values
 from pisigma.measurement.camera.camera_files import Repeatability
 from pisigma.planning.board_views import BoardViews
 from pisigma.planning.candidates import Candidates
-from pisigma.planning.choice import choose
-from pisigma.planning.knowledge import Knowledge
+from pisigma.planning.pose_selection import select_poses
+from pisigma.planning.robot_posterior import RobotPosterior
 from pisigma.planning.surroundings.arm_in_cell import ArmInCell
 
-RANDOM_CHOICES = 5
-"""Poses are drawn at random so often to compare with."""
+RANDOM_SELECTIONS = 5
+"""Random selections of poses that a plan is compared with."""
 DRAWS = 100
-"""Robots that are drawn from the distribution, for its quantiles."""
-MORE = 10
-"""Images more."""
+"""Robots that are drawn from the posterior for its quantiles."""
+MORE_IMAGES = 10
+"""Additional images whose benefit is predicted."""
 EXACT_CORNERS, EXACT_ROBOT = 1e-4, Repeatability(1e-9, 1e-9)
-"""[px] Corners, and a robot, that leave nothing."""
+"""Noise of corners [px] and repeatability of a robot that contribute nothing to the error."""
 
 
 @dataclass(frozen=True)
 class ExpectedAccuracy:
-    """Errors of the tool's position over the task that are expected after so many poses.
+    """Expected errors of the tool's position over the task after measuring a number of poses.
 
     Attributes:
-        poses: how many were measured.
+        poses: number of measured poses.
         rms: root mean square [m].
-        p95: 95 % of the errors are smaller [m].
-        random_rms: root mean square after as many poses that are drawn from the candidates at random [m].
+        p95: 95 % quantile [m].
+        random_rms: root mean square after as many poses drawn from the candidates at random [m].
     """
 
     poses: int
@@ -44,12 +44,13 @@ class ExpectedAccuracy:
 
 @dataclass(frozen=True)
 class RemainingError:
-    """What a group of unknowns does to the error that remains.
+    """Contribution of a group of unknowns to the remaining error.
 
     Attributes:
-        name: such as "correction of joint 2" or "tool".
-        rms: by so much the error over the task would be smaller if the group were certain, `sqrt(rms² - rms'²)` [m].
-        share: of the variance.
+        name: group, such as "correction of joint 2" or "tool".
+        rms: contribution to the RMS error over the task, `sqrt(rms² - rms'²)` with the error rms' if the group were
+            known exactly [m].
+        share: share of the variance.
     """
 
     name: str
@@ -57,7 +58,7 @@ class RemainingError:
     share: float
 
 
-def curve(
+def accuracy_curve(
     B: Float64[Tensor, "candidates values directions"],
     D: Float64[Tensor, "tasks 3 directions"],
     chosen: Int64[Tensor, " chosen"],
@@ -67,14 +68,14 @@ def curve(
     """Predict the accuracy against the number of poses.
 
     Args:
-        B: of the candidates, before the first of them is measured; see `Knowledge.measured`.
-        D: of the poses where the robot shall be accurate; see `Knowledge.tool`.
-        chosen: numbers of candidates, in their order.
+        B: derivatives of the measured values of the candidates under the prior; see `RobotPosterior.measured`.
+        D: derivatives of the tool's position over the task; see `RobotPosterior.tool`.
+        chosen: indices of the selected candidates, in their order.
         counts: numbers of poses.
-        seed: of the random choices.
+        seed: random seed of the random selections.
     """
     generator = torch.Generator().manual_seed(seed)
-    orders = [torch.randperm(len(B), generator=generator) for _ in range(RANDOM_CHOICES)]
+    orders = [torch.randperm(len(B), generator=generator) for _ in range(RANDOM_SELECTIONS)]
     points = []
     for count in counts:
         after = after_values(D, B[chosen[:count]].flatten(0, 1))
@@ -90,28 +91,30 @@ def curve(
 
 
 def rms_of(D: Float64[Tensor, "tasks 3 directions"]) -> float:
-    """Root mean square of the position's error over the task [m]; for D see `Knowledge.tool`."""
+    """Compute the RMS position error over the task [m]; for D see `RobotPosterior.tool`."""
     return float((D.square().sum() / len(D)).sqrt())
 
 
 def p95_of(D: Float64[Tensor, "tasks 3 directions"], seed: int = 0) -> float:
-    """95 % of the position errors over the task are smaller [m], by `DRAWS` robots of the distribution."""
+    """Compute the 95 % quantile of the position errors over the task [m] from `DRAWS` robots of the posterior."""
     generator = torch.Generator().manual_seed(seed)
     numbers = torch.randn(D.shape[2], DRAWS, generator=generator, dtype=D.dtype)
     return float(torch.quantile((D @ numbers).norm(dim=1).flatten(), 0.95))
 
 
-def remaining_errors(knowledge: Knowledge, task: Float64[Tensor, "tasks dof"]) -> tuple[RemainingError, ...]:
-    """Say what the error that remains comes from, the largest first.
+def remaining_errors(
+    posterior: RobotPosterior, task: Float64[Tensor, "tasks dof"]
+) -> tuple[RemainingError, ...]:
+    """Compute the contributions of groups of unknowns to the remaining error, the largest first.
 
-    With D as in `Knowledge.tool` and R_g the rows of the root that belong to a group, the group's certainty would take
-    the projection of D on the directions of R_g away (conditioning of a normal distribution).
+    With D as in `RobotPosterior.tool` and R_g the rows of the root that belong to a group, knowing the group exactly
+    would remove the projection of D on the directions of R_g (conditioning of a normal distribution).
     """
-    known = knowledge.uncertainty
-    D, root, total = knowledge.tool(task), known.root, rms_of(knowledge.tool(task)) ** 2
+    known = posterior.uncertainty
+    D, root, total = posterior.tool(task), known.root, rms_of(posterior.tool(task)) ** 2
     errors = []
-    for name, rows in _groups(knowledge).items():
-        # Directions in which the group hardly varies are rounding.
+    for name, rows in _groups(posterior).items():
+        # directions in which the group hardly varies are rounding errors
         _, sizes, vectors = torch.linalg.svd(root[rows], full_matrices=False)
         taken = D @ vectors[sizes > 1e-9 * sizes.max().clamp(min=1e-300)].t()
         square = float(taken.square().sum() / len(D))
@@ -119,9 +122,9 @@ def remaining_errors(knowledge: Knowledge, task: Float64[Tensor, "tasks dof"]) -
     return tuple(sorted(errors, key=lambda error: -error.rms))
 
 
-def _groups(knowledge: Knowledge) -> dict[str, list[int]]:
-    """Numbers of the unknowns by name of their group."""
-    known = knowledge.uncertainty
+def _groups(posterior: RobotPosterior) -> dict[str, list[int]]:
+    """Return the indices of the unknowns by the name of their group."""
+    known = posterior.uncertainty
     names = {"theta": "joint offsets", "d": "link lengths", "a": "link lengths"}
     names |= {"alpha": "angles between axes", "beta": "angles between axes"}
     groups: dict[str, list[int]] = {}
@@ -137,15 +140,15 @@ def _groups(knowledge: Knowledge) -> dict[str, list[int]]:
 
 @dataclass(frozen=True)
 class CameraProspects:
-    """Errors that are expected of planned images, and would be expected if one thing were better.
+    """Expected error of planned images, and the error expected if one condition were better.
 
     Attributes:
-        rms: root mean square of the position's error over the task [m].
-        more_images: the same with `MORE` images more [m].
-        exact_corners: with corners without noise [m].
-        exact_robot: with a robot that repeats exactly [m].
-        room: by how much the board may stand aside of where the cell has it before it leaves an image [m].
-        unidentifiable: parameters of the arm that only a further sensor identifies, a sentence each.
+        rms: RMS position error over the task [m].
+        more_images: RMS error with `MORE_IMAGES` more images [m].
+        exact_corners: RMS error with corners without noise [m].
+        exact_robot: RMS error with a robot that repeats exactly [m].
+        room: distance that the board may be from its place in the cell before it leaves an image [m].
+        unidentifiable: parameters of the arm that images cannot identify, one sentence each.
     """
 
     rms: float
@@ -157,38 +160,40 @@ class CameraProspects:
 
     @staticmethod
     def of(
-        knowledge: Knowledge,
+        posterior: RobotPosterior,
         candidates: Candidates,
         chosen: Int64[Tensor, " chosen"],
         task: Float64[Tensor, "tasks dof"],
         views: BoardViews,
         arm: ArmInCell,
     ) -> "CameraProspects":
-        """Predict them.
+        """Predict the errors.
 
         Args:
-            knowledge: before the first image.
+            posterior: unknowns of the robot before the first image.
             candidates: views of the board.
-            chosen: numbers of the planned ones.
-            task: joint values [rad or m] where the robot shall be accurate.
-            views: that the candidates are of.
+            chosen: indices of the planned ones.
+            task: joint values where the robot shall be accurate [rad or m].
+            views: conditions under which the camera sees the board.
             arm: the robot in its cell.
         """
         q, sight = candidates.q[chosen], views.sight
 
-        def rms(better: Knowledge) -> float:
+        def rms(better: RobotPosterior) -> float:
             return rms_of(better.informed(q).tool(task))
 
-        def seen_by(corner_noise: float, repeatability: Repeatability) -> Knowledge:
+        def seen_by(corner_noise: float, repeatability: Repeatability) -> RobotPosterior:
             better = replace(sight, corner_noise=corner_noise, repeatability=repeatability)
-            return replace(knowledge, instrument=replace(knowledge.instrument, sight=better))
+            return replace(posterior, instrument=replace(posterior.instrument, sight=better))
 
-        after = knowledge.informed(q)
+        after = posterior.informed(q)
         others = torch.ones(len(candidates.q), dtype=torch.bool)
         others[chosen] = False
         left = candidates.q[others]
         more = (
-            left[choose(after.measured(left), after.tool(task), min(MORE, len(left)))] if len(left) else left
+            left[select_poses(after.measured(left), after.tool(task), min(MORE_IMAGES, len(left)))]
+            if len(left)
+            else left
         )
         return CameraProspects(
             rms_of(after.tool(task)),
@@ -207,9 +212,9 @@ class CameraProspects:
 
     @property
     def sentences(self) -> tuple[str, ...]:
-        """What limits the result, what is not identifiable, and how exactly the board has to stand."""
+        """What limits the accuracy, what is not identifiable, and how exactly the board has to be placed."""
         better = {
-            f"{MORE} more images": self.more_images,
+            f"{MORE_IMAGES} more images": self.more_images,
             "corners without noise": self.exact_corners,
             "a robot that repeats exactly": self.exact_robot,
         }
@@ -217,20 +222,22 @@ class CameraProspects:
         what = limits[min(better, key=lambda name: better[name])]
         changes = ", ".join(f"{name} to {rms * 1e3:.3f} mm" for name, rms in better.items())
         return (
-            f"The RMS of {self.rms * 1e3:.3f} mm would come down by {changes}: {what} limits it most.",
+            f"The RMS position error of {self.rms * 1e3:.3f} mm would be lower with {changes}; "
+            f"{what} limits it most.",
             *self.unidentifiable,
-            "All lengths rest on the board: squares 0.1 % too large make the robot 0.1 % too large, which only a known "
-            "distance shows.",
-            f"The board leaves the first image where it or the camera is {self.room * 1e3:.0f} mm off what the cell "
-            "says; a larger margin_px leaves more room.",
+            "The scale comes from the board alone: squares 0.1 % too large make the robot 0.1 % too large, which only a "
+            "known distance reveals.",
+            f"The board leaves the first image if it or the camera is {self.room * 1e3:.0f} mm from its place in the "
+            "cell; a larger margin_px allows more.",
         )
 
 
 def _unidentifiable(arm: ArmInCell, is_fixed: bool) -> tuple[str, ...]:
-    """A pose of the target behind the last joint takes up all errors of its row, and the frame those along axis 1."""
+    """Say which parameters the unknown target and frame absorb: those of the last row, and those along axis 1."""
     frame, target = ("camera", "board") if is_fixed else ("board", "camera")
     first, last = arm.robot.joint_rows[0] + 1, arm.robot.joint_rows[-1] + 1
     return (
-        f"Images do not tell theta_{last}, d_{last}, a_{last} and alpha_{last} from where the {target} is on the "
-        f"flange, nor theta_{first} and d_{first} from where the {frame} stands; only a further constraint does.",
+        f"In images, theta_{last}, d_{last}, a_{last} and alpha_{last} cannot be distinguished from the pose of the "
+        f"{target} on the flange, nor theta_{first} and d_{first} from the pose of the {frame}; only a further "
+        "constraint identifies them.",
     )

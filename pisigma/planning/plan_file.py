@@ -1,4 +1,4 @@
-"""Plans as files: the poses as a CSV, and beside it a YAML with what is needed to go on planning."""
+"""Plan files: a CSV with the poses, and a YAML next to it with all that is needed to replan."""
 
 import csv
 import io
@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float64, Int64
 from pydantic import Field
 from torch import Tensor
 
-from pisigma.files.errors import MeasurementError, PlanningError
+from pisigma.files.errors import MeasurementError, Place, PlanningError
 from pisigma.files.output_file import write_whole
 from pisigma.files.yaml_file import Section, read_yaml, yaml_text
 from pisigma.measurement.csv.columns import PLAN_COLUMNS
@@ -27,15 +27,15 @@ from pisigma.robot.row import Bounded
 from pisigma.robot.writing import robot_document
 
 YAML_SUFFIX = ".plan.yaml"
-"""The plan `poses.csv` has its YAML beside it as `poses.plan.yaml`."""
+"""Suffix of the YAML: that of `poses.csv` is `poses.plan.yaml`."""
 
 
 class WayPoint(Section):
-    """Joint values by way of which the robot goes to a pose.
+    """Joint values through which the robot moves to a pose.
 
     Attributes:
-        before: the pose's number in the order.
-        joints: in deg, or mm of joints that slide.
+        before: number of the pose in the order of the plan.
+        joints: joint values [deg, or mm for prismatic joints].
     """
 
     before: int = Field(ge=1)
@@ -43,15 +43,15 @@ class WayPoint(Section):
 
 
 class PlanDocument(Section):
-    """The YAML beside the poses.
+    """Content of the YAML file of a plan.
 
     Attributes:
-        poses: name of the CSV file, which lies in the same folder.
-        robot: as drawn.
-        model: folder of the model that was planned for, seen from this file; None for a robot as drawn.
-        settings: what was planned; its files are seen from this file.
-        cell: what stands around the robot.
-        way_points: between the poses, where the straight motion of the joints is not free.
+        poses: name of the CSV file in the same folder.
+        robot: nominal robot.
+        model: folder of the model that was planned for, relative to this file; None for a robot as drawn.
+        settings: settings of the plan, with paths relative to this file.
+        cell: surroundings of the robot.
+        way_points: way points between poses where the straight joint motion is not free.
     """
 
     poses: str
@@ -64,17 +64,17 @@ class PlanDocument(Section):
 
 @dataclass(frozen=True, eq=False)
 class StoredPlan:
-    """Poses in the order in which they are measured, and what they were planned with.
+    """Poses in the order of measurement, with the settings, robot and cell of the plan.
 
     Attributes:
         arm: the robot in its cell.
-        settings: what was planned; its files are seen from the working directory.
+        settings: settings of the plan, with paths relative to the working directory.
         model: folder of the model that was planned for; None for a robot as drawn.
         q: joint values [rad or m].
-        check: whether a pose judges the calibration (set "test") or is calibrated with ("train").
-        candidate: row of the file of candidates, or number of the pose that was drawn; from 1.
-        way_points: per pose, the joint values by way of which the robot goes there [rad or m]; mostly none.
-        number: of every pose, which it keeps in parts of the plan; () where they count from 1.
+        check: whether each pose tests the calibration (set "test") or is calibrated with ("train").
+        candidate: row of each pose in the file of candidates, or its number among the random poses; from 1.
+        way_points: joint values through which the robot moves to each pose [rad or m]; mostly none.
+        number: number of each pose, kept in parts of the plan; () where they count from 1.
     """
 
     arm: ArmInCell
@@ -88,11 +88,11 @@ class StoredPlan:
 
     @property
     def numbers(self) -> tuple[int, ...]:
-        """Of every pose its number."""
+        """Number of each pose."""
         return self.number or tuple(range(1, len(self.q) + 1))
 
     def part(self, poses: Int64[Tensor, " some"]) -> "StoredPlan":
-        """Return some poses, which keep their numbers."""
+        """Return a part of the poses, which keep their numbers."""
         return replace(
             self,
             q=self.q[poses],
@@ -103,10 +103,10 @@ class StoredPlan:
         )
 
     def write(self, path: Path) -> None:
-        """Write the CSV, and the YAML beside it; both are replaced where they are there.
+        """Write the CSV and the YAML next to it; existing files are replaced.
 
         Raises:
-            OutputError: a file cannot be written there.
+            OutputError: a file cannot be written.
         """
         text = io.StringIO()
         writer = csv.writer(text, lineterminator="\n")
@@ -119,7 +119,7 @@ class StoredPlan:
         write_whole(yaml_of(path), yaml_text(self._document(path)))
 
     def _in_file_units(self, q: Float64[Tensor, "poses dof"]) -> list[list[float]]:
-        """The controller's values in deg or mm, with the digits that controllers take."""
+        """Return the controller's values [deg or mm] with the digits that controllers take."""
         robot = self.arm.robot
         return [
             [round(axis.in_file_unit(value), 6) for axis, value in zip(robot.axes, row, strict=True)]
@@ -127,7 +127,7 @@ class StoredPlan:
         ]
 
     def _document(self, path: Path) -> dict[str, Any]:
-        """The content of the YAML, of stated values only."""
+        """Return the content of the YAML, without values that are not stated."""
         folder = path.resolve().parent
         seen = self.settings.with_files(lambda path: os.path.relpath(path, folder))
         settings = {name: value for name, value in asdict(seen).items() if value is not None}
@@ -142,17 +142,17 @@ class StoredPlan:
 
 
 def joint_columns(robot: Robot) -> list[str]:
-    """Columns of the controller's values in files, such as q1_deg."""
+    """Return the names of the columns of the controller's values, such as q1_deg."""
     return [f"q{number}_{axis.file_unit}" for number, axis in enumerate(robot.axes, start=1)]
 
 
 def yaml_of(path: Path) -> Path:
-    """The YAML beside the CSV of a plan."""
+    """Return the path of the YAML that belongs to the CSV of a plan."""
     return path.with_suffix(YAML_SUFFIX)
 
 
 def read_plan(path: str | os.PathLike[str]) -> StoredPlan:
-    """Read a plan by its CSV or the YAML beside it.
+    """Read a plan from its CSV or its YAML.
 
     Raises:
         PlanningError: the YAML is missing or cannot be used.
@@ -162,8 +162,11 @@ def read_plan(path: str | os.PathLike[str]) -> StoredPlan:
     if file.suffix.lower() == ".csv":
         if not yaml_of(file).exists():
             raise PlanningError(
-                f"{file}: a plan was wanted, but there is no {yaml_of(file).name} beside it; give the poses that "
-                "`pisigma plan` wrote."
+                f"expected a plan, but there is no {yaml_of(file).name} next to it",
+                expected="a plan",
+                value=yaml_of(file).name,
+                at=Place(file),
+                remedy="give the poses that `pisigma plan` wrote",
             )
         file = yaml_of(file)
     document = read_yaml(file, PlanDocument, PlanningError)
@@ -195,22 +198,22 @@ def read_plan(path: str | os.PathLike[str]) -> StoredPlan:
 
 
 def _cells(table: Table, name: str) -> list[str]:
-    """The cells of a column of a plan."""
+    """Return the cells of a column of a plan."""
     if name not in table.header:
         raise MeasurementError(
-            f"{table.source}, line {table.header_line}: the column '{name}' is missing; give the poses as "
-            "`pisigma plan` wrote them."
+            "the column is missing",
+            at=Place(table.source, table.header_line, name),
+            remedy="give the poses as `pisigma plan` wrote them",
         )
     column = table.header.index(name)
     return [row[column].strip() if column < len(row) else "" for row in table.records]
 
 
 def _numbers(table: Table, name: str) -> list[int]:
-    """The cells of a column of a plan that holds numbers from 1."""
+    """Return the cells of a column of numbers from 1."""
     cells = _cells(table, name)
     for line, cell in zip(table.lines, cells, strict=True):
         if not (cell.isascii() and cell.isdigit()):
-            raise MeasurementError(
-                f"{table.source}, line {line}, column '{name}': a number from 1 was wanted, got '{cell}'."
-            )
+            at = Place(table.source, line, name)
+            raise MeasurementError(expected="a number from 1", value=cell, at=at)
     return list(map(int, cells))

@@ -1,4 +1,4 @@
-"""What a plan begins with, by its settings: instrument, candidates, rows that are measured, and views of a camera."""
+"""Inputs of a plan from its settings: instrument, candidate poses, measured rows, and views of a camera."""
 
 import os
 from typing import Any
@@ -23,30 +23,33 @@ from pisigma.planning.candidates import (
     read_candidates,
     with_workspace,
 )
-from pisigma.planning.knowledge import Instrument
 from pisigma.planning.plan_settings import PlanSettings
+from pisigma.planning.robot_posterior import Instrument
 from pisigma.planning.surroundings.arm_in_cell import ArmInCell
 from pisigma.robot.description import Robot
 
-REACHABLE = 1000
-"""Poses that stand for the workspace where a camera measures."""
+WORKSPACE_POSES = 1000
+"""Poses that represent the workspace where a camera measures."""
 
 
 def instrument_of(settings: PlanSettings, anchor: Float64[Tensor, " 3"] | None = None) -> Instrument:
-    """What measures.
+    """Return the measuring instrument.
 
     Args:
-        settings: what is to be planned.
-        anchor: where distances are from, in the measuring frame [m].
+        settings: settings of the plan.
+        anchor: origin of distances in the measuring frame [m].
 
     Raises:
-        PlanningError: distances are measured, but from nowhere.
+        PlanningError: distances are measured, but their origin is not stated.
     """
     if settings.camera is not None:
         return Instrument(settings.sensor, sight=sight_of(settings.camera))
     if settings.sensor == "distance" and anchor is None:
         raise PlanningError(
-            "where distances are measured from was wanted; state it as the tracker of the cell (--cell)."
+            "the origin of the measured distances is not stated",
+            expected="the origin of the measured distances",
+            option="--cell",
+            remedy="state it as the tracker of the cell",
         )
     stated: dict[str, Any] = {} if settings.sigma_mm is None else {"sigma": settings.sigma_mm / 1e3}
     stated |= {} if anchor is None else {"anchor": tuple(anchor.tolist())}
@@ -54,11 +57,11 @@ def instrument_of(settings: PlanSettings, anchor: Float64[Tensor, " 3"] | None =
 
 
 def find_candidates(settings: PlanSettings, arm: ArmInCell) -> Candidates:
-    """Draw or read the poses to choose from.
+    """Draw or read the poses to select from.
 
     Raises:
         MeasurementError: their file cannot be used.
-        PlanningError: a joint that slides has no limits to draw in.
+        PlanningError: a prismatic joint has no limits.
     """
     views, workspace = views_of(settings, arm), workspace_of(settings)
     if settings.candidates_from is not None:
@@ -67,11 +70,11 @@ def find_candidates(settings: PlanSettings, arm: ArmInCell) -> Candidates:
         candidates = draw_candidates(arm, settings.candidates, settings.seed, workspace, views)
     if views is None:
         return candidates
-    return with_workspace(arm, candidates, draw_candidates(arm, REACHABLE, settings.seed, workspace))
+    return with_workspace(arm, candidates, draw_candidates(arm, WORKSPACE_POSES, settings.seed, workspace))
 
 
 def with_measured(settings: PlanSettings, arm: ArmInCell) -> ArmInCell:
-    """The arm, for which candidates that were measured are free of self-collision.
+    """Return the arm such that candidates that were measured are free of self-collision.
 
     Raises:
         MeasurementError: the file of candidates cannot be used.
@@ -82,14 +85,14 @@ def with_measured(settings: PlanSettings, arm: ArmInCell) -> ArmInCell:
 
 
 def workspace_of(settings: PlanSettings) -> Workspace | None:
-    """Where the reflector is measured, or the target of a camera; None for anywhere."""
+    """Return the box in which the reflector or the target of a camera is measured; None for anywhere."""
     if settings.box_mm is None:
         return None
     return torch.tensor(settings.box_mm, dtype=torch.float64).reshape(2, 3) / 1e3
 
 
 def read_planned_rows(settings: PlanSettings, path: str | os.PathLike[str], robot: Robot) -> Measurements:
-    """Read measured rows, or the corners that a camera saw.
+    """Read measured rows, or corners detected in images.
 
     Raises:
         MeasurementError: the file cannot be used.
@@ -98,10 +101,10 @@ def read_planned_rows(settings: PlanSettings, path: str | os.PathLike[str], robo
 
 
 def views_of(settings: PlanSettings, arm: ArmInCell) -> BoardViews | None:
-    """From where the camera has to see its board; None without a camera.
+    """Return the conditions under which the camera sees its board; None without a camera.
 
     Raises:
-        PlanningError: the cell does not say from where, or where the board is.
+        PlanningError: the cell does not state them.
     """
     if settings.camera is None:
         return None
@@ -109,18 +112,20 @@ def views_of(settings: PlanSettings, arm: ArmInCell) -> BoardViews | None:
     if view is None or view.T_cell_frame is None:
         frame, target = ("camera", "board") if settings.camera.is_fixed else ("board", "camera")
         raise PlanningError(
-            f"where the {frame} is and from where images are sharp was wanted; state it in the cell (--cell), as "
-            "view: {frame: {x_mm: 400, z_mm: 50, yaw_deg: 180}, near_mm: 300, far_mm: 700}, and where the "
-            f"{target} is on the flange as tool."
+            f"the cell does not state where the {frame} is and at which depths images are sharp",
+            expected=f"the pose of the {frame} and the depths at which images are sharp",
+            option="--cell",
+            remedy="state them in the cell, as view: {frame: {x_mm: 400, z_mm: 50, yaw_deg: 180}, near_mm: 300, "
+            f"far_mm: 700}}, and the pose of the {target} on the flange as tool",
         )
     return BoardViews.of(sight_of(settings.camera), view.T_cell_frame, view)
 
 
 def sight_of(camera: CameraSettings) -> BoardSight:
-    """Read the files of camera and board.
+    """Load camera and board.
 
     Raises:
-        MeasurementError: a file cannot be used; the message says which and where.
+        MeasurementError: a file cannot be used.
     """
     seen_by, board = Camera.load(camera.camera), Board.load(camera.board)
     is_fixed = camera.is_fixed or seen_by.is_fixed

@@ -20,7 +20,7 @@ Box = tuple[float, float, float, float, float, float]
 MIN_LENGTH_MM, MAX_LENGTH_MM = 1e-3, 1e3
 """Range of instruments' standard deviations and robots' errors [mm]; other values are in the wrong unit."""
 FILES = ("candidates_from", "task", "measured")
-"""Settings that are files."""
+"""Settings that are paths of files."""
 
 
 def box(stated: str) -> tuple[float, ...]:

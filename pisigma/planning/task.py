@@ -1,4 +1,4 @@
-"""Where a robot is to be accurate: joint values, or poses of its tool, from a file."""
+"""Task of a plan: joint values or tool poses where the robot has to be accurate."""
 
 import os
 from collections.abc import Sequence
@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
-from pisigma.files.errors import PlanningError
+from pisigma.files.errors import Place, PlanningError
 from pisigma.measurement.csv.columns import find_column
 from pisigma.measurement.csv.poses import read_poses
 from pisigma.measurement.csv.reading import read_joints
@@ -22,12 +22,11 @@ from pisigma.robot.kinematics.status import Status
 from pisigma.robot.kinematics.tolerances import LIMIT_TOLERANCE
 
 REACHED = (Status.REACHED, Status.OUTSIDE_DOMAIN)
-
-
+"""Statuses of a pose whose joint values can be used."""
 TASK_POSES = 300
-"""Joint values that stand for the task, where more are stated or none."""
+"""Joint values that represent the task, where more are stated or none."""
 STARTS = 200
-"""Joint values that the inverse kinematics of a drawn robot without a closed form starts from."""
+"""Joint values from which the inverse kinematics of a robot without a closed form starts."""
 
 
 def task_poses(
@@ -36,13 +35,13 @@ def task_poses(
     q: Float64[Tensor, "poses dof"],
     model: CalibratedModel | None = None,
 ) -> Float64[Tensor, "tasks dof"]:
-    """Give joint values [rad or m] where the robot shall be accurate: of the task's file, or where it can be measured.
+    """Return joint values [rad or m] where the robot has to be accurate: of the task file, else of the workspace.
 
     Args:
         arm: the robot in its cell.
-        settings: which name the file.
-        q: joint values [rad or m] of the workspace.
-        model: of the robot, where there is one.
+        settings: settings that name the task file.
+        q: joint values of the workspace [rad or m].
+        model: model of the robot, if there is one.
 
     Raises:
         MeasurementError: the file cannot be used; the message names file, line and column.
@@ -55,11 +54,11 @@ def task_poses(
 
 
 def read_task(path: str | os.PathLike[str], model: CalibratedModel) -> Float64[Tensor, "tasks dof"]:
-    """Read joint values [rad or m], or poses that the inverse kinematics turns into joint values.
+    """Read joint values [rad or m], or poses that are converted to joint values by inverse kinematics.
 
     Args:
-        path: a CSV file with the columns of joint values, or of wanted poses (see `read_poses`).
-        model: of the robot; poses are of its tool, in its base frame.
+        path: CSV file with columns of joint values, or of poses (see `read_poses`).
+        model: model of the robot; poses are those of its tool in its base frame.
 
     Raises:
         MeasurementError: the file cannot be used; the message names file, line and column.
@@ -68,22 +67,26 @@ def read_task(path: str | os.PathLike[str], model: CalibratedModel) -> Float64[T
     table = read_table(path)
     if any(column.joint for name in table.header if (column := find_column(name))):
         q = read_joints(path, model.robot)
-        _refuse_outside(model.robot, q, [f"{path}, line {line}" for line in table.lines])
+        _refuse_outside(model.robot, q, [Place(path, line) for line in table.lines])
         return q
     poses = read_poses(path)
     solution = CorrectedIK(model)(poses.T)
     for line, status in zip(poses.line, map(Status, solution.status.tolist()), strict=True):
         if status not in REACHED:
-            raise PlanningError(f"{path}, line {line}: {status.name.lower()}. {status.sentence}")
+            raise PlanningError(
+                f"the status of the pose is {status.name}: {status.sentence.rstrip('.')}",
+                value=status.name,
+                at=Place(path, line),
+            )
     reached: Tensor = model.robot.to_dh(torch.as_tensor(solution.q))
     return reached
 
 
-def _refuse_outside(robot: Robot, q: Float64[Tensor, "tasks dof"], places: Sequence[str]) -> None:
-    """Refuse joint values [rad or m] that the robot cannot have.
+def _refuse_outside(robot: Robot, q: Float64[Tensor, "tasks dof"], places: Sequence[Place]) -> None:
+    """Refuse joint values [rad or m] outside the joint limits.
 
     Raises:
-        PlanningError: one is outside its limits; the message names its place.
+        PlanningError: a joint value is outside its limits.
     """
     values, (lower, upper) = robot.to_controller(q).numpy(), robot.axis_limits.T
     outside = (values < lower - LIMIT_TOLERANCE) | (values > upper + LIMIT_TOLERANCE)
@@ -91,6 +94,9 @@ def _refuse_outside(robot: Robot, q: Float64[Tensor, "tasks dof"], places: Seque
         axis = robot.axes[number]
         value, low, high = (axis.in_file_unit(some) for some in (values[row, number], axis.lower, axis.upper))
         raise PlanningError(
-            f"{places[row]}: joint '{axis.name}' at {value:.6g} {axis.file_unit} is outside its limits {low:.6g} to "
-            f"{high:.6g} {axis.file_unit}; give joint values that robot '{robot.name}' can have, and check their unit."
+            f"joint '{axis.name}' at {value:.6g} {axis.file_unit} is outside its limits {low:.6g} to {high:.6g} "
+            f"{axis.file_unit}",
+            value=axis.name,
+            at=places[row],
+            remedy=f"give joint values within the limits of robot '{robot.name}', and check their unit",
         )

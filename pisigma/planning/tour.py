@@ -1,4 +1,4 @@
-"""In which order to go to the poses of a plan, by what way points, and how long that takes."""
+"""Order of the poses of a plan, way points between them, and the duration."""
 
 import math
 from collections.abc import Sequence
@@ -15,25 +15,25 @@ from pisigma.planning.surroundings.motion import Motions
 from pisigma.robot.description import Robot
 
 FIRST_STAGE = 20
-"""Poses with which a robot that was never measured is calibrated first: fewer do not determine its unknowns."""
-ROUNDS = 8
-"""So often motions that turn out to be blocked are avoided by another order; what is left gets way points."""
-SLOWEST = 1e-3
-"""[rad/s or m/s] No robot goes from pose to pose more slowly."""
-LONGEST_SETTLING = 3600.0
-"""[s] At a pose."""
-DETOUR = 3.0
-"""A blocked motion counts as this many times its time while the order is looked for."""
+"""Poses of the first calibration of a robot that was never measured; fewer do not determine its unknowns."""
+MAX_REORDERINGS = 8
+"""Attempts to avoid blocked motions by another order; the remaining ones get way points."""
+MIN_SPEED = 1e-3
+"""[rad/s or m/s] Smallest valid speed."""
+MAX_SETTLING = 3600.0
+"""[s] Longest valid settling time."""
+DETOUR_FACTOR = 3.0
+"""Factor on the duration of a blocked motion while the order is optimised."""
 
 
 @dataclass(frozen=True)
 class Pace:
-    """How fast the robot goes from pose to pose.
+    """Speeds between poses, and settling time.
 
     Attributes:
-        speed: of every joint that turns [rad/s]; the joint that needs longest decides.
-        slide: of every joint that slides [m/s].
-        settling: time at every pose until the robot is still and was measured [s].
+        speed: speed of every revolute joint [rad/s]; the slowest joint determines the duration.
+        slide: speed of every prismatic joint [m/s].
+        settling: time at every pose until the robot is at rest and measured [s].
     """
 
     speed: float = math.radians(30.0)
@@ -41,20 +41,22 @@ class Pace:
     settling: float = 3.0
 
     def __post_init__(self) -> None:
-        """Refuse times that are none."""
-        if not all(SLOWEST <= speed < math.inf for speed in (self.speed, self.slide)) or not (
-            0 <= self.settling <= LONGEST_SETTLING
+        """Refuse values outside their valid range."""
+        for option, speed, factor, unit in (
+            ("speed", self.speed, math.degrees(1.0), "deg/s"),
+            ("slide", self.slide, 1e3, "mm/s"),
         ):
-            slowest = f"{math.degrees(SLOWEST):.2g} deg/s or {SLOWEST * 1e3:g} mm/s"
-            raise PlanningError(
-                f"speeds of {slowest} and more and a settling time of 0 to {LONGEST_SETTLING:g} s were wanted, got "
-                f"{math.degrees(self.speed):g} deg/s, {self.slide * 1e3:g} mm/s and {self.settling:g} s."
-            )
+            if not MIN_SPEED <= speed < math.inf:
+                expected, value = f"a speed >= {factor * MIN_SPEED:.2g} {unit}", f"{factor * speed:g} {unit}"
+                raise PlanningError(expected=expected, value=value, option=option)
+        if not 0 <= self.settling <= MAX_SETTLING:
+            expected, value = f"a settling time of 0 to {MAX_SETTLING:g} s", f"{self.settling:g} s"
+            raise PlanningError(expected=expected, value=value, option="settling")
 
     def seconds(
         self, robot: Robot, start: Float64[Tensor, "*#batch dof"], end: Float64[Tensor, "*#batch dof"]
     ) -> Float64[Tensor, "*_batch"]:
-        """Time of motions between joint values [s]: of the joint that needs longest, without its acceleration."""
+        """Compute the duration of joint motions [s]: that of the slowest joint, without acceleration."""
         speed = torch.where(torch.tensor(robot.revolute), self.speed, self.slide)
         seconds: Tensor = ((end - start).abs() / speed).amax(-1)
         return seconds
@@ -62,13 +64,13 @@ class Pace:
 
 @dataclass(frozen=True, eq=False)
 class Tour:
-    """An order of poses.
+    """An order of poses with way points.
 
     Attributes:
-        order: the poses, as they follow each other; those that no free motion was found to are left out.
-        before: per pose in this order, the way points that lead to it [rad or m]; mostly none.
-        left_out: poses that no free motion was found to.
-        seconds: that all takes.
+        order: indices of the poses in their order, without those that no free motion leads to.
+        before: way points before each pose in this order [rad or m]; mostly none.
+        left_out: indices of the poses that no free motion was found to.
+        seconds: total duration [s].
     """
 
     order: Int64[Tensor, " poses"]
@@ -84,18 +86,18 @@ def tour(
     start: Float64[Tensor, " dof"] | None = None,
     stages: Sequence[int] = (),
 ) -> Tour:
-    """Order poses so that all of it takes little time, by motions that touch nothing.
+    """Order poses for a short duration, with collision-free motions.
 
-    Nearest neighbour, then 2-opt (Croes 1958, Operations Research 6(6)), on the time of the straight motions. Motions
-    that are blocked are made expensive and the order is improved again; those that stay get way points.
+    Nearest neighbour, then 2-opt (Croes 1958, Operations Research 6(6)), on the duration of the straight joint motions.
+    Blocked motions are made expensive and the order is improved again; those that remain get way points.
 
     Args:
-        motions: of the robot in its cell; they know those of earlier tours.
-        q: joint values [rad or m] of the poses, each of them free.
-        pace: of the robot.
-        start: joint values where the robot stands [rad or m]; None for anywhere.
-        stages: numbers of poses that are gone to before all that follow in `q`, ascending, such as (20, 40): the
-            first 20 poses, then the next 20, then the rest, each in the order that takes little time.
+        motions: motions of the robot in its cell, which keep the results of earlier tours.
+        q: joint values of the poses, all of them free [rad or m].
+        pace: speeds and settling time.
+        start: current joint values of the robot [rad or m]; None for any.
+        stages: ascending numbers of poses that are measured before all that follow in `q`: (20, 40) means the first 20
+            poses, then the next 20, then the others, each stage in an order of short duration.
     """
     poses = q if start is None else torch.cat([start[None], q])
     seconds = pace.seconds(motions.arm.robot, poses[:, None], poses[None]).numpy()
@@ -109,18 +111,18 @@ def tour(
 
 
 def order_of_use(chosen: int, check: int) -> Int64[Tensor, " poses"]:
-    """Put poses that check a calibration evenly between chosen ones, of which the most useful stand first.
+    """Distribute the poses that test the calibration evenly among the others, which are sorted by usefulness.
 
     Args:
-        chosen: how many poses there are to calibrate with, numbered from 0.
-        check: how many there are to check with, numbered after these.
+        chosen: number of poses to calibrate with, numbered from 0.
+        check: number of poses to test with, numbered after these.
     """
     between = (torch.arange(check) + 0.5) * chosen / max(check, 1)
     return torch.cat([torch.arange(chosen) + 0.0, between]).argsort(stable=True)
 
 
 def stages_of(poses: int) -> tuple[int, ...]:
-    """Numbers of poses after which a calibration may be good enough, `FIRST_STAGE` and ever twice as many."""
+    """Return numbers of poses after which a calibration may be good enough: `FIRST_STAGE` times powers of two."""
     return tuple(FIRST_STAGE * 2**k for k in range(poses.bit_length()) if FIRST_STAGE * 2**k < poses)
 
 
@@ -131,10 +133,10 @@ def _ordered(
     stage: Int64[np.ndarray, " stage"],
     fixed_start: bool,
 ) -> Int64[np.ndarray, " stage"]:
-    """Some of the poses in an order that takes little time, the first of them where the robot stands or not."""
+    """Order the poses of a stage; with `fixed_start` the first one stays first."""
     times = seconds[np.ix_(stage, stage)]
     order = _nearest_neighbours(times, fixed_start)
-    for _ in range(ROUNDS):
+    for _ in range(MAX_REORDERINGS):
         order = _two_opt(times, order, fixed_start)
         path = poses[stage[order]]
         free = motions.are_free(path[:-1], path[1:]).numpy()
@@ -142,16 +144,16 @@ def _ordered(
         if not blocked.any():
             break
         one, other = order[:-1][blocked], order[1:][blocked]
-        times[one, other] = times[other, one] = _BLOCKED + DETOUR * times[one, other]
+        times[one, other] = times[other, one] = _BLOCKED + DETOUR_FACTOR * times[one, other]
     return np.take(stage, order)
 
 
 _BLOCKED = 1e4
-"""[s] Added to the time of motions that are blocked: longer than any motion."""
+"""[s] Penalty on the duration of blocked motions: longer than any motion."""
 
 
 def _nearest_neighbours(seconds: Float64[np.ndarray, "poses poses"], fixed_start: bool) -> np.ndarray:
-    """Always go to the nearest pose that is left, from every pose as the first one (or from the first alone)."""
+    """Order by nearest neighbours, starting from every pose (or from the first alone), and return the best order."""
     best: list[int] = []
     shortest = math.inf
     for first in range(1 if fixed_start else len(seconds)):
@@ -168,12 +170,12 @@ def _nearest_neighbours(seconds: Float64[np.ndarray, "poses poses"], fixed_start
 
 
 def _two_opt(seconds: Float64[np.ndarray, "poses poses"], order: np.ndarray, fixed_start: bool) -> np.ndarray:
-    """Turn stretches of the order round as long as that saves time; the ends are open."""
+    """Reverse parts of the order as long as that saves time; the ends are open."""
     count, first = len(order), 1 if fixed_start else 0
     while count > 2:
         times = seconds[np.ix_(order, order)]
         steps = np.diagonal(times, 1)
-        before = np.concatenate([[0.0], steps])  # into the stretch i to j, and out of it
+        before = np.concatenate([[0.0], steps])  # into the part from i to j, and out of it
         after = np.concatenate([steps, [0.0]])
         into = np.vstack([np.zeros(count), times[:-1]])  # from i - 1 to j
         out = np.hstack([times[:, 1:], np.zeros((count, 1))])  # from i to j + 1
@@ -189,12 +191,12 @@ def _two_opt(seconds: Float64[np.ndarray, "poses poses"], order: np.ndarray, fix
 def _with_way_points(
     motions: Motions, poses: Float64[Tensor, "poses dof"], order: np.ndarray, pace: Pace, fixed_start: bool
 ) -> Tour:
-    """Put way points in where a motion is blocked, and leave out poses that none leads to."""
+    """Insert way points where a motion is blocked, and leave out poses that cannot be reached."""
     stops, before, left_out = [int(order[0])], [poses[:0]], []
     for stop in order[1:].tolist():
         points = motions.points_between(poses[stops[-1]], poses[stop])
         movable = len(stops) > int(fixed_start)
-        if points is None and movable and motions.is_shut_in(poses[stops[-1]], poses[stop]):
+        if points is None and movable and motions.is_harder_to_leave(poses[stops[-1]], poses[stop]):
             left_out.append(stops.pop())
             before.pop()
             points = motions.points_between(poses[stops[-1]], poses[stop]) if stops else poses[:0]

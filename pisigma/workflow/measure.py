@@ -20,9 +20,9 @@ from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.fields import LeftOut
 from pisigma.planning.plan_file import StoredPlan, read_plan
 from pisigma.planning.plan_inputs import find_candidates, with_measured
-from pisigma.planning.session.judged_rows import FurtherPoses, JudgedRows, setup_sentence
 from pisigma.planning.session.reached import Reached, cross_validated, expected, reached
 from pisigma.planning.session.row_alarms import NEAR_POSE, joint_differences, of_all_rows
+from pisigma.planning.session.session_rows import FurtherPoses, SessionRows, setup_sentence
 from pisigma.planning.session.state import (
     AccuracyPoint,
     Advice,
@@ -75,10 +75,10 @@ class MeasuringSession:
         self._against = subject.model or plan.arm.robot
         self._task = task_poses(plan.arm, plan.settings, candidates.workspace, subject.model)
         self._further = FurtherPoses.of(plan, candidates, self._task)
-        self._before = subject.knowledge(plan.arm, replace(plan.settings, measured=None))
+        self._before = subject.posterior(plan.arm, replace(plan.settings, measured=None))
         self._planned, self._planned_check = plan.q, plan.check
         self._numbers = list(plan.numbers)
-        self._judged = JudgedRows(plan.arm.robot, self._before.instrument.sigma)
+        self._judged = SessionRows(plan.arm.robot, self._before.instrument.sigma)
         self._setup, self._setup_alarms, self._looked_at = "", list[Alarm](), 0
         self._reached: list[AccuracyPoint] = []
         self._expected: tuple[AccuracyPoint, ...] = ()
@@ -195,13 +195,13 @@ class MeasuringSession:
         progress("planning the remaining poses")
         again = None
         if self._settings.replan:
-            again = self._further.planned_again(self.plan, self._poses, so_far, measured.q, remaining)
+            again = self._further.replanned(self.plan, self._poses, so_far, measured.q, remaining)
         with self._lock:
             if again is not None:
                 self._adopt(again)
             remaining = self._open
             poses = self.plan.q[remaining[~self.plan.check[remaining]]]
-        ahead = expected(so_far.knowledge, so_far.point.poses, poses, self._further.q, self._task, STEP)
+        ahead = expected(so_far.posterior, so_far.point.poses, poses, self._further.q, self._task, STEP)
         with self._lock:
             self._expected, self._ahead_of = ahead, so_far
         return ()

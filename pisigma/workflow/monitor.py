@@ -20,9 +20,9 @@ from pisigma.lifetime.monitoring.history import (
     history_path,
     in_order,
     new_rows,
-    recall,
-    remember,
+    read_sessions,
     rows_hash,
+    store_sessions,
 )
 from pisigma.lifetime.monitoring.session import judge_session
 from pisigma.lifetime.monitoring.trends import (
@@ -35,7 +35,7 @@ from pisigma.lifetime.monitoring.trends import (
     trends_of,
 )
 from pisigma.lifetime.recalibration.motion import session_diagnostics
-from pisigma.lifetime.recalibration.recalibration_problem import owners_in
+from pisigma.lifetime.recalibration.recalibration_problem import frame_keys
 from pisigma.measurement.camera.camera_files import CameraFiles
 from pisigma.measurement.camera.corner_file import read_rows
 from pisigma.measurement.copies import RowValues
@@ -233,7 +233,7 @@ def monitor(
     judged: list[Record] = []
     untrusted: list[UntrustedSession] = []
     folder = source if settings.history and not isinstance(source, CalibratedModel) else None
-    earlier = () if folder is None else recall(history_path(folder), model_hash(folder))
+    earlier = () if folder is None else read_sessions(history_path(folder), model_hash(folder))
     for date, day in _by_day(rows, settings.dates):
         progress(f"{Path(day.source).name}, {date}")
         warnings += row_warnings(loaded.robot, day)
@@ -261,7 +261,7 @@ def monitor(
         raise MeasurementError(f"expected new rows, got none: {' '.join(warnings)}", expected="new rows")
     records = new = in_order(judged)
     if folder is not None:
-        records = remember(history_path(folder), model_hash(folder), new)
+        records = store_sessions(history_path(folder), model_hash(folder), new)
         warnings += [
             f"{one.file}: its session in the history was left out: expected {WANTED}, got {one.date}; monitor its rows "
             "again with --dates to correct the date."
@@ -332,7 +332,7 @@ def _record(
     file = Path(rows.source).name
     if implausible := check_rows(rows, model, stated.fitted, may_move(stated)).implausible:
         return UntrustedSession(file, date, implausible)
-    elsewhere = None if settings.moved is None else owners_in(rows, settings.moved)
+    elsewhere = None if settings.moved is None else frame_keys(rows, settings.moved)
     session, zeros = judge_session(model, posterior, rows, elsewhere)
     if implausible := session_diagnostics(model, rows, session):
         return UntrustedSession(file, date, implausible)

@@ -24,18 +24,17 @@ from pisigma.model.model_source import HoldsModel
 from pisigma.model.training_rows import known_rows, training_row_warnings
 from pisigma.planning.board_views import BoardViews
 from pisigma.planning.candidates import Candidates, spread
-from pisigma.planning.choice import choose
 from pisigma.planning.expected_accuracy import (
     CameraProspects,
     ExpectedAccuracy,
     RemainingError,
-    curve,
+    accuracy_curve,
     remaining_errors,
 )
-from pisigma.planning.knowledge import Knowledge
 from pisigma.planning.plan_file import StoredPlan, yaml_of
 from pisigma.planning.plan_inputs import find_candidates, read_planned_rows, views_of, with_measured
 from pisigma.planning.plan_settings import PlanSettings
+from pisigma.planning.robot_posterior import RobotPosterior
 from pisigma.planning.subject import Subject
 from pisigma.planning.surroundings.arm_in_cell import ArmInCell
 from pisigma.planning.surroundings.cell import Cell, read_cell
@@ -201,9 +200,9 @@ def plan(
     candidates.check_count(settings.count + settings.check)
     progress("prior knowledge")
     repeated = _check_measured(subject.model, settings, arm.robot)
-    knowledge = subject.knowledge(arm, settings)
+    posterior = subject.posterior(arm, settings)
     task = task_poses(arm, settings, candidates.workspace, subject.model)
-    problem = _Problem(subject, settings, arm, candidates, knowledge, task)
+    problem = _Problem(subject, settings, arm, candidates, posterior, task)
     chosen, stored, way = problem.choose(progress)
     progress("expected accuracy")
     points = problem.curve(chosen)
@@ -212,12 +211,12 @@ def plan(
         candidates,
         points,
         problem.needed(chosen, points),
-        remaining_errors(knowledge.informed(candidates.q[chosen]), task),
+        remaining_errors(posterior.informed(candidates.q[chosen]), task),
         way.seconds,
         (
             *repeated,
             *_warnings(way),
-            *arm.too_thick,
+            *arm.unseparated_links,
             *problem.unexcited_joints,
             *problem.view_warnings(chosen),
         ),
@@ -228,14 +227,14 @@ def plan(
 
 @dataclass(frozen=True, eq=False)
 class _Problem:
-    """The planning problem: robot, cell, candidates, task and prior knowledge.
+    """The planning problem: robot, cell, candidates, task and prior posterior.
 
     Attributes:
         subject: the robot or the model.
         settings: settings of the plan.
         arm: the robot in its cell.
         candidates: poses to choose from.
-        knowledge: knowledge of the unknowns before the first pose is measured.
+        posterior: distribution of the unknowns before the first pose is measured.
         task: joint values [rad or m] where the robot has to be accurate.
     """
 
@@ -243,7 +242,7 @@ class _Problem:
     settings: PlanSettings
     arm: ArmInCell
     candidates: Candidates
-    knowledge: Knowledge
+    posterior: RobotPosterior
     task: Float64[Tensor, "tasks dof"]
 
     @cached_property
@@ -253,13 +252,13 @@ class _Problem:
 
     @cached_property
     def measured(self) -> Float64[Tensor, "candidates values directions"]:
-        """Sensitivities of the candidates' measurements; see `Knowledge.measured`."""
-        return self.knowledge.measured(self.candidates.q)
+        """Sensitivities of the candidates' measurements; see `RobotPosterior.measured`."""
+        return self.posterior.measured(self.candidates.q)
 
     @cached_property
     def tool(self) -> Float64[Tensor, "tasks 3 directions"]:
-        """Uncertainty of the tool's position over the task; see `Knowledge.tool`."""
-        return self.knowledge.tool(self.task)
+        """Uncertainty of the tool's position over the task; see `RobotPosterior.tool`."""
+        return self.posterior.tool(self.task)
 
     @property
     def has_measurements(self) -> bool:
@@ -276,7 +275,7 @@ class _Problem:
         free, motions = torch.arange(len(q)), Motions(self.arm, self.candidates.workspace)
         for _ in range(MAX_ROUNDS):
             progress(f"{count} of {len(free):,} candidates")
-            chosen = free[choose(self.measured[free], self.tool, count, self.settings.criterion)]
+            chosen = free[select_poses(self.measured[free], self.tool, count, self.settings.criterion)]
             others = free[~torch.isin(free, chosen)]
             check = others[spread(self.arm, q[others], self.settings.check, q[chosen])]
             use = order_of_use(count, len(check))
@@ -320,7 +319,7 @@ class _Problem:
         """Return what limits a calibration with the chosen images; None without a camera."""
         if self.views is None:
             return None
-        return CameraProspects.of(self.knowledge, self.candidates, chosen, self.task, self.views, self.arm)
+        return CameraProspects.of(self.posterior, self.candidates, chosen, self.task, self.views, self.arm)
 
     @property
     def unexcited_joints(self) -> tuple[str, ...]:
@@ -353,7 +352,7 @@ class _Problem:
         return tuple(view_warnings(self.views.obliqueness(self.arm, q), q, self.arm.robot))
 
     def _curve(self, chosen: Int64[Tensor, " chosen"], counts: list[int]) -> tuple[ExpectedAccuracy, ...]:
-        return curve(self.measured, self.tool, chosen, counts, self.settings.seed)
+        return accuracy_curve(self.measured, self.tool, chosen, counts, self.settings.seed)
 
 
 def _check_measured(model: CalibratedModel | None, settings: PlanSettings, robot: Robot) -> tuple[str, ...]:

@@ -17,15 +17,15 @@ from pisigma.files.errors import IdentificationError, ModelError
 from pisigma.files.model_files import model_hash
 from pisigma.files.progress import Progress, stage
 from pisigma.lifetime.recalibration.adaptation import Adaptation, adapt
-from pisigma.lifetime.recalibration.candidates import FAR_BETTER, Gate, gate
-from pisigma.lifetime.recalibration.elsewhere import owners_elsewhere
+from pisigma.lifetime.recalibration.candidates import FAR_BETTER, CandidateChoice, choose_candidate
 from pisigma.lifetime.recalibration.movement import Movement, movements_text, significant_movements
 from pisigma.lifetime.recalibration.recalibrated_model import (
     KIND,
     recalibrated_model,
     recalibration_diagnostics,
 )
-from pisigma.lifetime.recalibration.recalibration_problem import Owner, owners_in, recalibration_problem
+from pisigma.lifetime.recalibration.recalibration_problem import FrameKey, frame_keys, recalibration_problem
+from pisigma.lifetime.recalibration.relocated_frames import relocated_frames
 from pisigma.lifetime.recalibration.summary import (
     LeftOutFigures,
     RecalibrationSummary,
@@ -56,7 +56,7 @@ from pisigma.workflow.result import AbstractModelResult
 from pisigma.workflow.settings.recalibration import RecalibrationSettings
 
 if TYPE_CHECKING:
-    from pisigma.lifetime.fleet.prior import Likeness
+    from pisigma.lifetime.fleet.prior import FleetConsistency
 
 MIN_ROWS = 5
 """Number of held-out rows below which a warning is given."""
@@ -81,7 +81,7 @@ class Recalibration(AbstractModelResult):
     model: CalibratedModel
     parent: CalibratedModel
     adaptation: Adaptation
-    gate: Gate
+    gate: CandidateChoice
     moved: tuple[Movement, ...]
     summary: RecalibrationSummary
     seconds: float
@@ -149,12 +149,14 @@ def recalibrate(
     every = rows
     rows, adaptation, outliers = _adapted(parent, posterior, rows, elsewhere, right.numbers)
     calibrator = HybridCalibrator(drawn)
-    judged = gate(parent, adaptation, elsewhere, rows, calibrator, stage(progress, "cross-validation"))
-    likeness = _likeness(parent, rows)
-    odd = likeness is not None and likeness.odd
+    judged = choose_candidate(
+        parent, adaptation, elsewhere, rows, calibrator, stage(progress, "cross-validation")
+    )
+    consistency = _fleet_consistency(parent, rows)
+    odd = consistency is not None and consistency.odd
     from_scratch = stage(progress, "from scratch")
     judged, kept = _kept(judged, odd, parent, adaptation, rows, calibrator, from_scratch)
-    moved = significant_movements(adaptation) if likeness is None and _believable(judged, drawn) else None
+    moved = significant_movements(adaptation) if consistency is None and _believable(judged, drawn) else None
     wrong = [one.row for one in outliers]
     diagnostics = verdict.implausible or recalibration_diagnostics(parent, judged, every, wrong, moved or ())
     moved = None if diagnostics else moved
@@ -168,8 +170,8 @@ def recalibrate(
     )
     if diagnostics:
         summary = summary.having(changed=NOT_TRUSTED)
-    if likeness is not None:
-        summary = summary.having(changed=likeness.sentence)
+    if consistency is not None:
+        summary = summary.having(changed=consistency.sentence)
     kept = with_wide_limits(replace(kept, metrics=summary.to_json()), rows)
     return Recalibration(
         kept, parent, adaptation, judged, moved or (), summary, seconds=time.perf_counter() - started
@@ -180,7 +182,7 @@ def _adapted(
     parent: CalibratedModel,
     posterior: ModelPosterior,
     rows: Measurements,
-    elsewhere: frozenset[Owner],
+    elsewhere: frozenset[FrameKey],
     far: Sequence[int],
 ) -> tuple[Measurements, Adaptation, tuple[WrongRowFigures, ...]]:
     """Return the rows without wrong ones, the model adapted to them, and the wrong rows including `far`."""
@@ -195,14 +197,14 @@ def _adapted(
 
 
 def _kept(
-    judged: Gate,
+    judged: CandidateChoice,
     odd: bool,
     parent: CalibratedModel,
     adaptation: Adaptation,
     rows: Measurements,
     calibrator: HybridCalibrator,
     progress: Progress,
-) -> tuple[Gate, CalibratedModel]:
+) -> tuple[CandidateChoice, CalibratedModel]:
     """Return the candidate that is kept, and its model.
 
     A robot unlike its fleet keeps the calibration from scratch, if its rows are enough for one.
@@ -217,7 +219,7 @@ def _kept(
 
 
 def _kept_model(
-    judged: Gate,
+    judged: CandidateChoice,
     parent: CalibratedModel,
     adaptation: Adaptation,
     rows: Measurements,
@@ -252,7 +254,7 @@ def _outliers(
     return tuple(outliers)
 
 
-def _believable(judged: Gate, robot: Robot) -> bool:
+def _believable(judged: CandidateChoice, robot: Robot) -> bool:
     """Whether the recalibrated model predicts held-out rows well enough for its changes of the arm to be credible."""
     error, kept = judged.rms["recalibrated"], judged.rms[judged.kept]
     if error is None or kept is None:
@@ -264,7 +266,7 @@ def _summary(
     parent: CalibratedModel,
     rows: Measurements,
     adaptation: Adaptation,
-    judged: Gate,
+    judged: CandidateChoice,
     moved: tuple[Movement, ...] | None,
 ) -> RecalibrationSummary:
     """Return all figures; `moved` is None where it is unknown."""
@@ -289,30 +291,30 @@ def _summary(
     )
 
 
-def _likeness(model: CalibratedModel, rows: Measurements) -> "Likeness | None":
+def _fleet_consistency(model: CalibratedModel, rows: Measurements) -> "FleetConsistency | None":
     """Return how similar the robot of the rows is to its fleet; None where the model is not the prior of a fleet."""
     if model.kind != FLEET_PRIOR:
         return None
-    from pisigma.lifetime.fleet.prior import Likeness  # imports statistics, which takes half a second
+    from pisigma.lifetime.fleet.prior import FleetConsistency  # imports statistics, which takes half a second
 
-    return Likeness.of(model, rows)
+    return FleetConsistency.of(model, rows)
 
 
 def _elsewhere(
     model: CalibratedModel, posterior: ModelPosterior, rows: Measurements, settings: RecalibrationSettings
-) -> frozenset[Owner]:
+) -> frozenset[FrameKey]:
     """Return the bases and tools that have moved: those that are stated to, or else those that the evidence shows.
 
     With the prior of a fleet, all of them: every robot has its own base and tool.
     """
     if model.kind == FLEET_PRIOR:
-        return owners_in(rows, ("base", "tool"))
+        return frame_keys(rows, ("base", "tool"))
     if settings.moved is None:
-        return owners_elsewhere(model, posterior, rows, posterior.noise)
-    return owners_in(rows, settings.moved)
+        return relocated_frames(model, posterior, rows, posterior.noise)
+    return frame_keys(rows, settings.moved)
 
 
-def _warnings(model: CalibratedModel, judged: Gate, rows: Measurements) -> tuple[str, ...]:
+def _warnings(model: CalibratedModel, judged: CandidateChoice, rows: Measurements) -> tuple[str, ...]:
     """Return warnings, one sentence each."""
     warnings = [*row_warnings(model.robot, rows), *condition_warnings(model, rows)]
     if judged.rows < MIN_ROWS:

@@ -73,7 +73,7 @@ def sees_board(arm: ArmInCell, settings: CameraSettings, q: np.ndarray, radius: 
     sight = (T_camera[:3, 3] + shares * (in_cell - T_camera[:3, 3])).reshape(-1, 3)
     free = all(
         _distance(sight, *segments[piece]) > radius[piece] + arm.cell.clearance - 1e-3
-        for piece in arm.beside.tolist()
+        for piece in arm.beam_blockers.tolist()
     )
     return bool(inside and sharp and angle <= OBLIQUE and free)
 

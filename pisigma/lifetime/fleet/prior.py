@@ -19,13 +19,13 @@ from pisigma.files.errors import FleetError
 from pisigma.joint_correction.feature import AbstractFeature
 from pisigma.joint_correction.joint_correction import JointCorrection
 from pisigma.lifetime.recalibration.adaptation import adapt
-from pisigma.lifetime.recalibration.recalibration_problem import ELSEWHERE, owners_in, recalibration_problem
+from pisigma.lifetime.recalibration.recalibration_problem import ELSEWHERE, frame_keys, recalibration_problem
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel, Provenance
 from pisigma.model.geometric_model import branches_of
 from pisigma.model.model_posterior import FLEET_PRIOR, ModelPosterior
 from pisigma.model.stored_starts import spread_rows
-from pisigma.planning.knowledge import Instrument, Knowledge
+from pisigma.planning.robot_posterior import Instrument, RobotPosterior
 from pisigma.robot.description import Robot
 
 LINEARISATIONS = 2
@@ -82,24 +82,24 @@ def fleet_prior(name: str, robot: Robot, fleet: Sequence[Measurements]) -> Fleet
             f"{FEWEST_ROBOTS} robots or more of one type were wanted to estimate what they have in common, got "
             f"{len(fleet)}."
         )
-    knowledge = Knowledge.of_robot(robot)
-    space = knowledge.uncertainty.space
+    posterior = RobotPosterior.of_robot(robot)
+    space = posterior.uncertainty.space
     first = population = class_population(robot)
     usual = first.covariance.diagonal()
     noise: Mapping[str, float] = {"position": Instrument().sigma}
     odd: tuple[int, ...] = ()
     for _ in range(LINEARISATIONS):
-        model = mean_robot(name, knowledge, population, fleet, noise)
+        model = mean_robot(name, posterior, population, fleet, noise)
         evidence = [evidence_of(model, population.mean, rows) for rows in fleet]
         population, odd = without_odd(evidence, first, usual)
         noise = _medians([one.noise for one in evidence])
-    model = mean_robot(name, knowledge, population.of_another(len(fleet) - len(odd)), fleet, noise)
+    model = mean_robot(name, posterior, population.of_another(len(fleet) - len(odd)), fleet, noise)
     return FleetPrior(model, population, space.names[: space.arm_size], odd)
 
 
 def class_population(robot: Robot) -> Population:
     """Give the robots of the class of a robot, see `pisigma.robot.robot_class`."""
-    uncertainty = Knowledge.of_robot(robot).uncertainty
+    uncertainty = RobotPosterior.of_robot(robot).uncertainty
     usual = of_arm(uncertainty.root, uncertainty.space).square().sum(1)
     return Population(torch.zeros_like(usual), usual.diag(), uncertainty.space.arm_size)
 
@@ -113,7 +113,7 @@ def of_arm(
 
 def mean_robot(
     name: str,
-    knowledge: Knowledge,
+    posterior: RobotPosterior,
     population: Population,
     fleet: Sequence[Measurements],
     noise: Mapping[str, float],
@@ -122,12 +122,12 @@ def mean_robot(
 
     Args:
         name: of the model.
-        knowledge: of the robot as drawn, with the unknowns of the population.
+        posterior: of the robot as drawn, with the unknowns of the population.
         population: errors of the robots.
         fleet: rows of robots, which say where they were measured.
         noise: per sensor, see `Adaptation.noise`.
     """
-    usual, size = knowledge.uncertainty, population.geometric
+    usual, size = posterior.uncertainty, population.geometric
     space, drawn = usual.space, usual.space.robot
     dh = drawn.dh + population.mean[:size].numpy().reshape(drawn.dh.shape)
     mean = drawn.with_geometry(dh=dh)
@@ -189,7 +189,7 @@ def evidence_of(
     """Say what the rows of a robot say, linearised at its most probable errors; the mean is that of the model."""
     posterior = ModelPosterior.of(model)
     rows = posterior.renamed(rows)
-    problem = recalibration_problem(model, posterior, rows, owners_in(rows, ("base", "tool")))
+    problem = recalibration_problem(model, posterior, rows, frame_keys(rows, ("base", "tool")))
     problem = replace(problem, groups=tuple(group for group in problem.groups if group.stands))
     adaptation = adapt(problem, posterior.noise)
     values, space = adaptation.values, problem.design.problem.space
@@ -214,7 +214,7 @@ def _medians(noises: Sequence[Mapping[str, float]]) -> dict[str, float]:
 
 
 @dataclass(frozen=True)
-class Likeness:
+class FleetConsistency:
     """How like the other robots of a fleet one is.
 
     Attributes:
@@ -226,7 +226,7 @@ class Likeness:
     gain: float
 
     @staticmethod
-    def of(model: CalibratedModel, rows: Measurements) -> "Likeness":
+    def of(model: CalibratedModel, rows: Measurements) -> "FleetConsistency":
         """See how far the robot of some rows is from the mean of a fleet prior.
 
         Args:
@@ -245,7 +245,7 @@ class Likeness:
         fleet = Population(mean, root @ root.t(), posterior.space.arm_size)
         square, count = fleet.surprise(evidence)
         gain = fleet.log_evidence(evidence) - class_population(drawn).log_evidence(evidence)
-        return Likeness(float(chi2.sf(square, count)), gain)
+        return FleetConsistency(float(chi2.sf(square, count)), gain)
 
     @property
     def odd(self) -> bool:

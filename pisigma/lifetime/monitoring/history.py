@@ -79,7 +79,7 @@ def history_path(model: str | os.PathLike[str]) -> Path:
     return folder.with_name(folder.name + SUFFIX)
 
 
-def remember(path: Path, model: str, records: Sequence[Record]) -> tuple[Record, ...]:
+def store_sessions(path: Path, model: str, records: Sequence[Record]) -> tuple[Record, ...]:
     """Add sessions to a history and give all of it.
 
     All are added in one transaction, or none where the process ends before. A session with the same rows takes the
@@ -112,7 +112,7 @@ def remember(path: Path, model: str, records: Sequence[Record]) -> tuple[Record,
         return _records(database, model)
 
 
-def recall(path: Path, model: str) -> tuple[Record, ...]:
+def read_sessions(path: Path, model: str) -> tuple[Record, ...]:
     """Give all sessions of a model in a history, which may not be there yet, by their dates.
 
     Raises:
@@ -190,7 +190,7 @@ def new_rows(
         model: the model.
         rows: of a session.
         date: of it.
-        earlier: sessions of the history; one with exactly these rows is replaced, see `remember`.
+        earlier: sessions of the history; one with exactly these rows is replaced, see `store_sessions`.
         judged: sessions of this call.
     """
     sha256 = rows_hash(rows)

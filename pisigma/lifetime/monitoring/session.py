@@ -17,14 +17,14 @@ from pisigma.estimation.posterior_update import PosteriorUpdate
 from pisigma.estimation.wrong_rows import Explained, with_wrong_rows
 from pisigma.files.errors import IdentificationError
 from pisigma.lifetime.recalibration.adaptation import AdaptedArm, linear_values, noise_of_sensors
-from pisigma.lifetime.recalibration.elsewhere import FAR
 from pisigma.lifetime.recalibration.movement import HistoryMovement, Movement, movements_of_group
 from pisigma.lifetime.recalibration.recalibration_problem import (
-    Owner,
+    FrameKey,
     RecalibrationProblem,
     hypotheses,
     recalibration_problem,
 )
+from pisigma.lifetime.recalibration.relocated_frames import FAR
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.groups import held_out_groups
 from pisigma.model.calibrated_model import CalibratedModel
@@ -148,7 +148,7 @@ def judge_session(
     model: CalibratedModel,
     posterior: ModelPosterior,
     rows: Measurements,
-    stated: Set[Owner] | None = None,
+    stated: Set[FrameKey] | None = None,
 ) -> tuple[Session, JointZeros]:
     """Compare everything that can have moved since a model was made.
 
@@ -171,12 +171,12 @@ def judge_session(
 
 def _elsewhere(
     model: CalibratedModel, posterior: ModelPosterior, rows: Measurements, still: "_Solved"
-) -> tuple["_Solved", dict[Owner, float]]:
+) -> tuple["_Solved", dict[FrameKey, float]]:
     """Find which bases and tools stand elsewhere: the base, the tool, or both where neither explains the rows."""
     geometry = posterior.geometry
     bases = frozenset(("base", name) for name in rows.frame if name in geometry.bases)
     tools = frozenset(("tool", name) for name in rows.target if name in geometry.tools)
-    tried: dict[frozenset[Owner], _Solved] = {frozenset(): still}
+    tried: dict[frozenset[FrameKey], _Solved] = {frozenset(): still}
     for owners in (bases, tools, bases | tools):
         if not owners or (owners == bases | tools and any(one.fits for one in tried.values())):
             continue
@@ -238,7 +238,7 @@ class _Solved:
 
 
 def _solve(
-    model: CalibratedModel, posterior: ModelPosterior, rows: Measurements, elsewhere: Set[Owner]
+    model: CalibratedModel, posterior: ModelPosterior, rows: Measurements, elsewhere: Set[FrameKey]
 ) -> _Solved:
     """Linearise, explain, and go on from there until the linearisation holds."""
     problem = recalibration_problem(model, posterior, rows, elsewhere)
@@ -285,7 +285,7 @@ def _freed(motion: Motion) -> DriftGroup:
     return replace(motion.group, size=max(motion.size, ANYWHERE))
 
 
-def _judged(solved: _Solved, elsewhere: dict[Owner, float]) -> Session:
+def _judged(solved: _Solved, elsewhere: dict[FrameKey, float]) -> Session:
     """Work out what there is to say."""
     every, wrong = solved.problem.setup.measurements, solved.problem.wrong_rows(solved.values)
     rows = every.select((~wrong).nonzero()[:, 0])
@@ -319,7 +319,7 @@ def _judged(solved: _Solved, elsewhere: dict[Owner, float]) -> Session:
     )
 
 
-def _moved(solved: _Solved, elsewhere: dict[Owner, float]) -> tuple[Movement, ...]:
+def _moved(solved: _Solved, elsewhere: dict[FrameKey, float]) -> tuple[Movement, ...]:
     """How far everything that moved has, all estimated together; the arm first."""
     problem, explanation = solved.problem, solved.explanation
     found = [(_freed(one), one.probability) for one in explanation.motions]

@@ -13,7 +13,7 @@ from torch import Tensor
 from pisigma.files.errors import IdentificationError
 from pisigma.files.progress import Progress
 from pisigma.lifetime.recalibration.adaptation import Adaptation, adapt
-from pisigma.lifetime.recalibration.recalibration_problem import Owner, recalibration_problem
+from pisigma.lifetime.recalibration.recalibration_problem import FrameKey, recalibration_problem
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.groups import groups_to_keep_whole
 from pisigma.measurement.splits import k_folds
@@ -43,7 +43,7 @@ STRAY = 5.0
 
 
 @dataclass(frozen=True)
-class Gate:
+class CandidateChoice:
     """Errors of left-out rows under every candidate, and the one that is kept.
 
     Attributes:
@@ -59,7 +59,7 @@ class Gate:
     names: Mapping[Kept, str] = field(default_factory=lambda: NAMES)
 
     @property
-    def with_least_error(self) -> "Gate":
+    def with_least_error(self) -> "CandidateChoice":
         """The same where the candidate with the least error is kept, by however little."""
         sizes = {name: size for name, size in self.rms.items() if size is not None}
         return replace(self, kept=min(sizes, key=lambda name: sizes[name])) if sizes else self
@@ -83,14 +83,14 @@ class Gate:
         )
 
 
-def gate(
+def choose_candidate(
     model: CalibratedModel,
     whole: Adaptation,
-    elsewhere: Set[Owner],
+    elsewhere: Set[FrameKey],
     rows: Measurements,
     calibrator: Calibrator,
     progress: Progress,
-) -> Gate:
+) -> CandidateChoice:
     """Leave out one fold of the rows after the other and predict it by every candidate.
 
     Args:
@@ -123,7 +123,7 @@ def gate(
     return replace(_decided(errors), names=OF_FLEET if model.kind == FLEET_PRIOR else NAMES)
 
 
-def _decided(errors: Mapping[Kept, Float64[Tensor, " rows"]]) -> Gate:
+def _decided(errors: Mapping[Kept, Float64[Tensor, " rows"]]) -> CandidateChoice:
     """The candidate that is kept."""
     smallest = torch.stack(list(errors.values())).amin(0)
     judged = torch.isfinite(smallest)
@@ -138,7 +138,7 @@ def _decided(errors: Mapping[Kept, Float64[Tensor, " rows"]]) -> Gate:
         for name, size in rms.items()
         if size is not None and _clearly_better(errors[name][counted], first)
     ]
-    return Gate(min(better)[1] if better else "recalibrated", rms, int(counted.sum()))
+    return CandidateChoice(min(better)[1] if better else "recalibrated", rms, int(counted.sum()))
 
 
 def _clearly_better(errors: Float64[Tensor, " rows"], than: Float64[Tensor, " rows"]) -> bool:

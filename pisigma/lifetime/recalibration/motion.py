@@ -8,7 +8,7 @@ import torch
 
 from pisigma.files.errors import IdentificationError, ModelError
 from pisigma.lifetime.monitoring.session import Session, is_frame, judge_session, shown_probability
-from pisigma.lifetime.recalibration.recalibration_problem import owners_in
+from pisigma.lifetime.recalibration.recalibration_problem import frame_keys
 from pisigma.lifetime.recalibration.wear import beyond_wear
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel
@@ -47,7 +47,7 @@ def judged_motion(
             some = replace(some.select(spread(measured_rows(rows), MOST_ROWS)), pair=None, distance=None)
         some = posterior.renamed(some)
         with torch.no_grad():
-            session, _ = judge_session(model, posterior, some, owners_in(some, fitted) if fitted else None)
+            session, _ = judge_session(model, posterior, some, frame_keys(some, fitted) if fitted else None)
         moved = tuple(one for one in session.moved if one.what.split()[0] not in fitted)
         if not session_diagnostics(model, some, session):
             return replace(session, moved=moved)

@@ -14,7 +14,7 @@ from torch import Tensor
 from pisigma.calibration.geometric.problem.setup import IdentifiedGeometry
 from pisigma.estimation.drift import DriftGroup
 from pisigma.lifetime.recalibration.adaptation import Adaptation
-from pisigma.lifetime.recalibration.recalibration_problem import RecalibrationProblem, frame_stretch
+from pisigma.lifetime.recalibration.recalibration_problem import RecalibrationProblem, frame_slice
 from pisigma.measurement.sensors.sensor import SHOWN_UNITS, ShownUnit
 from pisigma.robot.se3 import rotation_vector, transform_from_xyzrpy
 
@@ -158,7 +158,7 @@ def _of_frame(
     name = name or next(iter(after))
     if name not in before:
         return []
-    column = group.index - frame_stretch(space, kind, name).start
+    column = group.index - frame_slice(space, kind, name).start
     motion, covariance = torch.zeros(6).double(), torch.zeros(6, 6).double()
     motion[column], covariance[column[:, None], column] = shift, of_members
     if group.stands:  # relocated: `shift` counts from the initial guess, not from the frame of the model

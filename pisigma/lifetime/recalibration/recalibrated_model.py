@@ -12,7 +12,7 @@ from pisigma.calibration.hybrid.arm import HybridArm
 from pisigma.calibration.hybrid.uncertainty import PositionUncertainty
 from pisigma.estimation.covariance_root import CovarianceRoot
 from pisigma.lifetime.recalibration.adaptation import Adaptation
-from pisigma.lifetime.recalibration.candidates import Gate
+from pisigma.lifetime.recalibration.candidates import CandidateChoice
 from pisigma.lifetime.recalibration.movement import Movement
 from pisigma.lifetime.recalibration.wear import beyond_wear
 from pisigma.measurement.dataset import Measurements
@@ -119,7 +119,7 @@ def _transforms(frames: Mapping[str, np.ndarray]) -> dict[str, torch.Tensor]:
 
 def recalibration_diagnostics(
     parent: CalibratedModel,
-    judged: Gate,
+    judged: CandidateChoice,
     rows: Measurements,
     wrong: Sequence[int],
     moved: Sequence[Movement],
@@ -144,7 +144,7 @@ def recalibration_diagnostics(
     return (*_left_out(parent, judged, rows), *beyond_wear(parent.robot, moved))
 
 
-def _left_out(parent: CalibratedModel, judged: Gate, rows: Measurements) -> tuple[Diagnostic, ...]:
+def _left_out(parent: CalibratedModel, judged: CandidateChoice, rows: Measurements) -> tuple[Diagnostic, ...]:
     """Left-out rows that no candidate predicts."""
     error, limit = judged.rms[judged.kept], PLAUSIBLE_SHARE * parent.robot.reach
     if error is None:

@@ -30,7 +30,7 @@ from pisigma.measurement.sensors.sensor import ParameterUnit, UnknownGroup
 from pisigma.model.calibrated_model import CalibratedModel, Frames
 from pisigma.model.model_posterior import ModelPosterior
 
-Owner = tuple[str, str]
+FrameKey = tuple[str, str]
 """What can stand elsewhere: ("base", frame) or ("tool", target)."""
 ELSEWHERE: dict[ParameterUnit, float] = {"m": 0.1, "rad": 0.1, "px": 100.0, "1": 1.0}
 """Standard deviation of a base, a tool or a sensor's unknown that stands anywhere, about its guess, by its unit."""
@@ -42,7 +42,7 @@ WORTH = math.log(100)
 """[nats] Prior odds of 1 to 100 that a thing moved since the calibration, against that nothing did."""
 
 
-def owners_in(rows: Measurements, kinds: Collection[str]) -> frozenset[Owner]:
+def frame_keys(rows: Measurements, kinds: Collection[str]) -> frozenset[FrameKey]:
     """List the owners among rows: their frames for the kind "base", and their targets for the kind "tool"."""
     names = {"base": rows.frame, "tool": rows.target}
     return frozenset((kind, name) for kind in kinds for name in names[kind])
@@ -89,7 +89,7 @@ class RecalibrationProblem:
 
 
 def recalibration_problem(
-    model: CalibratedModel, posterior: ModelPosterior, rows: Measurements, elsewhere: Set[Owner]
+    model: CalibratedModel, posterior: ModelPosterior, rows: Measurements, elsewhere: Set[FrameKey]
 ) -> RecalibrationProblem:
     """State the problem.
 
@@ -121,7 +121,7 @@ def recalibration_problem(
     parameters = len(posterior.space.parameters)
     root[posterior.positions_in(space)] = posterior.root[:parameters]
     for group, name in new & known:
-        root[frame_stretch(space, group, name)] = 0.0
+        root[frame_slice(space, group, name)] = 0.0
     root[: len(start)] = torch.linalg.pinv(change) @ root[: len(start)]
     root[len(start) :] = posterior.root[parameters:]
     mean = torch.cat([torch.zeros_like(start), posterior.weights])
@@ -155,7 +155,7 @@ def _guess(
     posterior: ModelPosterior,
     space: ParameterSpace,
     rows: Measurements,
-    new: Set[Owner],
+    new: Set[FrameKey],
 ) -> InitialGuess:
     """Where everything but the arm is: as in the model, and guessed where it does not say that."""
     geometry = posterior.geometry
@@ -203,12 +203,12 @@ def _guess(
     )
 
 
-def _new_frames(kind: str, names: Sequence[str], frames: np.ndarray, new: Set[Owner]) -> Frames:
+def _new_frames(kind: str, names: Sequence[str], frames: np.ndarray, new: Set[FrameKey]) -> Frames:
     """Guessed bases or tools of those that stand elsewhere."""
     return {name: frame for name, frame in zip(names, frames, strict=True) if (kind, name) in new}
 
 
-def frame_stretch(space: ParameterSpace, group: str, name: str) -> slice:
+def frame_slice(space: ParameterSpace, group: str, name: str) -> slice:
     """Say where the parameters of a base or a tool stand."""
     number = (space.frames if group == "base" else space.targets).index(name)
     first = space.of(group).start + 6 * number
@@ -220,7 +220,7 @@ def _groups(
     space: ParameterSpace,
     rows: Measurements,
     root: Float64[Tensor, "unknowns directions"],
-    new: Set[Owner],
+    new: Set[FrameKey],
     free_unknowns: Collection[int],
 ) -> tuple[DriftGroup, ...]:
     """What may have drifted: the arm, bases and tools, and the correction; and what stands elsewhere."""
@@ -233,7 +233,7 @@ def _groups(
     ):
         for name in names:
             what = f"{kind} {name}" if len(names) > 1 else kind
-            stretch = frame_stretch(space, kind, name)
+            stretch = frame_slice(space, kind, name)
             index = torch.arange(stretch.start, stretch.stop)
             if (kind, name) in new:
                 groups.append(_elsewhere(space, what, index))

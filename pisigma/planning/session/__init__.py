@@ -1,1 +1,1 @@
-"""Measuring with a plan: rows judged as they come, what they reach so far, and when more would not help."""
+"""Measuring session: rows judged as they arrive, the accuracy reached so far, and when to stop."""

@@ -1,4 +1,4 @@
-"""Corners that a growing file gets image by image, as measurements."""
+"""Corners in a growing file, read image by image as measurements."""
 
 import os
 from dataclasses import replace
@@ -17,29 +17,29 @@ from pisigma.robot.description import Robot
 
 
 def growing_file(path: str | os.PathLike[str], robot: Robot, settings: PlanSettings) -> GrowingFile:
-    """Give the file that gets the rows of a plan, or the corners of images where a camera measures."""
+    """Open the growing file of a plan's rows, or of corners in images where a camera measures."""
     camera = settings.camera
     return GrowingFile(path, robot, None if camera is None else ImageReader(camera.files, robot))
 
 
 class ImageReader:
-    """Reads every image of a file of corners on its own, so that a faulty one harms no other.
+    """Reads every image of a file of corners separately, so that a faulty image does not affect others.
 
-    An image is complete where rows of another one follow it, or where nothing comes any more.
+    An image is complete once rows of another one follow, or at the end of the session.
     """
 
     def __init__(self, files: CameraFiles, robot: Robot) -> None:
-        """Read corners of a camera.
+        """Set up the reader.
 
         Args:
-            files: of the camera and its board.
-            robot: that is measured.
+            files: files of the camera and its board.
+            robot: robot that is measured.
         """
         self._files, self._robot = files, robot
         self._read: dict[str, Measurements | LeftOut] = {}
 
     def __call__(self, table: Table, final: bool) -> MeasuredFields:
-        """Solve the images that are complete; those that cannot be used are left out."""
+        """Return the poses of the complete images; images that cannot be used are left out."""
         images = list(_images(table))
         read = [self._once(image) for image in (images if final else images[:-1])]
         left_out = tuple(one for one in read if isinstance(one, LeftOut))
@@ -60,7 +60,7 @@ class ImageReader:
 
 
 def _images(table: Table) -> list[Table]:
-    """The rows of every image; a row without an image is one of its own."""
+    """Split a table by image; a row without an image forms its own."""
     column = table.header.index("image") if "image" in table.header else len(table.header)
     groups: dict[str, list[int]] = {}
     for row, fields in enumerate(table.records):

@@ -1,4 +1,4 @@
-"""What is wrong with a row, in a sentence: what was expected, what came, and what to do."""
+"""Alarms on single rows: what was expected, what was measured, and what to do."""
 
 from collections.abc import Iterator, Sequence
 
@@ -14,35 +14,35 @@ from pisigma.planning.session.state import Alarm
 from pisigma.robot.description import Robot
 
 SAME_READING = 2e-6
-"""[m] Readings of two poses never agree so well, not even with a robot that stands still."""
+"""[m] Difference below which readings are the same; noise makes independent readings differ by more."""
 SAME_VALUE = 1e-9
-"""[SI] Numbers that were written twice differ by no more."""
+"""[SI] Difference below which numbers are the same, up to rounding in the file."""
 SAME_POSE, NEAR_POSE = 0.1, 3.0
-"""[deg or mm] Joint values so near to those of a pose are that pose, or are meant to be."""
-SWAPPED = 0.2
-"""A point is that of another pose where it is nearer to it than this share of its error."""
-CONTRADICTION = 6
-"""Up to so many rows, an error may as well be one of the others."""
+"""[deg or mm] Differences of joint values below which a row is at a pose, and is meant to be at it."""
+SWAPPED_SHARE = 0.2
+"""A point belongs to another pose where its distance to it is below this share of its error."""
+AMBIGUOUS_ROWS = 6
+"""Number of rows up to which another row may be the wrong one."""
 
 
 def unreadable(row: LeftOut) -> Alarm:
-    """Complain of a row that cannot be read."""
+    """Return the alarm on a row that cannot be read."""
     return Alarm(row.line, "unreadable", f"line {row.line}, {row.reason}.", repeat=True)
 
 
 def of_all_rows(sentence: str) -> Alarm:
-    """Complain of what is wrong with all rows alike, which the header of their file may say."""
-    return Alarm(1, "setup", f"line 1: {sentence} Do not go on before it is right.", repeat=False)
+    """Return the alarm on a fault of all rows, for example in the header of the file."""
+    return Alarm(1, "setup", f"line 1: {sentence} Correct this before measuring on.", repeat=False)
 
 
 def cleared(line: int) -> Alarm:
-    """Take an alarm back."""
-    text = f"line {line}: the rows that came since agree with it, so it counts after all."
+    """Return the message that withdraws an alarm."""
+    text = f"line {line}: later rows agree with it, so the row counts after all."
     return Alarm(line, "cleared", text, repeat=False, counts=True)
 
 
 def stale_readings(rows: Measurements, start: int) -> Iterator[Alarm]:
-    """Find rows from one on whose readings are those of an earlier row: written twice, or from a frozen sensor."""
+    """Find rows from `start` on with the readings of an earlier row: written twice, or from a frozen sensor."""
     fields = rows.as_fields().numbers.values()
     numbers = torch.cat([values.reshape(rows.rows, -1) for values in fields], 1)
     position = torch.full((rows.rows, 3), torch.nan) if rows.position is None else rows.position
@@ -56,13 +56,13 @@ def stale_readings(rows: Measurements, start: int) -> Iterator[Alarm]:
         here, there = rows.line[row], rows.line[earlier]
         if float((rows.q[row] - rows.q[earlier]).abs().max()) < SAME_VALUE:
             text = (
-                f"line {here}: joint values and readings are those of line {there}; the row does not count."
+                f"line {here}: joint values and readings equal those of line {there}; the row does not count."
             )
             yield Alarm(here, "duplicate", text, repeat=False)
         else:
             text = (
-                f"line {here}: the position is exactly that of line {there}, but the joint values are others. The "
-                "sensor shows an old value; check that it measures, and measure the pose again."
+                f"line {here}: the position equals that of line {there} exactly, but the joint values differ. The "
+                "sensor shows an old value; check that it is measuring, and measure the pose again."
             )
             yield Alarm(here, "frozen", text, repeat=True)
 
@@ -74,7 +74,7 @@ def other_joint_values(
     poses: Float64[Tensor, "poses dof"],
     names: Sequence[str],
 ) -> Iterator[Alarm]:
-    """Find rows from one on whose joint values are not those of a planned pose; they count nevertheless."""
+    """Find rows from `start` on whose joint values differ from all planned poses; they count nevertheless."""
     for row in range(start, rows.rows):
         off = joint_differences(robot, rows.q[row : row + 1], poses)[0].abs()
         pose = int(off.amax(1).argmin())
@@ -85,12 +85,12 @@ def other_joint_values(
         name = robot.joints[joint]
         if most <= NEAR_POSE:
             text = (
-                f"joint '{name.name}' is {most:.2f} {name.file_unit} from its value in {names[pose]}; the row counts "
-                "at the joint values that it states."
+                f"joint '{name.name}' differs by {most:.2f} {name.file_unit} from its value in {names[pose]}; the row "
+                "counts at its own joint values."
             )
         else:
             text = _in_other_unit(robot, rows.q[row : row + 1], poses, names) or (
-                "no pose of the plan has its joint values; the row counts as one more pose."
+                "its joint values are not those of a planned pose; the row counts as an additional pose."
             )
         yield Alarm(rows.line[row], "pose", f"line {rows.line[row]}: {text}", repeat=False, counts=True)
 
@@ -98,10 +98,10 @@ def other_joint_values(
 def _in_other_unit(
     robot: Robot, q: Float64[Tensor, "1 dof"], poses: Float64[Tensor, "poses dof"], names: Sequence[str]
 ) -> str:
-    """Name the planned pose that a row is at if its angles are in another unit than stated; "" where none is."""
+    """Find the planned pose that a row is at if its angles are in another unit than stated; "" where there is none."""
     stated = {
-        180 / torch.pi: "radians that are named degrees",
-        torch.pi / 180: "degrees that are named radians",
+        180 / torch.pi: "radians labelled as degrees",
+        torch.pi / 180: "degrees labelled as radians",
     }
     for factor, unit in stated.items():
         other = torch.where(torch.tensor(robot.revolute), factor * q, q)
@@ -118,14 +118,14 @@ def contradicted(
     poses: Float64[Tensor, "poses dof"],
     names: Sequence[str],
 ) -> Alarm:
-    """Say how far a row is off what the others say of it, and whether its point is that of another pose.
+    """Return the alarm on a row that the others contradict, with the pose that its point may belong to.
 
     Args:
         rows: all rows.
-        judgement: of them.
-        row: number of the row.
-        poses: joint values of the poses that were planned [rad or m].
-        names: of these.
+        judgement: judgement of the rows.
+        row: index of the row.
+        poses: joint values of the planned poses [rad or m].
+        names: names of these poses.
     """
     assert judgement.model is not None
     assert judgement.errors is not None
@@ -140,14 +140,14 @@ def contradicted(
     what += f" ({usual:.2f} mm is usual here)" if usual == usual else ""
     other = _other_pose(rows, judgement, row, poses, names)
     if other:
-        advice = "Look for points or joint values that were swapped, and measure it again."
+        advice = "Check whether points or joint values were swapped, and measure it again."
         text = f"{what}; it looks like {other}. {advice}"
         return Alarm(line, "swapped", text, repeat=True)
     advice = "Check the reflector, its seat and the line of sight, and measure the pose again."
     if bool(rows.measured("corner")[row]):
-        advice = "Check the image, and that robot and board stood still, and take it again."
-    if rows.rows <= CONTRADICTION:
-        advice = f"It may as well be one of the others, as they are few. {advice}"
+        advice = "Check the image and that robot and board were at rest, and take it again."
+    if rows.rows <= AMBIGUOUS_ROWS:
+        advice = f"With so few rows, another one may be wrong instead. {advice}"
     return Alarm(line, "off", f"{what}. {advice}", repeat=True)
 
 
@@ -158,7 +158,7 @@ def _other_pose(
     poses: Float64[Tensor, "poses dof"],
     names: Sequence[str],
 ) -> str:
-    """Name the pose that was planned, or the row, whose point was measured; "" where it is none."""
+    """Find the planned pose or the row whose point was measured; "" where there is none."""
     assert judgement.model is not None
     assert judgement.errors is not None
     if rows.position is None or not bool(rows.position[row].isfinite().all()):
@@ -169,7 +169,7 @@ def _other_pose(
     T = predicted_poses(geometry.robot, geometry.bases, geometry.tools, at)
     distance = (T[:, :3, 3] - rows.position[row]).norm(dim=1)
     nearest = int(distance.argmin())
-    if not float(distance[nearest]) < SWAPPED * length:
+    if not float(distance[nearest]) < SWAPPED_SHARE * length:
         return ""
     where = names[nearest] if nearest < len(poses) else f"line {rows.line[nearest - len(poses)]}"
     return f"the point of {where} ({float(distance[nearest]) * 1e3:.2f} mm from it)"
@@ -178,13 +178,13 @@ def _other_pose(
 def joint_differences(
     robot: Robot, q: Float64[Tensor, "rows dof"], poses: Float64[Tensor, "poses dof"]
 ) -> Float64[Tensor, "rows poses dof"]:
-    """Joint values of rows minus those of poses, in the units of files [deg or mm]."""
+    """Compute joint values of rows minus those of poses [deg or mm]."""
     scale = torch.where(torch.tensor(robot.revolute), 180 / torch.pi, 1e3).double()
     return (q[:, None] - poses) * scale
 
 
 def is_wrong(judgement: RowJudgement) -> Tensor:
-    """Rows that the others contradict."""
+    """Return which rows the others contradict."""
     if judgement.errors is None:
         return torch.zeros_like(judgement.counts)
     return ~judgement.counts & (judgement.errors.chance < FALSE_ALARMS)

@@ -1,4 +1,4 @@
-"""Which rows count: each is judged by all others, and again when more are there."""
+"""Judgement of rows: each is predicted from all others, and again as more rows arrive."""
 
 import contextlib
 import math
@@ -39,20 +39,21 @@ from pisigma.robot.se3 import (
 )
 
 FALSE_ALARMS = 1e-3
-"""Share of right rows that are expected to be called wrong."""
+"""Expected share of correct rows that are called wrong."""
 FEW_ROWS = 12
-"""Up to so many, all of them are judged anew with every row, and each is tried as the wrong one."""
-CONTRADICTORY = 2.0
-"""Few rows whose errors are larger than those of the robot's class by this factor contradict each other."""
-CLEARER = 8.0
-"""An older row is blamed instead of a newer one where that explains the others better by so much misfit."""
+"""Number of rows up to which all are judged again with every new row, and each is tried as the wrong one."""
+CONTRADICTORY_FACTOR = 2.0
+"""Factor over the errors of the robot's class above which few rows contradict each other."""
+MIN_MISFIT_GAIN = 8.0
+"""Decrease of the misfit above which an older row is called wrong instead of a newer one."""
 REPEATABILITY = {"m": 8e-5, "rad": 1e-4}
-"""What a robot of any class does not do again, beside the noise of the sensor."""
+"""[m, rad] Repeatability of robots of any class, in addition to the noise of the sensor."""
 USUAL_NOISE = {"m": 5e-5, "rad": 2e-4}
-"""Of a sensor of which nothing is stated."""
+"""[m, rad] Noise of a sensor whose noise is not stated."""
 CLASS_VALUES = 20
-"""The class counts like so many measured values when the size of this robot's errors is estimated."""
+"""Weight of the robot's class in the estimate of the size of its errors, as a number of measured values."""
 LINEARISATIONS = 2
+"""Linearisations of base and tool."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,11 +61,11 @@ class LeftOutRows:
     """Rows that are each predicted from the others.
 
     Attributes:
-        chance: probability of an error as surprising or more in a row that is right; NaN where it cannot be judged.
+        chance: probability of an error this improbable or more in a correct row; NaN where it cannot be judged.
         length: size of the error of the measured length [m]; NaN where it cannot be judged.
         angle: size of the error of the measured orientation [rad]; NaN likewise.
-        position: error of the measured position, measured - predicted, in the frame of the row [m]; NaN likewise.
-        scale: by which factor this robot's errors are larger than those of its class; 1 where they are smaller.
+        position: measured - predicted position in the frame of the row [m]; NaN likewise.
+        scale: factor of this robot's errors over those of its class, at least 1.
     """
 
     chance: Float64[Tensor, " rows"]
@@ -76,21 +77,21 @@ class LeftOutRows:
 
 @dataclass(frozen=True, eq=False)
 class RowModel:
-    """Geometry, base, tool, gravity and a series of every joint as normal unknowns of the sizes of the robot's class.
+    """Linear model of rows, with the prior of the robot's class on geometry, gravity and a Fourier series per joint.
 
-    With X the columns of the unknowns with a prior and G those of base, tool and sensors, of which nothing is known
-    before, the values' covariance is `V = X S X^T + noise²` and `P = V^-1 - V^-1 G (G^T V^-1 G)^-1 G^T V^-1`. A row i
-    that is left out has the error `P_ii^-1 (P r)_i` with the covariance `P_ii^-1` (Rasmussen and Williams 2006,
-    sections 2.7 and 5.4.2), and what it adds to `r^T P r` is chi-square distributed.
+    With X the columns of the unknowns with a prior S, and G those of base, tool and sensors, which have none, the
+    covariance of the values is `V = X S X^T + noise²`, and `P = V^-1 - V^-1 G (G^T V^-1 G)^-1 G^T V^-1`. A row i that
+    is left out has the error `P_ii^-1 (P r)_i` with the covariance `P_ii^-1` (Rasmussen and Williams 2006, sections 2.7
+    and 5.4.2), and its contribution to `r^T P r` is chi-square distributed.
 
     Attributes:
-        setup: rows, and where base and tool start.
+        setup: rows, and initial guesses of base and tool.
         design: the unknowns.
-        values: per sensor, linearised at `point`.
-        weights: columns of the weights of gravity and series, linearised near that.
+        values: values of each sensor, linearised at `point`.
+        weights: columns of the weights of gravity and series, linearised nearby.
         point: all parameters.
         sigma: standard deviation of every value [m or rad].
-        kept: the rows that base and tool are fitted to, and others predicted from.
+        kept: rows that base and tool are fitted to, and that others are predicted from.
     """
 
     setup: CalibrationSetup
@@ -103,13 +104,13 @@ class RowModel:
 
     @staticmethod
     def of(robot: Robot, rows: Measurements, sigma: float | None, kept: Bool[Tensor, " rows"]) -> "RowModel":
-        """Linearise at the base and the tool that some of the rows determine.
+        """Linearise at the base and tool that are fitted to some of the rows.
 
         Args:
-            robot: as drawn.
+            robot: nominal robot.
             rows: all rows.
-            sigma: standard deviation of the sensor's lengths [m] where the rows state none; None for a usual one.
-            kept: the rows that base and tool are fitted to.
+            sigma: standard deviation of measured lengths where the rows state none [m]; None for `USUAL_NOISE`.
+            kept: rows that base and tool are fitted to.
 
         Raises:
             IdentificationError: the rows are too few for base and tool.
@@ -139,20 +140,20 @@ class RowModel:
 
     @property
     def geometry(self) -> IdentifiedGeometry:
-        """The robot with base and tool, and sensors, at the point of the linearisation."""
+        """Robot with base, tool and sensor unknowns at the linearisation point."""
         return identified_geometry(self.setup, self.point)
 
     @cached_property
     def misfit(self) -> float:
-        """`r^T P r` of the rows that are kept."""
+        """Misfit `r^T P r` of the kept rows."""
         kept = self.kept[self._row].nonzero()[:, 0]
         return float(self._residual[kept] @ self._projection(kept)[0] @ self._residual[kept])
 
     def left_out(self) -> LeftOutRows:
-        """Predict every row that is kept from the others that are, and all other rows from those that are kept.
+        """Predict every kept row from the other kept ones, and all other rows from the kept ones.
 
-        A robot may err more than its class: the scale is estimated from the rows that are kept, and the squares are
-        compared with Fisher's F distribution.
+        A robot may have larger errors than its class: the scale is estimated from the kept rows, so that squared errors
+        are compared with Fisher's F distribution.
         """
         from scipy.special import fdtrc  # scipy.stats takes a second to import
 
@@ -178,7 +179,7 @@ class RowModel:
     def _leave_out(
         self, rows: Tensor, values: Tensor, P: Tensor, square: Tensor, count: Tensor, errors: Tensor
     ) -> None:
-        """Fill in what some rows, each left out of some values with the projection P, add to the squares."""
+        """Fill in squares, degrees of freedom and errors of rows, each left out of some values with projection P."""
         pull = P @ self._residual[values]
         for row in rows.tolist():
             chosen = (self._row[values] == row).nonzero()[:, 0]
@@ -191,7 +192,7 @@ class RowModel:
                 errors[values[chosen]] = sigma * (axes @ (along / strength))
 
     def _sizes(self, errors: Float64[Tensor, " values"]) -> tuple[Tensor, Tensor, Tensor]:
-        """Errors of lengths and orientations by their sizes, and those of positions along the axes of the frame."""
+        """Return sizes of errors of lengths and orientations, and errors of positions along the axes of the frame."""
         rows = len(self.setup.measurements.q)
         length, angle = torch.full((2, rows), torch.nan, dtype=torch.float64)
         position = torch.full((rows, 3), torch.nan, dtype=torch.float64)
@@ -209,11 +210,11 @@ class RowModel:
         return length, angle, position
 
     def _solution(self) -> Float64[Tensor, " unknowns"]:
-        """The most probable unknowns by the rows that are kept, parameters counted from the start."""
+        """Return the mean of the unknowns given the kept rows, parameters counted from the start."""
         return self._projection(self.kept[self._row].nonzero()[:, 0])[1]
 
     def _projection(self, kept: Int64[Tensor, " chosen"]) -> tuple[Tensor, Tensor, int]:
-        """P of some of the values, the most probable unknowns, and how many of G's unknowns the values determine."""
+        """Return P for some values, the mean of the unknowns, and the number of G's unknowns that are determined."""
         X, r, free = self._columns[kept], self._residual[kept], self._size.isinf()
         Z, G = X[:, ~free] * self._size[~free], X[:, free]
         V = Z @ Z.t()
@@ -229,18 +230,18 @@ class RowModel:
 
     @cached_property
     def _row(self) -> Int64[Tensor, " values"]:
-        """Number of every value's row."""
+        """Row of every value."""
         return torch.cat([one.row.repeat_interleave(one.components) for one in self.values])
 
     @cached_property
     def _residual(self) -> Float64[Tensor, " values"]:
-        """Measured - predicted of the parameters at the start, as far as the linearised values say."""
+        """Measured - predicted at the start parameters, by the linearisation."""
         moved = (self.point - self.setup.start)[self.setup.problem.active]
         return torch.cat([(one.residual + one.geometry @ moved).flatten() for one in self.values])
 
     @cached_property
     def _size(self) -> Float64[Tensor, " unknowns"]:
-        """Standard deviation of the unknowns before anything is measured; infinite where nothing is known."""
+        """Prior standard deviation of the unknowns; infinite where there is no prior."""
         of_class = RobotClass.of(self.setup.problem.space.robot)
         prior = self.design.prior([of_class.usual.of(group) / USUAL_LENGTH for group in PriorGroup])
         sizes = torch.cat(
@@ -250,7 +251,7 @@ class RowModel:
 
 
 def _start_at(setup: CalibrationSetup, geometry: IdentifiedGeometry) -> Float64[Tensor, " parameters"]:
-    """The start with the bases and tools of another fit, where that has them."""
+    """Return the start parameters with the bases and tools of another fit, where it has them."""
     bases, tools = (block.clone() for block in setup.problem.space.split(setup.start)[1:])
     for number, frame in enumerate(setup.problem.space.frames):
         if frame in geometry.bases:
@@ -271,13 +272,13 @@ def _start_at(setup: CalibrationSetup, geometry: IdentifiedGeometry) -> Float64[
 def _noise(
     setup: CalibrationSetup, values: tuple[SensorValues, ...], sigma: float | None
 ) -> Float64[Tensor, " values"]:
-    """Standard deviation of every value, with what the robot does not repeat."""
+    """Return the standard deviation of every value, including the repeatability of the robot."""
     blocks = []
     for sensor, one in zip(setup.problem.sensors, values, strict=True):
         usual = USUAL_NOISE[sensor.unit] if sigma is None or sensor.unit == "rad" else sigma
         noise = 1 / one.root if one.stated else torch.full_like(one.root, usual)
         noise = (noise.square() + REPEATABILITY[sensor.unit] ** 2).sqrt()
-        if isinstance(sensor, CornerSensor):  # whose weights hold the repeatability
+        if isinstance(sensor, CornerSensor):  # its weights include the repeatability
             noise = torch.as_tensor(setup.measurements.readings[NOISE_COLUMN])[one.row]
         blocks.append(noise.repeat_interleave(one.components))
     return torch.cat(blocks)
@@ -285,12 +286,12 @@ def _noise(
 
 @dataclass(frozen=True, eq=False)
 class RowJudgement:
-    """Which rows count.
+    """Judgement of rows.
 
     Attributes:
         counts: rows that others do not contradict.
-        model: of the rows that count; None while they are too few for base and tool.
-        errors: of all rows under it; None likewise.
+        model: model of the rows that count; None while they are too few to fit base and tool.
+        errors: errors of all rows under this model; None likewise.
     """
 
     counts: Bool[Tensor, " rows"]
@@ -299,7 +300,7 @@ class RowJudgement:
 
     @property
     def judged(self) -> Bool[Tensor, " rows"]:
-        """Rows of which the others say anything."""
+        """Rows that can be predicted from the others."""
         none = torch.zeros_like(self.counts)
         return none if self.errors is None else self.errors.chance.isfinite()
 
@@ -307,13 +308,13 @@ class RowJudgement:
 def judge_rows(
     robot: Robot, rows: Measurements, sigma: float | None, trusted: Bool[Tensor, " rows"]
 ) -> RowJudgement:
-    """Judge rows by those that were right so far, and these by each other.
+    """Judge new rows by those that counted so far, and these by each other.
 
     Args:
-        robot: as drawn.
+        robot: nominal robot.
         rows: all rows, the last ones new.
         sigma: see `RowModel.of`.
-        trusted: rows that counted so far; of few rows none is trusted.
+        trusted: rows that counted so far; of `FEW_ROWS` or fewer, none is trusted.
     """
     few = rows.rows <= FEW_ROWS
     counts = torch.ones_like(trusted) if few else trusted.clone()
@@ -335,14 +336,14 @@ def judge_rows(
 def _contradicted(
     robot: Robot, rows: Measurements, sigma: float | None, model: RowModel, errors: LeftOutRows, few: bool
 ) -> tuple[RowModel, LeftOutRows] | None:
-    """Leave out the row among those that count that the others contradict; None where there is none.
+    """Leave out the row that the others contradict; None where there is none.
 
-    A wrong row among few moves base and tool so far that it cannot be told from the others but by leaving it out.
+    A wrong row among few moves base and tool so far that it can be distinguished only by leaving out each in turn.
     """
     counts = model.kept
     chance = torch.where(counts, errors.chance, torch.nan)
     suspects = [int(chance.nan_to_num(nan=1.0).argmin())] if bool((chance < FALSE_ALARMS).any()) else []
-    if few and (suspects or errors.scale > CONTRADICTORY):
+    if few and (suspects or errors.scale > CONTRADICTORY_FACTOR):
         suspects = counts.nonzero()[:, 0].tolist()
     misfits: dict[int, float] = {}
     for row in suspects if len(suspects) > 1 else ():
@@ -352,7 +353,7 @@ def _contradicted(
             every = torch.ones(int(others.sum()), dtype=torch.bool)
             misfits[row] = RowModel.of(robot, rows.select(others), sigma, every).misfit
     least = min(misfits.values(), default=0.0)
-    likely = [row for row in suspects if misfits.get(row, math.inf) <= least + CLEARER] or suspects
+    likely = [row for row in suspects if misfits.get(row, math.inf) <= least + MIN_MISFIT_GAIN] or suspects
     for row in likely[-1:]:
         others = counts.clone()
         others[row] = False

@@ -1,4 +1,4 @@
-"""What a measuring session has come to, as terminals and pages show it."""
+"""State of a measuring session, as terminals and pages show it."""
 
 import math
 from collections.abc import Iterable
@@ -12,20 +12,24 @@ from torch import Tensor
 from pisigma.robot.description import Robot
 
 AlarmKind = Literal["setup", "unreadable", "duplicate", "frozen", "swapped", "off", "pose", "cleared"]
-"""All rows have the same fault, such as a unit; the row cannot be read; it equals another one; the sensor shows an old
-value; the values of two poses are swapped; the value is off; the joint values are not those of a pose of the plan (a
-remark: the row counts); an alarm was taken back, as the rows that came since agree with the row."""
+"""Kind of an alarm.
+
+"setup": all rows have the same fault, such as a wrong unit. "unreadable": the row cannot be read. "duplicate": it
+equals another one. "frozen": the sensor shows an old value. "swapped": the values of two poses are swapped. "off": the other
+rows contradict the value. "pose": the joint values are not those of a planned pose (a remark: the row counts).
+"cleared": an alarm is withdrawn, because later rows agree with the row.
+"""
 
 
 @dataclass(frozen=True)
 class Alarm:
-    """A row that cannot be right, or a remark on one.
+    """Alarm or remark on a row.
 
     Attributes:
-        line: the row's line in the file.
-        kind: what is wrong.
-        sentence: what was expected, what came, and whether to measure the pose again.
-        repeat: whether the pose is to be measured again.
+        line: line of the row in the file.
+        kind: kind of the alarm.
+        sentence: what was expected, what was measured, and what to do.
+        repeat: whether to measure the pose again.
         counts: whether the row counts nevertheless.
     """
 
@@ -43,9 +47,9 @@ class RowsSoFar:
     Attributes:
         line: lines in the file.
         q: commanded joint values [rad or m].
-        position: where the target is predicted, in the robot's base frame [m]; NaN while base and tool are unknown.
-        error: measured - predicted position in the base frame [m]; NaN where it cannot be judged.
-        check: rows of the set "test", which judge the calibration and are not calibrated with.
+        position: predicted position of the target in the robot's base frame [m]; NaN while base and tool are unknown.
+        error: measured - predicted position in the robot's base frame [m]; NaN where it cannot be judged.
+        check: rows of the set "test", which test the calibration and are not calibrated with.
         alarmed: rows that do not count.
     """
 
@@ -62,11 +66,11 @@ class NextPose:
     """The pose to be measured next.
 
     Attributes:
-        number: of the pose, which it keeps when the rest is planned again.
+        number: number of the pose, which stays the same when the remaining poses are replanned.
         count: largest number of a pose so far.
         q: joint values [rad or m].
-        check: whether it judges the calibration.
-        commanded: the same as the controller counts, where its values are others.
+        check: whether it tests the calibration.
+        commanded: values of the controller, where they differ from the joint values [rad or m].
     """
 
     number: int
@@ -77,19 +81,19 @@ class NextPose:
 
     @property
     def values(self) -> Float64[np.ndarray, " axes"]:
-        """What the controller is to show [rad or m]."""
+        """Values to command at the controller [rad or m]."""
         return self.q if self.commanded is None else self.commanded
 
 
 @dataclass(frozen=True)
 class JointSpan:
-    """The values at which a joint was measured.
+    """Measured range of a joint.
 
     Attributes:
-        name: of the joint.
-        lower: smallest value measured [rad or m].
-        upper: largest value measured [rad or m].
-        planned: width that was measured over the width that the plan has; 1 where both are the same.
+        name: name of the joint.
+        lower: smallest measured value [rad or m].
+        upper: largest measured value [rad or m].
+        planned: width of the measured range over that of the plan, at most 1.
     """
 
     name: str
@@ -100,17 +104,17 @@ class JointSpan:
 
 @dataclass(frozen=True)
 class AccuracyPoint:
-    """How accurately a calibration with so many poses places the tool over the task [m]; NaN where that is unknown.
+    """Position error over the task after a number of poses [m]; NaN where a figure is unknown.
 
     Attributes:
         poses: number of poses calibrated with.
-        predicted_rms: root mean square, from the posterior.
-        predicted_p95: what 95 % of the poses stay below, from the posterior.
-        cross_validated_rms: root mean square of the errors of left-out rows, which hold the noise of the sensor too.
-        cross_validated_p95: what 95 % of them stay below.
-        checked_rms: root mean square of the errors of the poses that check the calibration, likewise with noise.
-        checked_p95: what 95 % of them stay below.
-        random_rms: predicted root mean square of as many poses drawn at random.
+        predicted_rms: root mean square predicted by the posterior.
+        predicted_p95: 95 % quantile predicted by the posterior.
+        cross_validated_rms: root mean square of the errors of held-out rows, which include the noise of the sensor.
+        cross_validated_p95: 95 % quantile of these errors.
+        checked_rms: root mean square of the errors of the test poses, which include the noise of the sensor.
+        checked_p95: 95 % quantile of these errors.
+        random_rms: predicted root mean square after as many random poses.
     """
 
     poses: int
@@ -123,18 +127,18 @@ class AccuracyPoint:
     random_rms: float = math.nan
 
     def to_json(self) -> dict[str, float | int | None]:
-        """Return the figures [mm] as plain values, None for those that are unknown."""
+        """Return the figures [mm] as plain values; None for unknown ones."""
         lengths = {f"{name}_mm": value * 1e3 for name, value in asdict(self).items() if name != "poses"}
         return {"poses": self.poses, **{name: _number(value) for name, value in lengths.items()}}
 
 
 @dataclass(frozen=True)
 class Advice:
-    """Whether to go on.
+    """What to do next.
 
     Attributes:
-        action: "measure" the next pose; "repeat" a pose; "correct" what is wrong with all rows; "stop".
-        sentence: why.
+        action: "measure" the next pose, "repeat" a pose, "correct" a fault of all rows, or "stop".
+        sentence: the reason.
     """
 
     action: Literal["measure", "repeat", "correct", "stop"]
@@ -147,15 +151,15 @@ class SessionState:
 
     Attributes:
         rows: all rows that were read.
-        alarms: what is wrong with which of them, in the order of the file.
-        next_pose: the pose to be measured next; None where the plan is done.
-        remaining: joint values of all poses that are left, the next one first [rad or m].
-        coverage: what was measured of every joint.
-        reached: accuracy so far, a point for each time that it was worked out, the last one holds.
-        expected: accuracy that the poses that are left would bring.
-        advice: whether to go on.
-        revolute: per axis of the controller, whether it turns (values in rad) or slides (in m).
-        base: `T_sensor_base`, where the robot's base is in the frame of the sensor [m]; None as long as it is unknown.
+        alarms: alarms on rows, in the order of the file.
+        next_pose: pose to be measured next; None where the plan is finished.
+        remaining: joint values of all remaining poses, the next one first [rad or m].
+        coverage: measured range of every joint.
+        reached: accuracy so far, one point for each time it was computed; the last one is valid.
+        expected: expected accuracy after the remaining poses.
+        advice: what to do next.
+        revolute: whether each axis of the controller is revolute (values in rad) or prismatic (in m).
+        base: `T_sensor_base`, pose of the robot's base in the frame of the sensor [m]; None while it is unknown.
     """
 
     rows: RowsSoFar
@@ -171,7 +175,7 @@ class SessionState:
 
     @property
     def accuracy(self) -> AccuracyPoint | None:
-        """Accuracy so far; None as long as it could not be worked out."""
+        """Accuracy so far; None while it cannot be computed."""
         return self.reached[-1] if self.reached else None
 
     def to_json(self) -> dict[str, object]:
@@ -210,7 +214,7 @@ class SessionState:
         }
 
     def in_file_units(self, q: Iterable[float]) -> list[float]:
-        """The controller's values in deg, or mm of joints that slide; of any number of the first joints."""
+        """Convert values of the controller's first axes to deg, or mm for prismatic joints."""
         return [
             float(np.rad2deg(value) if turns else value * 1e3)
             for value, turns in zip(q, self.revolute, strict=False)
@@ -218,24 +222,24 @@ class SessionState:
 
     @property
     def finished(self) -> bool:
-        """Whether more poses would not help, or none are left."""
+        """Whether more poses would not help, or none remain."""
         return self.advice.action == "stop"
 
 
 def _number(value: float) -> float | None:
-    """A number for JSON, which has no NaN."""
+    """Return a number for JSON, with None for NaN."""
     return value if math.isfinite(value) else None
 
 
 def coverage(
     robot: Robot, measured: Float64[Tensor, "rows dof"], planned: Float64[Tensor, "poses dof"]
 ) -> tuple[JointSpan, ...]:
-    """Compare the range in which every joint was measured with that of the plan; nothing of no rows.
+    """Compare the measured range of every joint with that of the plan; empty without rows.
 
     Args:
-        robot: as drawn.
+        robot: nominal robot.
         measured: joint values of the rows that count [rad or m].
-        planned: joint values of all poses that were planned [rad or m].
+        planned: joint values of all planned poses [rad or m].
     """
     if not len(measured):
         return ()

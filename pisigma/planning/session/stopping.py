@@ -1,11 +1,11 @@
-"""When more poses would not help."""
+"""Stopping rule of a measuring session."""
 
 from collections.abc import Sequence
 
 from pisigma.planning.session.state import AccuracyPoint, Advice
 
 AHEAD = 10
-"""What more poses bring is judged by so many, or all that are left."""
+"""Number of next poses whose expected benefit decides whether to stop."""
 
 
 def advice(
@@ -15,15 +15,15 @@ def advice(
     expected: Sequence[AccuracyPoint],
     left: int,
 ) -> Advice:
-    """Say whether to go on, and why.
+    """Decide whether to measure on or to stop, and why.
 
     Args:
-        limit_mm: 95 % of the errors are to stay below [mm]; None for no limit.
-        least_gain_mm: by which the next `AHEAD` poses have to lower that [mm].
-        reached: accuracy so far; the last point holds, and it has reached the limit if the one before it has, too: what
-            few rows say of themselves scatters, and the first of many points below the limit is often there by chance.
-        expected: accuracy that the poses that are left would bring.
-        left: number of poses that are left.
+        limit_mm: limit of the 95 % quantile of the errors [mm]; None for no limit.
+        least_gain_mm: decrease of that quantile by the next `AHEAD` poses below which to stop [mm].
+        reached: accuracy so far. The limit is reached when the last two points are below it: estimates from few rows
+            scatter, so that a first point below the limit is often there by chance.
+        expected: expected accuracy after the remaining poses.
+        left: number of remaining poses.
     """
     limit = "" if limit_mm is None else f"; the limit is {limit_mm:g} mm"
     if reached:
@@ -32,7 +32,7 @@ def advice(
         below = [limit_mm is not None and one.predicted_p95 * 1e3 <= limit_mm for one in reached[-2:]]
         if len(below) > 1 and all(below):
             return Advice("stop", f"Stop: with {point.poses} poses {now}{limit}.")
-        confirm = ", which the next poses have to confirm" if below[-1] else ""
+        confirm = ", which the next poses must confirm" if below[-1] else ""
         ahead = next((one for one in expected if one.poses >= point.poses + AHEAD), None) or next(
             reversed(expected), None
         )
@@ -41,9 +41,7 @@ def advice(
             more = f"{ahead.poses - point.poses} more poses would lower that by {max(gain, 0.0):.4f} mm only"
             return Advice("stop", f"Stop: {now}{limit}; {more}.")
     if not left:
-        return Advice("stop", f"Stop: all poses of the plan are measured{limit}.")
+        return Advice("stop", f"Stop: all poses of the plan have been measured{limit}.")
     if not reached:
-        return Advice(
-            "measure", f"{left} poses are left; there are too few rows to say how accurate they are."
-        )
-    return Advice("measure", f"{left} poses are left; {now}{limit}{confirm}.")
+        return Advice("measure", f"{left} poses remain; there are too few rows to estimate the accuracy.")
+    return Advice("measure", f"{left} poses remain; {now}{limit}{confirm}.")

@@ -1,1 +1,1 @@
-"""The cell that a robot is measured in: which poses are free and visible, and which motions between them."""
+"""The cell around a robot: which poses and motions are collision-free, and which poses are visible."""

@@ -1,4 +1,4 @@
-"""A robot in its cell: which joint values are within the limits, free of collisions, and seen by the tracker."""
+"""A robot in its cell: which joint values are within the limits, free of collisions, and visible to the tracker."""
 
 import math
 from collections import Counter
@@ -17,10 +17,10 @@ from pisigma.robot.description import Robot
 from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.robot.kinematics.tolerances import LIMIT_TOLERANCE
 
-CHUNK = 2048
-"""Poses that are looked at together: some MB."""
+POSES_PER_CHUNK = 2048
+"""Poses that are checked together: some MB."""
 ROUNDING = 1e-9
-"""[m] By which a measured pose is free."""
+"""[m] Distance by which a measured pose counts as free of self-collision."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,8 +28,8 @@ class Faults:
     """Why poses are not allowed.
 
     Attributes:
-        reasons: what a pose may fail for, each a sentence without its full stop.
-        failed: per pose and reason.
+        reasons: possible reasons, each a sentence without full stop.
+        failed: whether each pose fails for each reason.
     """
 
     reasons: tuple[str, ...]
@@ -37,16 +37,16 @@ class Faults:
 
     @property
     def allowed(self) -> Bool[Tensor, " poses"]:
-        """Poses that fail for nothing."""
+        """Poses without faults."""
         return ~self.failed.any(1)
 
     def counts(self) -> Counter[str]:
-        """How many poses fail for what; a pose counts for its first reason only."""
+        """Count the failing poses by their first reason."""
         first = self.failed[self.failed.any(1)].int().argmax(1)
         return Counter(self.reasons[reason] for reason in first.tolist())
 
     def sentence(self, pose: int) -> str | None:
-        """Why a pose is not allowed; None where it is."""
+        """Say why a pose is not allowed; None where it is allowed."""
         failed = self.failed[pose].nonzero()[:, 0].tolist()
         return "; ".join(self.reasons[column] for column in failed) + "." if failed else None
 
@@ -56,15 +56,15 @@ class ArmInCell:
     """A robot in its cell.
 
     Attributes:
-        drawn: the robot as drawn; its base is that of the cell.
+        drawn: nominal robot; its base is that of the cell.
         robot: the same with the reflector as its tool.
-        cell: what stands around it.
-        capsules: along its links.
-        pairs: of pieces of links that may touch each other.
-        room: that has to be between the pieces of every pair [m].
-        beside: pieces that must not stand in the tracker's beam: none of the link with the reflector, and none that
-            is so near to the reflector that it touches every beam.
-        limits: of the controller's values, with their margins [rad or m].
+        cell: surroundings of the robot.
+        capsules: capsules along the links.
+        pairs: pairs of capsules that may touch each other.
+        room: distance that the capsules of each pair have to keep [m].
+        beam_blockers: capsules that may block the tracker's beam: none of the link with the reflector, and none so near
+            to the reflector that it touches every beam.
+        limits: limits of the controller's values including margins [rad or m].
     """
 
     drawn: Robot
@@ -73,12 +73,12 @@ class ArmInCell:
     capsules: Capsules
     pairs: Int64[Tensor, "pairs 2"]
     room: Float64[Tensor, " pairs"]
-    beside: Int64[Tensor, " pieces"]
+    beam_blockers: Int64[Tensor, " pieces"]
     limits: Float64[Tensor, "axes 2"]
 
     @staticmethod
     def of(robot: Robot, cell: Cell | None = None) -> "ArmInCell":
-        """Put a robot into its cell; None for an empty one, in which only limits and self-collision count."""
+        """Put a robot into its cell; with None, only limits and self-collision are checked."""
         cell = cell or Cell()
         capsules = cell.capsules(robot)
         pairs = capsules.pairs(cell.clearance / 2)
@@ -89,27 +89,27 @@ class ArmInCell:
             capsules,
             pairs,
             torch.full((len(pairs),), cell.clearance / 2, dtype=torch.float64),
-            _beside(capsules, cell.clearance),
+            _beam_blockers(capsules, cell.clearance),
             cell.joints.limits(robot),
         )
 
     def with_measured(self, q: Float64[Tensor, "poses dof"]) -> "ArmInCell":
-        """The same where poses that were measured are free of self-collision, however thick the links are drawn.
+        """Return the arm such that measured poses are free of self-collision, whatever the radii of the links.
 
         Args:
-            q: joint values of these poses [rad or m].
+            q: joint values of measured poses [rad or m].
         """
         room = self.room
-        for chunk in torch.split(q, CHUNK):
+        for chunk in torch.split(q, POSES_PER_CHUNK):
             apart = self._apart(self.capsules.segments(chunk))
             room = torch.minimum(room, apart.amin(0) - ROUNDING)
         return replace(self, room=room)
 
     @property
-    def too_thick(self) -> tuple[str, ...]:
-        """Which links the cell states so thick that nothing keeps them apart any more, a sentence; mostly none.
+    def unseparated_links(self) -> tuple[str, ...]:
+        """Sentence on links that are not checked against each other because their stated radii are too large.
 
-        Links that touch in more than half of random poses are not kept apart, see `Capsules.pairs`.
+        Links that touch in more than half of random poses are not checked, see `Capsules.pairs`. Mostly empty.
         """
         tool = (
             None
@@ -127,34 +127,34 @@ class ArmInCell:
         names = ("the base", *(f"link {joint.name}" for joint in self.robot.joints))
         text = ", ".join(f"{names[one]} and {names[other]}" for one, other in sorted(links))
         return (
-            f"With the stated radii {text} touch in more than half of all poses, so nothing keeps them apart; if they "
-            "do not touch by construction, state smaller radii [mm] of links or tool in the cell's file.",
+            f"With the stated radii, {text} touch in more than half of all poses and are therefore not checked for "
+            "collision; unless they touch by construction, state smaller radii [mm] of links or tool in the cell file.",
         )
 
     def faults(self, q: Float64[Tensor, "poses dof"]) -> Faults:
-        """Say why which joint values [rad or m] are not allowed.
+        """Find the faults of joint values [rad or m].
 
         Raises:
             PoseError: they do not fit the robot.
         """
         self.robot.check_joint_count(q.shape[-1])
-        chunks = [self._faults(chunk) for chunk in torch.split(q, CHUNK)]
+        chunks = [self._faults(chunk) for chunk in torch.split(q, POSES_PER_CHUNK)]
         return Faults(tuple(chunks[0]), torch.cat([torch.stack([*chunk.values()], 1) for chunk in chunks]))
 
     def gap(self, q: Float64[Tensor, "poses dof"]) -> Float64[Tensor, " poses"]:
-        """The least room [m] between the links and what they must not touch, above the clearance.
+        """Compute the smallest distance between the links and all that they must not touch, minus the clearance [m].
 
-        Negative where it is not kept, infinite where there is nothing to touch.
+        Negative where the clearance is not kept, infinite where there is nothing to touch.
         """
         gaps = [
             torch.stack([*self._gaps(self.capsules.segments(chunk)).values()])
-            for chunk in torch.split(q, CHUNK)
+            for chunk in torch.split(q, POSES_PER_CHUNK)
         ]
         return torch.cat(gaps, -1).min(0).values
 
     @cached_property
     def lever(self) -> Float64[Tensor, " dof"]:
-        """How far a point of the robot moves at most per joint value [m/rad, or 1 for joints that slide]."""
+        """Largest motion of any point of the robot per joint value [m/rad, or 1 for prismatic joints]."""
         d, strokes = np.abs(self.robot.dh[:, 1]), np.zeros(len(self.robot.rows))
         for index, row in enumerate(self.robot.rows):
             bounds = [abs(bound) for bound in (row.lower, row.upper) if math.isfinite(bound)]
@@ -180,7 +180,7 @@ class ArmInCell:
         return faults
 
     def _gaps(self, segments: Float64[Tensor, "poses pieces 2 3"]) -> dict[str, Float64[Tensor, " poses"]]:
-        """Room between the links and everything that they must not touch [m], above the clearance."""
+        """Compute distances between the links and all that they must not touch, minus the clearance [m]."""
         clearance, radius = self.cell.clearance, self.capsules.radius
         infinite = segments.new_full((len(segments), 1), torch.inf)
         gaps = {"links of the robot touch each other": _least(self._apart(segments) - self.room, infinite)}
@@ -194,7 +194,7 @@ class ArmInCell:
         return gaps
 
     def _apart(self, segments: Float64[Tensor, "poses pieces 2 3"]) -> Float64[Tensor, "poses pairs"]:
-        """Room between the pieces of every pair [m]."""
+        """Compute the distance between the capsules of every pair [m]."""
         first, second = self.pairs.unbind(-1)
         radius = self.capsules.radius
         return segment_distance(segments[:, first], segments[:, second]) - radius[first] - radius[second]
@@ -202,12 +202,12 @@ class ArmInCell:
     def hidden(
         self, q: Float64[Tensor, "poses dof"], lines: Float64[Tensor, "poses lines 2 3"], what: str
     ) -> dict[str, Bool[Tensor, " poses"]]:
-        """Say in which poses something stands in a line of sight, by what it is.
+        """Find the poses in which a line of sight is blocked, by what blocks it.
 
         Args:
             q: joint values [rad or m].
-            lines: both ends of the lines, in the cell's frame [m].
-            what: that would be hidden, such as "the reflector from the tracker".
+            lines: both ends of the lines in the frame of the cell [m].
+            what: what would be hidden, such as "the reflector from the tracker".
         """
         return self._hidden(self.capsules.segments(q), lines, what)
 
@@ -217,12 +217,12 @@ class ArmInCell:
         lines: Float64[Tensor, "poses lines 2 3"],
         what: str,
     ) -> dict[str, Bool[Tensor, " poses"]]:
-        """Poses in which a line of sight has less room than the clearance."""
+        """Find the poses in which a line of sight is nearer to something than the clearance."""
         clearance = self.cell.clearance
         infinite = lines.new_full((len(lines), 1), torch.inf)
         distance = (
-            segment_distance(lines[:, :, None], segments[:, None, self.beside])
-            - self.capsules.radius[self.beside]
+            segment_distance(lines[:, :, None], segments[:, None, self.beam_blockers])
+            - self.capsules.radius[self.beam_blockers]
         )
         hidden = {f"a link hides {what}": _least(distance.flatten(1), infinite) < clearance}
         for box in self.cell.boxes:
@@ -233,7 +233,7 @@ class ArmInCell:
     def _turned_away(
         self, T: Float64[Tensor, "poses 4 4"], beam: Float64[Tensor, "poses 2 3"]
     ) -> dict[str, Bool[Tensor, " poses"]]:
-        """Poses in which the tracker stands outside the cone in which the reflector reflects."""
+        """Find the poses in which the tracker is outside the acceptance cone of the reflector."""
         reflector = self.cell.reflector
         if reflector is None:
             return {}
@@ -244,8 +244,8 @@ class ArmInCell:
         return {f"the reflector ({reflector.name}) is turned away from the tracker": turned_away}
 
 
-def _beside(capsules: Capsules, clearance: float) -> Int64[Tensor, " pieces"]:
-    """Pieces that do not touch the reflector by construction; see `Capsules.pairs`."""
+def _beam_blockers(capsules: Capsules, clearance: float) -> Int64[Tensor, " pieces"]:
+    """Return the capsules that do not touch the reflector by construction; see `Capsules.pairs`."""
     q = capsules.random_joints()
     reflector = forward_kinematics(capsules.robot, q)[:, None, None, :3, 3].expand(-1, 1, 2, 3)
     touches = segment_distance(reflector, capsules.segments(q)) < capsules.radius + clearance

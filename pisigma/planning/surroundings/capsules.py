@@ -1,4 +1,4 @@
-"""Capsules along the links of a robot: what of it must not touch anything."""
+"""Capsules along the links of a robot, for collision checks."""
 
 import itertools
 from collections.abc import Iterator, Mapping
@@ -17,31 +17,31 @@ from pisigma.robot.kinematics.forward import Geometry, iterate_rows
 from pisigma.robot.urdf_frames import inverse, row_frame
 
 RADIUS_SHARES = (0.05, 0.05, 0.05, 0.035)
-"""Radius of links where none is stated, from the first joint on, as a share of the length of the drawn arm; the last
-is that of all further links."""
+"""Default radii of links from the first joint on, as shares of the length of the nominal arm; the last one holds for
+all further links."""
 TOOL_RADIUS = 0.025
-"""[m] Of the tool where none is stated: a bracket with a reflector of 1.5 inches."""
-SHORTEST = 1e-6
-"""[m] Shorter pieces of links need no capsule, their neighbours cover them."""
+"""[m] Default radius of the tool: a bracket with a reflector of 1.5 inches."""
+MIN_LENGTH = 1e-6
+"""[m] Length below which a piece of a link needs no capsule, because its neighbours cover it."""
 SAMPLES = 500
-"""Random poses that show which pieces touch by construction."""
+"""Random poses by which capsules that touch by construction are found."""
 
 
 @dataclass(frozen=True, eq=False)
 class Capsules:
-    """Pieces of the links as line segments with a radius, each fixed to two frames of the robot.
+    """Pieces of the links as line segments with a radius, each end fixed to a frame of the robot.
 
-    A row of the drawing leads from its joint along the joint's axis by d, and then by a to the next row: these are
-    the pieces of its link. A URDF file says where joints are, so its links are straight from joint to joint. The last
-    piece is the tool.
+    A DH row leads from its joint along the joint's axis by d, and then by a to the next row: these are the pieces of
+    its link. A URDF file states the joint positions, so its links are straight from joint to joint. The last piece is
+    the tool.
 
     Attributes:
-        robot: as drawn, with the tool.
-        frame: per piece and end, the frame that the end is fixed to: 0 is the base, i the frame behind row i.
-        point: per piece and end, where it is in that frame [m].
-        link: per piece, the number of the joint that moves it; 0 for what stands still.
-        radius: per piece [m].
-        carrier: per piece, whether it carries the robot: it stands before the first joint, or on its axis.
+        robot: nominal robot with the tool.
+        frame: frame that each end of a piece is fixed to: 0 is the base, i the frame after row i.
+        point: position of each end in that frame [m].
+        link: number of the joint that moves each piece; 0 for fixed pieces.
+        radius: radius of each piece [m].
+        carrier: whether each piece carries the robot: it is before the first joint, or on its axis.
     """
 
     robot: Robot
@@ -59,15 +59,15 @@ class Capsules:
         radii: Mapping[str, float] | None = None,
         tool_radius: float = TOOL_RADIUS,
     ) -> "Capsules":
-        """Lay capsules along the drawing.
+        """Make capsules along the links of a robot.
 
         Args:
-            robot: as drawn, with the reflector as its tool.
-            tip: where the tool of the drawing is in the frame behind the last row [m], between which and the reflector
-                there is the reflector's bracket; None where it is that frame.
-            radius: of all links [m]; None for `RADIUS_SHARES` of the arm's length.
-            radii: of single links by the names of their rows [m].
-            tool_radius: of the tool [m].
+            robot: nominal robot with the reflector as its tool.
+            tip: position of the nominal tool in the frame after the last row, from which the bracket leads to the
+                reflector [m]; None for the origin of that frame.
+            radius: radius of all links [m]; None for `RADIUS_SHARES` of the arm's length.
+            radii: radii of single links by the names of their rows [m].
+            tool_radius: radius of the tool [m].
         """
         tip = np.zeros(3) if tip is None else tip
         pieces = [*_pieces_of_rows(robot, tip)]
@@ -89,15 +89,15 @@ class Capsules:
             torch.tensor([piece.carrier for piece in pieces]),
         )
         segments = capsules.segments(capsules.random_joints())
-        return capsules._of((segments[:, :, 1] - segments[:, :, 0]).norm(dim=-1).amax(0) > SHORTEST)
+        return capsules._of((segments[:, :, 1] - segments[:, :, 0]).norm(dim=-1).amax(0) > MIN_LENGTH)
 
     def _of(self, kept: Bool[Tensor, " pieces"]) -> "Capsules":
-        """The same with some of the pieces only."""
+        """Return a part of the pieces."""
         values = (self.frame, self.point, self.link, self.radius, self.carrier)
         return Capsules(self.robot, *(value[kept] for value in values))
 
     def segments(self, q: Float64[Tensor, "*batch dof"]) -> Float64[Tensor, "*batch pieces 2 3"]:
-        """Both ends of every piece [m], in the frame that poses are given in, at joint values q [rad or m]."""
+        """Compute both ends of every piece in the base frame of poses [m] at joint values q [rad or m]."""
         frames = torch.stack([*self._frames(q)], -3)[..., self.frame, :, :]
         return (frames[..., :3, :3] @ self.point[..., None])[..., 0] + frames[..., :3, 3]
 
@@ -106,24 +106,24 @@ class Capsules:
         return [as_transform(frame, q[..., 0]) for frame in (rows[0].before, *(row.after for row in rows))]
 
     def pairs(self, clearance: float) -> Int64[Tensor, "pairs 2"]:
-        """Pairs of pieces that must not touch each other: of links that are no neighbours.
+        """Return the pairs of pieces that must not touch each other: those of links that are not neighbours.
 
         Pairs that touch in more than half of random poses do so by construction, as in a wrist; the joint limits have
-        to keep these apart. Pairs whose distance never changes need no look at it.
+        to keep these apart. Pairs whose distance never changes are not checked.
 
         Args:
-            clearance: that is wanted between them [m].
+            clearance: distance to keep between them [m].
         """
         first, second = torch.combinations(torch.arange(len(self.link))).unbind(-1)
         segments = self.segments(self.random_joints())
         distance = segment_distance(segments[:, first], segments[:, second])
         touches = distance < self.radius[first] + self.radius[second] + clearance
-        changes = distance.amax(0) - distance.amin(0) > SHORTEST
+        changes = distance.amax(0) - distance.amin(0) > MIN_LENGTH
         wanted = ((self.link[second] - self.link[first]) > 1) & (touches.double().mean(0) < 0.5) & changes
         return torch.stack([first, second], -1)[wanted]
 
     def random_joints(self) -> Float64[Tensor, "poses dof"]:
-        """Joint values [rad or m] within the limits, the same at every call."""
+        """Draw joint values within the limits [rad or m], the same at every call."""
         generator = torch.Generator().manual_seed(0)
         limits = torch.from_numpy(self.robot.axis_limits).clamp(-np.pi, np.pi)
         draws = torch.rand(SAMPLES, len(limits), generator=generator, dtype=torch.float64)
@@ -137,10 +137,10 @@ class _Piece(NamedTuple):
     """One piece of a link.
 
     Attributes:
-        row: whose link it belongs to.
+        row: row whose link it belongs to.
         carrier: see `Capsules`.
-        frame: the frames that its ends are fixed to.
-        point: where these are in them [m].
+        frame: frames that its ends are fixed to.
+        point: positions of its ends in these frames [m].
     """
 
     row: int
@@ -150,7 +150,7 @@ class _Piece(NamedTuple):
 
 
 def _pieces_of_rows(robot: Robot, tip: Float64[np.ndarray, " 3"]) -> Iterator[_Piece]:
-    """Pieces from joint to joint and to the tip: straight where the drawing says where joints are, else by d and a."""
+    """Yield the pieces from joint to joint and to the tip: straight if joint positions are known, else by d, a."""
     has_seats = any(any(row.drawn_at) for row in robot.rows)
     seats = [np.array(row.drawn_at) for row in robot.rows] + [tip if has_seats else np.zeros(3)]
     first = robot.joint_rows[0]
@@ -158,7 +158,7 @@ def _pieces_of_rows(robot: Robot, tip: Float64[np.ndarray, " 3"]) -> Iterator[_P
         yield _Piece(0, True, (0, 0), (np.zeros(3), seats[0]))
     for i, row in enumerate(robot.rows):
         corners = [(i, seats[i]), (i + 1, seats[i + 1])]
-        if row.type == "prismatic":  # the joint's stroke, and then the link that slides
+        if row.type == "prismatic":  # the stroke of the joint, and then the moving link
             corners.insert(1, (i + 1, _behind(robot, i, seats[i])))
         elif not has_seats:
             corners.insert(1, (i + 1, _behind(robot, i, np.array([0.0, 0.0, robot.dh[i, 1]]))))
@@ -170,6 +170,6 @@ def _pieces_of_rows(robot: Robot, tip: Float64[np.ndarray, " 3"]) -> Iterator[_P
 
 
 def _behind(robot: Robot, row: int, point: Float64[np.ndarray, " 3"]) -> Float64[np.ndarray, " 3"]:
-    """A point of the frame before a row in the frame behind it, at the joint value 0 [m]."""
+    """Transform a point from the frame before a row to the frame after it, at the joint value 0 [m]."""
     result: np.ndarray = (inverse(row_frame(*robot.dh[row].tolist())) @ np.append(point, 1.0))[:3]
     return result

@@ -1,4 +1,4 @@
-"""What stands around a robot that is measured, as people write it down: joint margins, floor, boxes, tracker."""
+"""Cell files: the surroundings of a robot that is measured, with joint margins, floor, boxes, tracker and camera."""
 
 import os
 from typing import Annotated
@@ -24,13 +24,13 @@ Point = tuple[Bounded, Bounded, Bounded]
 
 
 class JointSection(Section):
-    """How far joints may move here.
+    """Joint limits in this cell.
 
     Attributes:
-        margin_deg: that joints which turn keep from their limits [deg].
-        margin_mm: the same of joints that slide [mm].
-        limits_deg: narrower limits of joints that turn, by name [deg].
-        limits_mm: the same of joints that slide [mm].
+        margin_deg: margin of revolute joints to their limits [deg].
+        margin_mm: margin of prismatic joints to their limits [mm].
+        limits_deg: narrower limits of revolute joints by name [deg].
+        limits_mm: narrower limits of prismatic joints by name [mm].
     """
 
     margin_deg: NotNegative = 0.0
@@ -39,11 +39,11 @@ class JointSection(Section):
     limits_mm: dict[str, Limits] = Field(default_factory=dict)
 
     def limits(self, robot: Robot) -> Float64[Tensor, "axes 2"]:
-        """Lowest and highest of the controller's values that are allowed [rad or m]; infinite where there is no limit.
+        """Return the allowed range of the controller's values [rad or m]; infinite where there is no limit.
 
         Raises:
-            RecipeError: a name is no joint, or one of the other kind.
-            PlanningError: nothing is left of a joint's range.
+            RecipeError: a name is not a joint of the robot, or is one of the other kind.
+            PlanningError: a joint's range is empty.
         """
         fields = ("limits_deg", "limits_mm")
         stated = stated_joints(robot, self.limits_deg, self.limits_mm, fields, "joints", axes=True)
@@ -61,20 +61,22 @@ class JointSection(Section):
             limits[index] += (margin, -margin)
             if not limits[index, 0] < limits[index, 1]:
                 raise PlanningError(
-                    f"joints: the limits and margins leave nothing of the range of joint '{joint.name}'; "
-                    "make them wider."
+                    f"the limits and margins leave no range for joint '{joint.name}'",
+                    value=joint.name,
+                    option="joints",
+                    remedy="widen the limits or reduce the margins",
                 )
         return torch.from_numpy(limits)
 
 
 class Box(Section):
-    """A box that the robot keeps out of, and that hides what is behind it.
+    """A box that the robot must not touch and that blocks lines of sight.
 
     Attributes:
-        name: for messages.
-        center_mm: its centre in the robot's base frame [mm].
-        size_mm: its edges along its own axes [mm].
-        yaw_deg: by which it is turned about the base frame's z axis [deg].
+        name: name for messages.
+        center_mm: centre in the robot's base frame [mm].
+        size_mm: lengths of the edges along the axes of the box [mm].
+        yaw_deg: rotation about the z axis of the robot's base frame [deg].
     """
 
     name: str = Field(min_length=1)
@@ -84,30 +86,30 @@ class Box(Section):
 
     @property
     def center(self) -> Float64[Tensor, " 3"]:
-        """Its centre [m]."""
+        """Centre in the robot's base frame [m]."""
         return torch.tensor(self.center_mm, dtype=torch.float64) / 1e3
 
     @property
     def half_size(self) -> Float64[Tensor, " 3"]:
-        """Half of its edges [m]."""
+        """Half the lengths of the edges [m]."""
         return torch.tensor(self.size_mm, dtype=torch.float64) / 2e3
 
     @property
     def rotation(self) -> Float64[Tensor, "3 3"]:
-        """Its axes in the base frame, as columns."""
+        """Rotation matrix from the axes of the box to the robot's base frame."""
         return rotation_from_rpy(torch.tensor([np.deg2rad(self.yaw_deg), 0.0, 0.0], dtype=torch.float64))
 
     def within(self, points: Float64[Tensor, "*batch 3"]) -> Float64[Tensor, "*batch 3"]:
-        """Points of the base frame in the frame of the box [m]."""
+        """Transform points from the robot's base frame to the frame of the box [m]."""
         return (points - self.center) @ self.rotation
 
 
 class LinkSection(Section):
-    """How thick links are.
+    """Radii of the links.
 
     Attributes:
-        radius_mm: of all links [mm]; None for a share of the arm's length, see `capsules.RADIUS_SHARES`.
-        radii_mm: of single links, by the names of their rows [mm].
+        radius_mm: radius of all links [mm]; None for a share of the arm's length, see `capsules.RADIUS_SHARES`.
+        radii_mm: radii of single links by the names of their rows [mm].
     """
 
     radius_mm: Positive | None = None
@@ -115,17 +117,17 @@ class LinkSection(Section):
 
 
 class ToolSection(FrameSection):
-    """Where the reflector is mounted, seen from the tool of the drawing (a URDF file's tip), in mm and deg.
+    """Pose of the reflector in the frame of the nominal tool (a URDF file's tip), in mm and deg.
 
     Attributes:
-        radius_mm: of what carries it [mm].
+        radius_mm: radius of its bracket [mm].
     """
 
     radius_mm: Positive = TOOL_RADIUS * 1e3
 
 
 class TrackerSection(Section):
-    """Where the tracker stands in the robot's base frame; near is enough."""
+    """Approximate position of the tracker in the robot's base frame."""
 
     x_mm: Bounded
     y_mm: Bounded
@@ -133,17 +135,17 @@ class TrackerSection(Section):
 
     @property
     def position(self) -> Float64[Tensor, " 3"]:
-        """Its origin [m]."""
+        """Position in the robot's base frame [m]."""
         return torch.tensor([self.x_mm, self.y_mm, self.z_mm], dtype=torch.float64) / 1e3
 
 
 class ReflectorSection(Section):
-    """A reflector that is not turned by hand between poses: from where the tracker sees it.
+    """A reflector that is not turned to the tracker by hand at every pose.
 
     Attributes:
-        name: such as "cat's eye".
-        axis: where it looks, in the frame of the tool.
-        acceptance_deg: half the angle of the cone in which it reflects [deg].
+        name: name such as "cat's eye".
+        axis: its optical axis in the frame of the tool.
+        acceptance_deg: half the angle of its acceptance cone [deg].
     """
 
     name: str = "SMR of 1.5 inches"
@@ -153,18 +155,18 @@ class ReflectorSection(Section):
     @model_validator(mode="after")
     def _has_direction(self) -> "ReflectorSection":
         if not any(self.axis):
-            raise ValueError("axis: a direction was wanted, such as [0, 0, 1]")
+            raise ValueError("axis: expected a direction such as [0, 0, 1], got the zero vector")
         return self
 
 
 class LensSection(Section):
-    """What the depth of field of a camera follows from.
+    """Lens data from which the depth of field of a camera is computed.
 
     Attributes:
         aperture: f-number.
-        focus_mm: depth at which corners are sharpest [mm].
-        pixel_um: edge of a pixel [um].
-        blur_px: diameter of a point's image that still counts as sharp [px].
+        focus_mm: depth of the focus plane [mm].
+        pixel_um: edge length of a pixel [um].
+        blur_px: diameter of a point's image up to which it counts as sharp [px].
     """
 
     aperture: Positive
@@ -173,11 +175,11 @@ class LensSection(Section):
     blur_px: Positive = 1.0
 
     def depths(self, f: float) -> tuple[float, float]:
-        """Give the nearest and the farthest depth that is sharp [m]; the farthest may be infinite.
+        """Compute the nearest and the farthest sharp depth [m]; the farthest may be infinite.
 
         With the image at v = f · pixel behind the lens, focused at s, the focal length is `v s / (v + s)` (thin lens),
-        and a point at depth z has an image with the diameter `A v |1/s - 1/z|` with the aperture A (Hecht, "Optics",
-        section 5.2.3).
+        and a point at depth z has an image of diameter `A v |1/s - 1/z|` for the aperture A (Hecht, "Optics", section
+        5.2.3).
 
         Args:
             f: focal length of the focused camera [px].
@@ -190,16 +192,16 @@ class LensSection(Section):
 
 
 class ViewSection(Section):
-    """From where a camera has to see its board: whole, sharp, and not too obliquely.
+    """Conditions under which a camera sees its board: completely, sharply, and not too obliquely.
 
     Attributes:
-        frame: where the board is in the base frame, or a camera that stands beside the robot; None where a model says
-            that. The board's x leads along its rows, y from row to row, and z away from who looks at it.
-        near_mm: depth of the board in front of the camera at least [mm]; None by the lens.
-        far_mm: and at most [mm].
-        lens: what both follow from, where they are not stated.
-        oblique_deg: angle between the board's normal and the line of sight at most [deg].
-        margin_px: that the board keeps from the edges of the image [px].
+        frame: pose of the board, or of a fixed camera, in the robot's base frame; None where a model states it. The
+            board's x axis runs along its rows, y from row to row, and z away from the viewer.
+        near_mm: smallest depth of the board in front of the camera [mm]; None to compute it from the lens.
+        far_mm: largest depth [mm]; None likewise.
+        lens: lens data, where the depths are not stated.
+        oblique_deg: largest angle between the board's normal and the line of sight [deg].
+        margin_px: distance that the board keeps from the edges of the image [px].
     """
 
     frame: FrameSection | None = None
@@ -214,19 +216,19 @@ class ViewSection(Section):
         stated = self.near_mm is not None and self.far_mm is not None
         if (self.near_mm is None) != (self.far_mm is None) or stated == (self.lens is not None):
             raise ValueError(
-                "near_mm and far_mm, or else the lens, were wanted: between which depths are images sharp?"
+                "expected either near_mm and far_mm or lens, between which depths images are sharp"
             )
         if stated and not self.near_mm < self.far_mm:  # type: ignore[operator]
-            raise ValueError(f"near_mm below far_mm was wanted, got {self.near_mm:g} and {self.far_mm:g}")
+            raise ValueError(f"expected near_mm < far_mm, got {self.near_mm:g} and {self.far_mm:g}")
         return self
 
     @property
     def T_cell_frame(self) -> Float64[Tensor, "4 4"] | None:
-        """The frame [m]; None where it is not stated."""
+        """Pose of the measuring frame in the frame of the cell [m]; None where it is not stated."""
         return None if self.frame is None else transform_from_xyzrpy(torch.from_numpy(self.frame.to_si()))
 
     def depths(self, f: float) -> tuple[float, float]:
-        """Give the nearest and the farthest depth [m] for a focal length [px]."""
+        """Return the nearest and the farthest depth [m] for a focal length f [px]."""
         if self.lens is not None:
             return self.lens.depths(f)
         assert self.near_mm is not None
@@ -235,20 +237,19 @@ class ViewSection(Section):
 
 
 class Cell(Section):
-    """What stands around a robot: everything is optional, and in the frame of the robot's base in mm and deg.
+    """Surroundings of a robot. All sections are optional, in the robot's base frame in mm and deg.
 
     Attributes:
-        clearance_mm: that links and the tracker's beam keep from everything, and links half of it from each other
-            [mm].
+        clearance_mm: distance that links and the tracker's beam keep from everything; links keep half of it from each
+            other [mm].
         floor_mm: height of the floor [mm]; None for no floor.
-        joints: margins and limits.
-        boxes: that the robot keeps out of.
-        links: how thick the links are.
-        tool: where the reflector is, or what a camera needs on the flange (camera or board); None for the tool of the
-            robot.
-        tracker: that has to see the reflector; None where the sensor needs no line of sight.
-        reflector: from where it can be seen; None where it is turned to the tracker at every pose.
-        view: from where a camera has to see its board; None without a camera.
+        joints: joint margins and limits.
+        boxes: boxes that the robot must not touch.
+        links: radii of the links.
+        tool: pose of the reflector, or of the camera or board on the flange; None for the tool of the robot.
+        tracker: tracker that has to see the reflector; None where the sensor needs no line of sight.
+        reflector: reflector with an acceptance cone; None where it is turned to the tracker at every pose.
+        view: conditions under which a camera sees its board; None without a camera.
     """
 
     clearance_mm: NotNegative = 20.0
@@ -265,24 +266,24 @@ class Cell(Section):
     def _fits_together(self) -> "Cell":
         names = [box.name for box in self.boxes]
         if twice := sorted({name for name in names if names.count(name) > 1}):
-            raise ValueError(f"the name '{twice[0]}' stands twice in boxes; names must differ")
+            raise ValueError(f"the name '{twice[0]}' appears twice in boxes; names must differ")
         if self.reflector is not None and self.tracker is None:
             raise ValueError(
-                "a reflector is seen from a tracker; add the section tracker, or leave reflector out"
+                "reflector is given without tracker; add the section tracker, or remove reflector"
             )
         for box in self.boxes if self.tracker is not None else ():
             assert self.tracker is not None
             if bool((box.within(self.tracker.position).abs() <= box.half_size).all()):
-                raise ValueError(f"the tracker stands inside the box '{box.name}'; correct one of them")
+                raise ValueError(f"the tracker is inside the box '{box.name}'; correct one of them")
         return self
 
     @property
     def clearance(self) -> float:
-        """What links and the tracker's beam keep from everything but the robot's other links [m]."""
+        """Distance that links and the tracker's beam keep from everything but the robot's other links [m]."""
         return self.clearance_mm / 1e3
 
     def robot_with_tool(self, robot: Robot) -> Robot:
-        """The robot with the reflector as its tool, where the cell says where that is."""
+        """Return the robot with the reflector as its tool, where the cell states it."""
         if self.tool is None:
             return robot
         drawn, reflector = (
@@ -291,7 +292,7 @@ class Cell(Section):
         return robot.with_geometry(tool=xyzrpy_from_transform(drawn @ reflector).numpy())
 
     def capsules(self, robot: Robot) -> Capsules:
-        """Capsules along the links of a robot and its reflector's bracket."""
+        """Make capsules along the links of a robot and the bracket of its reflector."""
         radius = self.links.radius_mm
         radii = {name: size / 1e3 for name, size in self.links.radii_mm.items()}
         tool_radius = TOOL_RADIUS if self.tool is None else self.tool.radius_mm / 1e3
@@ -305,15 +306,14 @@ class Cell(Section):
 
 
 def read_cell(path: str | os.PathLike[str], robot: Robot) -> Cell:
-    """Read the file of a cell.
+    """Read a cell file.
 
     Args:
         path: the YAML file.
-        robot: that stands in it.
+        robot: robot in the cell.
 
     Raises:
-        PlanningError: the file cannot be used, or it names links or joints that the robot has not; the message names
-            file, line and key.
+        PlanningError: the file cannot be used, or it names links or joints that the robot does not have.
     """
     cell = read_yaml(path, Cell, PlanningError)
     names = [row.name for row in robot.rows]

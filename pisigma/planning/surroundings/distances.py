@@ -4,17 +4,17 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
-SMALLEST = 1e-18
-"""[m²] Segments whose squared length is smaller are points."""
+MIN_SQUARED_LENGTH = 1e-18
+"""[m²] Squared length below which a segment is a point."""
 
 Segments = Float64[Tensor, "*#batch 2 3"]
 """Both ends of line segments [m]."""
 
 
 def segment_distance(first: Segments, second: Segments) -> Float64[Tensor, "*_batch"]:
-    """Distance of line segments [m].
+    """Compute the distance of line segments [m].
 
-    The nearest points of two segments are those of their lines, moved into the segments one after the other
+    The nearest points of two segments are those of their lines, clamped to the segments one after the other
     (Ericson 2005, Real-Time Collision Detection, section 5.1.9). The batches broadcast.
     """
     p, u = first[..., 0, :], first[..., 1, :] - first[..., 0, :]
@@ -25,21 +25,21 @@ def segment_distance(first: Segments, second: Segments) -> Float64[Tensor, "*_ba
     determinant = a * e - b * b
     parallel = determinant <= 1e-12 * a * e
     s = torch.where(parallel, 0.0, (b * f - c * e) / torch.where(parallel, 1.0, determinant)).clamp(0, 1)
-    t = ((b * s + f) / e.clamp(min=SMALLEST)).clamp(0, 1)
-    s = ((b * t - c) / a.clamp(min=SMALLEST)).clamp(0, 1)
+    t = ((b * s + f) / e.clamp(min=MIN_SQUARED_LENGTH)).clamp(0, 1)
+    s = ((b * t - c) / a.clamp(min=MIN_SQUARED_LENGTH)).clamp(0, 1)
     difference: Tensor = (w + s[..., None] * u - t[..., None] * v).norm(dim=-1)
     return difference
 
 
 def box_distance(segments: Segments, half_size: Float64[Tensor, "*#batch 3"]) -> Float64[Tensor, "*_batch"]:
-    """Distance of line segments from boxes about the origin, 0 inside [m].
+    """Compute the distance of line segments from boxes centred at the origin, 0 inside [m].
 
     The squared distance along a segment is convex, and its slope is linear between the planes of the box's faces: where
     it is 0 follows from the slopes at the two planes around it.
 
     Args:
-        segments: in the frame of the box.
-        half_size: of the box along its axes [m].
+        segments: segments in the frame of the box [m].
+        half_size: half the lengths of the edges of the box [m].
     """
     start, along = segments[..., 0, :], segments[..., 1, :] - segments[..., 0, :]
     level = along == 0.0
@@ -64,5 +64,5 @@ def box_distance(segments: Segments, half_size: Float64[Tensor, "*#batch 3"]) ->
 
 
 def _outside(point: Tensor, half: Tensor) -> Tensor:
-    """By how much coordinates are outside a box about the origin [m]."""
+    """Compute the distance of coordinates from a box centred at the origin [m]."""
     return point - torch.minimum(torch.maximum(point, -half), half)

@@ -1,4 +1,4 @@
-"""Motions between poses that go straight in joint values: whether they are free, and way points where they are not."""
+"""Straight joint motions between poses: whether they are collision-free, and way points where they are not."""
 
 import torch
 from jaxtyping import Bool, Float64
@@ -6,27 +6,26 @@ from torch import Tensor
 
 from pisigma.planning.surroundings.arm_in_cell import ArmInCell
 
-FINEST = 1e-3
-"""[m] Pieces of a motion in which no point of the robot moves farther are not divided, nor those of half the
-clearance."""
-TRIED = 60
-"""Poses that are tried as way points of a motion, and ten times as many pairs of them."""
+MIN_STEP = 1e-3
+"""[m] Motion of any point of the robot below which a piece is not divided further, nor below half the clearance."""
+MAX_WAY_POINTS_TRIED = 60
+"""Poses that are tried as way points of a motion; ten times as many pairs of them are tried."""
 BATCH = 20
-"""Of these are looked at together."""
+"""Way points that are checked together."""
 SAMPLE = 50
-"""Poses to which ways are looked for, to tell which of two poses is shut in."""
+"""Poses to which motions are checked, to find which of two poses is harder to leave."""
 
 
 class Motions:
-    """Straight motions of the joints between poses, each of which is looked at once at most.
+    """Straight joint motions between poses, each of which is checked only once.
 
     Attributes:
         arm: the robot in its cell.
-        pool: free poses that way points may be [rad or m].
+        pool: joint values of free poses that can be way points [rad or m].
     """
 
     def __init__(self, arm: ArmInCell, pool: Float64[Tensor, "free dof"]) -> None:
-        """Start with no motion."""
+        """Start without checked motions."""
         self.arm, self.pool = arm, pool
         self._free: dict[tuple[bytes, bytes], bool] = {}
         self._points: dict[tuple[bytes, bytes], Float64[Tensor, "points dof"] | None] = {}
@@ -34,7 +33,7 @@ class Motions:
     def are_free(
         self, start: Float64[Tensor, "motions dof"], end: Float64[Tensor, "motions dof"]
     ) -> Bool[Tensor, " motions"]:
-        """Whether they touch nothing, one way or the other."""
+        """Return which motions are collision-free, in either direction."""
         names = [*map(sorted, zip(_names(start), _names(end), strict=True))]
         pairs = [(one, other) for one, other in names]
         new = torch.tensor([pair not in self._free for pair in pairs], dtype=torch.bool).nonzero()[:, 0]
@@ -45,7 +44,7 @@ class Motions:
     def points_between(
         self, start: Float64[Tensor, " dof"], end: Float64[Tensor, " dof"]
     ) -> Float64[Tensor, "points dof"] | None:
-        """Way points of a motion, none where it is free as it is; None where no way was found."""
+        """Return the way points of a motion, empty where it is free without; None where none were found."""
         if bool(self.are_free(start[None], end[None])):
             return self.pool[:0]
         (pair,) = zip(_names(start[None]), _names(end[None]), strict=True)
@@ -53,8 +52,8 @@ class Motions:
             self._points[pair] = way_points(self.arm, start, end, self.pool)
         return self._points[pair]
 
-    def is_shut_in(self, pose: Float64[Tensor, " dof"], other: Float64[Tensor, " dof"]) -> bool:
-        """Whether fewer free motions lead away from a pose than from another one."""
+    def is_harder_to_leave(self, pose: Float64[Tensor, " dof"], other: Float64[Tensor, " dof"]) -> bool:
+        """Return whether fewer free motions lead away from a pose than from another one."""
         sample = self.pool[:: max(1, len(self.pool) // SAMPLE)]
         one, two = (int(self.are_free(q.expand_as(sample), sample).sum()) for q in (pose, other))
         return one < two
@@ -63,19 +62,19 @@ class Motions:
 def is_free(
     arm: ArmInCell, start: Float64[Tensor, "motions dof"], end: Float64[Tensor, "motions dof"]
 ) -> Bool[Tensor, " motions"]:
-    """Say which straight motions of the joints touch nothing.
+    """Return which straight joint motions are collision-free.
 
-    A piece of a motion is free where there is more room at its middle than any point of the robot can move from there
+    A piece of a motion is free where the gap at its midpoint is larger than any point of the robot can move from there
     to its ends; other pieces are halved (Schwarzer, Saha and Latombe 2005, IEEE Trans. Robotics 21(3), section IV).
 
     Args:
         arm: the robot in its cell.
-        start: joint values [rad or m].
-        end: likewise.
+        start: joint values at the start [rad or m].
+        end: joint values at the end [rad or m].
     """
     free = torch.ones(len(start), dtype=torch.bool)
     travel = (end - start).abs() @ arm.lever
-    finest = max(FINEST, arm.cell.clearance / 2)
+    finest = max(MIN_STEP, arm.cell.clearance / 2)
     motion, middle, half = torch.arange(len(start)), torch.full((len(start),), 0.5), 0.5
     middle = middle.double()
     while len(motion):
@@ -94,19 +93,19 @@ def way_points(
     end: Float64[Tensor, " dof"],
     pool: Float64[Tensor, "poses dof"],
 ) -> Float64[Tensor, "points dof"] | None:
-    """Find one or two poses by way of which a motion is free; the shortest way among those that are tried.
+    """Find one or two way points that make a motion collision-free, the shortest way among those that are tried.
 
     Args:
         arm: the robot in its cell.
-        start: joint values [rad or m].
-        end: likewise.
-        pool: free poses to go by.
+        start: joint values at the start [rad or m].
+        end: joint values at the end [rad or m].
+        pool: joint values of free poses that can be way points [rad or m].
 
     Returns:
-        The joint values of the poses in between [rad or m]; None where no way was found.
+        Joint values of the way points [rad or m]; None where no way was found.
     """
     to, back = _travel(arm, start, pool), _travel(arm, pool, end)
-    tried = (to + back).argsort()[:TRIED]
+    tried = (to + back).argsort()[:MAX_WAY_POINTS_TRIED]
     pool, to, back = pool[tried], to[tried], back[tried]
     reached, left = torch.zeros(2, len(pool), dtype=torch.bool)
     for some in torch.split(torch.arange(len(pool)), BATCH):
@@ -119,7 +118,7 @@ def way_points(
         return None
     first, second = torch.cartesian_prod(first, second).unbind(-1)
     length = to[first] + _travel(arm, pool[first], pool[second]) + back[second]
-    shortest = length.argsort()[: 10 * TRIED]
+    shortest = length.argsort()[: 10 * MAX_WAY_POINTS_TRIED]
     for some in torch.split(shortest, BATCH):
         free = is_free(arm, pool[first[some]], pool[second[some]])
         if bool(free.any()):
@@ -129,11 +128,11 @@ def way_points(
 
 
 def _travel(arm: ArmInCell, start: Tensor, end: Tensor) -> Float64[Tensor, " poses"]:
-    """How far points of the robot move at most [m]."""
+    """Compute the largest motion of any point of the robot [m]."""
     length: Tensor = (end - start).abs() @ arm.lever
     return length
 
 
 def _names(poses: Float64[Tensor, "poses dof"]) -> list[bytes]:
-    """What tells poses apart: the bytes of their joint values."""
+    """Return keys of poses: the bytes of their joint values."""
     return [pose.tobytes() for pose in poses.contiguous().numpy()]

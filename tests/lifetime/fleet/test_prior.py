@@ -9,7 +9,7 @@ from testing.models import no_type_checker
 
 from pisigma.estimation.population import Population, expectation_maximisation, without_odd
 from pisigma.files.errors import FleetError
-from pisigma.lifetime.fleet.prior import Likeness, RobotEvidence, fleet_prior
+from pisigma.lifetime.fleet.prior import FleetConsistency, RobotEvidence, fleet_prior
 from pisigma.lifetime.fleet.prior_summary import summarise_prior
 from pisigma.workflow.calibrate import calibrate
 from pisigma.workflow.recalibrate import recalibrate
@@ -58,8 +58,8 @@ def test_ten_poses_with_the_prior_are_far_better_than_without(prior):
 def test_a_robot_of_another_type_is_unlike_the_fleet_and_not_bent_to_it(prior):
     few = rows_of(60, 10, 3, odd=True)
     with no_type_checker():
-        assert Likeness.of(prior.model, few).odd
-        assert not Likeness.of(prior.model, rows_of(61, 20, 4)).odd
+        assert FleetConsistency.of(prior.model, few).odd
+        assert not FleetConsistency.of(prior.model, rows_of(61, 20, 4)).odd
         begun = recalibrate(prior.model, few)
         without = calibrate(DRAWN, few, CalibrationSettings(folds=0))
         fewer = recalibrate(prior.model, few.select(torch.arange(8)))

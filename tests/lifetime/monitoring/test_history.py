@@ -11,7 +11,7 @@ import torch
 from testing.closeness import assert_close
 
 from pisigma.files.errors import OutputError
-from pisigma.lifetime.monitoring.history import Record, history_path, remember
+from pisigma.lifetime.monitoring.history import Record, history_path, store_sessions
 from pisigma.lifetime.monitoring.session import JointZeros, Session
 from pisigma.lifetime.recalibration.movement import Movement
 
@@ -32,8 +32,8 @@ def record(number, date="2026-01-01"):
 
 def test_sessions_are_added_once_and_come_back_by_date(tmp_path):
     path = tmp_path / "model.history.sqlite"
-    remember(path, "model", [record(1, "2026-03-01"), record(2, "2026-02-01")])
-    records = remember(path, "model", [record(3, "2026-04-01"), record(1, "2026-03-01")])
+    store_sessions(path, "model", [record(1, "2026-03-01"), record(2, "2026-02-01")])
+    records = store_sessions(path, "model", [record(3, "2026-04-01"), record(1, "2026-03-01")])
     assert [one.file for one in records] == ["rows_2.csv", "rows_1.csv", "rows_3.csv"]
     assert records[1].session == record(1).session
     assert (records[0].temperature_c, records[1].temperature_c) == (None, 21.5)
@@ -43,8 +43,8 @@ def test_sessions_are_added_once_and_come_back_by_date(tmp_path):
 
 def test_another_model_has_a_history_of_its_own(tmp_path):
     path = tmp_path / "model.history.sqlite"
-    remember(path, "old", [record(1)])
-    assert [one.file for one in remember(path, "new", [record(2)])] == ["rows_2.csv"]
+    store_sessions(path, "old", [record(1)])
+    assert [one.file for one in store_sessions(path, "new", [record(2)])] == ["rows_2.csv"]
 
 
 def test_the_history_lies_beside_the_folder(tmp_path):
@@ -57,18 +57,18 @@ def test_other_files_are_refused_and_left_alone(tmp_path, content):
     path = tmp_path / "model.history.sqlite"
     path.write_bytes(content)
     with pytest.raises(OutputError, match=r"cannot be used.*--no-history"):
-        remember(path, "model", [record(1)])
+        store_sessions(path, "model", [record(1)])
     assert path.read_bytes() == content
 
 
 def test_a_kill_loses_nothing(tmp_path):
     path = tmp_path / "model.history.sqlite"
-    remember(path, "model", [record(0)])
+    store_sessions(path, "model", [record(0)])
     script = (
         "import sys; sys.path[:0] = sys.argv[2:]; from test_history import record; import pathlib, itertools\n"
-        "from pisigma.lifetime.monitoring.history import remember\n"
+        "from pisigma.lifetime.monitoring.history import store_sessions\n"
         "for n in itertools.count(1):\n"
-        "    remember(pathlib.Path(sys.argv[1]), 'model', [record(2 * n), record(2 * n + 1)]); print(n, flush=True)\n"
+        "    store_sessions(pathlib.Path(sys.argv[1]), 'model', [record(2 * n), record(2 * n + 1)]); print(n, flush=True)\n"
     )
     command = [sys.executable, "-c", script, str(path), os.path.dirname(__file__), *sys.path]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
@@ -77,6 +77,6 @@ def test_a_kill_loses_nothing(tmp_path):
         time.sleep(0.05)
         process.send_signal(signal.SIGKILL)
         written = 1 + len(process.stdout.read().split())
-    records = remember(path, "model", [])
+    records = store_sessions(path, "model", [])
     assert len(records) % 2 == 1  # pairs are written together
     assert len(records) >= 1 + 2 * written

@@ -12,10 +12,10 @@ from testing.models import hand_made_model
 
 from pisigma.files.errors import ModelError
 from pisigma.lifetime.recalibration.adaptation import Adaptation, adapt
-from pisigma.lifetime.recalibration.elsewhere import owners_elsewhere
 from pisigma.lifetime.recalibration.movement import significant_movements
 from pisigma.lifetime.recalibration.recalibrated_model import recalibrated_model
 from pisigma.lifetime.recalibration.recalibration_problem import recalibration_problem
+from pisigma.lifetime.recalibration.relocated_frames import relocated_frames
 from pisigma.model.calibrated_model import poses_of_rows
 from pisigma.model.model_posterior import ModelPosterior
 
@@ -68,8 +68,8 @@ def test_nothing_moved_is_said_where_nothing_moved():
 def test_an_instrument_elsewhere_is_found(moved):
     model, rows = model_before(), rows_later(12, 2, moved, SHIFTED)
     posterior = ModelPosterior.of(model)
-    assert owners_elsewhere(model, posterior, rows, posterior.noise) == {("base", "")}
-    assert not owners_elsewhere(model, posterior, rows_later(12, 2, moved), posterior.noise)
+    assert relocated_frames(model, posterior, rows, posterior.noise) == {("base", "")}
+    assert not relocated_frames(model, posterior, rows_later(12, 2, moved), posterior.noise)
     adaptation = adapted(model, rows, {("base", "")})
     errors = adaptation.errors_of(rows_later(300, 50, moved, SHIFTED, noise=0.0))["position"]
     assert rms(errors) < 1.5 * rms_of(model, rows_later(300, 50, noise=0.0))

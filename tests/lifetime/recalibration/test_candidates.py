@@ -9,12 +9,17 @@ from testing.closeness import assert_close
 
 from pisigma.calibration.hybrid.calibrator import HybridCalibrator
 from pisigma.lifetime.recalibration.adaptation import adapt
-from pisigma.lifetime.recalibration.candidates import ABOUT_AS_GOOD, Gate, _decided, gate
+from pisigma.lifetime.recalibration.candidates import (
+    ABOUT_AS_GOOD,
+    CandidateChoice,
+    _decided,
+    choose_candidate,
+)
 from pisigma.lifetime.recalibration.recalibration_problem import recalibration_problem
 from pisigma.model.model_posterior import ModelPosterior
 
 
-def decided(**errors: list[float]) -> Gate:
+def decided(**errors: list[float]) -> CandidateChoice:
     return _decided({name: torch.tensor(values).double() for name, values in errors.items()})
 
 
@@ -66,7 +71,7 @@ def test_left_out_rows_decide(count):
     problem = recalibration_problem(model, posterior, rows, frozenset())
     whole = adapt(problem, posterior.noise)
     calibrator = HybridCalibrator(posterior.space.robot)
-    judged = gate(model, whole, frozenset(), rows, calibrator, lambda what: None)
+    judged = choose_candidate(model, whole, frozenset(), rows, calibrator, lambda what: None)
     assert (judged.kept, judged.rows) == ("recalibrated", count)
     kept, old = judged.rms["recalibrated"], judged.rms["old"]
     assert kept is not None

@@ -60,8 +60,8 @@ def test_every_reason_is_named():
 )
 def test_links_that_are_too_thick_to_be_kept_apart_are_named(links: dict[str, object], named: str | None):
     arm = ArmInCell.of(Robot.load("ur10"), Cell(links=LinkSection.model_validate(links)))
-    assert len(arm.too_thick) == (named is not None)
-    assert named is None or named in arm.too_thick[0]
+    assert len(arm.unseparated_links) == (named is not None)
+    assert named is None or named in arm.unseparated_links[0]
 
 
 def test_a_motion_is_free_where_all_poses_on_it_are():

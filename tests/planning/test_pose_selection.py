@@ -5,10 +5,10 @@ import torch
 from testing.closeness import assert_close
 
 from pisigma.files.errors import PlanningError
-from pisigma.planning.choice import Choice, choose, condensed
-from pisigma.planning.expected_accuracy import curve, p95_of, remaining_errors, rms_of
-from pisigma.planning.knowledge import Knowledge
+from pisigma.planning.expected_accuracy import accuracy_curve, p95_of, remaining_errors, rms_of
 from pisigma.planning.plan_settings import Criterion
+from pisigma.planning.pose_selection import PoseSelection, condensed, select_poses
+from pisigma.planning.robot_posterior import RobotPosterior
 from pisigma.robot import Robot
 
 
@@ -18,8 +18,8 @@ def random_joints(count: int, seed: int) -> torch.Tensor:
 
 
 @pytest.fixture(scope="module")
-def knowledge() -> Knowledge:
-    return Knowledge.of_robot(Robot.load("ur5"), hybrid=False)
+def posterior() -> RobotPosterior:
+    return RobotPosterior.of_robot(Robot.load("ur5"), hybrid=False)
 
 
 def log_det(B: torch.Tensor) -> float:
@@ -34,11 +34,13 @@ def variance(B: torch.Tensor, goal: torch.Tensor) -> float:
 
 
 @pytest.mark.parametrize("criterion", ["D", "I"])
-def test_gains_and_exchange_are_those_of_the_criterion(knowledge: Knowledge, criterion: Criterion) -> None:
-    q, goal = random_joints(40, 0), condensed(knowledge.tool(random_joints(50, 1)))
+def test_gains_and_exchange_are_those_of_the_criterion(
+    posterior: RobotPosterior, criterion: Criterion
+) -> None:
+    q, goal = random_joints(40, 0), condensed(posterior.tool(random_joints(50, 1)))
     # Base and tool are known to a millimetre here, so that determinants are right to the last digits.
-    B = knowledge.measured(q).clamp(-30, 30)
-    choice = Choice(B, goal, criterion)
+    B = posterior.measured(q).clamp(-30, 30)
+    choice = PoseSelection(B, goal, criterion)
 
     def value(chosen: list[int]) -> float:
         return log_det(B[chosen]) if criterion == "D" else -variance(B[chosen], goal)
@@ -59,40 +61,44 @@ def test_gains_and_exchange_are_those_of_the_criterion(knowledge: Knowledge, cri
 @pytest.mark.parametrize("hybrid", [False, True])
 def test_the_goal_holds_what_is_left_of_the_variance_when_poses_are_measured(hybrid: bool) -> None:
     # before it is all where base and tool are, metres against tenths of a millimetre
-    knowledge, task = Knowledge.of_robot(Robot.load("ur5"), hybrid=hybrid), random_joints(50, 1)
-    q, goal = random_joints(60, 0), condensed(knowledge.tool(task))
+    posterior, task = RobotPosterior.of_robot(Robot.load("ur5"), hybrid=hybrid), random_joints(50, 1)
+    q, goal = random_joints(60, 0), condensed(posterior.tool(task))
     for count in (5, 20, 60):
-        left = rms_of(knowledge.informed(q[:count]).tool(task)) ** 2
-        assert_close(variance(knowledge.measured(q[:count]), goal), left, rtol=0.01)
+        left = rms_of(posterior.informed(q[:count]).tool(task)) ** 2
+        assert_close(variance(posterior.measured(q[:count]), goal), left, rtol=0.01)
 
 
 def test_criterion_i_leaves_less_error_of_the_tool_than_criterion_d_and_random_poses() -> None:
-    knowledge, q, task = Knowledge.of_robot(Robot.load("ur5")), random_joints(200, 4), random_joints(50, 5)
+    posterior, q, task = (
+        RobotPosterior.of_robot(Robot.load("ur5")),
+        random_joints(200, 4),
+        random_joints(50, 5),
+    )
     for count in (10, 25):
         chosen = [
-            choose(knowledge.measured(q), knowledge.tool(task), count, "I"),
-            choose(knowledge.measured(q), knowledge.tool(task), count, "D"),
+            select_poses(posterior.measured(q), posterior.tool(task), count, "I"),
+            select_poses(posterior.measured(q), posterior.tool(task), count, "D"),
             torch.arange(count),
         ]
-        left, *others = (rms_of(knowledge.informed(q[rows]).tool(task)) for rows in chosen)
+        left, *others = (rms_of(posterior.informed(q[rows]).tool(task)) for rows in chosen)
         assert left < 0.9 * min(others)
 
 
-def test_the_first_of_a_choice_are_the_greedy_choice_among_it(knowledge: Knowledge) -> None:
+def test_the_first_of_a_choice_are_the_greedy_choice_among_it(posterior: RobotPosterior) -> None:
     q, task = random_joints(60, 2), random_joints(40, 3)
-    chosen = choose(knowledge.measured(q), knowledge.tool(task), 12, "I")
+    chosen = select_poses(posterior.measured(q), posterior.tool(task), 12, "I")
     assert len(set(chosen.tolist())) == 12
-    choice = Choice(knowledge.measured(q[chosen]), condensed(knowledge.tool(task)), "I")
+    choice = PoseSelection(posterior.measured(q[chosen]), condensed(posterior.tool(task)), "I")
     choice.grow(12)
     assert choice.chosen == list(range(12))
 
 
-def test_the_curve_is_the_covariance_after_the_poses(knowledge: Knowledge) -> None:
+def test_the_curve_is_the_covariance_after_the_poses(posterior: RobotPosterior) -> None:
     q, task = random_joints(80, 4), random_joints(40, 5)
-    chosen = choose(knowledge.measured(q), knowledge.tool(task), 20)
-    points = curve(knowledge.measured(q), knowledge.tool(task), chosen, (10, 20))
+    chosen = select_poses(posterior.measured(q), posterior.tool(task), 20)
+    points = accuracy_curve(posterior.measured(q), posterior.tool(task), chosen, (10, 20))
     for point in points:
-        after = knowledge.informed(q[chosen[: point.poses]])
+        after = posterior.informed(q[chosen[: point.poses]])
         assert_close(point.rms, float(after.deviation(task).square().mean().sqrt()), rtol=1e-6)
         assert point.rms < point.p95 < 3 * point.rms
         assert point.rms < point.random_rms
@@ -106,18 +112,18 @@ def test_quantiles_are_those_of_one_normal_coordinate() -> None:
     assert_close(p95_of(D), 1.96e-3, rtol=0.03)
 
 
-def test_what_remains_is_named(knowledge: Knowledge) -> None:
+def test_what_remains_is_named(posterior: RobotPosterior) -> None:
     task = random_joints(40, 6)
-    errors = remaining_errors(knowledge, task)
+    errors = remaining_errors(posterior, task)
     assert {"base", "tool", "joint offsets"} <= {error.name for error in errors}
     assert errors[0].name == "base"
-    hybrid = Knowledge.of_robot(Robot.load("ur5")).informed(random_joints(300, 7))
+    hybrid = RobotPosterior.of_robot(Robot.load("ur5")).informed(random_joints(300, 7))
     assert any(error.name.startswith("correction of joint") for error in remaining_errors(hybrid, task))
 
 
-def test_impossible_choices_are_refused(knowledge: Knowledge) -> None:
+def test_impossible_choices_are_refused(posterior: RobotPosterior) -> None:
     q = random_joints(5, 0)
     with pytest.raises(PlanningError, match="1 to 5 poses"):
-        choose(knowledge.measured(q), knowledge.tool(q), 6)
+        select_poses(posterior.measured(q), posterior.tool(q), 6)
     with pytest.raises(PlanningError, match="joint values of the task"):
-        choose(knowledge.measured(q), knowledge.tool(q[:0]), 2)
+        select_poses(posterior.measured(q), posterior.tool(q[:0]), 2)

@@ -1,4 +1,4 @@
-"""What is known of a robot before the next pose is measured: the normal distribution of all its unknowns."""
+"""Normal distribution of all unknowns of a robot, before or after poses are measured."""
 
 from dataclasses import dataclass, replace
 
@@ -31,24 +31,24 @@ from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.robot.robot_class import RobotClass
 from pisigma.robot.se3 import rotation_vector, skew
 
-WIDE = (*(1.0,) * 6, *(0.1,) * 3, *(1.0,) * 3)
-"""[m, rad, m, rad] Where base and tool may be before anything is measured: so wide that it does not matter."""
+WIDE_PRIOR = (*(1.0,) * 6, *(0.1,) * 3, *(1.0,) * 3)
+"""[m, rad, m, rad] Standard deviations of base and tool before anything is measured: too wide to have an effect."""
 
-CHUNK = 512
-"""Poses whose derivatives are taken together: some MB."""
+POSES_PER_CHUNK = 512
+"""Poses whose derivatives are computed together: some MB."""
 
 
 @dataclass(frozen=True)
 class Instrument:
-    """What measures, and how well; repeatability of the robot counts as noise of the instrument.
+    """The measuring instrument and its noise, which includes the repeatability of the robot.
 
     Attributes:
         kind: "position" of a target, its "pose", its "distance" from an anchor, or a "camera" that sees a board.
-        sigma: standard deviation of a coordinate or a distance [m]. The default lies between what hybrid calibrations
-            of the measured UR5 and UR10 leave of a laser tracker's coordinates, 0.028 and 0.043 mm.
-        sigma_rotation: standard deviation of an angle about an axis [rad], of the UR10's target.
-        anchor: where distances are from, in the measuring frame [m].
-        sight: camera and board; one is the measuring frame, the other one the target. None of other kinds.
+        sigma: standard deviation of a coordinate or a distance [m]. The default is between the residuals of a laser
+            tracker's coordinates after hybrid calibrations of the measured UR5 and UR10, 0.028 and 0.043 mm.
+        sigma_rotation: standard deviation of an angle about an axis [rad]; the default is that of the UR10's target.
+        anchor: origin of distances in the measuring frame [m].
+        sight: camera and board, of which one is the measuring frame and the other the target; None for other kinds.
     """
 
     kind: SensorKind = "position"
@@ -59,15 +59,15 @@ class Instrument:
 
 
 @dataclass(frozen=True, eq=False)
-class Knowledge:
-    """The normal distribution of geometry, base, tool and the weights of a joint correction, and what measures them.
+class RobotPosterior:
+    """Normal distribution of geometry, base, tool and the weights of a joint correction, and the instrument.
 
-    Poses are those of the first target in the first frame.
+    Poses are those of the first target in the first measuring frame.
 
     Attributes:
-        uncertainty: the covariance `R R^T` of all unknowns, and the geometry where derivatives are taken.
-        correction: the most probable joint correction; None where it is 0.
-        instrument: what measures.
+        uncertainty: covariance `R R^T` of all unknowns, and the geometry at which derivatives are computed.
+        correction: mean joint correction; None where it is 0.
+        instrument: the measuring instrument.
     """
 
     uncertainty: PositionUncertainty
@@ -81,16 +81,16 @@ class Knowledge:
         *,
         hybrid: bool = True,
         gravity: Direction = USUAL,
-    ) -> "Knowledge":
-        """Give what is known of a robot that was never measured: errors of usual sizes around the drawing.
+    ) -> "RobotPosterior":
+        """Return the prior of a robot that was never measured, with the nominal geometry as mean.
 
         Geometric errors and weights have the standard deviations of the robot's class, see `RobotClass`.
 
         Args:
-            robot: as drawn; its tool should be about where the target is.
-            instrument: what will measure it.
-            hybrid: whether joint corrections are unknowns too, or the geometry alone.
-            gravity: direction in which things fall, in the frame of the robot's base.
+            robot: nominal robot; its tool should be near the target.
+            instrument: the measuring instrument.
+            hybrid: whether the joint correction is unknown as well as the geometry.
+            gravity: direction of gravity in the robot's base frame.
         """
         space = ParameterSpace(robot)
         usual, sizes = RobotClass.of(robot), [_geometric_sizes(space)]
@@ -100,46 +100,47 @@ class Knowledge:
             series = FourierSeries(robot, usual.harmonics)
             sizes += [_weight_sizes(torques, (usual.gravity,)), _weight_sizes(series, usual.bands)]
             features = torques, series
-        if instrument.kind == "distance":  # no distance changes when all is turned about the anchor
+        if instrument.kind == "distance":  # distances do not change with rotations about the anchor
             sizes[0][[*space.of("base")][3:]] = 0.0
         root = CovarianceRoot(torch.diag(torch.cat(sizes)))
         geometry = IdentifiedGeometry(robot, {"": robot.base}, {"": robot.tool}, {})
-        return Knowledge(PositionUncertainty(space, geometry, features, root, 1.0), None, instrument)
+        return RobotPosterior(PositionUncertainty(space, geometry, features, root, 1.0), None, instrument)
 
     @staticmethod
-    def of_model(model: CalibratedModel, instrument: Instrument = Instrument()) -> "Knowledge":
-        """Give what a calibrated model knows: its posterior.
+    def of_model(model: CalibratedModel, instrument: Instrument = Instrument()) -> "RobotPosterior":
+        """Return the posterior that a calibrated model keeps.
 
         Raises:
-            IdentificationError: the model holds no uncertainty.
+            IdentificationError: the model keeps no posterior.
         """
         if model.uncertainty is None:
             raise IdentificationError(
-                f"model '{model.name}' holds no uncertainty, so it does not say what to measure next; plan for its "
-                "robot, or calibrate it with this version."
+                f"model '{model.name}' keeps no posterior, from which poses to measure could be planned",
+                value=model.name,
+                remedy="plan for its robot, or calibrate it with this version",
             )
-        return Knowledge(
+        return RobotPosterior(
             model.uncertainty, None if model.hybrid is None else model.hybrid.correction, instrument
         )
 
     @staticmethod
-    def of_result(result: HybridResult, instrument: Instrument) -> "Knowledge":
-        """Give what a calibration knows: its posterior."""
-        return Knowledge(
+    def of_result(result: HybridResult, instrument: Instrument) -> "RobotPosterior":
+        """Return the posterior of a hybrid calibration."""
+        return RobotPosterior(
             result.uncertainty, None if result.learned is None else result.learned.correction, instrument
         )
 
-    def after(self, rows: Measurements) -> "Knowledge":
-        """Return what is known once rows are measured: the posterior of a hybrid calibration of them.
+    def after(self, rows: Measurements) -> "RobotPosterior":
+        """Return the posterior given measured rows: that of a hybrid calibration with them.
 
-        While they are too few for one, the covariance after measuring them, whatever their values.
+        Where they are too few for one, the posterior covariance given their joint values alone.
 
         Raises:
             PoseError: the joint values do not fit the robot.
             ImplausibleError: no calibration error explains the rows.
         """
         try:
-            return Knowledge.of_result(
+            return RobotPosterior.of_result(
                 HybridCalibrator(self.uncertainty.space.robot).fit(rows), self.instrument
             )
         except ImplausibleError:
@@ -147,8 +148,8 @@ class Knowledge:
         except IdentificationError:  # too few rows
             return self.informed(rows.q)
 
-    def informed(self, q: Float64[Tensor, "poses dof"]) -> "Knowledge":
-        """Return what is known once poses are measured, whatever the values: `C' = R (1 + B^T B)^-1 R^T`.
+    def informed(self, q: Float64[Tensor, "poses dof"]) -> "RobotPosterior":
+        """Return the posterior given measured poses, which does not depend on the values: `C' = R (1 + B^T B)^-1 R^T`.
 
         Args:
             q: commanded joint values [rad or m].
@@ -157,7 +158,7 @@ class Knowledge:
         return replace(self, uncertainty=replace(self.uncertainty, covariance_root=CovarianceRoot(root)))
 
     def moved(self, q: Float64[Tensor, "*batch dof"]) -> Float64[Tensor, "*batch dof"]:
-        """Joint values with their most probable corrections [rad or m]."""
+        """Return joint values with the mean joint correction [rad or m]."""
         if self.correction is None:
             return q
         with torch.no_grad():
@@ -165,15 +166,15 @@ class Knowledge:
         return moved
 
     def columns(self, q: Float64[Tensor, "poses dof"]) -> Float64[Tensor, "poses 6 unknowns"]:
-        """Derivative of the target's position [m] and rotation vector [rad] in its frame by all unknowns."""
+        """Compute the derivatives of the target's position [m] and rotation vector [rad] by all unknowns."""
         return self.uncertainty.columns(JointState(q), self.moved(q))
 
     def tool(self, q: Float64[Tensor, "poses dof"]) -> Float64[Tensor, "poses 3 directions"]:
-        """Derivative D of the target's position by independent standard normal numbers: its covariance is `D D^T`.
+        """Compute the derivative D of the target's position by standard normal numbers; its covariance is `D D^T`.
 
-        The position is that in the measuring frame, or where distances are measured in the robot's base frame, as these
-        do not say where the robot stands. Of a camera, a shift and a turn of all poses together do not count: where
-        the frame of a board stands, only the arm says, and only as far as the board is seen.
+        The position is in the measuring frame; for distances, which do not determine where the robot is, it is in the
+        robot's base frame. For a camera, a rigid motion of all poses together does not count, because the pose of the
+        board's frame is known through the arm only.
         """
         columns = self.columns(q)[:, :3]
         if self.instrument.sight is not None:
@@ -187,8 +188,8 @@ class Knowledge:
         return self.uncertainty.covariance_root.along(columns)
 
     def measured(self, q: Float64[Tensor, "poses dof"]) -> Float64[Tensor, "poses values directions"]:
-        """Derivative B of what is measured, over its noise, by these numbers; values have covariance `B B^T + 1`."""
-        return torch.cat([self._measured(some) for some in torch.split(q, CHUNK)])
+        """Compute the derivative B of measured values over their noise; the covariance of these is `B B^T + 1`."""
+        return torch.cat([self._measured(some) for some in torch.split(q, POSES_PER_CHUNK)])
 
     def _measured(self, q: Float64[Tensor, "poses dof"]) -> Float64[Tensor, "poses values directions"]:
         columns, instrument = self.columns(q), self.instrument
@@ -208,50 +209,52 @@ class Knowledge:
             columns = columns / noise[:, None]
         return self.uncertainty.covariance_root.along(columns)
 
-    def seen_anew(self, base: Float64[np.ndarray, " 6"], tool: Float64[np.ndarray, " 6"]) -> "Knowledge":
-        """Return what is known of the same arm in another frame, at another target, of which nothing is known.
+    def with_unknown_base_and_tool(
+        self, base: Float64[np.ndarray, " 6"], tool: Float64[np.ndarray, " 6"]
+    ) -> "RobotPosterior":
+        """Return the distribution for the same arm in another measuring frame and at another target, both unknown.
 
         Args:
-            base: about where the robot's base is in that frame, as x, y, z, roll, pitch, yaw [m, rad].
-            tool: about where the target is behind the last joint, likewise.
+            base: approximate pose of the robot's base in that frame, as x, y, z, roll, pitch, yaw [m, rad].
+            tool: approximate pose of the target in the frame of the last joint, likewise.
         """
         before = self.uncertainty
         robot = before.geometry.robot.with_geometry(base=base, tool=tool)
         geometry = IdentifiedGeometry(robot, {"": base}, {"": tool}, {})
         space = ParameterSpace(before.space.robot)
         arm, weights = before.root[: space.arm_size], before.root[len(before.space.parameters) :]
-        wide = torch.diag(torch.tensor(WIDE, dtype=torch.float64))
+        wide = torch.diag(torch.tensor(WIDE_PRIOR, dtype=torch.float64))
         blank = arm.new_zeros(len(wide), arm.shape[1])
-        beside = [rows.new_zeros(len(rows), len(wide)) for rows in (arm, weights)]
-        rows = [torch.cat(pair, 1) for pair in ((arm, beside[0]), (blank, wide), (weights, beside[1]))]
+        zeros = [rows.new_zeros(len(rows), len(wide)) for rows in (arm, weights)]
+        rows = [torch.cat(pair, 1) for pair in ((arm, zeros[0]), (blank, wide), (weights, zeros[1]))]
         root = CovarianceRoot(torch.cat(rows))
         return replace(
             self, uncertainty=replace(before, space=space, geometry=geometry, covariance_root=root)
         )
 
     def deviation(self, q: Float64[Tensor, "poses dof"]) -> Float64[Tensor, " poses"]:
-        """Standard deviation of the predicted position [m], `sqrt(σx² + σy² + σz²)`."""
+        """Compute the standard deviation of the predicted position [m], `sqrt(σx² + σy² + σz²)`."""
         return self.tool(q).square().sum((1, 2)).sqrt()
 
     def surprise(self, rows: Measurements) -> Float64[Tensor, " rows"]:
-        """Say how unlikely measured rows are: the length of `(B B^T + 1)^-1/2 r` over the root of its values.
+        """Compute how improbable measured rows are: the RMS of `(B B^T + 1)^-1/2 r`.
 
-        r is what was measured minus what is predicted, over the noise. A row that fits has about 1; under the
-        predictive distribution the square times the number of values is chi-squared.
+        r is measured minus predicted, over the noise. A row that fits has about 1; under the predictive distribution
+        the square times the number of values is chi-square distributed.
 
         Args:
             rows: positions, or poses where the instrument measures poses, of the first target in the first frame.
 
         Returns:
-            NaN for rows in which nothing of the kind was measured.
+            One value per row; NaN where neither was measured.
 
         Raises:
-            MeasurementError: the instrument measures distances, or is a camera.
+            MeasurementError: the rows have no positions, the instrument measures distances, or it is a camera.
             IdentificationError: a row has a frame or a target that was not calibrated.
         """
         instrument, geometry = self.instrument, self.uncertainty.geometry
         if instrument.kind in ("distance", "camera") or rows.position is None:
-            raise MeasurementError("positions were wanted to compare with the predicted ones, got none.")
+            raise MeasurementError(expected="rows with positions", value="none", option="rows")
         T = predicted_poses(
             geometry.robot, geometry.bases, geometry.tools, replace(rows, q=self.moved(rows.q))
         )
@@ -267,17 +270,17 @@ class Knowledge:
 
 
 def _geometric_sizes(space: ParameterSpace) -> Float64[Tensor, " parameters"]:
-    """Standard deviations of all parameters of a robot that was never measured [m or rad]."""
+    """Return the prior standard deviations of all parameters of a robot that was never measured [m or rad]."""
     of_class, sizes = RobotClass.of(space.robot), []
     arm = zip(space.parameters[: space.arm_size], space.robot.dh.ravel().tolist(), strict=True)
     for parameter, value in arm:
         group = PriorGroup(prior_group_of(parameter.group, abs(value) > of_class.usual.length))
         sizes.append(of_class.usual.of(group))
-    return torch.tensor([*sizes, *WIDE], dtype=torch.float64)
+    return torch.tensor([*sizes, *WIDE_PRIOR], dtype=torch.float64)
 
 
 def _weight_sizes(feature: AbstractFeature, of_groups: tuple[float, ...]) -> Float64[Tensor, " weights"]:
-    """Standard deviations of the used weights of a feature [rad, or m of prismatic joints]."""
+    """Return the prior standard deviations of the used weights of a feature [rad, or m for prismatic joints]."""
     sizes = torch.tensor(of_groups, dtype=torch.float64)[feature.group]
     unit = torch.where(torch.tensor(feature.robot.revolute), 1.0, feature.robot.reach)
     return (sizes * unit[:, None])[feature.used]

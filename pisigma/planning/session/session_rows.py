@@ -1,4 +1,4 @@
-"""The rows of a session: which of them count, what is wrong with the others, and which poses are left by them."""
+"""Rows of a measuring session: which of them count, alarms on the others, and replanning of the remaining poses."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -14,8 +14,8 @@ from pisigma.measurement.dataset import Measurements, join
 from pisigma.measurement.fields import LeftOut
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.planning.candidates import Candidates
-from pisigma.planning.choice import choose
 from pisigma.planning.plan_file import StoredPlan
+from pisigma.planning.pose_selection import select_poses
 from pisigma.planning.session.reached import Reached
 from pisigma.planning.session.row_alarms import (
     NEAR_POSE,
@@ -38,28 +38,28 @@ from pisigma.validation.checks.rows.mixed_rows import MOST_WRONG
 from pisigma.validation.checks.rows.row_check import MOVES
 from pisigma.validation.gate import check_rows
 
-CANDIDATES = 1_000
-"""So many of the plan's candidates are looked at."""
-ROUNDS = 3
-"""So often poses that no free motion leads to are replaced."""
+MAX_CANDIDATES = 1_000
+"""Candidates of the plan that are considered."""
+MAX_REPLACEMENTS = 3
+"""Attempts to replace poses that no free motion leads to."""
 
 
-class JudgedRows:
-    """Rows that are judged as they come, each by all others.
+class SessionRows:
+    """Rows of a session, each judged by all others as they arrive.
 
     Attributes:
-        rows: all of them that can be read, in the order of the file; None where there are none.
-        usable: those that are no copies.
-        judgement: of the usable ones.
-        alarms: what is wrong with which line, beside all rows alike.
+        rows: all readable rows in the order of the file; None where there are none.
+        usable: rows that are not copies of others.
+        judgement: judgement of the usable rows.
+        alarms: alarms on single rows.
     """
 
     def __init__(self, robot: Robot, sigma: float) -> None:
-        """Begin without rows.
+        """Start without rows.
 
         Args:
-            robot: as drawn.
-            sigma: standard deviation of the sensor's lengths [m] where rows state none.
+            robot: nominal robot.
+            sigma: standard deviation of measured lengths where rows state none [m].
         """
         self._robot, self._sigma = robot, sigma
         self.rows: Measurements | None = None
@@ -70,12 +70,12 @@ class JudgedRows:
 
     @property
     def alarms(self) -> tuple[Alarm, ...]:
-        """See the class."""
+        """Alarms on single rows."""
         return (*self._fixed, *self._contradicted.values())
 
     @property
     def counting(self) -> Bool[Tensor, " rows"]:
-        """Rows that count."""
+        """Rows that are usable and not contradicted by others."""
         counting = self.usable.clone()
         counting[self.usable] = self.judgement.counts
         return counting
@@ -87,16 +87,16 @@ class JudgedRows:
         planned: Float64[Tensor, "poses dof"],
         names: Sequence[str],
     ) -> list[Alarm]:
-        """Judge rows that were measured since, all of them together.
+        """Add new rows and judge all rows together.
 
         Args:
-            new: the rows in their order; None where there are none.
+            new: new rows in their order; None where there are none.
             left_out: rows that cannot be read.
-            planned: joint values of all poses that were planned [rad or m].
-            names: of these.
+            planned: joint values of all planned poses [rad or m].
+            names: names of these poses.
 
         Returns:
-            What is wrong with them, or with earlier ones in the light of them.
+            New alarms on these rows or on earlier ones.
         """
         alarms = [unreadable(row) for row in left_out]
         changed: list[Alarm] = []
@@ -116,7 +116,7 @@ class JudgedRows:
     def _judge(
         self, rows: Measurements, planned: Float64[Tensor, "poses dof"], names: Sequence[str]
     ) -> list[Alarm]:
-        """Judge all rows that are no copies, and say what is new."""
+        """Judge all usable rows and return the new alarms."""
         numbers = self.usable.nonzero()[:, 0]
         usable, judgement = rows.select(numbers), self.judgement
         for upto in _steps(len(judgement.counts), len(numbers)):
@@ -135,9 +135,9 @@ class JudgedRows:
         return [*new, *agreed]
 
     def errors(self) -> tuple[Float64[np.ndarray, "rows 3"], Float64[np.ndarray, "rows 3"]]:
-        """Where the target is predicted, and measured - predicted position, in the robot's base frame [m].
+        """Return the predicted position of the target and measured - predicted, in the robot's base frame [m].
 
-        NaN where they cannot be said.
+        NaN where they are unknown.
         """
         rows, model, errors = self.rows, self.judgement.model, self.judgement.errors
         position, error = torch.full((2, len(self.usable), 3), torch.nan, dtype=torch.float64)
@@ -153,10 +153,10 @@ class JudgedRows:
 
 
 def _steps(known: int, count: int) -> Iterator[int]:
-    """Numbers of rows that are judged in turn, when some were judged before.
+    """Yield the numbers of rows after which rows are judged, where `known` were judged before.
 
-    As rows are judged by those that counted before, no more than these are added at once; of several that were added at
-    once, each is then judged by the others, too.
+    Rows are judged by those that counted before, so no more than these are added at once. Of several rows that were
+    added at once, each is then judged by the others as well.
     """
     upto = known
     while upto < count:
@@ -169,14 +169,14 @@ def _steps(known: int, count: int) -> Iterator[int]:
 def setup_sentence(
     rows: Measurements, counts: Bool[Tensor, " rows"], against: Robot | CalibratedModel
 ) -> str:
-    """Say what the rows have in common that is wrong; "" where nothing is.
+    """Describe a fault that all rows have in common; "" where there is none.
 
-    Where a quarter of the rows or more contradict the others, all of them are judged together.
+    Where a quarter of the rows or more contradict the others, all rows are judged, including these.
 
     Args:
-        rows: all rows that are no copies.
-        counts: those that others do not contradict.
-        against: the robot as drawn, or the model that was planned for.
+        rows: all usable rows.
+        counts: rows that are not contradicted by others.
+        against: the nominal robot, or the model that was planned for.
     """
     some = rows.select(counts) if counts.double().mean() > 1 - MOST_WRONG else rows
     found = check_rows(some, against, may_move=MOVES).implausible
@@ -185,13 +185,13 @@ def setup_sentence(
 
 @dataclass(frozen=True, eq=False)
 class FurtherPoses:
-    """Poses that can be planned.
+    """Candidates for replanning the remaining poses.
 
     Attributes:
         q: joint values [rad or m].
-        number: of every pose among the candidates.
-        motions: free ones between poses.
-        task: joint values [rad or m] where the robot shall be accurate.
+        number: number of each pose among the candidates of the plan.
+        motions: motions between poses.
+        task: joint values where the robot has to be accurate [rad or m].
     """
 
     q: Float64[Tensor, "candidates dof"]
@@ -201,13 +201,13 @@ class FurtherPoses:
 
     @staticmethod
     def of(plan: StoredPlan, candidates: Candidates, task: Float64[Tensor, "tasks dof"]) -> "FurtherPoses":
-        """Take some of a plan's candidates."""
+        """Select evenly from the candidates of a plan."""
         count = len(candidates.q)
-        some = torch.linspace(0, count - 1, min(count, CANDIDATES)).round().long()
-        motions = Motions(plan.arm, candidates.workspace[:CANDIDATES])
+        some = torch.linspace(0, count - 1, min(count, MAX_CANDIDATES)).round().long()
+        motions = Motions(plan.arm, candidates.workspace[:MAX_CANDIDATES])
         return FurtherPoses(candidates.q[some], candidates.number[some], motions, task)
 
-    def planned_again(
+    def replanned(
         self,
         plan: StoredPlan,
         poses: int,
@@ -215,32 +215,32 @@ class FurtherPoses:
         measured: Float64[Tensor, "rows dof"],
         remaining: Int64[Tensor, " remaining"],
     ) -> StoredPlan | None:
-        """Choose the poses that are left anew, by what is known by now; the next one and those to check with stay.
+        """Select the remaining poses again, given the rows so far; the next pose and those for testing stay.
 
         Args:
-            plan: that holds now.
-            poses: to calibrate with, in all.
-            so_far: what the rows came to.
+            plan: the present plan.
+            poses: total number of poses to calibrate with.
+            so_far: posterior and accuracy given the rows so far.
             measured: joint values of the rows that count [rad or m].
-            remaining: numbers of the poses that are left, the next one first.
+            remaining: indices of the remaining poses, the next one first.
 
         Returns:
-            The plan; None where nothing can be chosen.
+            The new plan; None where nothing can be selected.
         """
         first = remaining[:1]
         check = remaining[1:][plan.check[remaining[1:]]]
         count = poses - so_far.point.poses - int((~plan.check[first]).sum())
         new = self._new(plan, torch.cat([measured, plan.q[first]]))
-        knowledge = so_far.knowledge
+        posterior = so_far.posterior
         if not len(first) or not 0 < count <= len(new):
             return None
         if not bool(plan.check[first]):
-            knowledge = knowledge.informed(plan.q[first])
-        seen, tool = knowledge.measured(self.q), knowledge.tool(self.task)
-        for _ in range(ROUNDS):
+            posterior = posterior.informed(plan.q[first])
+        seen, tool = posterior.measured(self.q), posterior.tool(self.task)
+        for _ in range(MAX_REPLACEMENTS):
             if count > len(new):
                 return None
-            chosen = new[choose(seen[new], tool, count, plan.settings.criterion)]
+            chosen = new[select_poses(seen[new], tool, count, plan.settings.criterion)]
             use = order_of_use(count, len(check))
             q = torch.cat([self.q[chosen], plan.q[check]])[use]
             way = tour(self.motions, q, plan.settings.pace, plan.q[first[0]], stages=(AHEAD,))
@@ -260,6 +260,6 @@ class FurtherPoses:
         )
 
     def _new(self, plan: StoredPlan, known: Float64[Tensor, "known dof"]) -> Int64[Tensor, " new"]:
-        """Numbers of the poses that are neither measured nor next."""
+        """Return the indices of candidates that are neither measured nor next."""
         off = joint_differences(plan.arm.robot, self.q, known).abs().amax(-1)
         return (off > NEAR_POSE).all(1).nonzero()[:, 0]

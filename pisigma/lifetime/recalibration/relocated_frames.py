@@ -7,7 +7,7 @@ from pisigma.calibration.geometric.initial_guess.initial_guess import chosen_row
 from pisigma.estimation.drift import WORTH
 from pisigma.files.errors import IdentificationError
 from pisigma.lifetime.recalibration.adaptation import adapt
-from pisigma.lifetime.recalibration.recalibration_problem import Owner, recalibration_problem
+from pisigma.lifetime.recalibration.recalibration_problem import FrameKey, recalibration_problem
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel, Frames
 from pisigma.model.model_posterior import ModelPosterior
@@ -18,9 +18,9 @@ FAR = 1e-3
 """[m, or of the reach] A base or a tool that drifted by less is where it was, but for the drift."""
 
 
-def owners_elsewhere(
+def relocated_frames(
     model: CalibratedModel, posterior: ModelPosterior, rows: Measurements, noise: Mapping[str, float]
-) -> frozenset[Owner]:
+) -> frozenset[FrameKey]:
     """Find which of the bases and tools that a model has stand elsewhere.
 
     Each hypothesis lets joints, geometry and correction drift; it has the evidence of the rows with the base, the tool,
@@ -45,14 +45,14 @@ def owners_elsewhere(
         for kind, names, frames in _kinds(rows, posterior)
     )
 
-    def evidence(elsewhere: Set[Owner]) -> float:
+    def evidence(elsewhere: Set[FrameKey]) -> float:
         problem = recalibration_problem(model, posterior, rows, elsewhere)
         return adapt(problem, noise).drift.log_evidence - WORTH * len(elsewhere)
 
     still = adapt(recalibration_problem(model, posterior, rows, frozenset()), noise).drift
     if all(group.size < FAR for group in still.groups if group.what.startswith(("base", "tool"))):
         return frozenset()
-    tried = {frozenset[Owner](): still.log_evidence}
+    tried = {frozenset[FrameKey](): still.log_evidence}
     with suppress(IdentificationError):  # so few rows cannot say where these stand
         tried |= {owners: evidence(owners) for owners in (bases, tools, bases | tools) if owners}
     return max(tried, key=lambda owners: tried[owners])

@@ -1,4 +1,4 @@
-"""Knowledge: conditioning on poses, predictions, and what measured rows say."""
+"""RobotPosterior: conditioning on poses, predictions, and what measured rows say."""
 
 import numpy as np
 import pytest
@@ -7,7 +7,7 @@ from testing.closeness import assert_close
 
 from pisigma.files.errors import MeasurementError
 from pisigma.measurement.dataset import Measurements
-from pisigma.planning.knowledge import Instrument, Knowledge
+from pisigma.planning.robot_posterior import Instrument, RobotPosterior
 from pisigma.robot import Robot
 from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.robot.se3 import rotation_from_vector
@@ -26,15 +26,15 @@ def robot() -> Robot:
 @pytest.mark.parametrize("kind", ["position", "pose", "distance"])
 def test_columns_are_the_derivative_of_what_is_measured(robot: Robot, kind: str) -> None:
     instrument = Instrument(kind, 1e-4, 2e-4, (1.0, 2.0, 0.5))
-    knowledge = Knowledge.of_robot(robot, instrument)
+    posterior = RobotPosterior.of_robot(robot, instrument)
     q = random_joints(robot, 4, 0)
-    B = knowledge.measured(q)
+    B = posterior.measured(q)
     assert B.shape[1] == {"position": 3, "pose": 6, "distance": 1}[kind]
-    step, index = 1e-6, knowledge.uncertainty.space.index("d_1")
+    step, index = 1e-6, posterior.uncertainty.space.index("d_1")
     dh = robot.dh.copy()
     dh[0, 1] += step
     T = [forward_kinematics(one, q)[:, :3, 3] for one in (robot, robot.with_geometry(dh=dh))]
-    size = knowledge.uncertainty.root[index, index]
+    size = posterior.uncertainty.root[index, index]
     if kind == "distance":
         lengths = [(position - torch.tensor(instrument.anchor)).norm(dim=1) for position in T]
         moved = ((lengths[1] - lengths[0]) / step)[:, None]
@@ -44,52 +44,52 @@ def test_columns_are_the_derivative_of_what_is_measured(robot: Robot, kind: str)
 
 
 def test_conditioning_is_that_of_a_normal_distribution(robot: Robot) -> None:
-    knowledge = Knowledge.of_robot(robot, hybrid=False)
+    posterior = RobotPosterior.of_robot(robot, hybrid=False)
     q, task = random_joints(robot, 20, 1), random_joints(robot, 30, 2)
-    A = knowledge.columns(q)[:, :3].flatten(0, 1)
-    C = knowledge.uncertainty.root.square()
-    expected = torch.linalg.inv(torch.linalg.inv(C) + A.t() @ A / knowledge.instrument.sigma**2)
-    root = knowledge.informed(q).uncertainty.root
+    A = posterior.columns(q)[:, :3].flatten(0, 1)
+    C = posterior.uncertainty.root.square()
+    expected = torch.linalg.inv(torch.linalg.inv(C) + A.t() @ A / posterior.instrument.sigma**2)
+    root = posterior.informed(q).uncertainty.root
     scale = expected.diagonal().sqrt()
     assert_close(root @ root.t() / scale / scale[:, None], expected / scale / scale[:, None], atol=1e-6)
     # What is measured first and what is measured second may be exchanged.
-    halves = knowledge.informed(q[:8]).informed(q[8:]).deviation(task)
-    assert_close(halves, knowledge.informed(q).deviation(task), rtol=1e-6)
+    halves = posterior.informed(q[:8]).informed(q[8:]).deviation(task)
+    assert_close(halves, posterior.informed(q).deviation(task), rtol=1e-6)
 
 
 def test_few_rows_are_conditioned_on_without_a_fit(robot: Robot) -> None:
-    knowledge, q = Knowledge.of_robot(robot), random_joints(robot, 2, 3)
+    posterior, q = RobotPosterior.of_robot(robot), random_joints(robot, 2, 3)
     rows = Measurements(q=q, position=forward_kinematics(robot, q)[:, :3, 3])
     task = random_joints(robot, 5, 4)
-    assert_close(knowledge.after(rows).deviation(task), knowledge.informed(q).deviation(task), rtol=1e-9)
+    assert_close(posterior.after(rows).deviation(task), posterior.informed(q).deviation(task), rtol=1e-9)
 
 
 def test_rows_surprise_as_chi_squared_and_wrong_ones_more(robot: Robot) -> None:
-    knowledge = Knowledge.of_robot(robot, Instrument("pose", 1e-4, 2e-4)).informed(
+    posterior = RobotPosterior.of_robot(robot, Instrument("pose", 1e-4, 2e-4)).informed(
         random_joints(robot, 60, 5)
     )
     q = random_joints(robot, 400, 6)
     T = forward_kinematics(robot, q)
     generator = torch.Generator().manual_seed(0)
-    spread = knowledge.measured(q)
+    spread = posterior.measured(q)
     numbers = torch.randn(spread.shape[2], generator=generator, dtype=torch.float64)
     off = spread @ numbers + torch.randn(400, 6, generator=generator, dtype=torch.float64)
     position = T[:, :3, 3] + off[:, :3] * 1e-4
     rotation = rotation_from_vector(off[:, 3:] * 2e-4) @ T[:, :3, :3]
-    surprise = knowledge.surprise(Measurements(q=q, position=position, rotation=rotation))
+    surprise = posterior.surprise(Measurements(q=q, position=position, rotation=rotation))
     assert 0.8 < float(surprise.square().mean()) < 1.2
     position[7, 0] += 5e-3
-    assert float(knowledge.surprise(Measurements(q=q, position=position, rotation=rotation))[7]) > 4
+    assert float(posterior.surprise(Measurements(q=q, position=position, rotation=rotation))[7]) > 4
 
 
 def test_what_cannot_be_known_is_refused(robot: Robot) -> None:
     rows = Measurements(q=random_joints(robot, 2, 0), position=torch.zeros(2, 3).double())
     with pytest.raises(MeasurementError, match="positions were wanted"):
-        Knowledge.of_robot(robot, Instrument("distance")).surprise(rows)
+        RobotPosterior.of_robot(robot, Instrument("distance")).surprise(rows)
 
 
 def test_distances_say_nothing_of_where_the_robot_stands(robot: Robot) -> None:
-    known = Knowledge.of_robot(robot, Instrument("distance", anchor=(1.5, -1.0, 0.3)), hybrid=False)
+    known = RobotPosterior.of_robot(robot, Instrument("distance", anchor=(1.5, -1.0, 0.3)), hybrid=False)
     q = torch.rand(40, robot.dof, dtype=torch.float64, generator=torch.Generator().manual_seed(3))
     after = known.informed(q).deviation(q)
     assert bool((after < 0.5 * known.deviation(q)).all())
@@ -100,7 +100,7 @@ def test_an_arm_seen_anew_is_known_as_one_never_measured_there(robot: Robot) -> 
     """In another frame, at another target, with nothing known of either."""
     base, tool = (np.array([0.3, -0.2, 0.1, *angles]) for angles in ((0.1, 0.2, 3.0), (0.5, -0.3, 0.2)))
     q = torch.linspace(-1, 1, 5 * robot.dof, dtype=torch.float64).view(5, robot.dof)
-    anew = Knowledge.of_robot(robot, hybrid=False).seen_anew(base, tool)
-    expected = Knowledge.of_robot(robot.with_geometry(base=base, tool=tool), hybrid=False)
+    anew = RobotPosterior.of_robot(robot, hybrid=False).with_unknown_base_and_tool(base, tool)
+    expected = RobotPosterior.of_robot(robot.with_geometry(base=base, tool=tool), hybrid=False)
     for D, wanted in ((anew.tool(q), expected.tool(q)), (anew.measured(q), expected.measured(q))):
         assert_close(D @ D.mT, wanted @ wanted.mT, rtol=1e-9)
