@@ -225,8 +225,8 @@ class CameraProspects:
             f"The RMS position error of {self.rms * 1e3:.3f} mm would be lower with {changes}; "
             f"{what} limits it most.",
             *self.unidentifiable,
-            "The scale comes from the board alone: squares 0.1 % too large make the robot 0.1 % too large, which only a "
-            "known distance reveals.",
+            "The scale comes from the board alone: squares 0.1 % too large make the robot 0.1 % too large, which only "
+            "a known distance reveals.",
             f"The board leaves the first image if it or the camera is {self.room * 1e3:.0f} mm from its place in the "
             "cell; a larger margin_px allows more.",
         )

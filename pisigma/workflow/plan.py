@@ -34,6 +34,7 @@ from pisigma.planning.expected_accuracy import (
 from pisigma.planning.plan_file import StoredPlan, yaml_of
 from pisigma.planning.plan_inputs import find_candidates, read_planned_rows, views_of, with_measured
 from pisigma.planning.plan_settings import PlanSettings
+from pisigma.planning.pose_selection import select_poses
 from pisigma.planning.robot_posterior import RobotPosterior
 from pisigma.planning.subject import Subject
 from pisigma.planning.surroundings.arm_in_cell import ArmInCell

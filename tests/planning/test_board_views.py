@@ -7,6 +7,7 @@ import pytest
 import torch
 from testing.board_views import CELL, OBLIQUE, arm_before_board, camera_settings, sees_board
 from testing.closeness import assert_close
+from testing.refusals import refused
 
 from pisigma.files.errors import PlanningError
 from pisigma.measurement.camera.board import Board
@@ -100,21 +101,21 @@ def test_sharp_depths_follow_from_the_lens():
 def test_depths_are_stated_once():
     lens = {"aperture": 4, "focus_mm": 500, "pixel_um": 5}
     for wrong in ({}, {"near_mm": 300}, {"near_mm": 300, "far_mm": 700, "lens": lens}):
-        with pytest.raises(ValueError, match="near_mm and far_mm, or else the lens"):
+        with pytest.raises(ValueError, match="near_mm and far_mm or lens"):
             ViewSection.model_validate(wrong)
-    with pytest.raises(ValueError, match="near_mm below far_mm"):
+    with pytest.raises(ValueError, match="near_mm < far_mm"):
         ViewSection.model_validate({"near_mm": 700, "far_mm": 300})
 
 
 def test_a_camera_needs_to_know_where_the_board_is(settings: PlanSettings):
-    with pytest.raises(PlanningError, match=r"where the board is .*--cell"):
+    with refused(PlanningError, option="--cell"):
         views_of(settings, ArmInCell.of(Robot.load("ur5")))
-    with pytest.raises(PlanningError, match="a camera and of a board were wanted"):
+    with refused(PlanningError, option="sensor", value="camera"):
         PlanSettings(sensor="camera")
 
 
 def test_points_far_outside_do_not_count_as_seen(tmp_path: Path, settings: PlanSettings):
-    """A strong distortion turns back outside of the image: what it shows inside is not there."""
+    """A strong distortion folds back outside the image, so that points outside project into it."""
     assert settings.camera is not None
     arm = arm_before_board()
     views = views_of(settings, arm)

@@ -6,6 +6,7 @@ import pytest
 import torch
 from testing.cells import CELL
 from testing.closeness import assert_close
+from testing.refusals import refused
 
 from pisigma.files.errors import MeasurementError, PlanningError
 from pisigma.planning.candidates import draw_candidates
@@ -62,7 +63,7 @@ def test_the_poses_are_in_their_order(stored: StoredPlan, tmp_path: Path):
 
 def test_a_table_without_its_plan_is_refused(stored: StoredPlan, tmp_path: Path):
     (tmp_path / "poses.plan.yaml").unlink()
-    with pytest.raises(PlanningError, match=r"no poses\.plan\.yaml beside it"):
+    with refused(PlanningError, file="poses.csv", value="poses.plan.yaml"):
         read_plan(tmp_path / "poses.csv")
 
 
@@ -70,31 +71,31 @@ def test_faults_of_the_files_are_named(stored: StoredPlan, tmp_path: Path):
     csv, yaml = tmp_path / "poses.csv", tmp_path / "poses.plan.yaml"
     text = yaml.read_text()
     yaml.write_text(text.replace("sensor: position", "sensor: lidar"))
-    with pytest.raises(PlanningError, match=r"poses\.plan\.yaml, line \d+: 'settings.sensor'"):
+    with refused(PlanningError, file="poses.plan.yaml", value="lidar"):
         read_plan(csv)
     yaml.write_text(text)
     csv.write_text(csv.read_text().replace(",order", ",number"))
-    with pytest.raises(MeasurementError, match=r"line 1: the column 'order' is missing"):
+    with refused(MeasurementError, file="poses.csv", line=1, column="order"):
         read_plan(csv)
 
 
 @pytest.mark.parametrize(
-    ("stated", "message"),
+    ("stated", "option", "value"),
     [
-        ({"sensor": "lidar"}, "sensor 'lidar' is unknown; Valid: camera, distance, pose, position"),
-        ({"criterion": "A"}, "criterion 'A' is unknown; Valid: D, I"),
-        ({"count": 0}, "count: 1 to 100,000 was wanted, got 0"),
-        ({"sigma_mm": -1.0}, "sigma_mm: 0.001 to 1000 mm was wanted, got -1"),
-        ({"box_mm": (0, 0, 0, 1, -1, 1)}, "box: the lowest x, y, z"),
-        ({"settling_s": -1.0}, "a settling time of 0 to 3600 s"),
+        ({"sensor": "lidar"}, "sensor", "lidar"),
+        ({"criterion": "A"}, "criterion", "A"),
+        ({"count": 0}, "count", 0),
+        ({"sigma_mm": -1.0}, "sigma_mm", -1.0),
+        ({"box_mm": (0, 0, 0, 1, -1, 1)}, "box_mm", "0, 0, 0, 1, -1, 1"),
+        ({"settling_s": -1.0}, "settling", "-1 s"),
     ],
 )
 @pytest.mark.usefixtures("without_type_checker")
-def test_settings_that_are_none_are_refused(stated: dict[str, object], message: str):
-    with pytest.raises(PlanningError, match=message):
+def test_invalid_settings_are_refused(stated: dict[str, object], option: str, value: object):
+    with refused(PlanningError, option=option, value=value):
         PlanSettings(**stated)  # type: ignore[arg-type]
 
 
-def test_distances_are_measured_from_somewhere():
-    with pytest.raises(PlanningError, match="where distances are measured from"):
+def test_the_origin_of_distances_has_to_be_stated():
+    with refused(PlanningError, option="--cell"):
         instrument_of(PlanSettings(sensor="distance"))

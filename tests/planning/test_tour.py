@@ -4,10 +4,10 @@ import itertools
 import math
 
 import numpy as np
-import pytest
 import torch
 from testing.cells import CELL
 from testing.closeness import assert_close
+from testing.refusals import refused
 
 from pisigma.files.errors import PlanningError
 from pisigma.planning.candidates import draw_candidates
@@ -84,6 +84,8 @@ def test_a_pose_that_no_motion_leads_to_is_left_out():
     assert len(way.order) == 2
 
 
-def test_a_pace_is_a_pace():
-    with pytest.raises(PlanningError, match=r"speeds of 0\.057 deg/s or 1 mm/s and more"):
-        Pace(speed=0.0)
+def test_invalid_paces_are_refused():
+    for option, value in (("speed", "0 deg/s"), ("slide", "-250 mm/s"), ("settling", "-1 s")):
+        stated = {"speed": 0.0, "slide": -0.25, "settling": -1.0}[option]
+        with refused(PlanningError, option=option, value=value):
+            Pace(**{option: stated})

@@ -15,8 +15,8 @@ AlarmKind = Literal["setup", "unreadable", "duplicate", "frozen", "swapped", "of
 """Kind of an alarm.
 
 "setup": all rows have the same fault, such as a wrong unit. "unreadable": the row cannot be read. "duplicate": it
-equals another one. "frozen": the sensor shows an old value. "swapped": the values of two poses are swapped. "off": the other
-rows contradict the value. "pose": the joint values are not those of a planned pose (a remark: the row counts).
+equals another one. "frozen": the sensor shows an old value. "swapped": the values of two poses are swapped. "off": the
+other rows contradict the value. "pose": the joint values are not those of a planned pose (a remark: the row counts).
 "cleared": an alarm is withdrawn, because later rows agree with the row.
 """
 

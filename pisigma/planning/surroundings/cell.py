@@ -63,7 +63,6 @@ class JointSection(Section):
                 raise PlanningError(
                     f"the limits and margins leave no range for joint '{joint.name}'",
                     value=joint.name,
-                    option="joints",
                     remedy="widen the limits or reduce the margins",
                 )
         return torch.from_numpy(limits)

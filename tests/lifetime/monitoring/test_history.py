@@ -68,7 +68,8 @@ def test_a_kill_loses_nothing(tmp_path):
         "import sys; sys.path[:0] = sys.argv[2:]; from test_history import record; import pathlib, itertools\n"
         "from pisigma.lifetime.monitoring.history import store_sessions\n"
         "for n in itertools.count(1):\n"
-        "    store_sessions(pathlib.Path(sys.argv[1]), 'model', [record(2 * n), record(2 * n + 1)]); print(n, flush=True)\n"
+        "    store_sessions(pathlib.Path(sys.argv[1]), 'model', [record(2 * n), record(2 * n + 1)])\n"
+        "    print(n, flush=True)\n"
     )
     command = [sys.executable, "-c", script, str(path), os.path.dirname(__file__), *sys.path]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
