@@ -25,7 +25,7 @@ from torch import Tensor
 from pisigma.lifetime.fleet.prior import fleet_prior
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel
-from pisigma.planning.pose_selection import choose
+from pisigma.planning.pose_selection import select_poses
 from pisigma.planning.robot_posterior import Instrument, RobotPosterior
 from pisigma.robot import Robot
 from pisigma.robot.se3 import rotation_from_vector

@@ -29,7 +29,7 @@ from pisigma.planning.camera_settings import CameraSettings
 from pisigma.planning.expected_accuracy import rms_of
 from pisigma.planning.plan_inputs import find_candidates, instrument_of, views_of
 from pisigma.planning.plan_settings import Criterion, PlanSettings
-from pisigma.planning.pose_selection import choose
+from pisigma.planning.pose_selection import select_poses
 from pisigma.planning.robot_posterior import RobotPosterior
 from pisigma.planning.surroundings.arm_in_cell import ArmInCell
 from pisigma.planning.surroundings.cell import Cell
@@ -124,7 +124,9 @@ def main(draws: int, candidates: int, counts: list[int]) -> None:
         }
         for name, posterior in bench.posterior.items():
             for criterion in get_args(Criterion):
-                chosen = select_poses(posterior.measured(bench.q), posterior.tool(bench.task), count, criterion)
+                chosen = select_poses(
+                    posterior.measured(bench.q), posterior.tool(bench.task), count, criterion
+                )
                 ways[f"{criterion}, {name}"] = [chosen] * draws
         pooled = {}
         for way, choices in ways.items():

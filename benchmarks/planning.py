@@ -27,7 +27,7 @@ from pisigma.calibration.hybrid.result import HybridResult
 from pisigma.measurement.dataset import Measurements
 from pisigma.planning.expected_accuracy import rms_of
 from pisigma.planning.plan_settings import Criterion
-from pisigma.planning.pose_selection import choose
+from pisigma.planning.pose_selection import select_poses
 from pisigma.planning.robot_posterior import Instrument, RobotPosterior
 from pisigma.robot import Robot
 from pisigma.validation.held_out.few_rows import fit_where_it_helps
