@@ -1,4 +1,4 @@
-"""The one gate for rows: every command that takes some lets them be judged here, with the same words and status."""
+"""Check of rows before they are used: every command that reads rows calls `check_rows`."""
 
 from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass
@@ -23,33 +23,34 @@ from pisigma.validation.held_out.diagnostic import Diagnostic
 from pisigma.validation.held_out.frames.fitted_frames import FrameKind
 from pisigma.validation.setup_faults.cause import length_text
 from pisigma.validation.setup_faults.explanations import position_spread
-from pisigma.validation.setup_faults.faults_as_drawn import FEWEST_ROWS_AS_DRAWN, largest_group, usual_error
+from pisigma.validation.setup_faults.faults_as_drawn import MIN_ROWS_AS_DRAWN, largest_group, usual_error
 from pisigma.validation.setup_faults.hypothesis import COLLAPSED
 from pisigma.validation.setup_faults.joint_faults import joint_causes, signs_and_exchanges
 from pisigma.validation.setup_faults.setup_fault import SetupFault
 
-FEWEST_CHECKED = 12
-"""From so many rows on a calibration says whether the errors of the arm are too large to be those of this robot."""
-FEWEST_ROWS = 4
-"""Of fewer, the positions may happen to be near each other."""
+MIN_ROWS_TO_CALIBRATE = 12
+"""Rows from which a calibration shows whether the errors of the arm are too large for this robot."""
+MIN_ROWS = 4
+"""With fewer rows, the positions may be near each other by chance."""
 SCALE = 30.0
-"""Positions are in another unit that are so many times as far apart as those of the robot as drawn."""
+"""Spread of the measured over that of the nominal positions above which (or below whose inverse) the unit is wrong."""
 ARM_SHARE = 0.3
-"""Share of the reach by which a tool that is not drawn spreads positions, and that poses are spread over at least."""
+"""Spread of positions caused by a tool that the nominal robot lacks, and smallest spread of usual poses, as a share of
+the reach."""
 
-FEWEST_FOR_JOINTS = 8
-"""Rows that tell columns of joints apart: 24 values, of which base and tool take 9."""
+MIN_ROWS_FOR_JOINTS = 8
+"""Rows that distinguish columns of joints: 24 values, of which base and tool take 9."""
 
 
 @dataclass(frozen=True, eq=False)
 class RowVerdict:
-    """What the checks say of rows.
+    """Findings of the checks of rows.
 
     Attributes:
-        diagnostics: those first that make the rows implausible.
-        judged: the rows with what the model says of them; None where they were judged by the robot as drawn, or where
-            too few of them have positions.
-        faults_of_lengths: what explains the errors of rows without positions.
+        diagnostics: the findings; those that make the rows implausible come first.
+        judged: the rows with the predictions of the model; None if they were compared with a nominal robot, or if too
+            few of them have positions.
+        faults_of_lengths: setup faults that explain the errors of rows without positions.
     """
 
     diagnostics: tuple[Diagnostic, ...] = ()
@@ -58,17 +59,17 @@ class RowVerdict:
 
     @property
     def setup_faults(self) -> tuple[SetupFault, ...]:
-        """What explains the errors of all rows alike, of any size, moves among it."""
+        """Setup faults that explain the errors of all rows, of any size, including allowed motions."""
         return self.faults_of_lengths if self.judged is None else self.judged.setup_faults
 
     @property
     def implausible(self) -> tuple[Diagnostic, ...]:
-        """Why nothing is to be concluded from the rows: commands end with status 3."""
+        """Findings because of which the rows must not be used; commands end with status 3."""
         return tuple(one for one in self.diagnostics if one.severity == "implausible")
 
     @property
     def trusted(self) -> bool:
-        """Whether something may be concluded from the rows."""
+        """Whether the rows may be used."""
         return not self.implausible
 
 
@@ -79,22 +80,22 @@ def check_rows(
     may_move: Collection[Move] = (),
     nominal: CalibratedModel | None = None,
 ) -> RowVerdict:
-    """Judge rows before anything is concluded from them.
+    """Check rows before they are used.
 
-    Against a model the checks of `ROW_CHECKS` are run, for rows without positions those of `diagnosed_lengths`.
-    Against a robot as drawn, and the mean robot of a fleet, the size of the positions is compared with that of the
-    robot's motion, from 6 rows on other robots of the catalogue are tried, from 8 on signs and exchanges of joint
-    columns, from 12 on the rows are calibrated with and checked by `CHECKS`, and from 24 on for faults in the setup.
+    Against a model, the checks of `ROW_CHECKS` are run, or those of `diagnosed_lengths` for rows without positions.
+    Against a nominal robot, or the mean robot of a fleet, the spread of the positions is compared with that of the
+    robot's poses; with at least 6 rows other robots of the catalogue are tried, with 8 signs and exchanges of joint
+    columns, with 12 the rows are used for a calibration that is checked by `CHECKS`, and with 24 for setup faults.
 
     Args:
-        rows: any.
-        against: a calibrated model, or the robot as drawn.
-        fitted: what stands elsewhere than when the model was made, for certain.
+        rows: the rows.
+        against: a calibrated model, or the nominal robot.
+        fitted: what is known to have moved since the model was made.
         may_move: what else may have moved since, without being a fault of the rows.
-        nominal: the nominal robot with the base and tool that suit it best; only shows what its errors fall to.
+        nominal: the nominal robot with base and tool fitted; only used to report its errors after a correction.
 
     Raises:
-        MeasurementError: the model does not know a frame or a target of the rows.
+        MeasurementError: the model does not have a frame or a target of the rows.
         PoseError: the joint values do not fit the robot.
     """
     if isinstance(against, CalibratedModel) and against.kind == FLEET_PRIOR and against.drawn is not None:
@@ -111,7 +112,7 @@ def check_rows(
 
 
 def _until_implausible(checks: Iterable[Iterable[Diagnostic]]) -> tuple[Diagnostic, ...]:
-    """What the checks say, up to the first that finds rows implausible: what the others say is a consequence."""
+    """Collect findings up to the first check that finds the rows implausible; later ones are consequences."""
     found: list[Diagnostic] = []
     for diagnostics in checks:
         found += diagnostics
@@ -121,17 +122,17 @@ def _until_implausible(checks: Iterable[Iterable[Diagnostic]]) -> tuple[Diagnost
 
 
 def _against_robot(rows: Measurements, robot: Robot) -> Iterator[Iterable[Diagnostic]]:
-    """Checks by the robot as drawn, the surest first."""
+    """Run the checks by the nominal robot, the most reliable first."""
     yield setup_diagnostics(robot, rows)
     yield size_of_positions(robot, rows)
     yield joint_columns(robot, rows)
     yield other_robot_diagnostics(robot, rows)
-    if rows.rows >= FEWEST_CHECKED:
+    if rows.rows >= MIN_ROWS_TO_CALIBRATE:
         yield _as_calibrated(rows, robot)
 
 
 def _as_calibrated(rows: Measurements, robot: Robot) -> tuple[Diagnostic, ...]:
-    """What is wrong with a calibration of the rows."""
+    """Check a calibration of the rows."""
     try:
         return diagnostics_of_rows(GeometricCalibrator(robot), rows)
     except IdentificationError as refusal:  # no calibration error explains the rows
@@ -140,9 +141,9 @@ def _as_calibrated(rows: Measurements, robot: Robot) -> tuple[Diagnostic, ...]:
 
 
 def size_of_positions(robot: Robot, rows: Measurements) -> Iterator[Diagnostic]:
-    """Compare the size of what was measured with that of the robot's motion."""
+    """Compare the spread of the measured positions with that of the nominal robot's."""
     group = largest_group(rows)
-    if group.position is None or group.rows < FEWEST_ROWS:
+    if group.position is None or group.rows < MIN_ROWS:
         return
     measured, drawn = (
         position_spread(group.position),
@@ -150,27 +151,30 @@ def size_of_positions(robot: Robot, rows: Measurements) -> Iterator[Diagnostic]:
     )
     arm = ARM_SHARE * robot.reach
     if measured > SCALE * (drawn + arm):
-        mistake = "x, y and z are millimetres that are named metres"
+        cause, mistake = "mm_named_m", "x, y and z are millimetres that are named metres"
     elif SCALE * measured < drawn > arm:
+        cause = "m_named_mm"
         mistake = "x, y and z are metres that are named millimetres, or do not change with the robot"
     else:
         return
     yield Diagnostic(
         kind="setup_fault",
         severity="implausible",
-        sentence=f"The measured positions are {measured * 1e3:,.1f} mm RMS from their mean, and those of robot "
-        f"'{robot.name}' at these joint values {drawn * 1e3:,.1f} mm: {mistake}; check the column names and the "
+        sentence=f"The measured positions are {measured * 1e3:,.1f} mm RMS from their mean, but those of robot "
+        f"'{robot.name}' at these joint values are {drawn * 1e3:,.1f} mm: {mistake}; check the column names and the "
         "instrument.",
+        cause=cause,
+        values={"measured_mm": measured * 1e3, "nominal_mm": drawn * 1e3},
     )
 
 
 def joint_columns(robot: Robot, rows: Measurements) -> Iterator[Diagnostic]:
-    """Try a reversed sign of every joint and an exchange of two neighbours, base and tool being fitted each time.
+    """Try a reversed sign of every joint and an exchange of two neighbours, with base and tool fitted each time.
 
-    Of more rows than `FEWEST_ROWS_AS_DRAWN` much more is tried, see `find_faults_as_drawn`.
+    With at least `MIN_ROWS_AS_DRAWN` rows, `find_faults_as_drawn` tries many more hypotheses instead.
     """
     group = largest_group(rows)
-    if not FEWEST_FOR_JOINTS <= group.rows < FEWEST_ROWS_AS_DRAWN:
+    if not MIN_ROWS_FOR_JOINTS <= group.rows < MIN_ROWS_AS_DRAWN:
         return
     here, usual = _errors(robot, group, group.q[None])[0], usual_error(robot, group.q)
     if not here > usual:
@@ -186,13 +190,15 @@ def joint_columns(robot: Robot, rows: Measurements) -> Iterator[Diagnostic]:
         yield Diagnostic(
             kind="setup_fault",
             severity="implausible",
-            sentence=f"{cause.clause[:1].upper()}{cause.clause[1:]}: with this set right, the errors of the robot as "
-            f"drawn fall from {length_text(here)} to {length_text(left)} RMS; {cause.advice}.",
+            sentence=f"{cause.clause[:1].upper()}{cause.clause[1:]}: with this corrected, the errors of the nominal "
+            f"robot fall from {length_text(here)} to {length_text(left)} RMS; {cause.advice}.",
+            cause=cause.kind,
+            values={"joints": tuple(joint + 1 for joint in cause.joints)},
         )
 
 
 def _errors(robot: Robot, rows: Measurements, q: Float64[Tensor, "maps rows dof"]) -> list[float]:
-    """Root mean squares of the position errors [m] with base and tool fitted, as if nothing were fitted."""
+    """Compute RMS position errors [m] with base and tool fitted, corrected for the degrees of freedom."""
     measured = MeasuredPoses.of(rows.position, None, 0.0)
     errors = []
     for T in forward_kinematics(robot, q):

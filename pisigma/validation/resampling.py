@@ -1,4 +1,4 @@
-"""How often what was measured is drawn again, for confidence intervals."""
+"""Settings of the bootstrap for confidence intervals."""
 
 from dataclasses import dataclass
 from typing import Annotated
@@ -6,15 +6,14 @@ from typing import Annotated
 from pisigma.files.errors import MeasurementError
 from pisigma.files.setting import HIDDEN, Option
 
-MOST_RESAMPLES = 1_000_000
+MAX_RESAMPLES = 1_000_000
 
 
 @dataclass(frozen=True)
 class Bootstrap:
-    """Percentile bootstrap (Efron and Tibshirani 1993, chapter 13) over groups of rows that belong together.
+    """Percentile bootstrap (Efron and Tibshirani 1993, chapter 13) over groups of rows with equal joint values.
 
-    Rows of one configuration share most of their error, so groups and not rows are drawn, as many as there are, with
-    replacement.
+    Rows of one configuration share most of their error. Therefore groups are drawn with replacement, not rows.
 
     Attributes:
         resamples: number of bootstrap resamples for confidence intervals.
@@ -27,9 +26,11 @@ class Bootstrap:
     confidence: Annotated[float, HIDDEN] = 0.95
 
     def __post_init__(self) -> None:
-        """Refuse settings that give no interval."""
-        if not 2 <= self.resamples <= MOST_RESAMPLES or not 0 < self.confidence < 1 or self.seed < 0:
-            raise MeasurementError(
-                f"bootstrap: 2 resamples or more and a confidence between 0 and 1 were wanted, a seed from 0 and up to "
-                f"{MOST_RESAMPLES:,} resamples, got {self.resamples}, {self.confidence:g} and seed {self.seed}."
-            )
+        """Refuse settings that define no interval."""
+        for name, valid, expected in (
+            ("resamples", 2 <= self.resamples <= MAX_RESAMPLES, f"2 to {MAX_RESAMPLES:,} resamples"),
+            ("confidence", 0 < self.confidence < 1, "a confidence level between 0 and 1"),
+            ("seed", self.seed >= 0, "a seed of at least 0"),
+        ):
+            if not valid:
+                raise MeasurementError(option=name, expected=expected, value=getattr(self, name))

@@ -350,7 +350,8 @@ class _Problem:
         if self.views is None:
             return ()
         q = self.candidates.q[chosen]
-        return tuple(view_warnings(self.views.obliqueness(self.arm, q), q, self.arm.robot))
+        found = view_warnings(self.views.obliqueness(self.arm, q), q, self.arm.robot)
+        return tuple(one.sentence for one in found)
 
     def _curve(self, chosen: Int64[Tensor, " chosen"], counts: list[int]) -> tuple[ExpectedAccuracy, ...]:
         return accuracy_curve(self.measured, self.tool, chosen, counts, self.settings.seed)

@@ -13,7 +13,7 @@ from pisigma.lifetime.recalibration.wear import beyond_wear
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.model_posterior import ModelPosterior
-from pisigma.validation.checks.rows.mixed_rows import MOST_WRONG, many_wrong
+from pisigma.validation.checks.rows.mixed_rows import MIN_WRONG_SHARE, many_wrong
 from pisigma.validation.held_out.diagnostic import Diagnostic
 from pisigma.validation.held_out.frames.fitted_frames import FrameKind
 from pisigma.validation.held_out.model_comparison import ModelComparison
@@ -64,7 +64,7 @@ def session_diagnostics(
         rows: of the session.
         session: what it says.
     """
-    if len(session.outliers) > MOST_WRONG * rows.rows:
+    if len(session.outliers) > MIN_WRONG_SHARE * rows.rows:
         wrong = [rows.place(row) in session.outliers for row in range(rows.rows)]
         return (many_wrong(rows, torch.tensor(wrong)),)
     limit = PLAUSIBLE_SHARE * model.robot.reach

@@ -22,7 +22,7 @@ from pisigma.model.model_posterior import FLEET_PRIOR
 from pisigma.model.stored_starts import spread_rows
 from pisigma.model.training_rows import kept_rows
 from pisigma.robot.se3 import invert, transform_from_xyzrpy, xyzrpy_from_transform
-from pisigma.validation.checks.rows.mixed_rows import MOST_WRONG, many_wrong
+from pisigma.validation.checks.rows.mixed_rows import MIN_WRONG_SHARE, many_wrong
 from pisigma.validation.gate import check_rows
 from pisigma.validation.held_out.diagnostic import Diagnostic
 from pisigma.validation.held_out.pose_statistics import image_deviation
@@ -133,7 +133,7 @@ def recalibration_diagnostics(
         wrong: numbers of those that were left out.
         moved: what is said to have moved.
     """
-    if len(wrong) > MOST_WRONG * rows.rows:
+    if len(wrong) > MIN_WRONG_SHARE * rows.rows:
         chosen = torch.zeros(rows.rows, dtype=torch.bool)
         chosen[list(wrong)] = True
         return (many_wrong(rows, chosen),)

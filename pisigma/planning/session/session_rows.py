@@ -34,7 +34,7 @@ from pisigma.planning.surroundings.motion import Motions
 from pisigma.planning.tour import order_of_use, tour
 from pisigma.robot.description import Robot
 from pisigma.robot.se3 import invert, transform_from_xyzrpy
-from pisigma.validation.checks.rows.mixed_rows import MOST_WRONG
+from pisigma.validation.checks.rows.mixed_rows import MIN_WRONG_SHARE
 from pisigma.validation.checks.rows.row_check import MOVES
 from pisigma.validation.gate import check_rows
 
@@ -178,7 +178,7 @@ def setup_sentence(
         counts: rows that are not contradicted by others.
         against: the nominal robot, or the model that was planned for.
     """
-    some = rows.select(counts) if counts.double().mean() > 1 - MOST_WRONG else rows
+    some = rows.select(counts) if counts.double().mean() > 1 - MIN_WRONG_SHARE else rows
     found = check_rows(some, against, may_move=MOVES).implausible
     return found[0].sentence if found else ""
 

@@ -1,4 +1,4 @@
-"""What limits a calibration by a camera, and what its images leave open."""
+"""Known weaknesses of calibrations by a camera: views, intrinsics, the tool, and what limits the accuracy."""
 
 from collections.abc import Iterator
 
@@ -25,20 +25,21 @@ from pisigma.validation.checks.check import AbstractCheck, CheckedCalibration
 from pisigma.validation.held_out.diagnostic import Diagnostic
 
 FRONTAL = np.deg2rad(12.0)
-"""Where nine in ten views are less oblique, the error over the workspace is 1.5 to 3 times that of usual views."""
+"""[rad] If 90 % of the views are less oblique, the error over the workspace is 1.5 to 3 times that of usual views."""
 ONE_BRANCH = 0.95
-"""Share of images by one branch of the arm from which on the others count as not measured."""
+"""Share of the images in one branch of the arm above which the other branches count as not measured."""
 EXPLAINED = 1.3
-"""Images that scatter by less than so many times what their corners explain leave nothing for a model of the arm."""
+"""Scatter of the images over that explained by their corners, below which no model of the arm can improve the fit."""
 WIDE = 3.0
-"""Deviations of focal lengths [px] from which on the intrinsics are free: the usual calibration leaves 0.5 px."""
+"""Standard deviation of the focal length [px] above which the intrinsics count as free; a usual calibration has 0.5."""
 CONTRADICTED = 4.0
-"""[standard deviations] Intrinsics that come out farther off contradict their calibration."""
+"""[standard deviations] Estimated intrinsics that deviate by more contradict their calibration."""
 POSTURES = 200
+"""Random joint vectors at which the error over the joint space is predicted."""
 
 
 class CameraCheck(AbstractCheck):
-    """Says which of the known traps of calibrations by cameras this one is in; `benchmarks/camera.py` measures them."""
+    """Reports which known weaknesses of camera calibrations this one has; `benchmarks/camera.py` measures them."""
 
     def diagnose(self, checked: CheckedCalibration) -> Iterator[Diagnostic]:
         """See `AbstractCheck.diagnose`."""
@@ -46,40 +47,45 @@ class CameraCheck(AbstractCheck):
         if not bool(by_corners.any()):
             return
         images, result = checked.rows.select(by_corners), checked.geometric
-        for sentence in (
-            *view_warnings(images.T[:, 2, 2].abs().clamp(max=1.0).acos().cpu(), images.q, checked.robot),
-            *_intrinsics(images, result),
-            *_tool(images, checked.rows, result),
-            *(
-                _limit(images, result) if bool(by_corners.all()) else ()
-            ),  # beside other sensors it need not be
-        ):
-            yield Diagnostic(kind="camera", severity="warning", sentence=sentence)
+        yield from view_warnings(images.T[:, 2, 2].abs().clamp(max=1.0).acos().cpu(), images.q, checked.robot)
+        yield from _intrinsics(images, result)
+        yield from _tool(images, checked.rows, result)
+        if bool(by_corners.all()):  # with other sensors, the camera need not be the limit
+            yield from _limit(images, result)
+
+
+def _warning(cause: str, sentence: str, **values: float | str) -> Diagnostic:
+    return Diagnostic(kind="camera", severity="warning", sentence=sentence, cause=cause, values=values)
 
 
 def view_warnings(
     tilt: Float64[Tensor, " images"], q: Float64[Tensor, "images dof"], robot: Robot
-) -> Iterator[str]:
-    """Say where views of a board are too frontal, or of one branch of the arm.
+) -> Iterator[Diagnostic]:
+    """Warn of views of a board that are too frontal, or all in one branch of the arm.
 
     Args:
-        tilt: how oblique they are [rad].
+        tilt: angle between the optical axis and the normal of the board [rad].
         q: joint values [rad or m].
-        robot: as drawn.
+        robot: the nominal robot.
     """
     most = float(tilt.quantile(0.9))
     if most < FRONTAL:
-        yield (
-            f"Nine in ten images show the board less than {np.rad2deg(most):.0f} deg oblique, which "
-            "hardly determines the distance and the tilt of the camera and doubles the error; take images up to 40 deg "
-            "oblique."
+        yield _warning(
+            "frontal_views",
+            f"90 % of the images show the board at less than {np.rad2deg(most):.0f} deg from frontal, which "
+            "hardly determines the distance and the tilt of the camera and doubles the error; take images at up to 40 "
+            "deg.",
+            tilt_deg=float(np.rad2deg(most)),
         )
     solver = closed_form_solver(robot)
     share = 0.0 if solver is None else _largest_share(nearest_branch(solver, q))
     if share >= ONE_BRANCH:
-        yield (
-            f"{share:.0%} of the images were taken on one branch of the arm (shoulder, elbow and wrist the same way), "
-            "which looks good there and is up to three times worse at other postures; take images on other branches."
+        yield _warning(
+            "one_branch",
+            f"{share:.0%} of the images were taken in one branch of the arm (the same configuration of shoulder, elbow "
+            "and wrist); the errors look small there and are up to three times as large in other configurations; take "
+            "images in other branches.",
+            share=share,
         )
 
 
@@ -87,47 +93,56 @@ def _largest_share(branch: Tensor) -> float:
     return float(torch.bincount(branch).max()) / len(branch)
 
 
-def _intrinsics(images: Measurements, result: CalibrationResult) -> Iterator[str]:
-    """Say where intrinsics are held, free, or far from their calibration."""
+def _intrinsics(images: Measurements, result: CalibrationResult) -> Iterator[Diagnostic]:
+    """Warn of intrinsics that are fixed, free, or far from their calibration."""
     identified = ImageIntrinsics.of(texts_of(images, INTRINSICS_COLUMN))
     cells = zip(texts_of(images, CAMERA_COLUMN), identified.stated, identified.sigma, strict=True)
     first = {camera: (stated, sigma) for camera, stated, sigma in reversed(list(cells)) if camera}
     for camera, (stated, sigma) in sorted(first.items()):
         if not sigma.any():
-            yield (
-                f"The intrinsics of camera '{camera}' were held as its file states them; off by as much as a usual "
-                "calibration leaves, they double the error over the workspace (0.1 mm of a UR5). Free them under their "
-                "prior, or check them."
+            yield _warning(
+                "intrinsics_fixed",
+                f"The intrinsics of camera '{camera}' were fixed at the values of its file; if these are off by as "
+                "much as a usual calibration leaves, they double the error over the workspace (0.1 mm for a UR5). "
+                "Estimate them under their prior, or check them.",
+                camera=camera,
             )
             continue
         free = sigma > 0
         off = (result.unknowns["camera"][camera] - stated)[free] / sigma[free]
         if sigma[0] > WIDE:
-            yield (
-                f"The intrinsics of camera '{camera}' were free, so a board that is not flat is taken for distortion "
-                "(0.3 mm of bow change k1 and the distance); state a calibration of the camera where there is one, and "
-                "put the board on glass."
+            yield _warning(
+                "intrinsics_free",
+                f"The intrinsics of camera '{camera}' were estimated without a prior, so a bow of the board appears as "
+                "distortion (a bow of 0.3 mm changes k1 and the distance); give a calibration of the camera if there "
+                "is one, and mount the board on glass.",
+                camera=camera,
             )
         elif np.abs(off).max() > CONTRADICTED:
-            yield (
-                f"The images contradict the calibration of camera '{camera}' by {np.abs(off).max():.1f} of its "
-                "standard deviations; check that it is of this lens, focus and resolution, and that the board is flat."
+            yield _warning(
+                "intrinsics_contradicted",
+                f"The images contradict the calibration of camera '{camera}' by {np.abs(off).max():.1f} standard "
+                "deviations; check that the calibration belongs to this lens, focus and resolution, and that the board "
+                "is flat.",
+                camera=camera,
+                deviations=float(np.abs(off).max()),
             )
 
 
-def _tool(images: Measurements, rows: Measurements, result: CalibrationResult) -> Iterator[str]:
-    """Say that the last joint's row goes with hand and eye, where nothing but images was measured."""
+def _tool(images: Measurements, rows: Measurements, result: CalibrationResult) -> Iterator[Diagnostic]:
+    """Warn that the hand-eye transform cannot be separated from the last DH row if only images were measured."""
     last = [name for name in result.redundancy.removed if name.endswith(f"_{len(result.robot.joints)}")]
     if last and images.rows == rows.rows:
-        yield (
-            f"Where the camera (or the board) is on the flange cannot be distinguished from errors of the last joint's "
-            f"row ({', '.join(last)}), so a tool that is drawn in the flange's frame is not identified; measure a few "
-            "positions of that tool with another sensor, or teach its centre."
+        yield _warning(
+            "tool_not_identified",
+            f"The pose of the camera (or the board) on the flange cannot be distinguished from errors of the last "
+            f"joint's row ({', '.join(last)}), so a tool that is defined in the flange frame is not identified; "
+            "measure a few positions of that tool with another sensor, or teach its TCP.",
         )
 
 
-def _limit(images: Measurements, result: CalibrationResult) -> Iterator[str]:
-    """Say that the images limit the calibration, and what of the predicted error the intrinsics and boards make."""
+def _limit(images: Measurements, result: CalibrationResult) -> Iterator[Diagnostic]:
+    """Warn that the images limit the accuracy, with the shares of the predicted error by intrinsics and boards."""
     problem, view = result.solved.problem, view_of(result.solved.refined)
     number = next(k for k, sensor in enumerate(problem.sensors) if sensor.name == "corner")
     ratio = view.noise[number] / float(torch.as_tensor(images.readings[NOISE_COLUMN]).median())
@@ -135,16 +150,20 @@ def _limit(images: Measurements, result: CalibrationResult) -> Iterator[str]:
         return
     total, shares = _predicted_error(result)
     parts = [f"{share:.0%} of its square from {what}" for what, share in shares.items() if share >= 0.1]
-    yield (
-        f"The camera is what limits this calibration: its images scatter by {ratio:.2f} times what their corners and "
-        f"the repeatability explain, and a position is predicted to {total * 1e3:.2g} mm over the joint space"
+    yield _warning(
+        "camera_limits",
+        f"The camera limits this calibration: its images scatter by {ratio:.2f} times what their corners and "
+        f"the repeatability explain, and a position is predicted to {total * 1e3:.2g} mm RMS over the joint space"
         f"{', ' + ' and '.join(parts) if parts else ''}. More images, a larger or nearer board and more pixels improve "
-        "it."
+        "it.",
+        scatter=float(ratio),
+        predicted_mm=total * 1e3,
+        **{f"share_{what.split()[-1]}": share for what, share in shares.items()},
     )
 
 
 def _predicted_error(result: CalibrationResult) -> tuple[float, dict[str, float]]:
-    """Predicted RMS error of a position over all postures [m], and which share of its square unknowns make."""
+    """Predict the RMS error of a position over the joint space [m], and the shares of its square by unknown."""
     limits = torch.from_numpy(np.asarray(result.robot.limits)).clamp(-np.pi, np.pi)
     generator = torch.Generator().manual_seed(0)
     draws = torch.rand(POSTURES, len(limits), generator=generator, dtype=torch.float64)
@@ -164,7 +183,7 @@ def _predicted_error(result: CalibrationResult) -> tuple[float, dict[str, float]
 
 
 def _conditioned(root: Float64[Tensor, "unknowns directions"], rows: list[int]) -> Tensor:
-    """Root of the covariance where some of the unknowns are known: the directions that move these are taken out."""
+    """Compute the root of the covariance given some of the unknowns, by removing the directions that move these."""
     axes, strength, _ = torch.linalg.svd(root[rows].t(), full_matrices=False)
     axes = axes[:, strength > 1e-9 * strength.max()]
     conditioned: Tensor = root - (root @ axes) @ axes.t()
@@ -172,5 +191,5 @@ def _conditioned(root: Float64[Tensor, "unknowns directions"], rows: list[int]) 
 
 
 def _square(J: Tensor, root: Tensor) -> float:
-    """Mean square of a coordinate's predicted error [m^2]."""
+    """Compute the mean square of a coordinate's predicted error [m²]."""
     return float((J @ root[: J.shape[1]]).square().sum(1).mean())

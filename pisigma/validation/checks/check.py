@@ -1,4 +1,4 @@
-"""What every check of a calibration has in common."""
+"""Interface of the checks of a calibration, and the calibration as they see it."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
@@ -23,14 +23,14 @@ from pisigma.validation.held_out.validation_figures import ValidationFigures
 
 @dataclass(frozen=True, eq=False)
 class CheckedCalibration:
-    """A calibration with all that a check may look at.
+    """A calibration, its rows, and everything else that a check may need.
 
     Attributes:
-        calibrator: what gave the geometric calibration; fits others to the same rows.
-        rows: that were calibrated with, as read; `rows.place(row)` names file and line.
-        results: by name, all fitted to these rows: "nominal" (the arm as drawn, base and tool fitted, every row
-            counted in full), "geometric", and "hybrid" where it was asked for.
-        validation: errors of held-out rows; None without any.
+        calibrator: the calibrator of the geometric calibration; checks also fit others to the same rows with it.
+        rows: the rows of the calibration, as read; `rows.place(row)` names file and line.
+        results: by name, all fitted to these rows: "nominal" (the nominal arm with base and tool fitted, all rows with
+            full weight), "geometric", and "hybrid" if one was requested.
+        validation: errors of held-out rows; None if no rows were held out.
     """
 
     calibrator: GeometricCalibrator
@@ -40,41 +40,41 @@ class CheckedCalibration:
 
     @property
     def robot(self) -> Robot:
-        """The robot as drawn."""
+        """The nominal robot."""
         return self.calibrator.robot
 
     @property
     def nominal(self) -> CalibrationResult:
-        """The arm as drawn, with base and tool fitted."""
+        """The nominal arm with base and tool fitted."""
         return geometric_result(self.results["nominal"])
 
     @property
     def geometric(self) -> CalibrationResult:
-        """The geometric calibration, or the one that the hybrid builds upon."""
+        """The geometric calibration, or the one that the hybrid is based on."""
         return geometric_result(self.results["geometric"])
 
     @property
     def hybrid(self) -> HybridResult | None:
-        """The hybrid calibration; None where only a geometric one was asked for."""
+        """The hybrid calibration; None if only a geometric one was requested."""
         result = self.results.get("hybrid")
         return result if isinstance(result, HybridResult) else None
 
     @cached_property
     def errors(self) -> Mapping[str, Mapping[str, Float64[Tensor, "rows components"]]]:
-        """By name of the result and by sensor, measured - predicted of every row [m or rad].
+        """Errors, measured minus predicted, by result and sensor [m or rad].
 
-        Rows are in the order of `rows`; NaN where the sensor measured nothing.
+        Rows are in the order of `rows`; NaN where the sensor has no value.
         """
         return MappingProxyType({name: result.errors_of(self.rows) for name, result in self.results.items()})
 
     @property
     def final_errors(self) -> Mapping[str, Float64[Tensor, "rows components"]]:
-        """The same by sensor of the calibration that is kept: the last one."""
+        """Errors of the last result by sensor, which is the calibration that is kept [m or rad]."""
         return list(self.errors.values())[-1]
 
     @cached_property
     def figures(self) -> ValidationFigures | None:
-        """Errors of the rows that were calibrated with, under every calibration; None where no length was measured."""
+        """Errors of the rows of the calibration under every result; None where no length was measured."""
         errors = {name: errors_under(result, self.rows) for name, result in self.results.items()}
         if not any(bool(torch.isfinite(one.position).any()) for one in errors.values()):
             return None
@@ -82,12 +82,12 @@ class CheckedCalibration:
 
 
 class AbstractCheck(ABC):
-    """Looks for one kind of fault in a calibration."""
+    """A check of a calibration for one kind of fault."""
 
     @abstractmethod
     def diagnose(self, checked: CheckedCalibration) -> Iterator[Diagnostic]:
-        """Say what is wrong; nothing where nothing is.
+        """Report faults; yield nothing if none is found.
 
         Raises:
-            IdentificationError: the measurements cannot be of this robot at all, so that they are refused.
+            IdentificationError: the measurements cannot belong to this robot and are refused.
         """

@@ -1,4 +1,4 @@
-"""Whether the arm was calibrated at all, or stays as drawn for want of rows."""
+"""Whether the arm was calibrated, or kept its nominal geometry because there were too few rows."""
 
 from collections.abc import Iterator
 
@@ -7,7 +7,7 @@ from pisigma.validation.held_out.diagnostic import Diagnostic
 
 
 class FewRowsCheck(AbstractCheck):
-    """Says so where parameters of the arm were wanted, but none was estimated."""
+    """Warns if parameters of the arm were to be estimated, but none was."""
 
     def diagnose(self, checked: CheckedCalibration) -> Iterator[Diagnostic]:
         """See `AbstractCheck.diagnose`."""
@@ -16,7 +16,8 @@ class FewRowsCheck(AbstractCheck):
             yield Diagnostic(
                 kind="few_rows",
                 severity="warning",
-                sentence=f"The arm stays as drawn, only base and tool were fitted: the {checked.rows.rows} rows do not "
-                "show that another geometry predicts left-out rows better; measure more poses, in which all joints "
-                "move.",
+                sentence="The arm keeps its nominal geometry, and only base and tool were fitted: with the "
+                f"{checked.rows.rows} rows, no other geometry predicts held-out rows better; measure more poses in "
+                "which all joints move.",
+                values={"rows": checked.rows.rows},
             )

@@ -1,4 +1,4 @@
-"""Whether the zero of a joint is farther off than robots leave their maker."""
+"""Whether the zero of a joint is farther off than in new robots."""
 
 import math
 from collections.abc import Iterator
@@ -8,16 +8,16 @@ from pisigma.validation.checks.setup_fault import setup_diagnostics
 from pisigma.validation.held_out.diagnostic import Diagnostic
 
 FAR = 8e-3
-"""[rad] Healthy industrial robots and cobots have zeros within 3 mrad of the drawn ones."""
+"""[rad] Healthy industrial robots and cobots have joint zeros within 3 mrad of the nominal ones."""
 CERTAIN = 3.0
-"""[standard errors] By which a zero is farther off."""
+"""[standard errors] Margin above `FAR`."""
 
 
 class JointZeroCheck(AbstractCheck):
-    """Warns of single zeros that are far off: a calibration takes them for the robot's, be they logged wrongly or true.
+    """Warns of single joint zeros that are far off: a calibration cannot distinguish a wrong zero from a wrong log.
 
-    Large ones show as a fault of the setup with the robot as drawn. Where the poses cover little of the workspace, base
-    and tool take up most of what they make, and the parameters alone show them.
+    Large ones are found as a setup fault with the nominal robot. If the poses cover little of the workspace, base and
+    tool absorb most of their effect, and only the estimated parameters show them.
     """
 
     def diagnose(self, checked: CheckedCalibration) -> Iterator[Diagnostic]:
@@ -31,8 +31,9 @@ class JointZeroCheck(AbstractCheck):
             yield Diagnostic(
                 kind="joint_zero",
                 severity="warning",
-                sentence=f"The zero of joint {joint} comes out {math.degrees(one.change):.3g} deg away from the drawn "
-                f"one (standard error {math.degrees(one.standard_error):.2g} deg), which is more than robots usually "
-                f"have: check whether joint {joint} was zeroed or logged otherwise; the calibration holds for joint "
-                "values that are logged like these.",
+                sentence=f"The zero of joint {joint} is estimated {math.degrees(one.change):.3g} deg away from the "
+                f"nominal one (standard error {math.degrees(one.standard_error):.2g} deg), which is more than robots "
+                f"usually have; check the zero of joint {joint} and how its values were logged (the calibration is "
+                "valid for joint values that are logged in the same way).",
+                values={"joint": joint, "change_deg": math.degrees(one.change)},
             )

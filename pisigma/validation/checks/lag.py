@@ -1,4 +1,4 @@
-"""Whether joint values were logged before the robot arrived, or after it had left."""
+"""Whether joint values were logged before the robot arrived, or after it had left the pose."""
 
 import math
 from collections.abc import Iterator
@@ -14,23 +14,22 @@ from pisigma.validation.held_out.diagnostic import Diagnostic
 from pisigma.validation.setup_faults.ordered_rows import OrderedRows
 
 CAP = 3.0
-"""Residuals longer than so many times their upper quartile count as so long."""
-FEWEST_ROWS = 12
+"""Residuals are clipped at this multiple of the upper quartile of their lengths."""
+MIN_ROWS = 12
 LIKELY = CLEARLY + math.log(100.0)
-"""Log Bayes factor from which on a lag is reported."""
+"""Log Bayes factor above which a lag is reported."""
 NOTICED, LARGE = 1.1, 1.5
-"""Errors that are so many times as large as without the lag are worth a warning, and make the calibration
-implausible."""
+"""Errors over those without the lag, above which a warning is given and above which the calibration is implausible."""
 
 
 @dataclass(frozen=True)
 class Lag:
-    """The share of a motion that the logged joint values are away from where the robot was measured.
+    """Lag between the logged joint values and the measured pose, as a share of the motion between two rows.
 
     Attributes:
-        before: whether they were logged before the arrival, on the way from the row before; else after it.
-        share: of the motion between two rows.
-        factor: how many times as large as without the lag the errors of the rows are.
+        before: whether they were logged before the arrival, on the way from the previous row; else after it.
+        share: lag over the motion between two rows [1].
+        factor: errors of the rows over those without the lag [1].
         log_bayes_factor: logarithm of the odds of a lag against none.
     """
 
@@ -41,9 +40,9 @@ class Lag:
 
 
 class LagCheck(AbstractCheck):
-    """Tests residuals against the motions between the rows: `r = X x + λ J Δq + e`.
+    """Tests the residuals for a share λ of the motions between the rows: `r = X x + λ J Δq + e`.
 
-    `J Δq` is what the motion from the row before, or to the next, would make of a row's values.
+    `J Δq` is the change of a row's values by the motion from the previous row, or to the next one.
     """
 
     def diagnose(self, checked: CheckedCalibration) -> Iterator[Diagnostic]:
@@ -53,24 +52,26 @@ class LagCheck(AbstractCheck):
         if lag is None or lag.log_bayes_factor < LIKELY or lag.factor < NOTICED:
             return
         when = "before the robot had arrived" if lag.before else "after the robot had left"
-        motion = "from the row before" if lag.before else "to the next row"
+        motion = "from the previous row" if lag.before else "to the next row"
         yield Diagnostic(
             kind="lag",
             severity="implausible" if lag.factor > LARGE else "warning",
-            sentence=f"The joint values were logged {when}: they are {abs(lag.share):.2g} of the motion {motion} away "
-            f"from where the robot was measured, which makes the errors {lag.factor:.3g} times as large; log them "
-            "when the robot stands still.",
+            sentence=f"The joint values were logged {when}: they differ from those at the measurement by "
+            f"{abs(lag.share):.2g} of the motion {motion}, which makes the errors {lag.factor:.3g} times as large; log "
+            "them when the robot has stopped.",
+            cause="before_arrival" if lag.before else "after_departure",
+            values={"share": lag.share, "factor": lag.factor},
         )
 
 
 def find_lag(rows: OrderedRows, measurements: Measurements) -> Lag | None:
-    """Fit a lag to the residuals of a calibration, likely or not; None where there are too few rows.
+    """Fit a lag to the residuals of a calibration, whether likely or not; None if there are too few rows.
 
     Args:
         rows: residuals of a calibration.
-        measurements: with which was calibrated.
+        measurements: the rows of the calibration.
     """
-    if len(rows.residual) < FEWEST_ROWS:
+    if len(rows.residual) < MIN_ROWS:
         return None
     lengths = np.linalg.norm(rows.residual, axis=1)
     longest = CAP * np.quantile(lengths, 0.75)
@@ -95,7 +96,7 @@ def find_lag(rows: OrderedRows, measurements: Measurements) -> Lag | None:
 def _motions(
     measurements: Measurements,
 ) -> tuple[Float64[np.ndarray, "rows dof"], Float64[np.ndarray, "rows dof"]]:
-    """Motions [rad or m] of every row from the row before it, and from the next back to it; 0 beyond a file."""
+    """Compute the motions [rad or m] from the previous row, and from the next row back; 0 at the ends of a file."""
     q = measurements.q.cpu().numpy()
     order = (
         np.argsort(np.array(measurements.line), kind="stable")

@@ -16,18 +16,18 @@ from pisigma.validation.held_out.diagnostic import Diagnostic
 from pisigma.validation.held_out.trained_calibrations import base_and_tool
 
 SUSPICIOUS = 0.01
-"""Share of the reach; arms are built to a third of that and better."""
+"""Errors of the nominal robot as a share of its reach; arms are built to a third of that and better."""
 NEARER = 1 / 3
-"""Share of the errors that another robot must leave at most. An arm as drawn explains its own measurements to a
-thousandth of its reach, so that of two different robots one is nearer by more."""
-FEWEST_ROWS = 6
-"""Of fewer, base and tool alone bring another robot near the rows."""
-ROWS = 200
-"""Rows that are enough to tell robots apart."""
+"""Errors of another robot over those of this one below which it is reported. A nominal arm explains its own
+measurements to a thousandth of its reach, so two different robots differ by more."""
+MIN_ROWS = 6
+"""With fewer rows, base and tool alone fit another robot to the rows."""
+MAX_ROWS = 200
+"""Rows that suffice to distinguish robots."""
 
 
 class OtherRobotCheck(AbstractCheck):
-    """Where the robot as drawn is far off, fits base and tool of the other robots of the catalogue."""
+    """Fits base and tool of all other robots of the catalogue if the nominal robot has large errors."""
 
     def diagnose(self, checked: CheckedCalibration) -> Iterator[Diagnostic]:
         """See `AbstractCheck.diagnose`."""
@@ -44,16 +44,18 @@ class OtherRobotCheck(AbstractCheck):
             yield Diagnostic(
                 kind="other_robot",
                 severity="implausible",
-                sentence=f"Robot '{name}' of the catalogue is far nearer to these rows: with base and tool fitted, its "
+                sentence=f"Robot '{name}' of the catalogue fits these rows far better: with base and tool fitted, its "
                 f"errors are {others[name]:.3g} mm RMS, those of robot '{robot.name}' {stated:.3g} mm; check which "
                 "robot was measured.",
+                cause=name,
+                values={"rms_mm": others[name], "nominal_rms_mm": stated},
             )
 
 
 def other_robot_diagnostics(robot: Robot, rows: Measurements) -> tuple[Diagnostic, ...]:
-    """Say of rows alone, before a calibration, whether another robot was measured; of few rows nothing is said."""
+    """Check rows without a calibration for another robot; empty if there are too few rows."""
     calibrator = GeometricCalibrator(robot)
-    if rows.rows < FEWEST_ROWS:
+    if rows.rows < MIN_ROWS:
         return ()
     try:
         as_drawn = base_and_tool(calibrator).fit(rows)
@@ -64,11 +66,11 @@ def other_robot_diagnostics(robot: Robot, rows: Measurements) -> tuple[Diagnosti
 
 
 def _rms_mm(checked: CheckedCalibration, other: Robot) -> float | None:
-    """RMS error of another robot as drawn [mm]; None of one with other joints, or that cannot be fitted."""
+    """Compute the RMS error of another nominal robot [mm]; None if it has other joints or cannot be fitted."""
     if other.name == checked.robot.name or other.revolute != checked.robot.revolute:
         return None
     count = checked.rows.rows
-    chosen = torch.linspace(0, count - 1, min(count, ROWS)).round().long()
+    chosen = torch.linspace(0, count - 1, min(count, MAX_ROWS)).round().long()
     rows = checked.rows.select(chosen)
     try:
         fitted = base_and_tool(replace(checked.calibrator, robot=other)).fit(rows)

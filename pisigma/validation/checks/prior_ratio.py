@@ -1,4 +1,4 @@
-"""Whether the errors of the geometry are of a size that a robot of this drawing and class can have."""
+"""Whether the geometric errors have a size that is possible for the nominal robot and its class."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -10,29 +10,29 @@ from pisigma.validation.checks.check import AbstractCheck, CheckedCalibration
 from pisigma.validation.held_out.diagnostic import Diagnostic
 
 UNUSUAL = 4.0
-"""Errors that are surely more than so many times as large as the prior says are worth a warning. Healthy robots have
-up to 4.6 times the default prior of 1 mrad."""
+"""Lower bound of the errors over their prior standard deviation above which a warning is given. Healthy robots have up
+to 4.6 times the default prior of 1 mrad."""
 IMPLAUSIBLE = 10.0
-"""Errors that are surely so many times as large as a prior that the user stated wider are not those of this robot: the
-odds against one normal error of 10 standard deviations are 1 to 1e23."""
+"""The same above which the rows do not belong to this robot (the user can state a wider prior): the odds against one
+normal error of 10 standard deviations are 1e23 to 1."""
 PREDICTED_SHARE = 0.25
-"""Left-out rows are predicted well where this share of the errors of the robot as drawn is left, at most,"""
+"""Held-out rows count as predicted well if their error is below this share of that of the nominal robot,"""
 PREDICTED_REACH = 0.005
-"""and not more than this share of the reach."""
+"""and below this share of the reach."""
 NAMES = {
-    PriorGroup.JOINT_OFFSET: "zeros of the joints",
+    PriorGroup.JOINT_OFFSET: "joint zeros",
     PriorGroup.LENGTH: "lengths",
-    PriorGroup.NO_LENGTH: "lengths that are drawn as 0",
+    PriorGroup.NO_LENGTH: "lengths that are nominally 0",
     PriorGroup.BETWEEN_AXES: "angles between the axes",
 }
 
 
 class PriorRatioCheck(AbstractCheck):
-    """Compares the estimated sizes of the geometric errors with what the prior says and with the robot's class.
+    """Compares the estimated sizes of the geometric errors with the prior and with the limits of the robot's class.
 
-    The class that is not stated is found: the narrowest one, from that of the maker on, in which zeros of joints of
-    these sizes are possible. Zeros larger than those of the maker's class are believed where left-out rows are
-    predicted well.
+    If the class is not stated, it is the narrowest one, starting from that of the manufacturer, in which joint zeros
+    of these sizes are possible. Joint zeros beyond the manufacturer's class are accepted if held-out rows are predicted
+    well.
     """
 
     def diagnose(self, checked: CheckedCalibration) -> Iterator[Diagnostic]:
@@ -48,16 +48,21 @@ class PriorRatioCheck(AbstractCheck):
             yield Diagnostic(
                 kind="prior_ratio",
                 severity="warning" if believed else "implausible",
-                sentence=f"The {NAMES[ratio.group]} are off by about {_size(ratio)}, {ratio.value:.2g} times what the "
-                f"prior says, {_consequence(ratio, usual, possible, believed)}.",
+                sentence=f"The {NAMES[ratio.group]} are off by about {_size(ratio)}, {ratio.value:.2g} times their "
+                f"prior standard deviation, {_consequence(ratio, usual, possible, believed)}.",
+                cause=ratio.group.name.lower(),
+                values={"ratio": ratio.value},
             )
 
 
 def class_of(checked: CheckedCalibration, large: Sequence[PriorRatio]) -> RobotClass | None:
-    """Find the class of a robot with errors of these sizes: the stated one, or the narrowest from its own on.
+    """Find the class of a robot with errors of these sizes: the stated one, or the narrowest from the maker's on.
 
-    A wider class than the maker's is believed of zeros of joints alone: lengths and angles of another class are those
-    of another robot, unless the user states the class.
+    A wider class than the manufacturer's is accepted for joint zeros only: lengths and angles of another class belong
+    to another robot, unless the user states the class.
+
+    Returns:
+        None if no class allows these errors.
     """
     usual = _usual_class(checked)
     sizes = [(ratio.group, ratio.size) for ratio in large]
@@ -72,10 +77,10 @@ def class_of(checked: CheckedCalibration, large: Sequence[PriorRatio]) -> RobotC
 
 
 def predicts_left_out_rows(checked: CheckedCalibration) -> bool:
-    """Say whether left-out rows are predicted far better than by the robot as drawn.
+    """Say whether held-out rows are predicted far better than by the nominal robot.
 
-    Without left-out rows the errors of those that were calibrated with count, enlarged for the parameters that the
-    geometric calibration used up.
+    Without held-out rows, the errors of the rows of the calibration are used, scaled up for the degrees of freedom of
+    the geometric calibration.
     """
     validation = checked.validation
     figures = checked.figures if validation is None else validation.figures()
@@ -105,19 +110,22 @@ def _size(ratio: PriorRatio) -> str:
 
 def _consequence(ratio: PriorRatio, usual: RobotClass, possible: RobotClass | None, believed: bool) -> str:
     if believed and (possible is usual or possible is None or ratio.at_least <= IMPLAUSIBLE):
-        return "so their size was taken from the data; check the nominal geometry and the robot, or give a wider prior"
+        return (
+            "so the size of the prior was estimated from the data; check the nominal geometry and the robot, or give a "
+            "wider prior"
+        )
     if believed and possible is not None:
         return (
-            f"as of robots of class {possible.name}, not {usual.name}; left-out rows are predicted well, so their size "
-            f"was taken from the data; if that is right, state --class {possible.name}"
+            f"which is usual for robots of class {possible.name}, not {usual.name}; held-out rows are predicted well, "
+            f"so the size of the prior was estimated from the data; if this is right, state --class {possible.name}"
         )
     if possible is None:
         return (
-            f"which no robot of {'class ' + usual.name if usual.name != 'hobby' else 'any class'} has; check whether "
-            "this robot was measured, its units, and order and directions of its joints, or give a wider prior if it "
-            "is meant to be so far off"
+            f"which no robot of {'class ' + usual.name if usual.name != 'hobby' else 'any class'} has; check that this "
+            "robot was measured, the units, and the order and directions of the joints, or give a wider prior if such "
+            "errors are expected"
         )
     return (
-        f"as of robots of class {possible.name}, but left-out rows are not predicted well; check whether this robot "
-        "was measured, its units, and order and directions of its joints, or measure more rows"
+        f"which is usual for robots of class {possible.name}, but held-out rows are not predicted well; check that "
+        "this robot was measured, the units, and the order and directions of the joints, or measure more rows"
     )

@@ -1,4 +1,4 @@
-"""All checks, of calibrations and of rows; a new one is a file and a line here."""
+"""Registry of all checks of calibrations and of rows; a new check is a file and a line here."""
 
 from pisigma.calibration.geometric.calibrator import GeometricCalibrator
 from pisigma.files.errors import IdentificationError, ImplausibleError
@@ -46,7 +46,7 @@ CHECKS: tuple[AbstractCheck, ...] = (
     TemperatureCheck(),
     CameraCheck(),
 )
-"""Of a calibration, in the order in which their diagnostics are printed."""
+"""Checks of a calibration, in the order in which their findings are printed."""
 
 ROW_CHECKS: tuple[AbstractRowCheck, ...] = (
     SetupOfRowsCheck(),
@@ -55,25 +55,25 @@ ROW_CHECKS: tuple[AbstractRowCheck, ...] = (
     ScaleOfRowsCheck(),
     UnexplainedRowsCheck(),
 )
-"""Of rows against a model, likewise; `pisigma.validation.gate` runs them for every command."""
+"""Checks of rows against a model, in order; `pisigma.validation.gate` runs them for every command."""
 
 
 def diagnostics_of(checked: CheckedCalibration) -> tuple[Diagnostic, ...]:
-    """Run all checks: those that make the calibration implausible first.
+    """Run all checks of a calibration; findings that make it implausible come first.
 
     Raises:
-        IdentificationError: the measurements cannot be of this robot at all.
+        IdentificationError: the measurements cannot belong to this robot.
     """
     diagnostics = [diagnostic for check in CHECKS for diagnostic in check.diagnose(checked)]
     return tuple(sorted(diagnostics, key=lambda diagnostic: diagnostic.severity != "implausible"))
 
 
 def diagnostics_of_rows(calibrator: GeometricCalibrator, rows: Measurements) -> tuple[Diagnostic, ...]:
-    """Calibrate with some rows and run all checks; nothing is said while they are too few for a calibration.
+    """Calibrate with some rows and run all checks; empty if there are too few rows for a calibration.
 
     Raises:
         ImplausibleError: no calibration error explains the rows.
-        IdentificationError: they cannot be of this robot at all.
+        IdentificationError: the rows cannot belong to this robot.
     """
     try:
         results = trained(calibrator, rows)

@@ -1,4 +1,4 @@
-"""Whether the measured values have anything to do with what the robot says."""
+"""Whether the measured values are related to the predictions of the robot at all."""
 
 import math
 from collections.abc import Iterator
@@ -14,15 +14,15 @@ from pisigma.validation.checks.check import AbstractCheck, CheckedCalibration
 from pisigma.validation.held_out.diagnostic import Diagnostic
 
 UNEXPLAINED = 0.5
-"""Residuals of more than this share of the spread of the positions themselves, as if the joints explained less than
-three quarters of the variance. Of a healthy robot they are less than a hundredth."""
+"""Residuals over the spread of the positions above which the joints explain less than three quarters of the variance.
+For a healthy robot the ratio is below 0.01."""
 
 
 class ResidualCheck(AbstractCheck):
-    """Holds the residuals of every sensor against the reach of the robot, and those of positions against their spread.
+    """Compares the residuals of every sensor with the reach of the robot, and those of positions with their spread.
 
     Half of the measured lengths must be within 1 % of the reach per axis, and half of the measured angles within
-    0.01 rad, which moves a point at the distance of the reach by as much. No calibration error is so large.
+    0.01 rad, which moves a point at the distance of the reach equally far. No calibration error is this large.
     """
 
     def diagnose(self, checked: CheckedCalibration) -> Iterator[Diagnostic]:
@@ -42,21 +42,24 @@ class ResidualCheck(AbstractCheck):
                 yield Diagnostic(
                     kind="residual",
                     severity="implausible",
-                    sentence=f"With the best fit a typical {sensor} is still {size} per axis from where robot "
-                    f"'{robot.name}' says ({before:.3g} times that as drawn), which no calibration error explains; "
-                    f"check units, order, signs and zeros of the joint columns, whether {rows} belong together, "
-                    f"{'the lengths of the board, ' if by_images else ''}and whether this robot was measured.",
+                    sentence=f"With the best fit, the median residual of {sensor} is still {size} per axis "
+                    f"({before:.3g} times as large for the nominal robot '{robot.name}'), which no calibration error "
+                    f"explains; check units, order, signs and zeros of the joint columns, whether {rows} belong "
+                    f"together, {'the lengths of the board, ' if by_images else ''}and whether this robot was "
+                    "measured.",
+                    cause=sensor,
+                    values={f"residual_{SENSORS[sensor].unit}": typical},
                 )
 
 
 def _typical(errors: Float64[Tensor, "rows components"]) -> float:
-    """Median length of the rows' errors per component [m or rad]."""
+    """Compute the median length of the errors per component [m or rad]."""
     length: float = errors.norm(dim=-1).nanmedian().item()
     return length / math.sqrt(errors.shape[-1])
 
 
 def _spread(rows: Measurements) -> float:
-    """Standard deviation of a coordinate of the positions about their mean in their frame [m]."""
+    """Compute the standard deviation of the coordinates of the positions about their mean in each frame [m]."""
     assert rows.position is not None
     squares = []
     for name in dict.fromkeys(rows.frame):

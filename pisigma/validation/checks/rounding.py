@@ -1,4 +1,4 @@
-"""Whether joint values or positions were rounded so coarsely that their errors come from it."""
+"""Whether joint values or positions were rounded so coarsely that rounding explains a part of the errors."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -16,28 +16,28 @@ from pisigma.validation.setup_faults.cause import joints_text, length_text
 from pisigma.validation.setup_faults.ordered_rows import OrderedRows
 
 STEPS = tuple(factor * 10.0**power for power in (1, 0, -1, -2, -3) for factor in (5, 2, 1))
-"""[deg or mm] That values may be rounded to, the coarsest first."""
+"""Rounding steps [deg or mm] that are tried, the coarsest first."""
 ON_LATTICE = 1e-4
-"""Rounded values are so near to a multiple of the step, in steps."""
-FEWEST_ROWS = 12
-SHARE = 0.25
-"""Of the squared errors that rounding has to make."""
-MOST = 1.7
-"""More would be left of rows that were rounded; series of the joints' errors take up a part of it."""
+"""Largest distance of a rounded value from a multiple of the step, in steps."""
+MIN_ROWS = 12
+MIN_SHARE = 0.25
+"""Share of the squared errors above which rounding is reported."""
+MAX_SHARE = 1.7
+"""Largest predicted over observed squared error of rounded rows; the series of joint errors absorbs a part of it."""
 LIKELY = math.log(100.0)
-"""Log likelihood ratio from which on errors are those of rounding."""
+"""Log likelihood ratio above which rounding causes the errors."""
 SIZES = np.geomspace(1e-3, 1e3, 61)
-"""Sizes of the other errors that are tried, over the noise."""
+"""Sizes of all other errors that are tried, over the noise."""
 
 
 @dataclass(frozen=True)
 class Rounding:
-    """Rounded values of rows.
+    """Rounded joint values.
 
     Attributes:
-        steps: of every joint [rad or m]; 0 where it is not rounded.
-        error: RMS of the position errors that the rounding of the joints makes [m].
-        share: of the squared errors of the rows that these are.
+        steps: rounding step of every joint [rad or m]; 0 if it is not rounded.
+        error: RMS position error caused by the rounding [m].
+        share: its share of the squared errors of the rows [1].
     """
 
     steps: tuple[float, ...]
@@ -46,10 +46,10 @@ class Rounding:
 
 
 class RoundingCheck(AbstractCheck):
-    """Compares the errors that rounding makes with those of the rows.
+    """Compares the errors that rounding causes with those of the rows.
 
-    Joints that were sent to whole degrees have rounded values without an error. So the errors must be those of rounded
-    joint values by their directions, too: large where a joint moves the tool far.
+    Joints that were commanded to whole degrees have round values without an error. Therefore the directions of the
+    errors must agree with rounded joint values too: they must be large where a joint moves the tool far.
     """
 
     def diagnose(self, checked: CheckedCalibration) -> Iterator[Diagnostic]:
@@ -60,8 +60,10 @@ class RoundingCheck(AbstractCheck):
                 kind="rounding",
                 severity="warning",
                 sentence=f"The joint values are rounded to {_steps_text(checked.robot, rounding.steps)}: this alone "
-                f"makes position errors of {length_text(rounding.error)} RMS, {rounding.share:.0%} of the squared "
+                f"causes position errors of {length_text(rounding.error)} RMS, {rounding.share:.0%} of the squared "
                 "errors of the rows; log them with more decimals.",
+                cause="joint_values",
+                values={"error_mm": rounding.error * 1e3, "share": rounding.share},
             )
         step = (
             _common_step(checked.rows.position.cpu().numpy() * 1e3)
@@ -74,25 +76,28 @@ class RoundingCheck(AbstractCheck):
                 step * 1e-3 / 2,
                 float(errors.square().sum(1).nanmean().sqrt()),
             )  # sqrt(3) step / sqrt(12)
-            if made**2 > SHARE * rms**2:
+            if made**2 > MIN_SHARE * rms**2:
                 yield Diagnostic(
                     kind="rounding",
                     severity="warning",
-                    sentence=f"The positions are rounded to {step:g} mm: this alone makes errors of "
-                    f"{length_text(made)} RMS, where the rows leave {length_text(rms)}; write them with more decimals.",
+                    sentence=f"The positions are rounded to {step:g} mm: this alone causes errors of "
+                    f"{length_text(made)} RMS, while those of the rows are {length_text(rms)}; write the positions "
+                    "with more decimals.",
+                    cause="positions",
+                    values={"step_mm": step, "error_mm": made * 1e3},
                 )
 
 
 def joint_rounding(result: CalibrationResult, measurements: Measurements) -> Rounding | None:
-    """Find joint values that are rounded and make a part of the errors; None where there are none.
+    """Find rounded joint values that cause a part of the errors; None if there are none.
 
-    With the derivative `J` of a row's values, rounding to steps `s` gives its residuals the covariance
-    `J diag(s²/12) J^T` besides that of the other errors, `σ² I`. The likelihood with rounding is compared with that
-    without, either with the σ that makes it largest.
+    With the derivative `J` of a row's values, rounding to steps `s` adds the covariance `J diag(s²/12) J^T` of a
+    uniform distribution to that of the other errors, `σ² I`. The maximum likelihoods over σ with and without rounding
+    are compared.
 
     Args:
         result: a geometric calibration.
-        measurements: with which was calibrated.
+        measurements: the rows of the calibration.
     """
     q = measurements.q.cpu().numpy()
     coupling = result.robot.coupling
@@ -101,12 +106,12 @@ def joint_rounding(result: CalibrationResult, measurements: Measurements) -> Rou
         unit = np.where(result.robot.revolute, math.degrees(1), 1e3)
         steps = np.array([_common_step(column[:, None]) for column in (q * unit).T]) / unit
     rows = OrderedRows.of(result) if steps.any() else None
-    if rows is None or len(rows.residual) < FEWEST_ROWS:
+    if rows is None or len(rows.residual) < MIN_ROWS:
         return None
     made = rows.by_joints * steps / math.sqrt(12)
     left = rows.left * math.sqrt(rows.values / max(rows.values - rows.used, 1.0))
     share = float(np.square(made).sum() / max(np.square(left).sum(), 1e-300))
-    if not SHARE < share < MOST or _gain(left, made) < LIKELY:
+    if not MIN_SHARE < share < MAX_SHARE or _gain(left, made) < LIKELY:
         return None
     position = (made * rows.noise[:, None])[:, :3]
     error = math.sqrt(np.square(position).sum() / len(position))
@@ -116,7 +121,7 @@ def joint_rounding(result: CalibrationResult, measurements: Measurements) -> Rou
 def _gain(
     residual: Float64[np.ndarray, "rows values"], made: Float64[np.ndarray, "rows values dof"]
 ) -> float:
-    """Logarithm of the likelihood with rounding over that without."""
+    """Compute the log likelihood ratio of rounding against none."""
     covariance = made @ made.transpose(0, 2, 1)
     sizes, axes = np.linalg.eigh(covariance)
     along = np.square(np.einsum("nvk,nv->nk", axes, residual))
@@ -129,9 +134,9 @@ def _gain(
 
 
 def _common_step(values: Float64[np.ndarray, "rows columns"]) -> float:
-    """Give the coarsest step that all values are multiples of; 0 where there is none."""
+    """Find the coarsest step that all values are multiples of; 0 if there is none."""
     values = values[np.isfinite(values).all(1)]
-    if len(values) < FEWEST_ROWS or np.ptp(values, 0).min() <= 0:
+    if len(values) < MIN_ROWS or np.ptp(values, 0).min() <= 0:
         return 0.0
     for step in STEPS:
         counts = values / step

@@ -11,20 +11,20 @@ from pisigma.validation.setup_faults.cause import length_text
 from pisigma.validation.setup_faults.row_order import Motion, find_motion
 
 LIKELY = CLEARLY + math.log(100.0)
-"""Log Bayes factor from which on a motion is reported, if something moves in one of a hundred measurements."""
+"""Log Bayes factor above which a motion is reported, assuming that something moves in 1 of 100 measurements."""
 CERTAIN = CLEARLY + math.log(1e6)
-"""Log Bayes factor from which on one may make a calibration implausible: no healthy one in a million is to be lost."""
+"""Log Bayes factor above which a motion can make a calibration implausible: at most 1 healthy one in a million is."""
 LARGE = 1.5
-"""Errors that are so many times as large as without the motion do not come from noise and robot any more."""
+"""Errors over those without the motion above which noise and robot cannot be their only cause."""
 
 
 class RowOrderCheck(AbstractCheck):
-    """Tests residuals against the order of the rows.
+    """Tests the residuals for a motion of a frame or the tool at some row, or a slow one over all rows.
 
-    A motion is reported where it is `LIKELY`. It makes the calibration implausible where it is `CERTAIN` and `LARGE`
-    against all that is left without it. A hybrid leaves less, so that smaller motions show; but a large one becomes a
-    part of it, so that both calibrations are looked at. A tool that seems to have moved just where the rows of another
-    frame begin is what the frames leave unexplained, unless the motion is `LARGE`.
+    A motion is reported if it is `LIKELY`. It makes the calibration implausible if it is `CERTAIN` and its factor on
+    the residuals is `LARGE`. A hybrid has smaller residuals, so smaller motions show; but it absorbs a part of large
+    ones, so both calibrations are tested. A tool that seems to have moved exactly where the rows of another frame start
+    is an effect of what the frames do not explain, unless the factor is `LARGE`.
     """
 
     def diagnose(self, checked: CheckedCalibration) -> Iterator[Diagnostic]:
@@ -46,29 +46,44 @@ class RowOrderCheck(AbstractCheck):
                 kind="row_order",
                 severity="implausible" if certain else "warning",
                 sentence=_sentence(motion, checked.rows),
+                cause=motion.moved,
+                values=_values(motion, checked.rows),
             )
 
 
+def _values(motion: Motion, rows: Measurements) -> dict[str, float | int | str]:
+    values: dict[str, float | int | str] = {
+        "name": motion.name,
+        "shift_mm": math.hypot(*motion.shift) * 1e3,
+        "turn_deg": math.degrees(motion.turn),
+        "factor": motion.factor,
+    }
+    if motion.first is not None:
+        row = int(motion.rows[motion.first])
+        values |= {"first_row": row, "first_line": rows.line[row]}
+    return values
+
+
 def _sentence(motion: Motion, rows: Measurements) -> str:
-    """Say what moved, from where on and by how much, and what to do."""
+    """Say what moved, at which row and how far, and what to do."""
     what = {"frame": "measuring frame", "target": "target on the tool", "tool": "tool"}[motion.moved]
     what += f" '{motion.name}'" if motion.name and motion.moved != "tool" else ""
     x, y, z = motion.shift * 1e3
     amount = f"{length_text(math.hypot(*motion.shift))} (x {x:.3g}, y {y:.3g}, z {z:.3g} mm "
     amount += "in its axes)" if motion.moved == "frame" else "in the flange's axes)"
     amount += f" and {math.degrees(motion.turn):.2g} deg" if motion.turn > 0 else ""
-    errors = f"the errors of the rows are {motion.factor:.3g} times as large as they would be without that"
+    errors = f"this makes the errors of the rows {motion.factor:.3g} times as large"
     if motion.first is None:
         return (
-            f"{rows.source}: the {what} moves slowly while the rows are measured, by up to {amount}; {errors}. Let the "
-            "instrument warm up, fasten its stand and the tool, and measure again, or begin new frames at several "
+            f"{rows.source}: the {what} moved slowly while the rows were measured, by up to {amount}; {errors}. Let "
+            "the instrument warm up, fasten its stand and the tool, and measure again, or start new frames at several "
             "lines (--new-frame-at)."
         )
     row = int(motion.rows[motion.first])
-    remedy = "name another target there (column 'target')"
+    remedy = "name another target in them (column 'target')"
     if motion.moved == "frame":
-        remedy = f"give them a frame of their own (--new-frame-at {rows.line[row] or 'LINE'})"
+        remedy = f"give them another frame (--new-frame-at {rows.line[row] or 'LINE'})"
     return (
-        f"{rows.place(row)}: from this row on the {what} has moved by {amount}; {errors}. Leave out the rows from "
-        f"there on, or {remedy}."
+        f"{rows.place(row)}: the {what} moved before this row by {amount}; {errors}. Leave out this row and the later "
+        f"ones, or {remedy}."
     )

@@ -1,4 +1,4 @@
-"""Whether all lengths are off by one factor: a wrong unit, or the scale of the instrument."""
+"""Whether all lengths of the arm are wrong by one factor: a wrong unit, or the scale of the instrument."""
 
 import math
 from collections.abc import Iterator
@@ -16,24 +16,25 @@ from pisigma.validation.held_out.calibration_summary import ScaleFigures
 from pisigma.validation.held_out.diagnostic import Diagnostic
 
 SCALE_SIGMAS = (0.003, 0.1)
-"""Prior standard deviations of a common factor on the lengths, equally likely: of instruments and heat, and of wrong
-units."""
+"""Prior standard deviations of a common factor on the lengths, with equal probability: of instruments and heat, and of
+wrong units."""
 LENGTH_ERRORS = np.geomspace(3e-5, 1.0, 40)
-"""[m] Standard deviations of the errors of single lengths, equally likely."""
+"""[m] Standard deviations of the errors of single lengths, with equal probability."""
 STRONG = math.log(10.0)
-"""Logarithm of the Bayes factor from which on a common factor is reported (Jeffreys 1961, Theory of Probability,
-appendix B: "strong").
+"""Logarithm of the Bayes factor above which a common factor is reported (Jeffreys 1961, Theory of Probability, appendix
+B: "strong").
 
-Nothing but drawn lengths says what the scale is, and links of 0.5 m that err by 0.3 mm are like a factor that errs by
-0.0004: of 600 simulated arms 5 are reported, and with a factor of 1.001 61 are. The most powerful test (Neyman and
-Pearson 1933) with as few false alarms, which knows how links err, would find a factor of 1.001 in half of the KR 10."""
+Only nominal lengths determine the scale, and errors of 0.3 mm of links of 0.5 m have the effect of a factor with an
+error of 0.0004. Of 600 simulated arms, 5 are reported without a factor, and 61 with a factor of 1.001. The most
+powerful test (Neyman and Pearson 1933) with as few false alarms, which knows the distribution of link errors, finds a
+factor of 1.001 in half of the KR 10."""
 IMPLAUSIBLE = 0.03
-"""A factor that is off by more comes from a wrong unit or another robot. Heat stretches arms and instruments by less
-than 0.2 %, and a scale bar that is used wrongly by 1 %."""
+"""Difference of the factor from 1 above which the unit or the robot is wrong. Heat stretches arms and instruments by
+less than 0.2 %, and wrong use of a scale bar by 1 %."""
 
 
-MOST_ODDS = 1e6
-"""Larger odds say no more than these."""
+MAX_ODDS = 1e6
+"""Limit of the reported odds."""
 
 
 @dataclass(frozen=True)
@@ -41,9 +42,9 @@ class CommonScale:
     """One factor on all lengths of an arm.
 
     Attributes:
-        factor: fitted lengths over drawn ones.
-        sigma: its standard deviation.
-        log_bayes_factor: logarithm of the odds of a factor that is not 1, before what was known of the setup.
+        factor: fitted over nominal lengths [1].
+        sigma: its standard deviation [1].
+        log_bayes_factor: logarithm of the odds of a factor other than 1 against 1, at equal prior odds.
     """
 
     factor: float
@@ -52,12 +53,12 @@ class CommonScale:
 
     @property
     def odds(self) -> float:
-        """Odds of such a factor against links that err each by itself, at most `MOST_ODDS`."""
-        return math.exp(min(self.log_bayes_factor, math.log(MOST_ODDS)))
+        """Odds of a common factor against independent errors of the links, at most `MAX_ODDS`."""
+        return math.exp(min(self.log_bayes_factor, math.log(MAX_ODDS)))
 
 
 class ScaleCheck(AbstractCheck):
-    """Looks for a factor that all lengths have in common, beside errors of each."""
+    """Looks for a common factor on all lengths, in addition to independent errors of each."""
 
     def diagnose(self, checked: CheckedCalibration) -> Iterator[Diagnostic]:
         """See `AbstractCheck.diagnose`."""
@@ -66,28 +67,28 @@ class ScaleCheck(AbstractCheck):
             return
         implausible = abs(scale.factor - 1) > IMPLAUSIBLE
         lengths = (
-            "lengths of the board, and whether the intrinsics of the camera are those of these images"
+            "lengths of the board, and that the intrinsics belong to the camera of these images"
             if "corner" in checked.rows.kinds
             else "unit of the position columns, the scale of the instrument and stated distances"
         )
         yield Diagnostic(
             kind="scale",
             severity="implausible" if implausible else "warning",
-            sentence=f"All lengths of the arm come out {scale.factor:.5g} times as large as drawn (standard deviation "
-            f"{scale.sigma:.1g}), which looks like a wrong unit or scale of the measurements: it is "
-            f"{scale.odds:.2g} times as likely as links that each err by "
-            f"themselves; check the {lengths}.",
+            sentence=f"All lengths of the arm are estimated {scale.factor:.5g} times as large as nominal (standard "
+            f"deviation {scale.sigma:.1g}), which indicates a wrong unit or scale of the measurements: this is "
+            f"{scale.odds:.2g} times as likely as independent errors of the links; check the {lengths}.",
+            values={"factor": scale.factor, "sigma": scale.sigma, "odds": scale.odds},
         )
 
 
 def scale_figures(checked: CheckedCalibration) -> ScaleFigures | None:
-    """What a factor on all measured positions would explain, and by how much true positions were then off.
+    """Estimate a factor on all measured positions, and the error of true positions that it causes.
 
-    An arm whose joints all turn meets positions that are larger by a factor as well if base, links and tool are larger
-    by it, so that no row shows it; only drawn lengths do.
+    An arm with revolute joints only fits scaled positions equally well with base, links and tool scaled by the same
+    factor, so the residuals do not show it; only the nominal lengths do.
 
     Returns:
-        None where no position was measured, a joint slides, or no drawn length was estimated.
+        None if no position was measured, a joint is prismatic, or no length that is nominally not 0 was estimated.
     """
     position = checked.rows.position
     if position is None or any(joint.type == "prismatic" for joint in checked.robot.joints):
@@ -109,16 +110,16 @@ def scale_figures(checked: CheckedCalibration) -> ScaleFigures | None:
 
 
 def common_scale(result: CalibrationResult) -> CommonScale | None:
-    """Estimate a factor on all lengths of the arm by its evidence.
+    """Estimate a factor on all lengths of the arm by Bayesian model comparison.
 
-    The drawn lengths L are believed to come out as `(1 + s) L + e`, and lengths drawn as 0 as e. The errors e are
-    normal with one standard deviation, over which the evidence is averaged with s and without. The data enter by
-    their normal equations at the solution, from which the prior is taken out. With the normal matrix N of the data,
-    their right-hand side b, and the prior precision P of all parameters, the likelihood of s is normal, with the
-    information `L^T P L - L^T P (N + P)^-1 P L` and the estimate `L^T P (N + P)^-1 b` over it.
+    The model of the true lengths is `(1 + s) L + e` with the nominal lengths L, and e for lengths that are nominally 0.
+    The errors e are normal with one standard deviation, over which the evidence is averaged, with s and without. The
+    data enter by their normal equations at the solution, from which the prior is subtracted. With the normal matrix N
+    of the data, their right-hand side b, and the prior precision P of all parameters, the likelihood of s is normal,
+    with the information `L^T P L - L^T P (N + P)^-1 P L` and the estimate `L^T P (N + P)^-1 b` over it.
 
     Returns:
-        None where no drawn length was estimated.
+        None if no length that is nominally not 0 was estimated.
     """
     problem, here = result.solved.problem, result.solved.refined
     precision = view_of(here).scaled(problem.precision[problem.active], problem.prior_group).numpy()

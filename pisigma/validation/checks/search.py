@@ -8,7 +8,7 @@ from pisigma.validation.held_out.diagnostic import Diagnostic
 
 
 class SearchCheck(AbstractCheck):
-    """A search that was stopped at its limit has no result; one that stalled near the minimum has."""
+    """Rejects a search that was stopped at the iteration limit, and warns of one that stalled near the minimum."""
 
     def diagnose(self, checked: CheckedCalibration) -> Iterator[Diagnostic]:
         """See `AbstractCheck.diagnose`."""
@@ -19,4 +19,5 @@ class SearchCheck(AbstractCheck):
                 kind="search",
                 severity="implausible" if stopped else "warning",
                 sentence=f"The search {status.value}.",
+                cause=status.name.lower(),
             )

@@ -1,4 +1,4 @@
-"""Whether the standard deviations that rows state agree with their residuals."""
+"""Whether the standard deviations stated in the rows agree with their residuals."""
 
 import math
 from collections.abc import Iterator
@@ -11,18 +11,18 @@ from pisigma.validation.held_out.calibration_validation import errors_under
 from pisigma.validation.held_out.diagnostic import Diagnostic
 
 DISAGREEING = 3.0
-"""Residuals so many times as large as stated, or as small, are worth a warning. A stated standard deviation is a
-manufacturer's bound or an estimate, and rarely better than to a factor of 2."""
+"""Ratio of residuals and stated standard deviations above which (or below whose inverse) a warning is given. A stated
+standard deviation is a manufacturer's bound or an estimate, and rarely correct to better than a factor of 2."""
 CHI_MEDIAN = {1: 0.6745, 3: 1.5382}
 """Median length of a standard normal vector by its number of components."""
 HELD_BACK = 0.5
-"""Share of the residuals that is left without the stated noise, at most, where it has held the calibration back."""
+"""Residuals without over those with the stated noise below which the stated noise impaired the calibration."""
 
 
 class StatedNoiseCheck(AbstractCheck):
-    """Compares the median residual with what the rows state.
+    """Compares the median residual with the standard deviations stated in the rows.
 
-    The median of n values has a relative standard deviation of about `1 / sqrt(n)`; three of these are granted.
+    The median of n values has a relative standard deviation of about `1 / sqrt(n)`; the tolerance is three of these.
     """
 
     def diagnose(self, checked: CheckedCalibration) -> Iterator[Diagnostic]:
@@ -41,8 +41,10 @@ class StatedNoiseCheck(AbstractCheck):
                     kind="stated_noise",
                     severity="warning",
                     sentence=f"The residuals of {sensor.name} are {larger:.3g} times as large as the standard "
-                    "deviations that the rows state, so these were multiplied by that; check their unit, or measure "
-                    "what the model does not explain.",
+                    "deviations stated in the rows, which were multiplied by this factor; check their unit, and "
+                    "whether the model lacks something.",
+                    cause=sensor.name,
+                    values={"residual_over_stated": larger},
                 )
             elif ratio * margin < 1 / DISAGREEING:
                 yield self._too_large(checked, sensor.name, 1 / max(ratio, 1e-9))
@@ -50,20 +52,22 @@ class StatedNoiseCheck(AbstractCheck):
     def _too_large(self, checked: CheckedCalibration, sensor: str, factor: float) -> Diagnostic:
         held_back = _share_without(checked) < HELD_BACK
         consequence = (
-            "and without them the arm is fitted far better, so they have held the calibration back;"
+            "and the arm is fitted far better without them, so they impaired the calibration;"
             if held_back
-            else "so that all predicted intervals are too wide;"
+            else "so all predicted intervals are too wide;"
         )
         return Diagnostic(
             kind="stated_noise",
             severity="implausible" if held_back else "warning",
-            sentence=f"The standard deviations that the rows state for {sensor} are {factor:.3g} times as large as the "
+            sentence=f"The standard deviations stated in the rows for {sensor} are {factor:.3g} times as large as the "
             f"residuals, {consequence} check the unit of the column, or leave it out.",
+            cause=sensor,
+            values={"residual_over_stated": 1 / factor},
         )
 
 
 def _share_without(checked: CheckedCalibration) -> float:
-    """RMS residual of a geometric calibration without the stated noise, over that with it."""
+    """Compute the RMS residual of a geometric calibration without the stated noise over that with it."""
     rows = replace(checked.rows, sigma_position=None, sigma_rotation=None)
     try:
         without = errors_under(checked.calibrator.fit(rows), rows).position

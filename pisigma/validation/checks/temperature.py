@@ -1,4 +1,4 @@
-"""Whether stated temperatures can be those of a robot in degrees Celsius."""
+"""Whether the temperatures of the rows are plausible for a robot in degrees Celsius."""
 
 from collections.abc import Iterator
 
@@ -8,8 +8,7 @@ from pisigma.validation.checks.check import AbstractCheck, CheckedCalibration
 from pisigma.validation.held_out.diagnostic import Diagnostic
 
 HOT = 60.0
-"""[deg C] Robots are allowed to work at up to 45 deg C, and their housings warm up by less than 15; a room of 20 deg C
-has 68 deg F."""
+"""[deg C] Robots may work at up to 45 deg C, and their housings warm up by less than 15 K; 20 deg C is 68 deg F."""
 
 
 class TemperatureCheck(AbstractCheck):
@@ -27,6 +26,8 @@ class TemperatureCheck(AbstractCheck):
                 kind="temperature",
                 severity="warning",
                 sentence=f"{rows.place(most)}: {float(rows.temperature[most]):.4g} deg C is hot for a robot "
-                f"({len(hot)} of {rows.rows} rows are above {HOT:g} deg C); check whether these are degrees "
-                "Fahrenheit, deg C = (deg F - 32) / 1.8.",
+                f"({len(hot)} of {rows.rows} rows are above {HOT:g} deg C); check whether the values are in degrees "
+                "Fahrenheit: deg C = (deg F - 32) / 1.8.",
+                rows=tuple(rows.place(row) for row in hot),
+                values={"hottest": rows.place(most), "temperature": float(rows.temperature[most])},
             )

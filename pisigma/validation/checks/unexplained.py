@@ -1,4 +1,4 @@
-"""Whether left-out rows err far more than robots do after a calibration."""
+"""Whether the errors of held-out rows are far larger than those of calibrated robots."""
 
 from collections.abc import Iterator
 
@@ -8,19 +8,20 @@ from pisigma.validation.checks.rounding import joint_rounding
 from pisigma.validation.held_out.diagnostic import Diagnostic
 
 FAR, FAR_HOBBY = 2.5e-3, 7.5e-3
-"""Shares of the reach that errors of a calibrated robot are far below, industrial arms and cobots or others."""
+"""Errors as a share of the reach above which a calibrated robot is implausible: industrial arms and cobots, others."""
 LARGE = 1e-3
-"""Share of the reach where calibrating has to help; measured arms (UR5, UR10, FANUC, Panda, FR3) have 2e-4 to 6e-4."""
+"""Errors as a share of the reach above which calibration must help; measured arms (UR5, UR10, FANUC, Panda, FR3) have
+2e-4 to 6e-4."""
 HARDLY = 1.3
-"""Errors of the drawn robot over those of the calibrated one."""
+"""Errors of the nominal robot over those of the calibrated one below which calibration hardly helped."""
 NOISE = 0.5
-"""Share of the errors that the stated noise of the sensor explains."""
+"""Share of the errors above which the stated noise of the sensor explains them."""
 
 
 class UnexplainedCheck(AbstractCheck):
-    """Compares errors of left-out positions, or else of those calibrated with, with what robots have.
+    """Compares the errors of held-out positions, or else those of the calibration, with those of calibrated robots.
 
-    What other checks found is named by them: rounded joint values make errors of the rows and not of the robot.
+    Errors that other checks explain are not reported again: rounded joint values are errors of the rows, not the robot.
     """
 
     def diagnose(self, checked: CheckedCalibration) -> Iterator[Diagnostic]:
@@ -36,24 +37,21 @@ class UnexplainedCheck(AbstractCheck):
         stated = checked.calibrator.robot_class or RobotClass.of(checked.robot).name
         far = left > (FAR_HOBBY if stated == HOBBY.name else FAR) * reach
         if far or (left > LARGE * reach and drawn < HARDLY * left):
-            what = (
-                "The calibrated robot errs"
-                if checked.validation is None
-                else "At left-out rows the robot errs"
-            )
+            what = "rows of the calibration" if checked.validation is None else "held-out rows"
             yield Diagnostic(
                 kind="unexplained",
                 severity="implausible",
-                sentence=f"{what} by {left:.3g} mm RMS, and as drawn by {drawn:.3g} mm: robots of this "
-                f"size have less than {LARGE * reach:.2g} mm after a calibration. Two populations, a moved frame "
-                "or tool, joint values that were logged too early or rounded, and a scale were tried"
-                f"{'' if far else ', and calibrating hardly helps'}; check what else differs between the rows, and the "
-                "sensor.",
+                sentence=f"The errors of the {what} are {left:.3g} mm RMS ({drawn:.3g} mm for the nominal robot), but "
+                f"robots of this size have less than {LARGE * reach:.2g} mm after a calibration"
+                f"{'' if far else ', and calibration hardly helped'}. Mixed populations, a moved frame or tool, joint "
+                "values that were logged too early or rounded, and a scale do not explain them; check what else "
+                "differs between the rows, and the sensor.",
+                values={"rms_mm": left, "nominal_rms_mm": drawn},
             )
 
     @staticmethod
     def _explained(checked: CheckedCalibration, left: float) -> bool:
-        """Whether rounding or the stated noise of the sensor makes errors of this size [mm]."""
+        """Say whether rounding or the stated noise of the sensor makes errors of this size [mm]."""
         sigma = checked.rows.sigma_position
         noise = 0.0 if sigma is None else 3**0.5 * float(sigma.nanmedian()) * 1e3
         return noise > NOISE * left or joint_rounding(checked.geometric, checked.rows) is not None

@@ -1,8 +1,8 @@
-"""The figures of a calibration as one typed value.
+"""Figures of a calibration as one typed value.
 
-Cards, tables on the screen, report pages and JSON render it, and a model folder keeps it as the metrics of its model.
-Figures are in millimetres and degrees. What does not exist is not set and stands in no JSON; what was wanted but has no
-finite value is None.
+Cards, tables on the screen, report pages and JSON are made from it, and a model folder stores it as metrics. Figures
+are in millimetres and degrees. Figures that do not exist are not set and are omitted from JSON; figures without a
+finite value are None.
 """
 
 import math
@@ -24,15 +24,15 @@ from pisigma.validation.held_out.validation_figures import LearningPoint, Valida
 
 
 class NoiseFigures(Section):
-    """Noise of one kind of sensor, as the residuals show it.
+    """Noise of one kind of sensor, estimated from the residuals.
 
     Attributes:
-        sensor: such as "position".
+        sensor: kind of sensor, such as "position".
         values: number of measured values.
-        used_by_parameters: how many of them the parameters use up.
+        used_by_parameters: effective number of parameters estimated from them.
         sigma_mm: standard deviation of one value [mm].
-        sigma_deg: the same of an angle [deg].
-        factor_on_stated_sigma: the same as a factor, where the rows state their standard deviations.
+        sigma_deg: standard deviation of one angle [deg].
+        factor_on_stated_sigma: factor on the standard deviations that the rows state.
     """
 
     sensor: str
@@ -47,13 +47,13 @@ class ParameterFigures(Section):
     """One row of the parameter table; see `pisigma.calibration.geometric.result.ParameterEstimate`.
 
     Attributes:
-        name: such as "theta_1".
-        unit: "mm", "deg", "px" or "1"; the unit of the four figures.
-        nominal: as drawn.
-        estimated: as identified.
-        change: estimated minus nominal.
-        standard_error: of the estimate; None where it was not estimated.
-        remark: what is to be said of it, in full.
+        name: name of the parameter, such as "theta_1".
+        unit: unit of the four figures: "mm", "deg", "px" or "1".
+        nominal: nominal value.
+        estimated: estimated value.
+        change: estimated minus nominal value.
+        standard_error: standard error of the estimate; None if it was not estimated.
+        remark: remark on the estimate as a sentence.
         label: the same in a few words.
     """
 
@@ -71,12 +71,12 @@ class RedundancyFigures(Section):
     """Which parameters the data determine; see `pisigma.calibration.geometric.identifiability`.
 
     Attributes:
-        kept: parameters of an identifiable choice.
-        removed: parameters that act like combinations of these.
+        kept: an identifiable set of parameters.
+        removed: parameters whose effect is a linear combination of those of the kept ones.
         no_effect: parameters that change no measured value.
-        dependencies: the combinations that are identified where single values are not, a sentence each.
-        pairwise_sets: sets of parameters that are redundant by Pearson correlation of pairs.
-        pairwise_kept: parameters that are left by pairs.
+        dependencies: combinations that are identifiable although single parameters are not, one sentence each.
+        pairwise_sets: sets of parameters that are redundant by the Pearson correlation of pairs.
+        pairwise_kept: parameters that remain by this criterion.
     """
 
     kept: tuple[str, ...]
@@ -98,15 +98,15 @@ class ObservabilityFigures(Section):
 
 
 class OutlierFigures(Section):
-    """A row that counted for less than half.
+    """A row with less than half of the full weight.
 
     Attributes:
         row: number in the measurements, from 0.
         place: file and line.
-        sensor: which value of the row.
+        sensor: kind of sensor of the value.
         deviations: length of the residual, in standard deviations of one value.
         residual_mm: length of the residual [mm].
-        residual_deg: the same of an orientation [deg].
+        residual_deg: the same for an orientation [deg].
     """
 
     row: int
@@ -121,12 +121,12 @@ class TrialFigures(Section):
     """A joint correction that was tried; see `pisigma.calibration.hybrid.search.Trial`.
 
     Attributes:
-        name: such as "gravity + series 56 + products (2, 2)".
+        name: name of the trial, such as "gravity + series 56 + products (2, 2)".
         unknowns: number of parameters and weights.
-        log_evidence: up to a constant of the data; None where it was not worked out.
-        left_out: RMS of training rows that were left out of the fit, in units of the geometric calibration's.
+        log_evidence: log evidence up to a constant of the data; None if it was not computed.
+        left_out: leave-out RMS error of training rows over that of the geometric calibration [1].
         seconds: time it took [s].
-        kept: whether it was better than what was kept before it.
+        kept: whether it was better than the best trial before it.
     """
 
     name: str
@@ -144,10 +144,10 @@ class LearnedFigures(Section):
         features: name and settings of every feature.
         orders: number of factors of every product unit.
         unknowns: number of parameters and weights.
-        effective_parameters: how many of them the data determine; the prior holds the others.
+        effective_parameters: effective number of parameters; the others are determined by the prior.
         linearisations: iterations of the fit.
-        noise: per sensor.
-        prior_scale: factor on predicted variances, by which left-out rows were met.
+        noise: noise per sensor.
+        prior_scale: factor on predicted variances that fits the leave-out errors.
     """
 
     features: tuple[dict[str, JsonValue], ...]
@@ -160,12 +160,12 @@ class LearnedFigures(Section):
 
 
 class HybridFigures(Section):
-    """What a hybrid calibration found beyond the geometry.
+    """Joint correction of a hybrid calibration.
 
     Attributes:
-        verdict: what was kept and why, in a sentence.
-        learned: the correction; None where none was kept.
-        trials: what was tried, in order.
+        verdict: what was kept and why, as a sentence.
+        learned: the correction; None if none was kept.
+        trials: the trials, in order.
     """
 
     verdict: str
@@ -174,13 +174,13 @@ class HybridFigures(Section):
 
 
 class ScaleFigures(Section):
-    """How far one factor on all measured lengths explains what a calibration found.
+    """A common factor on all measured lengths.
 
     Attributes:
-        factor: lengths of the arm over drawn ones.
-        sigma: its standard deviation.
-        odds: of such a factor against links that err each by itself, at most 1e6.
-        rms_mm: error of true positions, about their mean, where the factor is that of the sensor [mm].
+        factor: estimated over nominal lengths of the arm [1].
+        sigma: its standard deviation [1].
+        odds: odds of a common factor against independent errors of the links, at most 1e6.
+        rms_mm: RMS error of true positions, about their mean, if the factor is an error of the sensor [mm].
     """
 
     factor: float
@@ -190,7 +190,7 @@ class ScaleFigures(Section):
 
 
 class HeldOutFile(Section):
-    """SHA-256 of the file of held-out rows in the model folder, and of the measurements that it is of."""
+    """SHA-256 of the file of held-out rows in the model folder, and of its measurements."""
 
     sha256: str
     data_sha256: str
@@ -200,34 +200,34 @@ class CalibrationSummary(AbstractSummary):
     """All figures of a calibration.
 
     Attributes:
-        rows: number of rows that were calibrated with.
-        fit_seconds: time that the calibration took without its validation [s].
+        rows: number of rows of the calibration.
+        fit_seconds: duration of the calibration without its validation [s].
         status: why the search ended.
-        iterations: steps tried.
-        rank: number of independent combinations of parameters that the data determine.
-        condition_number: of the Jacobian of the free parameters.
-        observability: indices O1 to O5.
-        noise: per sensor.
+        iterations: number of steps tried.
+        rank: rank of the Jacobian: number of identifiable combinations of parameters.
+        condition_number: condition number of the Jacobian of the free parameters.
+        observability: observability indices O1 to O5.
+        noise: noise per sensor.
         parameters: the parameter table.
-        redundancy: which parameters the data determine.
-        weak_directions: directions that the data hardly determine, a sentence each.
-        scale: of the lengths, where positions were measured.
-        outliers: rows that counted for less than half, the worst first.
-        warnings: what to check or to measure next, a sentence each.
-        rmse_mm: RMS of the first sensor's residuals at every iteration, the initial guess first.
-        hybrid: what a hybrid calibration found beyond the geometry.
-        cross_validation: errors of rows that were held out in turn.
-        calibrated: errors of the rows that were calibrated with.
+        redundancy: which parameters are identifiable.
+        weak_directions: weakly identifiable directions, one sentence each.
+        scale: common factor of the lengths, if positions were measured.
+        outliers: rows with less than half of the full weight, the worst first.
+        warnings: what to check or to measure next, one sentence each.
+        rmse_mm: RMS residual of the first sensor at every iteration, starting with the initial guess.
+        hybrid: joint correction of a hybrid calibration.
+        cross_validation: errors of held-out rows of the cross-validation.
+        calibrated: errors of the rows of the calibration.
         test: errors of the rows that the file marks as test.
         held_out: errors of other simulated rows.
-        predicted_rms_mm: errors that the calibration predicts at other poses, see `predicted_at_other_poses`, where no
-            row was held out [mm].
-        held_out_rows: hashes of the file with every held-out row.
+        predicted_rms_mm: predicted RMS error at other poses if no row was held out, see `predicted_at_other_poses`
+            [mm].
+        held_out_rows: hashes of the file of held-out rows.
         learning_curve: errors of held-out rows by the number of training rows.
-        redundant_sets: of a recipe: sets of parameters that are redundant by pairs.
-        no_effect: of a recipe: parameters without effect, by pairs.
-        pairwise_parameters: of a recipe: number of parameters that are left by pairs.
-        paper: of a recipe: published figures, by name.
+        redundant_sets: for recipes: sets of parameters that are redundant by pairs.
+        no_effect: for recipes: parameters without effect, by pairs.
+        pairwise_parameters: for recipes: number of parameters that remain by pairs.
+        paper: for recipes: published figures, by name.
     """
 
     kinds = ("geometric_calibration", "hybrid_calibration")
@@ -262,7 +262,7 @@ class CalibrationSummary(AbstractSummary):
 
     @property
     def judged(self) -> ValidationFigures | None:
-        """Held-out errors: of the cross-validation, else of simulated rows, else of the test set."""
+        """Errors of held-out rows: of the cross-validation, else of simulated rows, else of the test set."""
         return self.cross_validation or self.held_out or self.test
 
 
@@ -270,7 +270,7 @@ def summarise(result: Result) -> CalibrationSummary:
     """Gather the figures of a calibration, without those of its validation.
 
     Args:
-        result: geometric or hybrid.
+        result: geometric or hybrid calibration.
     """
     geometric = geometric_result(result)
     exact, pairwise = geometric.redundancy, geometric.pairwise
@@ -361,6 +361,6 @@ def _or_none(value: float) -> float | None:
 
 
 def has_orientation(model: CalibratedModel) -> bool:
-    """Say whether a model knows how its tools are turned; one that was calibrated without orientations does not."""
+    """Say whether a model knows the orientation of its tools; without measured orientations, it does not."""
     summary = CalibrationSummary.read(model)
     return summary is None or any(noise.sensor in ("rotation", "corner") for noise in summary.noise)

@@ -1,4 +1,4 @@
-"""Calibrations judged on held-out rows: nominal, geometric and hybrid side by side."""
+"""Cross-validation of calibrations: errors of held-out rows under the nominal, geometric and hybrid calibration."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -39,27 +39,24 @@ from pisigma.validation.held_out.trained_calibrations import (
 from pisigma.validation.held_out.validation_figures import LearningPoint, ValidationFigures
 
 FEW_ROWS = 500
-"""Folds of up to so many rows are calibrated side by side; more need their memory for themselves."""
+"""Rows up to which folds are calibrated in parallel threads; larger folds need the memory for themselves."""
 
 
 @dataclass(frozen=True, eq=False)
 class CalibrationValidation:
-    """Errors of held-out rows, each under calibrations without it.
-
-    In rows that were never held out they are NaN.
+    """Errors of held-out rows, each under calibrations without it; NaN for rows that were never held out.
 
     Attributes:
-        folds: number of folds; 1 where rows were held out once, 0 for rows that were kept apart from the start.
-        models: by name: "nominal" (the nominal arm, base and tool fitted to the training rows), "geometric" and
-            "hybrid" where it was asked for, which chooses its features on the training rows alone.
-        spread: errors of positions beside what the hybrid predicts of them; None without one.
-        distances: errors of stated distances of sockets that were left out.
-        frames_fitted: how many frames were held out whole; where the base stands in them was fitted to the
-            held-out rows themselves, under either arm.
-        sockets_held_out: how many sockets were held out whole; their errors are from where their rows put the
-            ball on average.
-        not_judged: how many held-out rows have a target or an anchor that the rows calibrated with lack.
-        again: the same for other folds, whose errors count in the figures too.
+        folds: number of folds; 1 if rows were held out once, 0 for a separate test set.
+        models: errors by name: "nominal" (the nominal arm with base and tool fitted to the training rows), "geometric",
+            and "hybrid" if requested, which selects its features on the training rows alone.
+        spread: position errors with their predicted standard deviations under the hybrid; None without a hybrid.
+        distances: errors of stated distances of sockets that were held out.
+        frames_fitted: number of frames that were held out completely; their bases were fitted to the held-out rows.
+        sockets_held_out: number of sockets that were held out completely; their errors are relative to the mean
+            predicted position of the ball.
+        not_judged: number of held-out rows whose target or anchor no training row has.
+        again: validations with other folds (repeats), whose errors count in the figures too.
     """
 
     folds: int
@@ -73,27 +70,27 @@ class CalibrationValidation:
 
     @property
     def repeats(self) -> tuple["CalibrationValidation", ...]:
-        """One validation for every repeat."""
+        """The validations of all repeats."""
         return (replace(self, again=()), *self.again)
 
     @property
     def all_errors(self) -> dict[str, PoseErrors]:
-        """By model, errors of all rows in all repeats, one repeat after the other."""
+        """Errors of all rows in all repeats by model, one repeat after the other."""
         return {
             name: PoseErrors.joined([repeat.models[name] for repeat in self.repeats]) for name in self.models
         }
 
     @property
     def all_spread(self) -> PredictedSpread | None:
-        """What a hybrid predicts of these errors."""
+        """Position errors and their predicted standard deviations in all repeats; None without a hybrid."""
         spreads = [repeat.spread for repeat in self.repeats if repeat.spread is not None]
         return PredictedSpread.joined(spreads) if spreads else None
 
     def figures(self, simulations: Sequence[TrainTest] = ()) -> ValidationFigures:
-        """The figures in mm and deg of all repeats.
+        """Compute the statistics of all repeats in mm and deg.
 
         Args:
-            simulations: training and test rows of each of several simulations; their RMS errors are listed one by one.
+            simulations: training and test rows of each of several simulations, whose RMS errors are listed one by one.
         """
         last = list(self.models.values())[-1]
         figures: dict[str, object] = {"folds": self.folds} if self.folds else {}
@@ -124,16 +121,16 @@ class CalibrationValidation:
 
 @dataclass(frozen=True, eq=False)
 class JudgedFold:
-    """What is kept of one fold: errors of its held-out rows under all models.
+    """Result of one fold: errors of its held-out rows under all models.
 
     Attributes:
-        test: numbers of these rows.
-        errors: by model.
-        distances: of stated distances of sockets that it did without.
-        spread: errors of positions beside what a hybrid predicts of them.
-        frames: held out whole.
-        sockets: held out whole.
-        left_out: held-out rows that could not be judged.
+        test: numbers of the held-out rows.
+        errors: their errors by model.
+        distances: errors of stated distances of sockets that its calibration did not use.
+        spread: position errors and their predicted standard deviations under the hybrid.
+        frames: number of frames that were held out completely.
+        sockets: number of sockets that were held out completely.
+        left_out: number of held-out rows that could not be judged.
     """
 
     test: Int64[Tensor, " rows"]
@@ -146,7 +143,7 @@ class JudgedFold:
 
 
 def _joined(measurements: Measurements, judged: Sequence[JudgedFold], folds: int) -> CalibrationValidation:
-    """Everything together, in the order of the rows."""
+    """Combine the folds, in the order of the rows."""
     units = {SENSORS[kind].unit for kind in measurements.kinds if kind in SENSORS}
     turned = measurements.rotation is not None or "rad" in units
     errors = {name: PoseErrors.none(measurements.rows, turned) for name in judged[0].errors}
@@ -171,19 +168,19 @@ def validate(
     progress: Progress = lambda what: None,
     jobs: int | None = None,
 ) -> CalibrationValidation:
-    """Calibrate on the training rows of every split and judge on its test rows.
+    """Calibrate on the training rows of every split, and compute the errors of its test rows.
 
     Args:
-        calibrator: the calibration; "nominal" is the geometric one with no parameter of the arm free and no row
-            downweighted. Whatever it chooses, it chooses on the training rows.
+        calibrator: the calibrator; "nominal" is the geometric one without free parameters of the arm and with full
+            weight of all rows. Features and outliers are selected on the training rows only.
         measurements: the rows.
-        splits: from `k_folds` or `holdout`.
-        progress: called with the fold that is being judged, and what is being tried; not from other processes.
-        jobs: processes that judge the splits side by side, with one thread each; None for threads of this one.
+        splits: splits of `k_folds` or `holdout`.
+        progress: called with the current fold and trial; not called from other processes.
+        jobs: number of processes for the splits, with one thread each; None for threads of this process.
 
     Raises:
-        IdentificationError: the training rows of a split do not determine what is asked for, or no test row has a
-            target or anchor that its training rows have too.
+        IdentificationError: the training rows of a split do not determine the parameters, or no test row has a target
+            or anchor that its training rows have.
     """
     judged = judged_folds(calibrator, measurements, [splits], progress, jobs)
     return joined_repeats(measurements, [splits], judged)
@@ -196,7 +193,7 @@ def judged_folds(
     progress: Progress = lambda what: None,
     jobs: int | None = None,
 ) -> Iterator[JudgedFold]:
-    """Judge every fold of every repeat in turn, in threads or in processes; see `fold_tasks` and `validate`."""
+    """Judge every fold of every repeat, in threads or processes; see `fold_tasks` and `validate`."""
     tasks = fold_tasks(calibrator, measurements, repeats, progress if jobs is None else silent)
     return (
         run_in_threads(tasks, measurements.rows > FEW_ROWS) if jobs is None else run_in_processes(tasks, jobs)
@@ -209,13 +206,13 @@ def fold_tasks(
     repeats: Sequence[Sequence[TrainTest]],
     progress: Progress,
 ) -> list[Callable[[], JudgedFold]]:
-    """Give what judges every fold of every repeat.
+    """Make the functions that judge every fold of every repeat.
 
     Args:
         calibrator: see `validate`.
         measurements: the rows.
         repeats: training and test rows of every fold, per repeat; see `pisigma.measurement.splits.repeats`.
-        progress: called with the fold that is being judged, and what is being tried.
+        progress: called with the current fold and trial.
     """
     tasks: list[Callable[[], JudgedFold]] = []
     for number, splits in enumerate(repeats, 1):
@@ -232,7 +229,7 @@ def fold_tasks(
 def joined_repeats(
     measurements: Measurements, repeats: Sequence[Sequence[TrainTest]], judged: Iterator[JudgedFold]
 ) -> CalibrationValidation:
-    """Put the judged folds of all repeats together, in the order of `fold_tasks`."""
+    """Combine the judged folds of all repeats, in the order of `fold_tasks`."""
     first, *again = [_joined(measurements, [next(judged) for _ in splits], len(splits)) for splits in repeats]
     return replace(first, again=tuple(again))
 
@@ -245,7 +242,7 @@ def _judged_fold(
     distances: Mapping[PairOfSockets, float],
     progress: Progress,
 ) -> JudgedFold:
-    """Calibrate on the training rows of one split, without some distances, and judge on these and its test rows."""
+    """Calibrate on the training rows of one split without some distances, and judge these and its test rows."""
     progress(fold)
     train, test = split
     training = measurements.select(train)
@@ -256,8 +253,9 @@ def _judged_fold(
         results = trained(chosen, training, stage(progress, fold))
     except IdentificationError as problem:
         raise IdentificationError(
-            f"{fold}, calibrated with {training.rows} of the {measurements.rows} rows: {problem} All rows at once "
-            "may do: leave out the cross-validation, or ask for more folds."
+            f"{fold}, calibrated with {training.rows} of the {measurements.rows} rows: {problem} A calibration with "
+            "all rows may be possible: omit the cross-validation, or use more folds.",
+            value=fold,
         ) from None
     everything = measurements.select(torch.cat([train, judged_rows]))
     judged = _judge(geometric_of(calibrator), results, held_out, distances, everything)
@@ -280,24 +278,24 @@ def learning_curve(
     whole: CalibrationValidation | None = None,
     jobs: int | None = None,
 ) -> tuple[LearningPoint, ...]:
-    """Calibrate with fewer and fewer of the training rows of every split, and judge on all its test rows.
+    """Compute the errors of the test rows as a function of the number of training rows.
 
     Args:
         calibrator: see `validate`.
         measurements: the rows.
         splits: training and test rows.
         sizes: numbers of training rows.
-        seed: decides which rows are drawn; smaller draws are subsets of larger ones.
-        progress: called with what is being done.
-        whole: what all training rows gave, as the last point of the curve; None for none.
+        seed: random seed of the training rows; smaller draws are subsets of larger ones.
+        progress: called with the current step.
+        whole: validation with all training rows, as the last point of the curve; None for none.
         jobs: see `validate`.
 
     Returns:
-        The figures of the points, fewest rows first.
+        The points of the curve, fewest rows first.
 
     Raises:
-        MeasurementError: a split has fewer training rows than are wanted.
-        IdentificationError: so few rows do not determine what is asked for.
+        MeasurementError: a split has fewer training rows than requested.
+        IdentificationError: a number of rows is too small to determine the parameters.
     """
     points = []
     for rows in sorted(sizes):
@@ -316,13 +314,13 @@ def learning_curve(
 def judge(
     calibrator: Calibrator, result: Result, training: Measurements, test: Measurements
 ) -> CalibrationValidation:
-    """Judge a calibration on rows that were kept apart.
+    """Judge a calibration on a separate test set.
 
     Args:
-        calibrator: what calibrated, for the "nominal" figures; see `validate`.
-        result: what it gave.
+        calibrator: the calibrator, for the "nominal" errors; see `validate`.
+        result: its result.
         training: the rows that it was fitted to.
-        test: other rows.
+        test: the rows of the test set.
 
     Raises:
         IdentificationError: a test row has a frame or target that was not calibrated.
@@ -338,9 +336,9 @@ def _judge(
     distances: Mapping[PairOfSockets, float],
     rows: Measurements,
 ) -> JudgedFold:
-    """Judge all models on held-out rows, with frames that they lack fitted by a calibrator, if there is one.
+    """Judge all models on held-out rows, with missing frames fitted by a calibrator, if there is one.
 
-    Distances of sockets that they were made without are judged on all rows.
+    Held-out distances of sockets are judged on all rows.
     """
     if calibrator is not None:
         results = {name: with_frames(calibrator, fitted, held_out) for name, fitted in results.items()}
@@ -357,15 +355,15 @@ class PredictsErrors(Protocol):
     """A calibration of any kind."""
 
     def errors_of(self, measurements: Measurements) -> Mapping[str, Float64[Tensor, "rows components"]]:
-        """Measured - predicted values by sensor [m or rad]; see `CalibrationResult.errors_of`."""
+        """Compute measured minus predicted values by sensor [m or rad]; see `CalibrationResult.errors_of`."""
 
 
 def errors_under(result: PredictsErrors, measurements: Measurements) -> PoseErrors:
-    """Errors of any rows under a calibration, whatever sensor measured them.
+    """Compute the errors of rows of any sensor under a calibration.
 
     Returns:
-        As "position" the length of the error of whatever length a row has: of a position or a ball in a socket the
-        distance, of a touch, a wire or a pair the difference [m]. As "rotation" the same of whatever angle it has.
+        As `position` the length of the error of a row's measured length: the distance for a position or a ball in a
+        socket, the difference for a touch, a wire or a pair [m]. As `rotation` the same for its measured angle [rad].
 
     Raises:
         IdentificationError: a row has a frame, target or anchor that was not calibrated.

@@ -1,6 +1,6 @@
-"""The figures of a distilled model as one typed value: how far it is from the full solutions that it stands for.
+"""Figures of a distilled model as one typed value: its deviations from the full solutions that it approximates.
 
-A card, tables on the screen and JSON render it, and a model folder keeps it as the metrics of its model. Figures are in
+Cards, tables on the screen and JSON are made from it, and a model folder stores it as metrics. Figures are in
 millimetres and degrees.
 """
 
@@ -10,7 +10,7 @@ from pisigma.validation.held_out.validation_figures import ErrorFigures
 
 
 class ParentFigures(Section):
-    """The model that was distilled; `sha256` is that of its `model.yaml`, where it was read from a folder."""
+    """The model that was distilled; `sha256` is that of its `model.yaml` if it was read from a folder."""
 
     name: str
     kind: str
@@ -18,7 +18,7 @@ class ParentFigures(Section):
 
 
 class JointRange(Section):
-    """Smallest and largest nominal value of a joint among the poses; `unit` is "deg" or "mm"."""
+    """Smallest and largest nominal value of a joint over the poses; `unit` is "deg" or "mm"."""
 
     name: str
     unit: str
@@ -27,10 +27,10 @@ class JointRange(Section):
 
 
 class RegionFigures(Section):
-    """Where poses were drawn.
+    """Region in which poses were drawn.
 
     Attributes:
-        kind: "joints": between rows of joint values; or "box": the tool's position in a box.
+        kind: "joints" for interpolated rows of joint values, or "box" for tool positions in a box.
         rows: number of these rows of joint values.
         box_mm: x_min, x_max, y_min, y_max, z_min, z_max of the tool in the base frame [mm].
         joints: ranges of the joint values.
@@ -43,15 +43,15 @@ class RegionFigures(Section):
 
 
 class PoseFigures(Section):
-    """How many poses there were.
+    """Numbers of poses.
 
     Attributes:
         fitted: number of poses that the network was fitted to.
-        held_out: number of poses that were neither fitted to nor chosen by.
-        beyond_measured_share: share of the held-out poses beyond the joint values that the parent was measured at.
-        inside_domain_share: share of the held-out poses that count as inside the domain.
-        drawn: number of poses that were drawn for all of them.
-        refused: number of the drawn poses that were not taken, by reason.
+        held_out: number of held-out poses, used neither for fitting nor for selection.
+        beyond_measured_share: share of the held-out poses outside the joint range measured for the parent model.
+        inside_domain_share: share of the held-out poses inside the domain.
+        drawn: number of poses that were drawn in total.
+        refused: number of drawn poses that were rejected, by reason.
     """
 
     fitted: int
@@ -66,11 +66,11 @@ class SizeFigures(Section):
     """A size of network that was tried.
 
     Attributes:
-        orders: of the product units.
-        harmonics: cycles a turn up to which a joint's value is an input.
+        orders: orders of the product units.
+        harmonics: highest harmonic of a joint's value among the inputs [1/turn].
         unknowns: number of weights and biases per joint.
-        rms_mm: RMS of the tool's error over the poses for choosing [mm].
-        kept: whether it was chosen.
+        rms_mm: RMS error of the tool over the validation poses [mm].
+        kept: whether this size was selected.
     """
 
     orders: tuple[int, ...]
@@ -84,9 +84,9 @@ class DistilledErrors(Section):
     """Errors of the tool under the full model, with the joint values of three models.
 
     Attributes:
-        nominal: of the nominal robot.
-        distilled: of the distilled model.
-        full: of the full solution.
+        nominal: errors of the nominal robot.
+        distilled: errors of the distilled model.
+        full: errors of the full solution.
     """
 
     nominal: ErrorFigures
@@ -108,7 +108,7 @@ class AbsoluteFigures(Section):
 
 
 class DistilledJoint(Section):
-    """What the full solution adds to the values of a joint, and how far the network is from that; in `unit`."""
+    """Correction of a joint by the full solution, and error of the network's approximation, in `unit`."""
 
     name: str
     unit: str
@@ -121,13 +121,13 @@ class DistillationSummary(AbstractSummary):
 
     Attributes:
         parent: the model that was distilled.
-        region: where poses were drawn.
-        poses: how many there were.
-        sizes: that were tried, in order.
+        region: region in which poses were drawn.
+        poses: numbers of poses.
+        sizes: sizes that were tried, in order.
         held_out: errors of the tool on held-out poses.
         joints: corrections and their errors on held-out poses.
-        warnings: why the model should perhaps not be used, a sentence each.
-        limitations: what the full solution has and the distilled model lacks, a sentence each.
+        warnings: reasons for which the model may be unsuitable, one sentence each.
+        limitations: features of the full solution that the distilled model lacks, one sentence each.
     """
 
     kinds = ("distilled",)

@@ -1,6 +1,6 @@
-"""Calibrations of few rows: the arm stays as drawn unless left-out rows are predicted better with a fitted one.
+"""Calibrations of few rows: the arm stays nominal unless a fitted one predicts held-out rows better.
 
-A calibration and those of its cross-validation may go side by side.
+A calibration and those of its cross-validation can run in parallel.
 """
 
 from collections.abc import Iterator, Sequence
@@ -30,31 +30,31 @@ from pisigma.validation.held_out.trained_calibrations import (
 )
 
 FEW = 2.0
-"""Fewer measured values per parameter are few: the noise, and with it the size of the prior, is estimated from less
-than half of them."""
+"""Measured values per parameter below which rows are few: the noise, and with it the prior scale, is then estimated
+from less than half of them."""
 TOO_FEW = 1.25
-"""With fewer, left-out rows show nothing: a fit without a pose has hardly more values than parameters. What is left of
-all rows then has to show it."""
+"""Values per parameter below which held-out rows cannot decide, because a fit without a pose has hardly more values
+than parameters; an F test of the residuals of all rows decides instead."""
 CHANCE = 1e-4
-"""Probability that what is left shows a fitted arm that is as drawn. In 10 and 11 random positions of the measured UR10
-and UR5 the arms that show predict other rows with 0.6 and 0.25 times the error of the drawn arm (medians of 27 and 14
-draws; one is worse, 1.4 times)."""
-FEWEST_POSES = 10
-"""Fewer show nothing, even where the orientation is measured too: 6 poses of the UR10 would give 0.6 to 2.4 times."""
+"""Significance level of this test. In 10 and 11 random positions of the measured UR10 and UR5, the fitted arms that
+pass predict other rows with 0.6 and 0.25 times the error of the nominal arm (medians of 27 and 14 draws; the worst
+single one has 1.4 times)."""
+MIN_POSES = 10
+"""Fewer poses cannot decide, even with orientations: 6 poses of the UR10 would give 0.6 to 2.4 times the error."""
 USED_UP = 0.9
-"""Share of the values of a sensor. Where the parameters use up more of them, its noise is not determined."""
+"""Share of the values of a sensor used up by the parameters above which its noise is not determined."""
 
 
 def fit_where_it_helps(calibrator: Calibrator, rows: Measurements, progress: Progress) -> Result:
-    """Calibrate; few rows have to show that the fitted arm is better than the drawn one.
+    """Calibrate; with few rows, the fitted arm is kept only if it is shown to be better than the nominal one.
 
     Args:
-        calibrator: of either kind.
-        rows: to calibrate with.
-        progress: called with what is being done.
+        calibrator: a calibrator of either kind.
+        rows: the rows to calibrate with.
+        progress: called with the current step.
 
     Returns:
-        The calibration; with few rows that do not show it, the drawn arm with base and tool fitted.
+        The calibration, or the nominal arm with base and tool fitted.
 
     Raises:
         IdentificationError: see the calibrators' `fit`.
@@ -72,26 +72,26 @@ def fit_where_it_helps(calibrator: Calibrator, rows: Measurements, progress: Pro
 def _helps(
     calibrator: GeometricCalibrator, result: CalibrationResult, rows: Measurements, progress: Progress
 ) -> bool:
-    """Whether there are enough values per parameter, or else poses are predicted better by fits to the others."""
+    """Say whether there are enough values per parameter, or else whether a fit predicts held-out poses better."""
     ratio = distinct_values(result.solved.problem) / max(result.solved.findings.wanted, 1)
     if ratio >= FEW:
         return True
     if any(noise.used > USED_UP * noise.values for noise in result.noise):
         return False
     if ratio < TOO_FEW:
-        return distinct_rows(result.solved.problem) >= FEWEST_POSES and _evident(calibrator, result, rows)
+        return distinct_rows(result.solved.problem) >= MIN_POSES and _evident(calibrator, result, rows)
     try:
         errors = validate(calibrator, rows, k_folds(rows, None, seed=0), progress).models
-    except (IdentificationError, MeasurementError):  # without a pose nothing can be fitted any more
+    except (IdentificationError, MeasurementError):  # without one pose, nothing can be fitted
         return False
     nominal, fitted = (errors[name].position.square().nanmean() for name in ("nominal", "geometric"))
     return not bool(fitted >= nominal)
 
 
 def _evident(calibrator: GeometricCalibrator, result: CalibrationResult, rows: Measurements) -> bool:
-    """Whether the fitted arm leaves so much less of the values than the drawn one that chance cannot be the reason.
+    """Say whether the residuals of the fitted arm are significantly smaller than those of the nominal one.
 
-    Fisher's F-test of nested models, with the values that the parameters use up under their prior as their number.
+    This is the F test of nested models, with the effective number of parameters under their prior.
     """
     drawn = base_and_tool(calibrator).fit(rows).noise
     pairs = list(zip(result.noise, drawn, strict=True))
@@ -109,22 +109,23 @@ def fit_beside_folds(
     progress: Progress,
     jobs: int | None,
 ) -> tuple[Result, Iterator[JudgedFold]]:
-    """Calibrate, and begin a cross-validation.
+    """Calibrate, and start a cross-validation.
 
     Args:
-        calibrator: of either kind.
-        rows: to calibrate with.
+        calibrator: a calibrator of either kind.
+        rows: the rows to calibrate with.
         training: rows of the cross-validation.
-        repeats: training and test rows of every fold, per repeat; none for no cross-validation.
-        progress: called with what is being done, but for what other processes do.
-        jobs: processes that share the calibration and the folds, with one thread each; None for threads of this one.
+        repeats: training and test rows of every fold, per repeat; empty for no cross-validation.
+        progress: called with the current step of this process.
+        jobs: number of processes for the calibration and the folds, with one thread each; None for threads of this
+            process.
 
     Returns:
         The calibration, see `fit_where_it_helps`, and the folds for `joined_repeats`.
 
     Raises:
-        IdentificationError: the rows do not determine what is asked for; those of a fold say so when it is taken.
-        MemoryError: a process ended twice with the calibration or a fold.
+        IdentificationError: the rows do not determine the parameters; for a fold it is raised by the iterator.
+        MemoryError: a process was killed twice with the calibration or a fold.
     """
     validating = stage(progress, "cross-validation")
     if jobs is None or not repeats:

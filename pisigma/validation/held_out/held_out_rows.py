@@ -1,4 +1,4 @@
-"""Errors of every held-out row as a file in a model folder, so that a report can show where they are."""
+"""File of the errors of all held-out rows in a model folder, from which a report shows where they are."""
 
 import csv
 import hashlib
@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
-from pisigma.files.errors import ModelError
+from pisigma.files.errors import ModelError, Place
 from pisigma.files.model_files import HELD_OUT_CSV, read_model_file
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel
@@ -31,11 +31,11 @@ class HeldOutRows:
 
     Attributes:
         q: commanded joint values [rad or m].
-        frame: per row.
-        target: per row.
-        models: by name, lengths [m] and angles [rad] of the errors; NaN in rows that were never held out.
-        residual: measured minus predicted position under the last model [m], in the row's frame; NaN likewise, and
-            everywhere where it was not kept.
+        frame: frame of every row.
+        target: target of every row.
+        models: lengths [m] and angles [rad] of the errors by model; NaN in rows that were never held out.
+        residual: measured minus predicted position under the last model [m], in the row's frame; NaN in rows that were
+            never held out, and if it was not stored.
         data_sha256: hash of the measurements.
     """
 
@@ -48,11 +48,11 @@ class HeldOutRows:
 
     @staticmethod
     def of(validation: CalibrationValidation, measurements: Measurements) -> "HeldOutRows":
-        """Give the errors of the first repeat of a validation.
+        """Take the errors of the first repeat of a validation.
 
         Args:
-            validation: of the measurements.
-            measurements: the rows that were held out in turn.
+            validation: the cross-validation.
+            measurements: its rows.
         """
         spread = validation.spread
         residual = torch.full((measurements.rows, 3), torch.nan) if spread is None else spread.error
@@ -66,10 +66,10 @@ class HeldOutRows:
         )
 
     def to_csv(self, robot: Robot) -> str:
-        """Give CSV text: joint values, frame and target, and per model the errors in mm and deg.
+        """Write CSV text: joint values, frame and target, and per model the errors in mm and deg.
 
         Args:
-            robot: says which joints turn (degrees) and which slide (millimetres).
+            robot: the robot, for the units of revolute (deg) and prismatic (mm) joints.
         """
         columns: dict[str, list[str]] = {}
         for j, turns in enumerate(robot.revolute):
@@ -90,12 +90,12 @@ class HeldOutRows:
         return text.getvalue()
 
     def hashes(self, text: str) -> HeldOutFile:
-        """Give what the metrics of a model hold whose folder keeps these rows as such a text."""
+        """Compute the hashes that the metrics of the model store for this text and its measurements."""
         return HeldOutFile(sha256=hashlib.sha256(text.encode()).hexdigest(), data_sha256=self.data_sha256)
 
 
 def read_held_out(folder: Path, model: CalibratedModel) -> HeldOutRows | None:
-    """Read the file of a model folder; None where the model was made without one.
+    """Read the file of a model folder; None if the model was made without one.
 
     Raises:
         ModelError: the file is missing, or is not the one that was written with the model.
@@ -107,7 +107,9 @@ def read_held_out(folder: Path, model: CalibratedModel) -> HeldOutRows | None:
     path = folder / HELD_OUT_CSV
     content = read_model_file(folder, HELD_OUT_CSV)
     if hashlib.sha256(content).hexdigest() != hashes.sha256:
-        raise ModelError(f"{path}: was changed since the model was written; copy the model again.")
+        raise ModelError(
+            "the file was changed after the model was written", at=Place(path), remedy="copy the model again"
+        )
     head, *rows = csv.reader(io.StringIO(content.decode(), newline=""))
     columns = dict(zip(head, zip(*rows, strict=True), strict=True))
     names = [name.removesuffix("_mm") for name in head if name.endswith("_mm")]

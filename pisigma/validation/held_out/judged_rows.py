@@ -1,4 +1,4 @@
-"""Where every judged row is, and how far off before and after the calibration."""
+"""Rows with their positions in the workspace and their errors before and after the calibration."""
 
 import math
 from collections.abc import Hashable, Mapping, Sequence
@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Bool, Float64
 from torch import Tensor
 
-from pisigma.files.errors import MeasurementError, ModelError
+from pisigma.files.errors import MeasurementError, ModelError, Place
 from pisigma.measurement.copies import copy_warnings
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.groups import groups_of_equal_joints, numbers_of_names
@@ -23,10 +23,10 @@ from pisigma.validation.held_out.held_out_rows import HeldOutRows
 from pisigma.validation.held_out.pose_statistics import PoseErrors
 from pisigma.validation.held_out.reference_models import nominal_model
 
-LEAST_REPEATS = 10
-"""Degrees of freedom from which on repeated rows show the scatter."""
-MOST_PREDICTED = 4_000
-"""The accuracy is predicted at so many rows at most, evenly over them: each costs a millisecond."""
+MIN_REPEATS = 10
+"""Degrees of freedom that repeated rows need to show the scatter."""
+MAX_PREDICTED = 4_000
+"""Rows at which the accuracy is predicted, evenly over all: each takes a millisecond."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,21 +34,21 @@ class JudgedRows:
     """Rows and their errors, in SI units.
 
     Attributes:
-        origin: "held_out": errors under calibrations without the row; "training": of the rows that the model
-            was made of; "other": of other rows.
-        measurements: the rows; of a model's held-out rows joint values and names only.
-        place: position of the tool in the robot's base [m].
-        models: by name, "nominal" first and the model last, errors of every row.
-        residual: measured minus predicted position in the row's frame under the model [m]; NaN where there is none.
-        residual_origin: the same for the residuals as `origin` for the lengths.
-        predicted: standard deviation of the predicted position [m]; NaN where there is none.
-        inside: whether every joint value was measured when the model was made.
-        left_out: so many rows of the file are marked as rows to calibrate with, and are not among these.
-        again: which rows stand there twice, or are those that the model was made of, a sentence each.
-        nominal: what "nominal" has for base and tool: "fitted" to the model's own poses, or as "given" to the model
-            where nothing was calibrated, or those of the "model", which keeps too few poses; None of held-out rows.
-        unknown: so many rows have no position error that can be known.
-        repeats: of the cross-validation; errors are of the first one.
+        origin: "held_out": errors under calibrations without the row; "training": errors of training rows of the model;
+            "other": errors of other rows.
+        measurements: the rows; only joint values and names for held-out rows that a model stores.
+        place: position of the tool in the robot's base frame [m].
+        models: errors of every row by model, "nominal" first and the model last.
+        residual: measured minus predicted position in the row's frame under the model [m]; NaN if there is none.
+        residual_origin: as `origin`, for the residuals.
+        predicted: standard deviation of the predicted position [m]; NaN if there is none.
+        inside: whether every joint value is in the range measured for the model.
+        left_out: number of rows of the file that are marked as training rows and are not included.
+        again: warnings of duplicate rows and of training rows of the model.
+        nominal: base and tool of "nominal": "fitted" to the model's poses, as "given" to a model that was not
+            calibrated, or those of the "model" if it stores too few poses; None for held-out rows.
+        unknown: number of rows without a position error.
+        repeats: number of repeats of the cross-validation; the errors are those of the first one.
     """
 
     origin: str
@@ -67,7 +67,7 @@ class JudgedRows:
 
     @property
     def before(self) -> PoseErrors:
-        """Errors of the robot as drawn."""
+        """Errors of the nominal robot."""
         return self.models["nominal"]
 
     @property
@@ -77,15 +77,15 @@ class JudgedRows:
 
     @property
     def scatter(self) -> float | None:
-        """Pooled scatter of positions at equal joint values: its RMS length [mm]; None with too few of them."""
+        """Pooled scatter of positions at equal joint values, as RMS length [mm]; None with too few repeats."""
         finite = torch.isfinite(self.residual).all(-1)
-        if int(finite.sum()) <= LEAST_REPEATS:
+        if int(finite.sum()) <= MIN_REPEATS:
             return None
         measurements = self.measurements.select(finite)
         group = groups_of_equal_joints(measurements.q).tolist()
         names = list(zip(group, measurements.frame, measurements.target, strict=True))
         freedom = len(names) - len(set(names))
-        if freedom < LEAST_REPEATS:
+        if freedom < MIN_REPEATS:
             return None
         values = self.residual[finite]
         mean, _ = _means_by_name(values, names)
@@ -95,12 +95,12 @@ class JudgedRows:
 def rows_of_file(
     model: CalibratedModel, measurements: Measurements, held_out: HeldOutRows | None
 ) -> JudgedRows:
-    """Judge the rows of a file that the model was not made of; those marked as test alone, where some are.
+    """Judge the rows of a file without training rows of the model; only those marked as test if there are any.
 
     Args:
         model: the model.
-        measurements: the file.
-        held_out: what the model folder keeps of its held-out rows, or None.
+        measurements: the rows of the file.
+        held_out: held-out rows that the model folder stores, or None.
 
     Raises:
         MeasurementError: no row can be judged.
@@ -122,8 +122,10 @@ def rows_of_file(
     errors, residual = _errors(poses_of_rows(model, rows), rows)
     if not (torch.isfinite(errors.position).any() or errors.rotation is not None):
         raise MeasurementError(
-            f"{rows.source}: no row holds a position, an orientation or a socket that was touched twice, so the model "
-            "cannot be judged on this file; give poses or positions, or leave the file out."
+            "no row has a position, an orientation or a socket that was measured twice, so the model cannot be judged "
+            "on this file",
+            at=Place(rows.source),
+            remedy="give poses or positions, or omit the file",
         )
     T_nominal, own_frames = _nominal_poses(model, rows)
     models = {"nominal": _errors(T_nominal, rows)[0]}
@@ -141,7 +143,7 @@ def rows_of_file(
 
 
 def rows_of_folder(model: CalibratedModel, held_out: HeldOutRows) -> JudgedRows:
-    """Give the held-out rows that a model folder keeps."""
+    """Return the held-out rows that a model folder stores, as judged rows."""
     rows = Measurements(
         q=held_out.q, frame=held_out.frame, target=held_out.target, source=model.provenance.data_source
     )
@@ -151,7 +153,7 @@ def rows_of_folder(model: CalibratedModel, held_out: HeldOutRows) -> JudgedRows:
 
 
 def place_of(model: CalibratedModel, q: Float64[Tensor, "rows dof"]) -> Float64[Tensor, "rows 3"]:
-    """Compute the position of the tool in the robot's base [m]."""
+    """Compute the position of the tool in the robot's base frame [m]."""
     T = model.forward(q)
     T = torch.where(torch.isfinite(T), T, forward_kinematics(model.robot, q))
     base = transform_from_xyzrpy(torch.from_numpy(model.robot.base.copy()))
@@ -159,17 +161,17 @@ def place_of(model: CalibratedModel, q: Float64[Tensor, "rows dof"]) -> Float64[
 
 
 def predicted_at(model: CalibratedModel, rows: Measurements) -> Float64[Tensor, " rows"]:
-    """Compute standard deviations of predicted positions [m]; NaN without one, and past `MOST_PREDICTED` rows."""
+    """Compute standard deviations of predicted positions [m]; NaN if unknown, and beyond `MAX_PREDICTED` rows."""
     predicted = torch.full((rows.rows,), torch.nan, dtype=torch.float64)
-    chosen = torch.linspace(0, rows.rows - 1, min(rows.rows, MOST_PREDICTED)).round().long()
+    chosen = torch.linspace(0, rows.rows - 1, min(rows.rows, MAX_PREDICTED)).round().long()
     if model.uncertainty is not None and len(chosen):
-        with suppress(MeasurementError):  # a frame or target that was left out of the model
+        with suppress(MeasurementError):  # a frame or target that the model does not have
             predicted[chosen] = deviation_of_rows(model, rows.select(chosen)).norm(dim=-1)
     return predicted
 
 
 def inside(model: CalibratedModel, q: Float64[Tensor, "rows dof"]) -> Bool[Tensor, " rows"]:
-    """Say whether every joint value was measured; everywhere where the model does not keep that."""
+    """Say whether every joint value is in the measured range; always true if the model does not store it."""
     if model.hybrid is None:
         return torch.ones(len(q), dtype=torch.bool)
     return model.hybrid.coverage.contains(q)
@@ -195,19 +197,19 @@ def _judged(
 
 
 def _test_rows(measurements: Measurements) -> Measurements:
-    """Select the rows marked as test, or all where none is."""
+    """Select the rows marked as test, or all if none is."""
     test = torch.tensor([name == "test" for name in measurements.split or ()], dtype=torch.bool)
     return measurements if not test.any() or bool(test.all()) else measurements.select(test)
 
 
 def _repeats(model: CalibratedModel) -> int:
-    """Repeats of the cross-validation; the errors that are kept of every row are those of the first one."""
+    """Return the number of repeats of the cross-validation; the stored errors are those of the first one."""
     repeats: int = model.metrics.get("cross_validation", {}).get("repeats", 1)
     return repeats
 
 
 def _nominal_poses(model: CalibratedModel, rows: Measurements) -> tuple[Float64[Tensor, "rows 4 4"], bool]:
-    """Predict poses of the robot as drawn with the base and tool that suit it, and say whether these are its own."""
+    """Predict poses of the nominal robot with base and tool fitted, and say whether they could be fitted."""
     try:
         nominal = nominal_model(model, rows.rotation is not None)
     except ModelError:
@@ -218,7 +220,7 @@ def _nominal_poses(model: CalibratedModel, rows: Measurements) -> tuple[Float64[
 def _errors(
     T: Float64[Tensor, "rows 4 4"], rows: Measurements
 ) -> tuple[PoseErrors, Float64[Tensor, "rows 3"]]:
-    """Compute errors of rows, and the signed ones of positions; of balls in sockets from where these are on average."""
+    """Compute errors of rows, and the signed ones of positions; for balls in sockets relative to their mean."""
     position = torch.full_like(T[:, :3, 3], torch.nan) if rows.position is None else rows.position
     residual = position - T[:, :3, 3]
     if rows.socket is not None:

@@ -1,4 +1,4 @@
-"""Any number of models on the same measured rows: their errors, differences, and confidence intervals of both."""
+"""Comparison of models on the same rows: their errors, the differences, and confidence intervals of both."""
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Bool, Float64, Int64
 from torch import Tensor
 
-from pisigma.files.errors import MeasurementError
+from pisigma.files.errors import MeasurementError, Place
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.groups import groups_to_keep_whole
 from pisigma.measurement.sensors.socket import PairOfSockets
@@ -26,24 +26,23 @@ from pisigma.validation.resampling import Bootstrap
 
 Interval = tuple[float, float]
 """Lower and upper end."""
-NOTHING_TO_JUDGE = "expected positions, balls in sockets, wires, pairs or touches, got none; give x, y and z."
 UNITS = {"position": ("mm", 1e3), "orientation": ("deg", float(np.rad2deg(1.0)))}
-"""Of every quantity the unit of tables and files, and what an SI value is multiplied by."""
+"""Unit of every quantity in tables and files, and its factor from SI units."""
 STATISTICS = ("mean", "rms", "p95")
-"""Statistics that have an interval; the maximum has none, as no resample exceeds what was measured."""
+"""Statistics with a confidence interval; the maximum has none, because no resample exceeds the measured one."""
 QUANTILE = 0.95
-"""Of the statistic "p95"."""
+"""Quantile of the statistic "p95"."""
 _BATCH = 2**22
-"""Indices that are drawn at a time, at most."""
+"""Indices that are drawn at a time."""
 
 
 @dataclass(frozen=True)
 class Intervals:
-    """Confidence intervals of the statistics in `STATISTICS`, of several models [m or rad].
+    """Confidence intervals of the statistics in `STATISTICS` for several models [m or rad].
 
     Attributes:
-        value: lower and upper end of each statistic of each model; NaN where there is one configuration only.
-        difference: the same of its difference to the first model's.
+        value: lower and upper end of each statistic of each model; NaN if there is only one configuration.
+        difference: the same for its difference to that of the first model.
     """
 
     value: Float64[np.ndarray, "statistics models 2"]
@@ -56,8 +55,8 @@ def confidence_intervals(
     """Compute the intervals of all models on the same resamples.
 
     Args:
-        bootstrap: how they are computed.
-        errors: of the same rows under every model, lengths or angles [m or rad]; none is NaN.
+        bootstrap: settings of the bootstrap.
+        errors: lengths or angles of the errors of the same rows under every model [m or rad], without NaN.
         group: index of every row's group, from 0; every index occurs.
     """
     from scipy import stats
@@ -88,20 +87,20 @@ def confidence_intervals(
 
 
 def statistics(errors: Float64[np.ndarray, "models rows"]) -> Float64[np.ndarray, "statistics models"]:
-    """Compute mean, root mean square and 95 % quantile of every model's errors, as `STATISTICS` names them."""
+    """Compute mean, RMS and 95 % quantile of every model's errors, in the order of `STATISTICS`."""
     quantile = np.quantile(errors, QUANTILE, axis=1)
     return np.stack([errors.mean(1), np.sqrt((errors**2).mean(1)), quantile])
 
 
 @dataclass(frozen=True)
 class Difference:
-    """Errors of a model minus those of the first model on the same rows; below 0 where the model is better.
+    """Errors of a model minus those of the first model on the same rows; < 0 if the model is better.
 
     Attributes:
-        statistics: by name ("mean", "rms", "p95") the difference [mm or deg].
-        intervals: by name its confidence interval; None where there is one configuration only.
-        test: Wilcoxon's test of the configurations' mean differences.
-        better_share: share of the configurations in which the model's mean error is smaller.
+        statistics: differences by name ("mean", "rms", "p95") [mm or deg].
+        intervals: their confidence intervals; None if there is only one configuration.
+        test: Wilcoxon's signed-rank test of the mean differences of configurations.
+        better_share: share of the configurations in which the model's mean error is smaller [1].
     """
 
     statistics: Mapping[str, float]
@@ -110,7 +109,7 @@ class Difference:
     better_share: float
 
     def to_json(self, unit: str) -> dict[str, object]:
-        """Return the figures as plain values, the unit in their names."""
+        """Return the figures as plain values, with the unit in their names."""
         values: dict[str, object] = {f"{name}_{unit}": value for name, value in self.statistics.items()}
         values |= {f"{name}_{unit}_interval": interval for name, interval in self.intervals.items()}
         return values | {"better_share": self.better_share, "wilcoxon": asdict(self.test)}
@@ -121,14 +120,14 @@ class QuantityErrors:
     """Errors of one quantity under one model, in the unit of tables and files.
 
     Attributes:
-        unit: "mm" of positions, "deg" of orientations.
-        statistics: by name ("rms", "mean", "p95", "max") of the errors' sizes.
-        intervals: confidence intervals of "mean", "rms" and "p95"; None where there is one configuration only.
-        axes: by axis of the frame "mean" of the signed errors and "rms", "p95", "max" of their sizes; empty where no
-            row has the position too.
-        inside: `statistics` of the rows inside the model's domain; empty where there are none or it knows no domain.
-        outside: the same of the rows outside it.
-        difference: to the first model; None of the first.
+        unit: "mm" for positions, "deg" for orientations.
+        statistics: statistics of the sizes of the errors by name ("rms", "mean", "p95", "max").
+        intervals: confidence intervals of "mean", "rms" and "p95"; None if there is only one configuration.
+        axes: by axis of the frame, "mean" of the signed errors and "rms", "p95", "max" of their sizes; empty if some
+            rows have lengths instead of positions.
+        inside: `statistics` of the rows inside the model's domain; empty if there are none or the model has no domain.
+        outside: the same for the rows outside it.
+        difference: difference to the first model; None for the first one.
     """
 
     unit: str
@@ -142,14 +141,14 @@ class QuantityErrors:
 
 @dataclass(frozen=True)
 class ModelFigures:
-    """Everything that is said of one of the compared models.
+    """All figures of one of the compared models.
 
     Attributes:
-        name: what the model is called.
-        rows_not_predicted: rows with a measured length for which this model predicts nothing.
-        position: errors of positions, and of the lengths of other sensors in rows without one.
-        orientation: errors of orientations; None where none was measured.
-        rows_inside: compared rows inside the model's domain; None where it knows no domain.
+        name: name of the model.
+        rows_not_predicted: number of rows with a measured length for which this model has no prediction.
+        position: errors of positions, and of the lengths of other sensors in rows without a position.
+        orientation: errors of orientations; None if none was measured.
+        rows_inside: number of compared rows inside the model's domain; None if it has no domain.
         rows_outside: the same outside it.
     """
 
@@ -162,7 +161,7 @@ class ModelFigures:
 
     @property
     def quantities(self) -> dict[str, QuantityErrors]:
-        """Errors of "position" and, where measured, of "orientation"."""
+        """Errors of "position" and, if measured, of "orientation"."""
         both = {"position": self.position, "orientation": self.orientation}
         return {name: errors for name, errors in both.items() if errors is not None}
 
@@ -195,15 +194,15 @@ class ModelFigures:
 
 @dataclass(frozen=True)
 class ModelComparison:
-    """Models on the same rows.
+    """Comparison of models on the same rows.
 
     Attributes:
-        models: in the order in which they were given.
-        rows: rows that are compared.
-        rows_without_position: rows that hold no position, and no other length that could be judged.
-        configurations: number of different configurations of these rows.
-        bootstrap: how the intervals were computed.
-        socket_distance: errors of stated distances of sockets; None where none is stated.
+        models: figures of the models, in the given order.
+        rows: number of compared rows.
+        rows_without_position: number of rows without a position or another length that can be judged.
+        configurations: number of different configurations of the compared rows.
+        bootstrap: settings of the confidence intervals.
+        socket_distance: errors of stated distances of sockets; None if none is stated.
     """
 
     models: tuple[ModelFigures, ...]
@@ -236,31 +235,37 @@ def compare_models(
     fitted: Collection[FrameKind] = (),
     socket_distances: Mapping[PairOfSockets, float] = MappingProxyType({}),
 ) -> ModelComparison:
-    """Judge models on measurements; rows for which one of them predicts nothing count for none.
+    """Compare models on measurements, using only rows that all models predict.
 
     Args:
-        models: by name, one or more.
+        models: one or more models by name.
         measurements: the rows, in the frames that the models were fitted in.
-        bootstrap: how confidence intervals are computed. None: `Bootstrap()`.
-        fitted: frames or targets that are fitted to the rows, for every model; see `errors_in_fitted_frames`.
+        bootstrap: settings of the confidence intervals; None for `Bootstrap()`.
+        fitted: frames or targets that are fitted to the rows for every model; see `errors_in_fitted_frames`.
         socket_distances: stated distances of sockets of the rows [m].
 
     Raises:
-        MeasurementError: no lengths were measured, or in a frame or of a target that a model does not know, or no
-            row is predicted by all models, or a frame or target that is fitted has too few rows.
+        MeasurementError: no lengths were measured, a model does not have a frame or target, no row is predicted by all
+            models, or a frame or target that is fitted has too few rows.
         PoseError: the joint values do not fit a model's robot.
     """
     bootstrap = bootstrap or Bootstrap()
     vectors = {name: errors_in_fitted_frames(model, measurements, fitted) for name, model in models.items()}
     measured, others = has_position(measurements), other_lengths(measurements)
     if not bool((measured | others).any()):
-        raise MeasurementError(f"{measurements.source}: {NOTHING_TO_JUDGE}")
+        raise MeasurementError(
+            expected="positions, balls in sockets, wires, pairs or touches",
+            value="none",
+            at=Place(measurements.source),
+            remedy="give x, y and z",
+        )
     predicted = {name: torch.isfinite(errors.position).all(-1) for name, errors in vectors.items()}
     common = torch.stack(list(predicted.values())).all(0)
     if not common.any():
         raise MeasurementError(
-            f"{measurements.source}: there is no row with a measured length that {', '.join(models)} predict; give "
-            "rows nearer to what was calibrated with, and two or more of every socket."
+            f"there is no row with a measured length that {', '.join(models)} predict",
+            at=Place(measurements.source),
+            remedy="give rows nearer to those of the calibration, and two or more of every socket",
         )
     measured = measured | (others & torch.stack(list(predicted.values())).any(0))
     domains = [inside_domain(model, measurements) for model in models.values()]
@@ -295,16 +300,16 @@ def compare_models(
 def _distances(
     models: Mapping[str, CalibratedModel], rows: Measurements, stated: Mapping[PairOfSockets, float]
 ) -> SocketDistances | None:
-    """Figures of stated distances of sockets, each where its rows put the ball."""
+    """Compute the figures of stated distances of sockets, each at the mean predicted position of its ball."""
     poses = {name: poses_of_rows(model, rows) for name, model in models.items() if stated}
     return distance_figures([DistanceErrors.of(poses, stated, rows)])
 
 
 def inside_domain(model: CalibratedModel, measurements: Measurements) -> Bool[Tensor, " rows"] | None:
-    """Say which rows are inside a model's domain: where its correction was learned.
+    """Say which rows are inside a model's domain, in which its correction was learned.
 
     Returns:
-        None where the model knows no domain, as geometric calibrations do not.
+        None if the model has no domain, as geometric calibrations.
     """
     if model.hybrid is not None:
         return model.hybrid.coverage.contains(measurements.q)
@@ -326,7 +331,7 @@ def _quantity(
     group: Int64[Tensor, " rows"],
     bootstrap: Bootstrap,
 ) -> list[QuantityErrors]:
-    """Compute the figures of one quantity of all models on those of the common rows that have it under all."""
+    """Compute the figures of one quantity for all models, on the common rows that have it under all models."""
     unit, factor = UNITS[quantity]
     stacked = torch.stack(list(vectors)) * factor
     there = common & torch.isfinite(stacked).all(-1).all(0)
@@ -354,7 +359,7 @@ def _quantity(
 def _differences(
     sizes: Float64[np.ndarray, "models rows"], group: Int64[np.ndarray, " rows"], intervals: Intervals
 ) -> list[Difference]:
-    """Compare every model with the first, the first with itself too."""
+    """Compare every model with the first one, including itself."""
     values = statistics(sizes)
     means = np.stack([np.bincount(group, row) for row in sizes]) / np.bincount(group)
     return [
@@ -374,7 +379,7 @@ def _by_name(ends: Float64[np.ndarray, "statistics 2"]) -> dict[str, Interval | 
 
 
 def _some(errors: Float64[Tensor, "rows 3"], rows: Bool[Tensor, " rows"] | None) -> dict[str, float]:
-    """Compute the statistics of some rows; nothing where there are none."""
+    """Compute the statistics of some rows; empty if there are none."""
     return {} if rows is None or not bool(rows.any()) else error_statistics(errors[rows].norm(dim=-1))
 
 

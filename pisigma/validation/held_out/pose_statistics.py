@@ -1,4 +1,4 @@
-"""Errors of measured poses under a model, their statistics, and how large a calibration expected them to be."""
+"""Errors of measured poses under a model, their statistics, and the errors that a calibration predicts."""
 
 import math
 from collections.abc import Sequence
@@ -12,7 +12,7 @@ from pisigma.calibration.geometric.result import CalibrationResult
 from pisigma.calibration.hybrid.result import HybridResult
 from pisigma.calibration.hybrid.uncertainty import PositionUncertainty
 from pisigma.estimation.covariance_root import CovarianceRoot
-from pisigma.files.errors import MeasurementError
+from pisigma.files.errors import MeasurementError, Place
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.sensors.corner import position_deviations
 from pisigma.measurement.sensors.intrinsics import NOISE_COLUMN
@@ -21,19 +21,19 @@ from pisigma.robot.se3 import rotation_vector
 from pisigma.validation.held_out.validation_figures import ErrorFigures
 
 WITHIN = 1.96
-"""95 % of a normal value lie within so many standard deviations."""
+"""[standard deviations] Half the width of a 95 % interval of a normal distribution."""
 OTHER_POSES = 5
-"""Poses for every row, with the values of its joints from any rows, at which a calibration predicts its errors."""
+"""Poses per row at which a calibration predicts its errors; their joint values are those of the rows, permuted."""
 
 
 @dataclass(frozen=True, eq=False)
 class ErrorVectors:
-    """How measured rows are off from where a model expects them, measured minus expected.
+    """Pose errors of rows, measured minus predicted.
 
     Attributes:
-        position: along the axes of the row's frame [m]; NaN where no position was measured or predicted.
-        rotation: rotation vector of `R_measured R_expected^T` about these axes [rad]; NaN likewise; None where no row
-            has an orientation.
+        position: position errors along the axes of the row's frame [m]; NaN where nothing was measured or predicted.
+        rotation: rotation vectors of `R_measured R_predicted^T` about these axes [rad]; NaN where nothing was measured
+            or predicted; None if no row has an orientation.
     """
 
     position: Float64[Tensor, "rows 3"]
@@ -41,13 +41,13 @@ class ErrorVectors:
 
     @staticmethod
     def between(measurements: Measurements, expected: Float64[Tensor, "rows 4 4"]) -> "ErrorVectors":
-        """Errors of measurements against expected poses T_base_tool.
+        """Compute the errors of measurements relative to predicted poses T_base_tool.
 
         Raises:
             MeasurementError: no position was measured.
         """
         if measurements.position is None:
-            raise MeasurementError(f"{measurements.source}: {_no_positions(measurements)}")
+            raise _no_positions(measurements)
         position = measurements.position - expected[:, :3, 3]
         if measurements.rotation is None:
             return ErrorVectors(position, None)
@@ -68,13 +68,12 @@ class ErrorVectors:
 
 @dataclass(frozen=True, eq=False)
 class PoseErrors:
-    """How far measured rows are from where a model expects them.
+    """Lengths and angles of the pose errors of rows.
 
     Attributes:
-        position: length of the position error of every row [m]; NaN where no position was measured or
-            predicted.
-        rotation: angle of the rotation error of every row [rad]; NaN likewise; None where no row has an
-            orientation.
+        position: length of the position error of every row [m]; NaN where nothing was measured or predicted.
+        rotation: angle of the rotation error of every row [rad]; NaN where nothing was measured or predicted; None if
+            no row has an orientation.
     """
 
     position: Float64[Tensor, " rows"]
@@ -82,31 +81,31 @@ class PoseErrors:
 
     @staticmethod
     def between(measurements: Measurements, expected: Float64[Tensor, "rows 4 4"]) -> "PoseErrors":
-        """Errors of measurements against expected poses; see `ErrorVectors.between`."""
+        """Compute the errors of measurements relative to predicted poses; see `ErrorVectors.between`."""
         return ErrorVectors.between(measurements, expected).sizes
 
     @staticmethod
     def none(rows: int, turned: bool) -> "PoseErrors":
-        """Errors of rows that are not judged yet, with orientations or without."""
+        """Make errors that are all NaN, with orientations or without."""
         nothing = torch.full((rows,), torch.nan, dtype=torch.float64)
         return PoseErrors(nothing, nothing.clone() if turned else None)
 
     def put(self, rows: Int64[Tensor, " some"], errors: "PoseErrors") -> None:
-        """Write the errors of some rows, as far as both have orientations."""
+        """Set the errors of some rows in place; rotations only if both have some."""
         self.position[rows] = errors.position
         if self.rotation is not None and errors.rotation is not None:
             self.rotation[rows] = errors.rotation
 
     @staticmethod
     def joined(several: Sequence["PoseErrors"]) -> "PoseErrors":
-        """Join errors one after the other; all have orientations or none has."""
+        """Concatenate errors, which all have orientations or none has."""
         rotations = [errors.rotation for errors in several if errors.rotation is not None]
         return PoseErrors(
             torch.cat([errors.position for errors in several]), torch.cat(rotations) if rotations else None
         )
 
     def only(self, rows: Bool[Tensor, " rows"]) -> "PoseErrors":
-        """The errors of some rows; NaN in all others."""
+        """Set the errors of all other rows to NaN."""
         position = torch.where(rows, self.position, torch.nan)
         return PoseErrors(
             position, None if self.rotation is None else torch.where(rows, self.rotation, torch.nan)
@@ -114,7 +113,7 @@ class PoseErrors:
 
     @property
     def figures(self) -> ErrorFigures:
-        """RMS, mean, 95 % and maximum in mm and, where measured, in deg."""
+        """RMS, mean, 95 % quantile and maximum in mm and, if measured, in deg."""
         figures = {f"{name}_mm": value * 1e3 for name, value in error_statistics(self.position).items()}
         if self.rotation is not None:
             degrees = torch.rad2deg(self.rotation)
@@ -123,11 +122,17 @@ class PoseErrors:
 
 
 def error_statistics(errors: Float64[Tensor, " rows"]) -> dict[str, float]:
-    """Root mean square, mean, 95 % quantile and maximum of error lengths; NaN rows do not count."""
+    """Compute RMS, mean, 95 % quantile and maximum of error lengths, ignoring NaN.
+
+    Raises:
+        MeasurementError: all errors are NaN.
+    """
     present = errors[torch.isfinite(errors)]
     if not len(present):
         raise MeasurementError(
-            "there is no row with both a measured and a predicted value; nothing can be compared."
+            expected="a row with both a measured and a predicted value",
+            value="none",
+            remedy="give other rows",
         )
     return {
         "rms": float(present.square().mean().sqrt()),
@@ -138,30 +143,33 @@ def error_statistics(errors: Float64[Tensor, " rows"]) -> dict[str, float]:
 
 
 def axis_statistics(errors: Float64[Tensor, " rows"]) -> dict[str, float]:
-    """Mean of signed errors, which is their bias, and RMS, 95 % quantile and maximum of their sizes; without NaN."""
+    """Compute the mean of signed errors (bias) and RMS, 95 % quantile and maximum of their sizes, ignoring NaN."""
     sizes = error_statistics(errors.abs())
     return {**sizes, "mean": float(errors[torch.isfinite(errors)].mean())}
 
 
-def _no_positions(measurements: Measurements) -> str:
-    """What is missing in rows without positions."""
-    kinds = measurements.kinds - {"rotation"}
-    if not kinds:
-        return "no positions were measured; give x, y and z."
-    return (
-        f"no positions were measured, but {' and '.join(sorted(kinds))} values, which `pisigma evaluate` and "
-        "`pisigma verify` judge; give x, y and z, or hold rows out with `pisigma calibrate --hold-out`."
+def _no_positions(measurements: Measurements) -> MeasurementError:
+    """Make the error for rows without positions."""
+    kinds = " and ".join(sorted(measurements.kinds - {"rotation"}))
+    return MeasurementError(
+        expected="positions",
+        value=kinds or "none",
+        at=Place(measurements.source),
+        remedy="give x, y and z, use `pisigma evaluate` or `pisigma verify`, which accept such rows, or hold rows out "
+        "with `pisigma calibrate --hold-out`"
+        if kinds
+        else "give x, y and z",
     )
 
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """A model with and without its correction, on the same rows.
+    """Errors of the same rows with and without the correction of a model.
 
     Attributes:
-        nominal: errors of the model's robot without its correction (base and tool as fitted).
+        nominal: errors without the correction (base and tool as fitted).
         corrected: errors with it; NaN in the same rows.
-        not_predicted: rows that are left out of both, because the model predicts nothing there.
+        not_predicted: number of rows that are left out of both, because the model has no prediction there.
     """
 
     nominal: PoseErrors
@@ -170,7 +178,7 @@ class Comparison:
 
     @staticmethod
     def of(nominal: PoseErrors, corrected: PoseErrors) -> "Comparison":
-        """Compare on the rows that both have."""
+        """Compare on the rows for which both have errors."""
         both = ~(torch.isfinite(nominal.position) & torch.isnan(corrected.position))
         return Comparison(nominal.only(both), corrected, int((~both).sum()))
 
@@ -179,7 +187,7 @@ def compare_on(model: CalibratedModel, measurements: Measurements) -> Comparison
     """Compare a model with and without its correction on measurements.
 
     Raises:
-        MeasurementError: no positions were measured, or in a frame or of a target that the model does not know.
+        MeasurementError: there are no positions, or the model does not have a frame or target.
     """
     nominal, corrected = (
         PoseErrors.between(measurements, poses(model, measurements))
@@ -190,12 +198,12 @@ def compare_on(model: CalibratedModel, measurements: Measurements) -> Comparison
 
 @dataclass(frozen=True, eq=False)
 class PredictedSpread:
-    """How far measured positions are from predicted ones, and how far they were expected to be.
+    """Position errors and their predicted standard deviations.
 
     Attributes:
-        error: measured minus predicted along the axes of the row's frame [m]; NaN where a row has no position
-            or was not judged.
-        sigma: predicted standard deviation of it, with the noise of the measurement [m]; NaN likewise.
+        error: measured minus predicted position along the axes of the row's frame [m]; NaN if a row has no position or
+            was not judged.
+        sigma: predicted standard deviation of the error, including measurement noise [m]; NaN in the same rows.
     """
 
     error: Float64[Tensor, "rows 3"]
@@ -203,30 +211,30 @@ class PredictedSpread:
 
     @staticmethod
     def none(rows: int) -> "PredictedSpread":
-        """Of rows that are not judged yet."""
+        """Make a spread that is all NaN."""
         nothing = torch.full((rows, 3), torch.nan, dtype=torch.float64)
         return PredictedSpread(nothing, nothing.clone())
 
     @staticmethod
     def joined(spreads: Sequence["PredictedSpread"]) -> "PredictedSpread":
-        """Rows of one after the other."""
+        """Concatenate spreads."""
         return PredictedSpread(
             torch.cat([spread.error for spread in spreads]), torch.cat([spread.sigma for spread in spreads])
         )
 
     @property
     def values(self) -> int:
-        """Number of coordinates with an error and a prediction of it."""
+        """Number of coordinates with an error and a predicted standard deviation."""
         return int(self._judged.sum())
 
     @property
     def coverage(self) -> float:
-        """Share of coordinates whose error is within 1.96 standard deviations; 0.95 is wanted."""
+        """Share of coordinates whose error is within 1.96 standard deviations; ideally 0.95."""
         inside = self.error.abs() <= WITHIN * self.sigma
         return float(inside[self._judged].double().mean())
 
     def in_file_units(self) -> dict[str, float]:
-        """Coverage, and root mean square of the predicted deviation of a position [mm]; nothing without rows."""
+        """Return the coverage and the RMS predicted position error [mm]; empty without rows."""
         if not self.values:
             return {}
         rows = self._judged.all(-1)
@@ -239,10 +247,10 @@ class PredictedSpread:
 
 
 def predicted_spread(result: HybridResult, measurements: Measurements) -> PredictedSpread:
-    """Errors of measured positions under a hybrid calibration, and what it predicts of them.
+    """Compute position errors under a hybrid calibration and their predicted standard deviations.
 
-    The noise of the measurement is what the residuals of the calibration show, or, where its rows stated theirs, what
-    these rows state times the factor that the residuals show; rows that then state none are exact.
+    The measurement noise is that estimated from the residuals of the calibration. If the rows of the calibration stated
+    standard deviations, it is the stated one of each row times the estimated factor; rows that state none are exact.
 
     Raises:
         IdentificationError: a row has a target that was not calibrated.
@@ -267,17 +275,17 @@ def predicted_spread(result: HybridResult, measurements: Measurements) -> Predic
 def predicted_at_other_poses(
     result: CalibrationResult | HybridResult, measurements: Measurements
 ) -> float | None:
-    """RMS of the position errors, with the noise, that a calibration predicts where it was not measured [m].
+    """Compute the RMS position error, including noise, that a calibration predicts at other poses [m].
 
-    Every joint takes the values of the rows, in an order of its own: at the rows themselves a calibration knows more
-    than at any other pose between them, of few rows several times as much.
+    Other poses have the joint values of the rows, permuted independently for every joint. At the rows themselves the
+    predicted errors are smaller than at other poses between them, several times so for few rows.
 
     Args:
         result: the calibration.
-        measurements: the rows that it was calibrated with.
+        measurements: the rows of the calibration.
 
     Returns:
-        None where it predicts no positions.
+        None if it predicts no positions.
     """
     q, generator = measurements.q.detach().cpu(), torch.Generator().manual_seed(0)
     orders = torch.rand(OTHER_POSES, *q.shape, generator=generator).argsort(1)
@@ -297,7 +305,7 @@ def predicted_at_other_poses(
 
 
 def image_deviation(measurements: Measurements) -> float:
-    """Root mean square error of the positions that images give by themselves [m]; 0 without images."""
+    """Compute the RMS error of positions measured by single images [m]; 0 without images."""
     noise = measurements.readings.get(NOISE_COLUMN)
     if not isinstance(noise, Tensor):
         return 0.0
@@ -306,18 +314,18 @@ def image_deviation(measurements: Measurements) -> float:
 
 
 def image_remark(measurements: Measurements) -> tuple[str, ...]:
-    """Say how uncertain the positions of images are by themselves; nothing where there are no images."""
+    """Write a remark on the uncertainty of positions measured by images; empty without images."""
     deviation = image_deviation(measurements)
     if not deviation:
         return ()
     return (
-        f"The position that an image gives is itself uncertain by {deviation * 1e3:.2g} mm (RMS), which the errors "
-        "contain: the robot is more accurate than they say.",
+        f"The position measured by an image has an uncertainty of {deviation * 1e3:.2g} mm RMS, which is included in "
+        "the errors: the robot is more accurate than they indicate.",
     )
 
 
 def _noise(result: CalibrationResult | HybridResult, measurements: Measurements) -> Float64[Tensor, "rows 3"]:
-    """Standard deviations of the measured coordinates of every row [m]."""
+    """Compute the standard deviations of the measured coordinates of every row [m]."""
     deviation = torch.zeros(measurements.rows, 3, dtype=torch.float64)
     geometric, learned = (
         (result.geometric, result.learned) if isinstance(result, HybridResult) else (result, None)

@@ -1,4 +1,4 @@
-"""Tests of dependence and of difference from ranks alone: they assume no distribution of the errors."""
+"""Rank tests of dependence and of differences, which assume no distribution of the errors."""
 
 from dataclasses import dataclass
 
@@ -6,16 +6,16 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 SIGNIFICANT = 1e-3
-"""Probability below which a dependence is called significant."""
+"""p-value below which a dependence is called significant."""
 
 
 def rank_correlation(
     x: Float64[np.ndarray, " values"], y: Float64[np.ndarray, " values"]
 ) -> tuple[float, float]:
-    """Compute Spearman's rank correlation and its two-sided probability by chance.
+    """Compute Spearman's rank correlation and its two-sided p-value.
 
     Returns:
-        Correlation and probability; 0 and 1 where either is constant or there are fewer than three values.
+        Correlation and p-value; 0 and 1 if either variable is constant or there are fewer than three values.
     """
     from scipy.stats import spearmanr
 
@@ -31,11 +31,11 @@ def groups_differ(
     """Test whether groups have values of different size (Kruskal and Wallis 1952).
 
     Args:
-        group: index of every value's group; indices without a value do not count.
-        values: to compare.
+        group: index of every value's group; indices without a value are ignored.
+        values: the values.
 
     Returns:
-        The statistic H and its probability by chance; 0 and 1 where there are not two groups of different values.
+        The statistic H and its p-value; 0 and 1 if there are not two groups with different values.
     """
     from scipy.stats import kruskal
 
@@ -51,9 +51,9 @@ class SignedRank:
     """Result of Wilcoxon's signed-rank test.
 
     Attributes:
-        statistic: the smaller of the sums of the ranks of positive and of negative differences.
-        z: standardised, at most 0; 0 where there is no difference.
-        p: two-sided probability of sums as uneven as these or more where the differences lie about zero.
+        statistic: the smaller of the rank sums of positive and of negative differences.
+        z: standardised statistic, at most 0; 0 if there is no difference.
+        p: two-sided p-value for a symmetric distribution about 0.
         pairs: number of differences that are not 0; the others are left out.
     """
 
@@ -64,7 +64,7 @@ class SignedRank:
 
 
 def signed_rank(differences: Float64[np.ndarray, " pairs"]) -> SignedRank:
-    """Test whether paired differences lie about zero (Wilcoxon 1945), by the normal approximation with ties."""
+    """Test whether paired differences are symmetric about 0 (Wilcoxon 1945), by the normal approximation with ties."""
     from scipy.stats import wilcoxon
 
     pairs = int(np.count_nonzero(differences))

@@ -1,4 +1,4 @@
-"""What a model is compared with: the robot as drawn, and the geometric calibration under a hybrid."""
+"""Reference models for comparisons: the nominal robot, and the geometric calibration of a hybrid."""
 
 from dataclasses import replace
 
@@ -12,15 +12,15 @@ from pisigma.validation.held_out.trained_calibrations import base_and_tool
 
 
 def nominal_model(model: CalibratedModel, turned: bool) -> CalibratedModel:
-    """The robot as drawn, with the base and tool that suit it best.
+    """Make the model of the nominal robot with base and tool fitted to it.
 
-    Base and tool of an identified geometry go with that geometry and would make the drawn arm look worse than it is.
-    So they are fitted anew, to where the model says that the targets were at the joint values that it keeps of its
-    training rows; what the model is judged on plays no part. A model with nominal geometry has them already.
+    Base and tool of an identified geometry belong to that geometry and would increase the errors of the nominal arm.
+    Therefore they are fitted again, to the target poses that the model predicts at its stored joint values of training
+    rows; the rows under test are not used. A model with nominal geometry already has them.
 
     Args:
         model: a model of any kind.
-        turned: whether orientations will be judged; then they are fitted too.
+        turned: whether orientations are compared and therefore fitted too.
 
     Raises:
         ModelError: the model does not keep enough joint values to fit base and tool.
@@ -31,8 +31,10 @@ def nominal_model(model: CalibratedModel, turned: bool) -> CalibratedModel:
         fitted = base_and_tool(GeometricCalibrator(model.robot)).fit(_predicted(model, turned))
     except IdentificationError as problem:
         raise ModelError(
-            f"model {model.name}: base and tool of the robot as drawn cannot be fitted to the {len(model.starts)} "
-            f"joint values that it keeps ({' '.join(str(problem).rstrip('.').split())}); compare models by name."
+            f"model '{model.name}': base and tool of the nominal robot cannot be fitted to the {len(model.starts)} "
+            f"stored joint vectors of the model ({' '.join(str(problem).rstrip('.').split())})",
+            value=len(model.starts),
+            remedy="compare models by name",
         ) from problem
     robot = model.robot.with_geometry(base=fitted.robot.base, tool=fitted.robot.tool)
     return replace(
@@ -45,14 +47,16 @@ def nominal_model(model: CalibratedModel, turned: bool) -> CalibratedModel:
 
 
 def geometric_model(model: CalibratedModel) -> CalibratedModel:
-    """The geometric calibration that a hybrid builds upon; of another identified geometry the model itself.
+    """Return the geometric calibration that a hybrid is based on; for another identified geometry the model itself.
 
     Raises:
         ModelError: the model has no identified geometry.
     """
     if model.calibrated is None:
         raise ModelError(
-            f"model {model.name} ({model.kind}) has no identified geometry; calibrate with `pisigma calibrate`."
+            f"model '{model.name}' ({model.kind}) has no identified geometry",
+            value=model.kind,
+            remedy="calibrate with `pisigma calibrate`",
         )
     return replace(
         model,
@@ -67,7 +71,7 @@ def geometric_model(model: CalibratedModel) -> CalibratedModel:
 
 
 def _predicted(model: CalibratedModel, turned: bool) -> Measurements:
-    """Predicted rows at the kept joint values: every frame with the first target, every target in the first frame."""
+    """Predict rows at the stored joint values: every frame with the first target, every target in the first frame."""
     frames, targets = tuple(model.bases) or ("",), tuple(model.tools) or ("",)
     pairs = [(frame, targets[0]) for frame in frames] + [(frames[0], target) for target in targets[1:]]
     count = len(model.starts)

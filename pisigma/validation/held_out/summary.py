@@ -1,4 +1,4 @@
-"""What the figures of all kinds of models have in common: they are JSON, and the metrics of a model on disk."""
+"""Base of the figures of all kinds of models, which are the JSON of commands and the metrics of a model on disk."""
 
 from typing import Any, ClassVar, TypeVar
 
@@ -13,12 +13,12 @@ Summary = TypeVar("Summary", bound="AbstractSummary")
 
 
 class AbstractSummary(Section):
-    """All figures of a model. What does not exist is not set and stands in no JSON.
+    """All figures of a model. Figures that do not exist are not set and are omitted from JSON.
 
     Attributes:
-        kinds: of the models whose metrics these figures are.
-        command: what made the model: a command line or a call.
-        diagnostics: what is wrong with the result, those first that make it implausible.
+        kinds: kinds of models that have these metrics.
+        command: command line or call that made the model.
+        diagnostics: findings of the checks; those that make the result implausible come first.
     """
 
     kinds: ClassVar[tuple[str, ...]]
@@ -26,22 +26,22 @@ class AbstractSummary(Section):
     diagnostics: tuple[Diagnostic, ...] = ()
 
     def to_json(self) -> dict[str, Any]:
-        """Give everything that is set as JSON values, by name."""
+        """Return everything that is set as JSON values, by name."""
         return self.model_dump(mode="json", exclude_unset=True)
 
     def having(self: Summary, **figures: object) -> Summary:
-        """Give the same with more figures; those that are None are left out."""
+        """Return a copy with more figures; those that are None are left out."""
         return self.model_copy(update={name: value for name, value in figures.items() if value is not None})
 
     @classmethod
     def read(cls: type[Summary], model: CalibratedModel) -> Summary | None:
-        """Read the figures that a model keeps.
+        """Read the figures that a model stores.
 
         Returns:
-            None for a model of another kind, and for one that keeps no figures.
+            None for a model of another kind, and for one that stores no figures.
 
         Raises:
-            ModelError: the figures are not in the form of this version.
+            ModelError: the figures do not have the form of this version.
         """
         if model.kind not in cls.kinds or not model.metrics:
             return None
@@ -51,6 +51,7 @@ class AbstractSummary(Section):
             first = problem.errors()[0]
             key = ".".join(map(str, first["loc"]))
             raise ModelError(
-                f"model '{model.name}': the metrics are not those of this kind of model ({key}: {first['msg']}); "
-                "make the model again, or run `pisigma upgrade` on the folder of an earlier version."
+                f"model '{model.name}': invalid metrics for this kind of model ({key}: {first['msg']})",
+                value=key,
+                remedy="make the model again, or run `pisigma upgrade` on the folder of an earlier version",
             ) from None

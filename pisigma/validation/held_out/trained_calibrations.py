@@ -1,4 +1,4 @@
-"""Calibrations that are judged side by side, trained on the same rows, and what of the others they can predict."""
+"""Calibrations with the same training rows that are compared, and their predictions of other rows."""
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -31,12 +31,12 @@ Result = CalibrationResult | HybridResult
 
 
 def geometric_of(calibrator: Calibrator) -> GeometricCalibrator:
-    """The geometric calibrator, or the one that a hybrid builds upon."""
+    """Return the geometric calibrator, or the one that a hybrid is based on."""
     return calibrator.geometric if isinstance(calibrator, HybridCalibrator) else calibrator
 
 
 def geometric_result(result: Result) -> CalibrationResult:
-    """The geometric calibration, or the one that a hybrid builds upon."""
+    """Return the geometric calibration, or the one that a hybrid is based on."""
     return result.geometric if isinstance(result, HybridResult) else result
 
 
@@ -44,9 +44,9 @@ def fit(calibrator: Calibrator, rows: Measurements, progress: Progress) -> Resul
     """Calibrate; see the calibrators' `fit`.
 
     Args:
-        calibrator: of either kind.
-        rows: to calibrate with.
-        progress: called with what a hybrid tries.
+        calibrator: a calibrator of either kind.
+        rows: the rows to calibrate with.
+        progress: called with the current trial of a hybrid.
     """
     return (
         calibrator.fit(rows, progress) if isinstance(calibrator, HybridCalibrator) else calibrator.fit(rows)
@@ -59,20 +59,20 @@ def trained(
     progress: Progress = lambda what: None,
     result: Result | None = None,
 ) -> dict[str, Result]:
-    """Give the calibrations of some rows that are compared, by name.
+    """Fit all calibrations that are compared to the same rows.
 
     Args:
-        calibrator: of either kind.
-        rows: to calibrate with.
-        progress: called with what is being tried.
-        result: what the calibrator gave for these rows; None to calibrate.
+        calibrator: a calibrator of either kind.
+        rows: the rows to calibrate with.
+        progress: called with the current trial.
+        result: result of the calibrator for these rows; None to calibrate.
 
     Returns:
-        "nominal": the arm as drawn, base and tool fitted and every row counted in full; "geometric"; and "hybrid"
-        of a hybrid calibrator.
+        By name "nominal" (the nominal arm with base and tool fitted, all rows with full weight), "geometric", and
+        "hybrid" for a hybrid calibrator.
 
     Raises:
-        IdentificationError: the rows do not determine what is asked for.
+        IdentificationError: the rows do not determine the parameters.
     """
     nominal = base_and_tool(geometric_of(calibrator)).fit(rows)
     result = fit(calibrator, rows, progress) if result is None else result
@@ -81,7 +81,7 @@ def trained(
 
 
 def base_and_tool(calibrator: GeometricCalibrator) -> GeometricCalibrator:
-    """Give the calibrator of the arm as drawn: only base and tool are fitted, and every row counts in full."""
+    """Make the calibrator of the nominal arm: only base and tool are fitted, and all rows have full weight."""
     return replace(calibrator, free=(), loss=SquaredLoss())
 
 
@@ -91,13 +91,13 @@ def without_missing(
     of: Measurements,
     left_out: Collection[PairOfSockets] = (),
 ) -> Calibrator:
-    """Give the calibrator without stated frames and socket distances that some of the rows lack.
+    """Remove stated frames and socket distances from a calibrator that some of the rows lack.
 
     Args:
-        calibrator: for all rows.
-        rows: those that it will be fitted to.
-        of: all rows; what these lack too stays, so that the calibrator refuses it.
-        left_out: socket distances that it is to do without, too.
+        calibrator: calibrator for all rows.
+        rows: the rows that it will be fitted to.
+        of: all rows; frames and distances that these lack too are kept, so that the calibrator refuses them.
+        left_out: socket distances to remove in addition.
     """
     if isinstance(calibrator, HybridCalibrator):
         geometric = without_missing(calibrator.geometric, rows, of, left_out)
@@ -117,18 +117,18 @@ def without_missing(
 
 
 def with_frames(calibrator: GeometricCalibrator, result: Result, rows: Measurements) -> Result:
-    """Fit the bases of frames that a calibration lacks to the rows of these frames, and nothing else.
+    """Fit the bases of frames that a calibration lacks to the rows in these frames, and nothing else.
 
     Args:
-        calibrator: what gave the geometric calibration.
-        result: the calibration; of a hybrid, the bases of either arm are fitted.
+        calibrator: the calibrator of the geometric calibration.
+        result: the calibration; for a hybrid, the bases are fitted with and without the joint correction.
         rows: held-out rows, some of them in frames that were not calibrated.
 
     Returns:
-        The calibration with these bases too.
+        The calibration with these bases added.
 
     Raises:
-        IdentificationError: there are several targets, or the rows do not determine where the base is in their frame.
+        IdentificationError: there are several targets, or the rows do not determine the base in their frame.
     """
     geometric = geometric_result(result)
     missing = set(rows.frame) - set(geometric.bases)
@@ -136,8 +136,10 @@ def with_frames(calibrator: GeometricCalibrator, result: Result, rows: Measureme
         return result
     if len(geometric.tools) > 1:
         raise IdentificationError(
-            f"frame '{min(missing)}' is held out, which needs a single target, but there are "
-            f"{', '.join(sorted(geometric.tools))}; split by joints or by time."
+            f"frame '{min(missing)}' is held out, which requires a single target, but there are "
+            f"{', '.join(sorted(geometric.tools))}",
+            value=tuple(sorted(geometric.tools)),
+            remedy="split by joints or by time",
         )
     chosen = torch.tensor([name in missing for name in rows.frame]).nonzero()[:, 0]
     missed = rows.select(chosen)
@@ -156,7 +158,7 @@ def with_frames(calibrator: GeometricCalibrator, result: Result, rows: Measureme
 def _bases(
     calibrator: GeometricCalibrator, robot: Robot, rows: Measurements
 ) -> dict[str, Float64[np.ndarray, " 6"]]:
-    """Where an arm stands in the frames of some rows; every row counts in full."""
+    """Fit the bases of an arm in the frames of some rows, all with full weight."""
     frames = set(rows.frame)
     only_bases = replace(
         calibrator,
@@ -172,7 +174,7 @@ def _bases(
 
 
 def judgeable(measurements: Measurements, test: Tensor, training: Measurements) -> Tensor:
-    """Say which test rows have a target, and an anchor or its place, that the training rows have too.
+    """Say which test rows have a target, and an anchor (or its stated position), that the training rows have.
 
     Args:
         measurements: all rows.
@@ -183,7 +185,7 @@ def judgeable(measurements: Measurements, test: Tensor, training: Measurements) 
         One bool per test row.
 
     Raises:
-        IdentificationError: none has.
+        IdentificationError: no test row does.
     """
     targets, anchors = set(training.target), {*(training.anchor or ()), ""}
     names = measurements.anchor or ("",) * measurements.rows
@@ -196,19 +198,20 @@ def judgeable(measurements: Measurements, test: Tensor, training: Measurements) 
     ]
     if not any(rows_judged):
         raise IdentificationError(
-            f"{measurements.place(rows[0])}: neither this row nor any other that is held out with it has a target and "
-            "an anchor that other rows have; measure more poses with each, or leave out the cross-validation."
+            "neither this row nor any other row held out with it has a target and an anchor that other rows have",
+            at=measurements.at(rows[0]),
+            remedy="measure more poses with each, or omit the cross-validation",
         )
     return torch.tensor(rows_judged, device=test.device)
 
 
 @dataclass(frozen=True, eq=False)
 class DistanceErrors:
-    """Errors of stated distances.
+    """Errors of stated distances of sockets.
 
     Attributes:
-        stated: by the names of two sockets [m].
-        errors: by model, predicted minus stated, in the same order [m].
+        stated: stated distances by the names of two sockets [m].
+        errors: predicted minus stated distances by model, in the same order [m].
     """
 
     stated: Mapping[PairOfSockets, float] = field(default_factory=dict)
@@ -220,12 +223,12 @@ class DistanceErrors:
         stated: Mapping[PairOfSockets, float],
         rows: Measurements,
     ) -> "DistanceErrors":
-        """Under several calibrations; a socket is where its rows put the ball.
+        """Compute the errors under several calibrations, with sockets at the mean predicted position of their balls.
 
         Args:
-            poses: where calibrations without these distances have the target in every row, by name.
-            stated: the distances.
-            rows: of their sockets, and others.
+            poses: predicted poses of the target in every row by name of a calibration without these distances.
+            stated: the distances [m].
+            rows: rows of the sockets, and others.
         """
         errors, sockets = {}, tuple({one for pair in stated for one in pair})
         for model, T in poses.items():
@@ -238,7 +241,7 @@ class DistanceErrors:
 
     @staticmethod
     def joined(parts: "Sequence[DistanceErrors]") -> "DistanceErrors":
-        """Those of several folds."""
+        """Join the errors of several folds."""
         there = [part for part in parts if part.stated]
         stated = {pair: distance for part in there for pair, distance in part.stated.items()}
         names = there[0].errors if there else ()
@@ -250,11 +253,11 @@ class DistanceErrors:
 def left_out_of_folds(
     stated: Mapping[PairOfSockets, float], measurements: Measurements, splits: Sequence[TrainTest]
 ) -> tuple[dict[PairOfSockets, float], ...]:
-    """Assign every stated distance to one fold, whose calibration does without it.
+    """Assign every stated distance to one fold, whose calibration does not use it.
 
-    That is the fold without rows of one of the sockets, or else, of several folds, each in turn, as long as one
-    distance is left there: without any, a calibration does not determine the scale. One of a socket that no row has is
-    none's, so that the calibrations refuse it.
+    It is the fold without rows of one of the sockets; otherwise distances are assigned to the folds cyclically, as long
+    as one distance remains in the fold, because a calibration without any does not determine the scale. Distances of
+    a socket that no row has are assigned to no fold, so that the calibrations refuse them.
     """
     names = measurements.socket or ()
     known = [{names[row] for row in train.tolist()} if names else set() for train, _ in splits]
@@ -271,7 +274,7 @@ def left_out_of_folds(
 
 
 def distance_figures(repeats: Sequence[DistanceErrors]) -> SocketDistances | None:
-    """Figures of several repeats in mm; None where no distance was judged."""
+    """Compute the figures of several repeats in mm; None if no distance was judged."""
     repeats = [one for one in repeats if one.stated]
     if not repeats:
         return None

@@ -1,9 +1,9 @@
-"""What a training of networks on joint differences gave: joint errors, and all figures as one typed value."""
+"""Results of training networks on joint errors: joint errors before and after, and all figures as one typed value."""
 
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 from jaxtyping import Float64
 from torch import Tensor
@@ -18,12 +18,19 @@ from pisigma.validation.held_out.summary import AbstractSummary
 from pisigma.validation.held_out.validation_figures import ErrorFigures
 
 LEVEL = 0.05
-"""Relative change of an error that is taken for none."""
+"""Relative change of an error below which it counts as unchanged."""
+
+
+Effect = Literal["lowers", "does not change", "raises"]
+"""Effect of a correction on an error."""
+Recommendation = Literal["use it", "use it with care", "do not use it"]
+_QUANTITIES = {"position": "mm", "orientation": "deg"}
+"""Units of the compared errors."""
 
 
 @dataclass(frozen=True, eq=False)
 class JointErrors:
-    """Joint errors before and after the correction, of the same rows.
+    """Joint errors of the same rows before and after the correction.
 
     Attributes:
         T: the poses T_base_tool.
@@ -37,21 +44,21 @@ class JointErrors:
 
     @staticmethod
     def of(model: CalibratedModel, pairs: TrainingPairs) -> "JointErrors":
-        """Joint errors of the used rows, before and after the model's correction."""
+        """Compute the joint errors of the used rows, before and after the model's correction."""
         T, q, before = pairs.T[pairs.used], pairs.q_nominal[pairs.used], pairs.target[pairs.used]
         return JointErrors(T, before, before - model.correction(T, q))
 
 
 @dataclass(frozen=True, eq=False)
 class TrainingRun:
-    """What training the networks of a model gave.
+    """Result of training the networks of a model.
 
     Attributes:
         model: the model, without figures.
         history: the energies of the training.
         pairs: the training pairs.
         training: joint errors on the training rows.
-        held_out: joint errors on simulated rows that the fit did not see; None for measured data.
+        held_out: joint errors on held-out simulated rows; None for measured data.
         measurements: the training rows.
     """
 
@@ -79,7 +86,7 @@ class JointErrorFigures(Section):
 
     @staticmethod
     def of(errors: Float64[Tensor, " rows"], revolute: bool) -> "JointErrorFigures":
-        """Figures of the errors of a joint [rad or m]."""
+        """Compute the figures of the errors of a joint [rad or m]."""
         unit, factor = ("deg", math.degrees(1.0)) if revolute else ("mm", 1e3)
         sizes = errors.abs()
         figures = {"average": sizes.mean(), "deviation": sizes.std(correction=0), "maximum": sizes.max()}
@@ -89,7 +96,7 @@ class JointErrorFigures(Section):
 
     @property
     def unit(self) -> str:
-        """Unit of the figures: "deg" for a joint that turns, "mm" for one that slides."""
+        """Unit of the figures: "deg" for a revolute joint, "mm" for a prismatic one."""
         return "mm" if self.average_deg is None else "deg"
 
     @property
@@ -109,10 +116,10 @@ class JointFigures(Section):
     """Errors of one corrected joint.
 
     Attributes:
-        name: of the joint.
-        training: on the training rows.
-        held_out: on simulated rows that the fit did not see.
-        paper: published.
+        name: name of the joint.
+        training: errors on the training rows.
+        held_out: errors on held-out simulated rows.
+        paper: published errors.
     """
 
     name: str
@@ -122,7 +129,7 @@ class JointFigures(Section):
 
 
 class RowFigures(Section):
-    """Numbers of rows: used for training, left out of it by a rule, and kept apart as the set "test"."""
+    """Numbers of rows: used for training, left out of it by a rule, and held out as the set "test"."""
 
     used: int
     left_out: int
@@ -131,14 +138,14 @@ class RowFigures(Section):
 
 
 class ComparisonFigures(Section):
-    """Pose errors without and with the correction, of the same rows.
+    """Pose errors of the same rows without and with the correction.
 
     Attributes:
-        folds: of a cross-validation.
+        folds: number of folds of a cross-validation.
         rows: number of rows of a test set.
-        rows_not_predicted: rows that count in neither, because the model predicts nothing there.
-        nominal: without the correction, base and tool as fitted.
-        corrected: with it.
+        rows_not_predicted: number of rows that are left out of both, because the model has no prediction there.
+        nominal: errors without the correction, with base and tool as fitted.
+        corrected: errors with the correction.
     """
 
     folds: int | None = None
@@ -149,7 +156,7 @@ class ComparisonFigures(Section):
 
     @staticmethod
     def of(comparison: Comparison, **counts: int) -> "ComparisonFigures":
-        """The figures of a comparison, with numbers of folds or rows."""
+        """Compute the figures of a comparison, with numbers of folds or rows."""
         return ComparisonFigures(
             **counts,
             rows_not_predicted=comparison.not_predicted,
@@ -163,22 +170,46 @@ class ComparisonFigures(Section):
         return {"nominal": self.nominal, "corrected": self.corrected}
 
     @property
-    def verdict(self) -> str:
-        """Whether the correction helps, in a sentence."""
+    def effects(self) -> dict[str, Effect]:
+        """Effect of the correction on the RMS errors of "position" and, if measured, of "orientation"."""
         nominal, corrected = self.nominal.by_name, self.corrected.by_name
-        findings, harm, help_, larger = [], False, False, False
-        for name, quantity, unit in (("position", "rms_mm", "mm"), ("orientation", "rms_deg", "deg")):
-            if quantity in nominal:
-                before, after = nominal[quantity], corrected[quantity]
-                change = "lowers" if after < before * (1 - LEVEL) else "does not change"
-                change = "raises" if after > before * (1 + LEVEL) else change
-                harm, help_ = harm or change == "raises", help_ or change == "lowers"
-                rise = _rise(nominal[f"max_{unit}"], corrected[f"max_{unit}"], unit)
-                rise = rise and f", {'and' if change == 'raises' else 'but'} {rise}"
-                larger = larger or bool(rise)
-                findings.append(f"{change} the {name} error ({before:.3f} to {after:.3f} {unit} RMS{rise})")
-        advice = "; use it with care" if harm or larger else ""
-        advice = advice if help_ else "; do not use it"
+        return {
+            name: _effect(nominal[f"rms_{unit}"], corrected[f"rms_{unit}"])
+            for name, unit in _QUANTITIES.items()
+            if f"rms_{unit}" in nominal
+        }
+
+    @property
+    def increased_maxima(self) -> tuple[str, ...]:
+        """The quantities whose largest error the correction increases visibly."""
+        nominal, corrected = self.nominal.by_name, self.corrected.by_name
+        return tuple(
+            name
+            for name in self.effects
+            for unit in [_QUANTITIES[name]]
+            if _rise(nominal[f"max_{unit}"], corrected[f"max_{unit}"], unit)
+        )
+
+    @property
+    def recommendation(self) -> Recommendation:
+        """Whether to use the correction."""
+        effects = self.effects.values()
+        if "lowers" not in effects:
+            return "do not use it"
+        return "use it with care" if "raises" in effects or self.increased_maxima else "use it"
+
+    @property
+    def verdict(self) -> str:
+        """Effect of the correction on held-out rows, and whether to use it, as a sentence."""
+        nominal, corrected = self.nominal.by_name, self.corrected.by_name
+        findings = []
+        for name, effect in self.effects.items():
+            unit = _QUANTITIES[name]
+            before, after = nominal[f"rms_{unit}"], corrected[f"rms_{unit}"]
+            rise = _rise(nominal[f"max_{unit}"], corrected[f"max_{unit}"], unit)
+            rise = rise and f", {'and' if effect == 'raises' else 'but'} {rise}"
+            findings.append(f"{effect} the {name} error ({before:.3f} to {after:.3f} {unit} RMS{rise})")
+        advice = "" if self.recommendation == "use it" else f"; {self.recommendation}"
         return f"On held-out rows the correction {' and '.join(findings)}{advice}."
 
 
@@ -186,10 +217,10 @@ class TrainingSummary(AbstractSummary):
     """All figures of a training of networks.
 
     Attributes:
-        rows: how many there were.
+        rows: numbers of rows.
         joints: errors of every corrected joint.
-        cross_validation: pose errors of rows that were held out in turn, for measured data.
-        verdict: whether the correction helps on them, in a sentence.
+        cross_validation: pose errors of held-out rows, for measured data.
+        verdict: effect of the correction on them, as a sentence.
         test: pose errors of the rows that the file marks as test.
     """
 
@@ -211,9 +242,9 @@ def summarise_training(
     """Gather the figures of a training.
 
     Args:
-        run: what came out.
+        run: result of the training.
         paper: published figures, by joint.
-        validation: errors of rows that were held out in turn.
+        validation: errors of the cross-validation.
         test: errors of the rows of the set "test".
     """
     provenance = run.model.provenance
@@ -244,8 +275,14 @@ def _joint(run: TrainingRun, name: str, paper: Mapping[str, BeforeAfter]) -> Joi
     return JointFigures(name=name, **figures)
 
 
+def _effect(before: float, after: float) -> Effect:
+    if after > before * (1 + LEVEL):
+        return "raises"
+    return "lowers" if after < before * (1 - LEVEL) else "does not change"
+
+
 def _rise(before: float, after: float, unit: str) -> str:
-    """Say that the largest error rises, by however little; nothing where it does not."""
+    """Write that the largest error increases, if it does to the digits shown; else nothing."""
     texts = f"{before:.3f}", f"{after:.3f}"
     rises = after > before and texts[0] != texts[1]
     return f"the largest rises from {texts[0]} to {texts[1]} {unit}" if rises else ""

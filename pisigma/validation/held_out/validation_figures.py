@@ -1,9 +1,9 @@
-"""Figures of held-out rows as typed values, in millimetres and degrees."""
+"""Error statistics of held-out rows as typed values, in millimetres and degrees."""
 
 from pisigma.files.yaml_file import Section
 
 MODELS = ("nominal", "geometric", "hybrid")
-"""Calibrations that are judged side by side, in the order of the tables."""
+"""Calibrations that are compared, in the order of the tables."""
 
 
 class ErrorFigures(Section):
@@ -20,7 +20,7 @@ class ErrorFigures(Section):
 
     @property
     def by_name(self) -> dict[str, float]:
-        """The figures that there are, by name."""
+        """The figures that are set, by name."""
         return self.model_dump(exclude_unset=True)
 
 
@@ -32,9 +32,9 @@ class DistanceFigures(Section):
 
 
 class StatedDistance(Section):
-    """A stated distance of two sockets [mm], and by calibration without it the predicted one minus it [mm].
+    """A stated distance of two sockets [mm], and its errors under calibrations that do not use it [mm].
 
-    In several repeats of a cross-validation, the mean of these errors.
+    Errors are predicted minus stated; for several repeats of a cross-validation, their mean.
     """
 
     sockets: tuple[str, str]
@@ -43,10 +43,10 @@ class StatedDistance(Section):
 
 
 class SocketDistances(Section):
-    """Errors of stated distances of sockets under calibrations without them; `count` distances were left out in turn.
+    """Errors of `count` stated distances of sockets under calibrations that do not use them.
 
     Attributes:
-        each: one by one.
+        each: the single distances.
     """
 
     count: int
@@ -57,7 +57,7 @@ class SocketDistances(Section):
 
     @property
     def models(self) -> dict[str, DistanceFigures]:
-        """The calibrations that there are, by name."""
+        """The calibrations that have figures, by name."""
         return {name: figures for name in MODELS if (figures := getattr(self, name)) is not None}
 
 
@@ -65,17 +65,17 @@ class AbstractValidationFigures(Section):
     """Errors of held-out rows under several calibrations.
 
     Attributes:
-        folds: of the cross-validation; 1 where rows were held out once; not set for a test set.
-        repeats: of the cross-validation, where there are several.
-        rms_mm_of_repeats: by calibration, the RMS position error of each repeat [mm].
-        nominal: the robot as drawn, with base and tool fitted to the training rows.
-        geometric: the geometric calibration.
-        hybrid: geometry and joint correction.
-        coverage: share of the held-out coordinates that lie within the 95 % intervals that the hybrid predicts.
+        folds: number of folds of the cross-validation; 1 if rows were held out once; not set for a test set.
+        repeats: number of repeats of the cross-validation, if there are several.
+        rms_mm_of_repeats: RMS position error of each repeat by calibration [mm].
+        nominal: errors of the nominal robot, with base and tool fitted to the training rows.
+        geometric: errors of the geometric calibration.
+        hybrid: errors of geometry and joint correction.
+        coverage: share of the held-out coordinates within the 95 % intervals that the hybrid predicts.
         predicted_rms_mm: RMS of the position errors that it predicts [mm].
-        socket_distance: errors of stated distances between sockets that were left out.
-        frames_fitted: number of frames that were held out whole; their bases were fitted to the held-out rows.
-        sockets_held_out: number of sockets that were held out whole.
+        socket_distance: errors of stated distances between sockets that were held out.
+        frames_fitted: number of frames that were held out completely; their bases were fitted to the held-out rows.
+        sockets_held_out: number of sockets that were held out completely.
         rows_not_judged: number of held-out rows whose target or anchor no training row has.
     """
 
@@ -102,9 +102,9 @@ class ValidationFigures(AbstractValidationFigures):
     """See `AbstractValidationFigures`.
 
     Attributes:
-        rows: number of held-out rows with a length; each counts once, however many repeats there are.
-        rms_mm_of_simulations: by calibration, the RMS position error in each of several simulations [mm].
-        mean_rms_mm: by calibration, the mean of these [mm].
+        rows: number of held-out rows with a length, counted once for all repeats.
+        rms_mm_of_simulations: RMS position error in each of several simulations by calibration [mm].
+        mean_rms_mm: mean of these by calibration [mm].
     """
 
     rows: int
@@ -113,7 +113,7 @@ class ValidationFigures(AbstractValidationFigures):
 
 
 class LearningPoint(AbstractValidationFigures):
-    """Errors of held-out rows by calibrations with `rows` training rows; `held_out` rows were judged."""
+    """Errors of held-out rows under calibrations with `rows` training rows; `held_out` rows were judged."""
 
     rows: int
     held_out: int

@@ -1,4 +1,4 @@
-"""The cube in the workspace that poses are measured in, and its five poses."""
+"""Test cube in the workspace, and its five poses."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float64
 from torch import Tensor
 from torch.nn.functional import pad
 
-from pisigma.files.errors import MeasurementError, nearest_choice
+from pisigma.files.errors import MeasurementError, check_choice
 
 PLANES = {
     "C1-C2-C7-C8": (0, 1, 6, 7),
@@ -16,11 +16,11 @@ PLANES = {
     "C3-C4-C5-C6": (2, 3, 4, 5),
     "C4-C1-C6-C7": (3, 0, 5, 6),
 }
-"""Diagonal planes of the cube by their corners (ISO 9283:1998, 6.8). C1 to C4 go around the upper face, C5 to C8 lie
-below them; a plane's third corner is across from its first and its fourth from its second."""
+"""Diagonal planes of the cube by their corners (ISO 9283:1998, 6.8). C1 to C4 go around the upper face, C5 to C8 are
+below them; a plane's third corner is opposite its first, and its fourth opposite its second."""
 
 FROM_THE_ENDS = (0.08, 0.12)
-"""P2 to P5 lie at (10 ± 2) % of the diagonal's length from its ends (ISO 9283:1998, 6.8)."""
+"""Distance of P2 to P5 from the ends of the diagonals, (10 ± 2) % of their length (ISO 9283:1998, 6.8)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,7 +28,7 @@ class IsoCube:
     """A cube with edges along the axes of the base.
 
     Attributes:
-        centre: in the robot's base [m].
+        centre: centre in the robot's base frame [m].
         edge: length of an edge [m].
     """
 
@@ -37,31 +37,32 @@ class IsoCube:
 
     @property
     def corners(self) -> Float64[Tensor, "8 3"]:
-        """C1 to C8 [m]: the upper face from (+x, +y) on, counted about z, then the lower one."""
+        """C1 to C8 [m]: the upper face starting at (+x, +y), counterclockwise about z, then the lower one."""
         around = torch.tensor([[1, 1], [-1, 1], [-1, -1], [1, -1]], dtype=torch.float64)
         upper = torch.cat([around, torch.ones(4, 1, dtype=torch.float64)], 1)
         lower = torch.cat([around, -torch.ones(4, 1, dtype=torch.float64)], 1)
         return self.centre + self.edge / 2 * torch.cat([upper, lower])
 
     def poses(self, plane: str = "C1-C2-C7-C8", share: float = 0.1) -> Float64[Tensor, "5 3"]:
-        """Positions of P1 to P5 [m] (ISO 9283:1998, 6.8).
+        """Compute the positions of P1 to P5 [m] (ISO 9283:1998, 6.8).
 
-        P1 is where the diagonals of the plane meet, the centre of the cube; P2 to P5 lie on the diagonals near the
-        plane's corners, in their order.
+        P1 is the intersection of the diagonals of the plane, the centre of the cube; P2 to P5 are on the diagonals near
+        the plane's corners, in their order.
 
         Args:
             plane: one of `PLANES`.
-            share: distance from the diagonal's end over its length, 0.08 to 0.12.
+            share: distance from the end of the diagonal over its length, 0.08 to 0.12.
 
         Raises:
-            MeasurementError: there is no such plane, or the share is outside what the standard allows.
+            MeasurementError: the plane is unknown, or the standard does not allow the share.
         """
-        if plane not in PLANES:
-            raise MeasurementError(f"plane '{plane}' is unknown; {nearest_choice(plane, PLANES)}")
+        check_choice(MeasurementError, "plane", plane, PLANES)
         low, high = FROM_THE_ENDS
         if not low <= share <= high:
             raise MeasurementError(
-                f"cube: poses at {low:g} to {high:g} of the diagonal from its ends were wanted, got {share:g}."
+                option="share",
+                expected=f"a distance of {low:g} to {high:g} of the diagonal from its ends",
+                value=share,
             )
         ends = self.corners[list(PLANES[plane])]
         return torch.cat([self.centre[None], ends + share * (ends.roll(2, 0) - ends)])
@@ -73,24 +74,25 @@ def largest_cube(
     high: Float64[Tensor, " 3"],
     spacing: float,
 ) -> IsoCube:
-    """The largest cube within the workspace with edges along the axes (ISO 9283:1998, 6.8).
+    """Find the largest cube within the workspace with edges along the axes (ISO 9283:1998, 6.8).
 
-    A cube is within the workspace where every point of a grid in it is reached. Of equally large ones it is that
-    nearest to the middle of the region.
+    A cube is within the workspace if every point of a grid in it is reachable. Of several equally large cubes, the one
+    nearest to the middle of the region is returned.
 
     Args:
-        reaches: whether the robot reaches positions in its base [m], with the orientation that is to be tested.
-        low: lowest corner of the region to look in [m].
-        high: highest corner of it.
-        spacing: of the grid [m]; the edge of the cube is a multiple of it.
+        reaches: says which positions in the base frame [m] are reachable with the orientation under test.
+        low: lowest corner of the region to search [m].
+        high: highest corner of it [m].
+        spacing: spacing of the grid [m]; the edge of the cube is a multiple of it.
 
     Raises:
-        MeasurementError: no cube of the grid's spacing is within the workspace.
+        MeasurementError: not even a cube with an edge of `spacing` is within the workspace.
     """
     counts = [int(count) + 1 for count in ((high - low) / spacing + 1e-9).floor().tolist()]
     axes = [low[i] + spacing * torch.arange(count, dtype=torch.float64) for i, count in enumerate(counts)]
     points = torch.stack(torch.meshgrid(*axes, indexing="ij"), -1)
     inside = reaches(points.reshape(-1, 3)).reshape(counts)
+    # A summed-volume table counts the reachable points of any box in constant time; the size is found by bisection.
     held = inside.long().cumsum(0).cumsum(1).cumsum(2)
     held = pad(held, (1, 0, 1, 0, 1, 0))
     fits, fails = 0, min(counts)
@@ -99,8 +101,10 @@ def largest_cube(
         fits, fails = (cells, fails) if _full(held, cells).any() else (fits, cells)
     if not fits:
         raise MeasurementError(
-            f"cube: no cube with an edge of {spacing:g} m lies within the workspace; look in another region, with "
-            "another orientation or on a finer grid."
+            f"no cube with an edge of {spacing:g} m is within the workspace",
+            option="spacing",
+            value=spacing,
+            remedy="search another region, with another orientation, or on a finer grid",
         )
     edge = fits * spacing
     centres = low + spacing * _full(held, fits).nonzero().double() + edge / 2
@@ -110,7 +114,7 @@ def largest_cube(
 
 
 def _full(held: Tensor, cells: int) -> Tensor:
-    """Where a cube of so many cells begins of which every grid point is reached; `held` counts points up to each."""
+    """Say where a cube of `cells` cells starts whose grid points are all reachable; `held` is the cumulative count."""
     k = cells + 1
     sums = held
     for axis in range(3):

@@ -1,4 +1,4 @@
-"""Distance accuracy AD and distance repeatability RD: commanded against attained distances of two poses."""
+"""Distance accuracy AD and distance repeatability RD: commanded and attained distances of two poses."""
 
 from dataclasses import dataclass
 
@@ -12,11 +12,11 @@ from pisigma.validation.iso9283.pose import Accuracy, check_repeats
 
 @dataclass(frozen=True, eq=False)
 class DistanceRepeatability:
-    """How far attained distances spread; the standard writes both with ±.
+    """Spread of attained distances; the standard writes both values with ±.
 
     Attributes:
-        length: of the distance [m].
-        axes: of its components along x, y, z [m].
+        length: spread of the distance [m].
+        axes: spread of its components along x, y, z [m].
     """
 
     length: Float[Tensor, "*batch"]
@@ -29,16 +29,16 @@ def distance_accuracy(
     command_first: Float[Tensor, "*batch 3"],
     command_second: Float[Tensor, "*batch 3"],
 ) -> Accuracy:
-    """Positioning distance accuracy AD_P and AD_x, AD_y, AD_z [m] (ISO 9283:1998, 7.3.2).
+    """Compute the positioning distance accuracy AD_P and AD_x, AD_y, AD_z [m] (ISO 9283:1998, 7.3.2).
 
     `AD_P = D̄ - D_c` with `D_j = |P_1j - P_2j|` and `D_c = |P_c1 - P_c2|`; along an axis
     `AD_x = D̄_x - D_cx` with `D_xj = |x_1j - x_2j|` and `D_cx = |x_c1 - x_c2|`.
 
     Args:
         attained_first: positions of the n repeats at the first pose [m].
-        attained_second: the same at the second.
-        command_first: the commanded position of the first pose [m].
-        command_second: the same of the second.
+        attained_second: the same at the second pose.
+        command_first: commanded position of the first pose [m].
+        command_second: the same for the second pose.
     """
     commanded = command_first - command_second
     length, axes = _distances(attained_first, attained_second)
@@ -50,12 +50,12 @@ def distance_accuracy(
 def distance_repeatability(
     attained_first: Float[Tensor, "*batch n 3"], attained_second: Float[Tensor, "*batch n 3"]
 ) -> DistanceRepeatability:
-    """Positioning distance repeatability RD and RD_x, RD_y, RD_z [m] (ISO 9283:1998, 7.3.3).
+    """Compute the positioning distance repeatability RD and RD_x, RD_y, RD_z [m] (ISO 9283:1998, 7.3.3).
 
-    `RD = ± 3 √(Σ (D_j - D̄)² / (n - 1))`, and the same of the components `D_xj` along an axis.
+    `RD = ± 3 √(Σ (D_j - D̄)² / (n - 1))`, and the same for the components `D_xj` along an axis.
 
     Raises:
-        MeasurementError: there is one repeat only.
+        MeasurementError: there is only one repeat.
     """
     check_repeats(attained_first, "a distance")
     length, axes = _distances(attained_first, attained_second)
@@ -68,10 +68,10 @@ def angular_distance_accuracy(
     command_first: Float[Tensor, "*batch 3"],
     command_second: Float[Tensor, "*batch 3"],
 ) -> Float[Tensor, "*batch 3"]:
-    """Orientation distance accuracy AD_a, AD_b, AD_c [rad] (ISO 9283:1998, 7.3.2).
+    """Compute the orientation distance accuracy AD_a, AD_b, AD_c [rad] (ISO 9283:1998, 7.3.2).
 
-    `AD_a = D̄_a - D_ca` with `D_aj = |a_1j - a_2j|` and `D_ca = |a_c1 - a_c2|`; a full turn more or less makes no
-    difference. For the arguments see `distance_accuracy`, in angles [rad].
+    `AD_a = D̄_a - D_ca` with `D_aj = |a_1j - a_2j|` and `D_ca = |a_c1 - a_c2|`, wrapped to ±π. The arguments are those
+    of `distance_accuracy`, as angles [rad].
     """
     turned = _turned(attained_first, attained_second).mean(-2)
     return turned - wrap_to_pi(command_first - command_second).abs()
@@ -80,10 +80,10 @@ def angular_distance_accuracy(
 def angular_distance_repeatability(
     attained_first: Float[Tensor, "*batch n 3"], attained_second: Float[Tensor, "*batch n 3"]
 ) -> Float[Tensor, "*batch 3"]:
-    """Orientation distance repeatability RD_a, RD_b, RD_c [rad] (ISO 9283:1998, 7.3.3), written with ±.
+    """Compute the orientation distance repeatability RD_a, RD_b, RD_c [rad] (ISO 9283:1998, 7.3.3), written with ±.
 
     Raises:
-        MeasurementError: there is one repeat only.
+        MeasurementError: there is only one repeat.
     """
     check_repeats(attained_first, "a distance")
     return 3 * _turned(attained_first, attained_second).std(-2)

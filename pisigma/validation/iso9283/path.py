@@ -16,16 +16,16 @@ from pisigma.validation.iso9283.pose import (
 )
 
 _CROSSINGS = 2**21
-"""Pairs of a command point and a piece of a measured path that are in memory at a time."""
+"""Pairs of a command point and a segment of a measured path that are in memory at a time."""
 
 
 @dataclass(frozen=True, eq=False)
 class PathPoints:
-    """Measured paths where they cross the planes across the commanded path.
+    """Measured paths at the planes normal to the commanded path.
 
     Attributes:
-        position: of every path at every point of the commanded one [m].
-        angles: the same of the angles [rad], or None.
+        position: position of every path at every point of the commanded one [m].
+        angles: the same for the angles [rad], or None.
     """
 
     position: Float[Tensor, "n points 3"]
@@ -33,19 +33,22 @@ class PathPoints:
 
 
 def path_tangents(command: Float[Tensor, "points 3"]) -> Float[Tensor, "points 3"]:
-    """Unit vectors along a commanded path [1], at inner points from the neighbours on either side.
+    """Compute unit vectors along a commanded path [1], at inner points from the neighbours on either side.
 
     Raises:
-        MeasurementError: there is one point only, or neighbours coincide.
+        MeasurementError: there is only one point, or neighbours coincide.
     """
     if len(command) < 2:
-        raise MeasurementError(f"path: 2 command points or more were wanted, got {len(command)}.")
+        raise MeasurementError(option="command", expected="2 or more command points", value=len(command))
     along = torch.cat([command[1:2] - command[:1], command[2:] - command[:-2], command[-1:] - command[-2:-1]])
     length = torch.linalg.vector_norm(along, dim=-1, keepdim=True)
     if (length == 0).any():
         point = int((length[:, 0] == 0).nonzero()[0])
         raise MeasurementError(
-            f"path: the command has no direction at point {point} (counted from 0); give points that differ."
+            f"the path has no direction at point {point} (counted from 0)",
+            option="command",
+            value=point,
+            remedy="give points that differ",
         )
     tangents: Tensor = along / length
     return tangents
@@ -57,20 +60,20 @@ def resample_paths(
     angles: Float[Tensor, "n samples 3"] | None = None,
     tangents: Float[Tensor, "points 3"] | None = None,
 ) -> PathPoints:
-    """Measured paths at the points of the commanded one: where they cross the plane normal to it there.
+    """Compute where measured paths cross the planes normal to the commanded path at its points.
 
-    The planes are those of ISO 9283:1998, 8.2. Between two samples a path is straight; where one crosses a plane
-    several times along the command, the crossing nearest to the command point counts.
+    The planes are those of ISO 9283:1998, 8.2. Paths are interpolated linearly between samples. If a path crosses a
+    plane several times in the direction of the command, the crossing nearest to the command point is used.
 
     Args:
-        measured: samples of n repeats of the path [m]; a shorter path ends with NaN.
+        measured: samples of n repeats of the path [m]; shorter paths end with NaN.
         command: points of the commanded path [m], in the order in which they are passed.
-        angles: of the samples [rad].
-        tangents: directions of the command at its points, where `path_tangents` does not give them, as at corners.
+        angles: angles of the samples [rad].
+        tangents: directions of the command at its points if they are not those of `path_tangents`, for example at
+            corners.
 
     Raises:
-        MeasurementError: a path crosses a plane nowhere; it has to begin before the first point and to end behind
-            the last.
+        MeasurementError: a path does not cross a plane; it must start before the first point and end after the last.
     """
     tangents = path_tangents(command) if tangents is None else tangents
     step = max(1, _CROSSINGS // max(1, measured[..., 0].numel()))
@@ -88,13 +91,13 @@ def resample_paths(
 def path_accuracy(
     attained: Float[Tensor, "n points 3"], command: Float[Tensor, "points 3"]
 ) -> Float[Tensor, ""]:
-    """Positioning path accuracy AT_P [m] (ISO 9283:1998, 8.2).
+    """Compute the positioning path accuracy AT_P [m] (ISO 9283:1998, 8.2).
 
     `AT_P = max_i √((x̄_i - x_ci)² + (ȳ_i - y_ci)² + (z̄_i - z_ci)²)` over the points of the command.
 
     Args:
-        attained: n repeats of the path at the points of the command [m], see `resample_paths`.
-        command: the points [m].
+        attained: n repeats of the path at the command points [m], see `resample_paths`.
+        command: command points [m].
     """
     off: Tensor = torch.linalg.vector_norm(barycentre(attained.movedim(0, 1)) - command, dim=-1)
     return off.amax()
@@ -103,26 +106,26 @@ def path_accuracy(
 def path_orientation_accuracy(
     attained: Float[Tensor, "n points 3"], command: Float[Tensor, "points 3"]
 ) -> Float[Tensor, " 3"]:
-    """Orientation path accuracy AT_a, AT_b, AT_c [rad] (ISO 9283:1998, 8.2): `AT_a = max_i |ā_i - a_ci|`."""
+    """Compute the orientation path accuracy AT [rad] (ISO 9283:1998, 8.2): `AT_a = max_i |ā_i - a_ci|`, AT_b, AT_c."""
     return orientation_accuracy(attained.movedim(0, 1), command).abs().amax(0)
 
 
 def path_repeatability(attained: Float[Tensor, "n points 3"]) -> Float[Tensor, ""]:
-    """Positioning path repeatability RT_P [m] (ISO 9283:1998, 8.3).
+    """Compute the positioning path repeatability RT_P [m] (ISO 9283:1998, 8.3).
 
     `RT_P = max_i (l̄_i + 3 S_li)`, the largest positioning repeatability of the points of the command.
 
     Raises:
-        MeasurementError: there is one repeat only.
+        MeasurementError: there is only one repeat.
     """
     return position_repeatability(attained.movedim(0, 1)).amax()
 
 
 def path_orientation_repeatability(attained: Float[Tensor, "n points 3"]) -> Float[Tensor, " 3"]:
-    """Orientation path repeatability RT_a, RT_b, RT_c [rad] (ISO 9283:1998, 8.3): `max_i 3 S_ai`.
+    """Compute the orientation path repeatability RT_a, RT_b, RT_c [rad] (ISO 9283:1998, 8.3): `max_i 3 S_ai`.
 
     Raises:
-        MeasurementError: there is one repeat only.
+        MeasurementError: there is only one repeat.
     """
     return orientation_repeatability(attained.movedim(0, 1)).amax(0)
 
@@ -133,7 +136,7 @@ def _crossings(
     tangents: Float[Tensor, "some 3"],
     first: int,
 ) -> tuple[Tensor, Tensor]:
-    """Per path and command point the number of the piece that crosses its plane, and where on it (0 to 1)."""
+    """Find per path and command point the segment that crosses its plane, and the position on it (0 to 1)."""
     off = measured[:, None] - command[:, None]
     ahead = (off * tangents[:, None]).sum(-1)
     before, behind = ahead[..., :-1], ahead[..., 1:]
@@ -145,13 +148,15 @@ def _crossings(
     if torch.isinf(nearest).any():
         path, point = torch.isinf(nearest).nonzero()[0].tolist()
         raise MeasurementError(
-            f"path {path} does not pass command point {first + point} (both counted from 0); record it from before "
-            "the first point to behind the last, or leave the points at the ends out."
+            f"path {path} does not pass command point {first + point} (both counted from 0)",
+            option="measured",
+            value=(path, first + point),
+            remedy="record it from before the first point to after the last, or leave out the points at the ends",
         )
     return piece, share.gather(-1, piece[..., None])[..., 0]
 
 
 def _between(values: Tensor, steps: Tensor, piece: Tensor, share: Tensor) -> Tensor:
-    """Values at the beginning of pieces and a share of the step to their end."""
+    """Interpolate linearly between the start of a segment and its end."""
     where = piece.expand(-1, -1, 3)
     return values.gather(1, where) + share * steps.gather(1, where)

@@ -1,4 +1,4 @@
-"""Pose accuracy AP, pose repeatability RP, how both drift, and how much the direction of approach matters."""
+"""Pose accuracy AP, pose repeatability RP, their drift, and the variation with the direction of approach."""
 
 from dataclasses import dataclass
 
@@ -12,11 +12,11 @@ from pisigma.robot.se3 import rotation_vector, wrap_to_pi
 
 @dataclass(frozen=True, eq=False)
 class Accuracy:
-    """How far the middle of what was attained is from the command.
+    """Difference between the mean attained value and the command.
 
     Attributes:
-        length: of positions the distance, of distances the error of the length [m].
-        axes: along x, y, z [m], signed.
+        length: for positions the distance, for distances the error of the length [m].
+        axes: signed components along x, y, z [m].
     """
 
     length: Float[Tensor, "*batch"]
@@ -24,7 +24,7 @@ class Accuracy:
 
 
 def position_accuracy(attained: Float[Tensor, "*batch n 3"], command: Float[Tensor, "*batch 3"]) -> Accuracy:
-    """Positioning accuracy AP_P and AP_x, AP_y, AP_z (ISO 9283:1998, 7.2.1).
+    """Compute the positioning accuracy AP_P and AP_x, AP_y, AP_z [m] (ISO 9283:1998, 7.2.1).
 
     With the barycentre `x̄ = 1/n Σ x_j`: `AP_x = x̄ - x_c`, and `AP_P = √(AP_x² + AP_y² + AP_z²)`.
 
@@ -39,17 +39,17 @@ def position_accuracy(attained: Float[Tensor, "*batch n 3"], command: Float[Tens
 def orientation_accuracy(
     attained: Float[Tensor, "*batch n 3"], command: Float[Tensor, "*batch 3"]
 ) -> Float[Tensor, "*batch 3"]:
-    """Orientation accuracy AP_a, AP_b, AP_c [rad] (ISO 9283:1998, 7.2.1): `AP_a = ā - a_c`.
+    """Compute the orientation accuracy AP_a, AP_b, AP_c [rad] (ISO 9283:1998, 7.2.1): `AP_a = ā - a_c`.
 
     Args:
-        attained: angles of the n repeats [rad]; a full turn more or less makes no difference.
+        attained: angles of the n repeats [rad], modulo 2π.
         command: the commanded angles [rad].
     """
     return wrap_to_pi(attained - command[..., None, :]).mean(-2)
 
 
 def position_repeatability(attained: Float[Tensor, "*batch n 3"]) -> Float[Tensor, "*batch"]:
-    """Positioning repeatability RP_l [m] (ISO 9283:1998, 7.2.2): radius of a sphere about the barycentre.
+    """Compute the positioning repeatability RP_l [m] (ISO 9283:1998, 7.2.2): radius of a sphere about the barycentre.
 
     `RP_l = l̄ + 3 S_l` with the distances `l_j` from the barycentre, their mean `l̄` and
     `S_l = √(Σ (l_j - l̄)² / (n - 1))`.
@@ -58,7 +58,7 @@ def position_repeatability(attained: Float[Tensor, "*batch n 3"]) -> Float[Tenso
         attained: positions of the n repeats [m], two or more.
 
     Raises:
-        MeasurementError: there is one repeat only.
+        MeasurementError: there is only one repeat.
     """
     check_repeats(attained, "a command")
     distance = torch.linalg.vector_norm(attained - barycentre(attained)[..., None, :], dim=-1)
@@ -67,13 +67,13 @@ def position_repeatability(attained: Float[Tensor, "*batch n 3"]) -> Float[Tenso
 
 
 def orientation_repeatability(attained: Float[Tensor, "*batch n 3"]) -> Float[Tensor, "*batch 3"]:
-    """Orientation repeatability RP_a, RP_b, RP_c [rad] (ISO 9283:1998, 7.2.2).
+    """Compute the orientation repeatability RP_a, RP_b, RP_c [rad] (ISO 9283:1998, 7.2.2).
 
     Returns:
         `3 S_a` with `S_a = √(Σ (a_j - ā)² / (n - 1))`; the standard writes it with ±.
 
     Raises:
-        MeasurementError: there is one repeat only.
+        MeasurementError: there is only one repeat.
     """
     check_repeats(attained, "a command")
     spread: Tensor = wrap_to_pi(attained - attained[..., :1, :]).std(-2)
@@ -83,9 +83,9 @@ def orientation_repeatability(attained: Float[Tensor, "*batch n 3"]) -> Float[Te
 def directional_position_variation(
     attained: Float[Tensor, "*batch directions n 3"],
 ) -> Float[Tensor, "*batch"]:
-    """Multi-directional pose accuracy variation vAP_P [m] (ISO 9283:1998, 7.2.3).
+    """Compute the multi-directional pose accuracy variation vAP_P [m] (ISO 9283:1998, 7.2.3).
 
-    Largest distance between the barycentres of one pose that is approached along several paths:
+    It is the largest distance between the barycentres of one pose that is approached from several directions:
     `vAP_P = max_{h,k} √((x̄_h - x̄_k)² + (ȳ_h - ȳ_k)² + (z̄_h - z̄_k)²)`.
 
     Args:
@@ -100,9 +100,9 @@ def directional_position_variation(
 def directional_orientation_variation(
     attained: Float[Tensor, "*batch directions n 3"],
 ) -> Float[Tensor, "*batch 3"]:
-    """Multi-directional pose accuracy variation vAP_a, vAP_b, vAP_c [rad] (ISO 9283:1998, 7.2.3).
+    """Compute the multi-directional pose accuracy variation vAP_a, vAP_b, vAP_c [rad] (ISO 9283:1998, 7.2.3).
 
-    `vAP_a = max_{h,k} |ā_h - ā_k|`; a full turn more or less makes no difference.
+    `vAP_a = max_{h,k} |ā_h - ā_k|`, for angles modulo 2π.
     """
     middle = wrap_to_pi(attained - attained[..., :1, :1, :]).mean(-2)
     variation: Tensor = middle.amax(-2) - middle.amin(-2)
@@ -110,27 +110,26 @@ def directional_orientation_variation(
 
 
 def accuracy_drift(accuracy: Float[Tensor, "times *kinds"]) -> Float[Tensor, "times *kinds"]:
-    """Drift of pose accuracy dAP (ISO 9283:1998, 7.6): `dAP = |AP_{t=1} - AP_{t=T}|`.
+    """Compute the drift of pose accuracy dAP (ISO 9283:1998, 7.6): `dAP = |AP_{t=1} - AP_{t=T}|`.
 
     Args:
         accuracy: AP at every time, of positions [m] or of angles [rad], such as `position_accuracy(...).length` of
             `(times, n, 3)`.
 
     Returns:
-        The drift up to every time; the last is that of the standard, 0 is the first.
+        The drift up to every time; the first is 0, and the last is that of the standard.
     """
     return (accuracy[:1] - accuracy).abs()
 
 
 def repeatability_drift(repeatability: Float[Tensor, "times *kinds"]) -> Float[Tensor, "times *kinds"]:
-    """Drift of pose repeatability dRP (ISO 9283:1998, 7.6): `dRP = RP_{t=1} - RP_{t=T}`.
+    """Compute the drift of pose repeatability dRP (ISO 9283:1998, 7.6): `dRP = RP_{t=1} - RP_{t=T}`.
 
     Args:
         repeatability: RP at every time, of positions [m] or of angles [rad].
 
     Returns:
-        The drift up to every time, above 0 where the robot repeats better than at first; the last is that of the
-        standard.
+        The drift up to every time, > 0 if the repeatability has improved; the last is that of the standard.
     """
     return repeatability[:1] - repeatability
 
@@ -138,7 +137,7 @@ def repeatability_drift(repeatability: Float[Tensor, "times *kinds"]) -> Float[T
 def angular_deviations(
     attained: Float[Tensor, "*batch n 3 3"], command: Float[Tensor, "*batch 3 3"]
 ) -> Float[Tensor, "*batch n 3"]:
-    """Angles a, b, c [rad] about the frame's x, y and z by which attained rotations are off the command.
+    """Compute the angles a, b, c [rad] about the frame's x, y and z between attained and commanded rotations.
 
     They are the rotation vector of `R_j R_c^T`, which has no singular orientation; the commanded angles are then 0.
     """
@@ -146,23 +145,25 @@ def angular_deviations(
 
 
 def barycentre(attained: Float[Tensor, "*batch n 3"]) -> Float[Tensor, "*batch 3"]:
-    """Mean of the attained positions [m]; the first is taken off before, so that no digits are lost."""
+    """Compute the mean attained position [m], relative to the first one so that no digits are lost."""
     first = attained[..., :1, :]
     return first[..., 0, :] + (attained - first).mean(-2)
 
 
 def check_repeats(attained: Float[Tensor, "*batch n 3"], of: str) -> None:
-    """Make sure that there are enough repeats for a spread.
+    """Refuse fewer than two repeats, which have no spread.
 
     Args:
-        attained: what was attained in the n repeats.
+        attained: values of the n repeats.
         of: what was repeated, such as "a command".
 
     Raises:
-        MeasurementError: there is one repeat only.
+        MeasurementError: there is only one repeat.
     """
     if attained.shape[-2] < 2:
         raise MeasurementError(
-            f"repeatability: 2 repeats of {of} or more were wanted, got {attained.shape[-2]}; the standard asks for "
-            "30."
+            option="attained",
+            expected=f"2 or more repeats of {of}",
+            value=attained.shape[-2],
+            remedy="measure 30, as the standard asks for",
         )

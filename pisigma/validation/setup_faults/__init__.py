@@ -1,1 +1,1 @@
-"""Whether a correction is active, and which fault of the set-up explains large errors."""
+"""Faults of the setup or the file that explain large errors: hypotheses, how they are tried and reported."""

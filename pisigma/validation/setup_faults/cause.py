@@ -1,4 +1,4 @@
-"""What may be wrong with a setup, as one clause."""
+"""Causes of errors: what may be wrong with a setup or a file, one clause each."""
 
 import math
 from collections.abc import Iterable
@@ -7,16 +7,18 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Cause:
-    """One thing that is wrong with the setup.
+    """One fault of the setup or the file.
 
     Attributes:
         kind: "frame", "tool", "target", "position_unit", "rotation", "handedness", "rows", "joint_unit", "joint_order",
             "joint_sign", "joint_coupling", "joint_zero", "joint_values" or "correction".
         clause: what is wrong, such as "the sign of joint 3 is reversed".
         advice: what it means or what to check.
-        size: how much is assumed, 1 at least; of what explains equally well, the smallest is believed.
-        joints: the joints that it is about, from 0.
-        moved: how far the zeros of joints have moved at most [rad or m]; infinite where it is about something else.
+        size: complexity of the assumption, at least 1; of equally good explanations the simplest is chosen.
+        joints: indices of the joints concerned, from 0.
+        moved: largest motion of a joint zero [rad or m]; infinite for faults of other kinds.
+        amount: motion of a frame or tool [m], correct over stated values with a wrong unit, or the number of
+            corrections applied in addition to those logged (1 or -1); NaN for faults of other kinds.
     """
 
     kind: str
@@ -25,10 +27,11 @@ class Cause:
     size: float
     joints: tuple[int, ...] = ()
     moved: float = math.inf
+    amount: float = math.nan
 
 
 def joints_text(joints: tuple[int, ...]) -> str:
-    """Write the numbers of joints, which are counted from 0, as people count them."""
+    """Write joint indices (from 0) as joint numbers (from 1)."""
     if len(joints) == 1:
         return f"joint {joints[0] + 1}"
     if len(joints) > 2 and joints[-1] - joints[0] == len(joints) - 1:
@@ -37,11 +40,11 @@ def joints_text(joints: tuple[int, ...]) -> str:
 
 
 def joined(words: Iterable[str]) -> str:
-    """Join words as a list in a sentence."""
+    """Join words to a list in a sentence."""
     *first, last = words
     return f"{', '.join(first)} and {last}" if first else last
 
 
 def length_text(length: float) -> str:
-    """Write a length [m] in millimetres, with three digits or all whole ones."""
+    """Write a length [m] in millimetres, with three significant digits or all integer digits."""
     return f"{length * 1e3:.3g} mm" if abs(length) < 1 else f"{length * 1e3:,.0f} mm"

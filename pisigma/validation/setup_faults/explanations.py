@@ -1,4 +1,4 @@
-"""Everything that is tried to explain large errors, and which of it is believed."""
+"""Hypotheses that are tried to explain large errors, and the choice among them."""
 
 import itertools
 import math
@@ -37,22 +37,23 @@ if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
 
 SMALL_SHARE = 2e-4
-"""Share of the reach below which errors come from no fault of a joint column."""
+"""Errors as a share of the reach below which no fault of a joint column is their cause."""
 PLAUSIBLE_SHARE = 0.01
-"""Share of the reach that the errors which are left may have, at most."""
+"""Largest errors of a calibrated robot, and after correcting a fault, as a share of the reach."""
 PLAUSIBLE_TURN = PLAUSIBLE_SHARE / LEVER_SHARE
-"""The same of errors of orientations [rad], which count like position errors at `LEVER_SHARE` of the reach."""
+"""The same for orientations [rad], whose errors count as position errors at a distance of `LEVER_SHARE` of the
+reach."""
 AS_GOOD = 1.5
-"""A simpler explanation is believed where its errors are not larger than the best by this factor."""
-MOST_CONVENTIONS = 8
-"""Conventions of orientations that are looked at again, at most."""
-SMALLEST_TURN = 0.01
-"""[deg] A base or a tool that has turned by less has not turned."""
+"""Errors of a simpler explanation over the smallest ones up to which the simpler one is chosen."""
+MAX_CONVENTIONS = 8
+"""Promising conventions of orientations that are tried with the whole model."""
+MIN_TURN = 0.01
+"""[deg] Smaller rotations of a base or a tool are not reported."""
 _MOVED = {
     "frame": (
         "base",
-        "the robot or the sensor stands elsewhere than when the model was made; run again with --fit-frame, or "
-        "recalibrate with --moved base",
+        "the robot or the sensor was moved since the model was made; run again with --fit-frame, or recalibrate with "
+        "--moved base",
     ),
     "tool": (
         "tool",
@@ -62,20 +63,20 @@ _MOVED = {
 }
 EULER_ORDERS = ("ZYX", "XYZ", "XZY", "YXZ", "YZX", "ZXY", "ZYZ", "ZXZ", "XYX", "XZX", "YXY", "YZY")
 READ_ORDER = EULER_ORDERS[0]
-"""Order of the turns roll, pitch and yaw in measurement files."""
+"""Order of the rotations by roll, pitch and yaw in measurement files."""
 _MIRROR = torch.diag(torch.tensor([1.0, -1.0, 1.0], dtype=torch.float64))
 _MIRRORED = "{} mirrored, as in a left-handed frame (an axis has the wrong sign, or two are swapped)"
 
 
 def largest_explained(here: Hypothesis, reach: float) -> float:
-    """Give the largest error [m] that an explanation of the errors may leave, of a robot of such a reach [m]."""
+    """Return the largest error [m] that an explanation may leave, for a robot with a given reach [m]."""
     return min(COLLAPSED * here.error, PLAUSIBLE_SHARE * reach)
 
 
 def simplest(hypotheses: Sequence[Hypothesis], most: float) -> list[Hypothesis]:
-    """Choose the simplest of the hypotheses that explain the errors, to `most` [m] at least, about equally well.
+    """Choose the simplest of the hypotheses that explain the errors about equally well, to at most `most` [m].
 
-    What is left must be small beside the spread of the poses too, which millimetres that are taken for metres shrink.
+    The remaining errors must also be small relative to the spread of the poses, which a wrong unit can shrink.
     """
     explaining = [
         other for other in hypotheses if other.error <= min(most, COLLAPSED * other.measured.spread)
@@ -90,13 +91,12 @@ def simplest(hypotheses: Sequence[Hypothesis], most: float) -> list[Hypothesis]:
 
 
 def hypotheses(arm: PredictingArm, some: Measurements, here: Hypothesis, most: float) -> Iterator[Hypothesis]:
-    """Go through everything that may explain the errors to `most` [m]; first that nothing is wrong."""
+    """Yield all hypotheses that may explain the errors to `most` [m]; the first is that nothing is wrong."""
     yield from in_frames(arm, some, here, most)
     for measured, cause in units_and_frames(here.measured, here.T[:, :3, 3], "corner" in some.kinds):
         yield from in_frames(arm, some, replace(here, measured=measured, causes=(cause,)), most)
     if arm.model is not None:
-        for T, clause, advice in _other_corrections(arm.model, some):
-            cause = Cause("correction", clause, advice, 1.0)
+        for T, cause in _other_corrections(arm.model, some):
             yield from in_frames(arm, some, here.with_cause(cause, T, fitted=0), most)
     if not here.error > SMALL_SHARE * arm.robot.reach:
         return
@@ -111,7 +111,7 @@ def hypotheses(arm: PredictingArm, some: Measurements, here: Hypothesis, most: f
 
 
 def _likely_conventions(arm: PredictingArm, here: Hypothesis) -> Iterator[tuple[MeasuredPoses, Cause]]:
-    """Find conventions of orientations that may explain the errors."""
+    """Yield conventions of orientations that may explain the errors."""
     turned = here.measured.has_rotation
     if not bool(turned.any()):
         return
@@ -120,40 +120,38 @@ def _likely_conventions(arm: PredictingArm, here: Hypothesis) -> Iterator[tuple[
     R = torch.where(turned[:, None, None], torch.stack([rotation for rotation, _, _ in tried]), eye)
     for errors in arm.errors_in_frames(here.T, replace(here.measured, rotation=R)):
         limit = max(NEAR_BEST**2 * float(errors.min()), NOTICED**2)
-        for number in errors.argsort()[:MOST_CONVENTIONS].tolist():
+        for number in errors.argsort()[:MAX_CONVENTIONS].tolist():
             if float(errors[number]) <= limit:
-                advice = "write orientations as the documentation of measurement files says"
+                advice = "write orientations as described in the documentation of measurement files"
                 _, clause, size = tried[number]
                 yield replace(here.measured, rotation=R[number]), Cause("rotation", clause, advice, size)
 
 
 def _other_corrections(
     model: CalibratedModel, some: Measurements
-) -> Iterator[tuple[Float64[Tensor, "rows 4 4"], str, str]]:
-    """Predict poses with the correction once more than logged, and once less (first order: its square is small)."""
+) -> Iterator[tuple[Float64[Tensor, "rows 4 4"], Cause]]:
+    """Predict poses with the correction applied once more than logged, and once less (to first order)."""
     T, T_nominal = poses_of_rows(model, some), nominal_poses_of_rows(model, some)
-    yield (
-        T_nominal,
-        "the rows fit the nominal robot at the joint values of the file",
-        "either the log holds joint values from before the correction, or they were corrected once more on the way to "
-        "the robot, or the model is of another robot",
+    clause = "the rows fit the nominal robot at the joint values of the file"
+    advice = (
+        "either the log contains joint values from before the correction, or they were corrected again before they "
+        "reached the robot, or the model belongs to another robot"
     )
+    yield T_nominal, Cause("correction", clause, advice, 1.0, amount=1.0)
     T_less = T.clone()
     T_less[:, :3, 3] = 2 * T[:, :3, 3] - T_nominal[:, :3, 3]
     T_less[:, :3, :3] = T[:, :3, :3] @ T_nominal[:, :3, :3].mT @ T[:, :3, :3]
-    yield (
-        T_less,
-        "the robot ran without the correction that the joint values of the file hold",
-        "the log holds corrected joint values, but the robot was sent to the uncorrected ones",
-    )
+    clause = "the robot ran without the correction that the joint values of the file contain"
+    advice = "the log contains corrected joint values, but the robot was sent to the uncorrected ones"
+    yield T_less, Cause("correction", clause, advice, 1.0, amount=-1.0)
 
 
 def in_frames(
     arm: PredictingArm, some: Measurements, here: Hypothesis, most: float = math.inf
 ) -> Iterator[Hypothesis]:
-    """Go on to the same hypothesis with another frame, another tool, and both; as drawn, both are fitted anyway.
+    """Yield a hypothesis as it is, and with another frame, another tool, and both; without a model, both are fitted.
 
-    Both are fitted only where an affine fit, which leaves less, does not leave more than `most` [m].
+    Both are fitted only if an affine fit, which is a lower bound of the errors, leaves at most `most` [m].
     """
     rows, per_tool = len(here.T), 6 if bool(here.measured.has_rotation.any()) else 3
     bound = float(affine_error(here.T, here.measured)) * (1 - 13 / rows) if rows > 13 else 0.0
@@ -180,7 +178,7 @@ def in_frames(
 def _per_group(
     fit: Callable[[Tensor, MeasuredPoses], Tensor], group: Int64[Tensor, " rows"], here: Hypothesis
 ) -> Float64[Tensor, "rows 4 4"]:
-    """Fit the transform of every row's frame or target."""
+    """Fit the transform of every frame or target, and return it for every row."""
     X = torch.empty_like(here.T)
     for number in range(int(group.max()) + 1):
         rows = group == number
@@ -191,44 +189,45 @@ def _per_group(
 def _moved(
     kind: str, X: Float64[Tensor, "#rows 4 4"], frames: Float64[Tensor, "#rows 4 4"] | None = None
 ) -> Cause:
-    """Say that the "frame" or the "tool" has moved, and how far the farthest of some transforms takes its origin.
+    """Make the cause that the frame or the tool has moved, with the largest motion of its origin.
 
     Args:
-        kind: which.
-        X: transforms of it.
-        frames: where it was, in the coordinates of the transforms; None at their origin.
+        kind: "frame" or "tool".
+        X: its motions.
+        frames: its poses before the motion, in the coordinates of `X`; None for their origin.
     """
     what, advice = _MOVED[kind]
     origin = torch.zeros(3, 1).to(X) if frames is None else frames[:, :3, 3:]
     shift = (X[:, :3, :3] @ origin + X[:, :3, 3:] - origin).norm(dim=1).max()
     turn = float(torch.rad2deg(rotation_vector(X[:, :3, :3]).norm(dim=-1)).max())
-    motion = length_text(float(shift)) + (f" and {turn:.3g} deg" if turn > SMALLEST_TURN else "")
-    return Cause(kind, f"the {what} has moved by about {motion} against the model", advice, 2.0)
+    motion = length_text(float(shift)) + (f" and {turn:.3g} deg" if turn > MIN_TURN else "")
+    clause = f"the {what} has moved by about {motion} relative to the model"
+    return Cause(kind, clause, advice, 2.0, amount=float(shift))
 
 
 def units_and_frames(
     measured: MeasuredPoses, predicted: Float64[Tensor, "rows 3"], by_images: bool
 ) -> Iterator[tuple[MeasuredPoses, Cause]]:
-    """Go through positions in other units, mirrored positions and orientations, and inverse poses.
+    """Yield positions in other units, mirrored positions and orientations, and inverse poses.
 
     Args:
-        measured: the poses.
-        predicted: positions, but for the frames [m].
-        by_images: whether boards in images gave the poses: their scale is that of the board.
+        measured: the measured poses.
+        predicted: predicted positions, up to a rigid transform [m].
+        by_images: whether the poses are those of boards in images, whose scale is that of the board.
     """
     advice = "check the order and the directions of the sensor's axes"
     if by_images:
         factor = position_spread(predicted) / position_spread(measured.position)
         clause = f"the squares of the board are {factor:.4g} times as large as stated"
-        cause = Cause("position_unit", clause, "measure them and correct the file of the board", 1.0)
+        cause = Cause("position_unit", clause, "measure the board and correct its file", 1.0)
         yield replace(measured, position=measured.position * factor), cause
-        advice = "take the images as the sensor of the camera has them, not flipped"
+        advice = "use the images as the camera's sensor takes them, not flipped"
     else:
         for factor, are, named in MISNAMED_UNITS:
             clause = f"x, y and z are {are} that are named {named}"
             yield (
                 replace(measured, position=measured.position * factor),
-                Cause("position_unit", clause, "correct the unit in the column names", 1.0),
+                Cause("position_unit", clause, "correct the unit in the column names", 1.0, amount=factor),
             )
     positions = replace(measured, position=measured.position @ _MIRROR)
     what = "the measured positions are"
@@ -248,24 +247,24 @@ def units_and_frames(
 
 
 def position_spread(position: Float64[Tensor, "rows 3"]) -> float:
-    """Root mean square distance from the mean [m]."""
+    """Compute the RMS distance from the mean position [m]."""
     return float((position - position.mean(0)).square().sum(-1).mean().sqrt())
 
 
 def other_conventions(
     rotation: Float64[Tensor, "rows 3 3"],
 ) -> Iterator[tuple[Float64[Tensor, "rows 3 3"], str, float]]:
-    """Go through what measured orientations are where they were written in another convention.
+    """Yield the measured orientations under the assumption that they were written in another convention.
 
     Returns:
-        The rotations, what is wrong with those of the file, and how much that assumes, see `Cause.size`.
+        The rotations, what is wrong with those of the file, and the complexity of the assumption, see `Cause.size`.
     """
-    from scipy.spatial.transform import Rotation  # here, since every calibration imports this file
+    from scipy.spatial.transform import Rotation  # imported here, because every calibration imports this file
 
     read = Rotation.from_matrix(rotation.numpy())
     wxyz = Rotation.from_quat(np.roll(read.as_quat(), -1, 1))
     inverse = "the orientations are inverse (a conjugate quaternion, or a transposed matrix)"
-    scalar = "the quaternions stand in the order qw, qx, qy, qz (the scalar part first)"
+    scalar = "the quaternions are in the order qw, qx, qy, qz (the scalar part first)"
     yield from (
         (_matrices(read.inv()), inverse, 1.0),
         (_matrices(wxyz), scalar, 1.0),
@@ -275,7 +274,7 @@ def other_conventions(
     for columns in (RPY, RPY[::-1]):
         of_columns = [RPY.index(name) for name in columns]
         turned, vector = angles[:, of_columns], _as_rotation_vector(angles)[:, of_columns]
-        clause = f"{', '.join(columns)} hold the x, y and z of a rotation vector (axis times angle)"
+        clause = f"{', '.join(columns)} contain the x, y and z of a rotation vector (axis times angle)"
         yield _matrices(Rotation.from_rotvec(vector)), clause, 1.0
         for order in EULER_ORDERS:
             product = " · ".join(f"Rot{axis}({name})" for axis, name in zip(order, columns, strict=True))
@@ -290,9 +289,10 @@ def other_conventions(
 
 
 def _as_rotation_vector(angles: Float64[np.ndarray, "rows 3"]) -> Float64[np.ndarray, "rows 3"]:
-    """Of the two ways to write a rotation in roll, pitch and yaw, take the shorter one as a vector.
+    """Of the two ways to write a rotation in roll, pitch and yaw, choose the one that is shorter as a vector.
 
-    A vector that was read as angles may have had a second component beyond a quarter turn, which is read otherwise.
+    A rotation vector that was read as angles may have a second component beyond 90 deg, for which angles read back
+    from the matrix are the other solution.
     """
     roll, pitch, yaw = angles.T
     half = np.pi * np.stack([-np.sign(roll), np.sign(pitch), -np.sign(yaw)], 1)

@@ -1,4 +1,4 @@
-"""Setup faults that show with the robot as drawn, base and tool being fitted under every hypothesis."""
+"""Setup faults that are found with the nominal robot, with base and tool fitted under every hypothesis."""
 
 import math
 from collections import Counter
@@ -41,51 +41,51 @@ from pisigma.validation.setup_faults.hypothesis import (
 )
 from pisigma.validation.setup_faults.setup_fault import SetupFault, fault_of
 
-MOST_ROWS = 1_000
-"""Rows that explanations are tried on, spread over all of them."""
-MOST_ROWS_AS_DRAWN = 150
-"""The same of the robot as drawn, where base and tool are fitted to them under every hypothesis."""
-FEWEST_ROWS_AS_DRAWN = 24
-"""Base and tool, as 39 unknowns of an affine fit, leave too few of the values of fewer rows."""
-LARGEST_ZERO = 3 * HOBBY.largest.joint_offset
-"""[rad] Zeros of joints are not further off."""
-LARGEST_SLIDE = 3 * HOBBY.largest.length
-"""[m] The same of joints that slide."""
+MAX_ROWS = 1_000
+"""Rows that hypotheses are tried on, evenly over all rows."""
+MAX_ROWS_AS_DRAWN = 150
+"""The same with the nominal robot, where base and tool are fitted under every hypothesis."""
+MIN_ROWS_AS_DRAWN = 24
+"""With fewer rows, base and tool, as 39 unknowns of an affine fit, leave too few degrees of freedom."""
+MAX_ZERO = 3 * HOBBY.largest.joint_offset
+"""[rad] Largest plausible error of the zero of a revolute joint."""
+MAX_SLIDE = 3 * HOBBY.largest.length
+"""[m] The same of prismatic joints."""
 USUAL = 1e-3
 """Usual prior standard deviation of geometric errors [m and rad]."""
 SURE = 1e-3
-"""Joint values explain positions where chance would explain as much of them with a probability below this."""
-MOST_TARGETS = 4
+"""Probability of the F test below which joint values explain positions."""
+MAX_TARGETS = 4
 """Targets that are looked for under one name."""
-EXAMPLES = 3
-"""Rows that are named, at most."""
-TARGET_TURNS = 20
-"""Turns of fitting base and targets, at most."""
-TARGETS_SETTLED = 1e-2
-"""They end where a turn lowers the mean square by less than this share."""
-NAMING_ROUNDS = 8
-"""Rounds of naming every row after the nearest target and fitting base and targets anew, at most."""
+MAX_EXAMPLES = 3
+"""Rows that a sentence names."""
+MAX_TARGET_ITERATIONS = 20
+"""Alternating fits of the base and of the targets."""
+TARGET_TOLERANCE = 1e-2
+"""Relative decrease of the mean square per iteration at convergence."""
+MAX_CLUSTERINGS = 8
+"""Iterations of assigning every row to the nearest target and fitting base and targets again."""
 
 
 def find_faults_as_drawn(robot: Robot, measurements: Measurements) -> tuple[SetupFault, ...]:
-    """Find what makes the errors of the robot as drawn collapse to a quarter or less, the simplest first.
+    """Find setup faults that reduce the errors of the nominal robot to a quarter or less, the simplest first.
 
     Base and tool are fitted to the rows as they are and under every hypothesis: those of `find_setup_faults`, rows
-    shifted from one row on, several targets under one name, and a joint whose logged values are not those that it
-    had. They are tried where the errors are larger than geometric errors of the usual prior (1 mm, 1 mrad) make those
-    of the robot as drawn. There a true explanation leaves these usual errors, a tenth or less of what faults make.
+    shifted before or after some row, several targets under one name, and a joint whose logged values are wrong.
+    Hypotheses are tried if the errors are larger than geometric errors of the usual prior (1 mm, 1 mrad) make them. A
+    correct explanation then leaves these usual errors, which are a tenth or less of those caused by faults.
 
     Args:
-        robot: as drawn.
-        measurements: rows; those with positions in the frame and of the target that most are of are judged.
+        robot: the nominal robot.
+        measurements: rows; those with positions of the most frequent frame and target are judged.
 
     Returns:
-        Nothing where the errors are usual, or where nothing explains them.
+        Empty if the errors are of usual size, or if nothing explains them.
     """
     rows = largest_group(measurements)
-    if rows.rows < FEWEST_ROWS_AS_DRAWN:
+    if rows.rows < MIN_ROWS_AS_DRAWN:
         return ()
-    chosen = spread(torch.arange(MARGIN, rows.rows - MARGIN), MOST_ROWS_AS_DRAWN)
+    chosen = spread(torch.arange(MARGIN, rows.rows - MARGIN), MAX_ROWS_AS_DRAWN)
     some, arm = rows.select(chosen), PredictingArm(robot)
     measured = MeasuredPoses.of(some.position, some.rotation, LEVER_SHARE * robot.reach)
     raw = Hypothesis(some.q, arm.poses(some), measured)
@@ -111,14 +111,14 @@ def find_faults_as_drawn(robot: Robot, measurements: Measurements) -> tuple[Setu
 
 
 def _better_than_zeros(faults: Sequence[Hypothesis], error: float, usual: float) -> list[Hypothesis]:
-    """Keep the faults that explain the rows better than other zeros of all joints do, which a calibration finds.
+    """Keep the faults that explain the rows better than moved zeros of all joints, which a calibration estimates.
 
-    Zeros of single joints are kept too where they leave no more than usual errors.
+    Moved zeros of single joints are kept too if they leave errors of usual size.
 
     Args:
-        faults: that were found.
-        error: what is left with other zeros [m].
-        usual: errors of a healthy robot as drawn [m].
+        faults: the faults found.
+        error: RMS error with the zeros of all joints fitted [m].
+        usual: RMS error of a healthy nominal robot [m].
     """
     return [
         fault
@@ -129,13 +129,13 @@ def _better_than_zeros(faults: Sequence[Hypothesis], error: float, usual: float)
 
 
 def _error_with_zeros(robot: Robot, rows: Measurements, measured: MeasuredPoses) -> float:
-    """Root mean square of the errors [m] with the zeros of all joints fitted; infinite where they move too far."""
+    """Compute the RMS error [m] with the zeros of all joints fitted; infinite if they move too far."""
     try:
         fitted = GeometricCalibrator(robot, free="joint_offsets", prior=None).fit(rows).robot
     except IdentificationError:
         return math.inf
     moved = (fitted.dh - robot.dh)[:, :2]
-    if np.abs(moved[:, 0]).max() > LARGEST_ZERO or np.abs(moved[:, 1]).max() > LARGEST_SLIDE:
+    if np.abs(moved[:, 0]).max() > MAX_ZERO or np.abs(moved[:, 1]).max() > MAX_SLIDE:
         return math.inf
     arm = PredictingArm(robot.with_geometry(dh=fitted.dh))
     here = next(in_frames(arm, rows, Hypothesis(rows.q, arm.poses(rows), measured)))
@@ -143,9 +143,9 @@ def _error_with_zeros(robot: Robot, rows: Measurements, measured: MeasuredPoses)
 
 
 def _named_otherwise(robot: Robot, measurements: Measurements, usual: float) -> tuple[SetupFault, ...]:
-    """Find better names for the targets of the frame that most rows are of, where errors are larger than usual [m]."""
+    """Find better names for the targets of the most frequent frame if errors are larger than usual [m]."""
     rows = largest_group(measurements, by_target=False)
-    rows = rows.select(spread(torch.arange(rows.rows), MOST_ROWS))
+    rows = rows.select(spread(torch.arange(rows.rows), MAX_ROWS))
     number, lever = numbers_of_names(rows.target), LEVER_SHARE * robot.reach
     measured, T = MeasuredPoses.of(rows.position, rows.rotation, lever), forward_kinematics(robot, rows.q)
     here = Hypothesis(rows.q, fit_targets(T, measured, number)[1], measured)
@@ -160,7 +160,7 @@ def _named_otherwise(robot: Robot, measurements: Measurements, usual: float) -> 
 def _labelled(
     rows: Measurements, T: Float64[Tensor, "rows 4 4"], measured: MeasuredPoses
 ) -> list[Hypothesis]:
-    """Make hypotheses of other names of targets; see `better_labellings`."""
+    """Make hypotheses from other names of targets; see `better_labellings`."""
     return [
         Hypothesis(rows.q, one.T, measured, (one.cause,), 3 * one.targets)
         for one in better_labellings(rows, T, measured)
@@ -173,7 +173,14 @@ def _with_joints(
     most: float,
     values: int = 0,
 ) -> list[Hypothesis]:
-    """Make hypotheses of joint values of the robot as drawn, of which every row has some values of its own."""
+    """Make hypotheses from other joint values or poses, with the nominal robot.
+
+    Args:
+        arm: the predicting arm.
+        tried: joint values, measured poses and cause of each hypothesis.
+        most: largest error that an explanation may leave [m].
+        values: number of unknowns per row.
+    """
     return [
         other
         for q, measured, cause in tried
@@ -185,11 +192,11 @@ def _with_joints(
 
 
 def are_unrelated(robot: Robot, measurements: Measurements) -> bool:
-    """Say whether positions have nothing to do with the joint values of their rows, as where one side was sorted."""
+    """Say whether positions are unrelated to the joint values of their rows, for example because one was sorted."""
     rows = largest_group(measurements)
-    if rows.rows < FEWEST_ROWS_AS_DRAWN:
+    if rows.rows < MIN_ROWS_AS_DRAWN:
         return False
-    rows = rows.select(spread(torch.arange(rows.rows), MOST_ROWS_AS_DRAWN))
+    rows = rows.select(spread(torch.arange(rows.rows), MAX_ROWS_AS_DRAWN))
     assert rows.position is not None
     spread_out = float((rows.position - rows.position.mean(0)).square().sum(1).mean().sqrt())
     return spread_out > usual_error(robot, rows.q) and explains_nothing(
@@ -198,10 +205,10 @@ def are_unrelated(robot: Robot, measurements: Measurements) -> bool:
 
 
 def usual_error(robot: Robot, q: Float64[Tensor, "rows dof"]) -> float:
-    """Compute the root mean square of the position errors [m] that geometric errors of 1 mm and 1 mrad make.
+    """Compute the RMS position error [m] caused by geometric errors of 1 mm and 1 mrad.
 
-    Their covariance is `J P J^T` for the derivative `J` of the position by the parameters of all rows and the prior
-    covariance `P`; that base and tool take a part of it is left out.
+    Its covariance is `J P J^T` for the derivative `J` of the position by the DH parameters and their prior covariance
+    `P`. The part that base and tool absorb is neglected.
     """
     J = identification_jacobian(robot, q)[1][:, :3, : 5 * len(robot.rows)]
     return USUAL * float(J.square().sum((1, 2)).mean().sqrt())
@@ -214,7 +221,7 @@ def measured_rows(measurements: Measurements) -> Int64[Tensor, " rows"]:
 
 
 def largest_group(measurements: Measurements, by_target: bool = True) -> Measurements:
-    """Select the rows with positions of the frame (and target) that most are of; none where none was measured."""
+    """Select the rows with positions of the most frequent frame (and target); empty if none was measured."""
     if measurements.position is None:
         return measurements.select(torch.arange(0))
     rows = measured_rows(measurements)
@@ -227,17 +234,17 @@ def largest_group(measurements: Measurements, by_target: bool = True) -> Measure
 
 
 def spread(rows: Int64[Tensor, " rows"], most: int) -> Int64[Tensor, " chosen"]:
-    """Choose some of the rows, spread over them."""
+    """Choose at most `most` of the rows, evenly over them."""
     count = min(len(rows), most)
     return rows[torch.linspace(0, len(rows) - 1, count).round().long()]
 
 
 def explains_nothing(T: Float64[Tensor, "rows 4 4"], position: Float64[Tensor, "rows 3"]) -> bool:
-    """Say whether predicted poses explain no more of measured positions than chance, by an F test of the affine fit.
+    """Say whether predicted poses explain measured positions no better than chance, by an F test of the affine fit.
 
     Args:
         T: predicted poses.
-        position: measured positions [m], more than 13.
+        position: measured positions [m], at least 14.
     """
     from scipy.special import fdtrc  # scipy.stats takes a second to import
 
@@ -250,11 +257,11 @@ def explains_nothing(T: Float64[Tensor, "rows 4 4"], position: Float64[Tensor, "
 
 @dataclass(frozen=True, eq=False)
 class Labelling:
-    """Rows named after the targets that they fit.
+    """Assignment of the rows to the targets that they fit.
 
     Attributes:
-        cause: what is wrong with the names of the file.
-        T: predicted poses of the targets, base and tools being fitted under the better names.
+        cause: what is wrong with the names in the file.
+        T: predicted poses of the targets, with base and tools fitted under this assignment.
         targets: number of targets.
     """
 
@@ -266,19 +273,19 @@ class Labelling:
 def better_labellings(
     rows: Measurements, T: Float64[Tensor, "rows 4 4"], measured: MeasuredPoses
 ) -> Iterator[Labelling]:
-    """Find targets from the measurements alone: points of the tool that the measured positions cluster about.
+    """Find targets from the measurements alone, as clusters of the measured points of the tool.
 
-    As k-means, but base and targets are fitted to all rows in every round. With several names there are as many
-    targets, and each keeps the name that most of its rows have; with one name there are 2, then 3, up to
-    `MOST_TARGETS`.
+    The method is k-means, with base and targets fitted to all rows in every iteration. With several names there are as
+    many targets, and each keeps the most frequent name of its rows; with one name there are 2, then 3, up to
+    `MAX_TARGETS`.
 
     Args:
-        rows: with positions, of one frame.
-        T: poses that are predicted for them, with any base and tool.
-        measured: their poses.
+        rows: rows with positions in one frame.
+        T: their predicted poses, with any base and tool.
+        measured: their measured poses.
     """
     names = tuple(dict.fromkeys(rows.target))
-    for count in range(2, MOST_TARGETS + 1) if len(names) == 1 else (len(names),):
+    for count in range(2, MAX_TARGETS + 1) if len(names) == 1 else (len(names),):
         number, poses = _clustered(T, measured, count)
         cause = _one_name(rows, number) if len(names) == 1 else _other_names(rows, number, names)
         yield Labelling(cause, poses, count)
@@ -287,34 +294,34 @@ def better_labellings(
 def fit_targets(
     T: Float64[Tensor, "rows 4 4"], measured: MeasuredPoses, number: Int64[Tensor, " rows"]
 ) -> tuple[Float64[Tensor, "4 4"], Float64[Tensor, "rows 4 4"]]:
-    """Fit base and targets to measured poses by turns: base and the targets' mean, then every target's place.
+    """Fit base and targets to measured poses alternately: the base with the mean target, then every target.
 
     Args:
         T: predicted poses, with any base and tool.
-        measured: what was measured there.
-        number: of every row's target, 0 and up.
+        measured: the measured poses.
+        number: number of every row's target, from 0.
 
     Returns:
-        The base, and the poses that are predicted with it.
+        The base, and the poses predicted with it.
     """
     places = torch.zeros(int(number.max()) + 1, 3).to(T)
     last = math.inf
-    for _ in range(TARGET_TURNS):
+    for _ in range(MAX_TARGET_ITERATIONS):
         of_rows = T.clone()
         of_rows[:, :3, 3] += (T[:, :3, :3] @ places[number][..., None])[..., 0]
         base, tool = best_base_and_tool(of_rows, measured)
         fitted = base @ of_rows @ tool
         error = float(measured.squares(fitted).mean())
-        if error > (1 - TARGETS_SETTLED) * last:
+        if error > (1 - TARGET_TOLERANCE) * last:
             break
         last = error
-        points = _behind(base @ T, measured)
+        points = _in_tool_frame(base @ T, measured)
         places = torch.stack([points[number == k].mean(0) for k in range(len(places))])
     return base, fitted
 
 
-def _behind(T: Float64[Tensor, "rows 4 4"], measured: MeasuredPoses) -> Float64[Tensor, "rows 3"]:
-    """Give measured positions as predicted poses see them [m]."""
+def _in_tool_frame(T: Float64[Tensor, "rows 4 4"], measured: MeasuredPoses) -> Float64[Tensor, "rows 3"]:
+    """Transform measured positions to the frames of predicted poses [m]."""
     return (T[:, :3, :3].mT @ (measured.position - T[:, :3, 3])[..., None])[..., 0]
 
 
@@ -322,13 +329,11 @@ def _one_name(rows: Measurements, number: Int64[Tensor, " rows"]) -> Cause:
     used, sizes = torch.unique(number, return_counts=True)
     first = [_where(rows, int((number == k).nonzero()[0, 0])) for k in used]
     shares = joined(f"{100 * size / len(number):.0f} %" for size in sizes.tolist())
-    clause = (
-        f"the targets look mixed up: the rows are of {len(used)} targets under one name ({shares} of them)"
-    )
+    clause = f"the targets seem to be mixed up: {len(used)} targets have one name ({shares} of the rows)"
     return Cause(
         "target",
         clause,
-        f"name the targets in a column 'target'; they begin in {joined(first)}",
+        f"name the targets in a column 'target'; their first rows are {joined(first)}",
         float(len(used)),
     )
 
@@ -341,35 +346,38 @@ def _other_names(rows: Measurements, number: Int64[Tensor, " rows"], names: tupl
     wrong = [row for row, (name, other) in enumerate(zip(rows.target, better, strict=True)) if name != other]
     examples = [
         f"{_where(rows, row)} fits '{better[row]}' instead of '{rows.target[row]}'"
-        for row in wrong[:EXAMPLES]
+        for row in wrong[:MAX_EXAMPLES]
     ]
-    clause = f"the targets look mixed up: {len(wrong)} of {rows.rows} rows fit another target than the one they name"
+    clause = (
+        f"the targets seem to be mixed up: {len(wrong)} of {rows.rows} rows fit another target than they name"
+    )
     return Cause("target", clause, f"check the column 'target': {joined(examples)}", 2.0)
 
 
 def _where(rows: Measurements, row: int) -> str:
-    """Name a row in short: the file stands before it."""
+    """Name a row without its file."""
     return f"line {rows.line[row]}" if rows.line[row] else f"row {row}"
 
 
 def _clustered(
     T: Float64[Tensor, "rows 4 4"], measured: MeasuredPoses, count: int
 ) -> tuple[Int64[Tensor, " rows"], Float64[Tensor, "rows 4 4"]]:
-    """Cluster the points of the tool that were measured; returns their numbers and the predicted poses."""
+    """Cluster the measured points of the tool; return their cluster numbers and the predicted poses."""
     number = torch.zeros(len(T), dtype=torch.int64)
     base, tool = best_base_and_tool(T, measured)
-    points, fitted = _behind(base @ T, measured), base @ T @ tool
+    points, fitted = _in_tool_frame(base @ T, measured), base @ T @ tool
+    # Farthest-point start: each new centre is the median of the points that are farthest from the centres so far.
     centres = points.median(0).values[None]
     for _ in range(count):
         far = torch.cdist(points, centres).amin(1).topk(max(1, len(T) // (4 * count))).indices
         centres = torch.cat([centres, points[far].median(0).values[None]])
     centres = centres[1:]
-    for _ in range(NAMING_ROUNDS):
+    for _ in range(MAX_CLUSTERINGS):
         nearest = torch.cdist(points, centres).argmin(1)
         if bool((nearest == number).all()):
             break
         number = torch.unique(nearest, return_inverse=True)[1]
         base, fitted = fit_targets(T, measured, number)
-        points = _behind(base @ T, measured)
+        points = _in_tool_frame(base @ T, measured)
         centres = torch.stack([points[number == k].median(0).values for k in range(int(number.max()) + 1)])
     return number, fitted

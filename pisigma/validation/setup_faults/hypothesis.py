@@ -1,4 +1,4 @@
-"""A hypothesis of what is wrong with a setup, the arm that predicts poses under it, and joint values under it."""
+"""Hypotheses of setup faults, the arm that predicts poses under them, and the joint values under them."""
 
 from collections.abc import Iterator, Set
 from dataclasses import dataclass, replace
@@ -26,25 +26,25 @@ from pisigma.robot.se3 import rotation_vector
 from pisigma.validation.setup_faults.cause import Cause
 
 COLLAPSED = 0.25
-"""Share of the errors that is left, at most, where a setup fault explains them."""
-FEWEST_SPARE = 6
-"""Measured numbers that must be left over beyond what is fitted."""
-_MOST_POSES = 2**17
+"""Share of the errors that a setup fault may leave if it explains them."""
+MIN_FREEDOM = 6
+"""Degrees of freedom that a fit must leave."""
+_MAX_POSES = 2**17
 SHIFTS = (1, -1, 2, -2)
-"""Rows by which joint values may be shifted against what was measured."""
+"""Rows by which joint values may be shifted relative to the measurements."""
 MARGIN = max(SHIFTS)
 ENDS = 3
-"""Base and tool are fitted to the first and to the last third of the rows where a row may have been lost between."""
-_ADVICE = "look for a row that was lost or written twice on one side, and put both sides together again"
-ROUNDS = 30
+"""Base and tool are fitted to the first and to the last third of the rows if a row may have been lost in between."""
+_ADVICE = "look for a joint vector or a measurement that was lost or written twice, and match them again"
+MAX_ITERATIONS = 30
 TRIED, HOPELESS = 8, 0.25
-"""After so many rounds the search is given up where this share of the cost is left."""
-SETTLED = 1e-3
-"""The search ends when a step lowers the cost by less than this share."""
+"""Number of iterations after which the search is given up if more than this share of the cost remains."""
+CONVERGENCE_TOLERANCE = 1e-3
+"""Relative decrease of the cost per step at convergence."""
 STILL = 1e-3
-"""A joint that moves less [rad or m] is constant."""
+"""[rad or m] Range below which a joint value is constant."""
 EQUAL = 1e-6
-"""Columns that differ by less [rad or m] are equal."""
+"""[rad or m] Difference below which two columns are equal."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,9 +52,9 @@ class PredictingArm:
     """Predicts the poses of rows under hypotheses.
 
     Attributes:
-        robot: as drawn.
-        model: whose base and tool count; None: the robot as drawn, whose base and tool are fitted to the rows under
-            every hypothesis.
+        robot: the nominal robot.
+        model: the model, with its base and tool; None to use the nominal robot, with base and tool fitted to the rows
+            under every hypothesis.
     """
 
     robot: Robot
@@ -72,14 +72,14 @@ class PredictingArm:
         """Compute mean squared errors [m²] under hypotheses of the joint values, with the geometry alone.
 
         Args:
-            rows: of one frame and target.
-            q: joint values that they may have had [rad or m].
-            measured: their poses.
+            rows: rows of one frame and target.
+            q: hypothetical joint values [rad or m].
+            measured: measured poses.
 
         Returns:
             See `errors_in_frames`.
         """
-        chunks = torch.split(q, max(1, _MOST_POSES // rows.rows))
+        chunks = torch.split(q, max(1, _MAX_POSES // rows.rows))
         return torch.cat([self._screened(rows, chunk, measured) for chunk in chunks], 1)
 
     def errors_in_frames(
@@ -88,8 +88,8 @@ class PredictingArm:
         """Compute the mean squared errors [m²] of predicted poses.
 
         Returns:
-            Errors in the frame as it is, in one that is fitted, and, by a lower bound, with base and tool fitted;
-            the last alone where there is no model.
+            Errors with the frame as it is, with the frame fitted, and a lower bound of those with base and tool
+            fitted; only the last one without a model.
         """
         bound = affine_error(T, measured)
         if self.model is None:
@@ -108,14 +108,14 @@ class PredictingArm:
 
 @dataclass(frozen=True, eq=False)
 class Hypothesis:
-    """Predicted poses where something is taken to be wrong.
+    """Joint values, predicted and measured poses under the assumption of a fault.
 
     Attributes:
-        q: the joint values that the robot then had [rad or m].
-        T: the poses.
-        measured: measured poses, in the units that they then have.
-        causes: what is wrong.
-        fitted: numbers that were fitted.
+        q: joint values under it [rad or m].
+        T: predicted poses under it.
+        measured: measured poses under it, for example in other units.
+        causes: the faults assumed; empty for none.
+        fitted: number of parameters that were fitted.
     """
 
     q: Float64[Tensor, "rows dof"]
@@ -126,49 +126,52 @@ class Hypothesis:
 
     @property
     def size(self) -> float:
-        """How much is assumed; a frame and a tool together less than both alone, as a new set-up has both."""
+        """Complexity of the causes; frame and tool together count less than separately, as a new setup has both."""
         kinds = {cause.kind for cause in self.causes}
         return sum(cause.size for cause in self.causes) - (1 if {"frame", "tool"} <= kinds else 0)
 
     @property
     def error(self) -> float:
-        """Root mean square of the errors [m], as if nothing had been fitted."""
+        """RMS error [m], corrected for the degrees of freedom."""
         spare = self.measured.values - self.fitted
-        if spare < FEWEST_SPARE:
+        if spare < MIN_FREEDOM:
             return float("inf")
         mean = float(self.measured.squares(self.T).mean()) * self.measured.values / spare
         return float(np.sqrt(mean)) if np.isfinite(mean) else float("inf")
 
     def rms(self) -> tuple[float, float]:
-        """Root mean squares of positions [m] and, NaN where none was measured, of rotations [rad]."""
+        """Compute the RMS errors of positions [m] and of rotations [rad]; NaN if none was measured."""
         position = float((self.measured.position - self.T[:, :3, 3]).square().sum(-1).mean().sqrt())
         R = (self.measured.rotation @ self.T[:, :3, :3].mT)[self.measured.has_rotation]
         return position, float(rotation_vector(R).square().sum(-1).mean().sqrt())
 
     def without(self, kinds: Set[str]) -> "Hypothesis":
-        """Leave causes of some kinds unsaid."""
+        """Remove causes of some kinds, which are not reported."""
         return replace(self, causes=tuple(cause for cause in self.causes if cause.kind not in kinds))
 
     def with_cause(self, cause: Cause, T: Float64[Tensor, "rows 4 4"], fitted: int) -> "Hypothesis":
-        """Add a cause, under which the predicted poses are others."""
+        """Add a cause with the poses predicted under it."""
         return replace(self, T=T, causes=(*self.causes, cause), fitted=self.fitted + fitted)
 
 
 def shifted_rows(
     arm: PredictingArm, rows: Measurements, chosen: Int64[Tensor, " chosen"], measured: MeasuredPoses
 ) -> Iterator[tuple[Float64[Tensor, "chosen dof"], MeasuredPoses, Cause]]:
-    """Go through joint values or orientations of a row before or behind, in all rows or from one on.
+    """Yield hypotheses of joint values or orientations shifted by rows, in all rows or on one side of some row.
 
     Args:
-        arm: with which is predicted.
-        rows: in the order of the file.
-        chosen: those to judge, `MARGIN` or more from both ends.
-        measured: their poses.
+        arm: the predicting arm.
+        rows: rows in the order of the file.
+        chosen: numbers of the rows to judge, at least `MARGIN` from both ends.
+        measured: their measured poses.
     """
     q = rows.q[chosen]
     for shift in SHIFTS:
         cause = Cause(
-            "rows", f"the joint values are shifted by {_count(shift)} against the measurements", _ADVICE, 1.0
+            "rows",
+            f"the joint values are shifted by {_count(shift)} relative to the measurements",
+            _ADVICE,
+            1.0,
         )
         yield rows.q[chosen + shift], measured, cause
         if bool(measured.has_rotation.any()):
@@ -177,7 +180,7 @@ def shifted_rows(
             there = torch.isfinite(other).flatten(1).all(1)
             rotations = replace(measured, rotation=torch.where(there[:, None, None], other, 0.0))
             rotations = replace(rotations, has_rotation=there & measured.has_rotation)
-            clause = f"the orientations are shifted by {_count(shift)} against the positions"
+            clause = f"the orientations are shifted by {_count(shift)} relative to the positions"
             yield q, rotations, Cause("rows", clause, _ADVICE, 1.0)
     yield from _shifted_from_a_row(arm, rows, chosen)
 
@@ -185,9 +188,9 @@ def shifted_rows(
 def _shifted_from_a_row(
     arm: PredictingArm, rows: Measurements, chosen: Int64[Tensor, " chosen"]
 ) -> Iterator[tuple[Float64[Tensor, "chosen dof"], MeasuredPoses, Cause]]:
-    """Find the row from which on, or up to which, a shift explains most; base and tool are fitted beyond it.
+    """Find the row after (or before) which a shift explains most, with base and tool fitted to the other side.
 
-    The rows about it are left out, as what was lost there stands nowhere.
+    The rows next to it are left out, because the lost values are unknown.
     """
     inner = torch.arange(MARGIN, rows.rows - MARGIN)
     among = rows.select(inner)
@@ -201,8 +204,8 @@ def _shifted_from_a_row(
             gain = errors[0] - errors[shift] if at_start else errors[shift] - errors[0]
             change = int(gain.flip(0).cumsum(0).flip(0).argmax())
             place = rows.place(int(inner[change]))
-            where = f"from about {place} on" if at_start else f"up to about {place}"
-            clause = f"{where} the joint values are shifted by {_count(shift)} against the measurements"
+            where = f"after about {place}" if at_start else f"before about {place}"
+            clause = f"{where} the joint values are shifted by {_count(shift)} relative to the measurements"
             kept = chosen[(chosen - inner[change] + 0.5).abs() > abs(shift)]
             behind = kept >= inner[change]
             q = torch.where((behind == at_start)[:, None], rows.q[kept + shift], rows.q[kept])
@@ -210,23 +213,23 @@ def _shifted_from_a_row(
 
 
 def _count(shift: int) -> str:
-    """Write by how many rows joint values are shifted."""
+    """Write the number of rows of a shift."""
     return "one row" if abs(shift) == 1 else f"{abs(shift)} rows"
 
 
 def freed_joints(
     arm: PredictingArm, rows: Measurements, measured: MeasuredPoses
 ) -> list[tuple[Float64[Tensor, "rows dof"], Cause]]:
-    """Find for every joint that turns the values that it must have had, the others being as logged.
+    """Estimate the values of each revolute joint, with those of the others as logged.
 
-    In turn, every row's value is the one that brings the tool nearest to what was measured there, in closed form: a
-    target's position and axes move on circles about the joint's axis; then base and tool are fitted. Of positions two
-    numbers a row are left to be explained, of poses five.
+    Every row's value is the one that brings the tool nearest to the measured pose, in closed form, because a target's
+    position and axes move on circles about the joint axis. This alternates with fits of base and tool. Two values per
+    position, or five per pose, remain as a test of the hypothesis.
 
     Args:
-        arm: with which is predicted.
+        arm: the predicting arm.
         rows: rows with positions, of one frame and target.
-        measured: their poses.
+        measured: their measured poses.
     """
     return [
         (_freed(arm, rows, measured, joint), _cause(arm.robot, rows.q, joint))
@@ -238,19 +241,19 @@ def freed_joints(
 def _freed(
     arm: PredictingArm, rows: Measurements, measured: MeasuredPoses, joint: int
 ) -> Float64[Tensor, "rows dof"]:
-    """Find the values of one joint together with base and tool, by Levenberg and Marquardt's method."""
+    """Estimate the values of one joint together with base and tool by the Levenberg-Marquardt method."""
     q = rows.q.clone()
     if _copied(q, joint) is not None:
         q[:, joint] = q[:, joint].median()
     frames = best_base_and_tool(arm.poses(replace(rows, q=q)), measured)
     cost, damping = torch.tensor(torch.inf).double(), torch.tensor(1e-3).double()
     tried, first = (q, frames), cost
-    for number in range(ROUNDS):
+    for number in range(MAX_ITERATIONS):
         turned, free = _turned(arm, rows, joint, tried[0], tried[1], measured)
         T = arm.poses(replace(rows, q=turned))
         error = measured.squares(tried[1][0] @ T @ tried[1][1]).sum()
         if error < cost:
-            settled = bool(cost - error < SETTLED * cost)
+            settled = bool(cost - error < CONVERGENCE_TOLERANCE * cost)
             first = error if number == 0 else first
             q, frames, cost, damping = turned, tried[1], error, damping / 10
             here = T, free
@@ -273,13 +276,15 @@ def _turned(
     frames: tuple[Float64[Tensor, "4 4"], Float64[Tensor, "4 4"]],
     measured: MeasuredPoses,
 ) -> tuple[Float64[Tensor, "rows dof"], Float64[Tensor, "rows 6"]]:
-    """Turn a joint so that the tool is nearest to every measured pose, in closed form.
+    """Rotate a joint so that the tool is nearest to every measured pose, in closed form.
 
-    With `a` a vector of the tool from the joint's axis and `b` what was measured of it, both across the axis `z`, the
-    angle is `atan2(Σ w z·(a × b), Σ w a·b)`, over the target's position and the columns of its rotation.
+    With a vector `a` from the joint axis to the tool and the corresponding measured vector `b`, both perpendicular to
+    the axis `z`, the angle is `atan2(Σ w z·(a × b), Σ w a·b)`, summed over the target's position and the columns of its
+    rotation.
 
     Returns:
-        The joint values, and the motion of the target by the joint: shift [m] and turn [rad] in the measuring frame.
+        The joint values, and the derivative of the target's pose by the joint: shift [m] and rotation [rad] in the
+        measuring frame.
     """
     base, tool = frames
     T = arm.poses(replace(rows, q=q))
@@ -313,7 +318,7 @@ def _cause(robot: Robot, q: Float64[Tensor, "rows dof"], joint: int) -> Cause:
     if float(q[:, joint].max() - q[:, joint].min()) < STILL:
         clause = f"{name} is logged as constant ({torch.rad2deg(q[0, joint]):.4g} deg in all rows), though it moved"
     elif other is not None:
-        clause = f"the column of {name} holds the values of joint {other + 1}"
+        clause = f"the column of {name} contains the values of joint {other + 1}"
     else:
-        clause = f"the values of {name} are not those that it had, while the other joints' are"
-    return Cause("joint_values", clause, f"check what was logged for {name}", 3.0, (joint,))
+        clause = f"the logged values of {name} are wrong, while those of the other joints are correct"
+    return Cause("joint_values", clause, f"check the log of {name}", 3.0, (joint,))

@@ -1,4 +1,4 @@
-"""Setup faults of joint columns: order, sign, unit and zero, as maps of logged joint values that are tried on rows."""
+"""Faults of joint columns (order, sign, unit, coupling, zero) as affine maps of the logged joint values."""
 
 import itertools
 import math
@@ -22,32 +22,32 @@ QUARTER = math.pi / 2
 GRADIANS = 0.9
 """Degrees in a gradian."""
 ALMOST = math.radians(0.5)
-"""A zero this near to a quarter turn is meant to be there [rad]."""
-MOST_ORDERS = 5040
-"""Of seven joints; with more only two of them are exchanged."""
-MOST_ZEROS = 4**7
+"""[rad] A zero this near to a multiple of 90 deg is taken to be there."""
+MAX_ORDERS = 5040
+"""Number of orders of seven joints; with more joints, only pairs are exchanged."""
+MAX_ZEROS = 4**7
 SCREEN_ROWS = 32
 """Rows that every map is tried on."""
 NOTICED = 2e-5
-"""Errors below this count as none [m]."""
+"""[m] Smaller errors need no explanation."""
 PROMISING = 0.5
-"""Share of the errors that is left, at most, where a map is looked at again."""
-KEPT = 3
-"""Maps of each kind that are looked at again, at most."""
+"""Share of the errors that a promising map may leave."""
+MAX_KEPT = 3
+"""Promising maps of each kind."""
 NEAR_BEST = 4.0
-"""Maps whose errors are larger than the best by this factor are not."""
+"""Errors of a promising map over those of the best map."""
 STEPS = 36
-"""A zero is searched on a grid of so many values to either side, which then is made finer."""
-FINER = 7
-"""Times that the grid is made finer."""
+"""Grid values on either side in the search for a zero."""
+REFINEMENTS = 7
+"""Refinements of this grid."""
 
 
 @dataclass(frozen=True, eq=False)
 class JointMaps:
-    """Maps `q -> matrix · q + offset` of logged joint values to those that the robot had, one per hypothesis.
+    """Maps `q -> matrix · q + offset` of logged joint values to the true ones, one per hypothesis.
 
     Attributes:
-        matrix: what every joint has of each logged column.
+        matrix: weights of the logged columns in every joint value.
         offset: of each joint [rad or m].
     """
 
@@ -75,7 +75,7 @@ class JointMaps:
 
 
 def signs_and_exchanges(dof: int) -> JointMaps:
-    """List a reversed sign of every joint, and an exchange of two neighbours."""
+    """List a reversed sign of every joint, and every exchange of two neighbouring joints."""
     signs = JointMaps.scaled(1 - 2 * torch.eye(dof, dtype=torch.float64))
     order = torch.arange(dof).repeat(dof - 1, 1)
     pairs = torch.stack([torch.arange(dof - 1), torch.arange(1, dof)], 1)
@@ -88,17 +88,17 @@ def signs_and_exchanges(dof: int) -> JointMaps:
 
 
 def reversed_signs(dof: int) -> JointMaps:
-    """List all ways to reverse signs."""
+    """List all combinations of reversed signs."""
     choices = list(itertools.product((1.0, -1.0), repeat=dof))[1:]
     return JointMaps.scaled(torch.tensor(choices, dtype=torch.float64))
 
 
 def other_orders(dof: int) -> JointMaps:
-    """List all orders of the joints; of more than seven the exchanges of two."""
+    """List all orders of the joints; for more than seven joints, the exchanges of two."""
     orders = torch.arange(dof).repeat(math.comb(dof, 2), 1)
     pairs = torch.combinations(torch.arange(dof))
     orders = orders.scatter(1, pairs, pairs.flip(1))
-    if math.factorial(dof) <= MOST_ORDERS:
+    if math.factorial(dof) <= MAX_ORDERS:
         orders = torch.tensor(list(itertools.permutations(range(dof)))[1:], dtype=torch.int64).reshape(
             -1, dof
         )
@@ -106,7 +106,7 @@ def other_orders(dof: int) -> JointMaps:
 
 
 def coupled_joints(dof: int) -> JointMaps:
-    """List all pairs of joints of which one is counted together with the other, as after a belt or from the horizon."""
+    """List all pairs of joints of which one is logged relative to the other, as with a belt or from the horizon."""
     pairs = torch.tensor(list(itertools.permutations(range(dof), 2)), dtype=torch.int64).reshape(-1, 2)
     pairs, sign = pairs.repeat(2, 1), torch.tensor([1.0, -1.0]).double().repeat_interleave(len(pairs))
     maps = JointMaps.unchanged(len(pairs), dof)
@@ -114,7 +114,7 @@ def coupled_joints(dof: int) -> JointMaps:
 
 
 def other_units(robot: Robot) -> JointMaps:
-    """List degrees for radians and the reverse in any joints that turn, mm for m in those that slide, and gradians."""
+    """List exchanged units: degrees and radians (or gradians) of revolute joints, mm and m of prismatic ones."""
     turning = [1.0 if turns else 0.0 for turns in robot.revolute]
     rows = [[GRADIANS ** (sign * turns) for turns in turning] for sign in (1, -1) if any(turning)]
     for revolute, per_unit in ((True, math.degrees(1)), (False, 1e3)):
@@ -129,15 +129,15 @@ def other_units(robot: Robot) -> JointMaps:
 
 
 def quarter_turned_zeros(robot: Robot, inner: bool = False) -> JointMaps:
-    """List zeros moved by quarter turns of any joints that turn; of one joint at a time where these are too many.
+    """List zeros of revolute joints moved by multiples of 90 deg, of one joint at a time if there are too many.
 
     Args:
-        robot: with the joints.
-        inner: leave out the first and the last joint, whose zeros a base and a tool that are fitted take up.
+        robot: the robot.
+        inner: leave out the first and the last joint, whose zeros are absorbed by a fitted base and tool.
     """
     turning = [i for i, revolute in enumerate(robot.revolute) if revolute]
     turning = [i for i in turning if not inner or 0 < i < robot.dof - 1]
-    if 4 ** len(turning) <= MOST_ZEROS:
+    if 4 ** len(turning) <= MAX_ZEROS:
         choices = np.array(list(itertools.product((0, 1, 2, -1), repeat=len(turning)))[1:])
     else:
         choices = np.concatenate([k * np.eye(len(turning)) for k in (1, 2, -1)])
@@ -147,13 +147,13 @@ def quarter_turned_zeros(robot: Robot, inner: bool = False) -> JointMaps:
 
 
 def moved_zeros(joints: Int64[Tensor, " maps"], by: Float64[Tensor, " maps"], dof: int) -> JointMaps:
-    """Move the zero of one joint by so much [rad or m] in each map."""
+    """Move the zero of one joint by a given amount [rad or m] in each map."""
     maps = JointMaps.unchanged(len(joints), dof)
     return replace(maps, offset=maps.offset.index_put((torch.arange(len(joints)), joints), by))
 
 
 def joint_causes(maps: JointMaps, number: int, robot: Robot) -> tuple[Cause, ...]:
-    """Say what a map takes to be wrong with the joint columns."""
+    """Describe what is wrong with the joint columns under a map."""
     matrix, offset = maps.matrix[number], maps.offset[number].tolist()
     order = matrix.abs().argmax(1).tolist()
     factor = [row[column] for row, column in zip(matrix.tolist(), order, strict=True)]
@@ -167,7 +167,7 @@ def joint_causes(maps: JointMaps, number: int, robot: Robot) -> tuple[Cause, ...
         causes.append(Cause("joint_order", clause, advice, 1.0, moved))
     elif moved:
         columns = ", ".join(f"q{column + 1}" for column in order)
-        clause = f"the joint columns stand in another order (joints 1 to {robot.dof} are in {columns})"
+        clause = f"the joint columns are in another order (joints 1 to {robot.dof} are in {columns})"
         causes.append(Cause("joint_order", clause, advice, 2.0, moved))
     if negative := tuple(i for i, value in enumerate(factor) if value < 0):
         signs = "the sign of {} is reversed" if len(negative) == 1 else "the signs of {} are reversed"
@@ -191,7 +191,7 @@ def _coupling_cause(matrix: list[list[float]], robot: Robot) -> Cause:
     advice = (
         "state the coupling in the robot file, or log the angles between the links"
         if robot.coupling is None
-        else "log what the controller shows, or correct the coupling that the robot file states"
+        else "log the values that the controller shows, or correct the coupling in the robot file"
     )
     return Cause("joint_coupling", clause, advice, 1.0, (joint, other))
 
@@ -208,9 +208,8 @@ def _unit_causes(factor: list[float], robot: Robot) -> list[Cause]:
                     named, are = ("degrees", "gradians") if too_large else ("gradians", "degrees")
                 clause = f"the values of {joints_text(wrong)} are {are} that are named {named}"
                 size = 1.0 if list(wrong) == joints else len(wrong) + 0.5
-                causes.append(
-                    Cause("joint_unit", clause, "correct the unit in the column names", size, wrong)
-                )
+                advice = "correct the unit in the column names"
+                causes.append(Cause("joint_unit", clause, advice, size, wrong, amount=abs(factor[wrong[0]])))
     return causes
 
 
@@ -222,26 +221,28 @@ def _zero_cause(joints: tuple[int, ...], offset: list[float], robot: Robot) -> C
         by = f"{math.degrees(offset[i]):.4g} deg" if turns else f"{offset[i] * 1e3:.4g} mm"
         clauses.append(f"joint {i + 1} has moved by {by}")
         size += 1.25 if turns and is_quarter(offset[i]) else 1.5
-    advice = "check the zeros of the joints"
+    advice = "check the joint zeros"
     if joints == (0,):
-        advice += " (a measuring frame that is turned about or shifted along the first axis looks the same)"
+        advice += (
+            " (a measuring frame that is rotated about or shifted along the first axis has the same effect)"
+        )
     elif joints == (robot.dof - 1,):
-        advice += " (a tool that is turned about or shifted along the last axis looks the same)"
+        advice += " (a tool that is rotated about or shifted along the last axis has the same effect)"
     return Cause("joint_zero", " and ".join(clauses), advice, size, joints, max(map(abs, offset)))
 
 
 def is_quarter(angle: float) -> bool:
-    """Say whether an angle [rad] is a multiple of a quarter turn."""
+    """Say whether an angle [rad] is a multiple of 90 deg."""
     return abs(math.remainder(angle, QUARTER)) < 1e-12
 
 
 def likely_maps(arm: PredictingArm, measurements: Measurements, measured: MeasuredPoses) -> JointMaps:
-    """Find maps of joint values that may explain what was measured, to be tried with the whole model.
+    """Find maps of joint values that may explain the measured poses, to be tried with the whole model.
 
     Thousands of maps are tried on a few rows with the geometry alone; see `PredictingArm.screened_errors`.
 
     Args:
-        arm: with which is predicted.
+        arm: the predicting arm.
         measurements: rows with positions.
         measured: their poses.
     """
@@ -267,13 +268,13 @@ def likely_maps(arm: PredictingArm, measurements: Measurements, measured: Measur
         least = min(float(errors.min()) for _, errors in candidates if len(errors))
         limit = min(PROMISING**2 * unchanged[mode], max(NEAR_BEST**2 * least, NOTICED**2))
         for maps, errors in candidates:
-            best = errors.argsort()[:KEPT]
+            best = errors.argsort()[:MAX_KEPT]
             likely.append(maps.select(best[errors[best] <= limit]))
     return _distinct(likely)
 
 
 def _screened_rows(measurements: Measurements) -> Int64[Tensor, " chosen"]:
-    """Choose rows of the frame and target that most rows are of, spread over them."""
+    """Choose rows of the most frequent frame and target, evenly over the file."""
     names = list(zip(measurements.frame, measurements.target, strict=True))
     most = Counter(names).most_common(1)[0][0]
     rows = torch.tensor([name == most for name in names]).nonzero()[:, 0]
@@ -282,7 +283,7 @@ def _screened_rows(measurements: Measurements) -> Int64[Tensor, " chosen"]:
 
 
 def _best_zeros(robot: Robot, errors_of: Callable[[JointMaps], Float64[Tensor, " maps"]]) -> JointMaps:
-    """Find per joint the zero that explains most, moved by any amount; by a quarter turn where it is almost one."""
+    """Find the best zero of every joint on a refined grid, rounded to a multiple of 90 deg if it is near one."""
     dof = robot.dof
     width = torch.tensor(
         [torch.pi if turns else robot.reach for turns in robot.revolute], dtype=torch.float64
@@ -290,7 +291,7 @@ def _best_zeros(robot: Robot, errors_of: Callable[[JointMaps], Float64[Tensor, "
     by = torch.zeros(dof, dtype=torch.float64)
     joints = torch.arange(dof).repeat_interleave(2 * STEPS + 1)
     grid = torch.linspace(-1, 1, 2 * STEPS + 1, dtype=torch.float64)
-    for _ in range(FINER):
+    for _ in range(REFINEMENTS):
         tried = by[:, None] + width[:, None] * grid
         errors = errors_of(moved_zeros(joints, tried.flatten(), dof)).reshape(tried.shape)
         by = tried.gather(1, errors.argmin(1, keepdim=True))[:, 0]
@@ -303,7 +304,7 @@ def _best_zeros(robot: Robot, errors_of: Callable[[JointMaps], Float64[Tensor, "
 
 
 def _distinct(likely: list[JointMaps]) -> JointMaps:
-    """Join all maps that change something, each once."""
+    """Join the maps, without duplicates and without those that change nothing."""
     joined = JointMaps(
         torch.cat([maps.matrix for maps in likely]), torch.cat([maps.offset for maps in likely])
     )

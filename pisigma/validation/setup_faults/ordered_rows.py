@@ -1,4 +1,4 @@
-"""Residuals of a calibration in the order in which the rows were measured, with their derivatives."""
+"""Residuals of a calibration in the order of the file, with their derivatives."""
 
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -14,29 +14,30 @@ from pisigma.calibration.geometric.result import CalibrationResult
 from pisigma.calibration.hybrid.result import HybridResult
 from pisigma.joint_correction.fourier_series import FourierSeries
 
-MOST_ROWS = 4_000
-"""So many rows are looked at, drawn from all of them."""
+MAX_ROWS = 4_000
+"""Rows that are used, drawn from all of them."""
 SENSORS = ("position", "rotation")
-"""Whose values frame and tool shift whatever else is unknown."""
+"""Sensors whose values depend on frame and tool directly, without other unknowns."""
 HARMONICS, JOINT_ERROR = 3, 3e-4
-"""Series of the joint values, with the standard deviation of its weights [rad], that the parameters are joined by: in
-rows that were measured in the order of a joint's values, slow errors of its gear look like a slow motion."""
-OF_A_POSE = 6
-"""Values that a configuration says at most, however many targets and repeats there are: the pose of the tool."""
+"""Harmonics of a series of the joint values, and prior standard deviation of its weights [rad]. The series is fitted
+together with the parameters, because in rows ordered by a joint's values, slow errors of its gear look like a slow
+motion."""
+VALUES_PER_POSE = 6
+"""Independent values of a configuration (the pose of the tool), for any number of targets and repeats."""
 
 
 @dataclass(frozen=True, eq=False)
 class OrderedRows:
-    """Residuals of a calibration in the order of the file, with their derivatives, all over the noise.
+    """Residuals of a calibration in the order of the file, with their derivatives, all divided by the noise.
 
     Attributes:
         result: the geometric calibration.
-        problem: of the rows.
-        number: of every row in the measurements.
-        residual: three values a sensor, 0 where nothing was measured.
-        derivative: by all parameters.
-        values: how many values were measured.
-        noise: of every column of values [m or rad], or the factor on what the rows state.
+        problem: the problem of these rows.
+        number: number of every row in the measurements.
+        residual: three values per sensor, 0 where nothing was measured.
+        derivative: derivative of the values by all parameters.
+        values: number of measured values.
+        noise: standard deviation of every column of values [m or rad], or the factor on those stated in the rows.
     """
 
     result: CalibrationResult
@@ -49,7 +50,7 @@ class OrderedRows:
 
     @staticmethod
     def of(result: CalibrationResult | HybridResult) -> "OrderedRows | None":
-        """Of a calibration; None where it has no positions or orientations with noise."""
+        """Compute the residuals of a calibration; None if it has no positions or orientations with noise."""
         learned = result.learned if isinstance(result, HybridResult) else None
         geometric = result.geometric if isinstance(result, HybridResult) else result
         solved = geometric.solved
@@ -59,8 +60,8 @@ class OrderedRows:
         if not present:
             return None
         measured = torch.stack(present).any(0).nonzero()[:, 0].cpu()
-        some = measured[chosen_rows(len(measured), MOST_ROWS)]
-        line = np.zeros(data.rows) if data.origin else np.array(data.line)  # files stand one behind the other
+        some = measured[chosen_rows(len(measured), MAX_ROWS)]
+        line = np.zeros(data.rows) if data.origin else np.array(data.line)  # several files follow one another
         some = some[np.lexsort((rows[some].numpy(), line[rows[some]]))]
         problem = replace(solved.problem, pairs=0).select(some)
         whole, every = slice(0, len(some)), torch.arange(len(problem.space.parameters))
@@ -88,7 +89,7 @@ class OrderedRows:
 
     @cached_property
     def by_joints(self) -> Float64[np.ndarray, "rows values dof"]:
-        """Derivative by the joint values."""
+        """Derivative of the values by the joint values."""
         robot = self.problem.space.robot
         theta_or_d = 5 * np.array(robot.joint_rows) + ~np.array(robot.revolute)
         derivative: np.ndarray = self.derivative[:, :, theta_or_d] * robot.directions
@@ -96,7 +97,7 @@ class OrderedRows:
 
     @cached_property
     def X(self) -> Float64[np.ndarray, "rows values unknowns"]:
-        """Derivative by the parameters of the calibration, and by weights of a series for the joints' errors."""
+        """Derivative by the parameters of the calibration, and by the weights of a series of joint errors."""
         robot = self.problem.space.robot
         series = FourierSeries(robot, HARMONICS).columns(self.problem.state).cpu().numpy()
         by_weights = self.by_joints[..., None] * series[:, None]
@@ -105,7 +106,7 @@ class OrderedRows:
 
     @cached_property
     def precision(self) -> Float64[np.ndarray, " unknowns"]:
-        """1 / variance of the parameters by the prior, and of the weights."""
+        """Prior precision (1 / variance) of the parameters and of the weights."""
         robot = self.problem.space.robot
         active = self.problem.precision[self.problem.active]
         precision = view_of(self.result.solved.refined).scaled(active, self.problem.prior_group).cpu().numpy()
@@ -115,37 +116,37 @@ class OrderedRows:
 
     @cached_property
     def covariance(self) -> Float64[np.ndarray, "unknowns unknowns"]:
-        """Of the parameters, every row counting in full."""
+        """Covariance of the parameters and weights, with full weight of all rows."""
         flat = self.X.reshape(-1, self.X.shape[2])
         return inverse_of(flat.T @ flat + np.diag(self.precision))
 
     @cached_property
     def left(self) -> Float64[np.ndarray, "rows values"]:
-        """What the series of the joints' errors leaves of the residuals."""
+        """Residuals after fitting the parameters and the series of joint errors."""
         X, r = self.X.reshape(-1, self.X.shape[2]), self.residual.ravel()
         left: np.ndarray = r - X @ (self.covariance @ (X.T @ r))
         return left.reshape(self.residual.shape)
 
     @cached_property
     def used(self) -> float:
-        """Number of values that the calibration used up."""
+        """Effective number of parameters and weights."""
         return float((self.X * (self.X @ self.covariance)).sum())
 
     @cached_property
     def configuration(self) -> Int64[np.ndarray, " rows"] | None:
-        """Number of every row's joint values and frame, or target too; None where all rows differ."""
+        """Number of every row's configuration (joint values and frame, or target too); None if all rows differ."""
         group = self.problem.pose if self.problem.configuration is None else self.problem.configuration
         return None if group is None else renumbered(group).cpu().numpy()
 
     @property
     def independent(self) -> float:
-        """Values left after the calibration, those of one configuration counting as a pose at most."""
+        """Degrees of freedom after the calibration, with at most one pose per configuration."""
         count = len(self.residual) if self.configuration is None else int(self.configuration.max()) + 1
-        return min(self.values, OF_A_POSE * count) - self.used
+        return min(self.values, VALUES_PER_POSE * count) - self.used
 
 
 def inverse_of(normal: Float64[np.ndarray, "unknowns unknowns"]) -> Float64[np.ndarray, "unknowns unknowns"]:
-    """Invert a normal matrix with column scaling; directions that it does not hold get no variance."""
+    """Invert a normal matrix with column scaling; undetermined directions get variance 0."""
     scale = 1 / np.sqrt(np.maximum(normal.diagonal(), 1e-300))
     scales = scale * scale[:, None]
     inverse: np.ndarray = np.linalg.pinv(normal * scales, rcond=UNDETERMINED, hermitian=True) * scales

@@ -1,4 +1,4 @@
-"""Rows of two populations in one calibration: two arms, two tools or two frames under one name."""
+"""Mixtures of two populations of rows in one calibration: two arms, two tools or two frames under one name."""
 
 import math
 from collections.abc import Iterator
@@ -10,24 +10,24 @@ from jaxtyping import Bool, Float64, Int64
 
 from pisigma.validation.setup_faults.ordered_rows import OrderedRows, inverse_of
 
-FEWEST_ROWS = 20
-"""Of fewer rows two arms are not told apart."""
-MOST_ROWS = 300
-"""The populations are fitted to so many rows at most, spread over all of them."""
-SMALLEST_SHARE = 0.1
-"""Fewer rows of another population are outliers, to which the robust loss gives no weight."""
+MIN_ROWS = 20
+"""With fewer rows two arms cannot be distinguished."""
+MAX_ROWS = 300
+"""Rows that the populations are fitted to, evenly over all rows."""
+MIN_SHARE = 0.1
+"""Smaller populations are outliers, which the robust loss gives no weight."""
 TAILS = 5.0
-"""Degrees of freedom of the t distribution of the residuals, so that outliers make no population."""
-MOST_USED = 0.9
-"""Of the share of the values from which on the likelihood has no bound, see `_most_used`."""
-STARTS, FIRST_ROUNDS, ROUNDS = 8, 6, 40
-"""Expectation maximisation is started so often, and goes on from the best after its first rounds."""
-SETTLED = 1e-2
-"""Probabilities have settled that change by less."""
+"""Degrees of freedom of the t distribution of the residuals, so that outliers do not become a population."""
+MAX_USED = 0.9
+"""Share of the values used by parameters, over the share at which the likelihood is unbounded; see `_most_used`."""
+STARTS, FIRST_ITERATIONS, MAX_ITERATIONS = 8, 6, 40
+"""Starts of the expectation maximisation and their iterations, and iterations from the best of them."""
+CONVERGENCE_TOLERANCE = 1e-2
+"""Largest change of the probabilities, and relative change of the variance, at convergence."""
 ALTERNATING = 0.95
-"""Rows alternate where so many of them do: 1 in 20 may be predicted equally well by both."""
+"""Share of the rows that must alternate: 1 in 20 may be predicted equally well by both populations."""
 DIFFERENCE = 2.0
-"""Variance of the difference of two arms, over that of one from the drawn arm."""
+"""Variance of the difference of two arms over that of the difference of one arm and the nominal one."""
 _Differing = Literal["arm", "frame", "tool"]
 
 
@@ -36,12 +36,12 @@ class Populations:
     """Two populations of rows.
 
     Attributes:
-        differing: by what they differ.
-        second: whether a row of the measurements is of the smaller population.
-        tried: how many rows were judged.
-        difference: of base, tool or arm, as numbers of `differing` [m or rad].
-        factor: how many times as large as without the difference the errors of the rows are.
-        used: share of the values that everything fitted used up.
+        differing: what differs between them.
+        second: whether a row of the measurements belongs to the smaller population.
+        tried: number of rows that were judged.
+        difference: difference of their base, tool or arm parameters [m or rad].
+        factor: errors of the rows over those without the difference [1].
+        used: share of the values used up by all fitted parameters [1].
         log_bayes_factor: logarithm of the odds against one population, by the Bayesian information criterion (Schwarz
             1978, Annals of Statistics 6, 461-464).
     """
@@ -56,24 +56,24 @@ class Populations:
 
 
 def find_populations(rows: OrderedRows, count: int) -> Populations | None:
-    """Find the two populations that explain the residuals of a calibration best, likely or not.
+    """Find the two populations that explain the residuals of a calibration best, whether likely or not.
 
-    `r_i = X_i x + w_i Z_i m + e_i`: a row of the second population (w_i = 1) has the difference m besides what is
-    unknown of all rows. The probabilities of w_i, x, m and the size of e_i are found by expectation maximisation
-    (Dempster, Laird and Rubin 1977, JRSS B 39, 1-38), the errors having a t distribution. Tried are differences of the
-    tool, of the frame, and of arm, base and tool together.
+    `r_i = X_i x + w_i Z_i m + e_i`: a row of the second population (w_i = 1) has the difference m in addition to the
+    unknowns x of all rows. The probabilities of w_i, x, m and the variance of e_i are estimated by expectation
+    maximisation (Dempster, Laird and Rubin 1977, JRSS B 39, 1-38) with t-distributed errors. The differences tried are
+    those of the tool, of the frame, and of arm, base and tool together.
 
     Args:
         rows: residuals of a calibration.
-        count: how many rows the measurements have.
+        count: number of rows of the measurements.
 
     Returns:
-        None where there are too few rows.
+        None if there are too few rows.
     """
-    if len(rows.residual) < FEWEST_ROWS:
+    if len(rows.residual) < MIN_ROWS:
         return None
-    index = np.unique(np.linspace(0, len(rows.residual) - 1, MOST_ROWS).round().astype(int))
-    some = index if len(rows.residual) > MOST_ROWS else np.arange(len(rows.residual))
+    index = np.unique(np.linspace(0, len(rows.residual) - 1, MAX_ROWS).round().astype(int))
+    some = index if len(rows.residual) > MAX_ROWS else np.arange(len(rows.residual))
     independent = rows.independent / max(rows.values - rows.used, 1.0)
     found = []
     for differing, Z, precision in _differences(rows):
@@ -81,7 +81,7 @@ def find_populations(rows: OrderedRows, count: int) -> Populations | None:
         if fit.used > _most_used(rows.residual.shape[1]) * fit.values:
             continue
         second = np.zeros(count, dtype=bool)
-        second[rows.number] = _in_turn(fit.probability > 0.5)
+        second[rows.number] = _alternating(fit.probability > 0.5)
         if second.sum() > len(rows.number) / 2:
             second[rows.number] = ~second[rows.number]
         found.append(
@@ -99,20 +99,20 @@ def find_populations(rows: OrderedRows, count: int) -> Populations | None:
 
 
 def _most_used(components: int) -> float:
-    """Share of the values that the unknowns of two populations may use up.
+    """Return the share of the values that the unknowns of two populations may use up.
 
-    A fit that goes through a share u of the rows exactly lets the size of the errors go to 0. Of rows with c components
-    the likelihood of the t distribution then has no bound where c > (1 - u)(TAILS + c), that is u > TAILS/(TAILS + c):
-    5/8 of positions, 5/11 of poses.
+    If a fit passes through a share u of the rows exactly, the variance of the errors can go to 0. For rows with c
+    components, the likelihood of the t distribution is then unbounded if c > (1 - u)(TAILS + c), that is
+    u > TAILS/(TAILS + c): 5/8 for positions, 5/11 for poses.
 
     Args:
-        components: of the residual of a row.
+        components: number of components of the residual of a row.
     """
-    return MOST_USED * TAILS / (TAILS + components)
+    return MAX_USED * TAILS / (TAILS + components)
 
 
-def _in_turn(second: Bool[np.ndarray, " rows"]) -> Bool[np.ndarray, " rows"]:
-    """Take nearly every second row for every second row: rows where both agree are of either."""
+def _alternating(second: Bool[np.ndarray, " rows"]) -> Bool[np.ndarray, " rows"]:
+    """Replace nearly alternating rows by exactly alternating ones: rows that fit both may be assigned to either."""
     odd: np.ndarray = np.arange(len(second)) % 2 == 1
     for turn in (odd, ~odd):
         if np.mean(second == turn) > ALTERNATING:
@@ -123,7 +123,7 @@ def _in_turn(second: Bool[np.ndarray, " rows"]) -> Bool[np.ndarray, " rows"]:
 def _differences(
     rows: OrderedRows,
 ) -> Iterator[tuple[_Differing, Float64[np.ndarray, "rows values numbers"], Float64[np.ndarray, " numbers"]]]:
-    """Derivatives by everything that may differ, with the precision of the prior."""
+    """Yield the derivatives by each thing that may differ, with the precision of the prior of its difference."""
     space = rows.problem.space
     for kind, group in (("tool", rows.problem.target), ("frame", rows.problem.frame)):
         first = space.of("base" if kind == "frame" else "tool").start
@@ -138,16 +138,16 @@ def _differences(
 
 @dataclass(frozen=True, eq=False)
 class _Fit:
-    """Two populations that were fitted.
+    """Result of fitting two populations.
 
     Attributes:
-        probability: that a row is of the second one.
-        difference: of the two.
+        probability: probability that a row belongs to the second population.
+        difference: difference of the two.
         factor: see `Populations`.
         log_likelihood: with the difference, and without it.
-        used: how many numbers the values determine.
-        unknowns: how many of them are the difference.
-        values: how many there are.
+        used: effective number of unknowns.
+        unknowns: effective number of unknowns of the difference.
+        values: number of values.
     """
 
     probability: Float64[np.ndarray, " rows"]
@@ -159,7 +159,7 @@ class _Fit:
     values: int
 
     def gain(self, independent: float) -> float:
-        """Logarithm of the Bayes factor where only a share of the values is independent."""
+        """Compute the log Bayes factor if only a share of the values is independent."""
         values = max(independent * self.values, 2.0)
         gain = (self.log_likelihood[0] - self.log_likelihood[1]) * independent
         return gain - (self.unknowns + 1) / 2 * math.log(values)
@@ -167,22 +167,22 @@ class _Fit:
 
 @dataclass(frozen=True, eq=False)
 class _Mixture:
-    """Fits two populations that differ by some numbers."""
+    """Mixture of two populations that differ in some unknowns."""
 
     rows: OrderedRows
     Z: Float64[np.ndarray, "rows values numbers"]
     precision: Float64[np.ndarray, " numbers"]
 
     def best(self, some: Int64[np.ndarray, " some"]) -> _Fit:
-        """Fit from several starts to some rows, and then say of all rows which population they are of."""
+        """Fit the mixture to some rows from several starts, and assign all rows to a population."""
         r, X, Z = self.rows.residual[some], self.rows.X[some], self.Z[some]
         rng = np.random.default_rng(0)
         starts = [np.arange(len(some)) % 2 * 0.8 + 0.1, *rng.uniform(0, 1, (STARTS - 1, len(some)))]
         alone = _Em(r, X, Z[:, :, :0], np.r_[self.rows.precision])
-        one = alone.run(alone.begin(np.zeros(len(some))), ROUNDS)
+        one = alone.run(alone.start(np.zeros(len(some))), MAX_ITERATIONS)
         em = _Em(r, X, Z, np.r_[self.rows.precision, self.precision])
-        states = [em.run(em.begin(start), FIRST_ROUNDS) for start in starts]
-        state = em.run(max(states, key=lambda state: state.log_likelihood), ROUNDS)
+        states = [em.run(em.start(start), FIRST_ITERATIONS) for start in starts]
+        state = em.run(max(states, key=lambda state: state.log_likelihood), MAX_ITERATIONS)
         difference = state.x[X.shape[2] :]
         made = float(np.square(Z @ difference).mean()) * state.share * (1 - state.share)
         left = state.variance * r.size / max(r.size - state.used, 1.0) * TAILS / (TAILS - 2)
@@ -200,7 +200,7 @@ class _Mixture:
 
 @dataclass(frozen=True, eq=False)
 class _State:
-    """One round of expectation maximisation."""
+    """State of the expectation maximisation after an iteration."""
 
     probability: Float64[np.ndarray, " rows"]
     weights: Float64[np.ndarray, "2 rows"]
@@ -213,31 +213,34 @@ class _State:
 
 @dataclass(frozen=True, eq=False)
 class _Em:
-    """Expectation maximisation for rows `r = X x + w Z m + e`."""
+    """Expectation maximisation for rows `r = X x + w Z m + e` with t-distributed errors e."""
 
     r: Float64[np.ndarray, "rows values"]
     X: Float64[np.ndarray, "rows values common"]
     Z: Float64[np.ndarray, "rows values numbers"]
     precision: Float64[np.ndarray, " unknowns"]
 
-    def begin(self, probability: Float64[np.ndarray, " rows"]) -> _State:
-        """Begin with probabilities of the second population."""
+    def start(self, probability: Float64[np.ndarray, " rows"]) -> _State:
+        """Return the initial state for given probabilities of the second population."""
         variance = float(np.square(self.r).mean())
         ones = np.ones((2, len(self.r)))
         return _State(probability, ones, np.zeros(len(self.precision)), 0.5, variance, 0.0, -np.inf)
 
-    def run(self, state: _State, rounds: int) -> _State:
-        """Go on for some rounds, or until the probabilities have settled."""
-        for _ in range(rounds):
+    def run(self, state: _State, iterations: int) -> _State:
+        """Iterate until convergence, or for a number of iterations."""
+        for _ in range(iterations):
             before = state
             state = self._step(state)
             change = np.abs(state.probability - before.probability).max(initial=0.0)
-            if change < SETTLED and abs(state.variance / before.variance - 1) < SETTLED:
+            if (
+                change < CONVERGENCE_TOLERANCE
+                and abs(state.variance / before.variance - 1) < CONVERGENCE_TOLERANCE
+            ):
                 break
         return state
 
     def _step(self, state: _State) -> _State:
-        """Fit everything with the present probabilities, and compute new ones."""
+        """Solve for the unknowns with the current probabilities (M step), and update these (E step)."""
         second = state.probability * state.weights[1]
         total = (1 - state.probability) * state.weights[0] + second
         rows, values, common = self.X.shape
@@ -258,7 +261,7 @@ class _Em:
         return _State(fresh, weights, x, share, variance, used, log_likelihood)
 
     def squares(self, x: Float64[np.ndarray, " unknowns"]) -> Float64[np.ndarray, "2 rows"]:
-        """Squared lengths of what is left of every row in either population."""
+        """Compute the squared residuals of every row under either population."""
         common = self.X.shape[2]
         left = self.r - self.X @ x[:common]
         return np.stack([np.square(left).sum(1), np.square(left - self.Z @ x[common:]).sum(1)])
@@ -266,7 +269,7 @@ class _Em:
     def probabilities(
         self, x: Float64[np.ndarray, " unknowns"], share: float, variance: float
     ) -> tuple[Float64[np.ndarray, " rows"], float]:
-        """Probability that a row is of the second population, and the logarithm of the likelihood of all."""
+        """Compute the probability that a row belongs to the second population, and the log likelihood of all rows."""
         values = self.r.shape[1]
         logs = -(TAILS + values) / 2 * np.log1p(self.squares(x) / variance / TAILS)
         if not self.Z.shape[2]:

@@ -1,4 +1,4 @@
-"""Whether frame or tool moved while the rows were measured: residuals, tested against the order of the rows."""
+"""Motions of a frame or a tool while the rows were measured, found from the residuals in the order of the rows."""
 
 import math
 from collections.abc import Callable, Iterator, Sequence
@@ -16,20 +16,21 @@ from pisigma.calibration.hybrid.result import HybridResult
 from pisigma.estimation.loss import HampelLoss
 from pisigma.validation.setup_faults.ordered_rows import OrderedRows, inverse_of
 
-FEWEST_ROWS = 3
-"""Measured before and after a motion, at least."""
-MOST_USED = 0.8
-"""Share of the values that parameters and motions may use up, or the fit follows the noise, whose size it finds."""
+MIN_ROWS = 3
+"""Rows that must be measured before and after a motion."""
+MAX_USED = 0.8
+"""Share of the values that parameters and motions may use up; with more, the fit follows the noise, which it also
+estimates."""
 DEGREES = (1, 3, 6)
-"""Of the polynomials in the share of the rows that were measured which slow motions follow."""
+"""Degrees of the polynomials of slow motions, as functions of the share of the rows measured so far."""
 AS_LIKELY = 0.5
-"""Share of the largest log Bayes factor from which on a motion where a frame begins explains the residuals as well."""
+"""Share of the largest log Bayes factor above which a motion at the start of a frame explains the residuals too."""
 CAP = 3.0
-"""Residuals longer than so many times their upper quartile count as so long while the row of a motion is sought."""
-ROUNDS = 6
-"""Of reweighting at most."""
-SETTLED = 1e-2
-"""Weights and the noise have settled that change by less."""
+"""Residuals are clipped at this multiple of the upper quartile of their lengths while the row of a motion is sought."""
+MAX_ITERATIONS = 6
+"""Iterations of the reweighting."""
+CONVERGENCE_TOLERANCE = 1e-2
+"""Largest change of the weights, and relative change of the noise, at convergence."""
 _LOSS = HampelLoss()
 _Moved = Literal["frame", "target", "tool"]
 
@@ -40,15 +41,15 @@ class Motion:
 
     Attributes:
         moved: "frame", "target" (one of several on the tool) or "tool".
-        name: of the frame or the target.
+        name: name of the frame or the target.
         rows: numbers of its rows in the measurements, in the order of the file.
-        first: index in `rows` of the first row that moved; None where it moves slowly all the time.
-        shift: mean shift of the measured points after the motion [m], in their frame, or of a tool in that of the
-            flange; of a slow motion the largest one since the first row.
-        turn: angle by which frame or tool are turned [rad]; of a slow motion likewise.
-        log_bayes_factor: logarithm of the odds of the motion against none, if both were as likely before.
-        factor: how many times as large as without the motion the errors of the rows are.
-        begins_frame: whether a target or the tool has moved just where rows of another frame begin.
+        first: index in `rows` of the first row after the motion; None for a slow motion over all rows.
+        shift: mean shift of the measured points [m], in their frame, or for a tool in the flange frame; for a slow
+            motion the largest one since the first row.
+        turn: rotation angle of the frame or tool [rad]; for a slow motion likewise.
+        log_bayes_factor: logarithm of the odds of the motion against none, at equal prior odds.
+        factor: errors of the rows over those without the motion [1].
+        begins_frame: whether a target or the tool moved exactly where rows of another frame start.
     """
 
     moved: _Moved
@@ -63,30 +64,31 @@ class Motion:
 
 
 def find_motion(result: CalibrationResult | HybridResult) -> Motion | None:
-    """Find the motion of frame or tool that explains the residuals of a calibration best, likely or not.
+    """Find the motion of frame or tool that explains the residuals of a calibration best, whether likely or not.
 
-    A frame or a tool that is moved from row k on shifts the values of these rows by `Z_i m` with six numbers m. The
-    residuals r of the calibration, linear in its parameters and in a short series of the joint values, x, say how
-    likely that is: `r = X x + Z_k m + e`. How much of them is explained has a closed form for every k, from sums over
-    the rows behind it; far-off residuals are cut off for that. The best k is then fitted with far-off rows counting
-    less. Slow motions `Σ P_d(t) m_d`, polynomials of the share t of the rows that were measured, are fitted likewise.
+    A frame or a tool that moves before row k shifts the values of the rows from k by `Z_i m` with six unknowns m. The
+    model of the residuals r is linear in m and in x, the parameters of the calibration and the weights of a short
+    series of the joint values: `r = X x + Z_k m + e`. The explained sum of squares has a closed form for every k, from
+    sums over the later rows, for which large residuals are clipped. The best k is then fitted by iteratively reweighted
+    least squares. Slow motions `Σ P_d(t) m_d`, polynomials of the share t of the rows measured so far, are fitted in
+    the same way.
 
     The Bayes factor is that of Zellner's g-prior for m with unit information (Liang et al. 2008, JASA 103, 410-423,
-    eq. 6), over the number of rows k that were tried. What neighbours in the order of the rows have in common, because
-    the geometry does not explain everything and they were measured along a path, or repeat a pose, is no independent
-    value: their number is divided by the sum of the autocorrelations (Geyer 1992, Statistical Science 7, 473-483) or by
-    the design effect of repeated poses (Kish 1965), whichever is larger; and by how many times fewer principal
-    components than values the residuals of a row have, `values · tr(C²) / tr(C)²` with their covariance C.
+    eq. 6), divided by the number of rows k that were tried. Residuals of successive rows are correlated, because the
+    geometry does not explain everything and rows were measured along a path or repeat a pose. Therefore the number of
+    values is divided by the sum of the autocorrelations (Geyer 1992, Statistical Science 7, 473-483) or by the design
+    effect of repeated poses (Kish 1965), whichever is larger, and by the ratio of values to effective principal
+    components of a row's residuals, `values · tr(C²) / tr(C)²` with their covariance C.
 
     Returns:
-        None where no position or orientation was measured, or there are too few rows.
+        None if no position or orientation was measured, or if there are too few rows.
     """
     rows = OrderedRows.of(result)
     if rows is None:
         return None
     search = _Search(rows)
     fits = [search.fit(candidate) for candidate in search.candidates()]
-    # Which one it is: as if values were independent, as what a wrong candidate leaves is correlated.
+    # Candidates are compared as if all values were independent: the residuals of a wrong candidate are correlated.
     odds = [search.log_bayes_factor(fit, 1.0) for fit in fits]
     if not fits:
         return None
@@ -99,14 +101,14 @@ def find_motion(result: CalibrationResult | HybridResult) -> Motion | None:
 
 @dataclass(frozen=True, eq=False)
 class _Candidate:
-    """What may have moved.
+    """A motion that is tried.
 
     Attributes:
         moved: see `Motion`.
-        number: of the frame or the target.
-        index: of its rows, in the order of the file.
-        full: derivative by its motion.
-        course: share of every motion that a row has made: 0 or 1 where it moved at once.
+        number: number of the frame or the target.
+        index: indices of its rows, in the order of the file.
+        full: derivative of their values by its motion.
+        course: share of every motion completed at each row: 0 or 1 for a sudden motion.
         first: see `Motion`.
     """
 
@@ -119,29 +121,29 @@ class _Candidate:
 
     @cached_property
     def columns(self) -> Float64[np.ndarray, "own values motions"]:
-        """Derivative by all its motions."""
+        """Derivative of the rows' values by all its motions."""
         return np.concatenate([self.full * course[:, None, None] for course in self.course.T], 2)
 
     @property
     def tried(self) -> int:
-        """How many candidates it was chosen from."""
-        return 1 if self.first is None else len(self.index) - 2 * FEWEST_ROWS
+        """Number of candidates that it was chosen from."""
+        return 1 if self.first is None else len(self.index) - 2 * MIN_ROWS
 
     def from_row(self, first: int) -> "_Candidate":
-        """The same moved from a row on."""
+        """Return the candidate with a sudden motion before a row."""
         return replace(self, first=first, course=(np.arange(len(self.index)) >= first)[:, None] * 1.0)
 
 
 @dataclass(frozen=True, eq=False)
 class _Fit:
-    """A candidate fitted together with the parameters of the calibration, far-off rows counting less.
+    """Robust fit of a candidate together with the parameters of the calibration.
 
     Attributes:
-        candidate: what was fitted.
-        motion: its motions.
-        after: residuals that are left.
-        scale: standard deviation of one of them, per sensor.
-        effective: how many unknowns the values determine, the motions among them.
+        candidate: the candidate.
+        motion: its estimated motions.
+        after: remaining residuals.
+        scale: standard deviation of one residual, per sensor.
+        effective: effective number of unknowns, including the motions.
     """
 
     candidate: _Candidate
@@ -152,17 +154,17 @@ class _Fit:
 
     @property
     def shifts(self) -> Float64[np.ndarray, "own values"]:
-        """What the motion makes of the rows' values."""
+        """Changes of the rows' values by the motion."""
         shifts: np.ndarray = self.candidate.columns @ self.motion
         return shifts
 
     @property
     def weights(self) -> Float64[np.ndarray, "rows values"]:
-        """How much every value counts."""
+        """Weight of every value."""
         return _by_sensor(self.after, self.scale, _LOSS.weight)
 
     def costs(self, residual: Float64[np.ndarray, "rows values"]) -> Float64[np.ndarray, " rows"]:
-        """What every row costs with some residuals."""
+        """Compute the robust cost of every row for given residuals."""
         cost: np.ndarray = _by_sensor(residual, self.scale, _LOSS.cost).sum(1) / 3
         return cost
 
@@ -178,27 +180,27 @@ class _Search:
     rows: OrderedRows
 
     def candidates(self) -> Iterator[_Candidate]:
-        """Everything that may have moved: at once, from the row on that explains most, or slowly."""
+        """Yield everything that may have moved, suddenly at the best row or slowly."""
         lengths = np.linalg.norm(self.rows.residual, axis=1)
         longest = CAP * np.quantile(lengths, 0.75)
         cut = self.rows.residual * np.minimum(1.0, longest / np.maximum(lengths, 1e-300))[:, None]
         for candidate in self._rigid():
             count = len(candidate.index)
-            if count > 2 * FEWEST_ROWS:
+            if count > 2 * MIN_ROWS:
                 yield candidate.from_row(self._best_step(cut, candidate))
                 time = (2 * np.arange(count) + 1) / count - 1
                 for degree in DEGREES:
                     yield replace(candidate, course=legvander(time, degree)[:, 1:])
 
     def frame_starts(self, candidate: _Candidate) -> Iterator[_Candidate]:
-        """The same motion at once of a target or the tool, where rows of another frame begin."""
+        """Yield sudden motions of the same target or tool where rows of another frame start."""
         frame = self.rows.problem.frame.cpu().numpy()[candidate.index]
         changes = np.flatnonzero(np.diff(frame)) + 1
         if candidate.moved != "frame" and len(changes) < len(self.rows.problem.space.frames):
             yield from (candidate.from_row(int(first)) for first in changes)
 
     def _rigid(self) -> Iterator[_Candidate]:
-        """Frames, targets where there are several, and the tool with all of them."""
+        """Yield frames, targets (if there are several), and the tool with all targets."""
         space = self.rows.problem.space
         tool: _Moved = "target" if len(space.targets) > 1 else "tool"
         kinds: tuple[tuple[_Moved, torch.Tensor, tuple[str, ...]], ...] = (
@@ -223,14 +225,15 @@ class _Search:
             yield _Candidate("tool", 0, np.arange(len(group)), both, np.ones((len(group), 1)))
 
     def _best_step(self, residual: Float64[np.ndarray, "rows values"], candidate: _Candidate) -> int:
-        """The row from which on a motion explains most of the residuals, in closed form for all rows."""
+        """Find the row of the sudden motion that explains most of the residuals, in closed form for all rows."""
         index, Z, X = candidate.index, candidate.full, self.rows.X[candidate.index]
 
         def behind(terms: np.ndarray) -> np.ndarray:
-            """Sums over the rows from every row on."""
+            """Sum over each row and all later ones."""
             sums: np.ndarray = terms[::-1].cumsum(0)[::-1]
             return sums
 
+        # Frisch-Waugh: eliminating x leaves `information · m = gain` for every row, with x's covariance in between.
         ZX, ZZ = behind(np.einsum("nvm,nva->nma", Z, X)), behind(np.einsum("nvm,nvk->nmk", Z, Z))
         pull = np.einsum("nva,nv->a", self.rows.X, residual)
         gain = behind(np.einsum("nvm,nv->nm", Z, residual[index])) - ZX @ self.rows.covariance @ pull
@@ -238,10 +241,10 @@ class _Search:
         information = (ZZ - ZX @ self.rows.covariance @ ZX.transpose(0, 2, 1)) * scale * scale[:, None]
         solution = np.linalg.solve(information + 1e-6 * np.eye(len(scale)), (scale * gain)[..., None])
         explained = (scale * gain * solution[..., 0]).sum(1)
-        return FEWEST_ROWS + int(explained[FEWEST_ROWS : len(index) - FEWEST_ROWS].argmax())
+        return MIN_ROWS + int(explained[MIN_ROWS : len(index) - MIN_ROWS].argmax())
 
     def fit(self, candidate: _Candidate) -> _Fit:
-        """Fit a candidate together with the parameters; where it moved at once, the row is sought once more."""
+        """Fit a candidate together with the parameters; the row of a sudden motion is then searched once more."""
         fit = self.reweighted(candidate)
         if candidate.first is None:
             return fit
@@ -251,18 +254,18 @@ class _Search:
         size = candidate.full.shape[2]
         moved[candidate.index] -= candidate.full @ fit.motion[:size]
         gain = (fit.costs(still) - fit.costs(moved))[candidate.index][::-1].cumsum()[::-1]
-        first = FEWEST_ROWS + int(gain[FEWEST_ROWS : len(gain) - FEWEST_ROWS].argmax())
+        first = MIN_ROWS + int(gain[MIN_ROWS : len(gain) - MIN_ROWS].argmax())
         return fit if first == candidate.first else self.reweighted(candidate.from_row(first))
 
     @cached_property
     def still(self) -> _Fit:
-        """The same without a motion."""
+        """The fit without a motion."""
         nothing = np.zeros((len(self.rows.residual), self.rows.residual.shape[1], 0))
         index = np.arange(len(self.rows.residual))
         return self.reweighted(_Candidate("frame", 0, index, nothing, np.zeros((len(index), 1))))
 
     def reweighted(self, candidate: _Candidate) -> _Fit:
-        """Iteratively reweighted least squares, from rows of full weight on."""
+        """Fit a candidate by iteratively reweighted least squares, starting with full weights."""
         size, motions = self.rows.X.shape[2], candidate.columns.shape[2]
         A = np.concatenate([self.rows.X, np.zeros((*self.rows.X.shape[:2], motions))], 2)
         A[candidate.index, :, size:] = candidate.columns
@@ -270,7 +273,7 @@ class _Search:
         held = np.diag(np.concatenate([self.rows.precision, np.zeros(motions)]))
         left = max(1 - (self.rows.used + motions) / self.rows.values, 1e-2)
         weight, scale = np.ones_like(self.rows.residual), np.ones(self.rows.residual.shape[1] // 3)
-        for _ in range(ROUNDS):
+        for _ in range(MAX_ITERATIONS):
             weighted = A * (weight / np.repeat(scale, 3) ** 2).reshape(-1, 1)
             normal = weighted.T @ A
             covariance = inverse_of(normal + held)
@@ -280,30 +283,38 @@ class _Search:
             effective = float(np.einsum("ij,ji->", covariance, normal))
             fit = _Fit(candidate, x[size:], after, tuple(scale.tolist()), effective)
             before, weight = weight, fit.weights
-            if np.abs(weight - before).max() < SETTLED and np.abs(scale / old - 1).max() < SETTLED:
+            changes = np.abs(weight - before).max(), np.abs(scale / old - 1).max()
+            if max(changes) < CONVERGENCE_TOLERANCE:
                 break
         return fit
 
-    def log_bayes_factor(self, fit: _Fit, values_of_one: float) -> float:
-        """Logarithm of the odds of a candidate against no motion, where so many values say as much as one.
+    def log_bayes_factor(self, fit: _Fit, values_per_independent: float) -> float:
+        """Compute the log odds of a candidate against no motion.
 
-        Where motions and parameters use up nearly all values, nothing is left that contradicts them: no odds.
+        If motions and parameters use up nearly all values, nothing can contradict them: the odds are 0.
+
+        Args:
+            fit: of the candidate.
+            values_per_independent: number of values per independent value.
         """
-        if fit.effective > MOST_USED * self.rows.values:
+        if fit.effective > MAX_USED * self.rows.values:
             return -math.inf
-        values = max(min((self.rows.values - self.rows.used) / values_of_one, self.rows.independent), 1.0)
+        values = max(
+            min((self.rows.values - self.rows.used) / values_per_independent, self.rows.independent), 1.0
+        )
         before = min(float(fit.costs(residual).sum()) for residual in (self.rows.residual, self.still.after))
         left = float(fit.costs(fit.after).sum()) / max(before, 1e-300)
         gain = (values - len(fit.motion)) * math.log1p(values) - values * math.log1p(values * min(left, 1.0))
         return gain / 2 - math.log(fit.candidate.tried)
 
-    def values_of_one(self, fit: _Fit) -> float:
-        """How many values say as much as one that is independent, by what a candidate leaves."""
+    def values_per_independent(self, fit: _Fit) -> float:
+        """Estimate the number of values per independent value from the correlation of the residuals."""
         left = fit.after * np.sqrt(fit.weights)
         own = left[fit.candidate.index]
         total = max(float((own**2).sum()), 1e-150)
         together: float = own.shape[1] * float(np.square(own.T @ own).sum()) / total**2
         alike = 1.0
+        # Geyer's initial positive sequence: sums of two successive autocorrelations, up to the first negative one.
         for lag in range(1, len(own) // 2, 2):
             two = sum(float((own[near:] * own[:-near]).sum()) for near in (lag, lag + 1)) / total
             if two < 0:
@@ -317,14 +328,14 @@ class _Search:
         return together * float(max(alike, repeated, 1.0))
 
     def motion(self, fit: _Fit) -> Motion:
-        """Say what a fit means, in metres and radians."""
+        """Convert a fit to a motion in metres and radians."""
         candidate = fit.candidate
         weight = fit.weights[candidate.index]
         left = (weight * fit.after[candidate.index] ** 2).sum(0) / np.maximum(weight.sum(0), 1e-300)
         parts = zip(_sensors(fit.shifts.var(0)[None]), _sensors(left[None]), strict=True)
         factor = max(math.sqrt(1 + added.sum() / max(rest.sum(), 1e-300)) for added, rest in parts)
         course = candidate.course - candidate.course[0]
-        whole = course @ fit.motion.reshape(-1, candidate.full.shape[2])  # what every row has made of it
+        whole = course @ fit.motion.reshape(-1, candidate.full.shape[2])  # motion completed at every row
         largest = whole[np.linalg.norm(candidate.full[:, :3] @ whole[..., None], axis=(1, 2)).argmax()]
         shift, turn = largest[:3], largest[:2:-1]  # about x, y, z, stored as roll, pitch, yaw
         names = self.rows.problem.space.targets
@@ -341,12 +352,12 @@ class _Search:
             candidate.first,
             shift,
             float(np.linalg.norm(turn)),
-            self.log_bayes_factor(fit, self.values_of_one(fit)),
+            self.log_bayes_factor(fit, self.values_per_independent(fit)),
             factor,
         )
 
     def _center(self, rows: Int64[np.ndarray, " chosen"]) -> Float64[np.ndarray, " 3"]:
-        """Mean of the measured positions of some rows [m]; 0 where there are none."""
+        """Compute the mean measured position of some rows [m]; 0 if there is none."""
         position = self.rows.result.solved.measurements.position
         if position is None:
             return np.zeros(3)
@@ -355,12 +366,12 @@ class _Search:
 
 
 def _sensors(values: Float64[np.ndarray, "rows values"]) -> Sequence[Float64[np.ndarray, "rows 3"]]:
-    """The values of every sensor."""
+    """Split the values by sensor."""
     return np.split(values, values.shape[1] // 3, 1)
 
 
 def _scale(residual: Float64[np.ndarray, "rows 3"]) -> float:
-    """Standard deviation of one value, by the median of the rows that were measured."""
+    """Estimate the standard deviation of one value from the median of the measured rows."""
     lengths = np.linalg.norm(residual, axis=1)
     if not lengths.any():
         return 1.0
@@ -372,6 +383,6 @@ def _by_sensor(
     scale: Sequence[float],
     function: Callable[[torch.Tensor, int], torch.Tensor],
 ) -> Float64[np.ndarray, "rows values"]:
-    """A function of the length of every sensor's values over its scale, once for each of them."""
+    """Apply a function to the scaled length of every sensor's values, and repeat the result for its components."""
     lengths = [np.linalg.norm(part, axis=1) / one for part, one in zip(_sensors(values), scale, strict=True)]
     return np.repeat(np.stack([function(torch.from_numpy(one), 3).numpy() for one in lengths], 1), 3, axis=1)

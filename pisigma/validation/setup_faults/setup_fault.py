@@ -1,4 +1,4 @@
-"""A setup fault, as it is reported."""
+"""A setup fault that explains large errors, as it is reported."""
 
 import math
 from collections.abc import Sequence
@@ -12,19 +12,20 @@ from pisigma.validation.setup_faults.hypothesis import COLLAPSED, Hypothesis
 
 @dataclass(frozen=True)
 class SetupFault:
-    """An explanation under which the errors collapse.
+    """A setup fault that explains the errors: corrected, they fall to a quarter or less.
 
     Attributes:
-        kinds: those that it is about, see `Cause.kind`.
+        kinds: kinds of its causes, see `Cause.kind`.
         clause: what is wrong, such as "the sign of joint 3 is reversed".
         advice: what to check.
         before: root mean square of the position errors [m].
-        after: what it falls to [m].
-        after_nominal: what that of the nominal robot falls to [m]; NaN where the explanation is about the correction.
-        before_rotation: as `before`, of the rotation errors [rad]; NaN where none was measured.
-        after_rotation: what it falls to [rad].
-        moved: how far the zeros of joints have moved at most [rad or m]; infinite where it is about something else.
-        joints: those that it is about, from 0.
+        after: the same with the fault corrected [m].
+        after_nominal: the same of the nominal robot [m]; NaN if the fault concerns the joint correction.
+        before_rotation: root mean square of the rotation errors [rad]; NaN if none was measured.
+        after_rotation: the same with the fault corrected [rad].
+        moved: largest motion of a joint zero [rad or m]; infinite for faults of other kinds.
+        joints: indices of the joints concerned, from 0.
+        amounts: amount of every cause, see `Cause.amount`.
     """
 
     kinds: tuple[str, ...]
@@ -37,15 +38,16 @@ class SetupFault:
     after_rotation: float
     moved: float = math.inf
     joints: tuple[int, ...] = ()
+    amounts: tuple[float, ...] = ()
 
     @property
     def explains_orientation(self) -> bool:
-        """Whether the rotation errors are among what it explains."""
+        """Whether the fault explains the rotation errors too."""
         return self.after_rotation <= COLLAPSED * self.before_rotation
 
     @property
     def sentence(self) -> str:
-        """What is wrong, what the errors fall to without it, and what to check."""
+        """What is wrong, what the errors fall to with it corrected, and what to check."""
         clause = self.clause[:1].upper() + self.clause[1:]
         if not np.isfinite(self.after):
             return f"{clause}; {self.advice}."
@@ -55,10 +57,22 @@ class SetupFault:
             fall += f" and from {degrees[0]:.3g} deg to {degrees[1]:.3g} deg"
         if np.isfinite(self.after_nominal):
             fall += f" (those of the nominal robot to {length_text(self.after_nominal)})"
-        return f"{clause}: with this set right, the errors fall {fall}; {self.advice}."
+        return f"{clause}: with this corrected, the errors fall {fall}; {self.advice}."
+
+    @property
+    def cause(self) -> str:
+        """The kinds of its causes in one word, such as "joint_sign" or "frame+tool"; see `Diagnostic.cause`."""
+        return "+".join(self.kinds)
+
+    @property
+    def values(self) -> dict[str, float | int | str | tuple[int, ...]]:
+        """The numbers of the sentence; joints count from 1; see `Diagnostic.values`."""
+        figures = {"before_mm": self.before * 1e3, "after_mm": self.after * 1e3}
+        finite = {name: value for name, value in figures.items() if np.isfinite(value)}
+        return {**finite, "joints": tuple(joint + 1 for joint in self.joints)}
 
     def to_json(self) -> dict[str, object]:
-        """Return kinds, sentence and figures in mm and, where measured, in deg."""
+        """Return kinds, sentence and errors in mm and, if measured, in deg."""
         figures = {
             "before_rms_mm": self.before * 1e3,
             "after_rms_mm": self.after * 1e3,
@@ -71,7 +85,7 @@ class SetupFault:
 
 
 def either(faults: Sequence[SetupFault]) -> SetupFault:
-    """Join faults that explain the errors about equally well, the best first, as alternatives."""
+    """Combine faults that explain the errors about equally well, the best first, into one with alternatives."""
     clauses = dict.fromkeys(fault.clause for fault in faults)
     advice = dict.fromkeys(fault.advice for fault in faults)
     return replace(
@@ -80,7 +94,7 @@ def either(faults: Sequence[SetupFault]) -> SetupFault:
 
 
 def fault_of(here: Hypothesis, other: Hypothesis, after_nominal: float) -> SetupFault:
-    """Report a hypothesis with what the errors are here, and what they and those of the nominal robot [m] fall to."""
+    """Make the fault of a hypothesis, with the errors before (`here`) and after, and those of the nominal robot [m]."""
     (before, before_rotation), (after, after_rotation) = here.rms(), other.rms()
     return SetupFault(
         kinds=tuple(cause.kind for cause in other.causes),
@@ -93,4 +107,5 @@ def fault_of(here: Hypothesis, other: Hypothesis, after_nominal: float) -> Setup
         after_rotation=after_rotation,
         moved=max(cause.moved for cause in other.causes),
         joints=tuple(joint for cause in other.causes for joint in cause.joints),
+        amounts=tuple(cause.amount for cause in other.causes),
     )

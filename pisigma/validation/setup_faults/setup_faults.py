@@ -1,4 +1,4 @@
-"""The usual setup faults behind large errors of a model, recognised by trying each on the data."""
+"""Search for the usual setup faults that explain large errors of a model, by trying each on the data."""
 
 from collections.abc import Collection
 from dataclasses import replace
@@ -21,7 +21,7 @@ from pisigma.validation.setup_faults.explanations import (
     simplest,
 )
 from pisigma.validation.setup_faults.faults_as_drawn import (
-    MOST_ROWS,
+    MAX_ROWS,
     find_faults_as_drawn,
     measured_rows,
     spread,
@@ -31,7 +31,7 @@ from pisigma.validation.setup_faults.joint_faults import NOTICED
 from pisigma.validation.setup_faults.setup_fault import SetupFault, fault_of
 
 CAUSES = {"base": "frame", "tool": "tool"}
-"""Kind of the cause that a base or a tool has moved."""
+"""Kind of the cause "moved" by the kind of frame."""
 
 
 @torch.no_grad()
@@ -42,29 +42,29 @@ def find_setup_faults(
     fitted: Collection[FrameKind] = (),
     frames_only: bool = False,
 ) -> tuple[SetupFault, ...]:
-    """Find what makes the errors of a model collapse to a quarter or less, the simplest first.
+    """Find setup faults that reduce the errors of a model to a quarter or less, the simplest first.
 
-    Tried are: another frame and another tool (rigid transforms that fit best), positions in other units or mirrored,
-    orientations in another convention, rows shifted against each other, degrees for radians, millimetres for metres and
-    the reverse in joint columns, all orders and all signs of the joints, pairs of coupled joints, zeros moved by
-    quarter turns or one zero moved by anything, and a correction that was applied once more or once less than logged;
-    each also together with another frame and tool, which a new set-up of the sensor has. Several are returned where
-    they explain equally well. Where nothing explains the errors, the robot as drawn is tried: see
+    The hypotheses are: another frame and another tool (best-fitting rigid transforms), positions in other units or
+    mirrored, orientations in another convention, shifted rows, degrees for radians or millimetres for metres (and vice
+    versa) in joint columns, all orders and signs of the joints, pairs of coupled joints, zeros moved by multiples of 90
+    deg or one zero moved by any amount, and a correction that was applied once more or once less than logged; each also
+    together with another frame and tool, as after a new setup of the sensor. Several faults are returned if they
+    explain the errors equally well. If nothing explains the errors, the nominal robot is tried; see
     `find_faults_as_drawn`.
 
     Args:
         model: the model.
-        nominal: the nominal robot with the base and tool that suit it best; only shows what its errors fall to.
-            None not to show that.
-        measurements: rows with positions in frames and of targets that the model has; limits do not matter.
-        fitted: whether frames or targets are fitted anew: then any will do, and that one has moved is no fault.
-        frames_only: try only that frames or tools have moved.
+        nominal: the nominal robot with base and tool fitted, to report its errors after the correction; None not to
+            report them.
+        measurements: rows with positions in frames and of targets of the model; joint limits are not considered.
+        fitted: frames or targets that are fitted to the rows: any name is allowed, and a motion is not a fault.
+        frames_only: try only motions of frames and tools.
 
     Returns:
-        Nothing where errors are below 0.02 mm, or where nothing explains them.
+        Empty if the errors are below 0.02 mm, or if nothing explains them.
     """
     judged = judged_values(model, measurements)
-    some = judged.select(spread(measured_rows(judged), MOST_ROWS))
+    some = judged.select(spread(measured_rows(judged), MAX_ROWS))
     known = with_names_of(model, some, fitted)
     T = poses_of_rows(model, known)
     predicted = torch.isfinite(T).flatten(1).all(-1)
@@ -93,7 +93,7 @@ def find_setup_faults(
 
 
 def _nominal_error(nominal: CalibratedModel | None, some: Measurements, other: Hypothesis) -> float:
-    """Compute the root mean square of the position errors [m] of the nominal robot under a hypothesis."""
+    """Compute the RMS position error [m] of the nominal robot under a hypothesis."""
     kinds = {cause.kind for cause in other.causes}
     if nominal is None or "correction" in kinds:
         return float("nan")
@@ -104,17 +104,17 @@ def _nominal_error(nominal: CalibratedModel | None, some: Measurements, other: H
 
 
 def judged_values(model: CalibratedModel, measurements: Measurements) -> Measurements:
-    """Leave orientations out that a model does not know."""
+    """Leave out orientations if the model does not know that of its tool."""
     if has_orientation(model):
         return measurements
     return replace(measurements, rotation=None, sigma_rotation=None)
 
 
 def is_implausible(figures: ModelFigures, model: CalibratedModel) -> bool:
-    """Say whether errors of positions or of orientations are too large to be those of a calibrated robot.
+    """Say whether errors of positions or of orientations are too large for a calibrated robot.
 
     Args:
-        figures: of the model, or of another with its base and tool.
+        figures: figures of the model, or of another one with its base and tool.
         model: the model.
     """
     reach, orientation = model.robot.reach, figures.orientation if has_orientation(model) else None
@@ -123,11 +123,11 @@ def is_implausible(figures: ModelFigures, model: CalibratedModel) -> bool:
 
 
 def unexplained(model: CalibratedModel) -> str:
-    """Say of implausible errors of a model that no setup fault explains them, and what to check."""
+    """Write that no setup fault explains implausible errors of a model, and what to check."""
     limit, turn = PLAUSIBLE_SHARE * model.robot.reach * 1e3, np.rad2deg(PLAUSIBLE_TURN)
     return (
-        f"Errors of more than {limit:.3g} mm or {turn:.2g} deg are no calibration errors, but no usual setup fault "
+        f"Errors of more than {limit:.3g} mm or {turn:.2g} deg are not calibration errors, but no usual setup fault "
         "(frame, tool, units, conventions of orientations, shifted rows, order, signs and zeros of the joints, "
         "correction applied twice or not at all) explains them; check whether this robot was measured, and whether the "
-        "rows belong together."
+        "joint values and measurements of each row belong together."
     )

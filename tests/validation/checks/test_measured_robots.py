@@ -9,7 +9,7 @@ import torch
 from testing.checked import checked, kinds_of
 
 from pisigma.calibration.geometric.calibrator import GeometricCalibrator
-from pisigma.files.errors import IdentificationError
+from pisigma.files.errors import ImplausibleError
 from pisigma.measurement.dataset import Measurements
 from pisigma.robot import Robot
 from pisigma.validation.checks.registry import diagnostics_of
@@ -62,13 +62,13 @@ def test_another_robot_is_named(shared_data, robot, measured):
         "other_robot",
         "prior_ratio",
     }
-    assert f"Robot '{measured}' of the catalogue" in diagnostics[0].sentence
+    assert (diagnostics[0].kind, diagnostics[0].cause) == ("other_robot", measured)
 
 
 @pytest.mark.parametrize("distance", [0.005, 0.5])
 def test_a_wrong_distance_of_sockets_is_refused(shared_data, distance):
     rows = rows_of(shared_data, "panda", 1)
-    with pytest.raises(IdentificationError, match="stated distances"):
+    with pytest.raises(ImplausibleError):
         calibrator("panda", rows, distance).fit(rows)
 
 

@@ -1,4 +1,4 @@
-"""Values that were rounded so much that it shows are named with their step; round values without errors are not."""
+"""Coarsely rounded values are reported with their step; round values without errors are not."""
 
 from dataclasses import replace
 
@@ -13,10 +13,11 @@ from pisigma.calibration.geometric.calibrator import GeometricCalibrator
 from pisigma.measurement.dataset import Measurements
 from pisigma.robot import Robot
 from pisigma.validation.checks.rounding import RoundingCheck, joint_rounding
+from pisigma.validation.held_out.diagnostic import Diagnostic
 
 
-def said(robot: Robot, rows: Measurements) -> list[str]:
-    return [one.sentence for one in RoundingCheck().diagnose(checked(GeometricCalibrator(robot), rows))]
+def found(robot: Robot, rows: Measurements) -> list[Diagnostic]:
+    return list(RoundingCheck().diagnose(checked(GeometricCalibrator(robot), rows)))
 
 
 def rounded(arm: OutsideArm, degrees: float) -> np.ndarray:
@@ -29,11 +30,13 @@ def rounded(arm: OutsideArm, degrees: float) -> np.ndarray:
 def test_rounded_joint_values_are_named_with_their_step_and_error(name, degrees):
     arm = OutsideArm(name, 3)
     rows = arm.measured(logged=rounded(arm, degrees))
-    (sentence,) = said(arm.robot, rows)
-    assert f"{degrees:g} deg" in sentence
-    found = joint_rounding(GeometricCalibrator(arm.robot).fit(rows), rows)
+    (diagnostic,) = found(arm.robot, rows)
+    assert diagnostic.cause == "joint_values"
+    rounding = joint_rounding(GeometricCalibrator(arm.robot).fit(rows), rows)
+    step = np.where(arm.robot.revolute, np.deg2rad(degrees), degrees * 1e-3)
+    assert_close(rounding.steps, step)
     moved = arm.true.tip(arm.q)[0] - arm.true.tip(rows.q.numpy())[0]
-    assert_close(found.error, np.sqrt(np.square(moved).sum(1).mean()), rtol=0.15)
+    assert_close(rounding.error, np.sqrt(np.square(moved).sum(1).mean()), rtol=0.15)
 
 
 @pytest.mark.parametrize("name", ARMS)
@@ -42,16 +45,16 @@ def test_poses_at_round_values_and_fine_steps_are_left_alone(name, degrees):
     arm = OutsideArm(name, 5)
     if degrees > 0.05:  # sent to round values
         arm.q = rounded(arm, degrees)
-        assert said(arm.robot, arm.measured()) == []
+        assert found(arm.robot, arm.measured()) == []
     else:
-        assert said(arm.robot, arm.measured(logged=rounded(arm, degrees))) == []
+        assert found(arm.robot, arm.measured(logged=rounded(arm, degrees))) == []
 
 
 def test_rounded_positions_are_named_with_their_step():
     arm = OutsideArm("kr10", 3)
     rows = arm.measured()
     coarse = replace(rows, position=torch.round(rows.position * 1e3) / 1e3)
-    (sentence,) = said(arm.robot, coarse)
-    assert "rounded to 1 mm" in sentence
+    (diagnostic,) = found(arm.robot, coarse)
+    assert (diagnostic.cause, diagnostic.values["step_mm"]) == ("positions", 1.0)
     fine = replace(rows, position=torch.round(rows.position * 1e5) / 1e5)
-    assert said(arm.robot, fine) == []
+    assert found(arm.robot, fine) == []

@@ -11,14 +11,15 @@ from pisigma.calibration.geometric.calibrator import GeometricCalibrator
 from pisigma.validation.checks.temperature import TemperatureCheck
 
 
-@pytest.mark.parametrize(("hottest", "sentences"), [(35.0, 0), (70.0, 1)])
-def test_hot_rows_are_warned_of(hottest: float, sentences: int) -> None:
+@pytest.mark.parametrize(("hottest", "findings"), [(35.0, 0), (70.0, 1)])
+def test_hot_rows_are_warned_of(hottest: float, findings: int) -> None:
     simulated = simulate("ur5", rows=30, noise=5e-5)
     temperature = torch.linspace(20, hottest, 30, dtype=torch.float64)
     temperature[0] = torch.nan
     rows = replace(simulated.measurements, temperature=temperature)
-    said = list(TemperatureCheck().diagnose(checked(GeometricCalibrator(simulated.nominal), rows)))
-    assert len(said) == sentences
-    for diagnostic in said:
+    found = list(TemperatureCheck().diagnose(checked(GeometricCalibrator(simulated.nominal), rows)))
+    assert len(found) == findings
+    for diagnostic in found:
         assert diagnostic.severity == "warning"
-        assert "memory, row 29: 70 deg C is hot for a robot (6 of 30 rows" in diagnostic.sentence
+        assert diagnostic.values == {"hottest": rows.place(29), "temperature": 70.0}
+        assert diagnostic.rows == tuple(rows.place(row) for row in range(24, 30))

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from testing.closeness import assert_close
+from testing.refusals import refused
 
 from pisigma.files.errors import MeasurementError
 from pisigma.validation.held_out import model_comparison as module
@@ -93,9 +94,9 @@ def test_a_single_configuration_has_no_interval():
 
 
 @pytest.mark.parametrize(
-    ("resamples", "seed", "confidence"),
-    [(1, 0, 0.95), (100, 0, 0.0), (100, 0, 1.0), (100, -1, 0.95), (10**10, 0, 0.95)],
+    ("option", "value"),
+    [("resamples", 1), ("resamples", 10**10), ("confidence", 0.0), ("confidence", 1.0), ("seed", -1)],
 )
-def test_refuses_settings_that_give_no_interval(resamples: int, seed: int, confidence: float):
-    with pytest.raises(MeasurementError, match="2 resamples or more and a confidence between 0 and 1"):
-        Bootstrap(resamples, seed, confidence)
+def test_refuses_settings_that_give_no_interval(option: str, value: float):
+    with refused(MeasurementError, option=option, value=value):
+        Bootstrap(**{option: value})

@@ -5,6 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 from testing.closeness import assert_close
+from testing.refusals import refused
 from testing.sensors import ARM, TRUE_BASES, socket_data, touch_data, true_robot
 from testing.simulated_arm import simulate
 
@@ -64,17 +65,14 @@ def test_rows_of_a_target_that_is_seen_once_are_not_judged() -> None:
         "1 rows could not be judged: no row that was calibrated with had their target or anchor."
     ]
     alone = replace(rows, target=tuple(f"target {row}" for row in range(80)))
-    with pytest.raises(
-        IdentificationError, match=r"measure more poses with each, or leave out the cross-validation"
-    ):
+    with refused(IdentificationError) as caught:
         validate(GeometricCalibrator(arm.nominal), alone, k_folds(alone, 4, seed=0))
+    assert caught.value.file.startswith(alone.source)  # the first held-out row
 
 
 def test_too_few_training_rows_name_their_fold() -> None:
     arm = simulate("ur5", rows=12, noise=5e-5)
-    with pytest.raises(
-        IdentificationError, match=r"fold 1 of 4, calibrated with 9 of the 12 rows: .* 9 different"
-    ):
+    with refused(IdentificationError, value="fold 1 of 4"):
         validate(GeometricCalibrator(arm.nominal), arm.measurements, k_folds(arm.measurements, 4, seed=0))
 
 
@@ -133,7 +131,7 @@ def test_a_ball_that_once_missed_its_socket_does_not_move_it() -> None:
 def test_distances_of_sockets_that_no_row_has_are_still_refused() -> None:
     data = socket_data()
     wrong = exact(socket_distances=KNOWN | {("low/0", "low/7"): 0.05})
-    with pytest.raises(IdentificationError, match="no row has it"):
+    with pytest.raises(IdentificationError):
         validate(wrong, data, k_folds(data, None, 0, "placement"))
 
 
@@ -163,9 +161,7 @@ def test_a_held_out_frame_with_several_targets_is_refused() -> None:
     data = touch_data(("right", "left"), count=120)
     two = replace(data, target=("A", "B") * (data.rows // 2))
     frames = {name: tuple(TRUE_BASES[name]) for name in ("right", "left")}
-    with pytest.raises(
-        IdentificationError, match="held out, which needs a single target, but there are A, B"
-    ):
+    with refused(IdentificationError, value=("A", "B")):
         validate(exact(frames=frames), two, k_folds(two, None, 0, "placement"))
 
 

@@ -9,6 +9,7 @@ import pytest
 import torch
 from testing.closeness import assert_close
 from testing.models import hand_made_model
+from testing.refusals import refused
 from testing.report import bare_summary
 
 from pisigma.files.errors import ModelError
@@ -91,8 +92,8 @@ def test_without_a_section_there_are_none(tmp_path):
 
 def test_a_changed_or_missing_file_is_refused(measured, tmp_path):
     text, model = _kept(hand_made_model("kiro3"), _validation(ROWS, False, False), measured)
-    with pytest.raises(ModelError, match="cannot be read"):
+    with pytest.raises(ModelError):
         read_held_out(tmp_path, model)
     (tmp_path / HELD_OUT_CSV).write_text(text.replace("wall", "hall", 1), encoding="utf-8")
-    with pytest.raises(ModelError, match="was changed"):
+    with refused(ModelError, file=tmp_path / HELD_OUT_CSV):
         read_held_out(tmp_path, model)

@@ -8,6 +8,7 @@ import torch
 from testing.closeness import assert_close
 from testing.hybrid import hybrid_of, joints_in
 from testing.models import hand_made_model, joints_around, no_type_checker
+from testing.refusals import refused
 from testing.simulated_arm import simulate
 
 from pisigma.calibration.geometric.calibrator import GeometricCalibrator
@@ -136,12 +137,12 @@ def test_a_model_with_nominal_geometry_has_its_base_and_tool():
     model = hand_made_model("kiro4")
     q = joints_around("kiro4", 5)
     assert_close(nominal_model(model, True).forward(q), forward_kinematics(model.robot, q))
-    with pytest.raises(ModelError, match="has no identified geometry"):
+    with refused(ModelError, value=model.kind):
         geometric_model(model)
 
 
 def test_a_model_without_joint_values_has_no_nominal(arm):
-    with pytest.raises(ModelError, match="cannot be fitted to the 1 joint values that it keeps"):
+    with refused(ModelError, value=1):
         nominal_model(replace(arm[1], starts=arm[1].starts[:1]), False)
 
 
@@ -192,12 +193,12 @@ def test_rows_that_one_does_not_predict_count_for_none():
 def test_nothing_to_compare_is_said(arm):
     _, model = arm
     q = joints_around("ur10", 3)
-    with pytest.raises(IdentificationError, match="anchor 'a' has 3 distances"):
+    with pytest.raises(IdentificationError):
         compare_models(
             {"m": model},
             Measurements(q=q, distance=torch.ones(3).double(), anchor=("a", "a", "a")),
         )
-    with pytest.raises(MeasurementError, match="expected positions"):
+    with refused(MeasurementError, expected="positions, balls in sockets, wires, pairs or touches"):
         compare_models({"m": model}, Measurements(q=q, position=torch.full((3, 3), torch.nan).double()))
 
 

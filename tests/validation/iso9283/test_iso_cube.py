@@ -3,6 +3,7 @@
 import pytest
 import torch
 from testing.closeness import assert_close
+from testing.refusals import refused
 
 from pisigma.files.errors import MeasurementError
 from pisigma.validation.iso9283.cube import PLANES, IsoCube, largest_cube
@@ -35,11 +36,9 @@ def test_poses_lie_on_diagonals_of_a_plane_through_the_centre(plane: str, share:
 
 
 def test_what_the_standard_does_not_allow_is_refused():
-    with pytest.raises(
-        MeasurementError, match=r"0.08 to 0.12 of the diagonal from its ends were wanted, got 0.2"
-    ):
+    with refused(MeasurementError, option="share", value=0.2):
         CUBE.poses(share=0.2)
-    with pytest.raises(MeasurementError, match="plane 'C1-C2-C7' is unknown; did you mean"):
+    with refused(MeasurementError, option="plane", value="C1-C2-C7"):
         CUBE.poses("C1-C2-C7")
 
 
@@ -68,5 +67,5 @@ def test_the_whole_region_and_nothing():
     whole = largest_cube(lambda p: torch.ones(len(p), dtype=torch.bool), *REGION, spacing=0.1)
     assert_close(whole.edge, 2.0, atol=1e-12)
     assert_close(whole.centre, torch.zeros(3), atol=1e-12)
-    with pytest.raises(MeasurementError, match=r"no cube with an edge of 0.1 m lies within the workspace"):
+    with refused(MeasurementError, option="spacing", value=0.1):
         largest_cube(lambda p: p.norm(dim=-1) < 0.05, *REGION, spacing=0.1)

@@ -1,4 +1,4 @@
-"""Maps of logged joint values: what they do, and that every fault stands once."""
+"""Maps of logged joint values: what they do, and that every fault appears once."""
 
 import torch
 from testing.closeness import assert_close
@@ -29,7 +29,7 @@ def test_joint_maps(generator):
     )
 
 
-def test_every_fault_stands_once_and_changes_something():
+def test_every_fault_appears_once_and_changes_something():
     scara, arm = Robot.load("kiro3"), Robot.load("ur5")
     counts = {
         "signs": (reversed_signs(6), 2**6 - 1),
@@ -49,9 +49,8 @@ def test_every_fault_stands_once_and_changes_something():
         assert not bool((rows == same).all(1).any()), name
 
 
-def test_the_advice_on_coupled_joints_knows_a_stated_coupling():
+def test_the_advice_on_coupled_joints_depends_on_a_stated_coupling():
     (unstated,) = joint_causes(coupled_joints(6), 0, Robot.load("ur5"))
     (stated,) = joint_causes(coupled_joints(6), 0, coupled_robot())
-    assert unstated.clause == stated.clause
-    assert "state the coupling in the robot file" in unstated.advice
-    assert "log what the controller shows" in stated.advice
+    assert (unstated.kind, unstated.joints, unstated.clause) == (stated.kind, stated.joints, stated.clause)
+    assert unstated.advice != stated.advice

@@ -1,1 +1,1 @@
-"""Checks of rows against a model or a robot, one file each, before anything is concluded from them."""
+"""Checks of rows against a model or a robot, one file each, before the rows are used for anything."""

@@ -1,4 +1,4 @@
-"""Whether only some of the rows agree with a model, and the others with something else."""
+"""Whether only some of the rows agree with a model, and the others belong to another setup."""
 
 from collections.abc import Iterator
 
@@ -16,34 +16,34 @@ from pisigma.validation.setup_faults.cause import joined, length_text
 from pisigma.validation.setup_faults.setup_fault import either
 from pisigma.validation.setup_faults.setup_faults import find_setup_faults
 
-MOST_WRONG = 0.25
-"""Share of the rows beyond which it is not known which of them are wrong."""
-FEWEST_AGREEING = 0.35
-"""Share of the rows that agree with the model where the others are of something else."""
+MIN_WRONG_SHARE = 0.25
+"""Share of the rows above which it is not known which of them are wrong."""
+MIN_AGREEING_SHARE = 0.35
+"""Share of the rows that must agree with the model."""
 AGREES = 3.5
-"""Rows agree with a model that are within so many times of what it and the sensor usually err."""
+"""Error over the expected one (model and sensor) up to which a row agrees with a model."""
 APART = 2.0
-"""Rows are of something else that are farther off than those that agree by this factor at least."""
+"""Multiple of the limit `AGREES` above which a row belongs to another setup."""
 FAR_APART = 6.0
-"""The typical errors of both differ by this factor at least."""
+"""Ratio of the median errors of both groups."""
 BETWEEN = 0.15
 """Share of the rows that may be neither near nor far."""
 DRAWS, SAMPLE = 100, 4
-"""Small sets of rows to which a base or a tool is fitted, besides halves of the file and every second row."""
+"""Number and size of the random samples that a base or a tool is fitted to, as are halves and every second row."""
 SPARE_ROWS = 3
-"""Rows beyond those of a set that agree with what was fitted to it."""
-ADVICE = " Nothing is concluded from them together; measure again, or give each group a file or a frame of its own."
+"""Rows that must agree with a fit in addition to those of its sample."""
+ADVICE = " No result is computed from all of them; measure again, or give each group its own file or frame."
 EXPLAINED = 2.5
-"""Errors of usual size, where moved zeros of the joints explain them."""
+"""Error over the expected one up to which moved joint zeros explain all rows."""
 
 
 class MixedRowsCheck(AbstractRowCheck):
-    """Looks for the largest set of rows that agrees with the model, the base or the tool being as it is or anywhere.
+    """Looks for the largest set of rows that agrees with the model, with its base or tool as they are or fitted.
 
-    Bases and tools are fitted to small sets of rows, as in Fischler and Bolles 1981, Communications of the ACM 24(6).
-    Where a quarter or more of the rows are far off what the others agree on to the noise, rows of two setups are
-    mixed, or nobody knows which are wrong. Zeros of the joints that have moved make errors of all sizes, and are fitted
-    to all rows first.
+    Bases and tools are fitted to random samples of rows (RANSAC: Fischler and Bolles 1981, Communications of the ACM
+    24(6)). If more than a quarter of the rows are far off while the others agree to the noise, rows of two setups are
+    mixed, or it is not known which are wrong. Moved joint zeros cause errors of all sizes, so they are fitted to all
+    rows first.
     """
 
     def diagnose(self, judged: RowsUnderModel) -> Iterator[Diagnostic]:
@@ -56,35 +56,37 @@ class MixedRowsCheck(AbstractRowCheck):
 
 
 def mixed_rows(judged: RowsUnderModel, wrong: Bool[Tensor, " rows"]) -> Diagnostic:
-    """Say that so many rows do not agree with the others, and what distinguishes them."""
+    """Report that some rows do not agree with the others, what distinguishes them, and what explains them."""
     found = many_wrong(judged.rows, wrong)
     sentence = f"{found.sentence.removesuffix(ADVICE)}{_cause(judged, wrong)}{ADVICE}"
     return found.model_copy(update={"sentence": sentence})
 
 
 def many_wrong(rows: Measurements, wrong: Bool[Tensor, " rows"]) -> Diagnostic:
-    """Say that more rows are wrong than can be left out."""
+    """Report that more rows are wrong than can be left out."""
+    distinction = what_distinguishes(rows, wrong)
     return Diagnostic(
         kind="mixed_rows",
         severity="implausible",
         sentence=f"{int(wrong.sum())} of {rows.rows} rows do not agree with the others: "
-        f"{what_distinguishes(rows, wrong)}.{ADVICE}",
+        f"{distinction.clause}.{ADVICE}",
         rows=tuple(rows.place(row) for row in wrong.nonzero()[:, 0].tolist()),
+        values={"distinguished_by": distinction.by},
     )
 
 
 def _cause(judged: RowsUnderModel, wrong: Bool[Tensor, " rows"]) -> str:
-    """Say what explains the rows that are wrong, where something does."""
+    """Say what explains the wrong rows; empty if nothing does."""
     faults = find_setup_faults(judged.model, None, judged.rows.select(wrong), judged.fitted)
     if not faults:
         return ""
     fault = either(faults)
     fall = joined(length_text(error) for error in (fault.before, fault.after))
-    return f" In them {fault.clause} (errors before and after: {fall})."
+    return f" In these rows, {fault.clause} (errors without and with this correction: {fall})."
 
 
 def _agreements(judged: RowsUnderModel) -> Iterator[Float64[Tensor, "rows 4 4"]]:
-    """Poses as they are predicted, and with a base or a tool that agrees with as many rows as possible."""
+    """Yield the predicted poses, and those with a base or a tool that agrees with as many rows as possible."""
     if not judged.fitted:
         yield judged.drawn
     if len(set(judged.rows.frame)) > 1 or len(set(judged.rows.target)) > 1:
@@ -95,7 +97,7 @@ def _agreements(judged: RowsUnderModel) -> Iterator[Float64[Tensor, "rows 4 4"]]
         best, most = None, SAMPLE + SPARE_ROWS - 1
         for sample in samples:
             chosen = sample
-            for _ in range(3):
+            for _ in range(3):  # local optimisation: refit to all rows that agree
                 T = _fitted(judged, kind, chosen)
                 agreeing = judged.lengths(T) <= limit
                 chosen = agreeing.nonzero()[:, 0]
@@ -108,7 +110,7 @@ def _agreements(judged: RowsUnderModel) -> Iterator[Float64[Tensor, "rows 4 4"]]
 
 
 def _samples(rows: int) -> Iterator[Tensor]:
-    """Halves of the file, every second row, and small sets drawn from all."""
+    """Yield halves of the file, every second row, and small random samples."""
     every, draw = torch.arange(rows), torch.Generator().manual_seed(0)
     yield from (every[: rows // 2], every[rows // 2 :], every[::2], every[1::2])
     for _ in range(DRAWS):
@@ -116,7 +118,7 @@ def _samples(rows: int) -> Iterator[Tensor]:
 
 
 def _fitted(judged: RowsUnderModel, kind: str, chosen: Tensor) -> Float64[Tensor, "rows 4 4"]:
-    """Predicted poses with the base or the tool that suits some rows."""
+    """Predict the poses with the base or the tool fitted to some rows."""
     some, measured = judged.drawn[chosen], judged.measured.select(chosen)
     if kind == "base":
         return best_base(some, measured) @ judged.drawn
@@ -124,11 +126,11 @@ def _fitted(judged: RowsUnderModel, kind: str, chosen: Tensor) -> Float64[Tensor
 
 
 def _apart(judged: RowsUnderModel, T: Float64[Tensor, "rows 4 4"]) -> Bool[Tensor, " rows"] | None:
-    """Rows that are far from what the others agree on; None where these are few, or are not clearly apart."""
+    """Find the rows that are far from what the others agree on; None if these are few or not clearly separated."""
     ratio = judged.lengths(T) / (AGREES * judged.usual)
     near, far = ratio <= 1, ratio > APART
     count = judged.rows.rows
-    if not int(far.sum()) > MOST_WRONG * count or not int(near.sum()) >= FEWEST_AGREEING * count:
+    if not int(far.sum()) > MIN_WRONG_SHARE * count or not int(near.sum()) >= MIN_AGREEING_SHARE * count:
         return None
     if int((~near & ~far).sum()) > BETWEEN * count:
         return None
@@ -136,7 +138,7 @@ def _apart(judged: RowsUnderModel, T: Float64[Tensor, "rows 4 4"]) -> Bool[Tenso
 
 
 def _joints_explain(judged: RowsUnderModel) -> bool:
-    """Whether zeros of the joints that have moved, beside a base, explain all rows."""
+    """Say whether moved joint zeros explain all rows (linearised at the fitted poses)."""
     known, error = judged.known, (judged.measured.position - judged.predicted[:, :3, 3])
     columns = []
     for joint in range(known.dof):

@@ -1,4 +1,4 @@
-"""Rows without positions, such as balls in sockets, and stated distances of sockets, against a model."""
+"""Checks of rows without positions, such as balls in sockets, and of stated distances of sockets."""
 
 import math
 from collections.abc import Collection, Iterator, Sequence
@@ -13,7 +13,7 @@ from pisigma.files.errors import IdentificationError
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel, poses_of_rows
 from pisigma.robot.se3 import transform
-from pisigma.validation.checks.rows.row_check import FEWEST_ROWS, LARGE_SHARE, Move, fitted_or_new
+from pisigma.validation.checks.rows.row_check import LARGE_SHARE, MIN_ROWS, Move, fitted_or_new
 from pisigma.validation.held_out.diagnostic import Diagnostic
 from pisigma.validation.held_out.frames.fitted_frames import FrameKind, with_names_of
 from pisigma.validation.held_out.frames.row_errors import errors_of_rows
@@ -26,18 +26,20 @@ from pisigma.validation.setup_faults.setup_fault import SetupFault
 from pisigma.validation.setup_faults.setup_faults import unexplained
 
 FAR, STRETCHED = 3.0, 0.01
-"""A stated distance is missed by more than so many times the RMS of the rows' errors, and this share of it."""
+"""A stated distance is wrong if it is off by more than this multiple of the RMS error of the rows plus this share of
+the distance."""
 
-ROUNDS, SETTLED, STEP, LARGEST_STEP = 8, 0.9, 1e-6, 0.3
-"""Of a fit of what has moved: rounds, which end where less is gained, and steps in rad or m."""
+MAX_ITERATIONS, MIN_GAIN, STEP, MAX_STEP = 8, 0.9, 1e-6, 0.3
+"""Fit of what has moved: iterations, ratio of successive errors at which it ends, finite-difference step and largest
+step [rad or m]."""
 
 
 def missed_distances(comparison: ModelComparison, figures: ModelFigures) -> Iterator[Diagnostic]:
-    """Say which stated distances of sockets a model misses by more than its rows disagree.
+    """Report stated distances of sockets that a model contradicts by more than its rows scatter.
 
     Args:
-        comparison: of models on the rows of the sockets.
-        figures: of one of them.
+        comparison: comparison of models on the rows of the sockets.
+        figures: figures of one of these models.
     """
     distances = () if comparison.socket_distance is None else comparison.socket_distance.each
     rms = figures.position.statistics["rms"]
@@ -48,8 +50,10 @@ def missed_distances(comparison: ModelComparison, figures: ModelFigures) -> Iter
                 kind="socket_distance",
                 severity="implausible",
                 sentence=f"{figures.name}: the sockets {' and '.join(one.sockets)} are {one.stated_mm + error:.6g} mm "
-                f"apart by their rows, not {one.stated_mm:.6g} mm as stated, while the rows of every socket agree to "
-                f"{rms:.3g} mm RMS; check the distance, the names of the sockets and the scale of the robot.",
+                f"apart according to their rows, not {one.stated_mm:.6g} mm as stated, while the rows of every socket "
+                f"agree to {rms:.3g} mm RMS; check the distance, the names of the sockets and the scale of the robot.",
+                cause=figures.name,
+                values={"stated_mm": one.stated_mm, "measured_mm": one.stated_mm + error},
             )
 
 
@@ -59,20 +63,20 @@ def diagnosed_lengths(
     fitted: Collection[FrameKind],
     may_move: Collection[Move],
 ) -> tuple[tuple[Diagnostic, ...], tuple[SetupFault, ...]]:
-    """Say what is wrong with rows without positions whose errors are larger than those of wear.
+    """Report what is wrong with rows without positions whose errors are too large for wear.
 
-    Tried are a reversed sign of every joint, an exchange of two neighbours, the zero of every joint and another tool,
-    one at a time.
+    The hypotheses are a reversed sign of every joint, an exchange of two neighbouring joints, a moved zero of every
+    joint and another tool, one at a time.
 
     Args:
         model: the model.
-        rows: without positions; not judged are those of an anchor that has too few of them, and where touches or stated
-            points say where a base stood that may stand anywhere now.
-        fitted: what stands elsewhere for certain.
-        may_move: what else may have moved, without being a fault.
+        rows: rows without positions. Rows of an anchor that has too few of them are not judged; nor are touches and
+            wires to stated points if the base may have moved, because they depend on the base.
+        fitted: what is known to have moved.
+        may_move: what else may have moved without being a fault.
 
     Returns:
-        What makes the rows implausible, and the setup fault that explains them, which may be a move.
+        The findings that make the rows implausible, and the setup fault that explains them, which may be a motion.
     """
     kinds = fitted_or_new(model, rows, fitted)
     free = {"tool"} & {*kinds}
@@ -82,7 +86,7 @@ def diagnosed_lengths(
     known, reach = with_names_of(model, rows, kinds), model.robot.reach
     with suppress(IdentificationError):
         errors = _errors(model, known)
-        if int(torch.isfinite(errors).all(-1).sum()) < FEWEST_ROWS or not _rms(errors) > LARGE_SHARE * reach:
+        if int(torch.isfinite(errors).all(-1).sum()) < MIN_ROWS or not _rms(errors) > LARGE_SHARE * reach:
             return (), ()
         fault = _fault(model, known, free)
         faults = () if fault is None else (fault,)
@@ -90,7 +94,14 @@ def diagnosed_lengths(
         if left <= min(COLLAPSED * _rms(errors), PLAUSIBLE_SHARE * reach):
             return (), faults
         if fault is not None and not moves.issuperset(fault.kinds):
-            return (Diagnostic(kind="setup_fault", severity="implausible", sentence=fault.sentence),), faults
+            why = Diagnostic(
+                kind="setup_fault",
+                severity="implausible",
+                sentence=fault.sentence,
+                cause=fault.cause,
+                values=fault.values,
+            )
+            return (why,), faults
         if left > PLAUSIBLE_SHARE * reach:
             why = Diagnostic(kind="implausible_errors", severity="implausible", sentence=unexplained(model))
             return (why,), faults
@@ -99,7 +110,7 @@ def diagnosed_lengths(
 
 
 def _fault(model: CalibratedModel, rows: Measurements, free: Collection[str]) -> SetupFault | None:
-    """The one thing that makes the errors collapse best; None where nothing does."""
+    """Find the fault that explains the errors best; None if none does."""
     before, dof = _rms(_errors(model, rows)), rows.dof
     maps = signs_and_exchanges(dof)
     found = [
@@ -125,9 +136,9 @@ def _fault(model: CalibratedModel, rows: Measurements, free: Collection[str]) ->
 
 
 def _moved_most(model: CalibratedModel, rows: Measurements, free: Collection[str]) -> tuple[float, Cause]:
-    """The zero of one joint, or the tool, that leaves least when it is moved, and what it leaves [m].
+    """Find the joint zero, or the tool, whose motion leaves the smallest errors; return these [m] and the cause.
 
-    Chosen by errors that are linear in what moves, as where the model is.
+    The candidate is chosen with errors linearised at the model, and then fitted by iteration.
     """
     dof, fitted = rows.dof, _numbers(rows.dof, free)
     error = _errors(model, rows)
@@ -142,8 +153,8 @@ def _moved_most(model: CalibratedModel, rows: Measurements, free: Collection[str
     best = min(tried, key=left)
     after, x = _fitted(model, rows, [*fitted, *best])
     if len(best) > 1:
-        clause = f"the tool is {length_text(float(x[best].norm()))} away from where it was"
-        return after, Cause("tool", clause, "check what is mounted, or recalibrate the model", 3.0)
+        clause = f"the tool has moved by {length_text(float(x[best].norm()))}"
+        return after, Cause("tool", clause, "check which tool is mounted, or recalibrate the model", 3.0)
     (joint,) = best
     moved = float(x[joint])
     amount = f"{math.degrees(moved):.3g} deg" if model.robot.revolute[joint] else length_text(moved)
@@ -152,7 +163,7 @@ def _moved_most(model: CalibratedModel, rows: Measurements, free: Collection[str
 
 
 def _numbers(dof: int, moves: Collection[str]) -> list[int]:
-    """What is free where some things may have moved: zeros of joints, and 3 numbers of the tool."""
+    """List the unknowns that are free if some things may have moved: joint zeros, and the 3 coordinates of the tool."""
     kinds = (("joint_zero", range(dof)), ("tool", range(dof, dof + 3)))
     return [number for kind, numbers in kinds if kind in moves for number in numbers]
 
@@ -160,19 +171,19 @@ def _numbers(dof: int, moves: Collection[str]) -> list[int]:
 def _fitted(
     model: CalibratedModel, rows: Measurements, free: Sequence[int]
 ) -> tuple[float, Float64[Tensor, " numbers"]]:
-    """Root mean square of the errors [m] that are left with some numbers fitted, as if none were, and the numbers."""
+    """Fit some unknowns; return the RMS residual [m], corrected for the degrees of freedom, and the unknowns."""
     x = torch.zeros(rows.dof + 3, dtype=torch.float64)
     least, best = float("inf"), x
-    for _ in range(ROUNDS if free else 1):
+    for _ in range(MAX_ITERATIONS if free else 1):
         error = _errors(model, rows, x)
         here = _rms(error)
-        if not here < SETTLED * least:
+        if not here < MIN_GAIN * least:
             break
         least, best = here, x
         if free:
             J = _columns(model, rows, x, free, error)
             step = torch.linalg.lstsq(J, -torch.nan_to_num(error).flatten(), driver="gelsd").solution
-            x = x.index_add(0, torch.tensor(free), step.clamp(-LARGEST_STEP, LARGEST_STEP))
+            x = x.index_add(0, torch.tensor(free), step.clamp(-MAX_STEP, MAX_STEP))
     values = int((torch.nan_to_num(error) != 0).sum())
     return least * (values / max(values - len(free), 1)) ** 0.5, best
 
@@ -184,7 +195,7 @@ def _columns(
     free: Sequence[int],
     error: Float64[Tensor, "rows 3"],
 ) -> Float64[Tensor, "values free"]:
-    """Derivatives of all errors by some numbers."""
+    """Differentiate all errors by some unknowns, by finite differences."""
     eye = STEP * torch.eye(len(x), dtype=torch.float64)
     columns = [((_errors(model, rows, x + eye[number]) - error) / STEP).flatten() for number in free]
     return torch.nan_to_num(torch.stack(columns, -1))
@@ -193,7 +204,7 @@ def _columns(
 def _errors(
     model: CalibratedModel, rows: Measurements, x: Float64[Tensor, " numbers"] | None = None
 ) -> Float64[Tensor, "rows 3"]:
-    """Errors, where wanted with zeros [rad or m] and tool [m] moved."""
+    """Compute the errors [m], with joint zeros [rad or m] and tool [m] moved by `x` if given."""
     if x is None:
         return errors_of_rows(poses_of_rows(model, rows), rows).position
     zeros, tool = torch.split(x, [rows.dof, 3])
@@ -203,6 +214,6 @@ def _errors(
 
 
 def _rms(errors: Float64[Tensor, "rows 3"]) -> float:
-    """Root mean square of lengths, of the rows that have one."""
+    """Compute the RMS length [m] of the rows that have an error."""
     there = torch.isfinite(errors).all(-1)
     return float(errors[there].square().sum(-1).mean().sqrt())

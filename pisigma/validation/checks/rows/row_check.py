@@ -1,4 +1,4 @@
-"""What every check of rows against a model has in common."""
+"""Interface of the checks of rows against a model, and the rows as they see them."""
 
 import math
 from abc import ABC, abstractmethod
@@ -21,28 +21,28 @@ from pisigma.validation.setup_faults.setup_fault import SetupFault
 from pisigma.validation.setup_faults.setup_faults import find_setup_faults, judged_values
 
 Move = Literal["frame", "tool", "joint_zero"]
-"""What may have moved since a model was made: kinds of causes of setup faults."""
+"""What may have moved since a model was made; see the kinds of `Cause`."""
 MOVES: Final[frozenset[Move]] = frozenset({"frame", "tool", "joint_zero"})
 LARGE_SHARE = 2e-3
-"""Share of the reach beyond which errors are those of a mistake or a motion, and not of wear."""
+"""Errors as a share of the reach above which a mistake or a motion is their cause, and not wear."""
 STEP = 1e-6
-"""[rad or m] For derivatives by the joints."""
+"""[rad or m] Step of the finite differences by joint values."""
 FITTED = 9
-"""Numbers of a base and of a tool of positions."""
-FEWEST_ROWS = 5
-"""Fewer rows with positions say nothing of a mistake."""
+"""Number of parameters of a base and of the position of a tool."""
+MIN_ROWS = 5
+"""Rows with positions that a check needs."""
 
 
 @dataclass(frozen=True, eq=False)
 class RowsUnderModel:
-    """Rows with positions, and what a model says of them.
+    """Rows with positions, and the predictions of a model for them.
 
     Attributes:
         model: the model.
         rows: the rows.
-        fitted: what stands elsewhere for certain, so that it is fitted to the rows.
+        fitted: what is known to have moved and is therefore fitted to the rows.
         may_move: what else may have moved without being a fault.
-        nominal: the nominal robot with the base and tool that suit it best; only shows what its errors fall to.
+        nominal: the nominal robot with base and tool fitted; only used to report its errors after a correction.
     """
 
     model: CalibratedModel
@@ -59,7 +59,7 @@ class RowsUnderModel:
         may_move: Collection[Move],
         nominal: CalibratedModel | None = None,
     ) -> "RowsUnderModel | None":
-        """Take the rows that have positions where the model predicts any; None where these are too few.
+        """Select the rows that have a measured and a predicted position; None if there are too few.
 
         Frames and targets that the model does not have are fitted.
         """
@@ -69,14 +69,14 @@ class RowsUnderModel:
         some = judged_values(model, rows)
         T = poses_of_rows(model, with_names_of(model, some, kinds))
         there = torch.isfinite(rows.position).all(-1) & torch.isfinite(T).flatten(1).all(-1)
-        if int(there.sum()) < FEWEST_ROWS:
+        if int(there.sum()) < MIN_ROWS:
             return None
         some = replace(some.select(there), pair=None, distance=None)
         return RowsUnderModel(model, some, kinds, frozenset(may_move), nominal)
 
     @cached_property
     def known(self) -> Measurements:
-        """The rows with the names of the model for what is fitted."""
+        """The rows, with fitted frames and targets named as in the model."""
         return with_names_of(self.model, self.rows, self.fitted)
 
     @cached_property
@@ -86,7 +86,7 @@ class RowsUnderModel:
 
     @cached_property
     def predicted(self) -> Float64[Tensor, "rows 4 4"]:
-        """Predicted poses, with what is fitted."""
+        """Predicted poses, after fitting."""
         return fit_frames(self.drawn, self.measured, self.rows, self.fitted)[0] if self.fitted else self.drawn
 
     @cached_property
@@ -96,17 +96,17 @@ class RowsUnderModel:
 
     @cached_property
     def errors(self) -> Float64[Tensor, " rows"]:
-        """Lengths of the errors of the positions [m]."""
+        """Lengths of the position errors [m]."""
         return self.lengths(self.predicted)
 
     def lengths(self, T: Float64[Tensor, "rows 4 4"]) -> Float64[Tensor, " rows"]:
-        """Lengths of the errors of the positions of predicted poses [m]."""
+        """Compute the lengths of the position errors of predicted poses [m]."""
         result: Tensor = (self.measured.position - T[:, :3, 3]).norm(dim=-1)
         return result
 
     @cached_property
     def usual(self) -> Float64[Tensor, " rows"]:
-        """Standard deviation of the length of every row's error by the model's posterior and noise [m]; NaN without."""
+        """Standard deviation of every row's error by the model's posterior and noise [m]; NaN if it has none."""
         deviation = deviation_of_rows(self.model, self.known).square().sum(-1)
         known = self.model.uncertainty
         noise = torch.as_tensor(math.nan if known is None else known.noise.get("position", 0.0))
@@ -117,37 +117,37 @@ class RowsUnderModel:
 
     @cached_property
     def large(self) -> bool:
-        """Whether the errors of positions and orientations are too large to be those of wear."""
+        """Whether the errors of positions and orientations are too large for wear."""
         error = float(self.measured.squares(self.predicted).mean().sqrt())
         return error > LARGE_SHARE * self.model.robot.reach
 
     @cached_property
     def setup_faults(self) -> tuple[SetupFault, ...]:
-        """What explains the errors of all rows alike, of any size."""
+        """Setup faults that explain the errors of all rows, of any size."""
         return find_setup_faults(self.model, self.nominal, self.rows, self.fitted)
 
     @cached_property
     def moved_frames(self) -> tuple[SetupFault, ...]:
-        """Frames and tools that have moved by any size."""
+        """Motions of frames and tools of any size that explain the errors."""
         return find_setup_faults(self.model, self.nominal, self.rows, self.fitted, frames_only=True)
 
     def is_move(self, fault: SetupFault) -> bool:
-        """Whether a fault is only something that may have moved: frames, tools, and the zero of a single joint."""
+        """Say whether a fault is an allowed motion: of frames, tools, or the zero of a single joint."""
         return self.may_move.issuperset(fault.kinds) and len(set(fault.joints)) <= 1
 
 
 class AbstractRowCheck(ABC):
-    """Looks for one kind of fault in rows, by what a model says of them."""
+    """A check of rows for one kind of fault, by the predictions of a model."""
 
     @abstractmethod
     def diagnose(self, judged: RowsUnderModel) -> Iterator[Diagnostic]:
-        """Say what is wrong; nothing where nothing is."""
+        """Report faults; yield nothing if none is found."""
 
 
 def fitted_or_new(
     model: CalibratedModel, rows: Measurements, fitted: Collection[FrameKind]
 ) -> tuple[FrameKind, ...]:
-    """Add to what is fitted whether rows have frames or targets that a model does not."""
+    """Add frames and tools to what is fitted, if rows have some that a model does not have."""
     new: tuple[FrameKind, ...] = (
         *(("base",) if _unknown(rows.frame, model.bases) else ()),
         *(("tool",) if _unknown(rows.target, model.tools) else ()),
@@ -156,7 +156,7 @@ def fitted_or_new(
 
 
 def _unknown(names: tuple[str, ...], known: Collection[str]) -> bool:
-    """Whether rows have a frame or target that a model does not, see `pisigma.model.calibrated_model.known_names`."""
+    """Say whether a frame or target is unknown to a model, see `pisigma.model.calibrated_model.known_names`."""
     if not set(known) - {""}:
         return len(set(names)) > 1
     return not set(names) <= set(known) and not (len(known) == 1 and not any(names))

@@ -1,4 +1,4 @@
-"""Whether all measured lengths are too long or too short by one factor."""
+"""Whether all measured lengths are wrong by one factor."""
 
 from collections.abc import Iterator
 
@@ -14,20 +14,20 @@ from pisigma.validation.checks.rows.row_check import FITTED, STEP, AbstractRowCh
 from pisigma.validation.held_out.diagnostic import Diagnostic
 from pisigma.validation.setup_faults.cause import length_text
 
-SMALLEST = 5e-4
+MIN_CHANGE = 5e-4
 """Factors nearer to 1 come from heat: 20 K stretch an aluminium arm by 0.05 %."""
 UNUSUAL = 2.0
-"""Errors are explained at all only where they are larger than usual by this factor."""
+"""Errors over the expected ones below which no explanation is needed."""
 EXPLAINED = 0.6
-"""Share of the errors that is left, at most, where the factor is set right."""
+"""Share of the errors that may remain after correcting the factor."""
 AS_GOOD = 1.3
-"""Another explanation leaves errors that are larger by this factor at least."""
+"""Errors under any other explanation must be larger by this factor."""
 CLEAR = 5.0
-"""[standard deviations] By which the factor is not 1."""
+"""[standard deviations] Difference of the factor from 1."""
 
 
 class ScaleOfRowsCheck(AbstractRowCheck):
-    """Fits a factor on the measured positions beside a base and a tool, and compares it with moved zeros of joints."""
+    """Fits a factor on the measured positions together with base and tool, and compares it with moved joint zeros."""
 
     def diagnose(self, judged: RowsUnderModel) -> Iterator[Diagnostic]:
         """See `AbstractRowCheck.diagnose`."""
@@ -47,7 +47,7 @@ class ScaleOfRowsCheck(AbstractRowCheck):
             _fit(torch.cat([_frames(T), one[:, None]], 1), error)[0] for one in _joints(judged, base, tool)
         )
         if (
-            abs(factor) > max(SMALLEST, CLEAR * deviation)
+            abs(factor) > max(MIN_CHANGE, CLEAR * deviation)
             and after < EXPLAINED * before
             and min(others) > AS_GOOD * after
         ):
@@ -55,20 +55,21 @@ class ScaleOfRowsCheck(AbstractRowCheck):
                 kind="scale",
                 severity="implausible",
                 sentence=f"All measured lengths are {1 / (1 - factor):.5g} times as large as the model predicts "
-                f"(standard deviation {deviation:.1g}): with this set right, the errors fall from "
+                f"(standard deviation {deviation:.1g}); with this factor corrected, the errors fall from "
                 f"{length_text(before)} to {length_text(after)} RMS; check the unit and the scale of the instrument, "
                 "its temperature and that of the robot.",
+                values={"factor": 1 / (1 - factor), "sigma": deviation},
             )
 
 
 def _frames(T: Float64[Tensor, "rows 4 4"]) -> Float64[Tensor, "values numbers"]:
-    """Derivatives of positions by small motions of the base and by shifts of the tool."""
+    """Differentiate positions by small motions of the base and by shifts of the tool."""
     eye = torch.eye(3).to(T).expand(len(T), 3, 3)
     return torch.cat([eye, -skew(T[:, :3, 3]), T[:, :3, :3]], 2).flatten(0, 1)
 
 
 def _joints(judged: RowsUnderModel, base: Tensor, tool: Tensor) -> Iterator[Float64[Tensor, " values"]]:
-    """Derivatives of positions by the zero of every joint."""
+    """Differentiate positions by the zero of every joint, by finite differences."""
     known, here = judged.known, base @ judged.drawn @ tool
     for joint in range(known.dof):
         q = known.q.clone()
@@ -82,7 +83,7 @@ def _joints(judged: RowsUnderModel, base: Tensor, tool: Tensor) -> Iterator[Floa
 def _fit(
     A: Float64[Tensor, "values numbers"], error: Float64[Tensor, " values"]
 ) -> tuple[float, float, float]:
-    """Least squares: RMS length of the errors that are left [m], the last number, and its standard deviation."""
+    """Solve least squares; return the RMS length of the residuals [m], the last unknown, and its standard deviation."""
     scale = A.norm(dim=0).clamp(min=1e-300)
     U, size, V = torch.linalg.svd(A / scale, full_matrices=False)
     certain = size > 1e-6 * size[0]

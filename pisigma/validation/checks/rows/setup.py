@@ -1,4 +1,4 @@
-"""Whether a mistake in the setup or in the file explains all rows alike."""
+"""Whether a fault of the setup or the file explains the errors of all rows."""
 
 from collections.abc import Iterator
 
@@ -9,10 +9,10 @@ from pisigma.validation.setup_faults.setup_fault import either
 
 
 class SetupOfRowsCheck(AbstractRowCheck):
-    """Looks for setup faults under which the errors of a model collapse; see `find_setup_faults`.
+    """Looks for setup faults that explain the errors of a model; see `find_setup_faults`.
 
-    A base, a tool or the zero of one joint that has moved is no fault where it may have moved. Where base and tool may
-    not have, that they have is said however small it is.
+    A moved base, tool or zero of one joint is not a fault if it may have moved. If base and tool may not have moved,
+    their motion is reported even if it is small.
     """
 
     def diagnose(self, judged: RowsUnderModel) -> Iterator[Diagnostic]:
@@ -22,11 +22,18 @@ class SetupOfRowsCheck(AbstractRowCheck):
         else:
             faults = () if {"frame", "tool"} <= judged.may_move else judged.moved_frames
         if faults and not any(map(judged.is_move, faults)):
-            yield Diagnostic(kind="setup_fault", severity="implausible", sentence=either(faults).sentence)
+            fault = either(faults)
+            yield Diagnostic(
+                kind="setup_fault",
+                severity="implausible",
+                sentence=fault.sentence,
+                cause=fault.cause,
+                values=fault.values,
+            )
 
 
 class OtherRobotOfRowsCheck(AbstractRowCheck):
-    """Looks for another robot of the catalogue that large errors are of."""
+    """Looks for another robot of the catalogue that fits rows with large errors better."""
 
     def diagnose(self, judged: RowsUnderModel) -> Iterator[Diagnostic]:
         """See `AbstractRowCheck.diagnose`."""

@@ -1,4 +1,4 @@
-"""Whether nothing that can have moved explains large errors."""
+"""Whether large errors remain after fitting everything that may have moved."""
 
 import math
 from collections.abc import Iterator
@@ -13,13 +13,13 @@ from pisigma.validation.held_out.diagnostic import Diagnostic
 from pisigma.validation.setup_faults.explanations import PLAUSIBLE_SHARE
 from pisigma.validation.setup_faults.setup_faults import unexplained
 
-ROUNDS = 8
-LARGEST_STEP = 0.3
-"""[rad, or of the reach] A round moves no zero by more."""
+MAX_ITERATIONS = 8
+MAX_STEP = 0.3
+"""[rad, or share of the reach] Largest step of a joint zero in an iteration."""
 
 
 class UnexplainedRowsCheck(AbstractRowCheck):
-    """Fits the zeros of all joints, a base and a tool, where errors are too large to be those of a calibrated robot."""
+    """Fits all joint zeros, a base and a tool to rows whose errors are too large for a calibrated robot."""
 
     def diagnose(self, judged: RowsUnderModel) -> Iterator[Diagnostic]:
         """See `AbstractRowCheck.diagnose`."""
@@ -29,16 +29,17 @@ class UnexplainedRowsCheck(AbstractRowCheck):
             yield Diagnostic(kind="implausible_errors", severity="implausible", sentence=sentence)
 
     def _left(self, judged: RowsUnderModel) -> float:
-        """Root mean square of the errors [m] that are left, as if nothing had been fitted."""
+        """Compute the RMS residual after the fit [m], corrected for its degrees of freedom."""
         known, robot = judged.known, judged.model.robot
         zeros = torch.zeros(known.dof, dtype=torch.float64)
         largest = (
-            LARGEST_STEP * torch.tensor([1.0 if turns else robot.reach for turns in robot.revolute]).double()
+            MAX_STEP * torch.tensor([1.0 if turns else robot.reach for turns in robot.revolute]).double()
         )
         moves = "joint_zero" in judged.may_move
         least = float("inf")
-        for _ in range(ROUNDS if moves else 1):
+        for _ in range(MAX_ITERATIONS if moves else 1):
             T = self._poses(judged, zeros)
+            # Base and tool have a closed form for given zeros; a Gauss-Newton step of the zeros follows.
             base, tool = best_base_and_tool(T, judged.measured)
             error = judged.measured.position - (base @ T @ tool)[:, :3, 3]
             least = min(least, float(error.square().sum(1).mean().sqrt()))

@@ -1,4 +1,4 @@
-"""Single rows that no robot's error explains, while all others agree with a model: they are named and left out."""
+"""Single rows that no error of the robot explains, while all others agree with a model: they are left out."""
 
 from collections.abc import Collection, Iterable
 from dataclasses import dataclass, replace
@@ -17,15 +17,15 @@ from pisigma.validation.setup_faults.cause import length_text
 from pisigma.validation.setup_faults.explanations import PLAUSIBLE_SHARE, PLAUSIBLE_TURN
 
 FAR = 10.0
-"""Times the median error of the rows; wrong rows are farther off than that, and than any calibrated robot errs."""
-MOST_WRONG = 0.1
-"""Share of the rows; of more nobody knows which are wrong, and all are judged."""
-FEWEST_ROWS, FEWEST_FITTED = 6, 10
-"""Of fewer rows none is called wrong, and where frames or tools are fitted to them."""
+"""Error over the median error above which a row is wrong, if it is also larger than that of any calibrated robot."""
+MAX_WRONG_SHARE = 0.1
+"""Share of the rows; if more are far off, it is not known which ones are wrong, and all are judged."""
+MIN_ROWS, MIN_ROWS_TO_FIT = 6, 10
+"""Rows needed to call one wrong: in known frames, and with frames or tools fitted to the rows."""
 SUSPICIOUS, REFITS = 3.0, 12
-"""Times the median error of rows that frames and tools are not fitted to, and how often these are fitted."""
-NAMED = 5
-"""Rows that a sentence names, at most."""
+"""Error over the median error above which a row does not count in the fit of frames and tools; number of such fits."""
+MAX_NAMED = 5
+"""Rows that a sentence names."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,9 +33,9 @@ class WithoutWrongRows:
     """Rows without those that are wrong.
 
     Attributes:
-        rows: the others; all where none is wrong.
-        warnings: which rows are wrong and by how much; nothing where none is.
-        numbers: of the wrong rows.
+        rows: the remaining rows; all if none is wrong.
+        warnings: which rows are wrong and how far they are off; empty if none is.
+        numbers: row numbers of the wrong rows, from 0.
     """
 
     rows: Measurements
@@ -46,28 +46,30 @@ class WithoutWrongRows:
 def without_wrong_rows(
     models: Iterable[CalibratedModel], rows: Measurements, fitted: Collection[FrameKind] = ()
 ) -> WithoutWrongRows:
-    """Leave out single rows that are too far off to be measured rightly, under every one of the models.
+    """Leave out single rows that are too far off under every model to be measured correctly.
 
     Args:
-        models: that the rows are judged by.
-        rows: any.
-        fitted: what is fitted to the rows.
+        models: the models that the rows are compared with.
+        rows: the rows.
+        fitted: frames and tools that are fitted to the rows.
     """
     found = [_far_rows(model, rows, fitted) for model in models]
     if not found or any(one is None for one in found):
         return WithoutWrongRows(rows)
     numbers = sorted(set.intersection(*(set(one) for one in found if one is not None)))
-    if not 0 < len(numbers) <= max(MOST_WRONG * rows.rows, 1):
+    if not 0 < len(numbers) <= max(MAX_WRONG_SHARE * rows.rows, 1):
         return WithoutWrongRows(rows)
     kept = torch.ones(rows.rows, dtype=torch.bool)
     kept[numbers] = False
     sizes = found[0] or {}
-    named = [f"{rows.place(number)} ({sizes[number]})" for number in numbers[:NAMED]]
-    more = f" and {len(numbers) - NAMED} more" if len(numbers) > NAMED else ""
-    verb = "row is" if len(numbers) == 1 else "rows are"
+    named = [f"{rows.place(number)} ({sizes[number]})" for number in numbers[:MAX_NAMED]]
+    more = f" and {len(numbers) - MAX_NAMED} more" if len(numbers) > MAX_NAMED else ""
+    have, are = (
+        ("row has a larger error", "was") if len(numbers) == 1 else ("rows have larger errors", "were")
+    )
     warning = (
-        f"{len(numbers)} {verb} farther off than any calibrated robot errs, while the others agree with the model, and "
-        f"not judged: {', '.join(named)}{more}; check what was measured there, or measure the pose again."
+        f"{len(numbers)} {have} than any calibrated robot, while the others agree with the model, and {are} left "
+        f"out: {', '.join(named)}{more}; check these measurements, or measure the poses again."
     )
     return WithoutWrongRows(rows.select(kept.nonzero()[:, 0]), (warning,), tuple(numbers))
 
@@ -75,11 +77,11 @@ def without_wrong_rows(
 def _far_rows(
     model: CalibratedModel, rows: Measurements, fitted: Collection[FrameKind]
 ) -> dict[int, str] | None:
-    """Number of every row that is far off, with how far; None where the rows cannot be judged by the model."""
+    """Find the rows that are far off, with a text of how far; None if the model cannot judge the rows."""
     if rows.position is None:
         return _far_lengths(model, rows)
     there = torch.isfinite(rows.position).all(-1)
-    if int(there.sum()) < (FEWEST_FITTED if fitted else FEWEST_ROWS):
+    if int(there.sum()) < (MIN_ROWS_TO_FIT if fitted else MIN_ROWS):
         return None
     numbers = there.nonzero()[:, 0]
     judged = RowsUnderModel.of(model, rows.select(numbers), fitted, ())
@@ -90,10 +92,10 @@ def _far_rows(
 
 
 def _far_lengths(model: CalibratedModel, rows: Measurements) -> dict[int, str] | None:
-    """The same of rows without positions, such as balls in sockets."""
+    """Find the far rows among rows without positions, such as balls in sockets; see `_far_rows`."""
     lengths = errors_of_rows(poses_of_rows(model, rows), rows).position.norm(dim=-1)
     there = torch.isfinite(lengths)
-    if int(there.sum()) < FEWEST_FITTED:  # sockets and anchors are fitted to them
+    if int(there.sum()) < MIN_ROWS_TO_FIT:  # sockets and anchors are fitted to them
         return None
     far = lengths > max(FAR * float(lengths[there].median()), PLAUSIBLE_SHARE * model.robot.reach)
     return {row: length_text(float(lengths[row])) for row in far.nonzero()[:, 0].tolist()}
@@ -102,8 +104,8 @@ def _far_lengths(model: CalibratedModel, rows: Measurements) -> dict[int, str] |
 def _fitted_to_usual_rows(judged: RowsUnderModel) -> Float64[Tensor, "rows 4 4"]:
     """Predict the poses with frames and tools fitted to the rows that are not far off.
 
-    The poses of suspicious rows are taken to be as predicted and predicted again, which ends where the others alone
-    would lead.
+    Suspicious rows are replaced by their predictions before the next fit. This converges to the fit of the other rows,
+    and which rows are suspicious is decided again in every iteration.
     """
     T = judged.predicted
     for _ in range(REFITS):
@@ -122,21 +124,21 @@ def _fitted_to_usual_rows(judged: RowsUnderModel) -> Float64[Tensor, "rows 4 4"]
 
 
 def _angles(judged: RowsUnderModel, T: Float64[Tensor, "rows 4 4"]) -> Float64[Tensor, " rows"]:
-    """Angles between measured and predicted orientations [rad]; 0 where none was measured."""
+    """Compute the angles between measured and predicted orientations [rad]; 0 where none was measured."""
     angles = rotation_vector(judged.measured.rotation @ T[:, :3, :3].mT).norm(dim=-1)
     return torch.where(judged.measured.has_rotation, angles, 0.0)
 
 
 def _far(judged: RowsUnderModel, T: Float64[Tensor, "rows 4 4"]) -> tuple[Bool[Tensor, " rows"], list[str]]:
-    """Which rows are far off, and how far every row is."""
+    """Find the rows that are far off, and write how far every row is."""
     lengths = judged.lengths(T)
     far = lengths > max(FAR * float(lengths.median()), PLAUSIBLE_SHARE * judged.model.robot.reach)
     texts = [length_text(length) for length in lengths.tolist()]
     turned = judged.measured.has_rotation
-    if int(turned.sum()) >= FEWEST_ROWS:
+    if int(turned.sum()) >= MIN_ROWS:
         angles = _angles(judged, T)
         typical = float(angles[turned].median())
-        if typical <= PLAUSIBLE_TURN:  # else the model knows nothing of the tool's orientation
+        if typical <= PLAUSIBLE_TURN:  # otherwise the model does not know the tool's orientation
             far = far | (turned & (angles > max(FAR * typical, PLAUSIBLE_TURN)))
             degrees = torch.rad2deg(angles).tolist()
             texts = [

@@ -1,4 +1,4 @@
-"""Errors of measured rows whose frames or targets are fitted to the rows themselves, with honest degrees of freedom."""
+"""Errors of rows whose frames or targets are fitted to the rows themselves, corrected for the degrees of freedom."""
 
 from collections.abc import Callable, Collection
 from dataclasses import replace
@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float64, Int64
 from torch import Tensor
 
-from pisigma.files.errors import MeasurementError
+from pisigma.files.errors import MeasurementError, Place
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.groups import groups_to_keep_whole, numbers_of_names
 from pisigma.model.calibrated_model import CalibratedModel, poses_of_rows
@@ -30,20 +30,20 @@ from pisigma.validation.held_out.pose_statistics import ErrorVectors
 FrameKind = Literal["base", "tool"]
 """What can be fitted: the base in every frame of the rows, the tool of every target."""
 
-FEWEST = 6
-"""Different joint vectors that a frame or a target needs at least: 18 values for the 9 numbers of base and tool."""
+MIN_CONFIGURATIONS = 6
+"""Different joint vectors that a frame or a target needs: 18 values for the 9 parameters of base and tool."""
 DETERMINED = 1e-9
-"""Singular values below this share of the largest are of directions that the rows do not determine."""
+"""Singular value over the largest one below which the rows do not determine a direction."""
 
 
 def fitted_kinds(fit_frame: bool, fit_tool: bool) -> tuple[FrameKind, ...]:
-    """List what two options say is fitted."""
+    """List what is fitted according to two options."""
     kinds: tuple[tuple[FrameKind, bool], ...] = (("base", fit_frame), ("tool", fit_tool))
     return tuple(kind for kind, fitted in kinds if fitted)
 
 
 def with_names_of(model: CalibratedModel, rows: Measurements, fitted: Collection[FrameKind]) -> Measurements:
-    """Name the frames and the targets that are fitted as the model does, which holds any: they do not matter."""
+    """Replace the names of fitted frames and targets by some name of the model, as their poses do not matter."""
     if "base" in fitted:
         rows = replace(rows, frame=(next(iter(model.bases), ""),) * rows.rows)
     if "tool" in fitted:
@@ -52,7 +52,7 @@ def with_names_of(model: CalibratedModel, rows: Measurements, fitted: Collection
 
 
 def fitted_remark(rows: Measurements, fitted: Collection[FrameKind]) -> tuple[str, ...]:
-    """Say what a user should know of errors in fitted frames; nothing where none is fitted."""
+    """Write a remark on errors in fitted frames; empty if none is fitted."""
     if not fitted:
         return ()
     turned = rows.rotation is not None
@@ -60,12 +60,12 @@ def fitted_remark(rows: Measurements, fitted: Collection[FrameKind]) -> tuple[st
         "frame": 6 * len(set(rows.frame)) * ("base" in fitted),
         "tool": (6 if turned else 3) * len(set(rows.target)) * ("tool" in fitted),
     }
-    what = " and ".join(f"the {name} ({count} numbers)" for name, count in numbers.items() if count)
+    what = " and ".join(f"the {name} ({count} parameters)" for name, count in numbers.items() if count)
     values = len(set(groups_to_keep_whole(rows).tolist())) * (6 if turned else 3)
     return (
-        f"These rows determine {what} too, for every model, so an error of the robot's {' or '.join(fitted)} does not "
-        f"show. The errors are enlarged for that: their squares are divided by {values - sum(numbers.values())} "
-        f"degrees of freedom, {values} values less {sum(numbers.values())} fitted numbers.",
+        f"For every model, {what} were fitted to these rows, so errors of the robot's {' or '.join(fitted)} are not "
+        f"included. The errors are corrected for this: their squares are divided by {values - sum(numbers.values())} "
+        f"degrees of freedom ({values} values minus {sum(numbers.values())} fitted parameters).",
     )
 
 
@@ -74,32 +74,37 @@ def errors_in_fitted_frames(
 ) -> ErrorVectors:
     """Compute errors under a model, with frames or targets fitted as after a sensor or a reflector was moved.
 
-    What is fitted to n values makes their errors too small. So they are multiplied by `sqrt(n / (n - p))`, where p is
-    the trace of the hat matrix over these values, the number of parameters where there is one kind of them (Draper and
-    Smith 1998, Applied Regression Analysis, section 8.1). Rows with equal joint values count once in n.
+    Parameters that are fitted to n values make their errors too small. Therefore the errors are multiplied by
+    `sqrt(n / (n - p))`, where p is the trace of the hat matrix over these values, which is the number of parameters if
+    there is only one kind of values (Draper and Smith 1998, Applied Regression Analysis, section 8.1). Rows with equal
+    joint values count once in n.
 
     Args:
-        model: of any kind; the frames or targets that it holds do not matter where they are fitted.
-        measurements: rows with positions, and with orientations or without.
-        fitted: what is fitted; nothing for the errors in the model's own frames.
+        model: a model of any kind; its frames or targets are not used if they are fitted.
+        measurements: rows with positions, and optionally orientations.
+        fitted: what is fitted; empty for the errors in the frames of the model.
 
     Returns:
-        Measured minus predicted, see `errors_of_rows`; NaN where nothing was measured or predicted, and where
-        something is fitted in rows without a position.
+        Measured minus predicted, see `errors_of_rows`; NaN where nothing was measured or predicted, and in rows
+        without a position if something is fitted.
 
     Raises:
-        MeasurementError: a frame or a target has fewer than `FEWEST` different joint vectors, no positions were
-            measured that something could be fitted to, or the model lacks a frame or target that is not fitted.
-        IdentificationError: an anchor has too few rows to say where it is.
+        MeasurementError: a frame or a target has fewer than `MIN_CONFIGURATIONS` different joint vectors, there are no
+            positions to fit to, or the model lacks a frame or target that is not fitted.
+        IdentificationError: an anchor has too few rows to determine its position.
     """
     T = poses_of_rows(model, with_names_of(model, measurements, fitted))
     if not fitted:
         return errors_of_rows(T, measurements)
     if measurements.position is None:
+        given = " and ".join(sorted(measurements.kinds)) or "none"
         raise MeasurementError(
-            f"{measurements.source}: expected positions to fit the {' and the '.join(fitted)} to, got "
-            f"{' and '.join(sorted(measurements.kinds)) or 'none'}; leave the fit out (balls in sockets, and distances "
-            "from anchors at unknown points, do not depend on where the base stands)."
+            f"expected positions to fit the {' and the '.join(fitted)} to, got {given}",
+            expected="positions",
+            value=given,
+            at=Place(measurements.source),
+            remedy="omit the fit (balls in sockets, and distances from anchors at unknown points, do not depend on the "
+            "base)",
         )
     usable = torch.isfinite(measurements.position).all(-1) & torch.isfinite(T).flatten(1).all(-1)
     rows = measurements.select(usable.nonzero()[:, 0])
@@ -119,7 +124,7 @@ def errors_in_fitted_frames(
 
 
 def _enlargement(rows: Measurements, fitted: float) -> float:
-    """Factor on errors for so many fitted numbers."""
+    """Compute the factor on errors for a number of fitted parameters."""
     values = 3 * len(set(groups_to_keep_whole(rows).tolist()))
     return float((values / (values - fitted)) ** 0.5) if fitted else 1.0
 
@@ -127,7 +132,7 @@ def _enlargement(rows: Measurements, fitted: float) -> float:
 def _check_configurations(
     model: CalibratedModel, measurements: Measurements, rows: Measurements, fitted: Collection[FrameKind]
 ) -> None:
-    """Make sure that every frame and every target that is fitted has enough rows."""
+    """Refuse frames and targets that have too few rows to be fitted."""
     names = {
         "base": ("frame", measurements.frame, rows.frame),
         "tool": ("target", measurements.target, rows.target),
@@ -139,10 +144,14 @@ def _check_configurations(
                 [index for index, other in enumerate(there) if other == name], dtype=torch.int64
             )
             count = len(set(groups_to_keep_whole(rows.select(of_name)).tolist()))
-            if count < FEWEST:
+            if count < MIN_CONFIGURATIONS:
                 raise MeasurementError(
-                    f"{measurements.source}: {what} '{name}' holds {count} different joint vectors whose positions "
-                    f"the model '{model.name}' predicts, and fitting it takes {FEWEST} or more; measure more poses."
+                    f"expected {MIN_CONFIGURATIONS} or more different joint vectors of {what} '{name}' whose positions "
+                    f"the model '{model.name}' predicts, got {count}",
+                    expected=f"{MIN_CONFIGURATIONS} or more joint vectors of {what} '{name}'",
+                    value=count,
+                    at=Place(measurements.source),
+                    remedy="measure more poses",
                 )
 
 
@@ -151,16 +160,16 @@ def fit_frames(
 ) -> tuple[Float64[Tensor, "rows 4 4"], Float64[Tensor, "rows 6 numbers"]]:
     """Fit bases and tools of rows to their measured poses.
 
-    Either kind alone is fitted in closed form; both together go on from there by Levenberg and Marquardt's method.
+    Bases or tools alone are fitted in closed form; both together are then refined by the Levenberg-Marquardt method.
 
     Args:
         T: predicted poses, with any bases and tools.
-        measured: of the rows.
-        rows: with the names of frames and targets.
+        measured: measured poses of the rows.
+        rows: the rows, with the names of frames and targets.
         fitted: what is fitted.
 
     Returns:
-        The poses, and the derivatives of their values by all fitted numbers, see `frame_columns`.
+        The poses, and the derivatives of their values by all fitted parameters, see `frame_columns`.
     """
     frame, target = numbers_of_names(rows.frame), numbers_of_names(rows.target)
     bases, tools = (torch.eye(4).to(T).repeat(int(number.max()) + 1, 1, 1) for number in (frame, target))
@@ -206,7 +215,7 @@ def _columns(
     tools: tuple[Tensor, Int64[Tensor, " rows"]],
     fitted: Collection[FrameKind],
 ) -> tuple[Float64[Tensor, "rows 6 numbers"], Float64[Tensor, "rows 6"]]:
-    """Derivatives of all values by the numbers of the fitted bases and tools, and the errors; see `frame_columns`."""
+    """Compute the derivatives of all values by the fitted bases and tools, and the errors; see `frame_columns`."""
     J, error = frame_columns(T, measured, bases[0][bases[1]], tools[0][tools[1]])
     blocks = []
     for kind, (frames, number), part in zip(

@@ -1,4 +1,4 @@
-"""Errors of measured rows, whatever measured them."""
+"""Errors of measured rows of any sensor."""
 
 from dataclasses import replace
 
@@ -14,20 +14,20 @@ from pisigma.validation.held_out.pose_statistics import ErrorVectors
 def errors_of_rows(T: Float64[Tensor, "rows 4 4"], measurements: Measurements) -> ErrorVectors:
     """Compute the errors of rows against predicted poses of the targets.
 
-    Sockets, and anchors at unknown points, are where their rows fit best, and the errors are enlarged for that; see
-    `measured_errors`.
+    The positions of sockets, and of anchors at unknown points, are fitted to their rows, and the errors are corrected
+    for the degrees of freedom; see `measured_errors`.
 
     Args:
-        T: predicted, in the frame of every row.
+        T: predicted poses, in the frame of every row.
         measurements: the rows.
 
     Returns:
-        As positions the errors of positions, and in rows without one those of whatever length was measured: of a ball
-        in a socket along the axes of the frame, of a wire, a touch or a pair the difference as the first component. NaN
+        As `position` the errors of positions, and in rows without one those of the measured length: for a ball in a
+        socket along the axes of the frame, for a wire, a touch or a pair the difference as the first component. NaN
         where nothing was measured or predicted.
 
     Raises:
-        IdentificationError: an anchor has too few rows to say where it is.
+        IdentificationError: an anchor has too few rows to determine its position.
     """
     if measurements.position is not None:
         errors = ErrorVectors.between(measurements, T)
@@ -52,7 +52,7 @@ def errors_of_rows(T: Float64[Tensor, "rows 4 4"], measurements: Measurements) -
 
 
 def other_lengths(measurements: Measurements) -> Bool[Tensor, " rows"]:
-    """Say which rows have no position, but a length of another sensor."""
+    """Say which rows have a length of another sensor and no position."""
     kinds = [kind for kind in measurements.kinds if kind in SENSORS and SENSORS[kind].unit == "m"]
     there = torch.zeros(measurements.rows, dtype=torch.bool)
     for kind in kinds:
@@ -68,21 +68,21 @@ def has_position(measurements: Measurements) -> Bool[Tensor, " rows"]:
 
 
 def places_remark(measurements: Measurements) -> tuple[str, ...]:
-    """Say what a user should know of errors of rows that find out where a sensor stands."""
+    """Write a remark on errors of rows to which positions of sockets or anchors are fitted; empty if there are none."""
     rows = other_lengths(measurements).nonzero()[:, 0]
     groups = unknown_groups(measurements.select(rows))
     if not groups:
         return ()
     what = " and ".join(f"{len(group.owners)} {group.name}s" for group in groups)
     return (
-        f"Where {what} are, the rows say themselves, for every model: an error is how far a row is off what the others "
-        "of its socket or anchor agree on, enlarged for the numbers that were fitted to them. Where the robot's base "
-        "stands does not matter for that.",
+        f"For every model, the positions of {what} were fitted to these rows: an error is the deviation of a row from "
+        "the other rows of its socket or anchor, corrected for the fitted parameters. It does not depend on the pose "
+        "of the robot's base.",
     )
 
 
 def _whole_pairs(measurements: Measurements, rows: Bool[Tensor, " rows"]) -> Bool[Tensor, " rows"]:
-    """Leave out both rows of pairs that one is left out of."""
+    """Leave out both rows of a pair if one of them is left out."""
     broken = {
         name
         for name, there in zip(measurements.pair or (), rows.tolist(), strict=False)
