@@ -213,13 +213,6 @@ class Measurements:
         """Return the place of a row as a text; see `at`."""
         return self.as_fields().label(row)
 
-    def at(self, row: int) -> Place:
-        """Return the file and line of a row, for the fields of an error; see `place`."""
-        line = self.line[row] if row < len(self.line) else 0
-        if not line:
-            return Place(self.place(row))
-        return Place(self.origin[row] if self.origin else self.source, line)
-
     def split_sets(self) -> "tuple[Measurements, Measurements | None]":
         """Split the rows by the column `set` into training rows and held-out rows (the set "test").
 

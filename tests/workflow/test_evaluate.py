@@ -107,5 +107,6 @@ def test_a_base_or_a_tool_that_has_moved_is_named():
         )
         assert not found.accepted
         (diagnostic,) = found.diagnostics
+        assert (diagnostic.kind, diagnostic.cause) == ("setup_fault", {"base": "frame"}.get(what, what))
         assert f"--moved {what}" in diagnostic.sentence
         assert pisigma.evaluate(model, measured(q, poses, False), fitted).accepted

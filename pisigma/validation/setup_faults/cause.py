@@ -18,7 +18,8 @@ class Cause:
         joints: indices of the joints concerned, from 0.
         moved: largest motion of a joint zero [rad or m]; infinite for faults of other kinds.
         amount: motion of a frame or tool [m], correct over stated values with a wrong unit, or the number of
-            corrections applied in addition to those logged (1 or -1); NaN for faults of other kinds.
+            corrections applied in addition to those logged (1 or -1), or the number of targets under one name; NaN for
+            faults of other kinds.
     """
 
     kind: str

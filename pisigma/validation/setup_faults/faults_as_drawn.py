@@ -335,6 +335,7 @@ def _one_name(rows: Measurements, number: Int64[Tensor, " rows"]) -> Cause:
         clause,
         f"name the targets in a column 'target'; their first rows are {joined(first)}",
         float(len(used)),
+        amount=float(len(used)),
     )
 
 

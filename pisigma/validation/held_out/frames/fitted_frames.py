@@ -63,7 +63,7 @@ def fitted_remark(rows: Measurements, fitted: Collection[FrameKind]) -> tuple[st
     what = " and ".join(f"the {name} ({count} parameters)" for name, count in numbers.items() if count)
     values = len(set(groups_to_keep_whole(rows).tolist())) * (6 if turned else 3)
     return (
-        f"For every model, {what} were fitted to these rows, so errors of the robot's {' or '.join(fitted)} are not "
+        f"For every model, these rows are used to fit {what}, so errors of the robot's {' or '.join(fitted)} are not "
         f"included. The errors are corrected for this: their squares are divided by {values - sum(numbers.values())} "
         f"degrees of freedom ({values} values minus {sum(numbers.values())} fitted parameters).",
     )
