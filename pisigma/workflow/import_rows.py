@@ -9,8 +9,7 @@ from pisigma.files.errors import MeasurementError, Place
 from pisigma.files.output_file import check_output, write_whole
 from pisigma.measurement.csv.reading import fields_of
 from pisigma.measurement.dataset import Measurements
-from pisigma.measurement.foreign import accounting
-from pisigma.measurement.foreign.accounting import FileAccount, LeftOutRow, account, sentences
+from pisigma.measurement.foreign.accounting import FileAccount, FileLine, LeftOutRow, account, sentences
 from pisigma.measurement.foreign.conversion import ConvertedRows, MeasurementTable, convert, measurement_table
 from pisigma.measurement.foreign.export_file import read_export
 from pisigma.measurement.foreign.joining import JoinedRows, append_rows, join_rows
@@ -177,7 +176,7 @@ def import_rows(
     content = measurement_table(rows)
     exports = [mapping.file for mapping in proposal.mappings]
     left_out = [*(row for file in exports for row in file.skipped), *content.left_out]
-    used: list[accounting.Place] = list(content.places)
+    used: list[FileLine] = list(content.places)
     if joined is not None:
         left_out += (*joined.unmatched, *joined.unused)
         used += joined.used

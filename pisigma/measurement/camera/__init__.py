@@ -1,1 +1,1 @@
-"""Cameras and printed boards: from pixels of corners to poses of the camera that a robot is calibrated with."""
+"""Cameras and printed boards: from pixels of corners to camera poses for the calibration of a robot."""

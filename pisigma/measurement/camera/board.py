@@ -1,4 +1,4 @@
-"""Printed boards: where their corners are."""
+"""Printed boards and the positions of their corners."""
 
 import os
 from dataclasses import dataclass
@@ -16,12 +16,12 @@ Dictionary = Literal[
     "4x4_50", "4x4_100", "4x4_250", "4x4_1000", "5x5_50", "5x5_100", "5x5_250", "5x5_1000",
     "6x6_50", "6x6_100", "6x6_250", "6x6_1000", "7x7_50", "7x7_100", "7x7_250", "7x7_1000",
 ]  # fmt: skip
-"""Of the markers in the white squares of a ChArUco board, as OpenCV numbers them."""
+"""OpenCV's dictionary of the markers in the white squares of a ChArUco board."""
 TagFamily = Literal["tag16h5", "tag25h9", "tag36h10", "tag36h11"]
 TAG_CELLS = {"tag16h5": 6, "tag25h9": 7, "tag36h10": 8, "tag36h11": 8}
-"""Cells along the side of a tag, with those of its border."""
+"""Number of cells along the side of a tag, including its border."""
 Length = Annotated[float, Field(ge=0.2)]
-"""[mm] A length of a board; what is shorter was meant in metres."""
+"""[mm] A length of a board; shorter ones are probably in metres."""
 _LENGTHS: dict[BoardKind, tuple[str, ...]] = {
     "checkerboard": ("square_mm",),
     "charuco": ("square_mm", "marker_mm"),
@@ -30,21 +30,21 @@ _LENGTHS: dict[BoardKind, tuple[str, ...]] = {
 
 
 class BoardDocument(Section):
-    """A board as its file states it.
+    """A board file.
 
     Attributes:
-        kind: of the board.
-        name: of the board.
-        rows: of corners inside, or of AprilTags.
-        columns: of corners inside, or of AprilTags.
-        square_mm: side of a square [mm], of a checkerboard or a ChArUco board.
-        square_sigma_mm: its standard deviation, common to all squares [mm].
-        flatness_mm: tolerance of the flatness [mm].
+        kind: kind of board.
+        name: name of the board.
+        rows: number of rows of inner corners, or of AprilTags.
+        columns: number of columns of inner corners, or of AprilTags.
+        square_mm: side of a square of a checkerboard or a ChArUco board [mm].
+        square_sigma_mm: standard deviation of the side, common to all squares [mm].
+        flatness_mm: flatness tolerance [mm].
         marker_mm: side of the markers of a ChArUco board [mm].
-        dictionary: of these markers.
+        dictionary: dictionary of these markers.
         tag_mm: side of an AprilTag [mm].
-        spacing_mm: between neighbouring AprilTags [mm].
-        family: of these tags.
+        spacing_mm: gap between neighbouring AprilTags [mm].
+        family: family of these tags.
     """
 
     kind: BoardKind = "checkerboard"
@@ -62,18 +62,18 @@ class BoardDocument(Section):
 
     @model_validator(mode="after")
     def _lengths_of_kind(self) -> "BoardDocument":
-        wanted = _LENGTHS[self.kind]
-        stated = [name for name in ("square_mm", "marker_mm", "tag_mm", "spacing_mm") if getattr(self, name)]
-        if sorted(wanted) != sorted(stated):
+        expected = _LENGTHS[self.kind]
+        given = [name for name in ("square_mm", "marker_mm", "tag_mm", "spacing_mm") if getattr(self, name)]
+        if sorted(expected) != sorted(given):
             raise ValueError(
-                f"a board of kind {self.kind} has {' and '.join(wanted)} [mm], got {', '.join(stated) or 'none'}"
+                f"expected {' and '.join(expected)} of a board of kind {self.kind}, got {', '.join(given) or 'none'}"
             )
         if self.kind == "charuco" and (self.marker_mm or 0.0) >= (self.square_mm or 0.0):
-            raise ValueError("marker_mm is less than square_mm, as a marker lies in a square")
+            raise ValueError(f"expected marker_mm < square_mm, got {self.marker_mm} and {self.square_mm} mm")
         return self
 
     def board(self) -> "Board":
-        """The board that it states."""
+        """Return the board."""
         marker = self.marker_mm or self.tag_mm or 0.0
         pitch = self.square_mm or marker + (self.spacing_mm or 0.0)
         names = {"checkerboard": "", "charuco": self.dictionary, "apriltag": self.family}
@@ -87,23 +87,21 @@ class BoardDocument(Section):
 class Board:
     """A flat board with numbered corners.
 
-    Looked at from its printed side, x leads to the right, y down and z into the board, and rows are counted down. The
-    corners of checkerboards and ChArUco boards are those inside, row by row from 0; corner 0 is the origin, and the
-    square beyond it (where x and y are negative) is black. The corners of an AprilTag grid are those of its tags: of
-    tag i, counted row by row from 0, 4 i is the upper left one, and the others follow to the right; corner 0 is the
-    origin.
+    Seen from the printed side, x points right, y down and z into the board, and rows are counted downwards. Corners of
+    checkerboards and ChArUco boards are the inner ones, row by row from 0; corner 0 is the origin, and the square at
+    negative x and y is black. Corners of an AprilTag grid are those of its tags: corner 4 i is the upper left one of
+    tag i, counted row by row from 0, and the others follow clockwise; corner 0 is the origin.
 
     Attributes:
-        name: of the board.
-        rows: number of rows of corners, of a grid of AprilTags of tags.
-        columns: corners of a row, or tags.
-        square: distance of two neighbouring corners [m], of AprilTags from tag to tag; every length of the calibration
-            rests on it.
-        kind: of the board.
+        name: name of the board.
+        rows: number of rows of corners, or of AprilTags.
+        columns: number of corners, or of AprilTags, in a row.
+        square: distance between neighbouring corners, or from tag to tag [m]; it sets the scale of the calibration.
+        kind: kind of board.
         marker: side of the markers of a ChArUco board, or of AprilTags [m].
-        dictionary: of its markers: a `Dictionary` or a `TagFamily`.
-        scale_deviation: standard deviation of all its lengths together, as a share of them; None where none is stated.
-        flatness: distance of two planes between which its surface lies [m]; 0 where it is taken as flat.
+        dictionary: dictionary of its markers: a `Dictionary` or a `TagFamily`.
+        scale_deviation: relative standard deviation common to all its lengths; None if not given.
+        flatness: distance between two planes that enclose its surface [m]; 0 for a perfectly flat board.
     """
 
     name: str
@@ -121,13 +119,13 @@ class Board:
         """Read a board from a YAML file with `kind`, `rows`, `columns` and its lengths, such as `square_mm`.
 
         Raises:
-            MeasurementError: the file cannot be read or describes no board; the message names file, line and key.
+            MeasurementError: the file cannot be read or is not a valid board; `file`, `line` and `column` state where.
         """
         return read_yaml(path, BoardDocument, MeasurementError).board()
 
     @property
     def corners(self) -> Float64[np.ndarray, "corners 3"]:
-        """Where the corners are in the board's frame [m]."""
+        """Positions of the corners in the board's frame [m]."""
         row, column = np.divmod(np.arange(self.rows * self.columns), self.columns)
         grid = self.square * np.stack([column, row, np.zeros(len(row))], -1)
         if self.kind != "apriltag":
@@ -137,7 +135,7 @@ class Board:
 
     @property
     def edges(self) -> Int64[np.ndarray, "edges 2"]:
-        """Pairs of corners between which black meets white on a straight line."""
+        """Pairs of corners that are joined by a straight edge between black and white."""
         if self.kind == "apriltag":
             first = np.arange(4 * self.rows * self.columns)
             return np.stack([first, first // 4 * 4 + (first + 1) % 4], -1)
@@ -148,15 +146,15 @@ class Board:
 
     @property
     def clearance(self) -> float:
-        """Share of the length of an edge, to both of its sides, that is all black or white."""
+        """Width of the uniformly black or white areas on both sides of an edge, relative to its length."""
         if self.kind == "apriltag":
             return 1.0 / TAG_CELLS[self.dictionary]
         return 0.4 if self.kind == "checkerboard" else (1 - self.marker / self.square) / 2
 
     @property
     def is_symmetric(self) -> bool:
-        """Whether the board looks the same turned by 180 deg, so that its corners cannot be numbered by an image.
+        """Whether the board looks the same rotated by 180 deg, so that an image does not determine its numbering.
 
-        A checkerboard of an even sum of rows and columns of corners has squares of one colour in opposite places.
+        This is so for checkerboards whose number of rows plus columns of corners is even.
         """
         return self.kind == "checkerboard" and (self.rows + self.columns) % 2 == 0

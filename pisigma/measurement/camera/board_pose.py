@@ -10,32 +10,33 @@ from pisigma.estimation.loss import AbstractLoss
 from pisigma.measurement.camera.camera import Camera
 from pisigma.robot.se3 import nearest_rotation, rotation_from_vector, skew
 
-FEWEST_CORNERS = 6
-"""Of an image: four determine the pose, two more show whether one is wrong."""
-STEPS = 20
-SMALLEST_STEP = 1e-10
-"""[m or rad] Steps are not continued below."""
-SMALLEST_NOISE = 1e-6
-"""[px] Floor of the noise of corners, for exact ones."""
+MIN_CORNERS = 6
+"""Smallest number of corners in an image: four determine the pose, two more show whether one is wrong."""
+MAX_ITERATIONS = 20
+STEP_TOLERANCE = 1e-10
+"""[m or rad] Gauss-Newton step at which iterations stop."""
+MIN_NOISE = 1e-6
+"""[px] Lower bound of the noise of corners, for exact ones."""
 POSE = 6
+"""Number of parameters of a pose."""
 
 
 @dataclass(frozen=True, eq=False)
 class BoardPose:
-    """Where a board was in front of a camera.
+    """The pose of a board in front of a camera, with its covariance.
 
     Attributes:
         R: R_camera_board.
         t: origin of the board in the camera's frame [m].
-        cofactor: covariance of an error (shift of t [m], turn of R as a rotation vector in the camera's frame [rad])
-            for a noise of the corners of 1 px.
-        distance: by how much every corner misses its prediction [px: of corners of the usual deviation].
-        weight: how much every corner counts by the loss.
-        by_intrinsics: derivative of the pose (shift of t [m], turn of R as a rotation vector in the camera's frame
-            [rad]) by the intrinsics, which the corners are solved anew with.
-        root: with `rest` what the corners say of the intrinsics k whatever the pose is, for a noise of 1 px:
+        cofactor: covariance of the pose error (shift of t [m], rotation vector of R in the camera's frame [rad]) for a
+            noise of the corners of 1 px.
+        distance: residual of every corner, as a distance relative to its standard deviation [px].
+        weight: weight of every corner by the loss.
+        by_intrinsics: derivative of the solved pose (shift of t [m], rotation vector of R in the camera's frame [rad])
+            by the intrinsics.
+        root: information of the corners on the intrinsics k with the pose eliminated, for a noise of 1 px:
             `root (k - present) = rest`.
-        rest: see root [px].
+        rest: see `root` [px].
     """
 
     R: Float64[np.ndarray, "3 3"]
@@ -57,24 +58,24 @@ def solve_board_pose(
 ) -> BoardPose:
     """Find the pose of a flat board by Gauss-Newton steps, from the homography of its corners (Zhang 2000).
 
-    With the point `P = R X + t` of a corner X, a shift δ and a turn ω move P by `δ + ω × R X`.
+    A shift δ and a rotation vector ω move the point `P = R X + t` of a corner X by `δ + ω × R X`.
 
     Args:
-        camera: its intrinsics are taken as they are.
-        corners: in the frame of the board [m], all with z near 0 and not on one line.
-        pixels: where the image shows them [px].
-        loss: how corners count that are far from their prediction.
-        sigma: standard deviation of every corner over the usual one; None where all are alike.
+        camera: the camera, whose intrinsics are fixed here.
+        corners: corners in the frame of the board [m], all with z near 0 and not on one line.
+        pixels: their pixels in the image [px].
+        loss: robust loss of the corners' residuals.
+        sigma: standard deviation of every corner relative to the median; None if all are equal.
     """
     sigma = np.ones(len(pixels)) if sigma is None else sigma
     R, t = _by_homography(corners, camera.undistort(pixels))
-    for _ in range(STEPS):
+    for _ in range(MAX_ITERATIONS):
         residual, J, _ = linearised(camera, corners, pixels, sigma, R, t)
         root = np.sqrt(_weights(residual, loss))[:, None]
         A, b = (root[..., None] * J).reshape(-1, POSE), (root * residual).ravel()
         step = np.linalg.solve(A.T @ A, A.T @ b)
         t, R = t + step[:3], rotation_from_vector(torch.from_numpy(step[3:])).numpy() @ R
-        if np.abs(step).max() < SMALLEST_STEP:
+        if np.abs(step).max() < STEP_TOLERANCE:
             break
     residual, J, _ = linearised(camera, corners, pixels, sigma, R, t)
     weight = _weights(residual, loss)
@@ -95,9 +96,10 @@ def solve_board_pose(
 
 
 def triangle(columns: Float64[np.ndarray, "values columns"]) -> Float64[np.ndarray, "columns columns"]:
-    """Return the triangular factor of a matrix, square also where it has fewer rows than columns.
+    """Return the triangular factor R of a QR decomposition, square even with fewer rows than columns.
 
-    Its first rows belong to the pose, the next ones to what is left for other unknowns once the pose is eliminated.
+    With the pose in the first columns, the rows after `POSE` are the equations of the other unknowns with the pose
+    eliminated.
     """
     count = columns.shape[1]
     padded = np.concatenate([columns, np.zeros((count, count))])
@@ -108,17 +110,17 @@ def triangle(columns: Float64[np.ndarray, "values columns"]) -> Float64[np.ndarr
 def linearised(
     camera: Camera, corners: np.ndarray, pixels: np.ndarray, sigma: np.ndarray, R: np.ndarray, t: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return measured minus predicted pixels, and the predicted ones' derivative by pose and by point, over sigma."""
-    turned = corners @ R.T
-    predicted, by_point = camera.project(turned + t)
-    by_turn = -by_point @ skew(torch.from_numpy(turned)).numpy()
-    J = np.concatenate([by_point, by_turn], -1)
+    """Return measured minus predicted pixels and the derivatives of the prediction by pose and point, over sigma."""
+    rotated = corners @ R.T
+    predicted, by_point = camera.project(rotated + t)
+    by_rotation = -by_point @ skew(torch.from_numpy(rotated)).numpy()
+    J = np.concatenate([by_point, by_rotation], -1)
     return (pixels - predicted) / sigma[:, None], J / sigma[:, None, None], by_point / sigma[:, None, None]
 
 
 def _weights(residual: np.ndarray, loss: AbstractLoss) -> np.ndarray:
     distance = torch.from_numpy(np.linalg.norm(residual, axis=1))
-    scale = max(float(loss.scale(distance, 2, float(POSE))), SMALLEST_NOISE)
+    scale = max(float(loss.scale(distance, 2, float(POSE))), MIN_NOISE)
     weights: np.ndarray = loss.weight(distance / scale, 2).numpy()
     return weights
 
@@ -126,13 +128,13 @@ def _weights(residual: np.ndarray, loss: AbstractLoss) -> np.ndarray:
 def homography(
     plane: Float64[np.ndarray, "corners 2"], image: Float64[np.ndarray, "corners 2"]
 ) -> Float64[np.ndarray, "3 3"]:
-    """Find H of `image ~ H (x, y, 1)`, linear in its nine numbers up to their scale; depths come out positive.
+    """Find the homography H with `image ~ H (x, y, 1)` by the direct linear transform, with positive depths.
 
     Args:
         plane: points on a plane, in any unit.
-        image: where they appear, as x / z and y / z or in another unit that makes them about 1.
+        image: their images, as x / z and y / z or scaled to about 1.
     """
-    middle, size = plane.mean(0), np.ptp(plane, axis=0).max()
+    middle, size = plane.mean(0), np.ptp(plane, axis=0).max()  # normalised, for the condition of A
     at = np.concatenate([(plane - middle) / size, np.ones((len(plane), 1))], 1)
     zero = np.zeros_like(at)
     A = np.concatenate(
@@ -148,7 +150,7 @@ def homography(
 
 
 def _by_homography(corners: np.ndarray, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Pose of a flat board from `ray ~ [r1 r2 t] (x, y, 1)`."""
+    """Return the pose of a flat board from `ray ~ [r1 r2 t] (x, y, 1)`."""
     H = homography(corners[:, :2], rays)
     middle = corners[:, :2].mean(0)
     H = 2 * H / (np.linalg.norm(H[:, 0]) + np.linalg.norm(H[:, 1]))

@@ -1,4 +1,4 @@
-"""A camera: its intrinsics, how it projects points, and the files that hold them."""
+"""A camera: its intrinsics, the projection of points, and its files."""
 
 import os
 import re
@@ -9,35 +9,35 @@ import numpy as np
 from jaxtyping import Float64
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
-from pisigma.files.errors import MeasurementError
+from pisigma.files.errors import MeasurementError, Place
 from pisigma.files.input_file import read_text
 from pisigma.files.yaml_file import MAX_BYTES, Section, parse_yaml, yaml_text
 from pisigma.measurement.sensors.intrinsics import CAMERA_UNITS
 
 INTRINSICS = tuple(CAMERA_UNITS)
 USUAL_DEVIATIONS = (0.5, 0.5, 1.0, 1.0, 0.002, 0.01, 2e-4, 2e-4, 0.0)
-"""Standard deviations of the intrinsics that a usual calibration leaves, with 0 for k3, which it seldom frees."""
+"""Standard deviations of the intrinsics after a usual calibration, with 0 for k3, which is seldom estimated."""
 
 Positive = Annotated[float, Field(gt=0)]
 UNDISTORTED = 1e-14
-"""A shorter Newton step to the undistorted point is rounding."""
-UNDISTORT_STEPS = 20
-"""Newton steps from a distorted to the undistorted point; ordinary lenses take four."""
+"""Newton step at which the undistorted point has converged to rounding."""
+MAX_UNDISTORT_ITERATIONS = 20
+"""Newton iterations from a distorted to the undistorted point; ordinary lenses take four."""
 
 
 class IntrinsicsSection(Section):
-    """A number for each of a camera's intrinsics, such as its standard deviation; those that are not stated are 0.
+    """Standard deviations of a camera's intrinsics (or other numbers per intrinsic); 0 if not given.
 
     Attributes:
-        fx: of the focal length along u [px].
-        fy: of the focal length along v [px].
-        cx: of the principal point, u [px].
-        cy: of the principal point, v [px].
-        k1: of the radial distortion, as k2 and k3.
-        k2: see k1.
-        p1: of the tangential distortion, as p2.
-        p2: see p1.
-        k3: see k1.
+        fx: value of the focal length along u [px].
+        fy: value of the focal length along v [px].
+        cx: value of the principal point, u [px].
+        cy: value of the principal point, v [px].
+        k1: value of the first radial distortion coefficient.
+        k2: value of the second radial distortion coefficient.
+        p1: value of the first tangential distortion coefficient.
+        p2: value of the second tangential distortion coefficient.
+        k3: value of the third radial distortion coefficient.
     """
 
     fx: float = 0.0
@@ -52,28 +52,28 @@ class IntrinsicsSection(Section):
 
     @property
     def numbers(self) -> tuple[float, ...]:
-        """All of them, in the order of `INTRINSICS`."""
+        """All values in the order of `INTRINSICS`."""
         return tuple(self.model_dump().values())
 
 
 class CameraDocument(Section):
-    """A camera as pisigma's own files state it, with OpenCV's distortion.
+    """A camera file of pisigma, with OpenCV's distortion model.
 
     Attributes:
-        name: of the camera.
-        width: of its images [px].
-        height: of its images [px].
+        name: name of the camera.
+        width: width of its images [px].
+        height: height of its images [px].
         fx: focal length along u [px].
         fy: focal length along v [px].
         cx: principal point, u [px].
         cy: principal point, v [px].
-        k1: radial distortion, as k2 and k3.
-        k2: see k1.
-        p1: tangential distortion, as p2.
-        p2: see p1.
-        k3: see k1.
-        sigma: standard deviations of all of these.
-        is_fixed: whether it stands beside the robot and the board is on the flange; else the other way round.
+        k1: first radial distortion coefficient.
+        k2: second radial distortion coefficient.
+        p1: first tangential distortion coefficient.
+        p2: second tangential distortion coefficient.
+        k3: third radial distortion coefficient.
+        sigma: standard deviations of the intrinsics.
+        is_fixed: whether the camera is fixed and the board is on the flange; else the other way round.
     """
 
     name: str = "camera"
@@ -97,26 +97,26 @@ class CameraDocument(Section):
         """Refuse a standard deviation below 0."""
         for name, number in () if sigma is None else sigma:
             if number < 0:
-                raise ValueError(f"{name} is {number:g}, but a standard deviation of 0 or more was wanted")
+                raise ValueError(f"expected a standard deviation of 0 or more of {name}, got {number:g}")
         return sigma
 
     def camera(self) -> "Camera":
-        """The camera that it states."""
+        """Return the camera."""
         sigma = None if self.sigma is None else self.sigma.numbers
         return Camera(**self.model_dump(exclude={"sigma"}), sigma=sigma)
 
 
 class MatrixSection(BaseModel):
-    """A matrix of a ROS or OpenCV file, row by row; its other keys are not looked at."""
+    """A matrix of a ROS or OpenCV file, row by row; its other keys are ignored."""
 
     model_config = ConfigDict(frozen=True, extra="ignore", allow_inf_nan=False)
     data: tuple[float, ...]
 
 
 class MatrixDocument(BaseModel):
-    """A camera as `camera_info` of ROS and the calibration sample of OpenCV write it.
+    """A camera file of ROS (`camera_info`) or of OpenCV's calibration sample.
 
-    Fisheye lenses, whose coefficients mean something else, and binned images, whose pixels do, are refused.
+    Fisheye lenses are refused, as their coefficients have another meaning, and binned images, as their pixels do.
     """
 
     model_config = ConfigDict(frozen=True, extra="ignore", allow_inf_nan=False)
@@ -135,23 +135,23 @@ class MatrixDocument(BaseModel):
 class Camera:
     """A pinhole camera with radial and tangential distortion (Brown 1971, as in OpenCV and ROS's plumb_bob).
 
-    z looks out of the camera, x to the right and y down in the image.
+    z points out of the camera, x to the right and y down in the image.
 
     Attributes:
-        name: of the camera.
-        width: of its images [px].
-        height: of its images [px].
+        name: name of the camera.
+        width: width of its images [px].
+        height: height of its images [px].
         fx: focal length along u [px].
         fy: focal length along v [px].
         cx: principal point, u [px].
         cy: principal point, v [px].
-        k1: radial distortion, as k2 and k3 without a unit.
-        k2: see k1.
-        p1: tangential distortion, as p2 without a unit.
-        p2: see p1.
-        k3: see k1.
-        sigma: standard deviations of fx, fy, cx, cy [px], k1, k2, p1, p2, k3; None where none are stated.
-        is_fixed: whether it stands beside the robot and the board is on the flange; else the other way round.
+        k1: first radial distortion coefficient.
+        k2: second radial distortion coefficient.
+        p1: first tangential distortion coefficient.
+        p2: second tangential distortion coefficient.
+        k3: third radial distortion coefficient.
+        sigma: standard deviations of fx, fy, cx, cy [px], k1, k2, p1, p2, k3; None if not given.
+        is_fixed: whether the camera is fixed and the board is on the flange; else the other way round.
     """
 
     name: str
@@ -174,31 +174,35 @@ class Camera:
         """Read a camera from pisigma's own YAML, a ROS `camera_info` or an OpenCV file.
 
         Raises:
-            MeasurementError: the file cannot be read or describes no such camera; the message names file and key.
+            MeasurementError: the file cannot be read or is not a valid camera; `file` and `column` state the key.
         """
         source = os.fspath(path)
         text = read_text(path, MeasurementError, "YAML", MAX_BYTES)
         if not re.search(r"^\s*camera_matrix\s*:", text, re.MULTILINE):
             return parse_yaml(text, CameraDocument, MeasurementError, source).camera()
-        # OpenCV writes a directive and a tag that YAML does not know; commented out, they keep the lines' numbers
+        # OpenCV writes a directive and a tag that are not YAML; commenting them out keeps the line numbers
         plain = re.sub(r"^%YAML.*$|^---\s*$", "#", text, flags=re.MULTILINE).replace("!!opencv-matrix", "")
         document = parse_yaml(plain, MatrixDocument, MeasurementError, source)
-        matrix, bent = document.camera_matrix.data, document.distortion_coefficients.data
+        matrix, coefficients = document.camera_matrix.data, document.distortion_coefficients.data
         if len(matrix) != 9 or matrix[0] <= 0 or matrix[4] <= 0 or any(matrix[k] for k in (1, 3, 6, 7)):
             raise MeasurementError(
-                f"{source}: camera_matrix.data as fx, 0, cx, 0, fy, cy, 0, 0, 1 was wanted, got {matrix}."
+                expected="fx, 0, cx, 0, fy, cy, 0, 0, 1",
+                value=matrix,
+                at=Place(source, column="camera_matrix.data"),
             )
-        if len(bent) < 4 or any(bent[5:]):
+        if len(coefficients) < 4 or any(coefficients[5:]):
             raise MeasurementError(
-                f"{source}: distortion_coefficients.data as k1, k2, p1, p2 and k3 was wanted, got {bent}; calibrate "
-                "the camera with that model."
+                expected="k1, k2, p1, p2 and k3",
+                value=coefficients,
+                at=Place(source, column="distortion_coefficients.data"),
+                remedy="calibrate the camera with that model",
             )
         size = (document.camera_name, document.image_width, document.image_height)
-        k1, k2, p1, p2, k3 = (*bent, 0.0)[:5]
+        k1, k2, p1, p2, k3 = (*coefficients, 0.0)[:5]
         return Camera(*size, matrix[0], matrix[4], matrix[2], matrix[5], k1, k2, p1, p2, k3)
 
     def to_yaml(self) -> str:
-        """Write the camera as a file that `load` reads."""
+        """Return the camera as the text of a file that `load` reads."""
         numbers = dict(zip(INTRINSICS, self.intrinsics.tolist(), strict=True))
         content = {"name": self.name, "width": self.width, "height": self.height, **numbers}
         if self.is_fixed:
@@ -208,11 +212,11 @@ class Camera:
 
     @property
     def intrinsics(self) -> Float64[np.ndarray, " 9"]:
-        """All numbers of the model, in the order of `INTRINSICS` [px, and 1 from k1 on]."""
+        """All intrinsics in the order of `INTRINSICS` [px; k1, k2, p1, p2, k3 without unit]."""
         return np.array([getattr(self, name) for name in INTRINSICS])
 
     def with_intrinsics(self, values: Float64[np.ndarray, " 9"]) -> "Camera":
-        """Return the camera with other numbers in the order of `INTRINSICS`."""
+        """Return the camera with other intrinsics, in the order of `INTRINSICS`."""
         return replace(self, **dict(zip(INTRINSICS, values.tolist(), strict=True)))
 
     def project(
@@ -220,13 +224,13 @@ class Camera:
     ) -> tuple[Float64[np.ndarray, "*batch 2"], Float64[np.ndarray, "*batch 2 3"]]:
         """Return the pixels of points in the camera's frame [m] and their derivative by the points [px/m]."""
         xy = points[..., :2] / points[..., 2:]
-        bent, derivative = self._distorted(xy)
+        distorted, derivative = self._distorted(xy)
         scale = np.array([self.fx, self.fy])
         by_point = np.zeros((*xy.shape, 3))
         by_point[..., 0, 0] = by_point[..., 1, 1] = 1.0
         by_point[..., 2] = -xy
         by_point /= points[..., 2, None, None]
-        return bent * scale + (self.cx, self.cy), scale[:, None] * (derivative @ by_point)
+        return distorted * scale + (self.cx, self.cy), scale[:, None] * (derivative @ by_point)
 
     def by_intrinsics(self, points: Float64[np.ndarray, "*batch 3"]) -> Float64[np.ndarray, "*batch 2 9"]:
         """Return the derivative of the pixels of points in the camera's frame [m] by the intrinsics.
@@ -238,9 +242,9 @@ class Camera:
         x, y = xy[..., 0], xy[..., 1]
         square = x * x + y * y
         derivative = np.zeros((*xy.shape, len(INTRINSICS)))
-        bent = self._distorted(xy)[0]
+        distorted = self._distorted(xy)[0]
         for axis, focal in enumerate((self.fx, self.fy)):
-            derivative[..., axis, axis] = bent[..., axis]
+            derivative[..., axis, axis] = distorted[..., axis]
             derivative[..., axis, 2 + axis] = 1.0
             for column, power in ((4, square), (5, square**2), (8, square**3)):
                 derivative[..., axis, column] = focal * xy[..., axis] * power
@@ -250,28 +254,28 @@ class Camera:
 
     def undistort(self, pixels: Float64[np.ndarray, "*batch 2"]) -> Float64[np.ndarray, "*batch 2"]:
         """Return x / z and y / z of the rays of pixels, by Newton's method."""
-        bent = (pixels - (self.cx, self.cy)) / (self.fx, self.fy)
-        xy = bent.copy()
-        for _ in range(UNDISTORT_STEPS):
+        distorted = (pixels - (self.cx, self.cy)) / (self.fx, self.fy)
+        xy = distorted.copy()
+        for _ in range(MAX_UNDISTORT_ITERATIONS):
             now, derivative = self._distorted(xy)
-            step = np.linalg.solve(derivative, (bent - now)[..., None])[..., 0]
+            step = np.linalg.solve(derivative, (distorted - now)[..., None])[..., 0]
             xy += step
             if not np.abs(step).max(initial=0.0) > UNDISTORTED:
                 break
         return xy
 
     def _distorted(self, xy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Distorted x / z and y / z, and their derivative by the undistorted ones."""
+        """Return distorted x / z and y / z, and their derivative by the undistorted ones."""
         x, y = xy[..., 0], xy[..., 1]
         square = x * x + y * y
         radial = 1 + square * (self.k1 + square * (self.k2 + square * self.k3))
         slope = self.k1 + square * (2 * self.k2 + 3 * self.k3 * square)
-        bent = xy * radial[..., None]
-        bent[..., 0] += 2 * self.p1 * x * y + self.p2 * (square + 2 * x * x)
-        bent[..., 1] += self.p1 * (square + 2 * y * y) + 2 * self.p2 * x * y
+        distorted = xy * radial[..., None]
+        distorted[..., 0] += 2 * self.p1 * x * y + self.p2 * (square + 2 * x * x)
+        distorted[..., 1] += self.p1 * (square + 2 * y * y) + 2 * self.p2 * x * y
         derivative = np.empty((*xy.shape, 2))
         derivative[..., 0, 0] = radial + 2 * x * x * slope + 2 * self.p1 * y + 6 * self.p2 * x
         derivative[..., 1, 1] = radial + 2 * y * y * slope + 6 * self.p1 * y + 2 * self.p2 * x
         mixed = 2 * (x * y * slope + self.p1 * x + self.p2 * y)
         derivative[..., 0, 1] = derivative[..., 1, 0] = mixed
-        return bent, derivative
+        return distorted, derivative

@@ -1,16 +1,16 @@
-"""What the pixels of files of corners mean: cameras, boards, and how well the robot repeats."""
+"""Description of files of corners: cameras, boards, and the repeatability of the robot."""
 
 import math
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal, get_args
 
-from pisigma.files.errors import IdentificationError, MeasurementError, nearest_choice
+from pisigma.files.errors import IdentificationError, MeasurementError, check_choice
 from pisigma.files.setting import Option, texts
 
 IntrinsicsChoice = Literal["fixed", "prior", "free"]
-MOST_REPEATABILITY = 0.01, 0.105
-"""[m] and [rad] More is that of no robot, but of another unit."""
+MAX_REPEATABILITY = 0.01, 0.105
+"""[m] and [rad] No robot is worse; larger values are in another unit."""
 
 
 @dataclass(frozen=True)
@@ -26,11 +26,12 @@ class Repeatability:
     angle: Annotated[float, Option("--repeatability-deg", unit="deg")] = math.radians(0.01)
 
     def __post_init__(self) -> None:
-        """Refuse what is no standard deviation."""
-        if not (0 <= self.length <= MOST_REPEATABILITY[0] and 0 <= self.angle <= MOST_REPEATABILITY[1]):
+        """Check both standard deviations."""
+        if not (0 <= self.length <= MAX_REPEATABILITY[0] and 0 <= self.angle <= MAX_REPEATABILITY[1]):
             raise IdentificationError(
-                f"repeatability: standard deviations of 0 to 10 mm and 0 to 6 deg were wanted, got "
-                f"{self.length * 1e3:g} mm and {math.degrees(self.angle):g} deg."
+                option="repeatability",
+                expected="standard deviations of 0 to 10 mm and 0 to 6 deg",
+                value=f"{self.length * 1e3:g} mm and {math.degrees(self.angle):g} deg",
             )
 
 
@@ -61,21 +62,22 @@ class CameraFiles:
     intrinsics: IntrinsicsChoice = "prior"
 
     def __post_init__(self) -> None:
-        """Refuse what is no choice, cameras without boards, and boards without cameras."""
-        if self.intrinsics not in get_args(IntrinsicsChoice):
-            choices = nearest_choice(self.intrinsics, get_args(IntrinsicsChoice))
-            raise IdentificationError(f"intrinsics '{self.intrinsics}' is no choice; {choices}")
+        """Refuse unknown choices of intrinsics, cameras without boards, and boards without cameras."""
+        check_choice(IdentificationError, "intrinsics", self.intrinsics, get_args(IntrinsicsChoice))
         if not self.cameras or not self.boards:
-            raise MeasurementError("--camera and --board belong together; give both.")
+            missing = "--board" if self.cameras else "--camera"
+            raise MeasurementError(
+                "--camera and --board are needed together", option=missing, remedy="give both"
+            )
 
     @property
     def files(self) -> tuple[str, ...]:
-        """Of cameras and boards."""
+        """The files of cameras and boards."""
         return (*self.cameras, *self.boards)
 
     @property
     def options(self) -> list[str]:
-        """Options by which commands read the same."""
+        """The command line options that state the same."""
         words = [word for path in self.cameras for word in ("--camera", path)]
         words += [word for path in self.boards for word in ("--board", path)]
         usual, stated = Repeatability(), self.repeatability

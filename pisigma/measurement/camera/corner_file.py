@@ -1,4 +1,4 @@
-"""Files of corners, in which rows of other sensors may stand, as measurements."""
+"""Read files of corners, which may contain rows of other sensors, as measurements."""
 
 import os
 from collections.abc import Callable, Collection, Sequence
@@ -9,9 +9,9 @@ import numpy as np
 import torch
 from jaxtyping import Float64, Int64
 
-from pisigma.files.errors import MeasurementError, nearest_choice
+from pisigma.files.errors import MeasurementError, Place, nearest_choice
 from pisigma.measurement.camera.board import Board
-from pisigma.measurement.camera.board_pose import FEWEST_CORNERS
+from pisigma.measurement.camera.board_pose import MIN_CORNERS
 from pisigma.measurement.camera.camera import Camera
 from pisigma.measurement.camera.camera_files import CameraFiles
 from pisigma.measurement.camera.image_rows import Images, image_measurements
@@ -20,17 +20,17 @@ from pisigma.measurement.csv.columns import CORNERS, POSITION
 from pisigma.measurement.csv.reading import fields_of, number_column, text_column
 from pisigma.measurement.csv.table import Table, read_table
 from pisigma.measurement.dataset import Measurements, join
-from pisigma.measurement.fields import MeasuredFields
+from pisigma.measurement.fields import Fault, MeasuredFields, RowPlace
 from pisigma.measurement.sensors.intrinsics import NOISE_COLUMN
 from pisigma.robot.description import Robot
 
 SAME_JOINTS = 1e-9
-"""[rad or m] Joint values of one image differ by no more."""
-SEVERAL = 8
-"""Images of which some show corners beyond a quarter of what the camera sees."""
+"""[rad or m] Largest difference of the joint values of one image."""
+RESOLUTION_IMAGES = 8
+"""Number of images of which some show corners outside the upper left quarter of the field of view."""
 CONDITIONS = ("split", "payload", "temperature", "approach", "date")
-"""What rows of corners may state beside joints and pixels, as any other rows."""
-OF_IMAGES = (*CORNERS, "sigma_px", "camera", "board")
+"""Fields that rows of corners may have in addition to joint values and pixels."""
+IMAGE_COLUMNS = (*CORNERS, "sigma_px", "camera", "board")
 """Columns that only rows of corners have."""
 
 MeasurementFiles = str | os.PathLike[str] | Sequence[str | os.PathLike[str]]
@@ -40,17 +40,16 @@ CameraOrBoard = TypeVar("CameraOrBoard", Camera, Board)
 def read_corners(path: str | os.PathLike[str], robot: Robot, cameras: CameraFiles) -> Measurements:
     """Read a CSV file of corners: `image`, `corner`, `u_px`, `v_px` and the joints (`q1_deg` and so on).
 
-    Rows of one image have one name and the same joint values. `camera` and `board` name what an image was taken by
-    and shows, where there are several; corners count by 1 / `sigma_px`². Rows without a corner are those of other
+    Rows of one image have the same name and joint values. With several cameras or boards, the columns `camera` and
+    `board` name those of an image. Corners are weighted by 1 / `sigma_px`². Rows without a corner belong to other
     sensors.
 
     Returns:
-        One row an image, in the frame of the board with the camera as target (of a fixed camera the other way
+        One row per image, in the frame of the board with the camera as target (of a fixed camera the other way
         round), with the weights of `CornerSensor`; and the rows of other sensors.
 
     Raises:
-        MeasurementError: a file cannot be used, or the corners of an image are not of its board; the message names
-            the line.
+        MeasurementError: a file cannot be used, or the corners of an image do not fit its board.
     """
     table = read_table(path)
     if not set(CORNERS) & set(table.header):
@@ -59,7 +58,7 @@ def read_corners(path: str | os.PathLike[str], robot: Robot, cameras: CameraFile
 
 
 def corners_of(table: Table, robot: Robot, files: CameraFiles) -> Measurements:
-    """Turn rows of a file of corners into measurements; see `read_corners`."""
+    """Convert rows of a file of corners to measurements; see `read_corners`."""
     cameras = _by_name(Camera.load, files.cameras, "camera")
     boards = _by_name(Board.load, files.boards, "board")
     is_corner = _are_corners(table)
@@ -89,27 +88,30 @@ def corners_of(table: Table, robot: Robot, files: CameraFiles) -> Measurements:
 def read_rows(
     data: Measurements | MeasurementFiles, robot: Robot, cameras: CameraFiles | None = None
 ) -> Measurements:
-    """Read measurements of any sensors from one file or several; what stands there twice counts once.
+    """Read measurements of any sensors from one or several files, without duplicate rows.
 
     Args:
         data: measurements, or files of them.
-        robot: that was measured.
-        cameras: what the pixels mean where files hold corners.
+        robot: the measured robot.
+        cameras: cameras and boards of the files of corners.
 
     Raises:
-        MeasurementError: a file cannot be used, the files do not fit together, or cameras are stated and there are no
+        MeasurementError: a file cannot be used, the files do not fit together, or cameras are given and there are no
             corners.
     """
 
-    def counted_once(rows: MeasuredFields) -> MeasuredFields:
+    def without_duplicates(rows: MeasuredFields) -> MeasuredFields:
         return without_copies(rows, robot)
 
     if isinstance(data, Measurements):
-        return join([data], counted_once)
+        return join([data], without_duplicates)
     paths = [data] if isinstance(data, str | os.PathLike) else list(data)
     if len({os.path.realpath(path) for path in paths}) < len(paths):
         raise MeasurementError(
-            f"{', '.join(map(str, paths))}: a file is stated twice; state every file once."
+            "a file is given twice",
+            option="data",
+            value=", ".join(map(str, paths)),
+            remedy="give every file once",
         )
     if cameras is None:
         rows = [Measurements.read_csv(path, robot) for path in paths]
@@ -117,14 +119,15 @@ def read_rows(
         rows = [read_corners(path, robot, cameras) for path in paths]
         if not any("corner" in one.kinds for one in rows):
             raise MeasurementError(
-                f"{rows[0].source}: corners of images were wanted, as a camera is stated, but there is none of the "
-                f"columns {', '.join(CORNERS)}; add a file of corners, or leave camera and board out."
+                expected=f"corners of images for the given camera, with the columns {', '.join(CORNERS)}",
+                at=Place(rows[0].source),
+                remedy="add a file of corners, or leave out camera and board",
             )
-    return with_one_noise(join(rows, counted_once))
+    return with_one_noise(join(rows, without_duplicates))
 
 
 def with_one_noise(rows: Measurements) -> Measurements:
-    """Return the rows with one noise of corners, as their weights say how cameras differ."""
+    """Return the rows with the same noise for all corners; their weights state how cameras differ."""
     noise = rows.readings.get(NOISE_COLUMN)
     if not isinstance(noise, torch.Tensor):
         return rows
@@ -135,62 +138,75 @@ def with_one_noise(rows: Measurements) -> Measurements:
 def _by_name(
     load: Callable[[str], CameraOrBoard], paths: Sequence[str], what: str
 ) -> dict[str, CameraOrBoard]:
-    """Load cameras or boards, by their names."""
+    """Load cameras or boards and return them by name."""
     loaded: dict[str, CameraOrBoard] = {}
     for path in paths:
         one = load(path)
         if one.name in loaded:
             raise MeasurementError(
-                f"{path}: another {what} is called '{one.name}', too; give each a `name` of its own in its file."
+                f"another {what} has the same name '{one.name}'",
+                at=Place(path, column="name"),
+                value=one.name,
+                remedy="give each a different 'name' in its file",
             )
         loaded[one.name] = one
     return loaded
 
 
 def _stated(table: Table, column: str, choices: Collection[str]) -> list[str]:
-    """Return which camera or board every row is of; with one choice its name may be left out."""
+    """Return the camera or board of every row; with one choice its name may be omitted."""
     several = len(choices) > 1
     names = [""] * len(table.records)
     if several or column in table.header:
         names = text_column(table, column)
-    for line, name in zip(table.lines, names, strict=True):
+    for row, name in enumerate(names):
         if name not in choices and (name or several):
             raise MeasurementError(
-                f"{table.source}, line {line}, column '{column}': the name of a {column} was wanted, got '{name}'; "
-                f"{nearest_choice(name, choices)}"
+                expected=f"the name of a {column}",
+                value=name,
+                at=table.at(row, column),
+                remedy=nearest_choice(name, choices),
             )
     return [name or next(iter(choices)) for name in names]
 
 
 def _are_corners(table: Table) -> list[bool]:
-    """Return which rows hold a corner: those with an image.
+    """Return which rows contain a corner: those with an image.
 
     Raises:
-        MeasurementError: a column is missing, or a row is no valid CSV or has not as many fields as the header.
+        MeasurementError: a column is missing, a row is not valid CSV, or its number of fields is not that of the
+            header.
     """
-    for row, (line, fields) in enumerate(zip(table.lines, table.records, strict=True)):
-        if row in table.broken or len(fields) != len(table.header):
-            problem = table.broken.get(row, f"{len(fields)} fields, but the header has {len(table.header)}")
-            raise MeasurementError(f"{table.source}, line {line}: {problem}; complete the row.")
+    for row, fields in enumerate(table.records):
+        if row in table.broken:
+            fault = Fault(f"the row is not valid CSV: {table.broken[row]}", remedy="check the quotes")
+            raise fault.error(table.at(row))
+        if len(fields) != len(table.header):
+            raise MeasurementError(
+                expected=f"{len(table.header)} fields as in the header",
+                value=len(fields),
+                at=table.at(row),
+                remedy="complete the row",
+            )
     named, *_ = (text_column(table, name) for name in ("image", *CORNERS))
     return [bool(name) for name in named]
 
 
 def _some(table: Table, chosen: Sequence[bool]) -> Table:
-    """Return some of the rows."""
+    """Return the chosen rows."""
     rows = np.flatnonzero(chosen).tolist()
     records, lines = [table.records[row] for row in rows], tuple(table.lines[row] for row in rows)
     return replace(table, records=records, lines=lines, broken={})
 
 
 def _without_corners(table: Table, is_corner: Sequence[bool]) -> Table:
-    """Return the table as a file of measurements, so that joints and conditions are read and checked as there.
+    """Return the table as a measurement file, so that joint values and conditions are read and checked in the same way.
 
-    The rows of corners hold their number in place of a position that is not known yet.
+    Rows of corners contain their number instead of the position, which is not known yet.
     """
     unit = "m" if "x_m" in table.header else "mm"
     position = tuple(f"{axis}_{unit}" for axis in POSITION)
-    left = [number for number, name in enumerate(table.header) if name not in (*OF_IMAGES, *position)]
+    left = [number for number, name in enumerate(table.header) if name not in (*IMAGE_COLUMNS, *position)]
     index = {name: number for number, name in enumerate(table.header)}
     records = []
     for row, fields in enumerate(table.records):
@@ -204,7 +220,7 @@ def _without_corners(table: Table, is_corner: Sequence[bool]) -> Table:
 def _images(
     table: Table, rows: Measurements, camera: Camera, board: Board
 ) -> tuple[Images, Int64[torch.Tensor, " images"]]:
-    """Put the corners of one image together, for one camera and one board.
+    """Group the corners of one camera and one board by image.
 
     Returns:
         The images, and the number of the first row of each.
@@ -218,7 +234,7 @@ def _images(
         of_image.setdefault(name, []).append(row)
     for name, chosen in of_image.items():
         _check_image(table, name, chosen, rows.q, number)
-    if len(of_image) >= SEVERAL:
+    if len(of_image) >= RESOLUTION_IMAGES:
         _check_resolution(table, pixels, camera)
     first = torch.tensor([chosen[0] for chosen in of_image.values()])
     images = Images(
@@ -241,42 +257,48 @@ def _check_corners(
     camera: Camera,
     board: Board,
 ) -> None:
-    """Refuse corners that the board does not have or the camera cannot have taken, and deviations that are none.
+    """Refuse corners that the board does not have, pixels outside the image, and standard deviations of 0 or less.
 
     Raises:
-        MeasurementError: see above; the message names line and column.
+        MeasurementError: see above.
     """
     corners, size = len(board.corners), np.array([camera.width, camera.height])
-    for row, (line, corner) in enumerate(zip(table.lines, number, strict=True)):
+    for row, corner in enumerate(number):
         if corner != round(corner) or not 0 <= corner < corners:
             raise MeasurementError(
-                f"{table.source}, line {line}, column 'corner': a whole number from 0 to {corners - 1} was wanted, as "
-                f"board '{board.name}' has {corners} corners, got {corner:g}; check the board's rows and columns."
+                expected=f"a whole number from 0 to {corners - 1} for the {corners} corners of board '{board.name}'",
+                value=float(corner),
+                at=table.at(row, "corner"),
+                remedy="check the board's rows and columns",
             )
         if not sigma[row] > 0:
             raise MeasurementError(
-                f"{table.source}, line {line}, column 'sigma_px': a standard deviation above 0 was wanted, got "
-                f"{sigma[row]:g}."
+                expected="a standard deviation > 0", value=float(sigma[row]), at=table.at(row, "sigma_px")
             )
         if (pixels[row] < -1).any() or (pixels[row] > size).any():
             raise MeasurementError(
-                f"{table.source}, line {line}: the corner at u = {pixels[row, 0]:g}, v = {pixels[row, 1]:g} px is "
-                f"outside of the {camera.width} x {camera.height} px of camera '{camera.name}'; state the camera with "
-                "the intrinsics at the resolution of the images."
+                expected=f"a corner within the {camera.width} x {camera.height} px of camera '{camera.name}'",
+                value=f"u = {pixels[row, 0]:g}, v = {pixels[row, 1]:g} px",
+                at=table.at(row),
+                remedy=_RESOLUTION_REMEDY,
             )
 
 
+_RESOLUTION_REMEDY = "give the camera's intrinsics at the resolution of the images"
+
+
 def _check_resolution(table: Table, pixels: Float64[np.ndarray, "rows 2"], camera: Camera) -> None:
-    """Refuse images of which none shows a corner beyond a quarter of what the camera sees.
+    """Refuse images of which none shows a corner outside the upper left quarter of the field of view.
 
     Raises:
         MeasurementError: see above.
     """
     if (pixels.max(0) < np.array([camera.width, camera.height]) / 2).all():
         raise MeasurementError(
-            f"{table.source}: all corners lie within {pixels[:, 0].max():.0f} x {pixels[:, 1].max():.0f} px, a quarter "
-            f"of the {camera.width} x {camera.height} px of camera '{camera.name}'; state the camera with the "
-            "intrinsics at the resolution of the images."
+            expected=f"corners in all of the {camera.width} x {camera.height} px of camera '{camera.name}'",
+            value=f"corners within {pixels[:, 0].max():.0f} x {pixels[:, 1].max():.0f} px",
+            at=Place(table.source),
+            remedy=_RESOLUTION_REMEDY,
         )
 
 
@@ -287,20 +309,26 @@ def _check_image(
     q: Float64[torch.Tensor, "rows dof"],
     number: Float64[np.ndarray, " rows"],
 ) -> None:
-    """Refuse an image that cannot be one.
+    """Refuse an image with invalid corners.
 
     Raises:
-        MeasurementError: it has too few corners, one twice, or two vectors of joint values.
+        MeasurementError: it has too few corners, a corner twice, or different joint values.
     """
-    where = f"{table.source}, line {table.lines[rows[0]]}: image '{name}'"
-    if len(rows) < FEWEST_CORNERS:
+    at = RowPlace(table.source, table.lines[rows[0]], image=name)
+    if len(rows) < MIN_CORNERS:
         raise MeasurementError(
-            f"{where} has {len(rows)} corners, but {FEWEST_CORNERS} or more were wanted; remove the image."
+            expected=f"{MIN_CORNERS} or more corners", value=len(rows), at=at, remedy="remove the image"
         )
     if len(set(number[rows])) < len(rows):
-        raise MeasurementError(f"{where} has a corner twice; give every image a name of its own.")
+        raise MeasurementError(
+            "a corner appears twice",
+            at=replace(at, column="corner"),
+            remedy="give every image a different name",
+        )
     if float((q[rows] - q[rows[0]]).abs().max()) > SAME_JOINTS:
         raise MeasurementError(
-            f"{where} has rows of different joint values; give every image a name of its own, and all of its rows the "
-            "joint values at which it was taken."
+            "the rows of the image have different joint values",
+            at=replace(at, column="image"),
+            value=name,
+            remedy="give every image a different name, and all of its rows the joint values at which it was taken",
         )

@@ -1,4 +1,4 @@
-"""Images of boards as measurements: one row an image, with the pose that its corners give and its covariance."""
+"""Convert images of boards to measurements: one row per image, with the pose of the board and its covariance."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -8,11 +8,11 @@ import torch
 from jaxtyping import Float64
 
 from pisigma.estimation.loss import AbstractLoss, HampelLoss
-from pisigma.files.errors import MeasurementError
+from pisigma.files.errors import MeasurementError, Place
 from pisigma.measurement.camera.board import Board
 from pisigma.measurement.camera.board_pose import (
+    MIN_NOISE,
     POSE,
-    SMALLEST_NOISE,
     BoardPose,
     linearised,
     solve_board_pose,
@@ -36,27 +36,28 @@ from pisigma.measurement.sensors.intrinsics import (
 )
 from pisigma.robot.se3 import skew
 
-MOST_BENDS = 4
-"""Steps by which a board is bent at one set of intrinsics; the second is near rounding, where no corner is wrong."""
-SMALLEST_BEND = 1e-6
-"""[m] A board is not bent further by less."""
-LARGEST_MISS = 10.0
-"""[px] Where half of the corners of an image miss their prediction by more, they are not of this board."""
+MAX_BEND_ITERATIONS = 4
+"""Iterations of the board's shape at one set of intrinsics; without wrong corners, the second step is near rounding."""
+BEND_TOLERANCE = 1e-6
+"""[m] Change of the board's shape at which iterations stop."""
+MAX_MEDIAN_RESIDUAL = 10.0
+"""[px] Median residual of an image's corners above which they are not those of the board."""
 SHAPES = 3
+"""Number of shapes of a bent board, see `shapes`."""
 
 
 @dataclass(frozen=True, eq=False)
 class Images:
-    """The corners of images that one camera took of one board.
+    """The corners in images that one camera took of one board.
 
     Attributes:
         source: the file.
-        names: of the images, in the order in which they come.
+        names: names of the images, in the file's order.
         q: joint values of every image [rad or m].
-        lines: where the first corner of every image stands.
-        corners: numbers of the corners that every image shows.
-        pixels: where it shows them [px].
-        sigma: standard deviation of every corner, whose common factor is estimated; nothing where all are alike.
+        lines: line of the first corner of every image.
+        corners: numbers of the corners in every image.
+        pixels: their pixels [px].
+        sigma: standard deviation of every corner, up to a common factor that is estimated; empty if all are equal.
     """
 
     source: str
@@ -69,7 +70,7 @@ class Images:
 
     @property
     def relative_sigma(self) -> tuple[Float64[np.ndarray, " _corners"], ...]:
-        """Standard deviations over the usual one of all corners."""
+        """Standard deviations of the corners relative to their median."""
         if not self.sigma:
             return tuple(np.ones(len(corners)) for corners in self.corners)
         usual = np.median(np.concatenate(self.sigma))
@@ -87,19 +88,19 @@ def image_measurements(
     """Solve the pose of the board in every image.
 
     Args:
-        images: of one camera and one board.
-        camera: that took them.
-        board: that they show; corners are numbered as there.
-        is_fixed: whether the camera is fixed and the board on the flange.
-        repeatability: of the robot.
-        intrinsics: whether the camera's are held, under their prior, or free; see `prior_deviations`.
+        images: images of one camera and one board.
+        camera: the camera.
+        board: the board, with its numbering of the corners.
+        is_fixed: whether the camera is fixed and the board is on the flange.
+        repeatability: repeatability of the robot.
+        intrinsics: whether the camera's intrinsics are fixed, under their prior, or free; see `prior_deviations`.
 
     Returns:
-        One row an image, in the frame of the board with the camera as target (of a fixed camera the other way
+        One row per image, in the frame of the board with the camera as target (of a fixed camera the other way
         round), with the weights of `CornerSensor`.
 
     Raises:
-        MeasurementError: the corners of an image are not of this board.
+        MeasurementError: the corners of an image do not fit the board.
     """
     loss, bend = HampelLoss(), np.zeros(SHAPES)
 
@@ -128,7 +129,7 @@ def image_measurements(
 def _readings(
     solved: SolvedImages, changes: Sequence[np.ndarray], board: Board, repeatability: Repeatability
 ) -> dict[str, torch.Tensor | tuple[str, ...]]:
-    """Return the columns of `CornerSensor`, by how the pose of every row changes with that of its board."""
+    """Return the columns of `CornerSensor`; `changes` are derivatives of the rows' poses by those of the board."""
     at_board = solved.noise / solved.camera.fx * float(np.median([pose.t[2] for pose in solved.poses]))
     of_robot = np.diag([repeatability.length**2] * 3 + [repeatability.angle**2] * 3)
     of_corners = [
@@ -152,16 +153,16 @@ def _readings(
 def _board_poses(
     images: Images, camera: Camera, board: Board, bend: Float64[np.ndarray, " 3"], loss: AbstractLoss
 ) -> tuple[list[BoardPose], Float64[np.ndarray, " 3"]]:
-    """Solve the poses of a board at some intrinsics, bent as the images show it where it need not be flat.
+    """Solve the poses of a board at given intrinsics, together with its shape if it need not be flat.
 
     Returns:
         The poses, and the heights of the board's shapes [m].
 
     Raises:
-        MeasurementError: the corners of an image are not of this board.
+        MeasurementError: the corners of an image do not fit the board.
     """
     observed = images.corners, images.pixels, images.relative_sigma
-    for _ in range(MOST_BENDS):
+    for _ in range(MAX_BEND_ITERATIONS):
         corners = bent_corners(board, bend)
         poses = [
             solve_board_pose(camera, corners[number], pixels, loss, sigma)
@@ -172,39 +173,43 @@ def _board_poses(
             break
         before, noise = bend, corner_noise(poses, loss)
         bend = bent_further(bend, board, camera, *observed, poses, noise)
-        if np.abs(bend - before).max() < SMALLEST_BEND:
+        if np.abs(bend - before).max() < BEND_TOLERANCE:
             break
     return poses, bend
 
 
 def _refuse_other_boards(images: Images, board: Board, poses: Sequence[BoardPose]) -> None:
-    """Refuse images whose corners are not where a board of this kind has them.
+    """Refuse images whose corners do not fit the board, and images that show it mirrored.
 
     Raises:
         MeasurementError: see above.
     """
     for name, line, pose in zip(images.names, images.lines, poses, strict=True):
-        miss = float(np.median(pose.distance))
-        if not miss < LARGEST_MISS:
+        residual = float(np.median(pose.distance))
+        if not residual < MAX_MEDIAN_RESIDUAL:
             raise MeasurementError(
-                f"{images.source}, line {line}: half of the corners of image '{name}' are {miss:.3g} px or more from "
-                f"where a board of {board.rows} x {board.columns} corners has them; check the numbers of the corners, "
-                "the board and the camera, or remove the image."
+                expected=f"corners of image '{name}' on a board of {board.rows} x {board.columns} corners",
+                value=f"a median residual of {residual:.3g} px",
+                at=Place(images.source, line),
+                remedy="check the numbers of the corners, the board and the camera, or remove the image",
             )
     from_front = np.array([pose.R[:, 2] @ pose.t > 0 for pose in poses])
     if from_front.any() and not from_front.all():
         fewer = np.flatnonzero(from_front == (2 * from_front.sum() < len(from_front)))
+        name = images.names[fewer[0]]
         raise MeasurementError(
-            f"{images.source}, line {images.lines[fewer[0]]}: image '{images.names[fewer[0]]}' shows the board "
-            f"mirrored against {len(poses) - len(fewer)} of the {len(poses)} images; check whether it is mirrored, "
-            "and whether its corners are numbered as in the others."
+            f"image '{name}' shows the board mirrored compared with {len(poses) - len(fewer)} of {len(poses)} images",
+            value=name,
+            at=Place(images.source, images.lines[fewer[0]]),
+            remedy="check whether it is mirrored, and whether its corners are numbered as in the others",
         )
 
 
 def _target_pose(pose: BoardPose, is_fixed: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Pose of the target in its frame, and its change in the axes of the frame by that of the board's pose.
+    """Return the pose of the target in its frame, and its derivative (in axes of the frame) by the board's pose.
 
-    Of the inverse pose, position `-R^T t` moves by `-R^T (shift + t × turn)`, and the rotation turns by `-R^T turn`.
+    For a shift and a rotation vector of the board's pose, the position `-R^T t` of the inverse pose changes by
+    `-R^T (shift + t × rotation)`, and its rotation by `-R^T rotation`.
     """
     if is_fixed:
         return pose.R, pose.t, np.eye(POSE)
@@ -216,17 +221,18 @@ def _target_pose(pose: BoardPose, is_fixed: bool) -> tuple[np.ndarray, np.ndarra
 
 
 def _inverse_root(covariance: np.ndarray) -> np.ndarray:
-    """Lower triangular W with `W^T W` = inverse of a covariance, scaled first, as metres and radians differ."""
+    """Return the lower triangular W with `W^T W` = inverse of a covariance."""
+    # scaled to unit variances first, as the square root of a mix of metres and radians is ill-conditioned
     scale = np.sqrt(covariance.diagonal())
     root: np.ndarray = np.linalg.inv(np.linalg.cholesky(covariance / scale / scale[:, None])) / scale
     return root
 
 
 def shapes(board: Board) -> Float64[np.ndarray, "corners 3"]:
-    """Return by how much three low shapes stand out of the board's plane at its corners, 1 at most.
+    """Return the relative heights of three smooth shapes above the board's plane at its corners, 1 at most.
 
-    They are the squares and the product of the two coordinates in the plane, without what a plane explains of them, so
-    that the pose of the board stays that of its mean plane; they have no unit.
+    They are the squares and the product of the two coordinates in the plane, minus their best-fitting plane, so that
+    the pose of the board remains that of its mean plane.
     """
     corners = board.corners[:, :2]
     x, y = ((corners - corners.mean(0)) / np.ptp(corners, axis=0)).T
@@ -246,23 +252,23 @@ def bent_further(
     poses: Sequence[BoardPose],
     noise: float,
 ) -> Float64[np.ndarray, " 3"]:
-    """Return the heights of the shapes [m] that all images together show, by one Gauss-Newton step.
+    """Return the heights of the board's shapes [m] after one Gauss-Newton step over all images.
 
-    Every image's pose is eliminated by orthogonal triangularisation, as in `solve_board_pose`; a height is 0 with half
-    the board's flatness as its standard deviation before the images are looked at.
+    The pose of every image is eliminated by orthogonal triangularisation, as in `solve_board_pose`. The prior of a
+    height is 0 with half the board's flatness as standard deviation.
 
     Args:
-        bend: the heights that the poses were solved with [m].
-        board: with its flatness.
-        camera: that took the images.
-        numbers: of the corners in every image.
-        pixels: where it shows them [px].
-        sigma: standard deviation of every corner over the usual one.
-        poses: of the board in every image.
-        noise: standard deviation of u and v of a usual corner [px].
+        bend: heights with which the poses were solved [m].
+        board: the board, with its flatness.
+        camera: the camera.
+        numbers: numbers of the corners in every image.
+        pixels: their pixels [px].
+        sigma: standard deviation of every corner relative to the median.
+        poses: poses of the board in every image.
+        noise: standard deviation of u and v of a corner of median deviation [px].
     """
     of_corner, corners = shapes(board), bent_corners(board, bend)
-    prior = max(noise, SMALLEST_NOISE) / (board.flatness / 2)
+    prior = max(noise, MIN_NOISE) / (board.flatness / 2)
     rows = [np.concatenate([prior * np.eye(SHAPES), -prior * bend[:, None]], 1)]
     for number, at, deviation, pose in zip(numbers, pixels, sigma, poses, strict=True):
         residual, J, by_point = linearised(camera, corners[number], at, deviation, pose.R, pose.t)
@@ -276,7 +282,7 @@ def bent_further(
 
 
 def bent_corners(board: Board, bend: Float64[np.ndarray, " 3"]) -> Float64[np.ndarray, "corners 3"]:
-    """Return where the corners of a bent board are in its frame [m], by the heights of its shapes [m]."""
+    """Return the corners of a bent board in its frame [m], given the heights of its shapes [m]."""
     height = shapes(board) @ bend
     corners: np.ndarray = board.corners + height[:, None] * [0.0, 0.0, 1.0]
     return corners

@@ -1,4 +1,4 @@
-"""What is printed on a board: black rectangles on a white sheet, in the board's frame."""
+"""The printed pattern of a board: black rectangles on a white sheet, in the board's frame."""
 
 from dataclasses import dataclass
 
@@ -10,11 +10,11 @@ from pisigma.measurement.camera.board import Board
 
 @dataclass(frozen=True, eq=False)
 class Pattern:
-    """A printed board, as one sees it from where its z axis comes from (x to the right, y down).
+    """A printed board, seen along its z axis (x to the right, y down).
 
     Attributes:
-        black: black rectangles that do not overlap, each as left, top, right and bottom edge [m].
-        sheet: left, top, right and bottom edge of the white sheet with its quiet margin [m].
+        black: black rectangles that do not overlap: left, top, right and bottom edge [m].
+        sheet: left, top, right and bottom edge of the white sheet with its margin [m].
     """
 
     black: Float64[np.ndarray, "rectangles 4"]
@@ -22,13 +22,13 @@ class Pattern:
 
 
 def board_pattern(board: Board) -> Pattern:
-    """Return what is printed on a board, with a quiet margin of half a square around.
+    """Return the pattern of a board, with a white margin of half a square.
 
-    Checkerboards have one square more than corners each way, the first one black. Those of ChArUco boards have the
+    Checkerboards have one more square than corners in each direction, the first one black. ChArUco boards have the
     markers 0, 1 and so on in their white squares, row by row, and grids of AprilTags the tags 0, 1 and so on.
 
     Raises:
-        MeasurementError: there are not so many markers in its dictionary.
+        MeasurementError: the board has more markers than its dictionary.
         ImportError: OpenCV, which draws markers, is not installed.
     """
     if board.kind == "apriltag":
@@ -44,7 +44,7 @@ def board_pattern(board: Board) -> Pattern:
 
 
 def board_sheet(board: Board) -> Float64[np.ndarray, " 4"]:
-    """Return left, top, right and bottom edge of the white sheet of a board with its quiet margin [m]."""
+    """Return left, top, right and bottom edge of the white sheet of a board with its margin [m]."""
     if board.kind == "apriltag":
         margin = board.square / 2
         return np.array([-margin, -margin, *board.corners.max(0)[:2] + margin])
@@ -52,7 +52,7 @@ def board_sheet(board: Board) -> Float64[np.ndarray, " 4"]:
 
 
 def _markers(board: Board, left_top: np.ndarray) -> Float64[np.ndarray, "rectangles 4"]:
-    """Black rectangles of markers whose upper left corners are stated: runs of cells of one row."""
+    """Return the black rectangles of markers (runs of black cells in a row), given their upper left corners."""
     from pisigma.measurement.camera.detection.markers import marker_cells  # of the extra `camera`
 
     rectangles = []

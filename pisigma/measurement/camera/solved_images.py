@@ -1,4 +1,4 @@
-"""The poses of a board in the images of one camera, and the intrinsics that they show without a robot."""
+"""Solve the poses of a board in the images of one camera, and its intrinsics without a robot."""
 
 import math
 from collections.abc import Callable, Collection, Sequence
@@ -9,10 +9,10 @@ import torch
 from jaxtyping import Bool, Float64
 
 from pisigma.estimation.loss import AbstractLoss, HampelLoss, SquaredLoss
-from pisigma.files.errors import MeasurementError
+from pisigma.files.errors import MeasurementError, Place
 from pisigma.measurement.camera.board_pose import (
+    MIN_NOISE,
     POSE,
-    SMALLEST_NOISE,
     BoardPose,
     homography,
     solve_board_pose,
@@ -21,27 +21,29 @@ from pisigma.measurement.camera.camera import INTRINSICS, USUAL_DEVIATIONS, Came
 from pisigma.measurement.camera.camera_files import IntrinsicsChoice
 from pisigma.measurement.sensors.intrinsics import ImageIntrinsics, intrinsics_information
 
-ROUNDS = 20
-CLOSE = 0.1
-"""[standard deviations] Intrinsics that would move by less need not be linearised at anew."""
+MAX_ITERATIONS = 20
+CONVERGENCE_TOLERANCE = 0.1
+"""[standard deviations] Change of the intrinsics below which they need not be linearised again."""
 FREE_FOCAL, FREE_CENTRE = 0.05, 0.05
-"""Standard deviations of free intrinsics as shares of the focal lengths and of the width: wider than lenses vary."""
+"""Prior standard deviations of free intrinsics relative to focal lengths and width: larger than lenses vary."""
 FREE_DISTORTION = (0.3, 1.0, 0.01, 0.01, 3.0)
-FEWEST_IMAGES = 3
-WIDE = 10.0
-"""Times the deviations of free intrinsics, so that nothing but the images counts."""
+"""Prior standard deviations of k1, k2, p1, p2 and k3 if free."""
+MIN_IMAGES = 3
+UNINFORMATIVE = 10.0
+"""Factor on the prior standard deviations of free intrinsics with which only the images matter."""
 FIRST = ("fx", "fy", "k1")
+"""Intrinsics that are estimated first."""
 CELLS = 8
-"""Rows and columns of cells of an image, by which it is said where the board was."""
+"""Number of rows and columns of cells of an image, for its coverage by the board."""
 
 
 def prior_deviations(camera: Camera, choice: IntrinsicsChoice) -> Float64[np.ndarray, " 9"]:
-    """Return prior standard deviations of a camera's intrinsics [px, and 1 from k1 on], 0 of what is held.
+    """Return prior standard deviations of a camera's intrinsics [px; distortion without unit], 0 for fixed ones.
 
     Args:
-        camera: with the deviations that its file states; where it states none, those of a usual calibration.
-        choice: "fixed": all are held; "prior": as stated; "free": so wide that the images decide. What "prior" holds is
-            held then, too.
+        camera: the camera, with the standard deviations of its file or else those of a usual calibration.
+        choice: "fixed": all are fixed; "prior": standard deviations of the camera; "free": so large that the images
+            decide. Intrinsics that "prior" fixes are fixed with "free", too.
     """
     stated = np.array(camera.sigma or USUAL_DEVIATIONS)
     wide = [
@@ -59,10 +61,10 @@ class SolvedImages:
     """The poses of the board in all images of a camera.
 
     Attributes:
-        camera: as its file states it.
-        present: with the intrinsics that the poses were solved with.
-        sigma: see `prior_deviations`.
-        poses: image by image.
+        camera: the camera of the file, the prior.
+        present: the camera with the intrinsics with which the poses were solved.
+        sigma: prior standard deviations, see `prior_deviations`.
+        poses: pose of the board in every image.
         noise: standard deviation of u and v of a corner [px].
     """
 
@@ -74,7 +76,7 @@ class SolvedImages:
 
     @property
     def intrinsics(self) -> ImageIntrinsics:
-        """What every image says of the intrinsics, the pose's derivatives as its `by_intrinsics` has them."""
+        """Information of every image on the intrinsics, with the derivatives of its pose."""
         rows = (len(self.poses), len(INTRINSICS))
         stated = (self.present.intrinsics, self.camera.intrinsics, self.sigma)
         return ImageIntrinsics(
@@ -92,45 +94,48 @@ def solve_images(
     loss: AbstractLoss,
     source: str,
 ) -> SolvedImages:
-    """Solve the poses in all images again until the intrinsics are near to those that the images alone show.
+    """Solve the poses in all images, and iterate the intrinsics to the estimate of the images alone.
 
-    The robot's part in the intrinsics is linear about these: pose and intrinsics of an image are solved together by
-    variable projection (Golub and Pereyra 1973), whose steps these are.
+    These are steps of variable projection (Golub and Pereyra 1973), which eliminates the pose of every image. A
+    calibration of the robot later linearises the intrinsics at this estimate.
 
     Args:
-        camera: as its file states it.
-        sigma: see `prior_deviations`.
-        solve: gives the poses at some intrinsics.
-        loss: how corners count, for their noise.
-        source: what complaints call the images.
+        camera: the camera of the file.
+        sigma: prior standard deviations, see `prior_deviations`.
+        solve: returns the poses at given intrinsics.
+        loss: robust loss of the corners, for their noise.
+        source: name of the images in messages.
 
     Raises:
-        MeasurementError: the images and the deviations do not determine the intrinsics.
+        MeasurementError: the images and the prior do not determine the intrinsics.
     """
     present = camera
-    for _ in range(ROUNDS):
+    for _ in range(MAX_ITERATIONS):
         poses = tuple(solve(present))
         solved = SolvedImages(camera, present, sigma, poses, corner_noise(poses, loss))
         if not sigma.any():
             return solved
         root, mean = intrinsics_information(solved.intrinsics)
-        if np.linalg.norm(root @ (mean - present.intrinsics)) < CLOSE:
+        if np.linalg.norm(root @ (mean - present.intrinsics)) < CONVERGENCE_TOLERANCE:
             return solved
         if not (np.isfinite(mean).all() and (mean[:2] > 0).all()):
             break
         present = camera.with_intrinsics(mean)
     raise MeasurementError(
-        f"{source}: the images do not determine the intrinsics of camera '{camera.name}'; take images up to 40 deg "
-        "oblique that fill the whole frame, or hold the intrinsics nearer to a calibration (--intrinsics prior)."
+        f"the images do not determine the intrinsics of camera '{camera.name}'",
+        value=camera.name,
+        at=Place(source),
+        remedy="take images up to 40 deg oblique in which the board fills the whole frame, or keep the intrinsics "
+        "nearer to a calibration (--intrinsics prior)",
     )
 
 
 def corner_noise(poses: Sequence[BoardPose], loss: AbstractLoss) -> float:
-    """Return the standard deviation of u and v of a corner that the residuals of all images show [px]."""
+    """Return the standard deviation of u and v of a corner, estimated from the residuals of all images [px]."""
     distance = torch.from_numpy(np.concatenate([pose.distance for pose in poses]))
     used = float(POSE * len(poses))
-    scale = max(float(loss.scale(distance, 2, used)), SMALLEST_NOISE)
-    return max(float(loss.deviation(distance, 2, used, scale)), SMALLEST_NOISE)
+    scale = max(float(loss.scale(distance, 2, used)), MIN_NOISE)
+    return max(float(loss.deviation(distance, 2, used, scale)), MIN_NOISE)
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,7 +144,7 @@ class BoardView:
 
     Attributes:
         points: corners in the board's frame, z = 0 [m].
-        pixels: where the image shows them [px].
+        pixels: their pixels in the image [px].
     """
 
     points: Float64[np.ndarray, "corners 3"]
@@ -148,16 +153,16 @@ class BoardView:
 
 @dataclass(frozen=True, eq=False)
 class IntrinsicCalibration:
-    """A camera as its images of a board show it.
+    """A camera calibrated with images of a board.
 
     Attributes:
-        camera: with standard deviations.
+        camera: the camera, with standard deviations.
         noise: standard deviation of u and v of a corner [px].
         tilts: angle between the board's normal and the camera's axis in every image [rad].
-        disagreement: by how many times their noise images disagree on the intrinsics (Birge 1932): 1 where the model
-            fits, more of a bowed board. Standard deviations are enlarged by it.
-        disagrees: whether that is more than chance (three standard deviations).
-        covered: cells of the image, row by row, in which there was a corner in some image.
+        disagreement: ratio of the images' scatter about common intrinsics to their noise (Birge 1932): 1 if the model
+            fits, more for a bowed board. Standard deviations are multiplied by it.
+        disagrees: whether the ratio is larger than by chance (three standard deviations).
+        covered: cells of the image, row by row, in which some image has a corner.
     """
 
     camera: Camera
@@ -171,22 +176,25 @@ class IntrinsicCalibration:
 def calibrate_intrinsics(
     views: Sequence[BoardView], name: str, size: tuple[int, int], free_k3: bool = False
 ) -> IntrinsicCalibration:
-    """Fit intrinsics and all poses of the board to its corners.
+    """Fit the intrinsics and all poses of the board to its corners.
 
-    The focal lengths and k1 come first, as far from the solution the others lead astray; the last fit is robust.
+    The focal lengths and k1 are estimated first, because the other intrinsics diverge far from the solution; the last
+    fit is robust.
 
     Args:
         views: the board in every image.
-        name: of the camera.
+        name: name of the camera.
         size: width and height of the images [px].
-        free_k3: whether k3 is identified; else it is 0.
+        free_k3: whether k3 is estimated; else it is 0.
 
     Raises:
         MeasurementError: the images do not determine the intrinsics.
     """
-    if len(views) < FEWEST_IMAGES:
+    if len(views) < MIN_IMAGES:
         raise MeasurementError(
-            f"{FEWEST_IMAGES} images of the board or more were wanted, got {len(views)}; take 20 up to 40 deg oblique."
+            expected=f"{MIN_IMAGES} or more images of the board",
+            value=len(views),
+            remedy="take 20, up to 40 deg oblique",
         )
     start = initial_camera(views, name, size)
     everything = INTRINSICS if free_k3 else INTRINSICS[:-1]
@@ -196,9 +204,9 @@ def calibrate_intrinsics(
         start = start.with_intrinsics(mean)
     free = np.flatnonzero(solved.sigma)
     sigma = np.zeros(len(mean))
-    rest = solved.intrinsics.residual
-    freedom = rest.size - len(free)
-    disagreement = float(np.sqrt(np.square(rest).sum() / freedom))
+    residual = solved.intrinsics.residual
+    freedom = residual.size - len(free)
+    disagreement = float(np.sqrt(np.square(residual).sum() / freedom))
     sigma[free] = max(disagreement, 1.0) * np.linalg.norm(np.linalg.inv(root[np.ix_(free, free)]), axis=1)
     return IntrinsicCalibration(
         camera=replace(start, sigma=tuple(sigma.tolist())),
@@ -211,13 +219,13 @@ def calibrate_intrinsics(
 
 
 def initial_camera(views: Sequence[BoardView], name: str, size: tuple[int, int]) -> Camera:
-    """Find one focal length in closed form, with the principal point in the middle and no distortion (Zhang 2000).
+    """Estimate one focal length in closed form, with the principal point in the middle and no distortion (Zhang 2000).
 
-    Of the homography `h1 h2 h3` of a board, `h1 . h2 = 0` and `|h1| = |h2|` where the first two rows are divided by the
-    focal length.
+    The homography `h1 h2 h3` of a board satisfies `h1 . h2 = 0` and `|h1| = |h2|` if its first two rows are divided by
+    the focal length.
 
     Raises:
-        MeasurementError: all images look straight at the board, so that they do not determine it.
+        MeasurementError: all images are perpendicular to the board, so that they do not determine it.
     """
     middle, width = (np.array(size) - 1) / 2, float(size[0])
     slopes, constants = list[float](), list[float]()
@@ -229,7 +237,9 @@ def initial_camera(views: Sequence[BoardView], name: str, size: tuple[int, int])
     squared = -(np.dot(slopes, constants) / np.dot(slopes, slopes))
     if not squared > 0:
         raise MeasurementError(
-            "the images do not determine a focal length, as all look straight at the board; take oblique ones."
+            expected="oblique images of the board, which determine the focal length",
+            value="perpendicular ones",
+            remedy="take images up to 40 deg oblique",
         )
     focal = width / np.sqrt(squared)
     return Camera(name, *size, focal, focal, *middle.tolist())
@@ -238,8 +248,8 @@ def initial_camera(views: Sequence[BoardView], name: str, size: tuple[int, int])
 def _solved(
     views: Sequence[BoardView], start: Camera, names: Collection[str], loss: AbstractLoss
 ) -> SolvedImages:
-    """Solve all poses and the intrinsics of some names, with the others as they are."""
-    sigma = WIDE * prior_deviations(replace(start, sigma=(1.0,) * len(INTRINSICS)), "free")
+    """Solve all poses and the intrinsics in `names`, with the others fixed."""
+    sigma = UNINFORMATIVE * prior_deviations(replace(start, sigma=(1.0,) * len(INTRINSICS)), "free")
     sigma *= [name in names for name in INTRINSICS]
 
     def poses(camera: Camera) -> list[BoardPose]:
@@ -249,7 +259,7 @@ def _solved(
 
 
 def _covered(views: Sequence[BoardView], size: tuple[int, int]) -> Bool[np.ndarray, "cells cells"]:
-    """Which cells of the image hold a corner of some view."""
+    """Return the cells of the image that contain a corner of some view."""
     covered = np.zeros((CELLS, CELLS), dtype=bool)
     for view in views:
         cell = np.clip(CELLS * (view.pixels + 0.5) / size, 0, CELLS - 1).astype(int)

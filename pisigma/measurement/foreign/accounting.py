@@ -1,15 +1,15 @@
-"""What became of every row of the files of an import: rows read = rows used + rows named as left out."""
+"""Account for every row of the imported files: rows read = rows used + rows listed as left out."""
 
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import groupby
 
-Place = tuple[str, int]
+FileLine = tuple[str, int]
 """File and line of a row."""
 
-_LONGEST_LIST = 200
-"""Characters of a list of lines in a sentence; the lines of the JSON are complete."""
+_MAX_LIST = 200
+"""Number of characters of a list of lines in a sentence; lists in JSON are complete."""
 
 
 @dataclass(frozen=True)
@@ -17,10 +17,10 @@ class LeftOutRow:
     """A row of a file that was not imported.
 
     Attributes:
-        file: that it is in.
-        line: of the file.
-        reason: why it was left out, as the second half of "is left out: ...".
-        point: name of its point, "" where it has none.
+        file: its file.
+        line: its line.
+        reason: why it was left out, as a clause after "is left out: ...".
+        point: name of its point, "" if it has none.
     """
 
     file: str
@@ -29,19 +29,19 @@ class LeftOutRow:
     point: str = ""
 
     def to_json(self) -> dict[str, object]:
-        """Give file, line and reason as plain values."""
+        """Return file, line and reason as plain values for JSON."""
         return {"file": self.file, "line": self.line, "reason": self.reason}
 
 
 @dataclass(frozen=True)
 class FileAccount:
-    """What became of the rows of a file; `read` is the sum of `used` and the rows that were left out.
+    """Rows of a file that were used and left out; `read` is the sum of both.
 
     Attributes:
-        file: that was read.
+        file: the file.
         read: number of its rows.
-        used: number of those that were imported, or whose joint values were joined to an imported row.
-        left_out: the others.
+        used: number of rows that were imported, or whose joint values were joined to an imported row.
+        left_out: the other rows.
     """
 
     file: str
@@ -50,7 +50,7 @@ class FileAccount:
     left_out: tuple[LeftOutRow, ...]
 
     def to_json(self) -> dict[str, object]:
-        """Give the numbers of rows as plain values."""
+        """Return the numbers of rows as plain values for JSON."""
         return {
             "file": self.file,
             "rows_read": self.read,
@@ -60,13 +60,13 @@ class FileAccount:
 
 
 def account(
-    read: Sequence[Place], used: Sequence[Place], left_out: Sequence[LeftOutRow]
+    read: Sequence[FileLine], used: Sequence[FileLine], left_out: Sequence[LeftOutRow]
 ) -> tuple[FileAccount, ...]:
     """Count the rows of every file.
 
     Args:
-        read: places of all rows that were read, in their order.
-        used: places of the rows that were imported or joined.
+        read: file and line of all rows that were read, in their order.
+        used: file and line of the rows that were imported or joined.
         left_out: the rows that were left out.
     """
     places = Counter(used) + Counter((row.file, row.line) for row in left_out)
@@ -83,7 +83,7 @@ def account(
 
 
 def sentences(left_out: Sequence[LeftOutRow]) -> tuple[str, ...]:
-    """Name rows that were left out: one sentence for every file and reason."""
+    """Return sentences that list the rows that were left out, one for every file and reason."""
     by_reason: dict[tuple[str, str], list[LeftOutRow]] = {}
     for row in left_out:
         by_reason.setdefault((row.file, row.reason), []).append(row)
@@ -95,7 +95,7 @@ def sentences(left_out: Sequence[LeftOutRow]) -> tuple[str, ...]:
 
 
 def _lines(rows: Sequence[LeftOutRow]) -> str:
-    """Lines with the names of points, or with ranges such as "3, 5-9"; a long list ends with "..."."""
+    """Return lines with names of points, or as ranges such as "3, 5-9"; long lists end with "..."."""
     if any(row.point for row in rows):
         texts = [f"{row.line} ({row.point})" if row.point else str(row.line) for row in rows]
     else:
@@ -103,4 +103,4 @@ def _lines(rows: Sequence[LeftOutRow]) -> str:
         runs = [[line for _, line in run] for _, run in groupby(numbers, lambda one: one[1] - one[0])]
         texts = [str(run[0]) if len(run) == 1 else f"{run[0]}-{run[-1]}" for run in runs]
     text = ", ".join(texts)
-    return text if len(text) <= _LONGEST_LIST else text[:_LONGEST_LIST].rpartition(",")[0] + ", ..."
+    return text if len(text) <= _MAX_LIST else text[:_MAX_LIST].rpartition(",")[0] + ", ..."

@@ -1,4 +1,4 @@
-"""How the lines of an export are divided into cells, and how its numbers are written."""
+"""The format of an export: separators of cells and format of numbers."""
 
 import contextlib
 import csv
@@ -10,42 +10,42 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Literal, get_args
 
-from pisigma.files.errors import MeasurementError
+from pisigma.files.errors import MeasurementError, Place
 from pisigma.measurement.csv.table import SPREADSHEET_ERRORS
 
 SEPARATORS = ("\t", ";", ",", "|", " ")
-"""A blank stands for any number of blanks and tabs."""
-SAMPLE = 300
-"""Lines that are looked at."""
-MOST_COLUMNS = 2000
+"""Separators of cells; a blank means any number of blanks and tabs."""
+SAMPLED_LINES = 300
+"""Number of lines by which the format is recognised."""
+MAX_COLUMNS = 2000
 _BLANKS = 0.8
-"""Blanks stand in names, too: they separate cells only where no other separator explains nearly as much."""
+"""Weight of blanks as separators: names contain blanks, too, so other separators are preferred."""
 _SMALL, _FAR = 20.0, 200.0
-"""A number such as 2.104 that is below may be a length in mm with a group of thousands; 20,000 mm and more is none of a
-robot, and 200,000 mm and more none of a position alone."""
+"""Numbers such as 2.104 below these may be lengths in mm with a group of thousands: no robot measures 20,000 mm or more,
+and no position alone 200,000 mm or more."""
 COMMENT = re.compile(r"\s*(?://|#|%|!|\*\*|--|;|'|REM\b)\s*")
-"""What begins lines that are no rows; a line of cells may begin so, too."""
+"""Starts of comments; rows may start in the same way."""
 Decimal = Literal[".", ","]
 MISSING = frozenset(("", "-", "--", "---", "*", "n/a", "na", "nan", "null", "none", "nil", "n.a.", "missing"))
-"""What stands in the cell of a value that was not measured, in small letters."""
+"""Texts of cells that were not measured, in lower case."""
 _SPACES = " \u00a0\u2009\u202f'\u2019"
-"""What sets groups of thousands apart besides points and commas."""
+"""Separators of thousands other than points and commas."""
 _PLAIN = {sign: re.compile(rf"[-+]?[0-9]+(?:\{sign}[0-9]+)?") for sign in get_args(Decimal)}
-"""Numbers of the usual form, which are nearly all."""
+"""Numbers of the usual form, for speed."""
 
 
 @dataclass(frozen=True)
 class NumberFormat:
-    """How the numbers of a file are written.
+    """The format of the numbers of a file.
 
     Attributes:
-        decimal: the sign before the decimals; the other one may set thousands apart.
+        decimal: the decimal sign; the other sign may separate thousands.
     """
 
     decimal: Decimal
 
     def text(self, cell: str) -> str | None:
-        """Write a number with a decimal point and without groups, with every digit of the cell; None if it is none."""
+        """Return a number with a decimal point, without groups and with all digits; None if the cell is not a number."""
         if _PLAIN[self.decimal].fullmatch(cell):
             return cell if self.decimal == "." else cell.replace(",", ".")
         cell = cell.strip().replace("\u2212", "-")
@@ -57,9 +57,9 @@ class NumberFormat:
         return f"{match['sign']}{whole}{decimals}{exponent.replace('D', 'E')}"
 
     def certainty(self, cell: str) -> float:
-        """Say how surely a cell is a number of this format: 0 where it is none, less than 1 where it could be another.
+        """Return how certainly a cell is a number of this format: 0 if it is not, less than 1 if it is ambiguous.
 
-        A group of thousands without decimals, such as 1,234, may as well be a number with three decimals.
+        A group of thousands without decimals, such as 1,234, may also be a number with three decimals.
         """
         text = self.text(cell)
         if text is None:
@@ -68,7 +68,7 @@ class NumberFormat:
         return 0.5 if cell.count(other) == 1 and self.decimal not in cell else 1.0
 
     def is_ambiguous(self, cells: Iterable[str]) -> bool:
-        """Say whether the sign before decimals may set thousands apart in every cell that has it, such as 1,234."""
+        """Return whether the decimal sign may separate thousands in every cell that has it, such as 1,234."""
         sign = re.escape(self.decimal)
         signed = [cell for cell in cells if self.decimal in cell]
         return bool(signed) and all(
@@ -88,29 +88,29 @@ def _pattern(decimal: Decimal) -> re.Pattern[str]:
 
 
 def is_missing(cell: str) -> bool:
-    """Say whether a cell states that nothing was measured."""
+    """Return whether a cell means that nothing was measured."""
     return cell.strip().lower() in MISSING
 
 
 @dataclass(frozen=True)
 class Dialect:
-    """How a file is written.
+    """The format of a file.
 
     Attributes:
-        separator: between cells, one of `SEPARATORS`.
-        numbers: how numbers are written.
+        separator: separator of cells, one of `SEPARATORS`.
+        numbers: format of numbers.
     """
 
     separator: str
     numbers: NumberFormat
 
     def __str__(self) -> str:
-        """In words, such as "semicolons between cells, decimal commas"."""
+        """Return a description such as "semicolons between cells, decimal commas"."""
         signs = {".": "points", ",": "commas", "\t": "tabs", ";": "semicolons", "|": "bars", " ": "blanks"}
         return f"{signs[self.separator]} between cells, decimal {signs[self.numbers.decimal]}"
 
     def split(self, line: str) -> list[str]:
-        """Give the cells of a line without surrounding blanks; a quote that is not closed belongs to its cell."""
+        """Return the cells of a line without surrounding blanks; an unclosed quote belongs to its cell."""
         if '"' in line:
             with contextlib.suppress(csv.Error):
                 reader = csv.reader(
@@ -121,8 +121,8 @@ class Dialect:
         return [cell.strip() for cell in cells]
 
     def is_row(self, cells: Sequence[str]) -> bool:
-        """Say whether cells are a row: two numbers or more, or one and else what says that nothing was measured."""
-        if not 2 <= len(cells) <= MOST_COLUMNS:
+        """Return whether cells are a row: two or more numbers, or one number with markers of missing values."""
+        if not 2 <= len(cells) <= MAX_COLUMNS:
             return False
         if cells[0].startswith(("#", "%", ";", "!")):
             return cells[0] in SPREADSHEET_ERRORS
@@ -130,24 +130,25 @@ class Dialect:
         return numeric >= 2 or (numeric == 1 and sum(map(is_missing, cells)) >= len(cells) - 2)
 
     def is_number(self, cell: str) -> bool:
-        """Say whether a cell holds a number."""
+        """Return whether a cell is a number."""
         return self.numbers.text(cell) is not None
 
 
 def sniff(lines: Sequence[tuple[int, str]], source: str, decimal: Decimal | None = None) -> Dialect:
-    """Find the separator and the decimal sign by which most cells of most lines are numbers.
+    """Find the separator and the decimal sign with which most cells of most lines are numbers.
 
-    Of readings that explain equally much the first wins, in the order of `SEPARATORS` and with points.
+    Of equally good formats the first is returned, in the order of `SEPARATORS` and with points first.
 
     Args:
-        lines: of the file with their numbers, without blank ones.
-        source: the file, as complaints call it.
-        decimal: the decimal sign where it is stated.
+        lines: numbers and texts of the lines of the file, without blank ones.
+        source: the file, for messages.
+        decimal: the decimal sign, if it is stated.
 
     Raises:
-        MeasurementError: no reading gives a table of numbers, or its points or commas may be either sign.
+        MeasurementError: no format results in a table of numbers, or the decimal sign is ambiguous.
     """
-    sampled = [*lines[: SAMPLE // 2], *lines[SAMPLE // 2 :][-SAMPLE // 2 :]]
+    half = SAMPLED_LINES // 2
+    sampled = [*lines[:half], *lines[half:][-half:]]
     sample = [line for _, line in sampled]
     signs = (decimal,) if decimal else get_args(Decimal)
     choices = [
@@ -157,8 +158,10 @@ def sniff(lines: Sequence[tuple[int, str]], source: str, decimal: Decimal | None
     best = max(scores)
     if best <= 0:
         raise MeasurementError(
-            f"{source}: no lines of equally many numbers were recognised; a table with one measurement per line was "
-            "wanted, its cells separated by tabs, semicolons, commas or blanks."
+            expected="a table of numbers with one measurement per line",
+            value="no lines with the same number of numbers",
+            at=Place(source),
+            remedy="separate cells by tabs, semicolons, commas or blanks",
         )
     dialect = choices[scores.index(best)]
     if decimal is None:
@@ -170,12 +173,12 @@ def sniff(lines: Sequence[tuple[int, str]], source: str, decimal: Decimal | None
 def _check_decimal(dialect: Dialect, rows: Sequence[tuple[int, list[str]]], source: str) -> None:
     """Refuse a table whose numbers may have groups of thousands instead of decimals.
 
-    That is where every number with the sign looks like 2.104, and either the sign separates the cells, too, or a column
-    has whole numbers besides, or all of these numbers are small and another column holds whole numbers; and where a
-    column holds such numbers and else whole ones of hundreds.
+    This is so if every number with the sign looks like 2.104, and either the sign also separates the cells, or a column
+    also contains whole numbers, or all of these numbers are small and another column contains whole numbers; and if a
+    column contains such numbers together with whole numbers of three digits only.
 
     Raises:
-        MeasurementError: see above; the message names line and column.
+        MeasurementError: see above.
     """
     sign, width = dialect.numbers.decimal, Counter(len(row) for _, row in rows).most_common(1)[0][0]
     columns = [
@@ -205,24 +208,26 @@ def _check_decimal(dialect: Dialect, rows: Sequence[tuple[int, list[str]]], sour
     k = is_mixed.index(True) if any(is_mixed) else next(k for k, ours in enumerate(signed) if ours)
     number, cell = signed[k][0]
     raise MeasurementError(
-        f"{source}, line {number}, column {k + 1}: '{cell}' may have decimals or a group of thousands; state --decimal "
-        "point or --decimal comma."
+        "the number may have decimals or a group of thousands",
+        at=Place(source, number, k + 1),
+        value=cell,
+        remedy="state --decimal point or --decimal comma",
     )
 
 
 def _has_hundreds(cells: Sequence[str]) -> bool:
-    """Whether cells are whole numbers of three digits, among others."""
+    """Return whether some cells are whole numbers of three digits."""
     return any(re.fullmatch(r"[-+]?[1-9]\d\d", cell) for cell in cells)
 
 
 def _counts(cells: Sequence[str]) -> bool:
-    """Whether cells count the rows."""
+    """Return whether cells number the rows consecutively."""
     numbers = [int(cell) if cell.isdigit() and len(cell) < 9 else -1 for cell in cells]
     return all(after - before == 1 for before, after in itertools.pairwise(numbers))
 
 
 def _score(dialect: Dialect, lines: Sequence[str]) -> float:
-    """Share of the lines that are rows of one width, times the share of their cells that are surely numbers."""
+    """Return the share of lines that are rows of one width, times the share of their cells that are certain numbers."""
     rows = [dialect.split(line) for line in lines]
     numeric = [row for row in rows if dialect.is_row(row)]
     if not numeric:

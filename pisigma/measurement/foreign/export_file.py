@@ -1,4 +1,4 @@
-"""An export as a table of texts, whatever its encoding: its comments, heading, units and rows."""
+"""Read an export in any text encoding as a table of texts: comments, headings, units and rows."""
 
 import codecs
 import os
@@ -6,51 +6,50 @@ import re
 from collections import Counter
 from dataclasses import dataclass
 
-from pisigma.files.errors import MeasurementError, printable
+from pisigma.files.errors import MeasurementError, Place, printable
 from pisigma.files.input_file import MAX_BYTES, read_input
 from pisigma.measurement.csv.table import SPREADSHEET_ERRORS
-from pisigma.measurement.foreign.accounting import LeftOutRow, Place
+from pisigma.measurement.foreign.accounting import FileLine, LeftOutRow
 from pisigma.measurement.foreign.dialect import COMMENT, Decimal, Dialect, sniff
 from pisigma.measurement.foreign.headings import is_recognised
 from pisigma.measurement.foreign.summary_rows import summary_rows
 from pisigma.measurement.foreign.units import ambiguous_unit, unit_symbol
 
-LONGEST_LINE = 100_000
-"""Characters of a line; a thousand columns have fewer."""
+MAX_LINE = 100_000
+"""Number of characters of a line; a thousand columns have fewer."""
 _Lines = list[tuple[int, str]]
 _MARKS = (
     (codecs.BOM_UTF8, "utf-8"),
-    (codecs.BOM_UTF32_LE, "utf-32-le"),  # begins with the mark of UTF-16
+    (codecs.BOM_UTF32_LE, "utf-32-le"),  # starts with the mark of UTF-16
     (codecs.BOM_UTF32_BE, "utf-32-be"),
     (codecs.BOM_UTF16_LE, "utf-16-le"),
     (codecs.BOM_UTF16_BE, "utf-16-be"),
 )
-_NO_TEXT = {
-    b"PK\x03\x04": "a workbook or an archive; save its sheet as CSV",
-    b"\xd0\xcf\x11\xe0": "an old Excel workbook; save its sheet as CSV",
-    b"%PDF": "a PDF; export the measurements as text",
-    b"\x1f\x8b": "compressed; unpack it",
+_BINARY = {
+    b"PK\x03\x04": ("a workbook or an archive", "save its sheet as CSV"),
+    b"\xd0\xcf\x11\xe0": ("an old Excel workbook", "save its sheet as CSV"),
+    b"%PDF": ("a PDF", "export the measurements as text"),
+    b"\x1f\x8b": ("a compressed file", "unpack it"),
 }
 _CONTROLS = frozenset(map(chr, range(32))) - set("\t\n\r\x0b\x0c\x1a")
-"""Characters that no text holds; old exports end with the end-of-file mark 1A."""
+"""Control characters that are not in texts; old exports end with the end-of-file mark 1A."""
 
 
 @dataclass(frozen=True, eq=False)
 class ExportFile:
-    """A file of an instrument or a controller, before its meaning is looked at.
+    """A file of an instrument or a controller, uninterpreted.
 
     Attributes:
-        source: the file, as complaints call it.
-        headings: of the columns; their numbers from "1" on where the file has none.
+        source: the file, for messages.
+        headings: headings of the columns; their numbers from "1" if the file has none.
         has_header: whether it has headings.
-        header_line: line of the headings; that of the first row where it has none.
-        units: symbols of the units of its unit row, "" for columns without; units with several meanings as they are
-            spelt.
-        comments: titles and comments, as they stand there.
-        records: the cells of every row, in the order of the file.
-        lines: where the rows stand.
-        dialect: how it is written.
-        skipped: lines with numbers that are no rows, those after the first row that are neither rows nor blank, and
+        header_line: line of the headings, or of the first row if it has none.
+        units: symbols of its unit row, "" for columns without a unit; ambiguous units keep their spelling.
+        comments: titles and comments.
+        records: cells of every row, in the order of the file.
+        lines: lines of the rows.
+        dialect: format of the file.
+        skipped: lines with numbers that are not rows, lines after the first row that are neither rows nor blank, and
             rows that summarise others.
     """
 
@@ -66,19 +65,19 @@ class ExportFile:
     skipped: tuple[LeftOutRow, ...]
 
     @property
-    def places(self) -> tuple[Place, ...]:
-        """Where all rows stand, with those that are left out."""
+    def places(self) -> tuple[FileLine, ...]:
+        """File and line of all rows, including skipped ones."""
         return (
             *((self.source, line) for line in self.lines),
             *((one.file, one.line) for one in self.skipped),
         )
 
     def column(self, index: int) -> list[str]:
-        """The cells of a column."""
+        """Return the cells of a column."""
         return [record[index] for record in self.records]
 
     def numbers(self, index: int) -> list[float]:
-        """The numbers of a column in its file's unit, without the cells that hold none."""
+        """Return the numbers of a column in the file's unit, without cells that are not numbers."""
         texts = (self.dialect.numbers.text(cell) for cell in self.column(index))
         return [float(text) for text in texts if text is not None]
 
@@ -86,16 +85,16 @@ class ExportFile:
 def read_export(
     path: str | os.PathLike[str], decimal: Decimal | None = None, most: int = MAX_BYTES
 ) -> ExportFile:
-    """Read an export: encoding, separator and decimal sign are recognised, headings, unit row and comments told apart.
+    """Read an export, recognising encoding, separator, decimal sign, headings, unit row and comments.
 
     Args:
         path: the file.
-        decimal: the decimal sign, where it is stated.
-        most: bytes that the file may have.
+        decimal: the decimal sign, if it is stated.
+        most: largest size of the file [bytes].
 
     Raises:
-        MeasurementError: the file cannot be read, is no text, holds no table of numbers, or a row has another number
-            of cells than the others; the message names the line.
+        MeasurementError: the file cannot be read, is not text, does not contain a table of numbers, or a row has
+            another number of cells than the others.
     """
     source = printable(str(path), cut=False)
     lines = _lines_of(decoded(read_input(path, MeasurementError, most), source), source)
@@ -112,8 +111,8 @@ def read_export(
             rows.append(i)
         elif any(cells[i]) and cells[i][: len(top.headings)] != top.headings:
             if not _is_comment(line, cells[i]):
-                _check_skipped(cells[i], dialect, width, f"{source}, line {number}")
-            skipped.append(LeftOutRow(source, number, "it is no row of the table"))
+                _check_skipped(cells[i], dialect, width, Place(source, number))
+            skipped.append(LeftOutRow(source, number, "it is not a row of the table"))
     headings, units = top.headings, top.units
     used = [
         k for k in range(width - ends_empty) if (headings and headings[k]) or any(cells[i][k] for i in rows)
@@ -138,18 +137,21 @@ def read_export(
 
 
 def _lines_of(text: str, source: str) -> _Lines:
-    """The lines that are not blank, each with its number."""
+    """Return the lines that are not blank, with their numbers."""
     lines = [(number, line) for number, line in enumerate(text.split("\n"), start=1) if line.strip()]
     for number, line in lines:
-        if len(line) > LONGEST_LINE:
+        if len(line) > MAX_LINE:
             raise MeasurementError(
-                f"{source}, line {number}: has {len(line):,} characters; one line per measurement was wanted."
+                expected=f"a line of up to {MAX_LINE:,} characters",
+                value=len(line),
+                at=Place(source, number),
+                remedy="write one line per measurement",
             )
     return lines
 
 
 def _is_content(line: str, row: list[str], headings: list[str]) -> bool:
-    """Whether cells without numbers are a row nevertheless, whose reader will say what is wrong with it."""
+    """Return whether cells without numbers are a row nevertheless, which the reader of measurement files will refuse."""
     return any(row) and row[: len(headings)] != headings and not _is_comment(line, row)
 
 
@@ -157,7 +159,7 @@ def _is_comment(line: str, row: list[str]) -> bool:
     return bool(COMMENT.match(line)) and row[0] not in SPREADSHEET_ERRORS
 
 
-def _check_skipped(row: list[str], dialect: Dialect, width: int, place: str) -> None:
+def _check_skipped(row: list[str], dialect: Dialect, width: int, at: Place) -> None:
     """Refuse a row of another width, which would be lost.
 
     Raises:
@@ -166,22 +168,24 @@ def _check_skipped(row: list[str], dialect: Dialect, width: int, place: str) -> 
     if sum(map(dialect.is_number, row)) < 2:
         return
     raise MeasurementError(
-        f"{place}: {len(row)} cells, but the other rows have {width}; complete or remove the row, or state --decimal "
-        "where decimal commas were taken for separators."
+        expected=f"{width} cells as in the other rows",
+        value=len(row),
+        at=at,
+        remedy="complete or remove the row, or state --decimal if decimal commas were read as separators",
     )
 
 
 @dataclass
 class _Top:
-    """What stands before the first row.
+    """The lines before the first row.
 
     Attributes:
-        headings: of the columns, [] where there are none.
-        header_line: line of the headings, 0 where there are none.
-        units: of the unit row, see `ExportFile.units`; [] where there is none.
+        headings: headings of the columns, [] if there are none.
+        header_line: line of the headings, 0 if there are none.
+        units: units of the unit row, see `ExportFile.units`; [] if there is none.
         comments: titles and comments.
         skipped: lines with numbers that are neither headings nor rows.
-        end: how many of the lines these are; what follows them is content.
+        end: number of these lines.
     """
 
     headings: list[str]
@@ -193,10 +197,10 @@ class _Top:
 
 
 def _read_top(lines: _Lines, dialect: Dialect, width: int, source: str) -> _Top:
-    """Tell headings, unit row and comments apart in the lines before the first row.
+    """Separate headings, unit row and comments in the lines before the first row.
 
     Raises:
-        MeasurementError: there are more or fewer headings than columns, or a row before the first one lacks a cell.
+        MeasurementError: the number of headings is not that of the columns, or a row before the first one lacks a cell.
     """
     cells = [_heading_cells(line, dialect, width) for _, line in lines]
     is_units = [len(row) == width and _is_unit_row(row) for row in cells]
@@ -204,11 +208,11 @@ def _read_top(lines: _Lines, dialect: Dialect, width: int, source: str) -> _Top:
     if heading is None:
         for (number, _), row in zip(lines, cells, strict=True):
             if len(row) > 2 and _recognised(row) >= 0.5:
-                raise _wrong_headings(row, dialect, width, f"{source}, line {number}")
+                raise _wrong_headings(row, dialect, width, Place(source, number))
     units = next((i for i in reversed(range(len(lines))) if is_units[i]), None)
     table = max(
         -1 if i is None else i for i in (heading, units)
-    )  # the last line that is surely above the rows
+    )  # the last line that is certainly above the rows
     top = _Top(
         headings=[] if heading is None else cells[heading],
         header_line=0 if heading is None else lines[heading][0],
@@ -224,19 +228,19 @@ def _read_top(lines: _Lines, dialect: Dialect, width: int, source: str) -> _Top:
         if i in (heading, units):
             continue
         if is_certain and i > table and is_plain:
-            top.end = i  # what is below the headings is accounted for like what is further down
+            top.end = i  # lines below the headings are accounted for in the same way as those between rows
             break
         if is_plain and numeric >= max(2, width // 2) and (heading is None or i > table):
-            _check_skipped(cells[i], dialect, width, f"{source}, line {number}")
+            _check_skipped(cells[i], dialect, width, Place(source, number))
         if numeric >= 2:
-            top.skipped.append(LeftOutRow(source, number, "it is no row of the table"))
+            top.skipped.append(LeftOutRow(source, number, "it is not a row of the table"))
         else:
             top.comments.append(line)
     return top
 
 
 def _heading_row(lines: _Lines, cells: list[list[str]], is_units: list[bool], width: int) -> int | None:
-    """The line of the headings: of those of the table's width the one with most names that instruments use."""
+    """Return the index of the headings: the line of the table's width with the most recognised names."""
     possible = [
         (_recognised(row), i)
         for i, row in enumerate(cells)
@@ -250,26 +254,26 @@ def _heading_row(lines: _Lines, cells: list[list[str]], is_units: list[bool], wi
 
 
 def _is_unit_row(cells: list[str]) -> bool:
-    """Whether cells are units, and perhaps texts beside them that are no names of columns."""
+    """Return whether cells are units, possibly with other texts that are not names of columns."""
     symbols = [unit_symbol(cell) or ambiguous_unit(cell) for cell in cells]
     others = [cell for cell, symbol in zip(cells, symbols, strict=True) if cell and not symbol]
     count = sum(map(bool, symbols))
     return count >= (max(2, len(others)) if others else 1) and not any(map(is_recognised, others))
 
 
-def _wrong_headings(cells: list[str], dialect: Dialect, width: int, place: str) -> MeasurementError:
-    """Say that there are more or fewer headings than columns."""
+def _wrong_headings(cells: list[str], dialect: Dialect, width: int, at: Place) -> MeasurementError:
+    """Return the exception for a number of headings that is not that of the columns."""
     commas = dialect.separator == "," and len(cells) < width
     action = (
         "export decimal points, or semicolons between cells" if commas else "give every column one heading"
     )
     return MeasurementError(
-        f"{place}: expected {width} headings as the rows have {width} cells, got {len(cells)}; {action}."
+        expected=f"{width} headings as the rows have {width} cells", value=len(cells), at=at, remedy=action
     )
 
 
 def _heading_cells(line: str, dialect: Dialect, width: int) -> list[str]:
-    """The cells of a heading, which may begin as a comment, end with a separator or have blanks before its units."""
+    """Return the cells of a heading, which may start like a comment, end with a separator or have spaced units."""
     bare = COMMENT.sub("", line, count=1) if COMMENT.match(line) else line
     for text in (line, bare, re.sub(r"(?<!\s)\s+(?=[\[(])", "", bare)):
         cells = dialect.split(text)
@@ -281,7 +285,7 @@ def _heading_cells(line: str, dialect: Dialect, width: int) -> list[str]:
 
 
 def _recognised(cells: list[str]) -> float:
-    """Share of the cells that are names which instruments use."""
+    """Return the share of cells that are recognised names."""
     return sum(map(is_recognised, cells)) / len(cells)
 
 
@@ -289,15 +293,15 @@ def decoded(content: bytes, source: str) -> str:
     """Decode a text: by its byte order mark, as UTF-16 without one, as UTF-8, else as Windows-1252.
 
     Args:
-        content: of the file.
-        source: the file, as complaints call it.
+        content: content of the file.
+        source: the file, for messages.
 
     Raises:
-        MeasurementError: it is no text.
+        MeasurementError: it is not text.
     """
-    for start, what in _NO_TEXT.items():
+    for start, (what, remedy) in _BINARY.items():
         if content.startswith(start):
-            raise MeasurementError(f"{source}: is {what}.")
+            raise MeasurementError(expected="text", value=what, at=Place(source), remedy=remedy)
     encoding, mark = next(((name, mark) for mark, name in _MARKS if content.startswith(mark)), ("", b""))
     for attempt in (encoding,) if encoding else (_utf16_without_mark(content), "utf-8", "cp1252"):
         try:
@@ -306,11 +310,13 @@ def decoded(content: bytes, source: str) -> str:
             continue
         if attempt and not _CONTROLS & set(text):
             return text.rstrip("\x1a").replace("\r\n", "\n").replace("\r", "\n")
-    raise MeasurementError(f"{source}: is no text in UTF-8, UTF-16 or Windows-1252; export it as text.")
+    raise MeasurementError(
+        expected="text in UTF-8, UTF-16 or Windows-1252", at=Place(source), remedy="export it as text"
+    )
 
 
 def _utf16_without_mark(content: bytes) -> str:
-    """The byte order of UTF-16, of whose characters nearly all have a zero byte; "" where the text is no UTF-16."""
+    """Return the byte order of UTF-16, in which most characters have a zero byte; "" for other texts."""
     even, odd = content[0:4096:2].count(0), content[1:4096:2].count(0)
     most = 0.4 * min(len(content), 4096) / 2
     return "utf-16-le" if odd > most > even else "utf-16-be" if even > most > odd else ""

@@ -1,4 +1,4 @@
-"""What the headings of exports mean: a registry of the names that makers and instruments use."""
+"""A registry of the headings of makers and instruments, and their meanings."""
 
 import re
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ _SIDES = {
     "measured": "actual act meas measured ist tracker reflector smr laser",
     "": "tcp tool pos position pose coord coordinate coordinates value values val jnt trans translation",
 }
-"""Words that may stand beside a name, by what they say: who stated it, or nothing."""
+"""Words that may accompany a name: for commanded values, for measured values, and without meaning."""
 _SIDE_OF = {word: side for side, words in _SIDES.items() for word in words.split()}
 _OF_QUATERNION = re.compile(r"^(?:rot|rotation|ori|orient|orientation|quat|quaternion)(?=q[0-4xyzw]$)")
 _BRACKETS = re.compile(r"^(.*?)\s*(?:\[([^\]]*)\]|\(([^)]*)\)|<([^>]*)>)\s*$")
@@ -22,15 +22,15 @@ _TRAILING = re.compile(r"^(.*?)(?:\s*/\s*|\s+in\s+|[\s_,-]+)([A-Za-z°µμ]+)\.?
 
 @dataclass(frozen=True)
 class Heading:
-    """A heading, taken apart.
+    """A parsed heading.
 
     Attributes:
-        text: as in the file.
-        name: what is left without unit, case, separators and words that say nothing, such as "j1" of "J_1 [deg]".
-        unit: symbol of the unit that stands in it, or "".
-        unknown_unit: what stands in brackets and is no unit.
-        side: "commanded" or "measured" where it says so.
-        is_column: whether it is the name of a column of measurement files, but for its case.
+        text: the heading as in the file.
+        name: its name without unit, case, separators and words without meaning, such as "j1" of "J_1 [deg]".
+        unit: symbol of its unit, or "".
+        unknown_unit: text in brackets that is not a unit.
+        side: "commanded" or "measured" if it states so, or "".
+        is_column: whether it is the name of a column of measurement files, in any case.
     """
 
     text: str
@@ -42,7 +42,7 @@ class Heading:
 
 
 def parse_heading(text: str) -> Heading:
-    """Take a heading apart; one that is longer than headings are means nothing."""
+    """Parse a heading; overlong ones have no meaning."""
     if len(text) > MAX_WORD_CHARACTERS:
         return Heading(text, "", "")
     column = find_column(text.strip().lower())
@@ -52,14 +52,14 @@ def parse_heading(text: str) -> Heading:
     words = [word for word in re.split(r"[\W_]+", name.casefold()) if word]
     side = next(filter(None, (_SIDE_OF.get(word) for word in words)), "")
     for sides in (("commanded", "measured"), ("",)):
-        rest = [word for word in words if _SIDE_OF.get(word) not in sides]
-        words = rest if rest and not all(word.isdigit() for word in rest) else words
+        others = [word for word in words if _SIDE_OF.get(word) not in sides]
+        words = others if others and not all(word.isdigit() for word in others) else words
     name = _OF_QUATERNION.sub("", "".join(words))
     return Heading(text, name, unit, unknown, side)
 
 
 def _unit_apart(text: str) -> tuple[str, str, str]:
-    """The name in a heading, the symbol of its unit, and what stands in the place of a unit and is none."""
+    """Return the name in a heading, the symbol of its unit, and a text in place of a unit that is not one."""
     match = _BRACKETS.match(text)
     if match:
         inside = next(group for group in match.groups()[1:] if group is not None)
@@ -75,15 +75,15 @@ def _unit_apart(text: str) -> tuple[str, str, str]:
 
 @dataclass(frozen=True)
 class Maker:
-    """How a maker names columns.
+    """A maker's names of columns.
 
     Attributes:
-        name: of the maker.
-        joints: names of the joints in their order, or one that numbers follow; "" where others name them so, too.
+        name: name of the maker.
+        joints: names of the joints in order, or one name that is followed by numbers; "" if others use the same names.
         rotation: its encoding of rotations.
-        position: name of x, where it is needed to tell that it is this maker.
-        length: unit that it always writes lengths in; "" where that may be set.
-        angle: the same of angles.
+        position: name of x, if it is needed to recognise the maker.
+        length: unit of all lengths; "" if it is configurable.
+        angle: unit of all angles; "" if it is configurable.
     """
 
     name: str
@@ -105,12 +105,11 @@ MAKERS = (
     Maker("Epson", "", "epson", length="mm", angle="deg"),
     Maker("Kawasaki", "", "kawasaki", length="mm", angle="deg"),
 )
-"""An instrument or a controller more is one line; those without names of their own for the joints are recognised by
-their rotations."""
+"""Makers; a further one is one line. Makers without specific names of joints are recognised by their rotations."""
 
 _JOINTS = "j joint q axis ax achse th theta gelenk axe eje asse jt a rax position"
 JOINT_NAMES = tuple(_JOINTS.split())
-"""What numbers of joints follow, whoever writes it."""
+"""Names of joints that are followed by numbers, of any maker."""
 
 POSITIONS = tuple(
     tuple(names.split())
@@ -124,7 +123,7 @@ POSITIONS = tuple(
         "r14 r24 r34",
     )
 )
-"""Names of the coordinates of a position; a way to name them is one text."""
+"""Names of the coordinates of a position; a further set of names is one text."""
 
 _MEANINGS = {
     "point": "point pointname punkt punktname pt ptname pos name label pointid id measurement no nr num number index",
@@ -134,7 +133,7 @@ _MEANINGS = {
     "set": "set split",
 }
 MEANINGS = {name: quantity for quantity, names in _MEANINGS.items() for name in names.split()}
-"""Names of what is no joint, position or rotation, the better ones first; a name more is one word."""
+"""Names of other quantities, better ones first; a further name is one word."""
 _OTHERS = {
     name
     for names in (
@@ -146,11 +145,11 @@ _OTHERS = {
 
 
 def joint_of(name: str, pattern: str) -> int | None:
-    """Number of a joint by its name in the way of a maker, as written; None where it is none.
+    """Return the number of a joint by a maker's name of it, as written; None if it is not a joint.
 
     Args:
-        name: of a heading.
-        pattern: see `Maker.joints`.
+        name: name in a heading.
+        pattern: the maker's names, see `Maker.joints`.
     """
     if not pattern.endswith("#"):
         names = pattern.split()
@@ -160,7 +159,7 @@ def joint_of(name: str, pattern: str) -> int | None:
 
 
 def is_recognised(text: str) -> bool:
-    """Say whether a heading means something that is kept."""
+    """Return whether a heading has a known meaning."""
     heading = parse_heading(text)
     patterns = (*(f"{name}#" for name in JOINT_NAMES), *(maker.joints for maker in MAKERS if maker.joints))
     return (

@@ -1,4 +1,4 @@
-"""A log of joint values and a list of measurements, put together by name, order or time."""
+"""Join a log of joint values and a list of measurements by name, order or time."""
 
 import os
 import re
@@ -9,58 +9,65 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from pisigma.files.errors import MeasurementError
+from pisigma.files.errors import MeasurementError, Place
 from pisigma.measurement.csv.columns import find_column
 from pisigma.measurement.csv.reading import number_column, text_column
 from pisigma.measurement.csv.table import read_table
-from pisigma.measurement.foreign.accounting import LeftOutRow, Place, sentences
+from pisigma.measurement.foreign.accounting import FileLine, LeftOutRow, sentences
 from pisigma.measurement.foreign.conversion import ConvertedRows
 from pisigma.measurement.foreign.quantities import KEYS, is_measured, joints_of
-from pisigma.measurement.foreign.time_stamps import date_of, day_first, has_open_date, is_clock, seconds_of
+from pisigma.measurement.foreign.time_stamps import (
+    ambiguous_date,
+    date_of,
+    day_first,
+    has_open_date,
+    is_clock,
+    seconds_of,
+)
 
 JoinBy = Literal["point", "order", "time"]
-"""[s] Two time stamps of one pose differ by no more, where nothing is said."""
-_MOVED = 0.05
-"""[deg or mm] A joint that moves by more around a time stamp did not stand."""
+_MAX_MOTION = 0.05
+"""[deg or mm] Motion of a joint around a time stamp above which the robot did not stand still."""
 _NANOSECONDS = 1e15
-"""Numbers above are no seconds of a clock, but nanoseconds, as ROS names its images."""
+"""Numbers above are nanoseconds, as in ROS's names of images, not seconds."""
 
 
 @dataclass(frozen=True, eq=False)
 class JoinedRows:
-    """Rows that were put together.
+    """Measurements joined with joint values.
 
     Attributes:
-        rows: what was measured, in its order, with the joint values.
-        used: file and line of the rows of the log whose joint values were joined.
-        unmatched: rows of both that have no partner.
-        unused: rows of the log that need none, as another one has their point or nothing was measured at their time.
-        warnings: what else should be known, each a sentence.
+        rows: the measurements in their order, with joint values.
+        used: file and line of the rows of the log that were joined.
+        unmatched: rows of both files that have no partner.
+        unused: rows of the log that need no partner: another row has their point, or nothing was measured at their
+            time.
+        warnings: warnings, each a sentence.
     """
 
     rows: ConvertedRows
-    used: tuple[Place, ...]
+    used: tuple[FileLine, ...]
     unmatched: tuple[LeftOutRow, ...]
     unused: tuple[LeftOutRow, ...]
     warnings: tuple[str, ...]
 
 
 def join_rows(measured: ConvertedRows, joints: ConvertedRows, by: JoinBy, within: float = 0.2) -> JoinedRows:
-    """Put a list of measurements and a log of joint values together.
+    """Join a list of measurements and a log of joint values.
 
-    Rows of the list stay in their order; one without a partner is left out and named. Poses of the log are commanded or
-    calculated, and are left out.
+    Rows of the list keep their order; rows without a partner are left out and listed. Poses in the log are commanded or
+    calculated ones and are left out.
 
     Args:
         measured: rows without joint values.
         joints: rows with joint values.
-        by: "point": names of points, without the groups before "::" and whatever their case and leading zeros;
-            "order": the first with the first and so on; "time": the row of the log that is nearest in time.
+        by: "point": names of points, ignoring groups before "::", case and leading zeros; "order": the first with the
+            first and so on; "time": the row of the log that is nearest in time.
         within: largest difference of time stamps [s].
 
     Raises:
-        MeasurementError: there is nothing to join by, numbers of rows differ, a name stands at different joint values,
-            no row has a partner, or names of points contradict the order or the time.
+        MeasurementError: there is no column to join by, numbers of rows differ, a name has different joint values, no
+            row has a partner, or names of points contradict the order or the time.
     """
     if by == "order":
         partner = _by_order(measured, joints)
@@ -70,9 +77,7 @@ def join_rows(measured: ConvertedRows, joints: ConvertedRows, by: JoinBy, within
         partner = _by_time(measured, joints, within)
     matched = np.flatnonzero(partner >= 0)
     if not len(matched):
-        raise MeasurementError(
-            f"{measured.source} and {joints.source}: {_nothing(measured, joints, by, within)}"
-        )
+        raise _no_partner(measured, joints, by, within)
     warnings = [] if by == "point" else _check_names(measured, joints, partner, by)
     commanded = [name for name in joints.cells if is_measured(name)]
     kept = [name for name in joints.cells if name not in (*commanded, *KEYS, *measured.cells)]
@@ -87,13 +92,17 @@ def join_rows(measured: ConvertedRows, joints: ConvertedRows, by: JoinBy, within
     if commanded:
         names = ", ".join(commanded)
         warnings.append(
-            f"{joints.source}: {names} are left out, as the measurements are those of {measured.source}."
+            f"{joints.source}: {names} are left out, as the measurements are in {measured.source}."
         )
     if by == "time":
         warnings += _moving(joints, partner[matched], within)
     alone = np.setdiff1d(np.arange(len(joints.lines)), partner)
     known = np.intersect1d(alone, _partners(joints, partner, by))
-    why = "nothing was measured at its time" if by == "time" else "another row has its point and joint values"
+    why = (
+        "nothing was measured at its time"
+        if by == "time"
+        else "another row has the same point and joint values"
+    )
     return JoinedRows(
         rows=rows,
         used=tuple(joints.places[row] for row in np.unique(partner[matched])),
@@ -112,7 +121,7 @@ def _left_out(rows: ConvertedRows, which: Int64[np.ndarray, " _which"], reason: 
 
 
 def append_rows(rows: Sequence[ConvertedRows]) -> ConvertedRows:
-    """Put the rows of several files behind each other; what one of them lacks is empty in its rows."""
+    """Concatenate the rows of several files; columns that one of them does not have are empty in its rows."""
     if len(rows) == 1:
         return rows[0]
     names = list(dict.fromkeys(name for one in rows for name in one.cells))
@@ -130,12 +139,12 @@ def append_rows(rows: Sequence[ConvertedRows]) -> ConvertedRows:
 def _check_names(
     measured: ConvertedRows, joints: ConvertedRows, partner: Int64[np.ndarray, " rows"], by: JoinBy
 ) -> list[str]:
-    """Refuse rows that are put together although both files name points and the names say otherwise.
+    """Refuse joined rows whose points have different names in both files.
 
-    Where no name is in both, the numbers at their ends are compared, which may count from another number on.
+    If no name is in both files, the numbers at their ends are compared, which may start at different numbers.
 
     Returns:
-        Sentences on names that cannot be compared.
+        Warnings of names that cannot be compared.
 
     Raises:
         MeasurementError: see above.
@@ -153,19 +162,20 @@ def _check_names(
         if not set(ours) & set(theirs) or (len(offsets) == 1 and offsets != {0}) or not is_clear:
             row = int(np.flatnonzero(partner >= 0)[0])
             return [
-                f"{measured.source}, line {measured.lines[row]}: the point '{_point(measured, row)}' is put together "
-                f"with '{_point(joints, int(partner[row]))}' ({joints.source}, line {joints.lines[partner[row]]}), and "
-                "no name is the same in both files; check that their rows belong together."
+                f"{measured.source}, line {measured.lines[row]}: the point '{_point(measured, row)}' is joined with "
+                f"'{_point(joints, int(partner[row]))}' ({joints.source}, line {joints.lines[partner[row]]}), and no "
+                "name is the same in both files; check that their rows belong together."
             ]
     lines = dict(zip(theirs, joints.lines, strict=True))
     for row, other in enumerate(partner.tolist()):
         name = ours[row]
         if other >= 0 and name in lines and theirs[other] and theirs[other] != name:
             raise MeasurementError(
-                f"{measured.source}, line {measured.lines[row]}: joining by {by} puts the point "
-                f"'{_point(measured, row)}' together with '{_point(joints, other)}' ({joints.source}, line "
-                f"{joints.lines[other]}), but that file names it in line {lines[name]}; join by point, or leave the "
-                "column of the names out with --map."
+                f"joining by {by} joins the point with '{_point(joints, other)}' of line {joints.lines[other]} of "
+                f"{joints.source}, in which '{_point(measured, row)}' is the point of line {lines[name]}",
+                at=Place(measured.source, measured.lines[row]),
+                value=_point(measured, row),
+                remedy="join by point, or leave out the column of the names with --map",
             )
     return []
 
@@ -173,8 +183,10 @@ def _check_names(
 def _by_order(measured: ConvertedRows, joints: ConvertedRows) -> Int64[np.ndarray, " rows"]:
     if len(measured.lines) != len(joints.lines):
         raise MeasurementError(
-            f"{measured.source} has {len(measured.lines)} rows and {joints.source} {len(joints.lines)}, so that they "
-            "cannot be joined by order; join them by point or time, or complete the shorter one."
+            expected=f"{len(measured.lines)} rows as in {measured.source}, to join by order",
+            value=len(joints.lines),
+            at=Place(joints.source),
+            remedy="join by point or time, or complete the shorter file",
         )
     return np.arange(len(measured.lines))
 
@@ -188,20 +200,22 @@ def _by_point(measured: ConvertedRows, joints: ConvertedRows) -> Int64[np.ndarra
         if values[row_of.setdefault(name, row)] != values[row] and name:
             first, text = joints.lines[row_of[name]], joints.cells["point"][row]
             raise MeasurementError(
-                f"{joints.source}, line {joints.lines[row]}: the point '{text}' stands in line {first} at other joint "
-                "values; give every pose a name of its own."
+                f"the point '{text}' has other joint values in line {first}",
+                at=Place(joints.source, joints.lines[row]),
+                value=text,
+                remedy="give every pose a different name",
             )
     names = map(_plain_name, measured.cells["point"])
     return np.array([row_of.get(name, -1) if name else -1 for name in names], dtype=np.int64)
 
 
 def _plain_name(text: str) -> str:
-    """A name without the groups before it, case, and leading zeros."""
+    """Return a name without the groups before it, in lower case and without leading zeros."""
     return re.sub(r"(?<![\d.])0+(?=\d)", "", text.rpartition("::")[2].strip().casefold())
 
 
 def _number_of(name: str) -> str:
-    """The number at the end of a plain name, "" where there is none."""
+    """Return the number at the end of a plain name; "" if there is none."""
     return _plain_name(re.sub(r".*?(\d*)$", r"\1", name, flags=re.DOTALL))
 
 
@@ -220,34 +234,33 @@ def _by_time(measured: ConvertedRows, joints: ConvertedRows, within: float) -> I
 
 
 def _times(rows: ConvertedRows, other: ConvertedRows) -> Float64[np.ndarray, " rows"]:
-    """Time stamps [s].
+    """Return the time stamps [s].
 
     Raises:
-        MeasurementError: one is none, or has an order of day and month that neither its file nor the other one tells.
+        MeasurementError: one is invalid, or neither file determines its order of day and month.
     """
     texts, others = _stamps(rows), _stamps(other)
     first = day_first(texts)
     if first is None and len({date_of(text) for text in (*texts, *others)}) == 1:
-        first = True  # on one and the same day the order does not matter
+        first = True  # on the same day the order does not matter
     times = np.empty(len(rows.lines))
     for row, text in enumerate(texts):
         seconds = seconds_of(text, first)
         if seconds is None and has_open_date(text) and seconds_of(text, True) is not None:
-            raise MeasurementError(
-                f"{rows.source}, line {rows.lines[row]}: '{text}' may have the day or the month first; write dates as "
-                "2026-03-02 or 02.03.2026."
-            )
+            raise ambiguous_date(Place(rows.source, rows.lines[row]), text)
         if seconds is None:
             raise MeasurementError(
-                f"{rows.source}, line {rows.lines[row]}: expected a time stamp such as 12.5, 10:31:02.5, 10:31:02 PM "
-                f"or 2026-03-02 10:31:02.5, got '{text}'; correct it, or remove the row."
+                expected="a time stamp such as 12.5, 10:31:02.5, 10:31:02 PM or 2026-03-02 10:31:02.5",
+                value=text,
+                at=Place(rows.source, rows.lines[row]),
+                remedy="correct it, or remove the row",
             )
         times[row] = seconds
     return times
 
 
 def _stamps(rows: ConvertedRows) -> list[str]:
-    """The texts of time stamps; a clock gets the date of its row where a column holds one."""
+    """Return the texts of the time stamps; clock times are completed by a column of dates."""
     _check_key(rows, "time", "time stamps")
     dates = rows.cells.get("date", ("",) * len(rows.lines))
     return [
@@ -259,8 +272,10 @@ def _stamps(rows: ConvertedRows) -> list[str]:
 def _check_key(rows: ConvertedRows, key: str, what: str) -> None:
     if key not in rows.cells:
         raise MeasurementError(
-            f"{rows.source}: no column holds {what}, by which rows were to be joined; name it with --map "
-            f"HEADING={key}, or join by something else."
+            expected=f"a column of {what}, to join rows by them",
+            value="none",
+            at=Place(rows.source),
+            remedy=f"name it with --map HEADING={key}, or join in another way",
         )
 
 
@@ -272,7 +287,7 @@ def _joint_columns(rows: ConvertedRows) -> list[str]:
 def _partners(
     joints: ConvertedRows, partner: Int64[np.ndarray, " rows"], by: JoinBy
 ) -> Int64[np.ndarray, " _log"]:
-    """The rows of the log that need no mention: those that were joined, and between them those of a running log."""
+    """Return the rows of the log that need not be listed: joined ones, and those between them of a continuous log."""
     if by != "time":
         if by == "point":
             names = {_plain_name(joints.cells["point"][row]) for row in partner if row >= 0}
@@ -286,36 +301,46 @@ def _point(rows: ConvertedRows, row: int) -> str:
 
 
 def _moving(joints: ConvertedRows, partner: Int64[np.ndarray, " _rows"], within: float) -> list[str]:
-    """A sentence where joints moved around the time at which something was measured."""
+    """Return a warning if joints moved around the time of a measurement."""
     times = _times(joints, joints)
     try:
         q = np.array([[float(text) for text in joints.cells[name]] for name in _joint_columns(joints)]).T
     except ValueError:
-        return []  # the reader names the cell
+        return []  # the reader reports the cell
     order = np.argsort(times, kind="stable")
     low = np.searchsorted(times[order], times[partner] - within)
     high = np.searchsorted(times[order], times[partner] + within, side="right")
     moved = [float(np.ptp(q[order[a:b]], axis=0).max()) for a, b in zip(low, high, strict=True)]
-    count = sum(value > _MOVED for value in moved)
+    count = sum(value > _MAX_MOTION for value in moved)
     if not count:
         return []
     return [
         f"The joints move by up to {max(moved):.3g} (deg or mm) within {within:g} s of {count} measurements; measure "
-        "while the robot stands."
+        "while the robot stands still."
     ]
 
 
-def _nothing(measured: ConvertedRows, joints: ConvertedRows, by: JoinBy, within: float) -> str:
-    """Say why no row has a partner."""
+def _no_partner(
+    measured: ConvertedRows, joints: ConvertedRows, by: JoinBy, within: float
+) -> MeasurementError:
+    """Return the exception for files of which no row has a partner."""
+    at = Place(f"{measured.source} and {joints.source}")
     if by == "time":
         times, logged = _times(measured, joints), _times(joints, measured)
-        apart = np.abs(times[:1000, None] - logged[None, :1000]).min()
-        return (
-            f"no time stamps are within {within:g} s of each other, the nearest are {apart:.6g} s apart; check the "
-            "clocks and their zones."
+        difference = np.abs(times[:1000, None] - logged[None, :1000]).min()
+        return MeasurementError(
+            expected=f"time stamps within {within:g} s of each other",
+            value=f"a smallest difference of {difference:.6g} s",
+            at=at,
+            remedy="check the clocks and their time zones",
         )
     first, second = measured.cells["point"][0], joints.cells["point"][0]
-    return f"no point has the same name in both, '{first}' and '{second}' for example; check the columns of the names."
+    return MeasurementError(
+        expected="points with the same name in both files",
+        value=f"{first} and {second}",
+        at=at,
+        remedy="check the columns of the names",
+    )
 
 
 @dataclass(frozen=True)
@@ -323,9 +348,9 @@ class JoinedJoints:
     """Cells of a log of joint values by image.
 
     Attributes:
-        columns: of the log that are kept, such as "q1_deg" and "payload_kg".
-        cells: texts of these columns by the name of the image; images without a partner are missing.
-        remarks: sentences on rows without a partner, and what else should be known.
+        columns: columns of the log that are kept, such as "q1_deg" and "payload_kg".
+        cells: texts of these columns by name of the image; images without a partner are missing.
+        remarks: sentences on rows without a partner, and warnings.
     """
 
     columns: tuple[str, ...]
@@ -334,12 +359,12 @@ class JoinedJoints:
 
 
 def join_joints(names: Sequence[str], path: str | os.PathLike[str], within: float) -> JoinedJoints:
-    """Give every image the joint values at which it was taken.
+    """Return the joint values at which every image was taken.
 
     Args:
-        names: of the images, without the endings of their files; where the log has times, time stamps.
-        path: CSV file with joint values (`q1_deg` and so on), and a column `image` (with ending or without) or `time`;
-            its further columns are kept where measurement files have such.
+        names: names of the images without file extensions; time stamps if the log has times.
+        path: CSV file with joint values (`q1_deg` and so on) and a column `image` (with or without extension) or
+            `time`; further columns are kept if they are columns of measurement files.
         within: largest difference of time stamps [s].
 
     Raises:
@@ -350,8 +375,9 @@ def join_joints(names: Sequence[str], path: str | os.PathLike[str], within: floa
     by: JoinBy = "point" if "image" in table.header else "time"
     if not joints or (by == "time" and "time" not in table.header):
         raise MeasurementError(
-            f"{table.source}, line {table.header_line}: joint values (q1_deg and so on) and a column 'image' or 'time' "
-            f"were wanted, got {', '.join(table.header)}."
+            expected="joint values (q1_deg and so on) and a column image or time",
+            value=", ".join(table.header),
+            at=table.header_place,
         )
     for name in joints:
         number_column(table, name)
@@ -365,7 +391,9 @@ def join_joints(names: Sequence[str], path: str | os.PathLike[str], within: floa
     rows = joined.rows.cells
     columns = tuple(name for name in rows if find_column(name))
     others = [name for name in rows if name not in (*columns, *images)]
-    unread = [f"{table.source}: {', '.join(others)} are left out, as measurement files have no such columns."]
+    unread = [
+        f"{table.source}: {', '.join(others)} are left out, as they are not columns of measurement files."
+    ]
     values = zip(*(rows[name] for name in columns), strict=True)
     of_image = dict(zip(rows["point"], values, strict=True))
     remarks = (*sentences(joined.unmatched), *joined.warnings, *(unread if others else ()))
@@ -373,7 +401,7 @@ def join_joints(names: Sequence[str], path: str | os.PathLike[str], within: floa
 
 
 def _stamp(name: str) -> str:
-    """A time stamp in the name of an image, in seconds where it is a number of nanoseconds."""
+    """Return the time stamp in the name of an image, with nanoseconds converted to seconds."""
     try:
         return repr(int(name) * 1e-9) if int(name) > _NANOSECONDS else name
     except ValueError:

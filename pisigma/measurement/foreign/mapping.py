@@ -1,10 +1,10 @@
-"""Which column of an export is what, and in which unit: as stated, else as proposed; and why that may be wrong."""
+"""Map the columns of an export to quantities and units, as stated or else as proposed, and warn of doubtful ones."""
 
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
-from pisigma.files.errors import MeasurementError, nearest_choice
+from pisigma.files.errors import MeasurementError, Place, check_choice
 from pisigma.measurement.csv.columns import POSITION
 from pisigma.measurement.foreign.dialect import is_missing
 from pisigma.measurement.foreign.export_file import ExportFile
@@ -41,20 +41,20 @@ from pisigma.measurement.foreign.units import (
 )
 
 _JOINT_LIKE = re.compile(r"e(?:ax|xt)?[1-6a-f]|[qj]\d.*")
-"""How external axes are called, and what begins like a joint."""
-_TILTED = 0.2
-"""Angles of rotations in degrees that are all smaller are those of a tool that hardly tilts."""
+"""Names of external axes, and names that start like those of joints."""
+_MIN_TILT = 0.2
+"""[deg or rad] Angles of rotations that are all smaller may be those of a tool that hardly tilts, in any unit."""
 
 
 @dataclass(frozen=True, eq=False)
 class FileMapping:
-    """A file and what its columns are.
+    """A file and the meaning of its columns.
 
     Attributes:
         file: the export.
-        columns: all of them, in its order.
-        rotations: encodings between which the headings do not decide; () where nothing is open.
-        incomplete: columns that hold some values of a rotation and not all; () where there is no such rotation.
+        columns: all columns, in its order.
+        rotations: encodings of rotations that fit the headings; () if at most one does.
+        incomplete: columns that contain some but not all values of a rotation; () if there are none.
     """
 
     file: ExportFile
@@ -64,31 +64,31 @@ class FileMapping:
 
     @property
     def quantities(self) -> dict[str, MappedColumn]:
-        """The columns that are kept, by what they are."""
+        """The kept columns by quantity."""
         return {one.target.quantity: one for one in self.columns if one.target.quantity != LEFT_OUT}
 
     @property
     def has_joints(self) -> bool:
-        """Whether it holds joint values."""
+        """Whether the file contains joint values."""
         return bool(joints_of(self.quantities))
 
     @property
     def has_measured(self) -> bool:
-        """Whether it holds anything else that is kept, besides names and times of the rows."""
+        """Whether it contains other kept columns, except names and times of the rows."""
         return bool(set(self.quantities) - {*KEYS, *joints_of(self.quantities)})
 
     def key(self, column: MappedColumn) -> str:
-        """Name a column as mappings do: by its heading, or by its number where several have that."""
+        """Return the name of a column in mappings: its heading, or its number if several have the same heading."""
         return column.heading if self.file.headings.count(column.heading) == 1 else str(column.index + 1)
 
     @property
     def without_unit(self) -> tuple[MappedColumn, ...]:
-        """The columns whose unit is not known; a time without one is in s."""
+        """The columns whose unit is unknown; times without a unit are in s."""
         return tuple(one for one in self.columns if one.target.needs not in (None, "time"))
 
     @property
     def likely_units(self) -> dict[UnitKind, str]:
-        """Likely units of the columns without, by what they measure."""
+        """Likely units of the columns without a unit, by kind of unit."""
         kinds = {one.target.needs for one in self.without_unit}
         small_angles = is_certain("rad", largest(self.file, joint_columns(self.columns)))
         length = "m" if is_certain("m", largest(self.file, coordinates(self.columns))) else "mm"
@@ -97,20 +97,20 @@ class FileMapping:
 
     @property
     def title(self) -> str:
-        """What was read, and how it is written."""
+        """A line with file, number of rows and format."""
         return f"{self.file.source}: {len(self.file.records)} rows, {self.file.dialect}"
 
-    def place(self, column: MappedColumn, line: int = 0) -> str:
-        """File, line and column, as messages name them; the line of the headings where none is given."""
-        return f"{self.file.source}, line {line or self.file.header_line}, column '{column.heading}'"
+    def at(self, column: MappedColumn, line: int = 0) -> Place:
+        """Return file, line and column for messages, by default the line of the headings."""
+        return Place(self.file.source, line or self.file.header_line, column.heading)
 
     def example(self, column: MappedColumn) -> str:
-        """The first cell of a column that is not empty."""
+        """Return the first cell of a column that is not empty."""
         return next(filter(None, self.file.column(column.index)), "")
 
     @property
     def possible_joints(self) -> list[MappedColumn]:
-        """The columns that are left out, but that are named as joints are."""
+        """The columns that are left out although they are named like joints."""
         left_out = [
             one for one in self.columns if one.target.quantity == LEFT_OUT and one.reason == UNRECOGNISED
         ]
@@ -120,25 +120,24 @@ class FileMapping:
 def map_columns(
     file: ExportFile, stated: Mapping[str, str], rotation: str | None, units: Mapping[UnitKind, str]
 ) -> FileMapping:
-    """Find out what the columns of a file are and in which units.
+    """Determine the quantities and units of the columns of a file.
 
-    A unit is taken from the mapping, the heading, the unit row, the comments, from `units`, of a coordinate from the
-    others where these are stated, and last from the maker whose names these are, where the values can be in no other
+    Units are taken, in this order, from the mapping, the heading, the unit row, the comments, `units`, for a coordinate
+    from the other coordinates if these are stated, and from the maker with these names if the values can be in no other
     unit.
 
     Args:
         file: the export.
-        stated: by heading, or by number of a column, what it is; see `parse_target`. Others are not looked at.
-        rotation: encoding of the rotations, `NO_ROTATION` to leave them out, None to tell it by the headings.
-        units: by what they measure, symbols of the units of columns for which the file states none.
+        stated: targets by heading or number of a column, see `parse_target`; names that the file does not have are
+            ignored.
+        rotation: encoding of the rotations, `NO_ROTATION` to leave them out, None to determine it by the headings.
+        units: symbols by kind of unit, for columns for which the file states none.
 
     Raises:
-        MeasurementError: a statement does not fit the file, or there are no headings that say what the columns are.
+        MeasurementError: a statement does not fit the file, or the headings do not determine the columns.
     """
-    if rotation is not None and rotation not in (NO_ROTATION, *ROTATIONS):
-        raise MeasurementError(
-            f"--rotation {rotation}: {nearest_choice(rotation, (NO_ROTATION, *ROTATIONS))}"
-        )
+    if rotation is not None:
+        check_choice(MeasurementError, "--rotation", rotation, (NO_ROTATION, *ROTATIONS))
     proposal = Proposal(file)
     for name, text in stated.items():
         _take_stated(proposal, name, text)
@@ -151,17 +150,20 @@ def map_columns(
 
 
 def _take_stated(proposal: Proposal, name: str, text: str) -> None:
-    """Columns that the caller names, by heading or by number."""
+    """Decide the columns that the caller names by heading or number."""
     file = proposal.file
     indices = [index for index, heading in enumerate(file.headings) if heading == name]
     if not indices and name.isdigit() and 1 <= int(name[:9]) <= len(file.headings):
         indices = [int(name) - 1]
     for index in indices:
-        target, written = parse_target(text, f"--map {name}={text}"), _written_unit(proposal, index)
+        target, written = parse_target(text, name), _written_unit(proposal, index)
         if target.unit and written and target.unit != written:
             raise MeasurementError(
-                f"{file.source}, column '{name}': --map says {target.unit}, but the file says {written}; map it to "
-                f"{Target(target.quantity, written).text}."
+                option="--map",
+                expected=f"{written} as the file states",
+                value=target.unit,
+                at=Place(file.source, file.header_line, name),
+                remedy=f"map it to {Target(target.quantity, written).text}",
             )
         if target.needs and fits(target.quantity, written):
             target = replace(target, unit=written)
@@ -169,21 +171,24 @@ def _take_stated(proposal: Proposal, name: str, text: str) -> None:
 
 
 def _written_unit(proposal: Proposal, index: int) -> str:
-    """The unit that heading or unit row state."""
+    """Return the unit that the heading or the unit row states."""
     return proposal.headings[index].unit or unit_symbol(proposal.file.units[index])
 
 
 def _with_units(
     columns: tuple[MappedColumn, ...], proposal: Proposal, units: Mapping[UnitKind, str]
 ) -> tuple[MappedColumn, ...]:
-    """The columns with the units that their targets lack, as far as they are to be had."""
+    """Return the columns with the units that their targets lack, as far as they can be determined."""
     file = proposal.file
     written = stated_units(file.comments)
     for stated, symbol in units.items():
         if written.get(stated, symbol) not in (symbol, *AMBIGUOUS):
             raise MeasurementError(
-                f"{file.source}: --unit says {symbol}, but the file says {written[stated]}; leave {symbol} away, or "
-                "state the units of single columns with --map."
+                option="--unit",
+                expected=f"{written[stated]} as the file states",
+                value=symbol,
+                at=Place(file.source),
+                remedy=f"leave out {symbol}, or state the units of single columns with --map",
             )
     others = {one.target.unit for one in coordinates(columns) if one.is_stated and one.target.unit}
     of_others: dict[UnitKind, str] = {"length": next(iter(others))} if len(others) == 1 else {}
@@ -208,7 +213,7 @@ def _with_units(
         )
         for source, by_kind in sources:
             if ambiguous and source != "--unit":
-                continue  # only the caller knows which one is meant
+                continue  # only the caller knows which unit is meant
             if kind is not None and kind in by_kind and open_unit and not target.unit:
                 target = replace(target, unit=by_kind[kind])
                 column = replace(column, target=target, reason=f"{column.reason}; unit by {source}")
@@ -217,12 +222,12 @@ def _with_units(
 
 
 def ambiguous_spelling(file: ExportFile, index: int, kind: UnitKind | None) -> str:
-    """Give the unit of several meanings that a file states of a column; "" where there is none.
+    """Return the ambiguous unit that a file states for a column; "" if there is none.
 
     Args:
-        file: whose heading, unit row or comments state it.
-        index: of the column.
-        kind: of the unit that the column needs.
+        file: the export, with headings, unit row and comments.
+        index: index of the column.
+        kind: kind of unit that the column needs.
     """
     if kind is None:
         return ""
@@ -234,7 +239,7 @@ def ambiguous_spelling(file: ExportFile, index: int, kind: UnitKind | None) -> s
 def _units_of_maker(
     maker: Maker | None, file: ExportFile, columns: tuple[MappedColumn, ...]
 ) -> dict[UnitKind, str]:
-    """The units that a maker always writes, where the values can be in no other one."""
+    """Return the units that a maker always writes, if the values can be in no other unit."""
     if maker is None:
         return {}
     kinds: tuple[tuple[UnitKind, str, list[MappedColumn]], ...] = (
@@ -247,18 +252,18 @@ def _units_of_maker(
 
 
 def joint_columns(columns: tuple[MappedColumn, ...]) -> list[MappedColumn]:
-    """The columns of joints that turn, or whose unit is not known."""
-    turning = [one for one in columns if is_joint(one.target.quantity)]
-    return [one for one in turning if not one.target.unit or UNITS[one.target.unit].kind == "angle"]
+    """Return the columns of revolute joints, or of joints whose unit is unknown."""
+    joints = [one for one in columns if is_joint(one.target.quantity)]
+    return [one for one in joints if not one.target.unit or UNITS[one.target.unit].kind == "angle"]
 
 
 def coordinates(columns: tuple[MappedColumn, ...]) -> list[MappedColumn]:
-    """The columns of the position."""
+    """Return the columns of the position."""
     return [one for one in columns if one.target.quantity in POSITION]
 
 
 def angles(columns: tuple[MappedColumn, ...]) -> list[MappedColumn]:
-    """The columns of angles of rotations."""
+    """Return the columns of angles of rotations."""
     return [
         one
         for one in columns
@@ -267,14 +272,14 @@ def angles(columns: tuple[MappedColumn, ...]) -> list[MappedColumn]:
 
 
 def largest(file: ExportFile, columns: list[MappedColumn]) -> float:
-    """The largest absolute value in columns, in the file's unit."""
+    """Return the largest absolute value in columns, in the file's unit."""
     return max((abs(number) for column in columns for number in file.numbers(column.index)), default=0.0)
 
 
 def doubts(mapping: FileMapping) -> tuple[str, ...]:
-    """Name values that can hardly be in their units, external axes that move, and rows that may be no measurements.
+    """Return warnings of values that are unlikely in their units, moving external axes, and doubtful rows.
 
-    Every sentence names file, line and column.
+    Every sentence states file, line and column.
     """
     sentences = [_left_out(mapping, one) for one in mapping.possible_joints]
     groups = (
@@ -292,7 +297,7 @@ def doubts(mapping: FileMapping) -> tuple[str, ...]:
 
 
 def _of_unit(mapping: FileMapping, name: str, columns: list[MappedColumn], unit: str) -> str:
-    """A sentence on values that are too large or too small for their unit."""
+    """Return a warning of values that are too large or too small for their unit; "" if there are none."""
     values = [
         (abs(float(number)), line, column)
         for column in columns
@@ -300,31 +305,31 @@ def _of_unit(mapping: FileMapping, name: str, columns: list[MappedColumn], unit:
         if (number := mapping.file.dialect.numbers.text(cell)) is not None
     ]
     largest, line, column = max(values, key=lambda one: one[0], default=(0.0, 0, columns[0]))
-    if name.startswith("angles") and largest < _TILTED:
+    if name.startswith("angles") and largest < _MIN_TILT:
         return ""
     reason = doubt(unit, largest, len(mapping.file.records))
-    return f"{mapping.place(column, line)}: the {name} have {reason}; check their unit." if reason else ""
+    return f"{mapping.at(column, line)}: the {name} have {reason}; check their unit." if reason else ""
 
 
 def _left_out(mapping: FileMapping, column: MappedColumn) -> str:
-    """A sentence on an external axis that moves and is left out."""
+    """Return a warning of an external axis that moves and is left out; "" if it does not move."""
     values = mapping.file.numbers(column.index)
     if not values or min(values) == max(values):
         return ""
     return (
-        f"{mapping.place(column)}: it moves from {min(values):g} to {max(values):g} and is left out; if it is a "
+        f"{mapping.at(column)}: the column varies from {min(values):g} to {max(values):g} and is left out; if it is a "
         "joint of the robot, name it with --map."
     )
 
 
 def _no_values(mapping: FileMapping) -> list[str]:
-    """Sentences on positions all of whose coordinates are one number, as where nothing was measured."""
+    """Return warnings of positions with three equal coordinates, which may mark that nothing was measured."""
     columns = coordinates(mapping.columns)
     if len(columns) != 3:
         return []
     cells = zip(*(mapping.file.column(column.index) for column in columns), strict=True)
     return [
-        f"{mapping.place(columns[0], line)}: all coordinates of the position are {row[0]}; leave the cells empty where "
+        f"{mapping.at(columns[0], line)}: all coordinates of the position are {row[0]}; leave the cells empty if "
         "nothing was measured."
         for line, row in zip(mapping.file.lines, cells, strict=True)
         if len(set(row)) == 1 and not is_missing(row[0])
@@ -332,7 +337,7 @@ def _no_values(mapping: FileMapping) -> list[str]:
 
 
 def _called_means(mapping: FileMapping) -> list[str]:
-    """A sentence on rows that are called means, where others are not, and are taken for measurements nevertheless."""
+    """Return a warning of rows that are named as means, unlike others, and that are used as measurements."""
     records = mapping.file.records
     named = named_statistics(records)
     if not named or len(named) == len(records):
@@ -340,7 +345,6 @@ def _called_means(mapping: FileMapping) -> list[str]:
     row, name = next(iter(named.items()))
     column = next(one for one in mapping.columns if statistic(records[row][one.index]) == name)
     return [
-        f"{mapping.place(column, mapping.file.lines[row])}: {len(named)} rows are called "
-        f"'{records[row][column.index]}' and taken for measurements, as none is the mean of the rows before it; remove "
-        "them if they summarise others."
+        f"{mapping.at(column, mapping.file.lines[row])}: {len(named)} rows are named '{records[row][column.index]}' "
+        "and used as measurements, as none is the mean of the rows before it; remove them if they summarise others."
     ]

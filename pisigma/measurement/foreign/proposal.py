@@ -1,11 +1,11 @@
-"""What the columns of an export probably are, by their headings, or by their order where there are none."""
+"""Propose the quantities of the columns of an export by their headings, or by their order without headings."""
 
 import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
-from pisigma.files.errors import MeasurementError
+from pisigma.files.errors import MeasurementError, Place
 from pisigma.measurement.csv.columns import POSITION, QUATERNION, RPY
 from pisigma.measurement.foreign.export_file import ExportFile
 from pisigma.measurement.foreign.headings import (
@@ -24,31 +24,31 @@ from pisigma.measurement.foreign.time_stamps import seconds_of
 from pisigma.measurement.foreign.units import UNITS, UnitKind
 
 NO_ROTATION = "none"
-"""The encoding of rotations that are not wanted."""
+"""The choice of `--rotation` that leaves out rotations."""
 UNRECOGNISED = "not recognised"
-"""Why a column is left out whose heading means nothing."""
+"""Reason for columns that are left out because their headings have no known meaning."""
 
 _JOINTS_WITHOUT_HEADINGS = (6, 7)
-_RISING = 5
-"""Rows whose first numbers rise by chance in one of 120 files."""
-_ORDERED = 8
-"""Rows whose numbers in one of ten columns rise or fall by chance in one of 2,000 files."""
-_MANY, _SET_BACK = 20, 0.1
-"""From so many rows on, so few of the steps may go the other way."""
-_MOVING = 0.4
-"""Share of the steps that times take; joints that stand in many rows take fewer."""
+_MIN_RISING = 5
+"""Number of rows of which the first column rises by chance in one of 120 files."""
+_MIN_ORDERED = 8
+"""Number of rows of which one of ten columns rises or falls by chance in one of 2,000 files."""
+_MANY, _MAX_REVERSED = 20, 0.1
+"""Number of rows from which this share of the steps may have the other sign, as where a clock was set."""
+_MIN_CHANGES = 0.4
+"""Smallest share of the steps in which times change; joints that stand still in many rows change less often."""
 _Side = Literal["commanded", "measured"]
 
 
 @dataclass(eq=False)
 class Proposal:
-    """A mapping of columns that is being made.
+    """A mapping of columns under construction.
 
     Attributes:
         file: the export.
-        columns: by index what is decided.
-        maker: whose names the columns have; None where several makers write so.
-        rotations: encodings between which the headings do not decide.
+        columns: decided columns by index.
+        maker: the maker with these names of columns; None if several makers use them.
+        rotations: encodings of rotations that fit the headings, if there are several.
     """
 
     file: ExportFile
@@ -57,25 +57,25 @@ class Proposal:
     rotations: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        """Take the headings apart."""
+        """Parse the headings."""
         texts = self.file.headings if self.file.has_header else ("",) * len(self.file.headings)
         self.headings: list[Heading] = [parse_heading(text) for text in texts]
 
     @property
     def quantities(self) -> set[str]:
-        """What the decided columns are."""
+        """Quantities of the decided columns."""
         return {column.target.quantity for column in self.columns.values()}
 
     def put(self, index: int, quantity: str, reason: str) -> None:
-        """Decide what a column is."""
+        """Decide the quantity of a column."""
         target = Target(quantity, "" if quantity == LEFT_OUT else self.headings[index].unit)
         self.columns[index] = MappedColumn(index, self.file.headings[index], target, reason)
 
     def names(self, *kinds: UnitKind) -> dict[str, list[int]]:
-        """The columns that are not decided by their names; those whose heading states a unit of another kind are not.
+        """Return the undecided columns by name, without those whose heading states a unit of another kind.
 
         Args:
-            kinds: of units; none of them for all columns.
+            kinds: kinds of units; none for all columns.
         """
         names: dict[str, list[int]] = {}
         for index, heading in enumerate(self.headings):
@@ -87,31 +87,31 @@ class Proposal:
     def put_group(
         self, group: Mapping[str, str], names: Mapping[str, list[int]], side: _Side, reason: str
     ) -> None:
-        """Decide what columns are by their names; where some are commanded and some measured, those of one side."""
+        """Decide columns by their names; of commanded and measured ones, keep those of one side."""
         for name, quantity in group.items():
             sides = {self.headings[index].side for index in names[name]}
-            wanted = next(one for one in (side, "", *sides) if one in sides)
+            chosen = next(one for one in (side, "", *sides) if one in sides)
             for index in names[name]:
-                if self.headings[index].side == wanted:
+                if self.headings[index].side == chosen:
                     self.put(index, quantity, reason)
                 else:
-                    self.put(index, LEFT_OUT, f"the {side} values are taken")
+                    self.put(index, LEFT_OUT, f"the {side} values are used")
 
     def leave_out(self, group: Mapping[str, object], names: Mapping[str, list[int]], reason: str) -> None:
-        """Leave columns out by their names."""
+        """Leave out columns by their names."""
         for index in (index for name in group for index in names.get(name, ())):
             self.put(index, LEFT_OUT, reason)
 
 
 def propose(proposal: Proposal, rotation: str | None) -> None:
-    """Decide what all columns are that are not decided.
+    """Decide the quantities of all undecided columns.
 
     Args:
-        proposal: with what is stated.
-        rotation: encoding of rotations, `NO_ROTATION`, or None to tell it by the headings.
+        proposal: the mapping with the stated columns.
+        rotation: encoding of rotations, `NO_ROTATION`, or None to determine it by the headings.
 
     Raises:
-        MeasurementError: there are no headings, and the number of columns does not tell either.
+        MeasurementError: there are no headings, and the number of columns does not determine them.
     """
     if not proposal.file.has_header:
         _take_by_order(proposal, rotation)
@@ -130,9 +130,9 @@ def propose(proposal: Proposal, rotation: str | None) -> None:
 
 
 def _take_by_order(proposal: Proposal, rotation: str | None) -> None:
-    """Columns without headings: joints and a position, a point and its position, or a position.
+    """Decide columns without headings: joints and a position, a point and its position, or a position.
 
-    Columns that are stated to be something else, such as a time, are passed over.
+    Columns that are stated as other quantities, such as a time, are skipped.
     """
     stated = {index: one.target.quantity for index, one in proposal.columns.items()}
     order = [index for index in range(len(proposal.headings)) if _has_place(stated.get(index))]
@@ -149,28 +149,30 @@ def _take_by_order(proposal: Proposal, rotation: str | None) -> None:
     is_usual = joints in _JOINTS_WITHOUT_HEADINGS or (joints == 0 and measured == POSITION)
     is_otherwise = any(of_index.get(index, quantity) != quantity for index, quantity in stated.items())
     if is_otherwise or (not is_usual and len(set(stated) & set(order)) > 1):
-        return  # whoever states columns otherwise has to state all of them
+        return  # with another order, all columns have to be stated
     if joints > 0:
         _check_times(proposal, of_index)
     if not is_usual:
         raise MeasurementError(
-            f"{proposal.file.source}: the file has no headings, and its {len(proposal.headings)} columns are not six "
-            "or seven joints and a position; say what they are by their numbers, such as --map "
-            "1=q1_deg,2=q2_deg,3=x_mm,4=-, and by --rotation where three angles or a quaternion follow the position."
+            expected="headings, or columns of six or seven joints and a position",
+            value=f"{len(proposal.headings)} columns without headings",
+            at=Place(proposal.file.source),
+            remedy="name them by their numbers, such as --map 1=q1_deg,2=q2_deg,3=x_mm,4=-, and with --rotation if three "
+            "angles or a quaternion follow the position",
         )
     for index, quantity in of_index.items():
         if index not in proposal.columns:
-            proposal.put(index, quantity, "its order, as there is no heading")
+            proposal.put(index, quantity, "order of the columns, as there is no heading")
 
 
 def _has_place(stated: str | None) -> bool:
-    """Whether the order says what a column is, of which the caller says nothing else."""
+    """Return whether a column counts in the order of joints, position and rotation."""
     rotations = {name for one in ROTATIONS.values() for name in (*one.columns, *one.quantities())}
     return stated is None or bool(joints_of([stated])) or stated in {*POSITION, *RPY, *QUATERNION, *rotations}
 
 
 def _is_counter(file: ExportFile) -> bool:
-    """Whether the first column holds names, or counts the rows from any number on."""
+    """Return whether the first column contains names or numbers the rows consecutively."""
     cells = file.column(0)
     numbers = [int(cell) if cell.isdigit() and len(cell) < 9 else -1 for cell in cells]
     counts = len(cells) > 1 and all(number == i for i, number in enumerate(numbers, start=numbers[0]))
@@ -178,11 +180,11 @@ def _is_counter(file: ExportFile) -> bool:
 
 
 def _check_times(proposal: Proposal, of_index: Mapping[int, str]) -> None:
-    """Refuse a column whose numbers rise or fall from row to row: it may hold times.
+    """Refuse a column whose numbers rise or fall from row to row, as it may contain times.
 
     Args:
-        proposal: of a file without headings.
-        of_index: what its columns are by their order.
+        proposal: the mapping of a file without headings.
+        of_index: quantities of its columns by their order.
 
     Raises:
         MeasurementError: see above.
@@ -192,35 +194,36 @@ def _check_times(proposal: Proposal, of_index: Mapping[int, str]) -> None:
         numbers = file.numbers(index)
         if index in proposal.columns or quantity == "point" or len(numbers) < len(file.records):
             continue
-        if not _is_ordered(numbers, 0 if index else _RISING):
+        if not _is_ordered(numbers, 0 if index else _MIN_RISING):
             continue
         unit = "mm" if quantity in POSITION else "deg"
         raise MeasurementError(
-            f"{file.source}, line {file.lines[0]}, column {index + 1}: the file has no headings, and the numbers of "
-            f"this column go from {numbers[0]:g} to {numbers[-1]:g} row by row, as times do; say what it is with --map "
-            f"{index + 1}=time_s or --map {index + 1}={quantity}_{unit}."
+            f"the file has no headings, and this column runs from {numbers[0]:g} to {numbers[-1]:g}, as times do",
+            at=Place(file.source, file.lines[0], index + 1),
+            value=f"{numbers[0]:g} to {numbers[-1]:g}",
+            remedy=f"state it with --map {index + 1}=time_s or --map {index + 1}={quantity}_{unit}",
         )
 
 
 def _is_ordered(numbers: Sequence[float], rising: int) -> bool:
-    """Whether numbers rise or fall from row to row as chance hardly lets them, but for a clock that was set.
+    """Return whether numbers rise or fall from row to row more often than by chance, except where a clock was set.
 
     Args:
-        numbers: of a column.
-        rising: from so many numbers on it is enough that all rise; 0 where it is not.
+        numbers: numbers of a column.
+        rising: number of rows from which it is enough that all rise; 0 if it is not.
     """
     steps = [after - before for before, after in itertools.pairwise(numbers)]
     up, down = (sum(sign * step > 0 for step in steps) for sign in (1, -1))
     few, most = sorted((up, down))
-    if most < _MOVING * len(steps) or len(numbers) < min(rising or _ORDERED, _ORDERED):
+    if most < _MIN_CHANGES * len(steps) or len(numbers) < min(rising or _MIN_ORDERED, _MIN_ORDERED):
         return False
     if len(numbers) >= _MANY:
-        return few <= _SET_BACK * most
-    return few == 0 and (len(numbers) >= _ORDERED or most == len(steps) == up)
+        return few <= _MAX_REVERSED * most
+    return few == 0 and (len(numbers) >= _MIN_ORDERED or most == len(steps) == up)
 
 
 def _ends_with_matrices(file: ExportFile, leading: int) -> bool:
-    """Whether the last 16 columns are the rows of homogeneous transforms."""
+    """Return whether the last 16 columns are the rows of homogeneous transforms."""
     ends = {tuple(map(file.dialect.numbers.text, record[-4:])) for record in file.records}
     last = [0.0, 0.0, 0.0, 1.0]
     return len(file.headings) >= 16 + leading and all(
@@ -229,9 +232,9 @@ def _ends_with_matrices(file: ExportFile, leading: int) -> bool:
 
 
 def _take_joints(proposal: Proposal) -> None:
-    """The largest group of columns that are named as joints are; of equally large ones that with a maker's names.
+    """Decide the joints: the largest group of columns with names of joints, preferring a maker's names.
 
-    Joints that are stated count with the number in their heading, or else with their own.
+    Stated joints count with the number in their heading, or else with that of their target.
     """
     stated = [one for one in proposal.columns.values() if joints_of([one.target.quantity])]
     if not all(one.is_stated for one in stated):
@@ -243,10 +246,10 @@ def _take_joints(proposal: Proposal) -> None:
     shift, most = 0, 1
     for maker in (*makers, *general):
         numbers = {name: number for name in names if (number := joint_of(name, maker.joints)) is not None}
-        beside = [joint_of(proposal.headings[one.index].name, maker.joints) for one in stated]
+        in_heading = [joint_of(proposal.headings[one.index].name, maker.joints) for one in stated]
         others = [
             int(one.target.quantity[1:]) if number is None else number
-            for one, number in zip(stated, beside, strict=True)
+            for one, number in zip(stated, in_heading, strict=True)
         ]
         counted = sorted([*numbers.values(), *others])
         consecutive = counted in (list(range(1, len(counted) + 1)), list(range(len(counted))))
@@ -260,20 +263,20 @@ def _take_joints(proposal: Proposal) -> None:
 
 
 def _take_position(proposal: Proposal) -> None:
-    """The coordinates that were measured; a position that was only commanded is none."""
+    """Decide the measured coordinates; a position that is only commanded is left out."""
     for group in POSITIONS:
         names, taken = proposal.names("length"), proposal.quantities
-        wanted = {name: one for name, one in zip(group, POSITION, strict=True) if one not in taken}
-        if not wanted or not set(wanted) <= set(names):
+        missing = {name: one for name, one in zip(group, POSITION, strict=True) if one not in taken}
+        if not missing or not set(missing) <= set(names):
             continue
-        if {proposal.headings[index].side for name in wanted for index in names[name]} == {"commanded"}:
-            proposal.leave_out(wanted, names, "commanded, not measured")
+        if {proposal.headings[index].side for name in missing for index in names[name]} == {"commanded"}:
+            proposal.leave_out(missing, names, "commanded, not measured")
         else:
-            proposal.put_group(wanted, names, "measured", "heading")
+            proposal.put_group(missing, names, "measured", "heading")
 
 
 def _take_rotation(proposal: Proposal, rotation: str | None) -> None:
-    """The rotation by the names of its values, by the maker of the joints, or as stated."""
+    """Decide the rotation by the names of its values, by the maker of the joints, or as stated."""
     columns = {name for one in ROTATIONS.values() for name in (*one.columns, *one.quantities())}
     names = {
         name: indices
@@ -283,7 +286,7 @@ def _take_rotation(proposal: Proposal, rotation: str | None) -> None:
     matches = {} if columns & proposal.quantities else encodings_of(set(names))
     if rotation == NO_ROTATION:
         for group in matches.values():
-            proposal.leave_out(group, names, "no rotation is wanted")
+            proposal.leave_out(group, names, "--rotation none")
         return
     chosen = rotation or (proposal.maker.rotation if proposal.maker else "")
     if rotation is None and chosen not in matches and len(matches) == 1:
@@ -300,7 +303,7 @@ def _take_rotation(proposal: Proposal, rotation: str | None) -> None:
 
 
 def _take_names(proposal: Proposal) -> None:
-    """Where no column is called so, the first one with a name of its own in every row names the points."""
+    """Decide the names of points: without such a heading, the first column with a different name in every row."""
     file = proposal.file
     if "point" in proposal.quantities:
         return
@@ -314,13 +317,13 @@ def _take_names(proposal: Proposal) -> None:
         )
         if file.has_header and is_open and is_name and len(set(cells)) == len(cells) > 1:
             proposal.columns[index] = MappedColumn(
-                index, file.headings[index], Target("point"), "a name of its own in every row"
+                index, file.headings[index], Target("point"), "a different name in every row"
             )
             return
 
 
 def _take_third_coordinate(proposal: Proposal) -> None:
-    """Of two stated coordinates the third: the only length that is left, or else the column in its place."""
+    """Decide the third of two stated coordinates: the only remaining length, or else the column in its place."""
     place = {
         one.target.quantity: index
         for index, one in proposal.columns.items()
@@ -347,16 +350,16 @@ def _take_third_coordinate(proposal: Proposal) -> None:
     step = (second[1] - first[1]) / (POSITION.index(second[0]) - POSITION.index(first[0]))
     in_place = first[1] + step * (number - POSITION.index(first[0]))
     if len(lengths) == 1:
-        proposal.put(lengths[0], missing[0], "the only length left beside two stated coordinates")
+        proposal.put(lengths[0], missing[0], "the only other length, with two stated coordinates")
     elif abs(step) == 1 and in_place in free:
-        proposal.put(int(in_place), missing[0], "stands beside two stated coordinates")
+        proposal.put(int(in_place), missing[0], "next to two stated coordinates")
 
 
 def incomplete_rotation(proposal: Proposal) -> list[int]:
-    """Find columns that are named like all values of a rotation but one, with no other numbers between them.
+    """Find columns with the names of all values of a rotation except one, and no other numbers between them.
 
     Args:
-        proposal: in which everything is decided; columns that are stated or used do not count.
+        proposal: the complete mapping; stated and used columns are ignored.
     """
     headings, file = proposal.headings, proposal.file
     free = [
@@ -376,13 +379,13 @@ def incomplete_rotation(proposal: Proposal) -> list[int]:
 
 
 def _take_other(proposal: Proposal, name: str, index: int) -> None:
-    """A column that is neither joint, position nor rotation."""
+    """Decide a column that is neither joint, position nor rotation."""
     unit = proposal.headings[index].unit
     of_unit = {"temperature": "temperature", "time": "time"}.get(UNITS[unit].kind if unit else "")
     quantity = of_unit or MEANINGS.get(name, LEFT_OUT)
     if quantity == LEFT_OUT:
         proposal.put(index, LEFT_OUT, UNRECOGNISED)
     elif quantity in proposal.quantities:
-        proposal.put(index, LEFT_OUT, "there is another such column")
+        proposal.put(index, LEFT_OUT, "another column has the same meaning")
     else:
         proposal.put(index, quantity, "heading")

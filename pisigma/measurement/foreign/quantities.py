@@ -1,4 +1,4 @@
-"""What columns of exports can be mapped to: columns of measurement files, values of rotations, names and times."""
+"""Targets of columns of exports: columns of measurement files, values of rotations, names and times."""
 
 import functools
 from collections.abc import Iterable
@@ -10,11 +10,11 @@ from pisigma.measurement.foreign.rotations import ROTATIONS
 from pisigma.measurement.foreign.units import UNITS, UnitKind
 
 LEFT_OUT = "-"
-"""In mappings, what a column is mapped to that is not wanted."""
+"""In mappings, the target of a column that is left out."""
 KEYS = ("point", "time")
-"""Quantities by which rows of two files are joined; no measurement file keeps them."""
+"""Quantities by which rows of two files are joined; they are not in measurement files."""
 
-_BESIDE = frozenset(
+_NOT_MEASURED = frozenset(
     (
         "sigma_position",
         "sigma_rotation",
@@ -27,7 +27,7 @@ _BESIDE = frozenset(
         "pair",
     )
 )
-"""Quantities that are no measurement by themselves."""
+"""Quantities that are not measurements by themselves."""
 
 _KINDS: dict[str, UnitKind] = {
     "mm": "length",
@@ -41,11 +41,11 @@ _KINDS: dict[str, UnitKind] = {
 
 @dataclass(frozen=True)
 class Target:
-    """What a column is mapped to.
+    """The target of a column in a mapping.
 
     Attributes:
-        quantity: such as "q1", "x", "kuka_a" or "point"; `LEFT_OUT` where it is not wanted.
-        unit: symbol of the unit of the cells; "" where it has none or is not known.
+        quantity: quantity such as "q1", "x", "kuka_a" or "point"; `LEFT_OUT` if the column is left out.
+        unit: symbol of the unit of the cells; "" if it has none or is unknown.
     """
 
     quantity: str
@@ -53,26 +53,26 @@ class Target:
 
     @property
     def text(self) -> str:
-        """As `--map` takes it."""
+        """The text for `--map`."""
         named = measurement_column(self.quantity, self.unit)
         return named or "_".join(filter(None, (self.quantity, self.unit)))
 
     @property
     def needs(self) -> UnitKind | None:
-        """Kind of the unit that it needs and lacks; None where nothing is missing."""
+        """Kind of the missing unit; None if no unit is missing."""
         return None if self.unit else unit_kind(self.quantity)
 
 
 @dataclass(frozen=True)
 class MappedColumn:
-    """A column of an export and what it is.
+    """A column of an export and its target.
 
     Attributes:
-        index: of the column in its file, from 0.
-        heading: of the column, or its number from 1.
-        target: what it is mapped to.
+        index: index of the column in its file, from 0.
+        heading: heading of the column, or its number from 1.
+        target: its quantity and unit.
         reason: why, in a few words.
-        is_stated: whether the caller said so.
+        is_stated: whether the caller stated the target.
     """
 
     index: int
@@ -83,40 +83,44 @@ class MappedColumn:
 
 
 def joints_of(quantities: Iterable[str]) -> list[str]:
-    """Those of some quantities that are joint values, in the order of the joints."""
+    """Return the quantities that are joint values, in the order of the joints."""
     return sorted(filter(is_joint, quantities), key=lambda name: int(name[1:]))
 
 
 def fits(quantity: str, unit: str) -> bool:
-    """Say whether values of a quantity can be in a unit; "" fits all. Joints turn or slide."""
+    """Return whether values of a quantity can be in a unit; "" fits all, and joints can be in angles or lengths."""
     kinds = {unit_kind(quantity)} | ({"length"} if is_joint(quantity) else set())
     return not unit or UNITS[unit].kind in kinds
 
 
 def is_measured(name: str) -> bool:
-    """Say whether a column of measurement files holds a measurement, and not what is only stated beside one."""
+    """Return whether a column of measurement files contains measurements, not names, conditions or deviations."""
     column = find_column(name)
-    return column is not None and not (column.joint or column.approach or column.quantity in _BESIDE)
+    return column is not None and not (column.joint or column.approach or column.quantity in _NOT_MEASURED)
 
 
 def unit_kind(quantity: str) -> UnitKind | None:
-    """Give what the unit of a quantity measures; None where it has none. A joint without a unit turns."""
+    """Return the kind of unit of a quantity; None if it has no unit. Joints without a unit are revolute."""
     if is_joint(quantity):
         return "angle"
     return _quantities().get(quantity)
 
 
 def measurement_column(quantity: str, unit: str) -> str:
-    """Name of the column of measurement files for a quantity in a unit of such files; "" where there is none."""
+    """Return the column of measurement files for a quantity in one of their units; "" if there is none."""
     names = (f"{quantity}_{unit}" if unit else quantity, f"{quantity.partition('_')[0]}_{unit}")
     return next((name for name in names if (column := find_column(name)) and column.quantity == quantity), "")
 
 
-def parse_target(text: str, place: str) -> Target:
-    """Read what a column is mapped to, such as "q1_deg", "x_in", "ur_rx_rad", "point", or "-".
+def parse_target(text: str, heading: str) -> Target:
+    """Parse the target of a column in a mapping, such as "q1_deg", "x_in", "ur_rx_rad", "point", or "-".
+
+    Args:
+        text: the target.
+        heading: heading or number of the column, for messages.
 
     Raises:
-        MeasurementError: there is no such column or unit; `place` says where it stands.
+        MeasurementError: there is no such column or unit.
     """
     if text in ("", LEFT_OUT):
         return Target(LEFT_OUT)
@@ -128,18 +132,23 @@ def parse_target(text: str, place: str) -> Target:
         if is_quantity and (not unit or unit in UNITS) and fits(quantity, unit):
             return Target(quantity, unit)
     choices = {"q1_deg", "x_mm", "y_mm", "z_mm", "time_s", LEFT_OUT, *_quantities()}
-    raise MeasurementError(f"{place}: '{text}' is unknown; {nearest_choice(text, choices)}")
+    raise MeasurementError(
+        f"unknown target '{text}' of the column '{heading}'",
+        option="--map",
+        value=text,
+        remedy=nearest_choice(text, choices),
+    )
 
 
 def is_joint(quantity: str) -> bool:
-    """Whether a quantity is the value of a joint."""
+    """Return whether a quantity is the value of a joint."""
     column = find_column(f"{quantity}_deg")
     return column is not None and column.joint > 0
 
 
 @functools.cache
 def _quantities() -> dict[str, UnitKind | None]:
-    """All quantities but joints by name, with what their units measure."""
+    """Return the kinds of unit of all quantities except joints, by name."""
     kinds: dict[str, UnitKind | None] = {"point": None, "time": "time"}
     for field in number_fields():
         kinds |= {column.quantity: _KINDS.get(column.unit) for column in field.columns}

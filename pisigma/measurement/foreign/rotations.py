@@ -13,20 +13,20 @@ Unit = str
 _Values = Float64[Tensor, "rows values"]
 _Rotations = Float64[Tensor, "rows 3 3"]
 
-LARGEST_SKEWNESS = 1e-3
-"""How far the columns of a rotation matrix, or the norm of a quaternion, may be from those of a rotation."""
+MAX_SKEWNESS = 1e-3
+"""Largest deviation of `R^T R` of a matrix from the identity, and of the squared norm of a quaternion from 1."""
 
 
 @dataclass(frozen=True)
 class RotationEncoding:
-    """How a maker writes rotations R_frame_tool.
+    """A maker's encoding of rotations R_frame_tool.
 
     Attributes:
-        name: as `--rotation` takes it, and in the columns of mappings, such as "kuka_a_deg".
-        meaning: in words.
-        values: names of its values, in the order in which they are written without a header.
-        to_rotation: rotations of the values: angles [rad] or numbers.
-        columns: columns of measurement files that mean the same as the values, in their order; () where there are none
+        name: name for `--rotation` and for columns in mappings, such as "kuka_a_deg".
+        meaning: description for messages.
+        values: names of its values, in the order of files without a header.
+        to_rotation: converts values (angles [rad] or numbers) to rotations.
+        columns: columns of measurement files with the same meaning, in the order of the values; () if there are none
             and the rotation is written as a quaternion.
         is_angles: whether the values are angles, which have a unit.
         aliases: other names of all values, each in the order of `values`.
@@ -41,21 +41,21 @@ class RotationEncoding:
     aliases: tuple[tuple[str, ...], ...] = ()
 
     def quantities(self) -> tuple[str, ...]:
-        """Give what its values are called in mappings."""
+        """Return the names of its values in mappings."""
         return tuple(f"{self.name}_{value}" for value in self.values)
 
     def is_rotation(self, values: _Values) -> Bool[Tensor, " rows"]:
-        """Say for which rows the values make a rotation."""
+        """Return for which rows the values are a rotation."""
         if self.is_angles:
             return values.isfinite().all(1)
         R = values.reshape(-1, 3, 3) if len(self.values) == 9 else values[:, :, None]
         identity = torch.eye(R.shape[2], dtype=R.dtype)
-        orthonormal = ((R.mT @ R - identity).abs().amax((1, 2)) < LARGEST_SKEWNESS) & values.isfinite().all(1)
+        orthonormal = ((R.mT @ R - identity).abs().amax((1, 2)) < MAX_SKEWNESS) & values.isfinite().all(1)
         return orthonormal & (torch.linalg.det(R) > 0) if len(self.values) == 9 else orthonormal
 
 
 def _euler(name: str, meaning: str, values: str, product: str, *aliases: str) -> RotationEncoding:
-    """Make the encoding of three angles: "a:z b:y c:x" for RotZ(a)·RotY(b)·RotX(c)."""
+    """Return the encoding of three angles: "a:z b:y c:x" for RotZ(a)·RotY(b)·RotX(c)."""
     names, factors = values.split(), [factor.split(":") for factor in product.split()]
     axes = "".join(axis for _, axis in factors)
     order = [names.index(value) for value, _ in factors]
@@ -83,7 +83,7 @@ def _about(axis: int, angle: Float64[Tensor, " rows"]) -> _Rotations:
 
 
 def _quaternion(name: str, meaning: str, values: str, order: str, *aliases: str) -> RotationEncoding:
-    """Make the encoding of a quaternion whose values are in the `order`, such as "wxyz"."""
+    """Return the encoding of a quaternion whose values are in the `order`, such as "wxyz"."""
 
     def to_rotation(quaternion: _Values) -> _Rotations:
         return rotation_from_quaternion(quaternion[:, [order.index(part) for part in "xyzw"]])
@@ -95,7 +95,7 @@ def _quaternion(name: str, meaning: str, values: str, order: str, *aliases: str)
 
 
 def _matrix(name: str, meaning: str, values: str, *aliases: str) -> RotationEncoding:
-    """Make the encoding of a rotation matrix by its rows."""
+    """Return the encoding of a rotation matrix, row by row."""
     to_rotation: Callable[[_Values], _Rotations] = lambda entries: entries.reshape(-1, 3, 3)  # noqa: E731
     return RotationEncoding(name, meaning, tuple(values.split()), to_rotation, (), False, _split(aliases))
 
@@ -137,17 +137,17 @@ _ENCODINGS = (
     ),
 )  # fmt: skip
 ROTATIONS: dict[str, RotationEncoding] = {encoding.name: encoding for encoding in _ENCODINGS}
-"""By name; an encoding more is one line."""
+"""Encodings by name; a further encoding is one line."""
 MATRIX_ROWS = (
     *("matrix_r11", "matrix_r12", "matrix_r13", "x"),
     *("matrix_r21", "matrix_r22", "matrix_r23", "y"),
     *("matrix_r31", "matrix_r32", "matrix_r33", "z"),
 )
-"""What the first twelve entries of a homogeneous transform are, row by row."""
+"""Quantities of the first twelve entries of a homogeneous transform, row by row."""
 
 
 def encodings_of(names: Collection[str]) -> dict[str, dict[str, str]]:
-    """Give the encodings all of whose values are among some names: by encoding, its values by these names."""
+    """Return the encodings whose values are all among `names`: by encoding, its quantities by these names."""
     there = set(names)
     matches: dict[str, dict[str, str]] = {}
     for encoding in _ENCODINGS:

@@ -1,4 +1,4 @@
-"""Mappings of columns as people write them: on a command line, or in a file for the next time."""
+"""Mappings of columns on the command line or in a file."""
 
 import os
 from collections.abc import Mapping, Sequence
@@ -11,17 +11,17 @@ from pisigma.measurement.foreign.mapping import FileMapping
 
 
 class SavedMap(Section):
-    """A file of mappings: for every file of an import, what its columns are by their headings."""
+    """A file of mappings: targets by heading, for every file of an import."""
 
     files: tuple[dict[str, str], ...]
 
 
 StatedMaps = Sequence[Mapping[str, str]]
-"""Mappings of which the one that fits a file best counts."""
+"""Mappings, of which the one that fits a file best is used."""
 
 
 def parse_map(text: str) -> StatedMaps:
-    """Read a mapping such as "A1=q1_deg,X=x_mm,note=-", or a file of mappings.
+    """Parse a mapping such as "A1=q1_deg,X=x_mm,note=-", or read a file of mappings.
 
     Raises:
         MeasurementError: it is neither.
@@ -29,15 +29,16 @@ def parse_map(text: str) -> StatedMaps:
     if "=" not in text:
         if not os.path.exists(text):
             raise MeasurementError(
-                f"--map {text}: HEADING=COLUMN was wanted, such as A1=q1_deg,X=x_mm, or a file that --save-map wrote; "
-                "there is no such file."
+                option="--map",
+                expected="HEADING=COLUMN, such as A1=q1_deg,X=x_mm, or an existing file of --save-map",
+                value=text,
             )
         return read_yaml(text, SavedMap, MeasurementError).files
     stated: dict[str, str] = {}
     heading = ""
     for part in text.split(","):
         heading += part
-        if "=" not in part:  # the heading itself holds a comma
+        if "=" not in part:  # the heading contains a comma
             heading += ","
             continue
         name, _, target = heading.rpartition("=")
@@ -45,13 +46,15 @@ def parse_map(text: str) -> StatedMaps:
         heading = ""
     if heading or "" in stated:
         raise MeasurementError(
-            f"--map {text}: HEADING=COLUMN was wanted, with commas between, such as A1=q1_deg,X=x_mm."
+            option="--map",
+            expected="HEADING=COLUMN with commas between, such as A1=q1_deg,X=x_mm",
+            value=text,
         )
     return (stated,)
 
 
 def map_for(maps: StatedMaps, headings: Sequence[str]) -> Mapping[str, str]:
-    """Choose the mapping that names most headings of a file; of several mappings one that names no others."""
+    """Return the mapping that names most headings of a file; of several mappings, one that names no others."""
     there = {*headings, *map(str, range(1, len(headings) + 1))}
     fitting = maps if len(maps) == 1 else [one for one in maps if set(one) <= there]
     return max(fitting, key=lambda one: len(set(one) & there), default={})
@@ -67,7 +70,12 @@ def check_used(maps: StatedMaps, headings: Sequence[Sequence[str]]) -> None:
     for name in dict.fromkeys(name for one in maps for name in one):
         if name not in there:
             columns = ", ".join(f"'{text}'" for one in headings for text in one)
-            raise MeasurementError(f"--map {name}=...: no file has such a column; the columns are {columns}.")
+            raise MeasurementError(
+                f"no file has a column '{name}'",
+                option="--map",
+                value=name,
+                remedy=f"choose one of {columns}",
+            )
 
 
 def save_map(mappings: Sequence[FileMapping], path: str | os.PathLike[str]) -> None:

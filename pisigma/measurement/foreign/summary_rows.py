@@ -1,4 +1,4 @@
-"""Rows that summarise others, such as "Mean" and "StdDev": they are no measurements."""
+"""Find rows that summarise others, such as "Mean" and "StdDev", which are not measurements."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -19,30 +19,30 @@ ecarttype écarttype somme devstd deviazionestandard scartotipo
 desviación desviaciónestándar desviacionestandar desvestándar desvestandar desvest desvstd suma
 """
 _AVERAGES = frozenset(_CALLED_AVERAGES.split())
-"""What instruments and spreadsheets call means, in small letters and without blanks, points and dashes."""
+"""Names of means in instruments and spreadsheets, in lower case and without blanks, points and dashes."""
 _OTHERS = frozenset(_CALLED_OTHERWISE.split())
-"""What they call other statistics, which no measurement is called."""
+"""Names of other statistics."""
 
-_LARGEST_SHARE = 0.25
-"""Share of rows called means that are summaries without a look at their values."""
-_FEWEST = 4
-"""Rows that a row without a name must be the mean of."""
-_LAST = 6
-"""Rows at the end of a file that are compared with statistics of those before them."""
-_CLEAR = 100.0
-"""A column tells a mean from a measurement where its values differ by more than so many times their rounding."""
+_MAX_SHARE = 0.25
+"""Share of rows named as means up to which they are summaries without a check of their values."""
+_MIN_ROWS = 4
+"""Smallest number of rows of which a row without a name can be recognised as the mean."""
+_LAST_ROWS = 6
+"""Number of rows at the end of a file that are compared with statistics of those before them."""
+_MIN_RANGE = 100.0
+"""Range of a column's values relative to their rounding above which it distinguishes a mean from a measurement."""
 
 
 def summary_rows(records: Sequence[Sequence[str]], numbers: NumberFormat) -> dict[int, str]:
     """Find rows that summarise others.
 
-    A row is a summary where one of its cells names a statistic, or where it follows or precedes all other rows and
-    holds their mean and other statistics in every column. Rows that are called means and nothing else are measurements
-    where they are many and none is the mean of the rows before it: that is how they were measured.
+    A row is a summary if one of its cells names a statistic, or if it precedes or follows all other rows and contains
+    their mean or other statistics in every column. Many rows named as means, of which none is the mean of the rows
+    before it, are measurements: the instrument averaged every one of them.
 
     Args:
         records: cells of the rows.
-        numbers: how numbers are written.
+        numbers: format of numbers.
 
     Returns:
         By row, why it is a summary.
@@ -50,7 +50,7 @@ def summary_rows(records: Sequence[Sequence[str]], numbers: NumberFormat) -> dic
     named = named_statistics(records)
     is_mode = len(named) == len(records) or (
         set(named.values()) <= _AVERAGES
-        and len(named) > max(1.0, _LARGEST_SHARE * len(records))
+        and len(named) > max(1.0, _MAX_SHARE * len(records))
         and not _holds_means(records, numbers, named)
     )
     named = {} if is_mode else named
@@ -58,17 +58,17 @@ def summary_rows(records: Sequence[Sequence[str]], numbers: NumberFormat) -> dic
         row: f"'{next(cell for cell in records[row] if statistic(cell) == name)}' names a summary of other rows"
         for row, name in named.items()
     }
-    rest = [row for row in range(len(records)) if row not in named]
-    texts = [[numbers.text(cell) for cell in records[row]] for row in rest]
-    behind = _statistics_behind(texts)
-    before = 0 if behind else _statistics_behind(texts[::-1])
-    why = "it holds the mean, or another statistic, of the rows"
-    found |= dict.fromkeys(rest[len(rest) - behind :], f"{why} before it")
-    return found | dict.fromkeys(rest[:before], f"{why} after it")
+    unnamed = [row for row in range(len(records)) if row not in named]
+    texts = [[numbers.text(cell) for cell in records[row]] for row in unnamed]
+    after = _count_statistics(texts)
+    before = 0 if after else _count_statistics(texts[::-1])
+    why = "it is the mean, or another statistic, of the rows"
+    found |= dict.fromkeys(unnamed[len(unnamed) - after :], f"{why} before it")
+    return found | dict.fromkeys(unnamed[:before], f"{why} after it")
 
 
 def named_statistics(records: Sequence[Sequence[str]]) -> dict[int, str]:
-    """Give the rows in which a cell names a statistic, and which; the last such cell of a row counts."""
+    """Return the statistics that cells name, by row; the last such cell of a row is used."""
     return {
         row: name
         for row, record in enumerate(records)
@@ -78,13 +78,13 @@ def named_statistics(records: Sequence[Sequence[str]]) -> dict[int, str]:
 
 
 def statistic(cell: str) -> str:
-    """A cell without blanks and signs; what it is of, "value", and how many times it is taken say nothing."""
+    """Return a cell without blanks, signs, multiples ("3σ"), "value" and the quantity ("mean of X")."""
     text = re.sub(r"^\d+\s*[x*]?\s*(?=σ|sigma)|\(.*?\)|\[.*?\]|\s(?:of|von)\s.*", "", cell.casefold().strip())
     return re.sub(r"[\W_]+|values?$|wert$", "", text) if text[:1].isalpha() else ""
 
 
 def _holds_means(records: Sequence[Sequence[str]], numbers: NumberFormat, named: Mapping[int, str]) -> bool:
-    """Whether a row that is called a mean is that of the rows since the one before that is called so."""
+    """Return whether a row that is named as a mean is that of the rows since the previous such row."""
     group: list[list[str | None]] = []
     for row, record in enumerate(records):
         texts = [numbers.text(cell) for cell in record]
@@ -101,15 +101,15 @@ def _holds_means(records: Sequence[Sequence[str]], numbers: NumberFormat, named:
     return False
 
 
-def _statistics_behind(texts: Sequence[Sequence[str | None]]) -> int:
-    """How many rows at the end hold statistics of all rows before them, among them the mean; 0 for none."""
-    if len(texts) <= _FEWEST:
+def _count_statistics(texts: Sequence[Sequence[str | None]]) -> int:
+    """Return the number of last rows that are statistics, including the mean, of all rows before them."""
+    if len(texts) <= _MIN_ROWS:
         return 0
     width = min(map(len, texts))
     columns = [k for k in range(width) if all(row[k] is not None for row in texts)]
     values = np.array([[float(row[k] or "nan") for k in columns] for row in texts])
     rounding = np.array([[_rounding(row[k] or "") for k in columns] for row in texts])
-    for count in range(1, min(_LAST, len(texts) - _FEWEST) + 1):
+    for count in range(1, min(_LAST_ROWS, len(texts) - _MIN_ROWS) + 1):
         if _are_statistics(values[:-count], values[-count:], rounding):
             return count
     return 0
@@ -120,12 +120,12 @@ def _are_statistics(
     last: Float64[np.ndarray, "last columns"],
     rounding: Float64[np.ndarray, "all columns"],
 ) -> bool:
-    """Whether all of the last rows are statistics of the rows, and one of them is their mean.
+    """Return whether all of the last rows are statistics of the rows, and one of them is their mean.
 
-    A mean that was calculated was rounded, or has more digits than the rows; the middle of commanded values is neither.
+    A calculated mean is rounded or has more digits than the rows, unlike a centre of commanded values.
     """
     finest = rounding[: len(rows)].min(0)
-    clear = np.ptp(rows, axis=0) > _CLEAR * rounding[len(rows) :].max(0)
+    clear = np.ptp(rows, axis=0) > _MIN_RANGE * rounding[len(rows) :].max(0)
     clear &= ~np.all(np.diff(rows, axis=0) == 1, axis=0)  # numbers of the points
     if clear.sum() < 3:
         return False
@@ -150,7 +150,7 @@ def _are_statistics(
 
 
 def _rounding(number: str) -> float:
-    """Half a unit of the last digit of a number."""
+    """Return half a unit of the last digit of a number."""
     mantissa, _, exponent = number.partition("E")
     decimals = len(mantissa.partition(".")[2])
     return 0.5 * 10.0 ** (int(exponent or 0) - decimals)

@@ -1,22 +1,24 @@
-"""Time stamps as instruments and controllers write them."""
+"""Time stamps of instruments and controllers."""
 
 import math
 import re
 from collections.abc import Sequence
 from datetime import UTC, datetime
 
+from pisigma.files.errors import MeasurementError, Place
+
 _DATE = re.compile(r"(\d{1,4})([./-])(\d{1,2})\2(\d{1,4})(?:$|[ T,]+(.*))")
 _CLOCK = re.compile(r"(\d{1,2}):(\d{2})(?::(\d{2}(?:[.,]\d+)?))?(?:\s*([AaPp])\.?[Mm]\.?)?")
 
 
 def seconds_of(text: str, day_first: bool | None = None) -> float | None:
-    """Seconds of a number, of a clock, or of a date with a clock (in UTC where no zone is named); None for others.
+    """Return the seconds of a number, a clock time, or a date with a clock time (UTC by default); None for others.
 
     Args:
-        text: such as "12.5", "10:31:02.5", "10:31:02 PM", "2026-03-02 10:31:02.5", "02.03.2026 10:31" or
+        text: time stamp such as "12.5", "10:31:02.5", "10:31:02 PM", "2026-03-02 10:31:02.5", "02.03.2026 10:31" or
             "02/03/2026 10:31".
-        day_first: whether the day is before the month in dates such as 02/03/2026; None where that is not known: such
-            dates are read if only one order is possible.
+        day_first: whether the day is before the month in dates such as 02/03/2026; None if unknown: such dates are read
+            if only one order is possible.
     """
     text = text.strip()
     try:
@@ -38,7 +40,7 @@ def seconds_of(text: str, day_first: bool | None = None) -> float | None:
 
 
 def iso_day(text: str, day_first: bool | None = None) -> str | None:
-    """The day of a date, or of a date with a clock, as ISO 8601 writes it; None for others, see `seconds_of`."""
+    """Return the day of a date, with or without a clock time, in the form of ISO 8601; None for other texts."""
     match = _DATE.fullmatch(text.strip())
     if match is None or (match[5] and not is_clock(match[5])):
         return None
@@ -47,36 +49,46 @@ def iso_day(text: str, day_first: bool | None = None) -> str | None:
 
 
 def date_of(text: str) -> str:
-    """The date of a time stamp as it is written; "" where it has none."""
+    """Return the date of a time stamp as written; "" if it has none."""
     match = _DATE.match(text.strip())
     return text.strip()[: match.start(5) if match[5] is not None else None].strip(" T,") if match else ""
 
 
 def is_clock(text: str) -> bool:
-    """Say whether a time stamp is a clock without a date."""
+    """Return whether a time stamp is a clock time without a date."""
     return bool(_CLOCK.fullmatch(text.strip()))
 
 
 def day_first(texts: Sequence[str]) -> bool | None:
-    """Say whether dates such as 13/03/2026 have the day first; None where no date tells, or dates contradict."""
+    """Return whether dates such as 13/03/2026 have the day first; None if they do not determine it or disagree."""
     matches = [match for match in map(_DATE.match, map(str.strip, texts)) if match and _is_open(match)]
     is_day, is_month = (any(int(match[group]) > 12 for match in matches) for group in (1, 3))
     return is_day if is_day != is_month else None
 
 
 def has_open_date(text: str) -> bool:
-    """Say whether the order of day and month matters for a time stamp."""
+    """Return whether the date of a time stamp depends on the order of day and month."""
     match = _DATE.match(text.strip())
     return bool(match and _is_open(match) and match[1] != match[3])
 
 
+def ambiguous_date(at: Place, text: str) -> MeasurementError:
+    """Return the exception for a date of which the day or the month may be first."""
+    return MeasurementError(
+        expected="a date with a known order of day and month",
+        value=text,
+        at=at,
+        remedy="write dates as 2026-03-02 or 02.03.2026",
+    )
+
+
 def _is_open(match: re.Match[str]) -> bool:
-    """Whether a date has slashes or dashes and its year last; with points the day is first."""
+    """Return whether a date has slashes or dashes and its year last; with points the day is first."""
     return match[2] != "." and len(match[4]) == 4
 
 
 def _day(match: re.Match[str], first: bool | None) -> datetime | None:
-    """Midnight of a date; None where it is none, or has two meanings."""
+    """Return midnight of a date; None if it is invalid or ambiguous."""
     one, two, last = int(match[1]), int(match[3]), int(match[4])
     if len(match[1]) == 4:
         year, month, day = one, two, last
@@ -97,7 +109,7 @@ def _day(match: re.Match[str], first: bool | None) -> datetime | None:
 
 
 def _clock(match: re.Match[str]) -> float | None:
-    """Seconds since midnight; None where there is no such time."""
+    """Return the seconds since midnight; None if there is no such time."""
     hours, minutes, seconds = int(match[1]), int(match[2]), float((match[3] or "0").replace(",", "."))
     if half := match[4]:
         if not 1 <= hours <= 12:

@@ -1,4 +1,4 @@
-"""Units of exports: how they are spelt, and how values get from them into those of measurement files."""
+"""Units of exports: their spellings, and conversion to the units of measurement files."""
 
 import decimal
 import math
@@ -10,10 +10,10 @@ from typing import Literal
 from pisigma.files.errors import MeasurementError, nearest_choice
 
 UnitKind = Literal["length", "angle", "time", "mass", "temperature"]
-_FEWEST = 3
-"""Rows from which on values that are all small tell their unit."""
-_LONGEST_PLAIN = 40
-"""Digits that a scaled number is written out with; longer ones keep their exponent."""
+_MIN_ROWS = 3
+"""Number of rows from which small values determine their unit."""
+_MAX_DIGITS = 40
+"""Number of digits up to which a scaled number is written without an exponent."""
 
 
 @dataclass(frozen=True)
@@ -21,10 +21,10 @@ class ForeignUnit:
     """A unit of exports.
 
     Attributes:
-        kind: what is measured in it.
-        column: the unit of measurement files that its values are written in.
-        factor: exact number of those in one of these.
-        spellings: of it besides its symbol, in small letters.
+        kind: the measured quantity.
+        column: unit of measurement files to which its values are converted.
+        factor: exact conversion factor to that unit.
+        spellings: spellings in addition to its symbol, in lower case.
     """
 
     kind: UnitKind
@@ -50,15 +50,15 @@ UNITS: dict[str, ForeignUnit] = {
     "g": ForeignUnit("mass", "kg", "1e-3", "gram grams"),
     "c": ForeignUnit("temperature", "c", "1", "°c degc celsius"),
 }
-"""By symbol; a unit more is one line."""
+"""Units by symbol; a further unit is one line."""
 
 AMBIGUOUS = {
     "grad": "degrees in German, gradians in other languages",
     "grade": "degrees in Italian, gradians in French",
 }
-"""Spellings that are units of several meanings, and which; `--unit` or `--map` has to say which one is meant."""
-_LONGEST_COMMENT = 500
-"""Characters of a comment that are looked at."""
+"""Ambiguous spellings of units and their meanings; `--unit` or `--map` has to state which one is meant."""
+_MAX_COMMENT = 500
+"""Number of characters of a comment that are searched for units."""
 
 _SYMBOLS = {name: symbol for symbol, unit in UNITS.items() for name in (symbol, *unit.spellings.split())}
 _SAID = re.compile(
@@ -66,32 +66,32 @@ _SAID = re.compile(
     r"values)\b(.*)"
 )
 _BETWEEN = frozenset(("", "in", "and", "und", "are", "is"))
-"""Words between such a word and its unit; an inch has to be spelt out in a comment."""
+"""Words that may be between a word of `_SAID` and its unit; in comments, an inch has to be spelt out."""
 
 
 def unit_symbol(text: str) -> str:
-    """Give the symbol of a unit, however it is spelt; "" where it is none."""
+    """Return the symbol of a unit in any spelling; "" if it is not a unit."""
     return _SYMBOLS.get(text.strip().strip("[]()<>{}").strip().lower(), "")
 
 
 def ambiguous_unit(text: str) -> str:
-    """Give the spelling of a unit with several meanings, see `AMBIGUOUS`; "" where it is none."""
+    """Return the spelling of an ambiguous unit, see `AMBIGUOUS`; "" if it is not one."""
     bare = text.strip().strip("[]()<>{}").strip().lower()
     return bare if bare in AMBIGUOUS else ""
 
 
 def stated_units(comments: Sequence[str]) -> dict[UnitKind, str]:
-    """Give the units that comments and titles state, such as "units mm, deg" or "angles: degrees".
+    """Return the units that comments and titles state, such as "units mm, deg" or "angles: degrees".
 
-    The units follow their word; of several for one kind the first counts. A unit of several meanings stays as it is
-    spelt, see `AMBIGUOUS`.
+    The units follow their word; of several units of one kind the first is used. Ambiguous units keep their spelling,
+    see `AMBIGUOUS`.
     """
     stated: dict[UnitKind, str] = {}
     for comment in comments:
-        rest = comment[:_LONGEST_COMMENT]
-        while said := _SAID.search(rest):
-            rest = said[1]
-            for word in re.split(r"[\s,;:=/()\[\]]+", rest):
+        text = comment[:_MAX_COMMENT]
+        while said := _SAID.search(text):
+            text = said[1]
+            for word in re.split(r"[\s,;:=/()\[\]]+", text):
                 if word.lower() in _BETWEEN:
                     continue
                 if symbol := unit_symbol(word):
@@ -104,54 +104,54 @@ def stated_units(comments: Sequence[str]) -> dict[UnitKind, str]:
 
 
 def parse_units(text: str) -> dict[UnitKind, str]:
-    """Read units such as "mm,deg": by what they measure, their symbols.
+    """Parse units such as "mm,deg" and return their symbols by kind.
 
     Raises:
-        MeasurementError: a unit is unknown, or two are for the same.
+        MeasurementError: a unit is unknown, or two are of the same kind.
     """
     units: dict[UnitKind, str] = {}
     for word in filter(None, re.split(r"[\s,;]+", text)):
         symbol = unit_symbol(word)
         if not symbol:
-            raise MeasurementError(f"--unit {text}: '{word}' is unknown; {nearest_choice(word, UNITS)}")
-        if units.setdefault(UNITS[symbol].kind, symbol) != symbol:
             raise MeasurementError(
-                f"--unit {text}: states two units of {UNITS[symbol].kind}; state one of each kind."
+                f"unknown unit '{word}'", option="--unit", value=word, remedy=nearest_choice(word, UNITS)
             )
+        if units.setdefault(UNITS[symbol].kind, symbol) != symbol:
+            raise MeasurementError(option="--unit", expected=f"one unit of {UNITS[symbol].kind}", value=text)
     return units
 
 
 def scaled(number: str, symbol: str) -> str:
-    """Give a number in the unit of its column of measurement files, with every digit.
+    """Return a number in the unit of its column of measurement files, with every digit.
 
     Args:
-        number: with a decimal point, or what stands in its cell and is no number.
-        symbol: of its unit; "" where it has none.
+        number: text of the number with a decimal point, or another text, which is returned unchanged.
+        symbol: symbol of its unit; "" if it has none.
     """
     factor = UNITS[symbol].factor if symbol else "1"
     if factor == "1":
         return number
     try:
-        with decimal.localcontext(prec=2 * _LONGEST_PLAIN):
+        with decimal.localcontext(prec=2 * _MAX_DIGITS):
             value = decimal.Decimal(number) * decimal.Decimal(factor)
     except decimal.DecimalException:
         return number
-    is_plain = value.is_finite() and abs(value.adjusted()) <= _LONGEST_PLAIN
+    is_plain = value.is_finite() and abs(value.adjusted()) <= _MAX_DIGITS
     return "0" if not value else f"{value:f}" if is_plain else str(value)
 
 
 def doubt(symbol: str, largest: float, rows: int) -> str:
-    """Say why values can hardly be in their unit; "" where nothing speaks against it.
+    """Return why values are unlikely to be in their unit; "" if they are not.
 
-    A joint turns at most two or three times, nothing is measured from beyond 200 m, and a measured robot moves by
-    more than three degrees and 20 mm.
+    Joints rotate by at most two or three turns, nothing is measured from more than 200 m away, and a measured robot
+    moves by more than three degrees and 20 mm.
 
     Args:
-        symbol: of the unit.
-        largest: absolute value among all joint values, or among all coordinates.
+        symbol: symbol of the unit.
+        largest: largest absolute value of all joint values, or of all coordinates.
         rows: number of rows.
     """
-    few = rows < _FEWEST
+    few = rows < _MIN_ROWS
     doubts = {
         "rad": (largest > 4 * math.pi, "degrees"),
         "deg": (not few and 0 < largest <= math.pi, "radians"),
@@ -166,6 +166,6 @@ def doubt(symbol: str, largest: float, rows: int) -> str:
 
 
 def is_certain(symbol: str, largest: float) -> bool:
-    """Say whether values can only be in a unit and not in the other one of its kind that is in use; see `doubt`."""
+    """Return whether values can only be in a unit, and not in the other usual unit of its kind; see `doubt`."""
     bounds = {"deg": largest > 4 * math.pi, "rad": 0.2 < largest <= 2 * math.pi + 0.1}
     return bounds.get(symbol, {"mm": largest > 200, "m": 0.05 < largest < 20}.get(symbol, False))

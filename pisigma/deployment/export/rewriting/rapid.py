@@ -28,7 +28,7 @@ from pisigma.deployment.export.rewriting.scan import (
     masked,
     numbers_in,
 )
-from pisigma.measurement.foreign.rotations import LARGEST_SKEWNESS
+from pisigma.measurement.foreign.rotations import MAX_SKEWNESS
 from pisigma.robot.se3 import rotation_from_quaternion, transform
 
 _Read = TypeVar("_Read", Pose, Frame)
@@ -253,7 +253,7 @@ def _not_normalised(text: str) -> str:
     """Why a position and a quaternion are no frame; "" where they are one."""
     quaternion = numbers_in(text)[3:]
     norm = math.hypot(*quaternion)
-    if abs(norm - 1) <= LARGEST_SKEWNESS:
+    if abs(norm - 1) <= MAX_SKEWNESS:
         return ""
     written = ", ".join(f"{value:g}" for value in quaternion)
     return f"expected a quaternion of norm 1, got [{written}] with norm {norm:g}"

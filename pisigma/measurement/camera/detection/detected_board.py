@@ -1,4 +1,4 @@
-"""Corners of a board in an image: refined to sub-pixel as saddles of gray values, and how blurred the edges are."""
+"""Corners of a board in an image, refined to sub-pixel accuracy as saddles of gray values, and the blur of edges."""
 
 from dataclasses import dataclass
 
@@ -9,36 +9,36 @@ from scipy.ndimage import map_coordinates
 from scipy.special import erf
 
 from pisigma.measurement.camera.board import Board
-from pisigma.measurement.camera.board_pose import FEWEST_CORNERS
+from pisigma.measurement.camera.board_pose import MIN_CORNERS
 
 Image = UInt8[np.ndarray, "height width"]
 """Gray values; the centre of the first pixel is at u = v = 0."""
 ALONG = np.linspace(0.2, 0.8, 9)
-"""Where edges are crossed, as shares of their lengths: away from other edges."""
+"""Positions of the crossings of an edge relative to its length, away from other edges."""
 ACROSS = np.linspace(-1.0, 1.0, 41)
-"""Where they are sampled on both sides, as shares of how far they are followed."""
+"""Positions of the samples on both sides of an edge, relative to half the sampled width."""
 FOLLOWED = 0.7
-"""Share of the clearance of an edge in which it is followed: what is printed beyond is blurred, too."""
+"""Half the sampled width relative to the clearance of an edge: the print beyond it is blurred, too."""
 ENDS = 0.7
-"""From here on, an edge is as black or as white as it gets."""
+"""Relative position beyond which the samples are fully black or white."""
 SMOOTHING = 1.5
-"""[px] Standard deviation of the blur before gradients are taken, less in small windows; best on rendered images."""
+"""[px] Standard deviation of the smoothing before gradients, less in small windows; best on rendered images."""
 WINDOW = 0.8
-"""Half of the side of the window around a corner, as share of the clearance."""
-SMALLEST_SQUARE = 16.0
-"""[px²] Squares that appear smaller hold no window."""
+"""Half of the side of the window around a corner, relative to the clearance."""
+MIN_SQUARE = 16.0
+"""[px²] Smallest area of a square in the image that contains a window."""
 _STOP = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 100, 1e-4)
-LARGEST = 16
-"""[px] Half of the side of a window: lines that a lens bends are straight in it to some thousandths of a pixel."""
-STEPS = 4
+MAX_HALF_WINDOW = 16
+"""[px] Half of the side of a window: lines distorted by a lens are straight in it to some thousandths of a pixel."""
+ITERATIONS = 4
 DAMPING = 1e-9
-"""Added to the normal matrices, whose diagonals are scaled to 1: a window without contrast determines nothing."""
+"""Damping of the normal matrices, whose diagonals are scaled to 1, for windows without contrast."""
 LOG_BLURS = np.log((0.2, 6.0))
-"""Of what the fit may make of the blur [px]."""
-FARTHEST = 0.5
-"""[px] A fit that moves a corner by more has fitted something else."""
-FIRST_BLUR = 1.0
-"""[px] Standard deviation of the blur with which the fit begins."""
+"""Logarithms of the smallest and largest blur [px] of a fit."""
+MAX_SHIFT = 0.5
+"""[px] Shift of a corner above which a fit is discarded, as it has fitted something else."""
+INITIAL_BLUR = 1.0
+"""[px] Initial standard deviation of the blur in a fit."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,8 +46,8 @@ class DetectedBoard:
     """The corners of a board in an image.
 
     Attributes:
-        corners: their numbers, see `Board`.
-        pixels: u and v of each [px].
+        corners: numbers of the corners, see `Board`.
+        pixels: u and v of every corner [px].
     """
 
     corners: Int64[np.ndarray, " corners"]
@@ -56,17 +56,21 @@ class DetectedBoard:
 
 @dataclass(frozen=True)
 class NoBoard:
-    """An image without corners that can be used.
+    """An image without usable corners.
 
     Attributes:
-        reason: clause that says why, such as "no board is found in it".
+        reason: why, as a clause, such as "no board is found in it".
+        piece: number of rows and columns of corners that were found; None if none were.
+        is_mirrored: whether the image is mirrored.
     """
 
     reason: str
+    piece: tuple[int, int] | None = None
+    is_mirrored: bool = False
 
 
 def shown_edges(detected: DetectedBoard, board: Board) -> Float64[np.ndarray, "edges 2 2"]:
-    """Pixels of both ends of the edges of a board between corners that were detected [px]."""
+    """Return the pixels of both ends of the board's edges between detected corners [px]."""
     pixels = np.full((len(board.corners), 2), np.nan)
     pixels[detected.corners] = detected.pixels
     ends = pixels[board.edges]
@@ -75,21 +79,22 @@ def shown_edges(detected: DetectedBoard, board: Board) -> Float64[np.ndarray, "e
 
 
 def refined(image: Image, detected: DetectedBoard, board: Board) -> DetectedBoard:
-    """Move the corners of squares to where the gradients around them point past (Förstner & Gülch 1987), and fit them.
+    """Refine corners of squares to sub-pixel accuracy.
 
-    The window around each is as large as it can be without other edges in it; corners whose window leaves the image are
-    left out. From there the gray values are fitted, see `fit_saddles`.
+    Corners are first moved to the point to which the gradients around them are perpendicular (Förstner & Gülch 1987).
+    The window around each is as large as possible without other edges in it; corners whose window leaves the image are
+    left out. The gray values are then fitted, see `fit_saddles`.
 
     Args:
-        image: that shows them.
-        detected: about where they are.
-        board: whose corners they are.
+        image: the image.
+        detected: approximate corners.
+        board: the board.
     """
     ends = shown_edges(detected, board)
     shortest = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1).min(initial=np.inf)
     half = max(round(WINDOW * board.clearance * shortest), 2) if len(ends) else 2
     start = np.ascontiguousarray(detected.pixels, dtype=np.float32).reshape(-1, 1, 2)
-    # gradients of pixels that are sharp against their size point past the corner by some hundredths of a pixel
+    # without smoothing, gradients of a sharp image are biased by some hundredths of a pixel
     smooth = cv2.GaussianBlur(image.astype(np.float32), (0, 0), min(SMOOTHING, half / 4))
     moved = cv2.cornerSubPix(smooth, start, (half, half), (-1, -1), _STOP)
     pixels = np.asarray(moved, dtype=np.float64).reshape(-1, 2)
@@ -106,23 +111,23 @@ def refined(image: Image, detected: DetectedBoard, board: Board) -> DetectedBoar
 def _axes_of_squares(
     grid: Float64[np.ndarray, "corners 2"], pixels: Float64[np.ndarray, "corners 2"]
 ) -> Float64[np.ndarray, "corners 2 2"] | None:
-    """Derivatives of pixels by steps along rows and columns of squares, by their homography; None without one."""
-    H = cv2.findHomography(grid, pixels)[0] if len(grid) > FEWEST_CORNERS and np.ptp(grid, 0).all() else None
+    """Return the derivatives of pixels by steps along rows and columns of squares, or None without a homography."""
+    H = cv2.findHomography(grid, pixels)[0] if len(grid) > MIN_CORNERS and np.ptp(grid, 0).all() else None
     if H is None:
         return None
     projected = grid @ H[:, :2].T + H[:, 2]
     axes = (H[:2, :2] - (projected[:, :2] / projected[:, 2:])[..., None] * H[2, :2]) / projected[:, 2:, None]
-    return axes if (np.abs(np.linalg.det(axes)) > SMALLEST_SQUARE).all() else None
+    return axes if (np.abs(np.linalg.det(axes)) > MIN_SQUARE).all() else None
 
 
 @dataclass(frozen=True, eq=False)
 class EdgeProfiles:
-    """How black turns to white across the edges of a board.
+    """Profiles of the gray values across the edges of a board.
 
     Attributes:
-        at: where every edge is crossed [px].
-        across: normals of the edges as long as they are followed to each side [px].
-        profile: gray level along the crossings, from 0 at their begin to 1 at their end; NaN without contrast.
+        at: crossing points on every edge [px].
+        across: normals of the edges, of half the sampled width [px].
+        profile: gray values along the crossings, from 0 at the start to 1 at the end; NaN without contrast.
     """
 
     at: Float64[np.ndarray, "edges crossings 2"]
@@ -134,9 +139,10 @@ class EdgeProfiles:
         """Sample an image across edges.
 
         Args:
-            image: that shows the board.
+            image: the image.
             ends: pixels of both ends of every edge [px].
-            clearance: share of the length of an edge to whose sides nothing else is printed, see `Board.clearance`.
+            clearance: width of the uniform areas on both sides of an edge relative to its length, see
+                `Board.clearance`.
         """
         along = ends[:, 1] - ends[:, 0]
         across = FOLLOWED * clearance * np.stack([-along[:, 1], along[:, 0]], -1)
@@ -155,8 +161,8 @@ class EdgeProfiles:
     def blur(self) -> float:
         """Standard deviation of the blur [px]; NaN without edges.
 
-        The areas between a step from 0 to 1 that is blurred with the standard deviation σ and the step sum up to
-        `σ sqrt(2/π)`. A motion blurs edges across it only, so that the third quartile of all edges is given.
+        The area between a step from 0 to 1 and the step blurred with the standard deviation σ is `σ sqrt(2/π)`. Motion
+        blurs only the edges across it, so the third quartile of all edges is returned.
         """
         missing = np.where(ACROSS < 0, self.profile, 1 - self.profile).mean((1, 2))
         blur = 2 * np.linalg.norm(self.across, axis=1) * missing / np.sqrt(2 / np.pi)
@@ -164,9 +170,9 @@ class EdgeProfiles:
 
     @property
     def points(self) -> Float64[np.ndarray, "edges crossings 2"]:
-        """Where the middle between black and white is on every crossing [px]: half of its area is on either side.
+        """Positions of the edge on every crossing [px], with half of the blurred area on either side.
 
-        Where an edge has no contrast, it stays as it is.
+        Edges without contrast keep their position.
         """
         offset = np.nan_to_num(1 - 2 * self.profile.mean(2))
         points: np.ndarray = self.at + offset[..., None] * self.across[:, None]
@@ -179,32 +185,32 @@ def fit_saddles(
     axes: Float64[np.ndarray, "corners 2 2"],
     share: float,
 ) -> Float64[np.ndarray, "corners 2"]:
-    """Fit corners where two black and two white squares meet, by least squares over the pixels around each.
+    """Fit corners between two black and two white squares by least squares over the surrounding pixels.
 
-    With `s_i` the distances of a pixel at x from the two lines through the corner at c, of the directions `θ_i`, its
-    gray value is `(m + k erf(s_1 / √2 σ) erf(s_2 / √2 σ)) (1 + g · (x - c))`: edges that are blurred by σ, under light
-    of the slope g. Nine unknowns of every corner (c, θ_1, θ_2, log σ, m, k, g) are found by Gauss-Newton steps. Where
-    the noise of pixels is independent this is the most likely corner; the gradients of the same pixels leave twice the
-    noise, and light that changes across the image moves them.
+    With `s_i` the distances of a pixel at x from the two lines of directions `θ_i` through the corner at c, its gray
+    value is `(m + k erf(s_1 / √2 σ) erf(s_2 / √2 σ)) (1 + g · (x - c))`: edges blurred by σ, under light of gradient g.
+    The nine unknowns of every corner (c, θ_1, θ_2, log σ, m, k, g) are found by Gauss-Newton steps. For independent
+    noise of the pixels this is the maximum-likelihood estimate; corners from gradients of the same pixels have twice
+    the noise and are biased by gradients of the light.
 
     Args:
-        gray: image.
-        pixels: corners, to half a pixel [px].
+        gray: gray values of the image.
+        pixels: corners, accurate to half a pixel [px].
         axes: derivative of pixels by steps along rows and columns of squares, one in each column [px].
-        share: of a square up to which nothing else is printed.
+        share: distance up to which nothing else is printed, relative to a square.
 
     Returns:
-        The corners; those that the fit moves by more than `FARTHEST` stay.
+        The corners; those that a fit would move by more than `MAX_SHIFT` are not changed.
     """
     x, weight = _windows(gray.shape, pixels, axes, share)
     values = gray[x[..., 1], x[..., 0]]
     x = x - pixels[:, None]
     state = np.zeros((len(pixels), 9))
-    state[:, 2:4], state[:, 4] = np.arctan2(axes[:, 1], axes[:, 0]), np.log(FIRST_BLUR)
+    state[:, 2:4], state[:, 4] = np.arctan2(axes[:, 1], axes[:, 0]), np.log(INITIAL_BLUR)
     saddle = weight * _saddle(x, state)[0]
     state[:, 5] = (weight * values).sum(1) / np.maximum(weight.sum(1), 1.0)
     state[:, 6] = (saddle * (values - state[:, 5, None])).sum(1) / np.maximum((saddle**2).sum(1), 1.0)
-    for _ in range(STEPS):
+    for _ in range(ITERATIONS):
         predicted, J = _predicted(x, state)
         weighted = (weight[..., None] * J).swapaxes(1, 2)
         normal, right = weighted @ J, weighted @ (values - predicted)[..., None]
@@ -213,7 +219,7 @@ def fit_saddles(
         state += np.linalg.solve(normal, right / scale[..., None])[..., 0] / scale
         state[:, 4] = np.clip(state[:, 4], *LOG_BLURS)
     moved = state[:, :2]
-    kept = np.linalg.norm(moved, axis=1, keepdims=True) < FARTHEST
+    kept = np.linalg.norm(moved, axis=1, keepdims=True) < MAX_SHIFT
     return np.where(kept, pixels + moved, pixels)
 
 
@@ -223,8 +229,8 @@ def _windows(
     axes: Float64[np.ndarray, "corners 2 2"],
     share: float,
 ) -> tuple[Int64[np.ndarray, "corners window 2"], Float64[np.ndarray, "corners window"]]:
-    """Return the pixels around every corner, and weights: 1 where nothing but its squares is shown, else 0."""
-    side = np.arange(-LARGEST, LARGEST + 1)
+    """Return the pixels around every corner, and weights: 1 within the squares of the corner, else 0."""
+    side = np.arange(-MAX_HALF_WINDOW, MAX_HALF_WINDOW + 1)
     offsets = np.stack(np.meshgrid(side, side), -1).reshape(-1, 2)
     x = np.rint(pixels)[:, None].astype(int) + offsets
     in_squares = np.linalg.solve(axes, (x - pixels[:, None]).swapaxes(1, 2))
@@ -259,7 +265,7 @@ def _saddle(
 def _predicted(
     x: Float64[np.ndarray, "corners window 2"], state: Float64[np.ndarray, "corners 9"]
 ) -> tuple[Float64[np.ndarray, "corners window"], Float64[np.ndarray, "corners window 9"]]:
-    """Return gray values, and their derivatives by all unknowns."""
+    """Return predicted gray values, and their derivatives by all unknowns."""
     saddle, by = _saddle(x, state)
     light = 1 + (state[:, None, 7:] * x).sum(-1)
     printed = state[:, 5, None] + state[:, 6, None] * saddle

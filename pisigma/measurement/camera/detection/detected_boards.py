@@ -1,4 +1,4 @@
-"""The boards in many images, and how well their poses predict the corners."""
+"""The boards in several images, and the residuals of their corners."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -8,12 +8,12 @@ import numpy as np
 from jaxtyping import Float64
 
 from pisigma.estimation.loss import HampelLoss
-from pisigma.files.errors import MeasurementError
+from pisigma.files.errors import MeasurementError, Place
 from pisigma.measurement.camera.board import Board
 from pisigma.measurement.camera.board_pose import solve_board_pose
 from pisigma.measurement.camera.camera import Camera
 from pisigma.measurement.camera.detection.detected_board import DetectedBoard, NoBoard
-from pisigma.measurement.camera.image_rows import LARGEST_MISS
+from pisigma.measurement.camera.image_rows import MAX_MEDIAN_RESIDUAL
 
 
 @dataclass(frozen=True, eq=False)
@@ -21,10 +21,10 @@ class BoardImage:
     """The image of a file, and the board in it.
 
     Attributes:
-        file: of the image.
-        size: its width and height [px]; 0 where the file cannot be read.
-        board: the corners that can be used, or why there are none.
-        blur: standard deviation of the blur of the board's edges [px]; NaN where none was found.
+        file: the image file.
+        size: width and height of the image [px]; 0 if the file cannot be read.
+        board: the usable corners, or why there are none.
+        blur: standard deviation of the blur of the board's edges [px]; NaN if no board was found.
     """
 
     file: Path
@@ -34,22 +34,22 @@ class BoardImage:
 
     @property
     def name(self) -> str:
-        """That of the file, without ending."""
+        """Name of the file without its extension."""
         return self.file.stem
 
     @property
     def is_read(self) -> bool:
-        """Whether the file is a whole image."""
+        """Whether the file is a complete image."""
         return self.size != (0, 0)
 
 
 @dataclass(frozen=True, eq=False)
 class DetectedBoards:
-    """Boards in images, and where their poses predict the corners.
+    """Boards in images, and their corners as predicted by their poses.
 
     Attributes:
-        images: with a board and without, in the order of the files.
-        predicted: pixels of the corners of every image that has some, by its name [px].
+        images: all images, in the order of the files.
+        predicted: predicted pixels of the corners of every image with a board, by its name [px].
     """
 
     images: tuple[BoardImage, ...]
@@ -57,17 +57,17 @@ class DetectedBoards:
 
     @property
     def boards(self) -> dict[str, DetectedBoard]:
-        """The boards that can be used, by the names of their images."""
+        """The usable boards, by names of the images."""
         return {one.name: one.board for one in self.images if isinstance(one.board, DetectedBoard)}
 
     @property
     def left_out(self) -> dict[str, str]:
-        """Why images have no board that can be used, by their names."""
+        """Why images have no usable board, by names of the images."""
         return {one.name: one.board.reason for one in self.images if isinstance(one.board, NoBoard)}
 
     @property
     def residuals(self) -> dict[str, Float64[np.ndarray, "_corners 2"]]:
-        """Detected minus predicted pixels, by the names of the images [px]."""
+        """Detected minus predicted pixels, by names of the images [px]."""
         return {name: board.pixels - self.predicted[name] for name, board in self.boards.items()}
 
     @property
@@ -78,21 +78,21 @@ class DetectedBoards:
 
     @property
     def sentences(self) -> tuple[str, ...]:
-        """What the images show, and which are left out and why; some board can be used."""
+        """Sentences on the images and those that are left out; requires a usable board."""
         boards = self.boards
         count = sum(len(board.corners) for board in boards.values())
         used = [one for one in self.images if one.name in boards]
         blurred = max(used, key=lambda one: one.blur)
         return (
-            f"{len(boards)} of {len(self.images)} images show the board: {count:,} corners, which camera and pose of "
-            f"the board in each image predict to {self.rms:.3f} px (RMS of u and v).",
-            f"Edges are blurred by {np.median([one.blur for one in used]):.2f} px (median of the standard deviations), "
-            f"most of all by {blurred.blur:.2f} px in {blurred.name}.",
+            f"{len(boards)} of {len(self.images)} images show the board: {count:,} corners, with RMS residuals of "
+            f"{self.rms:.3f} px (u and v) after solving the pose of the board in each image.",
+            f"The blur of edges has a median standard deviation of {np.median([one.blur for one in used]):.2f} px; the "
+            f"largest is {blurred.blur:.2f} px, in {blurred.name}.",
             *(f"{name} is left out: {reason}." for name, reason in self.left_out.items()),
         )
 
     def to_json(self) -> dict[str, object]:
-        """Return figures of the images as plain values."""
+        """Return figures of the images as plain values for JSON."""
         residuals, left_out = self.residuals, self.left_out
         return {
             "rms_px": self.rms,
@@ -111,7 +111,7 @@ class DetectedBoards:
 
 
 def rms_of(residual: Float64[np.ndarray, "*corners 2"]) -> float:
-    """Root mean square of u and v [px]."""
+    """Return the root mean square of u and v [px]."""
     return float(np.sqrt(np.square(residual).mean()))
 
 
@@ -119,22 +119,24 @@ def predict_boards(images: Sequence[BoardImage], camera: Camera, board: Board) -
     """Predict corners by the pose of the board in every image; images that no pose explains lose their corners.
 
     Raises:
-        MeasurementError: an image is not as large as those of the camera.
+        MeasurementError: an image has another size than those of the camera.
     """
     checked, predicted, corners = list[BoardImage](), {}, board.corners
     for one in images:
         if one.is_read and one.size != (camera.width, camera.height):
             raise MeasurementError(
-                f"{one.file}: an image of {camera.width} x {camera.height} px was wanted, as the camera "
-                f"'{camera.name}' takes them, got {one.size[0]} x {one.size[1]}; check the camera."
+                expected=f"an image of {camera.width} x {camera.height} px of camera '{camera.name}'",
+                value=f"{one.size[0]} x {one.size[1]} px",
+                at=Place(one.file),
+                remedy="check the camera",
             )
         if isinstance(one.board, DetectedBoard):
             at = corners[one.board.corners]
             pose = solve_board_pose(camera, at, one.board.pixels, HampelLoss())
-            if (miss := float(np.median(pose.distance))) < LARGEST_MISS:
+            if (residual := float(np.median(pose.distance))) < MAX_MEDIAN_RESIDUAL:
                 predicted[one.name] = camera.project(at @ pose.R.T + pose.t)[0]
             else:
-                reason = f"half of its corners miss board and camera by {miss:.3g} px or more"
+                reason = f"the median residual of its corners with this board and camera is {residual:.3g} px"
                 one = replace(one, board=NoBoard(reason))
         checked.append(one)
     return DetectedBoards(tuple(checked), predicted)

@@ -8,10 +8,10 @@ import cv2
 import numpy as np
 from jaxtyping import Float64
 
-from pisigma.files.errors import MeasurementError
+from pisigma.files.errors import MeasurementError, Place
 from pisigma.files.input_file import read_input
 from pisigma.measurement.camera.board import Board, BoardKind
-from pisigma.measurement.camera.board_pose import FEWEST_CORNERS
+from pisigma.measurement.camera.board_pose import MIN_CORNERS
 from pisigma.measurement.camera.detection.detected_board import (
     DetectedBoard,
     EdgeProfiles,
@@ -23,22 +23,22 @@ from pisigma.measurement.camera.detection.detected_board import (
 from pisigma.measurement.camera.detection.detected_boards import BoardImage
 from pisigma.measurement.camera.detection.markers import detect_apriltags, detect_charuco
 
-SMALLEST_PIECE = 3
-"""Rows and columns of corners of a piece of a board that is recognised as one."""
+MIN_PIECE = 3
+"""Number of rows and columns of corners from which a piece of a board is recognised."""
 
 
 def detect_checkerboard(image: Image, board: Board) -> DetectedBoard | NoBoard:
-    """Find all corners of a checkerboard, which has to be in the image whole.
+    """Find all corners of a checkerboard, which must be completely visible.
 
-    Corners are searched by sectors (Duda & Frese 2018) and refined by their gradients, which on rendered images is as
-    accurate as the search with twice the resolution, and four times as fast.
+    Corners are found by sectors (Duda & Frese 2018) and refined by their gradients; on rendered images this is as
+    accurate as the search at twice the resolution, and four times as fast.
 
     Returns:
         The corners; those of a symmetric board are numbered from the one nearest to the upper left of the image.
     """
     there, corners = cv2.findChessboardCornersSB(image, (board.columns, board.rows))
     if not there:
-        return NoBoard(_reason(image, board))
+        return _missing(image, board)
     grid = np.asarray(corners, dtype=np.float64).reshape(board.rows, board.columns, 2)
     grid = _numbered(image, grid, board.is_symmetric)
     return refined(image, DetectedBoard(np.arange(len(board.corners)), grid.reshape(-1, 2)), board)
@@ -47,29 +47,30 @@ def detect_checkerboard(image: Image, board: Board) -> DetectedBoard | NoBoard:
 def _numbered(
     image: Image, grid: Float64[np.ndarray, "rows columns 2"], is_symmetric: bool
 ) -> Float64[np.ndarray, "rows columns 2"]:
-    """Turn a grid of corners so that its first one is corner 0, with rows counted clockwise of columns."""
+    """Rotate or mirror a grid of corners so that its first one is corner 0, with rows clockwise of columns."""
     right, down = grid[0, -1] - grid[0, 0], grid[-1, 0] - grid[0, 0]
     if right[0] * down[1] < right[1] * down[0]:
         grid = grid[:, ::-1]
-    turned = grid[::-1, ::-1]
+    rotated = grid[::-1, ::-1]
     if is_symmetric:
-        return turned if turned[0, 0].sum() < grid[0, 0].sum() else grid
+        return rotated if rotated[0, 0].sum() < grid[0, 0].sum() else grid
     middles = (grid[:-1, :-1] + grid[1:, :-1] + grid[:-1, 1:] + grid[1:, 1:]) / 4
     column, row = np.rint(middles).astype(int).reshape(-1, 2).T
     is_black = np.indices(middles.shape[:2]).sum(0).ravel() % 2 == 0
     gray = image[row, column]
-    return grid if gray[is_black].mean() < gray[~is_black].mean() else turned
+    return grid if gray[is_black].mean() < gray[~is_black].mean() else rotated
 
 
-def _reason(image: Image, board: Board) -> str:
-    """Say why no whole board was found: a piece of one is there, or none."""
-    size = (SMALLEST_PIECE, SMALLEST_PIECE)
+def _missing(image: Image, board: Board) -> NoBoard:
+    """Return why no complete board was found: only a piece of it is visible, or nothing."""
+    size = (MIN_PIECE, MIN_PIECE)
     there, _, piece = cv2.findChessboardCornersSBWithMeta(image, size, cv2.CALIB_CB_LARGER)
-    wanted = f"{board.rows} x {board.columns} corners"
+    expected = f"{board.rows} x {board.columns} corners"
     if there:
         rows, columns = piece.shape
-        return f"only a piece of {rows} x {columns} corners is found of a board of {wanted}"
-    return f"no board of {wanted} is found in it"
+        reason = f"only a piece of {rows} x {columns} corners of a board of {expected} is found"
+        return NoBoard(reason, piece=(rows, columns))
+    return NoBoard(f"no board of {expected} is found in it")
 
 
 DETECTORS: dict[BoardKind, Callable[[Image, Board], DetectedBoard | NoBoard]] = {
@@ -78,11 +79,11 @@ DETECTORS: dict[BoardKind, Callable[[Image, Board], DetectedBoard | NoBoard]] = 
     "apriltag": detect_apriltags,
 }
 ENDINGS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".pgm", ".webp")
-"""Of the images of a folder."""
+"""Extensions of image files in a folder."""
 
 
 def image_files(paths: Sequence[str | os.PathLike[str]]) -> tuple[Path, ...]:
-    """List image files; those of a folder by their names.
+    """Return image files; those of a folder sorted by name.
 
     Raises:
         MeasurementError: there are none, or two have the same name.
@@ -93,24 +94,29 @@ def image_files(paths: Sequence[str | os.PathLike[str]]) -> tuple[Path, ...]:
         files += [one for one in inside if one.suffix.lower() in ENDINGS] if path.is_dir() else [path]
     if not files:
         raise MeasurementError(
-            f"{', '.join(map(str, paths))}: images ({', '.join(ENDINGS)}) were wanted, but there are none."
+            expected=f"images ({', '.join(ENDINGS)})", value="none", at=Place(", ".join(map(str, paths)))
         )
     of_name: dict[str, Path] = {}
     for file in files:
         if (other := of_name.setdefault(file.stem, file)) != file:
             for one in (other, file):
-                read_image(one)  # the name of what is no image does not matter
-            raise MeasurementError(f"{file}: has the name of {other}; give every image a name of its own.")
+                read_image(one)  # a file that is not an image is reported first
+            raise MeasurementError(
+                f"the image has the same name as {other}",
+                at=Place(file),
+                value=file.stem,
+                remedy="give every image a different name",
+            )
     return tuple(files)
 
 
 def detect_boards(
     files: Sequence[Path],
     board: Board,
-    most_blur: float = 3.0,
+    max_blur: float = 3.0,
     progress: Callable[[str], None] = lambda name: None,
 ) -> list[BoardImage]:
-    """Find the corners of a board in the images of some files; see `detect_board`.
+    """Find the corners of a board in image files; see `detect_board`.
 
     Raises:
         MeasurementError: no image can be used.
@@ -119,54 +125,55 @@ def detect_boards(
     for file in files:
         progress(file.name)
         try:
-            images.append(detect_board(file, board, most_blur))
+            images.append(detect_board(file, board, max_blur))
         except MeasurementError as problem:  # one damaged file does not stop the others
-            images.append(
-                BoardImage(file, (0, 0), NoBoard(str(problem).removeprefix(f"{file}: ").rstrip(".")), np.nan)
-            )
+            reason = str(problem).replace(f" ({file})", "").rstrip(".")
+            images.append(BoardImage(file, (0, 0), NoBoard(reason), np.nan))
     reasons = [f"{one.name}: {one.board.reason}" for one in images if isinstance(one.board, NoBoard)]
     if len(reasons) == len(files):
         raise MeasurementError(
-            f"none of {len(files)} images can be used ({reasons[0]}); check the board's rows and columns and the light."
+            f"none of {len(files)} images can be used; {reasons[0]}",
+            value=len(files),
+            remedy="check the board's rows and columns and the light",
         )
     return images
 
 
-def detect_board(path: Path, board: Board, most_blur: float) -> BoardImage:
+def detect_board(path: Path, board: Board, max_blur: float) -> BoardImage:
     """Find the corners of a board in the image of a file.
 
     Args:
         path: the file.
-        board: that is searched.
-        most_blur: largest standard deviation of the blur of its edges [px].
+        board: the board to find.
+        max_blur: largest standard deviation of the blur of its edges [px].
 
     Raises:
-        MeasurementError: the file cannot be read or is no image.
+        MeasurementError: the file cannot be read or is not an image.
     """
     image = read_image(path)
     size, detected = (image.shape[1], image.shape[0]), DETECTORS[board.kind](image, board)
     if isinstance(detected, NoBoard):
         flipped = DETECTORS[board.kind](np.ascontiguousarray(image[:, ::-1]), board) if board.marker else None
         if isinstance(flipped, DetectedBoard):
-            detected = NoBoard("it is mirrored, as its markers show; take it as the camera's sensor has it")
+            detected = NoBoard("it is mirrored, as its markers show; do not mirror images", is_mirrored=True)
         return BoardImage(path, size, detected, np.nan)
     blur = EdgeProfiles.of(image, shown_edges(detected, board), board.clearance).blur
-    if len(detected.corners) < FEWEST_CORNERS:
-        reason = f"it shows {len(detected.corners)} corners, but {FEWEST_CORNERS} or more were wanted"
-    elif blur > most_blur:
-        reason = f"its edges are blurred by {blur:.1f} px (standard deviation), more than {most_blur:g} px"
+    if len(detected.corners) < MIN_CORNERS:
+        reason = f"expected {MIN_CORNERS} or more corners in it, got {len(detected.corners)}"
+    elif blur > max_blur:
+        reason = f"its edges are blurred by {blur:.1f} px (standard deviation), more than {max_blur:g} px"
     else:
         return BoardImage(path, size, detected, blur)
     return BoardImage(path, size, NoBoard(reason), blur)
 
 
 def read_image(path: str | os.PathLike[str]) -> Image:
-    """Read the gray values of an image file of any format that OpenCV reads, as the sensor has them.
+    """Read the gray values of an image file in any format of OpenCV.
 
-    It is not turned by what a camera notes of its orientation, as the intrinsics are those of the sensor.
+    The orientation in its metadata is ignored, as the intrinsics are those of the sensor.
 
     Raises:
-        MeasurementError: it cannot be read or is no image.
+        MeasurementError: it cannot be read or is not an image.
     """
     content = np.frombuffer(read_input(path, MeasurementError), dtype=np.uint8)
     try:
@@ -174,14 +181,16 @@ def read_image(path: str | os.PathLike[str]) -> Image:
     except cv2.error:  # it is empty, or its header states more pixels than memory can hold
         image = None
     if _is_truncated(content.tobytes()):
-        raise MeasurementError(f"{path}: the image is truncated; copy the file again.")
+        raise MeasurementError("the image is truncated", at=Place(path), remedy="copy the file again")
     if image is None:
-        raise MeasurementError(f"{path}: is no image that OpenCV reads; give PNG, JPEG, TIFF or BMP files.")
+        raise MeasurementError(
+            expected="an image that OpenCV reads", at=Place(path), remedy="give PNG, JPEG, TIFF or BMP files"
+        )
     return np.asarray(image, dtype=np.uint8)
 
 
 def _is_truncated(content: bytes) -> bool:
-    """Whether the end of a PNG or JPEG file is missing, of which OpenCV gives what is there."""
+    """Return whether the end of a PNG, JPEG or BMP file is missing; OpenCV would return the part that is there."""
     if content.startswith(b"\x89PNG"):
         return b"IEND" not in content[-4096:]
     if content.startswith(b"\xff\xd8"):

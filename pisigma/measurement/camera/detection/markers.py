@@ -1,4 +1,4 @@
-"""ChArUco boards and grids of AprilTags in images, and what their markers look like."""
+"""Detection of ChArUco boards and grids of AprilTags, and the patterns of their markers."""
 
 import cv2
 import numpy as np
@@ -14,12 +14,12 @@ from pisigma.measurement.camera.detection.detected_board import (
     refined,
 )
 
-ROUNDS = 2
-"""How often the sides of tags are searched: the first time, they may be off by a pixel."""
+ITERATIONS = 2
+"""Number of searches of the sides of tags: before the first one, they may be off by a pixel."""
 
 
 def detect_charuco(image: Image, board: Board) -> DetectedBoard | NoBoard:
-    """Find the corners of a ChArUco board beside whose squares markers are read, which may be some of them."""
+    """Find the corners of a ChArUco board that are next to a decoded marker, possibly only some of them."""
     size = (board.columns + 1, board.rows + 1)
     printed = cv2.aruco.CharucoBoard(size, board.square, board.marker, dictionary_of(board))
     corners, numbers, _, _ = cv2.aruco.CharucoDetector(printed).detectBoard(image)
@@ -30,9 +30,9 @@ def detect_charuco(image: Image, board: Board) -> DetectedBoard | NoBoard:
 
 
 def detect_apriltags(image: Image, board: Board) -> DetectedBoard | NoBoard:
-    """Find the corners of the AprilTags that are in an image whole: where lines along their sides cross.
+    """Find the corners of the AprilTags that are completely visible, as intersections of lines along their sides.
 
-    Corners of tags are rounded by blur, so that their gradients lead inwards; their sides are not.
+    Blur rounds the corners of tags, so that gradients there are biased inwards; their sides are not affected.
     """
     quads, numbers, _ = cv2.aruco.ArucoDetector(dictionary_of(board)).detectMarkers(image)
     number = np.zeros(0, dtype=np.int64) if numbers is None else np.asarray(numbers, dtype=np.int64).ravel()
@@ -40,7 +40,7 @@ def detect_apriltags(image: Image, board: Board) -> DetectedBoard | NoBoard:
     if not len(used):
         return NoBoard(f"no AprilTag of family {board.dictionary} of the board is found in it")
     tags = np.asarray(quads, dtype=np.float64).reshape(-1, 4, 2)[used]
-    for _ in range(ROUNDS):
+    for _ in range(ITERATIONS):
         tags = _crossings(image, tags, board.clearance)
     corners = 4 * number[used, None] + np.arange(4)
     return DetectedBoard(corners.ravel(), tags.reshape(-1, 2))
@@ -49,7 +49,7 @@ def detect_apriltags(image: Image, board: Board) -> DetectedBoard | NoBoard:
 def _crossings(
     image: Image, tags: Float64[np.ndarray, "tags 4 2"], clearance: float
 ) -> Float64[np.ndarray, "tags 4 2"]:
-    """Corners of tags as crossings of the lines through the points of their sides, the first after the last side."""
+    """Return corners of tags as intersections of the lines fitted to their sides, the first one after the last side."""
     ends = np.stack([tags, np.roll(tags, -1, 1)], 2).reshape(-1, 2, 2)
     points = EdgeProfiles.of(image, ends, clearance).points
     middle = points.mean(1)
@@ -63,10 +63,10 @@ def _crossings(
 
 
 def dictionary_of(board: Board) -> cv2.aruco.Dictionary:
-    """Return the markers of which a board has the first ones.
+    """Return the dictionary of a board's markers, of which it has the first ones.
 
     Raises:
-        MeasurementError: the board needs more.
+        MeasurementError: the board has more markers than the dictionary.
     """
     is_grid = board.kind == "apriltag"
     name = f"APRILTAG_{board.dictionary.removeprefix('tag')}" if is_grid else board.dictionary.upper()
@@ -74,12 +74,15 @@ def dictionary_of(board: Board) -> cv2.aruco.Dictionary:
     needed = board.rows * board.columns if is_grid else (board.rows + 1) * (board.columns + 1) // 2
     if needed > (there := len(dictionary.bytesList)):
         raise MeasurementError(
-            f"board '{board.name}': {needed} markers are needed, but {board.dictionary} has {there}; take another."
+            option="dictionary",
+            expected=f"a dictionary with {needed} markers for board '{board.name}'",
+            value=f"{board.dictionary} with {there}",
+            remedy="choose another",
         )
     return dictionary
 
 
 def marker_cells(board: Board, number: int) -> Bool[np.ndarray, "cells cells"]:
-    """Say which cells of a marker are black, row by row, its black border included."""
+    """Return which cells of a marker are black, row by row, including its black border."""
     dictionary = dictionary_of(board)
     return np.asarray(cv2.aruco.generateImageMarker(dictionary, number, dictionary.markerSize + 2) == 0)
