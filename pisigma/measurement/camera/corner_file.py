@@ -108,7 +108,7 @@ def read_rows(
     paths = [data] if isinstance(data, str | os.PathLike) else list(data)
     if len({os.path.realpath(path) for path in paths}) < len(paths):
         raise MeasurementError(
-            "a file is given twice",
+            "the same file is given twice",
             option="data",
             value=", ".join(map(str, paths)),
             remedy="give every file once",

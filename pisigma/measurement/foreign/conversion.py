@@ -284,7 +284,8 @@ def measurement_table(rows: ConvertedRows) -> MeasurementTable:
             expected="measurements",
             value="joint values only",
             at=Place(rows.source),
-            remedy="name their columns with --map, or join the file that contains them with --join point, order or time",
+            remedy="name their columns with --map, or join the file that contains them with --join point, order or "
+            "time",
         )
     if _order(names[0])[0]:
         raise MeasurementError(

@@ -21,8 +21,8 @@ MAX_COLUMNS = 2000
 _BLANKS = 0.8
 """Weight of blanks as separators: names contain blanks, too, so other separators are preferred."""
 _SMALL, _FAR = 20.0, 200.0
-"""Numbers such as 2.104 below these may be lengths in mm with a group of thousands: no robot measures 20,000 mm or more,
-and no position alone 200,000 mm or more."""
+"""Numbers such as 2.104 below these may be lengths in mm with a group of thousands: no robot reaches 20,000 mm, and no
+position alone is 200,000 mm away."""
 COMMENT = re.compile(r"\s*(?://|#|%|!|\*\*|--|;|'|REM\b)\s*")
 """Starts of comments; rows may start in the same way."""
 Decimal = Literal[".", ","]
@@ -45,7 +45,7 @@ class NumberFormat:
     decimal: Decimal
 
     def text(self, cell: str) -> str | None:
-        """Return a number with a decimal point, without groups and with all digits; None if the cell is not a number."""
+        """Return a number with a decimal point, without groups, with all digits; None if the cell is not a number."""
         if _PLAIN[self.decimal].fullmatch(cell):
             return cell if self.decimal == "." else cell.replace(",", ".")
         cell = cell.strip().replace("\u2212", "-")
@@ -208,7 +208,7 @@ def _check_decimal(dialect: Dialect, rows: Sequence[tuple[int, list[str]]], sour
     k = is_mixed.index(True) if any(is_mixed) else next(k for k, ours in enumerate(signed) if ours)
     number, cell = signed[k][0]
     raise MeasurementError(
-        "the number may have decimals or a group of thousands",
+        f"'{cell}' may have decimals or a group of thousands",
         at=Place(source, number, k + 1),
         value=cell,
         remedy="state --decimal point or --decimal comma",

@@ -151,7 +151,7 @@ def _lines_of(text: str, source: str) -> _Lines:
 
 
 def _is_content(line: str, row: list[str], headings: list[str]) -> bool:
-    """Return whether cells without numbers are a row nevertheless, which the reader of measurement files will refuse."""
+    """Return whether cells without numbers are a row, which the reader of measurement files will refuse."""
     return any(row) and row[: len(headings)] != headings and not _is_comment(line, row)
 
 

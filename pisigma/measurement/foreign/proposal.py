@@ -157,8 +157,8 @@ def _take_by_order(proposal: Proposal, rotation: str | None) -> None:
             expected="headings, or columns of six or seven joints and a position",
             value=f"{len(proposal.headings)} columns without headings",
             at=Place(proposal.file.source),
-            remedy="name them by their numbers, such as --map 1=q1_deg,2=q2_deg,3=x_mm,4=-, and with --rotation if three "
-            "angles or a quaternion follow the position",
+            remedy="name them by their numbers, such as --map 1=q1_deg,2=q2_deg,3=x_mm,4=-, and with --rotation if "
+            "three angles or a quaternion follow the position",
         )
     for index, quantity in of_index.items():
         if index not in proposal.columns:

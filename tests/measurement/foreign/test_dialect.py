@@ -1,6 +1,7 @@
 """Separators and decimal signs are told from the cells."""
 
 import pytest
+from testing.refusals import refused
 
 from pisigma.files.errors import MeasurementError
 from pisigma.measurement.foreign.dialect import Decimal, Dialect, sniff
@@ -37,9 +38,9 @@ def test_a_stated_sign_counts():
     assert sniffed(["1,250;2,125"], ".").numbers.decimal == "."
 
 
-def test_commas_that_may_set_thousands_apart_are_refused_where_they_separate_cells():
+def test_commas_that_may_separate_thousands_or_cells_are_refused():
     lines = ["q1,x", '10,"1,234"', '11,"-2,345"']
-    with pytest.raises(MeasurementError, match="state --decimal point or --decimal comma"):
+    with refused(MeasurementError, line=2, column=2, value="1,234"):
         sniffed(lines)
     assert sniffed(lines, ".").numbers.text("1,234") == "1234"
     assert sniffed([*lines, '12,"0,345"']).numbers.text("1,234") == "1.234"
@@ -47,28 +48,26 @@ def test_commas_that_may_set_thousands_apart_are_refused_where_they_separate_cel
 
 @pytest.mark.parametrize("lines", [[], ["only words here", "and here"], ["1.5", "2.5"]])
 def test_no_table_is_refused(lines: list[str]):
-    with pytest.raises(MeasurementError, match="table with one measurement per line"):
+    with refused(MeasurementError, file="a.csv", line=None):
         sniffed(lines)
 
 
 @pytest.mark.parametrize(
-    "lines",
+    ("lines", "column", "value"),
     [
-        ["x;y", "2.104;12", "3.210;800", "951;1.200"],
-        ["x;y", "2,104;12", "3,210;800", "951;1,200"],
-        ["q1;x;y", "170;2.104;3.200", "30;1.950;1.100"],
-        ["q1;x;y", "170;22.104;300", "30;21.950;1100"],
-        ["q1;x;y", "17.5;1.104;300", "30.25;950;1100"],
+        (["x;y", "2.104;12", "3.210;800", "951;1.200"], 1, "2.104"),
+        (["x;y", "2,104;12", "3,210;800", "951;1,200"], 1, "2,104"),
+        (["q1;x;y", "170;2.104;3.200", "30;1.950;1.100"], 2, "2.104"),
+        (["q1;x;y", "170;22.104;300", "30;21.950;1100"], 2, "22.104"),
+        (["q1;x;y", "17.5;1.104;300", "30.25;950;1100"], 2, "1.104"),
     ],
 )
-def test_groups_of_thousands_that_may_be_decimals_are_refused_with_line_and_column(lines: list[str]):
-    with pytest.raises(
-        MeasurementError, match=r"a\.csv, line 2, column [12]: '.*' may have decimals or a group"
-    ):
+def test_groups_of_thousands_that_may_be_decimals_are_refused(lines: list[str], column: int, value: str):
+    with refused(MeasurementError, file="a.csv", line=2, column=column, value=value):
         sniffed(lines)
     assert sniffed(lines, ".").numbers.decimal == "."
 
 
-def test_numbers_of_points_do_not_make_three_decimals_doubtful():
+def test_numbers_of_points_do_not_make_three_decimals_ambiguous():
     assert sniffed(["n;x;y", "1;2.104;3.200", "2;1.950;1.100", "3;1.1;2.5"]).numbers.decimal == "."
     assert sniffed(["n;x;y", "7;2.104;3.200", "8;1.950;1.100"]).numbers.decimal == "."

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-import pytest
+from testing.refusals import refused
 
 from pisigma.files.errors import MeasurementError
 from pisigma.measurement.foreign.export_file import ExportFile, read_export
@@ -40,11 +40,12 @@ def test_headings_that_come_again_and_blanks_before_units(tmp_path: Path):
 
 
 def test_a_row_of_another_width_is_refused(tmp_path: Path):
-    with pytest.raises(MeasurementError, match="line 3: 2 cells, but the other rows have 3"):
+    with refused(MeasurementError, line=3, value=2):
         read(tmp_path, "a,b,c\n1,2,3\n4,5\n6,7,8\n")
-    with pytest.raises(MeasurementError, match="export decimal points, or semicolons between cells"):
+    with refused(MeasurementError, line=1, value=3) as caught:
         read(tmp_path, "q1_deg,x_mm,y_mm\n1,5,2,5,3,5\n2,5,3,5,4,5\n")
-    with pytest.raises(MeasurementError, match="line 1: expected 3 headings as the rows have 3 cells, got 4"):
+    assert "semicolons" in caught.value.remedy
+    with refused(MeasurementError, line=1, value=4):
         read(tmp_path, "j1,j2,x,y\n1,2,3\n4,5,6\n")
 
 

@@ -1,8 +1,9 @@
-"""Which columns are what: by headings, by order, as stated; units that are lacking or do not fit."""
+"""Quantities of columns by headings, by order, as stated; units that are missing or do not fit."""
 
 from pathlib import Path
 
 import pytest
+from testing.refusals import assert_fields, refused
 
 from pisigma.files.errors import MeasurementError
 from pisigma.measurement.foreign.conversion import convert
@@ -24,10 +25,10 @@ def targets(mapping: FileMapping) -> list[str]:
     return [column.target.text for column in mapping.columns]
 
 
-def refusal(tmp_path: Path, text: str, *stated: object, **units: str) -> str:
-    with pytest.raises(MeasurementError) as problem:
+def refusal(tmp_path: Path, text: str, *stated: object, **units: str) -> MeasurementError:
+    with refused(MeasurementError) as problem:
         convert(mapped(tmp_path, text, *stated, **units))
-    return str(problem.value)
+    return problem.value
 
 
 DEGREES_MM = [*(f"q{i}_deg" for i in range(1, 7)), "x_mm", "y_mm", "z_mm"]
@@ -55,31 +56,33 @@ def test_headings(tmp_path: Path, header: str):
 
 def test_units_that_the_file_does_not_state(tmp_path: Path):
     generic = f"j1,j2,j3,j4,j5,j6,x,y,z\n{ROW}\n"
-    assert "state it, --unit mm,deg if that is right, or --map 'j1=q1_deg'" in refusal(tmp_path, generic)
+    problem = refusal(tmp_path, generic)
+    assert_fields(problem, option="--unit", line=1, column="j1", value="mm,deg")
+    assert "'j1=q1_deg'" in problem.remedy
     assert targets(mapped(tmp_path, generic, length="mm", angle="deg")) == DEGREES_MM
-    assert "says mm" in refusal(tmp_path, f"// units m\n{generic}", length="mm")
-    assert "--unit m,rad if that is right, or --map 'j1=q1_rad'" in refusal(
-        tmp_path, "j1,j2,x,y,z\n1.5,-2.5,0.5,1.2,3\n1.6,-2.6,0.6,1.2,3\n"
-    )
+    problem = refusal(tmp_path, f"// units m\n{generic}", length="mm")
+    assert_fields(problem, option="--unit", value="mm")
+    problem = refusal(tmp_path, "j1,j2,x,y,z\n1.5,-2.5,0.5,1.2,3\n1.6,-2.6,0.6,1.2,3\n")
+    assert_fields(problem, option="--unit", value="m,rad")
+    assert "'j1=q1_rad'" in problem.remedy
     small = "A1,A2,A3,A4,A5,A6,X,Y,Z\n1,-2,0.5,1,2,3,1.2,-0.3,0.4\n"
-    assert "no unit is stated of the columns 'A1'" in refusal(tmp_path, small)  # may as well be rad and m
+    # they may as well be rad and m
+    assert_fields(refusal(tmp_path, small), option="--unit", column="A1")
 
 
 def test_a_unit_in_a_heading_that_is_unknown_or_does_not_fit(tmp_path: Path):
     furlongs = ROW.join(("q1_deg,q2_deg,q3_deg,q4_deg,q5_deg,q6_deg,X [furlong],Y [mm],Z [mm]\n", "\n"))
-    assert "'X [furlong]'" in refusal(tmp_path, furlongs, length="mm")
+    assert_fields(refusal(tmp_path, furlongs, length="mm"), option="--unit", column="X [furlong]")
     assert targets(mapped(tmp_path, furlongs.replace("furlong", "deg")))[6] == "-"
-    assert "--map says mm, but the file says m" in refusal(
-        tmp_path, furlongs.replace("furlong", "m"), {"X [m]": "x_mm"}
-    )
+    problem = refusal(tmp_path, furlongs.replace("furlong", "m"), {"X [m]": "x_mm"})
+    assert_fields(problem, option="--map", column="X [m]", value="mm")
 
 
 def test_a_position_is_in_one_unit(tmp_path: Path):
     text = "j1 [deg],j2 [deg],X [m],Y [mm],Z [mm]\n1,2,3,4,5\n"
-    assert "'X [m]' is in m, but 'Y [mm]' in mm" in refusal(tmp_path, text)
-    assert "'j1 [deg]' is in deg, but 'j2 [rad]' in rad" in refusal(
-        tmp_path, text.replace("j2 [deg]", "j2 [rad]").replace("[m]", "[mm]")
-    )
+    assert_fields(refusal(tmp_path, text), line=1, column="Y [mm]", value="mm")
+    angles = text.replace("j2 [deg]", "j2 [rad]").replace("[m]", "[mm]")
+    assert_fields(refusal(tmp_path, angles), line=1, column="j2 [rad]", value="rad")
 
 
 def test_stated_columns(tmp_path: Path):
@@ -88,9 +91,10 @@ def test_stated_columns(tmp_path: Path):
     mapping = mapped(tmp_path, text, stated)
     assert targets(mapping) == [*DEGREES_MM, "-"]
     assert all(column.is_stated for column in mapping.columns)
-    with pytest.raises(MeasurementError, match="'q1_degg' is unknown; did you mean 'q1_deg'"):
+    with refused(MeasurementError, option="--map", value="q1_degg") as caught:
         mapped(tmp_path, text, {"a": "q1_degg"})
-    assert "are both q1" in refusal(tmp_path, text, stated | {"2": "q1_deg"})
+    assert "'q1_deg'" in caught.value.remedy
+    assert_fields(refusal(tmp_path, text, stated | {"2": "q1_deg"}), line=1, value="q1")
 
 
 @pytest.mark.parametrize(
@@ -101,7 +105,7 @@ def test_stated_columns(tmp_path: Path):
         {"A6": "q6_deg", "Y": "y_mm", "Z": "z_mm"},
     ],
 )
-def test_the_rest_is_proposed_beside_stated_columns(tmp_path: Path, stated: dict[str, str]):
+def test_other_columns_are_proposed_with_stated_ones(tmp_path: Path, stated: dict[str, str]):
     text = f"A1,A2,A3,A4,A5,A6,X,Y,Z,note\n{ROW},warm\n{ROW},\n"
     assert targets(mapped(tmp_path, text, stated, length="mm", angle="deg")) == [*DEGREES_MM, "-"]
     from_zero = text.replace("A1,A2,A3,A4,A5,A6", "axis0,axis1,axis2,axis3,axis4,axis5")
@@ -109,9 +113,11 @@ def test_the_rest_is_proposed_beside_stated_columns(tmp_path: Path, stated: dict
     assert targets(mapping) == [*DEGREES_MM, "-"]
 
 
-def test_equal_headings_are_told_apart_by_their_numbers(tmp_path: Path):
+def test_equal_headings_are_distinguished_by_their_numbers(tmp_path: Path):
     text = "j1 [deg],j2 [deg],X [mm],Y [mm],Z [mm],X [mm]\n1,2,3,4,5,6\n"
-    assert "such as --map '3=-'" in refusal(tmp_path, text)
+    problem = refusal(tmp_path, text)
+    assert_fields(problem, column="X [mm]", value="x")
+    assert "'3=-'" in problem.remedy
     assert targets(mapped(tmp_path, text, {"3": "-"}))[2:] == ["-", "y_mm", "z_mm", "x_mm"]
 
 
@@ -120,7 +126,7 @@ def test_a_name_is_a_better_point_than_a_number(tmp_path: Path):
     assert targets(mapped(tmp_path, text))[:2] == ["-", "point"]
 
 
-def test_what_was_commanded_is_no_measurement(tmp_path: Path):
+def test_commanded_values_are_not_measurements(tmp_path: Path):
     header = "j1 [deg],j2 [deg],x nom [mm],y nom [mm],z nom [mm],x [mm],y [mm],z [mm]"
     assert targets(mapped(tmp_path, f"{header}\n1,2,3,4,5,6,7,8\n"))[2:] == [
         "-",
@@ -153,13 +159,13 @@ def test_files_without_headings(tmp_path: Path, joints: int):
     assert targets(mapped(tmp_path, counted)) == ["point", *names]
     with_quaternion = "\n".join(f"{row} 1 0 0 0" for row in rows)
     assert targets(mapped(tmp_path, with_quaternion, rotation="abb")) == [*names, "qw", "qx", "qy", "qz"]
-    with pytest.raises(MeasurementError, match="say what they are by their numbers"):
+    with refused(MeasurementError, value=f"{joints + 7} columns without headings"):
         mapped(tmp_path, with_quaternion)
 
 
-def test_rotations_that_several_makers_write_so(tmp_path: Path):
+def test_rotations_of_several_makers(tmp_path: Path):
     text = "J1 [deg],J2 [deg],X [mm],Y [mm],Z [mm],A [deg],B [deg],C [deg]\n1,2,3,4,5,6,7,8\n"
-    assert "state --rotation kuka, mitsubishi, doosan, or none" in refusal(tmp_path, text)
+    assert_fields(refusal(tmp_path, text), option="--rotation", value="kuka, mitsubishi, doosan")
     assert targets(mapped(tmp_path, text, rotation="mitsubishi"))[5:] == ["yaw_deg", "pitch_deg", "roll_deg"]
     assert targets(mapped(tmp_path, text, rotation="none"))[5:] == ["-", "-", "-"]
     assert targets(mapped(tmp_path, text.replace("J", "A"), length="mm"))[5:] == [
@@ -167,33 +173,33 @@ def test_rotations_that_several_makers_write_so(tmp_path: Path):
         "pitch_deg",
         "yaw_deg",
     ]
-    with pytest.raises(MeasurementError, match="did you mean 'kuka'"):
+    with refused(MeasurementError, option="--rotation", value="kuca") as caught:
         mapped(tmp_path, text, rotation="kuca")
+    assert "'kuka'" in caught.value.remedy
 
 
-def test_rows_that_are_no_rotation_are_named(tmp_path: Path):
+def test_rows_that_are_not_a_rotation_are_refused(tmp_path: Path):
     names = ",".join(f"r{i}{k}" for i in (1, 2, 3) for k in (1, 2, 3))
     text = f"q1_deg,q2_deg,x_mm,y_mm,z_mm,{names}\n1,2,3,4,5,1,0,0,0,1,0,0,0,1\n1,2,3,4,5,1,0,0,0,1,0,0,0,2\n"
-    assert "line 3, columns 'r11'" in refusal(tmp_path, text)
+    assert_fields(refusal(tmp_path, text), line=3, column="r11", value="1, 0, 0, 0, 1, 0, 0, 0, 2")
     rows = convert(mapped(tmp_path, text.replace("1,0,0,0,1,0,0,0,2", ",,,,,,,,")))
     assert rows.cells["qw"] == ("1.0", "")
 
 
-def test_cells_that_are_no_numbers_are_named(tmp_path: Path):
+def test_cells_that_are_not_numbers_are_refused(tmp_path: Path):
     text = f"A1,A2,A3,A4,A5,A6,X,Y,Z\n{ROW}\n{ROW}\n{ROW.replace('30.5', '30.5.1')}\n"
-    assert "line 4, column 'A3': '30.5.1' is no number with a decimal point" in refusal(tmp_path, text)
+    assert_fields(refusal(tmp_path, text), line=4, column="A3", value="30.5.1")
 
 
 def test_doubts_about_units_and_external_axes(tmp_path: Path):
     rows = "".join(f"{170 - i},-20,{i}.5,1200.5,{i},400\n" for i in range(8))
     found = doubts(mapped(tmp_path, f"J1 [rad],J2 [rad],E1 [mm],X [m],Y [m],Z [m]\n{rows}"))
     assert len(found) == 3
-    assert "line 1, column 'E1 [mm]': it moves from 0.5 to 7.5" in found[0]
-    assert (
-        "line 2, column 'J1 [rad]': the joint values have values up to 170 rad, which look like degrees"
-        in found[1]
-    )
-    assert "values up to 1200.5 m, which look like millimetres" in found[2]
+    assert "line 1, column 'E1 [mm]': " in found[0]
+    assert " 0.5 to 7.5 " in found[0]
+    assert "line 2, column 'J1 [rad]': " in found[1]
+    assert " 170 rad" in found[1]
+    assert " 1200.5 m" in found[2]
     assert not doubts(mapped(tmp_path, f"J1 [deg],J2 [deg],-,X [mm],Y [mm],Z [mm]\n{rows}"))
 
 
@@ -206,7 +212,7 @@ def test_doubts_about_units_and_external_axes(tmp_path: Path):
         ("target", "aa", "target"),
     ],
 )
-def test_a_name_of_its_own_in_every_row_is_that_of_the_point(tmp_path: Path, heading, cells, target):
+def test_different_names_in_all_rows_are_those_of_points(tmp_path: Path, heading, cells, target):
     rows = "\n".join(f"{cell},{ROW}" for cell in cells)
     assert targets(mapped(tmp_path, f"{heading},{','.join(DEGREES_MM)}\n{rows}"))[0] == target
 
@@ -237,7 +243,7 @@ def test_of_two_stated_coordinates_the_third_is_proposed(tmp_path: Path, heading
 @pytest.mark.parametrize(
     "stated", [{"7": "x_mm", "8": "y_mm"}, {"7": "x_mm", "9": "z_mm"}, {"2": "q2_deg"}, {"10": "-"}]
 )
-def test_without_headings_the_rest_follows_the_order(tmp_path: Path, stated: dict[str, str]):
+def test_without_headings_other_columns_follow_the_order(tmp_path: Path, stated: dict[str, str]):
     more = [",0.1", ",0.3"] if "10" in stated else ["", ""]
     text = "".join(f"{ROW}{end}\n" for end in more)
     assert targets(mapped(tmp_path, text, stated, length="mm", angle="deg"))[:9] == DEGREES_MM

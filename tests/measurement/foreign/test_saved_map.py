@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-import pytest
+from testing.refusals import refused
 
 from pisigma.files.errors import MeasurementError
 from pisigma.measurement.foreign.saved_map import check_used, map_for, parse_map
@@ -11,9 +11,9 @@ from pisigma.measurement.foreign.saved_map import check_used, map_for, parse_map
 def test_mappings_of_a_command_line():
     assert parse_map("A1=q1_deg, X [mm] =x_mm,note=-") == ({"A1": "q1_deg", "X [mm]": "x_mm", "note": "-"},)
     assert parse_map("X, measured=x_mm,a=b=point") == ({"X, measured": "x_mm", "a=b": "point"},)
-    with pytest.raises(MeasurementError, match="HEADING=COLUMN was wanted"):
+    with refused(MeasurementError, option="--map", value="A1=q1_deg,X"):
         parse_map("A1=q1_deg,X")
-    with pytest.raises(MeasurementError, match=r"--map A1: HEADING=COLUMN was wanted, .* no such file"):
+    with refused(MeasurementError, option="--map", value="A1"):
         parse_map("A1")
 
 
@@ -25,11 +25,12 @@ def test_mappings_of_a_file(tmp_path: Path):
     assert map_for(maps, ("A1", "X", "more")) == maps[0]
     assert map_for(maps, ("other",)) == {}
     path.write_text("columns: {}\n")
-    with pytest.raises(MeasurementError, match="unknown key 'columns'"):
+    with refused(MeasurementError, file=path, line=1, column="columns"):
         parse_map(str(path))
 
 
 def test_a_heading_that_no_file_has_is_refused():
     check_used(({"1": "q1_deg", "X": "x_mm"},), [("X", "Y")])
-    with pytest.raises(MeasurementError, match="no file has such a column; the columns are 'X', 'Y'"):
+    with refused(MeasurementError, option="--map", value="A1") as caught:
         check_used(({"A1": "q1_deg"},), [("X", "Y")])
+    assert "'X', 'Y'" in caught.value.remedy

@@ -1,6 +1,7 @@
 """Encodings that nobody states."""
 
 import pytest
+from testing.refusals import refused
 
 from pisigma.files.errors import MeasurementError
 from pisigma.measurement.foreign.export_file import decoded
@@ -16,15 +17,15 @@ def test_texts_come_back(encoding: str):
 
 
 @pytest.mark.parametrize(
-    ("content", "said"),
+    ("content", "value"),
     [
-        (b"PK\x03\x04abc", "workbook"),
-        (b"%PDF-1.7", "PDF"),
-        (b"\x1f\x8b\x08", "unpack"),
-        (b"a\x00b\x01\x02", "is no text"),
-        (b"\xff\xfea", "is no text"),
+        (b"PK\x03\x04abc", "a workbook or an archive"),
+        (b"%PDF-1.7", "a PDF"),
+        (b"\x1f\x8b\x08", "a compressed file"),
+        (b"a\x00b\x01\x02", None),
+        (b"\xff\xfea", None),
     ],
 )
-def test_what_is_no_text_is_refused(content: bytes, said: str):
-    with pytest.raises(MeasurementError, match=said):
+def test_binary_files_are_refused(content: bytes, value: str | None):
+    with refused(MeasurementError, file="a.csv", value=value):
         decoded(content, "a.csv")

@@ -3,6 +3,7 @@
 import math
 
 import pytest
+from testing.refusals import refused
 
 from pisigma.files.errors import MeasurementError
 from pisigma.measurement.foreign.units import (
@@ -68,9 +69,10 @@ def test_units_of_comments(comment: str, units: dict[str, str]):
 
 def test_stated_units():
     assert parse_units("mm,deg") == {"length": "mm", "angle": "deg"}
-    with pytest.raises(MeasurementError, match="did you mean"):
+    with refused(MeasurementError, option="--unit", value="mn") as caught:
         parse_units("mn")
-    with pytest.raises(MeasurementError, match="two units of length"):
+    assert "'m'" in caught.value.remedy
+    with refused(MeasurementError, option="--unit", value="mm,m"):
         parse_units("mm,m")
 
 
