@@ -1,4 +1,4 @@
-"""The documentation says what is there: commands, snippets, links, figures, columns, recipe keys."""
+"""The documentation agrees with the code: commands, snippets, links, figures, columns, recipe keys."""
 
 import importlib.util
 import json
@@ -24,7 +24,7 @@ ROOT = Path(__file__).parent.parent
 DOCS = ROOT / "docs"
 PAGES = sorted(DOCS.rglob("*.md"))
 LARGEST_FIGURE = 150_000
-"""Bytes."""
+"""Maximum size of a figure [bytes]."""
 
 
 def _name(page: Path) -> str:
@@ -49,7 +49,7 @@ def _hook(name: str) -> ModuleType:
 
 
 def _command_lines() -> list[tuple[str, tuple[str, ...]]]:
-    """Every line of a bash block that calls pisigma, as words; what follows `||` or `&&` is not looked at."""
+    """Return every line of a bash block that calls pisigma, as words; text after `||` or `&&` is ignored."""
     found = []
     for page in PAGES:
         for block in re.findall(r"^```bash\n(.*?)^```", _text(page), flags=re.MULTILINE | re.DOTALL):
@@ -62,7 +62,7 @@ def _command_lines() -> list[tuple[str, tuple[str, ...]]]:
 
 
 def _grouped(words: list[str]) -> tuple[str, ...]:
-    """The words of a call, with those of a command of a group, such as `fleet run`, as one."""
+    """Return the words of a call, with a command of a group, such as `fleet run`, as one word."""
     return (" ".join(words[:2]), *words[2:]) if words[0] in GROUPS else tuple(words)
 
 
@@ -129,12 +129,12 @@ for page in sys.argv[1:]:
 os.chdir(sys.path[0])
 print("\\n" + json.dumps(faults))
 """
-"""Runs every page's snippets, a folder each; one process for all, as most of the time goes into imports."""
+"""Program that runs the snippets of every page in a separate folder; one process, as imports take most of the time."""
 
 
 @pytest.fixture(scope="module")
 def faults(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
-    """Tracebacks of the pages whose snippets fail, warnings being errors; by the number of the page."""
+    """Return tracebacks of the pages with failing snippets, with warnings as errors, by the number of the page."""
     folder = tmp_path_factory.mktemp("snippets")
     (folder / "run_all.py").write_text(RUN_ALL)
     for number, page in enumerate(RUNNABLE):
@@ -156,7 +156,7 @@ def faults(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
 
 @pytest.mark.parametrize("page", RUNNABLE, ids=_name)
 def test_snippets_that_are_marked_run(page: Path, faults: dict[str, str]) -> None:
-    """All of a page together, as a reader runs it."""
+    """Run all snippets of a page together, as a reader does."""
     fault = faults.get(str(RUNNABLE.index(page)))
     assert fault is None, f"{_name(page)}: {fault}"
 
@@ -169,7 +169,7 @@ def test_python_blocks_are_python(page: Path) -> None:
 
 
 def _anchors(page: Path) -> set[str]:
-    """As Python-Markdown makes them of headings."""
+    """Return the anchors that Python-Markdown makes of headings."""
     found = set()
     for title in re.findall(r"^#+ (.+)$", _without_blocks(_text(page)), flags=re.MULTILINE):
         plain = re.sub(r"[^\w\s-]", "", title.replace("`", "")).strip().lower()
@@ -178,7 +178,7 @@ def _anchors(page: Path) -> set[str]:
 
 
 @pytest.mark.parametrize("page", PAGES, ids=_name)
-def test_links_lead_somewhere(page: Path) -> None:
+def test_links_have_a_target(page: Path) -> None:
     for target in re.findall(r"\]\(([^)\s]+)\)", _without_blocks(_text(page))):
         file, _, anchor = target.partition("#")
         other = (page.parent / file).resolve() if file else page
@@ -195,13 +195,13 @@ def _entries(nav: object) -> list[str]:
     return [entry for part in inner for entry in _entries(part)]  # type: ignore[attr-defined]
 
 
-def test_navigation_holds_every_page_once() -> None:
+def test_navigation_contains_every_page_once() -> None:
     stated = yaml.safe_load((ROOT / "mkdocs.yml").read_text(encoding="utf-8"))
     entries = _entries(stated["nav"])
     assert sorted(entries) == sorted(_name(page) for page in PAGES)
 
 
-def test_figures_are_small_used_and_have_their_command_beside_them() -> None:
+def test_figures_are_small_used_and_shown_with_their_command() -> None:
     shown = set()
     for page in PAGES:
         parts = _without_blocks(_text(page)).split("\n\n")
@@ -210,11 +210,11 @@ def test_figures_are_small_used_and_have_their_command_beside_them() -> None:
                 path = (page.parent / figure).resolve()
                 shown.add(path)
                 assert path.stat().st_size <= LARGEST_FIGURE, figure
-                assert "`" in part + parts[number + 1], f"{_name(page)}: {figure} has no command beside it"
+                assert "`" in part + parts[number + 1], f"{_name(page)}: {figure} has no command"
     assert shown == {path.resolve() for path in (DOCS / "figures").glob("*.png")}
 
 
-def test_nothing_has_to_be_fetched_and_no_machine_is_named() -> None:
+def test_pages_need_no_network_and_name_no_machine() -> None:
     for path in [*PAGES, *DOCS.rglob("*.py"), *DOCS.rglob("*.css"), ROOT / "mkdocs.yml"]:
         text = path.read_text(encoding="utf-8")
         assert not re.search(r"https?://|\bwww\.", text), path
@@ -232,7 +232,7 @@ def test_the_table_of_columns_is_that_of_the_reader() -> None:
     assert named - joints == {name for name in valid if not re.match(r"q\d", name)}
 
 
-def test_the_cells_that_are_shown_are_some(tmp_path: Path) -> None:
+def test_the_example_cells_show_every_key(tmp_path: Path) -> None:
     blocks = re.findall(r"^```yaml\n(.*?)^```", _text(DOCS / "how-to" / "plan.md"), re.MULTILINE | re.DOTALL)
     shown: set[str] = set()
     for block in blocks:
@@ -264,7 +264,7 @@ def test_every_status_and_every_robot_is_named() -> None:
     assert all(f"`{name}`" in robots for name in catalogue())
 
 
-def test_published_figures_are_those_of_the_runs() -> None:
+def test_published_figures_agree_with_the_runs() -> None:
     page, readme = (
         _text(DOCS / "how-to" / "choose-a-model.md"),
         (ROOT / "README.md").read_text(encoding="utf-8"),
