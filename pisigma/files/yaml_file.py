@@ -288,7 +288,8 @@ def _error_at(
         return error(f"unknown key '{keys[-1]}'", value=keys[-1], at=at, remedy=hint)
     if finding["type"] == "missing":
         at = Place(source, line, _dotted((*keys, path[-1])))
-        return error(f"the key '{path[-1]}' is missing", expected="a value", at=at, remedy="add it")
+        what = "an entry of the list" if isinstance(path[-1], int) else f"the key '{path[-1]}'"
+        return error(f"{what} is missing", expected="a value", at=at, remedy="add it")
     if finding["type"].startswith("union_tag"):
         tag = str(context["discriminator"]).strip("'()")
         path = (*path, tag)
@@ -299,6 +300,8 @@ def _error_at(
         line, keys = _locate(node, path)
         value = context["tag"]
     at = Place(source, line, _dotted(keys) or None)
+    if isinstance(cause := context.get("error"), PisigmaError):
+        return cause.located(at, error)
     if finding["type"] in ("union_tag_invalid", "literal_error") and (texts := allowed_texts(document, path)):
         return error(f"unknown value '{value}'", value=value, at=at, remedy=nearest_choice(str(value), texts))
     value = value if isinstance(value, str | int | float) else None

@@ -1,6 +1,6 @@
-"""What a robot is: its description, its file and the catalogue; where it goes: kinematics and kernels.
+"""Robot descriptions, robot files, the catalogue, and kinematics in torch and in compiled kernels.
 
-Names are loaded on first use, so that kernels are without torch; `__init__.pyi` tells them to type checkers.
+Names are loaded on first use, so that kernels do not import torch; `__init__.pyi` declares them to type checkers.
 """
 
 from pisigma.files.lazy_names import lazily

@@ -1,4 +1,4 @@
-"""Robots as chains of joints and back, whatever rows they are written down with."""
+"""Convert robots to joint frames and back, independent of the DH convention of their rows."""
 
 from dataclasses import replace
 
@@ -11,10 +11,10 @@ from pisigma.robot.urdf_rows import NEARLY_PARALLEL, rows_of_chain
 
 
 def joint_origins(robot: Robot) -> tuple[list[Frame], Frame]:
-    """Frames of the joints at zero, each in that of the joint before, and what is behind the last one.
+    """Return the frames of the joints at zero, each in that of the joint before, and the transform after the last one.
 
-    A joint stands where its row has it after `RotZ(theta) · Trans(0, 0, d)` and turns about or slides along its z axis,
-    against it where its direction is -1. Base and tool are left out.
+    The frame of a joint is that of its row after `RotZ(theta) · Trans(0, 0, d)`. The joint moves about or along its z
+    axis, in the opposite sense if its direction is -1. Base and tool are not included.
     """
     origins, behind = [], np.eye(4)
     for row, (theta, d, a, alpha, beta) in zip(robot.rows, robot.dh.tolist(), strict=True):
@@ -29,16 +29,16 @@ def joint_origins(robot: Robot) -> tuple[list[Frame], Frame]:
 def robot_of_origins(
     like: Robot, origins: list[Frame], end: Frame, nearly_parallel: float = NEARLY_PARALLEL
 ) -> Robot:
-    """The robot whose joints stand at these frames, with base, tool, names and limits of another.
+    """Return the robot with these joint frames, and base, tool, names and limits of another robot.
 
     Args:
-        like: the other robot, with as many joints that move.
-        origins: as `joint_origins` gives them.
-        end: what is behind the last joint, before the tool.
+        like: the other robot, with the same number of joints.
+        origins: joint frames as returned by `joint_origins`.
+        end: transform from the last joint to the frame that the tool is attached to.
         nearly_parallel: see `rows_of_chain`.
 
     Returns:
-        The robot with one row a joint, of DH parameters or, between nearly parallel axes, Hayati's.
+        A robot with one row per joint, in DH parameters or, between nearly parallel axes, Hayati's.
     """
     joints = tuple(
         ChainJoint(
@@ -58,5 +58,5 @@ def robot_of_origins(
 
 
 def in_few_rows(robot: Robot) -> Robot:
-    """The same robot with one row a joint and no length larger than it is: nearly parallel axes take Hayati's rows."""
+    """Return the same robot with one row per joint and no inflated lengths: nearly parallel axes get Hayati's rows."""
     return robot_of_origins(robot, *joint_origins(robot))

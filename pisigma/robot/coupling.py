@@ -1,9 +1,10 @@
-"""How the joints of the DH rows follow what a controller counts: the only file that maps one to the other.
+"""Conversion between the controller's values and the joint values of the DH rows; no other file converts them.
 
     q_dh = f(C · q_controller + b)
 
-C and b are written in the robot's file. f is the identity, except for joints that a four-bar linkage drives.
-Files, answers of the inverse kinematics and programs hold the controller's values; everything else holds DH values.
+The robot's file states C and b. f is the identity, except for joints that are driven by a four-bar linkage.
+Files, results of the inverse kinematics and robot programs contain the controller's values; everything else uses DH
+values.
 """
 
 import itertools
@@ -18,24 +19,24 @@ from jaxtyping import Bool, Float, Float64
 from pisigma.files.errors import PoseError, RobotError
 from pisigma.robot.row import Row
 
-SLACK = 1e-9
-"""[rad or m] How far a joint value may lie beyond a limit by rounding."""
+LIMIT_TOLERANCE = 1e-9
+"""Largest excess over a joint limit that is attributed to rounding [rad or m]."""
 
 
 @dataclass(frozen=True)
 class FourBar:
-    """A linkage of a ground, a crank, a coupler and a rocker, whose rocker is the joint.
+    """A four-bar linkage of ground, crank, coupler and rocker; the rocker is the joint.
 
-    The pivot of the crank is the origin and that of the rocker lies at (ground, 0). The crank end P at the angle ψ and
-    the rocker end Q at the angle φ are one coupler length apart (Freudenstein 1955), assembled without crossing. With
-    equal opposite sides it is a parallelogram, φ = ψ.
+    The pivot of the crank is the origin, that of the rocker is at (ground, 0). The crank end P at the angle ψ and the
+    rocker end Q at the angle φ are one coupler length apart (Freudenstein 1955), in the assembly without crossing. With
+    equal opposite sides the linkage is a parallelogram and φ = ψ.
 
     Attributes:
         ground: distance of the pivots [m].
         crank: length of the driven bar [m].
         coupler: length of the bar between crank and rocker [m].
-        rocker: length of the bar that turns with the joint [m].
-        zero: angle ψ of the crank where `C · q_controller + b` is 0 [rad].
+        rocker: length of the bar that rotates with the joint [m].
+        zero: angle ψ of the crank at `C · q_controller + b` = 0 [rad].
     """
 
     ground: float
@@ -45,15 +46,15 @@ class FourBar:
     zero: float
 
     def follow(self, x: Any) -> Any:
-        """Joint value [rad] at a crank turned by x [rad], 0 where the parallelogram's would be 0."""
+        """Return the joint value [rad] for a crank rotation x [rad]; a parallelogram returns x."""
         return self._other_end(x, self.crank, self.rocker, 1.0)
 
     def drive(self, u: Any) -> Any:
-        """Turn of the crank [rad] at a joint value u [rad]; the inverse of `follow`."""
+        """Return the crank rotation [rad] for a joint value u [rad]; the inverse of `follow`."""
         return self._other_end(u, self.rocker, self.crank, -1.0)
 
     def length_slopes(self, x: Any) -> tuple[Any, Any, Any]:
-        """Derivatives of `follow` by crank, coupler and rocker, each times the length itself [rad]."""
+        """Return the derivatives of `follow` with respect to crank, coupler and rocker, each times its length [rad]."""
         step, result = 1e-5, []
         for name in ("crank", "coupler", "rocker"):
             length = getattr(self, name)
@@ -63,7 +64,7 @@ class FourBar:
         return first, second, third
 
     def _other_end(self, turn: Any, length: float, other: float, side: float) -> Any:
-        """Turn of the bar at the other pivot, which is `side · ground` along x."""
+        """Return the rotation of the bar at the other pivot, which is at `side · ground` along x."""
         xp, angle = _functions(turn), turn + self.zero
         x, y = length * xp.cos(angle) - side * self.ground, length * xp.sin(angle)
         square = x * x + y * y
@@ -75,17 +76,17 @@ class FourBar:
 
 @dataclass(frozen=True, eq=False)
 class Coupling:
-    """What the controller commands, and how the joints of the DH rows follow.
+    """Axes of the controller, and the relation of the joints of the DH rows to them.
 
     Attributes:
-        axes: what the controller commands, with the limits of its values.
-        turning: per joint, whether it turns.
+        axes: axes that the controller commands, with the limits of its values.
+        turning: for every joint, whether it is revolute.
         matrix: `(dof, axes)`: C, [rad or m] of a joint per [rad or m] of an axis.
         offset: `(dof,)`: b [rad or m].
-        four_bars: per joint that a linkage drives, its number and the linkage.
-        driven: `(dof, axes)`: which axes the entry of a coupled joint names, be it with the factor 0; none of a joint
-            without entry.
-        stops: per joint that has mechanical limits beside those of the axes, its number and these [rad or m].
+        driven: `(dof, axes)`: which axes the file's entry of a coupled joint names, possibly with the factor 0; all
+            False for a joint without an entry.
+        four_bars: index and linkage of every joint that is driven by a linkage.
+        stops: index and mechanical limits [rad or m] of every joint that has its own in addition to those of the axes.
     """
 
     axes: tuple[Row, ...]
@@ -97,17 +98,21 @@ class Coupling:
     stops: tuple[tuple[int, tuple[float, float]], ...] = ()
 
     def __post_init__(self) -> None:
-        """Check that every axis can be told from the joints."""
-        if np.linalg.matrix_rank(self.matrix) < len(self.axes):
+        """Check that the joint values determine all axes."""
+        rank = int(np.linalg.matrix_rank(self.matrix))
+        if rank < len(self.axes):
             names = ", ".join(axis.name for axis in self.axes)
             raise RobotError(
-                f"coupling: different values of the axes {names} give the same pose, since their factors depend on "
-                "each other; correct the factors."
+                f"the factors of the axes {names} are linearly dependent, so different values give the same pose",
+                expected=f"rank {len(self.axes)}",
+                value=rank,
+                option="coupling",
+                remedy="correct the factors",
             )
 
     @property
     def passive(self) -> bool:
-        """Whether there are joints that follow the others and that no axis of the controller moves alone."""
+        """Whether there are more joints than axes, so that some joints only follow others."""
         return len(self.matrix) > len(self.axes)
 
     @property
@@ -116,7 +121,7 @@ class Coupling:
         return np.array([[axis.lower, axis.upper] for axis in self.axes])
 
     def to_dh(self, q: Any) -> Any:
-        """DH values `(*batch, dof)` at the controller's values `(*batch, axes)`, both [rad or m]; arrays or tensors.
+        """Convert the controller's values `(*batch, axes)` to DH values `(*batch, dof)`, arrays or tensors [rad or m].
 
         Raises:
             PoseError: there are more or fewer values than axes.
@@ -124,15 +129,15 @@ class Coupling:
         return self._by_four_bars(_times(q, self.matrix) + _like(q, self.offset), FourBar.follow)
 
     def to_controller(self, q: Any) -> Any:
-        """The controller's values `(*batch, axes)` at DH values `(*batch, dof)`; the inverse of `to_dh`.
+        """Convert DH values `(*batch, dof)` to the controller's values `(*batch, axes)`; the inverse of `to_dh`.
 
-        Where there are passive joints it is the least-squares solution.
+        With passive joints this is the least-squares solution.
         """
         driven = self._by_four_bars(q, FourBar.drive) - _like(q, self.offset)
         return _times(driven, np.linalg.pinv(self.matrix))
 
     def slope(self, q: Any) -> Any:
-        """Derivative of `to_dh` by the controller's values, `(*batch, dof, axes)`."""
+        """Return the derivative of `to_dh` with respect to the controller's values, `(*batch, dof, axes)`."""
         slope = np.broadcast_to(self.matrix, (*np.shape(q)[:-1], *self.matrix.shape)).copy()
         step = 1e-6
         for joint, bar in self.four_bars:
@@ -141,32 +146,34 @@ class Coupling:
         return slope
 
     def approach_to_dh(self, approach: Any) -> Any:
-        """From which side the joints come, +1 or -1, where the sides of all axes that move them agree, else 0."""
+        """Convert approach directions of axes to those of joints: +1 or -1 if all axes of a joint agree, else 0."""
         return _sides(approach, np.sign(self.matrix))
 
     def approach_to_controller(self, approach: Any) -> Any:
-        """From which side the axes come, where those of the joints say it; else 0."""
+        """Convert approach directions of joints to those of axes: +1 or -1 where the joints determine it, else 0."""
         return _sides(approach, np.sign(np.round(np.linalg.pinv(self.matrix), 12)))
 
     def is_inside(self, q: Float[np.ndarray, "*batch dof"]) -> Bool[np.ndarray, "*batch"]:
-        """Whether DH values are within the stops, and the controller's there within its limits; NaN is not."""
+        """Return whether DH values are within the stops and the controller's values within its limits; NaN is not."""
         values, (lower, upper) = self.to_controller(q), self.limits.T
-        inside = ((values >= lower - SLACK) & (values <= upper + SLACK)).all(-1)
+        inside = ((values >= lower - LIMIT_TOLERANCE) & (values <= upper + LIMIT_TOLERANCE)).all(-1)
         for joint, (least, most) in self.stops:
-            inside &= (q[..., joint] >= least - SLACK) & (q[..., joint] <= most + SLACK)
+            inside &= (q[..., joint] >= least - LIMIT_TOLERANCE) & (q[..., joint] <= most + LIMIT_TOLERANCE)
         return np.asarray(inside)
 
-    def turned_inside(
+    def wrapped_inside(
         self, q: Float64[np.ndarray, "rows dof"], near: Float64[np.ndarray, "#rows dof"] | None = None
     ) -> tuple[Float64[np.ndarray, "rows dof"], Bool[np.ndarray, " rows"]]:
-        """Turn joints by full turns so that the controller's values come into its limits, and near to others.
+        """Shift coupled joints by full turns so that the controller's values are within its limits.
 
         Args:
             q: DH values [rad or m].
-            near: DH values to come near to, as far as the limits allow; None turns as little as possible.
+            near: reference values; of the shifts within the limits the one nearest to them is taken. None: the smallest
+                shift.
 
         Returns:
-            The DH values, and whether the controller's are within its limits; others are left as they came.
+            The shifted DH values, and whether the controller's values are within its limits; rows for which no shift
+            achieves that are unchanged.
         """
         turns = 2 * math.pi * self._turns()
         every = q[:, None] + turns
@@ -177,14 +184,14 @@ class Coupling:
         return np.where(reached[:, None], every[np.arange(len(q)), best], q), reached
 
     def _turns(self) -> Float64[np.ndarray, "turns dof"]:
-        """Full turns by -1, 0 or 1 of all joints that are coupled and turn; the others have limits of their own."""
+        """Return all combinations of -1, 0 or 1 full turns of the coupled revolute joints; others have own limits."""
         shared = (self.matrix != 0).sum(0) > 1
         coupled = ((self.matrix != 0).sum(1) > 1) | (self.matrix[:, shared] != 0).any(1)
         choices = [(-1, 0, 1) if both else (0,) for both in np.logical_and(coupled, self.turning).tolist()]
         return np.array(list(itertools.product(*choices)), dtype=np.float64)
 
     def _by_four_bars(self, values: Any, change: Any) -> Any:
-        """The values, those of joints with a linkage changed by it."""
+        """Apply a function of the linkage to the values of the joints that have one."""
         if not self.four_bars:
             return values
         bars = dict(self.four_bars)
@@ -195,7 +202,13 @@ class Coupling:
 
 
 def hull(coupling: Coupling) -> Float64[np.ndarray, "dof 2"]:
-    """Smallest and largest DH value of every joint [rad or m] within the controller's limits; infinite of no range."""
+    """Return the smallest and largest DH value of every joint [rad or m] within the controller's limits.
+
+    The limits are infinite for an unlimited joint and for one whose range is empty.
+
+    Raises:
+        RobotError: a four-bar linkage does not close everywhere within the limits.
+    """
     ends = coupling.matrix[..., None] * np.where(np.isfinite(coupling.limits), coupling.limits, 0.0)
     unbounded = ((coupling.matrix != 0) & ~np.isfinite(coupling.limits).all(1)).any(1)
     lower, upper = ends.min(-1).sum(1) + coupling.offset, ends.max(-1).sum(1) + coupling.offset
@@ -210,21 +223,24 @@ def hull(coupling: Coupling) -> Float64[np.ndarray, "dof 2"]:
 
 
 def _driven(bar: FourBar, turn: np.ndarray, stops: tuple[float, float], joint: int) -> tuple[float, float]:
-    """Smallest and largest value [rad] of a joint that a linkage drives, which has to close all the way between."""
-    with np.errstate(invalid="ignore"):  # complained of below
+    """Return the smallest and largest value [rad] of a joint with a linkage, which has to close everywhere between."""
+    with np.errstate(invalid="ignore"):  # NaN is reported below
         ends = bar.drive(np.array(stops))
         x = np.linspace(np.fmax(turn[0], ends[0]), np.fmin(turn[1], ends[1]), 181)
         u = bar.follow(x)
     if not (np.isfinite(u).all() and (np.diff(np.sign(np.sin(x + bar.zero))) == 0).all()):
         raise RobotError(
-            f"coupling: the four-bar linkage of joint {joint + 1} does not close, or stretches out, at a value within "
-            "the limits; give the joint stops (limits_deg in its entry), or correct its lengths."
+            f"the four-bar linkage of joint {joint + 1} does not close, or is stretched, at a value within the limits",
+            expected="a linkage that closes",
+            value=joint + 1,
+            option="coupling",
+            remedy="give the joint stops (limits_deg in its entry), or correct its lengths",
         )
     return float(u[0]), float(u[-1])
 
 
 def _functions(values: Any) -> Any:
-    """The module whose functions take the values."""
+    """Return the module for functions of the values, numpy or torch."""
     if not hasattr(values, "new_tensor"):
         return np
     import torch
@@ -233,21 +249,24 @@ def _functions(values: Any) -> Any:
 
 
 def _like(values: Any, constants: np.ndarray) -> Any:
-    """Constants as values are: an array, or a tensor of their type on their device."""
+    """Return constants as an array, or as a tensor of the dtype and device of the values."""
     return values.new_tensor(constants) if hasattr(values, "new_tensor") else constants
 
 
 def _times(values: Any, matrix: np.ndarray) -> Any:
-    """`matrix · values` along the last axis; what stands alone stays exactly what it is, NaN included.
+    """Return `matrix · values` along the last axis; a row with a single 1 keeps its value exactly, NaN included.
 
     Raises:
-        PoseError: there are more or fewer values than the matrix takes.
+        PoseError: the last axis of the values does not fit the matrix.
     """
-    shape, wanted = tuple(values.shape), matrix.shape[1]
-    if shape[-1:] != (wanted,):
+    shape, count = tuple(values.shape), matrix.shape[1]
+    if shape[-1:] != (count,):
+        expected = f"{count} values along the last axis"
         raise PoseError(
-            f"coupled joints: {wanted} values were wanted along the last axis, got the shape {shape}; the controller "
-            "counts its axes, and the rows of the description their joints."
+            f"coupled joints: expected {expected}, got the shape {shape}",
+            expected=expected,
+            value=shape,
+            remedy="check whether these are values of the controller's axes or of the DH rows",
         )
     columns: Sequence[Any] = [
         sum(
@@ -264,7 +283,7 @@ def _times(values: Any, matrix: np.ndarray) -> Any:
 
 
 def _sides(approach: Any, signs: np.ndarray) -> Any:
-    """Sides +1 or -1 of what moves by a sum of others, where all of these come from sides that agree, else 0."""
+    """Return the approach direction, +1 or -1, of a sum of moving values if all of them agree, else 0."""
     count = _like(approach, np.abs(signs).sum(1))
     total = _times(approach, signs)
     return (abs(total) == count) * total / count.clip(1)

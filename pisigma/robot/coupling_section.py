@@ -1,4 +1,4 @@
-"""Coupled joints as robot files state them, in millimetres and degrees."""
+"""Coupled joints in robot files, in millimetres and degrees."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -9,20 +9,20 @@ from pydantic import Field
 from pisigma.files.errors import RobotError, nearest_choice
 from pisigma.files.yaml_file import Section
 from pisigma.robot.coupling import Coupling, FourBar, hull
-from pisigma.robot.row import LARGEST, Bounded, Row
+from pisigma.robot.row import MAX_MAGNITUDE, Bounded, Row
 
 
 class FourBarSection(Section):
-    """The lengths of a linkage, and the angle of its crank where factors and offset give 0; see `FourBar`."""
+    """The bar lengths of a linkage, and its crank angle where the sum of factors and offset is 0; see `FourBar`."""
 
-    ground_mm: float = Field(gt=0, le=LARGEST)
-    crank_mm: float = Field(gt=0, le=LARGEST)
-    coupler_mm: float = Field(gt=0, le=LARGEST)
-    rocker_mm: float = Field(gt=0, le=LARGEST)
+    ground_mm: float = Field(gt=0, le=MAX_MAGNITUDE)
+    crank_mm: float = Field(gt=0, le=MAX_MAGNITUDE)
+    coupler_mm: float = Field(gt=0, le=MAX_MAGNITUDE)
+    rocker_mm: float = Field(gt=0, le=MAX_MAGNITUDE)
     zero_deg: Bounded
 
     def to_si(self) -> FourBar:
-        """The linkage in SI units."""
+        """Convert to SI units."""
         lengths = (self.ground_mm, self.crank_mm, self.coupler_mm, self.rocker_mm)
         ground, crank, coupler, rocker = (length / 1e3 for length in lengths)
         return FourBar(ground, crank, coupler, rocker, float(np.deg2rad(self.zero_deg)))
@@ -32,15 +32,15 @@ class CoupledJointSection(Section):
     """How one joint follows the controller's values: `q_dh = f(sum of factor · q_controller + offset)`.
 
     Attributes:
-        joint: name of its row.
-        factors: by name of a row, how far the joint moves for 1 deg (1 mm) of the controller's value of that name, in
-            the joint's own deg (mm); 0 for those that are not named, the joint's own included. What is named, be it
-            with 0, is what the errors of the joint may depend on.
-        offset_deg: of a joint that turns.
-        offset_mm: of a joint that slides.
-        four_bar: the linkage that drives it, if one does.
-        limits_deg: mechanical stops of a joint that turns, which hold besides the limits of the controller's values.
-        limits_mm: the same of a joint that slides.
+        joint: name of the joint's row.
+        factors: motion of the joint [deg or mm] per 1 deg or 1 mm of the controller's value, by row name. Values that
+            are not named, including the joint's own, have the factor 0. The errors of the joint may depend on the named
+            values only, so a value may be named with the factor 0.
+        offset_deg: offset of a revolute joint.
+        offset_mm: offset of a prismatic joint.
+        four_bar: linkage that drives the joint, if any.
+        limits_deg: mechanical stops of a revolute joint, in addition to the limits of the controller's values.
+        limits_mm: mechanical stops of a prismatic joint.
     """
 
     joint: str
@@ -55,17 +55,17 @@ class CoupledJointSection(Section):
 def coupled(
     rows: Sequence[Row], sections: Sequence[CoupledJointSection]
 ) -> tuple[tuple[Row, ...], Coupling | None]:
-    """Give the rows with the limits of their DH values, and how these follow the controller's.
+    """Return the rows with the limits of their DH values, and the coupling of DH values and controller values.
 
-    A joint that no section names is what the controller counts. One that a section names, but of which no section has
-    a factor, is passive: the controller has no value for it.
+    The value of a joint without a section is the controller's. A joint that has a section but no factor in any section
+    is passive: the controller has no value for it.
 
     Args:
-        rows: of the robot, with the limits of the controller's values.
-        sections: as in the file.
+        rows: rows of the robot, with the limits of the controller's values.
+        sections: sections of the file.
 
     Raises:
-        RobotError: a name, unit or factor does not fit; the message says which.
+        RobotError: a name, unit or factor does not fit.
     """
     if not sections:
         return tuple(rows), None
@@ -77,7 +77,11 @@ def coupled(
     for joint in joints:
         if joint not in axes and np.isfinite([joint.lower, joint.upper]).any():
             raise RobotError(
-                f"coupling: the joint '{joint.name}' is passive, so the controller has no limits for it; remove them."
+                f"the joint '{joint.name}' is passive, so the controller has no limits for it",
+                expected="no limits",
+                value=joint.name,
+                option="coupling",
+                remedy="remove the limits",
             )
     plain = [CoupledJointSection(joint=joint.name, factors={joint.name: 1.0}) for joint in joints]
     stated = [by_name.get(section.joint, section) for section in plain]
@@ -100,16 +104,19 @@ def coupled(
 
 
 def _check_names(sections: Sequence[CoupledJointSection], names: Sequence[str]) -> None:
-    """Refuse entries of joints that there are not, or twice."""
+    """Check that every section names existing joints, and that no joint has two sections."""
     for name in (name for section in sections for name in (section.joint, *section.factors)):
         if name not in names:
-            raise RobotError(f"coupling: there is no joint '{name}'; {nearest_choice(name, names)}")
-    if len({section.joint for section in sections}) < len(sections):
-        raise RobotError("coupling: a joint has two entries; join them, one per joint.")
+            remedy = nearest_choice(name, names)
+            raise RobotError(f"there is no joint '{name}'", value=name, option="coupling", remedy=remedy)
+    joints = [section.joint for section in sections]
+    if twice := [name for name in names if joints.count(name) > 1]:
+        problem = f"the joint '{twice[0]}' has two entries"
+        raise RobotError(problem, value=twice[0], option="coupling", remedy="merge them, one per joint")
 
 
 def _factor(section: CoupledJointSection, joint: Row, axis: Row) -> float:
-    """By how many [rad or m] a joint moves per [rad or m] of an axis."""
+    """Return the motion of a joint [rad or m] per [rad or m] of an axis."""
     factor = section.factors.get(axis.name, 0.0)
     return factor if axis.type == joint.type else factor * axis.in_file_unit(1.0) / joint.in_file_unit(1.0)
 
@@ -119,21 +126,28 @@ def _within(row: Row, lower: float, upper: float) -> Row:
 
 
 def _offset(joint: Row, section: CoupledJointSection) -> float:
-    """The offset of a joint [rad or m]."""
-    sliding = joint.type == "prismatic"
-    turning = section.offset_deg, section.limits_deg, section.four_bar
-    length = section.offset_mm, section.limits_mm
-    if any(turning if sliding else length):
+    """Return the offset of a joint [rad or m].
+
+    Raises:
+        RobotError: the section has entries of the other joint type.
+    """
+    is_prismatic = joint.type == "prismatic"
+    of_revolute = section.offset_deg, section.limits_deg, section.four_bar
+    of_prismatic = section.offset_mm, section.limits_mm
+    if any(of_revolute if is_prismatic else of_prismatic):
         unit = joint.file_unit
         raise RobotError(
-            f"coupling: the joint '{joint.name}' is {joint.type}; state offset_{unit} and limits_{unit} and nothing "
-            "that belongs to the other kind."
+            f"the joint '{joint.name}' is {joint.type}, but its entry has keys of the other joint type",
+            expected=f"offset_{unit} and limits_{unit}",
+            value=joint.name,
+            option="coupling",
+            remedy=f"state offset_{unit} and limits_{unit} only",
         )
-    return section.offset_mm / 1e3 if sliding else float(np.deg2rad(section.offset_deg))
+    return section.offset_mm / 1e3 if is_prismatic else float(np.deg2rad(section.offset_deg))
 
 
 def coupling_document(coupling: Coupling, joints: Sequence[Row]) -> list[dict[str, object]]:
-    """The sections that `coupled` makes a coupling of, as plain values."""
+    """Return the sections of a coupling as plain values; the inverse of `coupled`."""
     result: list[dict[str, object]] = []
     bars, stops = dict(coupling.four_bars), dict(coupling.stops)
     for index, (joint, factors) in enumerate(zip(joints, coupling.matrix.tolist(), strict=True)):

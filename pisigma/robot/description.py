@@ -1,4 +1,4 @@
-"""What a robot is: DH + Hayati rows, joints, base and tool, in SI units."""
+"""Robot description: DH and Hayati rows, joints, base and tool, in SI units."""
 
 import math
 import os
@@ -12,34 +12,34 @@ from jaxtyping import Float64
 from pisigma.files.errors import PoseError, RobotError, nearest_choice
 from pisigma.robot.coupling import Coupling
 from pisigma.robot.robot_file import read_robot
-from pisigma.robot.row import LARGEST, MOST_ROWS, JointType, Row
+from pisigma.robot.row import MAX_MAGNITUDE, MAX_ROWS, JointType, Row
 from pisigma.robot.urdf_frames import Frame, frame_of, row_frame, shift, turn
 
 if TYPE_CHECKING:
     import pytorch_kinematics
 
 BASE_FRAME, TOOL_FRAME = "base_link", "tool0"
-"""Names of the first and the last frame of a chain of pytorch-kinematics."""
+"""Names of the first and last frame of a pytorch-kinematics chain."""
 
 
 @dataclass(frozen=True, eq=False)
 class Robot:
     """A serial robot: `T_base_tool(q) = base · A_1(q_1) ... A_n(q_n) · tool`.
 
-    "base" is the frame that poses are given in; `base` maps the frame of the first row into it.
+    Poses are given in the frame "base"; `base` is the pose of the first row's frame in it.
 
     Attributes:
         name: short name, as in the catalogue.
-        maker: who builds it.
-        source: where the figures come from.
+        maker: manufacturer.
+        source: origin of the parameter values.
         rows: joints and fixed rows, from the base to the tool.
         dh: `(rows, 5)`: theta [rad], d [m], a [m], alpha [rad], beta [rad].
         base: x, y, z [m], roll, pitch, yaw [rad] of `Trans(x, y, z) · RotZ(roll) · RotY(pitch) · RotX(yaw)`.
-        tool: the same for the tool behind the last row.
-        coupling: how the joints of the rows follow the controller's values; None where these are the same. Joint values
-            are DH values everywhere but in files, in answers of `CorrectedIK` and where a name or docstring says that
-            they are the controller's.
-        urdf: the content of the URDF file that it was drawn in, for exports; None where it was drawn otherwise.
+        tool: pose of the tool in the frame after the last row, in the same form.
+        coupling: relation between the joint values of the rows (DH values) and the controller's values; None if they
+            are equal. Joint values are DH values everywhere except in files, in results of `CorrectedIK` and where a
+            name or docstring says that they are the controller's.
+        urdf: content of the URDF file that describes the robot, for exports; None if it was not read from one.
     """
 
     name: str
@@ -53,53 +53,47 @@ class Robot:
     urdf: bytes | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
-        """Check that the parts fit together and make the arrays read-only."""
+        """Check that the parts are consistent and make the arrays read-only."""
         robot = f"robot '{self.name}'"
         for name, shape in (("dh", (len(self.rows), 5)), ("base", (6,)), ("tool", (6,))):
             values = np.array(getattr(self, name), dtype=np.float64)
             if values.shape != shape:
-                raise RobotError(f"{robot}: {name} of shape {shape} was wanted, got {values.shape}.")
-            if not (np.abs(values) <= LARGEST / 1e3).all():
                 raise RobotError(
-                    f"{robot}: {name} has an entry that is not finite or over {LARGEST / 1e3:.0e} m or rad; correct it."
+                    f"{robot}: expected {name} of shape {shape}, got {values.shape}",
+                    expected=f"shape {shape}",
+                    value=values.shape,
+                )
+            if not (np.abs(values) <= MAX_MAGNITUDE / 1e3).all():
+                raise RobotError(
+                    f"{robot}: {name} has an entry that is not finite or exceeds {MAX_MAGNITUDE / 1e3:.0e} m or rad",
+                    expected=f"finite values up to {MAX_MAGNITUDE / 1e3:.0e} m or rad",
+                    remedy="correct it",
                 )
             values.setflags(write=False)
             object.__setattr__(self, name, values)
         if self.dof == 0:
-            raise RobotError(f"{robot}: it has no joint that moves; add a revolute or prismatic one.")
+            remedy = "add a revolute or prismatic joint"
+            raise RobotError(f"{robot} has no joint", expected="a joint", remedy=remedy)
         names = [row.name for row in self.rows]
-        if len(names) > MOST_ROWS:
-            raise RobotError(f"{robot}: it has {len(names):,} rows; {MOST_ROWS:,} at most were wanted.")
+        if len(names) > MAX_ROWS:
+            expected = f"at most {MAX_ROWS:,} rows"
+            problem = f"{robot}: expected {expected}, got {len(names):,}"
+            raise RobotError(problem, expected=expected, value=len(names))
         if len(set(names)) < len(names):
-            twice = sorted(name for name in names if names.count(name) > 1)
-            raise RobotError(f"{robot}: the row name '{twice[0]}' stands twice; names must differ.")
-        types = get_args(JointType)
+            twice = sorted(name for name in names if names.count(name) > 1)[0]
+            problem, remedy = f"{robot}: the row name '{twice}' appears twice", "use different names"
+            raise RobotError(problem, value=twice, remedy=remedy)
         for row in self.rows:
-            place = f"{robot}, row '{row.name}'"
-            if row.type not in types:
-                hint = nearest_choice(row.type, types)
-                raise RobotError(f"{place}: the type cannot be '{row.type}'; {hint}")
-            if row.direction not in (1, -1):
-                raise RobotError(f"{place}: direction is +1 or -1, got {row.direction}.")
-            stroke = [bound for bound in (row.lower, row.upper) if math.isfinite(bound)]
-            if row.type == "prismatic" and max(map(abs, stroke), default=0.0) > LARGEST / 1e3:
-                raise RobotError(
-                    f"{place}: a limit is above {LARGEST / 1e3:.0e} m; correct it or leave both out."
-                )
-            if not row.lower < row.upper:
-                raise RobotError(
-                    f"{place}: the lower limit {row.lower:g} is not below the upper limit {row.upper:g}; "
-                    "swap or correct them."
-                )
+            _check_row(row, f"{robot}, row '{row.name}'")
 
     @staticmethod
     def load(robot: str | os.PathLike[str], base: str | None = None, tip: str | None = None) -> "Robot":
-        """Load a robot by catalogue name, from a YAML or from a URDF file.
+        """Load a robot by catalogue name, or from a YAML or URDF file.
 
         Args:
-            robot: name or file.
-            base: of a URDF file the link that poses are given in; its root where none is given.
-            tip: of a URDF file the link that is the tool; its only end where none is given.
+            robot: catalogue name or path of a file.
+            base: link of a URDF file that poses are given in; None for the root link.
+            tip: link of a URDF file that is the tool; None if only one link has no child.
 
         Raises:
             UnknownRobotError: neither a catalogue name nor a file; the message lists the catalogue.
@@ -109,7 +103,7 @@ class Robot:
 
     @cached_property
     def joints(self) -> tuple[Row, ...]:
-        """The rows that move, in order."""
+        """Rows that move, in order."""
         return tuple(row for row in self.rows if row.type != "fixed")
 
     @property
@@ -124,25 +118,25 @@ class Robot:
 
     @property
     def axes(self) -> tuple[Row, ...]:
-        """What the controller commands, in order; the joints where they are not coupled."""
+        """Axes that the controller commands, in order; the joints if they are not coupled."""
         return self.joints if self.coupling is None else self.coupling.axes
 
     @property
     def axis_limits(self) -> Float64[np.ndarray, "axes 2"]:
-        """Lower and upper limit of every axis [rad or m]: what the controller allows."""
+        """Lower and upper limit of every axis of the controller [rad or m]."""
         return np.array([[axis.lower, axis.upper] for axis in self.axes])
 
     def to_dh(self, q: Any) -> Any:
-        """Give the joint values `(*batch, dof)` at the controller's values `(*batch, axes)`, both [rad or m]."""
+        """Convert the controller's values `(*batch, axes)` to joint values `(*batch, dof)`, both [rad or m]."""
         return q if self.coupling is None else self.coupling.to_dh(q)
 
     def to_controller(self, q: Any) -> Any:
-        """Give the controller's values `(*batch, axes)` at joint values `(*batch, dof)`, both [rad or m]."""
+        """Convert joint values `(*batch, dof)` to the controller's values `(*batch, axes)`, both [rad or m]."""
         return q if self.coupling is None else self.coupling.to_controller(q)
 
     @property
     def limits(self) -> Float64[np.ndarray, " dof 2"]:
-        """Lower and upper limit of every joint [rad or m]; of a coupled one the widest that the axes allow."""
+        """Lower and upper limit of every joint [rad or m]; of a coupled joint the range that the axes allow."""
         return np.array([[joint.lower, joint.upper] for joint in self.joints])
 
     @property
@@ -152,14 +146,14 @@ class Robot:
 
     @cached_property
     def revolute(self) -> tuple[bool, ...]:
-        """For every joint, whether it turns."""
+        """Whether each joint is revolute."""
         return tuple(joint.type == "revolute" for joint in self.joints)
 
     @cached_property
     def reach(self) -> float:
-        """A length [m] that no tool position can be farther than from the first row's origin.
+        """Upper bound of the distance of the tool from the origin of the first row [m].
 
-        Prismatic joints count with their farthest limit, or not at all where they have none.
+        Prismatic joints contribute their larger limit, or nothing if they have no limits.
         """
         strokes = sum(
             max(abs(bound) for bound in (joint.lower, joint.upper) if np.isfinite(bound))
@@ -175,7 +169,7 @@ class Robot:
         base: Float64[np.ndarray, " 6"] | None = None,
         tool: Float64[np.ndarray, " 6"] | None = None,
     ) -> "Robot":
-        """The same robot with other geometric parameters; what is not given stays."""
+        """Return the robot with other geometric parameters; None keeps the present values."""
         return replace(
             self,
             dh=self.dh if dh is None else dh,
@@ -184,15 +178,14 @@ class Robot:
         )
 
     def to_pytorch_kinematics(self) -> "pytorch_kinematics.SerialChain":
-        """Give the robot as a chain of pytorch-kinematics in float64; see `serial_chain`.
+        """Convert the robot to a float64 chain of pytorch-kinematics; see `serial_chain`.
 
-        `chain.forward_kinematics(q).get_matrix()` is T_base_tool at joint values q [rad or m] of shape `(*batch, dof)`
-        with one batch axis.
+        `chain.forward_kinematics(q).get_matrix()` is T_base_tool at joint values q [rad or m] of shape `(batch, dof)`.
         """
         return serial_chain(self)
 
     def check_joint_count(self, count: int) -> None:
-        """Refuse joint values whose last axis does not fit the joints.
+        """Check that joint values have one column per joint.
 
         Raises:
             PoseError: `count` is not the number of joints.
@@ -200,21 +193,44 @@ class Robot:
         if count != self.dof:
             names = ", ".join(joint.name for joint in self.joints)
             raise PoseError(
-                f"robot '{self.name}' has {self.dof} joints ({names}), but the joint values have {count} "
-                "columns; give one per joint."
+                f"robot '{self.name}' has {self.dof} joints ({names}), but the joint values have {count} columns",
+                expected=f"{self.dof} columns",
+                value=count,
+                remedy="give one per joint",
             )
 
 
-def serial_chain(robot: Robot) -> "pytorch_kinematics.SerialChain":
-    """Build the chain from the frame that poses are given in to the tool, in float64 on the CPU.
+def _check_row(row: Row, place: str) -> None:
+    """Check type, direction and limits of a row; `place` precedes the message."""
+    types = get_args(JointType)
+    if row.type not in types:
+        hint = nearest_choice(row.type, types)
+        raise RobotError(f"{place}: unknown joint type '{row.type}'", value=row.type, remedy=hint)
+    if row.direction not in (1, -1):
+        problem = f"{place}: expected the direction +1 or -1, got {row.direction}"
+        raise RobotError(problem, expected="+1 or -1", value=row.direction)
+    bounds = row.lower, row.upper
+    stroke = max((abs(bound) for bound in bounds if math.isfinite(bound)), default=0.0)
+    if row.type == "prismatic" and stroke > MAX_MAGNITUDE / 1e3:
+        expected = f"limits up to {MAX_MAGNITUDE / 1e3:.0e} m"
+        problem, remedy = f"{place}: expected {expected}, got {stroke:g} m", "correct them or leave both out"
+        raise RobotError(problem, expected=expected, value=stroke, remedy=remedy)
+    if not row.lower < row.upper:
+        problem = f"{place}: the lower limit {row.lower:g} is not below the upper limit {row.upper:g}"
+        expected, remedy = "a lower limit below the upper limit", "swap or correct them"
+        raise RobotError(problem, expected=expected, value=bounds, remedy=remedy)
 
-    A joint stands where its row has it after `RotZ(theta) · Trans(0, 0, d)` and moves about or along z, or against
-    it where its direction is -1; `Trans(a, 0, 0) · RotX(alpha) · RotY(beta)` leads on to the next. Everything is made
-    in float64: a chain that is made in float32 and converted is off by 2e-8 m.
+
+def serial_chain(robot: Robot) -> "pytorch_kinematics.SerialChain":
+    """Build a pytorch-kinematics chain from the base frame to the tool, in float64 on the CPU.
+
+    The frame of a joint is that of its row after `RotZ(theta) · Trans(0, 0, d)`. The joint moves about or along z, in
+    the opposite sense if its direction is -1; `Trans(a, 0, 0) · RotX(alpha) · RotY(beta)` leads to the next joint.
+    Everything is computed in float64: a chain that is built in float32 and converted is off by 2e-8 m.
 
     Args:
-        robot: its rows are the frames of the chain, between `base_link` and `tool0`; joints are named like the rows
-            and take the same joint values [rad or m].
+        robot: the robot; its rows are the frames of the chain, between `base_link` and `tool0`, and joints have the
+            names and joint values [rad or m] of the rows.
     """
     import torch
     from pytorch_kinematics import SerialChain, Transform3d

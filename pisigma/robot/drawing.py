@@ -1,4 +1,4 @@
-"""What a file says of a robot, before it is checked as a whole."""
+"""Contents of a robot file, not yet checked as a whole."""
 
 from typing import NamedTuple
 
@@ -10,18 +10,18 @@ from pisigma.robot.row import Row
 
 
 class Drawing(NamedTuple):
-    """What a file says of a robot, not yet checked as a whole; see `Robot`, which has the same attributes.
+    """Contents of a robot file, not yet checked as a whole; see `Robot`, which has the same attributes.
 
     Attributes:
         name: short name, as in the catalogue.
-        maker: who builds it.
-        source: where the figures come from.
+        maker: manufacturer.
+        source: origin of the parameter values.
         rows: joints and fixed rows, from the base to the tool.
         dh: `(rows, 5)`, columns as `DH_COLUMNS`.
         base: as `FRAME_COLUMNS`.
         tool: as `FRAME_COLUMNS`.
-        coupling: how the joints follow the controller's values; None where they are the same.
-        urdf: the content of the URDF file that it is; None where it is none.
+        coupling: relation of joint values and controller values; None if they are equal.
+        urdf: content of the file if it is a URDF file, else None.
     """
 
     name: str

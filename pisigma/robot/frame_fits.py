@@ -1,4 +1,4 @@
-"""Rigid transforms before and behind predicted poses that explain measured ones best, in closed form."""
+"""Fit base and tool transforms to measured poses, in closed form or by Levenberg-Marquardt."""
 
 from dataclasses import dataclass, replace
 
@@ -9,26 +9,26 @@ from torch import Tensor
 from pisigma.robot.se3 import nearest_rotation, rotation_from_vector, rotation_vector, skew, transform
 
 LEVER_SHARE = 0.2
-"""A rotation error counts like a position error at this share of the reach."""
+"""Lever arm of rotation errors as a share of the reach; see `MeasuredPoses.lever`."""
 ALTERNATIONS = 10
-"""Projections onto the rotations by which a guess of base and tool is polished."""
-STEPS = 20
-AFFINE_NUMBERS = 13
-"""Unknowns of every coordinate of an affine base and tool: so many positions or fewer do not determine them."""
-SETTLED = 1e-6
-"""The search for base and tool ends when a step lowers the cost by less than this share."""
-FIRST_DAMPING = 1e-6
+"""Alternating projections onto rotations that refine the initial guess of base and tool."""
+MAX_ITERATIONS = 20
+AFFINE_UNKNOWNS = 13
+"""Unknowns per coordinate of an affine base and tool; this many positions or fewer do not determine them."""
+CONVERGENCE_TOLERANCE = 1e-6
+"""Relative decrease of the cost below which the fit of base and tool has converged."""
+INITIAL_DAMPING = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
 class MeasuredPoses:
-    """Measured positions and rotations, ready for comparison with predicted poses.
+    """Measured positions and rotations, for comparison with predicted poses.
 
     Attributes:
         position: measured positions [m].
         rotation: measured rotations; the identity where none was measured.
-        has_rotation: which rows hold a rotation.
-        lever: a rotation error counts like a position error at this distance [m].
+        has_rotation: which rows have a rotation.
+        lever: lever arm that converts rotation errors [rad] to position errors [m].
     """
 
     position: Float64[Tensor, "*#batch rows 3"]
@@ -40,7 +40,7 @@ class MeasuredPoses:
     def of(
         position: Float64[Tensor, "rows 3"] | None, rotation: Float64[Tensor, "rows 3 3"] | None, lever: float
     ) -> "MeasuredPoses":
-        """Take measured poses; every row has a position [m], and some may have a rotation."""
+        """Make measured poses of positions [m] of all rows and rotations of some; rows without one are not finite."""
         assert position is not None
         rows, eye = len(position), torch.eye(3, dtype=torch.float64)
         if rotation is None:
@@ -61,7 +61,7 @@ class MeasuredPoses:
 
     @property
     def values(self) -> int:
-        """Number of independent numbers that were measured."""
+        """Number of independent measured values."""
         return 3 * len(self.position) + 3 * int(self.has_rotation.sum())
 
     @property
@@ -82,7 +82,7 @@ class MeasuredPoses:
 def best_base(
     T: Float64[Tensor, "*batch rows 4 4"], measured: MeasuredPoses
 ) -> Float64[Tensor, "*batch 4 4"]:
-    """Find the transform X for which `X T` are nearest to measured poses (weighted orthogonal Procrustes)."""
+    """Find the transform X that minimises the distance of `X T` to measured poses (weighted orthogonal Procrustes)."""
     middle, wanted = T[..., :3, 3].mean(-2, keepdim=True), measured.position.mean(0)
     M = (measured.position - wanted).mT @ (T[..., :3, 3] - middle)
     if bool(measured.has_rotation.any()):
@@ -95,7 +95,7 @@ def best_base(
 def best_tool(
     T: Float64[Tensor, "*batch rows 4 4"], measured: MeasuredPoses
 ) -> Float64[Tensor, "*batch 4 4"]:
-    """Find the transform X for which `T X` are nearest to measured poses; it turns nothing without rotations."""
+    """Find the transform X that minimises the distance of `T X` to measured poses; a translation without rotations."""
     R = T[..., :3, :3]
     offset = (R.mT @ (measured.position - T[..., :3, 3])[..., None])[..., 0].mean(-2)
     if not bool(measured.has_rotation.any()):
@@ -107,12 +107,12 @@ def best_tool(
 def affine_error(
     T: Float64[Tensor, "*#batch rows 4 4"], measured: MeasuredPoses
 ) -> Float64[Tensor, "*#batch"]:
-    """Compute the mean squared error [m²] per row that the best affine base and tool leave: rigid ones leave no less.
+    """Compute the residual mean squared error [m²] per row of the best affine base and tool, a bound for rigid ones.
 
-    Every coordinate of `R_base (R t + p) + p_base` is linear in 13 unknowns where nothing is held to be a rotation, and
-    `|R_measured - R_base R R_tool|² / 2` is at least 3 less three times the largest singular value of the mean of
-    `R_measured ⊗ R` (Shah 2013, J. Mechanisms Robotics 5(3)). So thousands of hypotheses are compared in closed form.
-    The lengths are divided by the degrees of freedom that are left.
+    Without the rotation constraint every coordinate of `R_base (R t + p) + p_base` is linear in 13 unknowns, and
+    `|R_measured - R_base R R_tool|² / 2` is at least 3 minus three times the largest singular value of the mean of
+    `R_measured ⊗ R` (Shah 2013, J. Mechanisms Robotics 5(3)). This compares thousands of hypotheses in closed form.
+    Squared lengths are divided by the remaining degrees of freedom.
 
     Args:
         T: predicted poses.
@@ -132,28 +132,30 @@ def affine_error(
 def best_base_and_tool(
     T: Float64[Tensor, "*batch rows 4 4"], measured: MeasuredPoses
 ) -> tuple[Float64[Tensor, "*batch 4 4"], Float64[Tensor, "*batch 4 4"]]:
-    """Find transforms X, Y for which `X T Y` are nearest to measured poses; Y turns nothing without rotations.
+    """Find transforms X, Y that minimise the distance of `X T Y` to measured poses.
 
-    The initial guess is what `affine_error` fits, its matrices replaced by the nearest rotations; then Levenberg and
-    Marquardt's method on all batches at once.
+    Without measured rotations Y is a translation.
+
+    The initial guess is the affine fit of `affine_error` with its matrices replaced by the nearest rotations. It is
+    refined by the Levenberg-Marquardt method on all batches at once.
 
     Args:
         T: predicted poses.
-        measured: what was measured there.
+        measured: measured poses.
     """
     base, tool = _affine_base_and_tool(T, measured)
-    damping = torch.full_like(T[..., 0, 0, 0], FIRST_DAMPING)
+    damping = torch.full_like(T[..., 0, 0, 0], INITIAL_DAMPING)
     cost = measured.squares(base[..., None, :, :] @ T @ tool[..., None, :, :]).sum(-1)
-    for _ in range(STEPS):
+    for _ in range(MAX_ITERATIONS):
         step = base_and_tool_step(T, measured, base, tool, damping)
-        nearer, behind = moved_base_and_tool(base, tool, step)
-        tried = measured.squares(nearer[..., None, :, :] @ T @ behind[..., None, :, :]).sum(-1)
-        better = tried < cost
-        settled = bool(((cost - tried).abs() <= SETTLED * cost).all())
-        base = torch.where(better[..., None, None], nearer, base)
-        tool = torch.where(better[..., None, None], behind, tool)
-        cost, damping = torch.minimum(cost, tried), torch.where(better, damping / 10, damping * 10)
-        if settled:
+        new_base, new_tool = moved_base_and_tool(base, tool, step)
+        new_cost = measured.squares(new_base[..., None, :, :] @ T @ new_tool[..., None, :, :]).sum(-1)
+        better = new_cost < cost
+        converged = bool(((cost - new_cost).abs() <= CONVERGENCE_TOLERANCE * cost).all())
+        base = torch.where(better[..., None, None], new_base, base)
+        tool = torch.where(better[..., None, None], new_tool, tool)
+        cost, damping = torch.minimum(cost, new_cost), torch.where(better, damping / 10, damping * 10)
+        if converged:
             break
     return base, tool
 
@@ -163,14 +165,14 @@ def moved_base_and_tool(
     tool: Float64[Tensor, "*batch 4 4"],
     step: Float64[Tensor, "*batch 12"],
 ) -> tuple[Float64[Tensor, "*batch 4 4"], Float64[Tensor, "*batch 4 4"]]:
-    """Shift and turn base and tool by a step of `base_and_tool_step`."""
+    """Move base and tool by a step of `base_and_tool_step`."""
     return moved_frame(base, step[..., :6]), moved_frame(tool, step[..., 6:])
 
 
 def moved_frame(
     frame: Float64[Tensor, "*batch 4 4"], step: Float64[Tensor, "*batch 6"]
 ) -> Float64[Tensor, "*batch 4 4"]:
-    """Shift [m] and turn [rad] a frame, about its origin."""
+    """Translate [m] and rotate [rad] a frame about its origin."""
     return transform(
         rotation_from_vector(step[..., 3:]) @ frame[..., :3, :3], frame[..., :3, 3] + step[..., :3]
     )
@@ -199,14 +201,14 @@ def _affine_solution(
 
 
 def _nearest_rotations(columns: Float64[Tensor, "*batch 9 1"]) -> Float64[Tensor, "*batch 3 3"]:
-    """Give the rotations nearest to matrices that are written as columns."""
+    """Return the rotations nearest to matrices that are flattened to columns."""
     return nearest_rotation(columns.reshape(*columns.shape[:-2], 3, 3))
 
 
 def _affine_base_and_tool(
     T: Float64[Tensor, "*batch rows 4 4"], measured: MeasuredPoses
 ) -> tuple[Float64[Tensor, "*batch 4 4"], Float64[Tensor, "*batch 4 4"]]:
-    """Guess base and tool in closed form; see `affine_error`."""
+    """Estimate base and tool in closed form; see `affine_error`."""
     R, p, position = T[..., :3, :3], T[..., :3, 3], measured.position
     R_tool = torch.eye(3).to(T).expand(*T.shape[:-3], 3, 3)
     if bool(measured.has_rotation.any()):
@@ -220,7 +222,7 @@ def _affine_base_and_tool(
         best = agreement.argmax(-1)[..., None, None, None]
         R_base = bases.take_along_dim(best, -3)[..., 0, :, :]
         R_tool = Z.take_along_dim(best, -3)[..., 0, :, :].mT
-    elif T.shape[-3] > AFFINE_NUMBERS:
+    elif T.shape[-3] > AFFINE_UNKNOWNS:
         R_base = nearest_rotation(_affine_solution(T, position)[1][..., 9:12, :].mT)
     else:
         R_base = best_base(T, measured)[..., :3, :3]
@@ -238,10 +240,11 @@ def frame_columns(
     base: Float64[Tensor, "*batch #rows 4 4"],
     tool: Float64[Tensor, "*batch #rows 4 4"],
 ) -> tuple[Float64[Tensor, "*batch rows 6 12"], Float64[Tensor, "*batch rows 6"]]:
-    """Derivatives of poses `base T tool` by shift [m] and turn [rad] of the base, then of the tool; and the errors.
+    """Return the Jacobian of poses `base T tool` with respect to base and tool, and the errors.
 
-    The base turns about its origin, in the measuring frame. The six values of a row are those of its position [m] and,
-    times the lever, of its rotation vector; the latter are 0 where no rotation was measured.
+    The columns are translation [m] and rotation [rad] of the base, then of the tool; the base rotates about its origin,
+    in the measuring frame. The six values of a row are those of its position [m] and of its rotation vector times the
+    lever [m]; the latter are 0 where no rotation was measured.
     """
     R_base, R_flange = base[..., :3, :3], base[..., :3, :3] @ T[..., :3, :3]
     arm = (R_base @ (T[..., :3, 3:] + T[..., :3, :3] @ tool[..., :3, 3:]))[..., 0]
@@ -261,16 +264,16 @@ def base_and_tool_step(
     damping: Float64[Tensor, "*batch"],
     free: Float64[Tensor, "*batch rows 6"] | None = None,
 ) -> Float64[Tensor, "*batch 12"]:
-    """Compute a damped step: shift [m] and turn [rad] of the base, in the measuring frame, then those of the tool.
+    """Compute a damped step: translation [m] and rotation [rad] of the base, in the measuring frame, then of the tool.
 
     Args:
         T: predicted poses.
-        measured: what was measured there.
-        base: before them, as it is now.
-        tool: behind them, as it is now.
-        damping: Marquardt's, relative to the normal matrix.
-        free: shift [m] and turn [rad] of every row's pose by a value of its own, which is eliminated (variable
-            projection, Golub and Pereyra 1973); None where there is none.
+        measured: measured poses.
+        base: current base.
+        tool: current tool.
+        damping: Marquardt's damping, relative to the diagonal of the normal matrix.
+        free: translation [m] and rotation [rad] of every row's pose per unit of an unknown of that row, which is
+            eliminated (variable projection, Golub and Pereyra 1973); None for no such unknown.
     """
     J, error = frame_columns(T, measured, base[..., None, :, :], tool[..., None, :, :])
     residual = error[..., None]

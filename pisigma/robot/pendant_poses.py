@@ -1,4 +1,4 @@
-"""Where a robot description has the tool when one axis after the other moves, to be compared at the teach pendant."""
+"""Tool poses of a robot description with one axis moved at a time, for comparison with the teach pendant."""
 
 import math
 import os
@@ -11,19 +11,19 @@ from pisigma.robot.description import Robot
 from pisigma.robot.row import FRAME_COLUMNS, Row, in_file_units
 from pisigma.robot.urdf_frames import Frame, frame_of, row_frame, xyzrpy_of
 
-TURN, STROKE = math.pi / 2, 0.1
-"""How far an axis that turns [rad], or slides [m], is moved."""
+ROTATION, STROKE = math.pi / 2, 0.1
+"""Motion of a revolute axis [rad] and of a prismatic axis [m]."""
 
 
 @dataclass(frozen=True, eq=False)
 class PendantPose:
-    """The tool with one axis moved and all others at 0.
+    """The pose of the tool with one axis moved and all others at 0.
 
     Attributes:
-        axis: that is moved; None where all are at 0.
-        value: what the controller shows for it [rad or m].
-        tool: x, y, z [m], roll, pitch, yaw [rad] of `Trans(x, y, z) · RotZ(roll) · RotY(pitch) · RotX(yaw)` in the base
-            frame.
+        axis: axis that is moved; None if all are at 0.
+        value: the controller's value of that axis [rad or m].
+        tool: pose of the tool in the base frame: x, y, z [m], roll, pitch, yaw [rad] of
+            `Trans(x, y, z) · RotZ(roll) · RotY(pitch) · RotX(yaw)`.
         inside: whether all of the controller's values are within its limits.
     """
 
@@ -34,16 +34,16 @@ class PendantPose:
 
     @property
     def in_file_unit(self) -> float:
-        """What the controller shows [deg or mm]."""
+        """The controller's value of the moved axis [deg or mm]."""
         return 0.0 if self.axis is None else self.axis.in_file_unit(self.value)
 
     @property
     def tool_in_file_units(self) -> dict[str, float]:
-        """The tool's pose by column [mm, deg]."""
+        """Pose of the tool by column [mm, deg]."""
         return in_file_units(FRAME_COLUMNS, self.tool)
 
     def to_json(self) -> dict[str, object]:
-        """Give all of it as plain values."""
+        """Return the pose as plain values for JSON."""
         unit = "deg" if self.axis is None else self.axis.file_unit
         moved: dict[str, object] = {"axis": self.axis and self.axis.name, f"value_{unit}": self.in_file_unit}
         return moved | self.tool_in_file_units | {"within_limits": self.inside}
@@ -52,12 +52,12 @@ class PendantPose:
 def pendant_poses(
     robot: Robot | str | os.PathLike[str], base: str | None = None, tip: str | None = None
 ) -> tuple[PendantPose, ...]:
-    """Give the tool's pose with all axes at 0, and with each at 90 deg (100 mm) or as far as its limits allow.
+    """Return the tool's pose with all axes at 0, and with each at 90 deg (100 mm) or as far as its limits allow.
 
     Args:
         robot: a robot, a name of the catalogue, or a robot file (YAML or URDF).
-        base: of a URDF file the link that poses are given in.
-        tip: of a URDF file the link that is the tool.
+        base: link of a URDF file that poses are given in.
+        tip: link of a URDF file that is the tool.
 
     Raises:
         RobotError: the robot cannot be read.
@@ -66,7 +66,7 @@ def pendant_poses(
     count, (lower, upper) = len(drawn.axes), drawn.axis_limits.T
     values = np.zeros((count + 1, count))
     for index, axis in enumerate(drawn.axes):
-        step = TURN if axis.type == "revolute" else STROKE
+        step = ROTATION if axis.type == "revolute" else STROKE
         ends = min(step, upper[index]), max(-step, lower[index])
         values[index + 1, index] = ends[0] if abs(ends[0]) >= abs(ends[1]) else ends[1]
     inside = ((values >= lower) & (values <= upper)).all(1)
@@ -80,7 +80,7 @@ def pendant_poses(
 
 
 def _tool(robot: Robot, q: Float64[np.ndarray, " dof"]) -> Frame:
-    """T_base_tool at joint values [rad or m]."""
+    """Return T_base_tool at joint values [rad or m]."""
     T: Frame = frame_of(robot.base)
     values = iter(q.tolist())
     for row, (theta, d, a, alpha, beta) in zip(robot.rows, robot.dh.tolist(), strict=True):

@@ -1,4 +1,4 @@
-"""How large errors usually are, how large they can be, and what wear or a collision changes, by class of robots."""
+"""Robot classes: usual and largest sizes of their errors, and changes by wear or a collision."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -22,15 +22,15 @@ HOBBY_MAKERS: Final = ("Trossen", "ROBOTIS", "Niryo", "AR4", "Elephant Robotics"
 
 @dataclass(frozen=True)
 class GeometricSizes:
-    """One size for each kind of geometric parameter.
+    """Error sizes by kind of geometric parameter.
 
     The order is that of `pisigma.calibration.geometric.problem.prior_sizes.PriorGroup`.
 
     Attributes:
-        joint_offset: of theta [rad].
-        length: of d and a that are drawn [m].
-        no_length: of d and a that are drawn as 0 [m].
-        between_axes: of alpha and beta [rad].
+        joint_offset: size for theta [rad].
+        length: size for d and a with a nominal value other than 0 [m].
+        no_length: size for d and a with the nominal value 0 [m].
+        between_axes: size for alpha and beta [rad].
     """
 
     joint_offset: float
@@ -39,22 +39,22 @@ class GeometricSizes:
     between_axes: float
 
     def of(self, group: int) -> float:
-        """The size of a group of parameters [m or rad]."""
+        """Return the size for a group of parameters [m or rad]."""
         return (self.joint_offset, self.length, self.no_length, self.between_axes)[group]
 
 
 @dataclass(frozen=True)
 class ChangeLimits:
-    """What wear or a collision can change in an arm that still works, by kind of parameter.
+    """Largest changes by wear or a collision in an arm that still works, by kind of parameter.
 
-    A belt that jumps a tooth or a brake that slips moves the zero of a joint by some degrees; a casting that has bent
-    by more than these lengths and angles is visibly broken. A base, a tool, or the zero of a single joint may move by
-    anything: they are moved, or zeroed again.
+    A belt that jumps a tooth or a brake that slips moves the zero of a joint by some degrees; a casting that is bent
+    by more than these lengths and angles is visibly broken. The base, the tool or the zero of a single joint may change
+    by any amount, because people move and zero them.
 
     Attributes:
-        joint_zero: of several joints at once [rad].
-        length: of d and a, and the zero of a joint that slides [m].
-        angle: of alpha and beta [rad].
+        joint_zero: change of the zeros of several joints at once [rad].
+        length: change of d, a and the zero of a prismatic joint [m].
+        angle: change of alpha and beta [rad].
     """
 
     joint_zero: float
@@ -64,16 +64,16 @@ class ChangeLimits:
 
 @dataclass(frozen=True)
 class RobotClass:
-    """Standard deviations of the errors of the robots of a class, before anything is measured, and their limits.
+    """Prior standard deviations of the errors of a class of robots, and their limits.
 
     Attributes:
-        name: what `--class` states.
-        usual: standard deviations of geometric errors.
-        gravity: of the weights of `GravityTorques` [rad].
-        bands: of the weights of `FourierSeries` [rad], by band of `BAND_STARTS`.
-        harmonics: of the series.
-        largest: standard deviations of geometric errors that no robot of the class surely exceeds.
-        change: what wear or a collision can change.
+        name: name of the class, as for `--class`.
+        usual: prior standard deviations of geometric errors.
+        gravity: prior standard deviation of the weights of `GravityTorques` [rad].
+        bands: prior standard deviations of the weights of `FourierSeries` [rad], by band of `BAND_STARTS`.
+        harmonics: number of harmonics of the series.
+        largest: standard deviations of geometric errors that no robot of the class exceeds.
+        change: largest changes by wear or a collision.
     """
 
     name: ClassName
@@ -86,15 +86,15 @@ class RobotClass:
 
     @staticmethod
     def of(robot: Robot) -> "RobotClass":
-        """The class of a robot's maker, or else `INDUSTRIAL`."""
+        """Return the class of the robots of a maker, `INDUSTRIAL` if the maker is not known."""
         if robot.maker.startswith("Universal Robots"):
             return UNIVERSAL_ROBOTS
         if robot.maker.startswith(COBOT_MAKERS):
             return COBOT
         return HOBBY if robot.maker.startswith(HOBBY_MAKERS) else INDUSTRIAL
 
-    def holds(self, sizes: Sequence[tuple[int, float]]) -> bool:
-        """Say whether errors of these sizes [m or rad], by group of parameters, are possible in this class."""
+    def allows(self, sizes: Sequence[tuple[int, float]]) -> bool:
+        """Return whether errors of these sizes [m or rad], by group of parameters, are possible in this class."""
         return all(size <= self.largest.of(group) for group, size in sizes)
 
 
@@ -107,13 +107,13 @@ INDUSTRIAL: Final = RobotClass(
     largest=GeometricSizes(joint_offset=10e-3, length=10e-3, no_length=10e-3, between_axes=10e-3),
     change=ChangeLimits(joint_zero=0.1, length=0.005, angle=0.01),
 )
-"""Arms with one eccentricity, one ovality and one gear ripple a joint.
+"""Arms whose joints have one eccentricity, one ovality and one gear ripple each.
 
-1.5 times the medians of the sizes that maximise the evidence of hybrid calibrations of simulated kr10, irb120, arm7 and
-scara arms (two each, 400 positions) and of the measured FANUC R-2000iC (720). The factor makes predicted errors right
-for few poses, from which a calibration has to estimate the sizes as well: with 15 such arms the median of predicted
-over true RMS is 1.05 after 15 chosen poses, 1.1 after 30 and 1.1 after 60; without it 0.74, 0.93 and 1.1. The largest
-sizes are twice those of the worst healthy arm that was measured."""
+The sizes are 1.5 times the medians of those that maximise the evidence of hybrid calibrations of simulated kr10,
+irb120, arm7 and scara arms (two each, 400 positions) and of the measured FANUC R-2000iC (720 positions). The factor
+makes predicted errors correct for few poses, from which a calibration has to estimate the sizes too: for 15 such arms
+the median of predicted over true RMS is 1.05 after 15 planned poses, 1.1 after 30 and 1.1 after 60; without the factor
+it is 0.74, 0.93 and 1.1. The largest sizes are twice those of the worst healthy arm that was measured."""
 
 COBOT: Final = replace(
     INDUSTRIAL,
@@ -121,8 +121,8 @@ COBOT: Final = replace(
     largest=replace(INDUSTRIAL.largest, joint_offset=20e-3),
     change=ChangeLimits(joint_zero=0.1, length=0.008, angle=0.02),
 )
-"""Light arms with harmonic drives, whose zeros are set by hand after a repair and slip in a collision. Their gears are
-taken for those of industrial arms where none of the maker was measured."""
+"""Light arms with harmonic drives, whose zeros are set by hand after a repair and slip in a collision. Gear errors are
+those of industrial arms unless arms of the maker were measured."""
 
 UNIVERSAL_ROBOTS: Final = replace(
     COBOT,
@@ -131,8 +131,8 @@ UNIVERSAL_ROBOTS: Final = replace(
     bands=(2e-4, 2e-4, 6e-5, 3e-5, 5e-5, 5e-5, 5e-5, 4e-5, 3e-5),
     harmonics=31,
 )
-"""Between the sizes that maximise the evidence of hybrid calibrations of the measured UR5 (1,000 positions) and UR10
-(1,941 poses). Their gears err with many harmonics, which poses for other robots cannot distinguish."""
+"""Sizes between those that maximise the evidence of hybrid calibrations of the measured UR5 (1,000 positions) and UR10
+(1,941 poses). Their gear errors have many harmonics, which the pose sets of other robots cannot distinguish."""
 
 HOBBY: Final = replace(
     COBOT,
@@ -141,8 +141,8 @@ HOBBY: Final = replace(
     largest=GeometricSizes(joint_offset=100e-3, length=20e-3, no_length=20e-3, between_axes=20e-3),
     change=ChangeLimits(joint_zero=0.3, length=0.02, angle=0.1),
 )
-"""Arms without a reliable zero: built by hobbyists or in a laboratory, surgical arms with potentiometers, and old ones
-that were put together again. Their zeros are 20 to 50 mrad off."""
+"""Arms without a reliable zero: built by hobbyists or in a laboratory, surgical arms with potentiometers, and old arms
+that were reassembled. Their zeros are wrong by 20 to 50 mrad."""
 
 CLASSES: Final[dict[str, RobotClass]] = {one.name: one for one in (INDUSTRIAL, COBOT, HOBBY)}
-"""By name, the narrowest first."""
+"""Classes by name, the one with the smallest errors first."""

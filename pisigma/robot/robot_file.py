@@ -1,4 +1,4 @@
-"""Robots from files: the catalogue, YAML (millimetres and degrees outside, SI inside) and URDF."""
+"""Read robots from the catalogue, YAML files (mm and deg) and URDF files."""
 
 import os
 from importlib import resources
@@ -13,14 +13,14 @@ from pisigma.files.errors import RobotError, UnknownRobotError, nearest_choice
 from pisigma.files.yaml_file import Section, parse_yaml, read_yaml
 from pisigma.robot.coupling_section import CoupledJointSection, coupled
 from pisigma.robot.drawing import Drawing
-from pisigma.robot.row import MOST_ROWS, Bounded, JointType, Row
+from pisigma.robot.row import MAX_ROWS, Bounded, JointType, Row
 from pisigma.robot.urdf_frames import frame_of, shift, turn, xyzrpy_of
 
 Limits = Annotated[tuple[Bounded, Bounded], Field(description="lower and upper")]
 
 
 class ParameterSection(Section):
-    """The parameters of a row. Angles in degrees, lengths in millimetres."""
+    """DH and Hayati parameters of a row, angles in degrees and lengths in millimetres."""
 
     theta_deg: Bounded = 0.0
     d_mm: Bounded = 0.0
@@ -29,13 +29,13 @@ class ParameterSection(Section):
     beta_deg: Bounded = 0.0
 
     def to_si(self) -> Float64[np.ndarray, " 5"]:
-        """The parameters as `DH_COLUMNS` [rad or m]."""
+        """Return the parameters in the order of `DH_COLUMNS` [rad or m]."""
         theta, alpha, beta = np.deg2rad([self.theta_deg, self.alpha_deg, self.beta_deg])
         return np.array([theta, self.d_mm / 1e3, self.a_mm / 1e3, alpha, beta])
 
 
 class RowSection(ParameterSection):
-    """One joint or fixed row."""
+    """A joint or a fixed row."""
 
     name: str = Field(min_length=1)
     type: JointType
@@ -52,17 +52,20 @@ class RowSection(ParameterSection):
             "fixed": "limits_deg" if self.limits_deg else "limits_mm" if self.limits_mm else None,
         }[self.type]
         if wrong:
-            raise ValueError(f"row '{self.name}' is {self.type} and cannot have {wrong}; remove it")
+            problem = f"row '{self.name}' is {self.type} and cannot have {wrong}"
+            raise RobotError(problem, value=wrong, remedy="remove it")
         limits = self.limits_deg or self.limits_mm
         if limits and not limits[0] < limits[1]:
-            raise ValueError(
-                f"the lower limit {limits[0]:g} of row '{self.name}' is not below its upper limit "
-                f"{limits[1]:g}; swap or correct them"
+            raise RobotError(
+                f"row '{self.name}': the lower limit {limits[0]:g} is not below the upper limit {limits[1]:g}",
+                expected="a lower limit below the upper limit",
+                value=limits,
+                remedy="swap or correct them",
             )
         return self
 
     def to_row(self) -> Row:
-        """The row without its parameters, in SI."""
+        """Convert to a row in SI units, without the parameters."""
         if self.limits_deg is not None:
             lower, upper = np.deg2rad(self.limits_deg)
         elif self.limits_mm is not None:
@@ -85,25 +88,25 @@ class FrameSection(Section):
     yaw_deg: Bounded = 0.0
 
     def to_si(self) -> np.ndarray:
-        """x, y, z [m], roll, pitch, yaw [rad]."""
+        """Return x, y, z [m], roll, pitch, yaw [rad]."""
         lengths = np.array([self.x_mm, self.y_mm, self.z_mm]) / 1e3
         return np.concatenate([lengths, np.deg2rad([self.roll_deg, self.pitch_deg, self.yaw_deg])])
 
 
 class RobotDocument(Section):
-    """The whole file.
+    """A robot file.
 
     Attributes:
-        convention: "standard", where a row is `RotZ(theta) · Trans(a, 0, d) · RotX(alpha) · RotY(beta)`; or "modified",
-            where it is `RotX(alpha) · Trans(a, 0, 0) · RotZ(theta) · Trans(0, 0, d)` (Craig 1986).
-        coupling: joints that do not simply follow the controller's value of the same name.
+        convention: "standard" for rows `RotZ(theta) · Trans(a, 0, d) · RotX(alpha) · RotY(beta)`; "modified" for rows
+            `RotX(alpha) · Trans(a, 0, 0) · RotZ(theta) · Trans(0, 0, d)` (Craig 1986).
+        coupling: joints whose values differ from the controller's values of the same names.
     """
 
     name: str = Field(min_length=1)
     maker: str
     source: str
     convention: Literal["standard", "modified"] = "standard"
-    rows: tuple[RowSection, ...] = Field(min_length=1, max_length=MOST_ROWS)
+    rows: tuple[RowSection, ...] = Field(min_length=1, max_length=MAX_ROWS)
     base: FrameSection = FrameSection()
     tool: FrameSection = FrameSection()
     coupling: tuple[CoupledJointSection, ...] = ()
@@ -112,14 +115,16 @@ class RobotDocument(Section):
     def _rows_fit_together(self) -> "RobotDocument":
         names = [row.name for row in self.rows]
         if twice := sorted({name for name in names if names.count(name) > 1}):
-            raise ValueError(f"the row name '{twice[0]}' stands twice in rows; names must differ")
+            problem = f"the row name '{twice[0]}' appears twice"
+            raise RobotError(problem, value=twice[0], remedy="use different names")
         if all(row.type == "fixed" for row in self.rows):
-            raise ValueError("no row moves; add a revolute or prismatic one")
+            remedy = "add a revolute or prismatic joint"
+            raise RobotError("the robot has no joint", expected="a joint", remedy=remedy)
         self.drawing()
         return self
 
     def drawing(self) -> Drawing:
-        """The robot in SI units.
+        """Convert the robot to SI units.
 
         Raises:
             RobotError: the coupling does not fit the rows, or a row of the modified convention has a beta.
@@ -132,19 +137,19 @@ class RobotDocument(Section):
 
 
 def catalogue() -> tuple[str, ...]:
-    """Names of the robots that come with pisigma, sorted."""
+    """Return the sorted names of the robots that are included in pisigma."""
     folder = resources.files("pisigma.robot") / "catalogue"
     names = (entry.name for entry in folder.iterdir())
     return tuple(sorted(name.removesuffix(".yaml") for name in names if name.endswith(".yaml")))
 
 
 def robot_file(robot: str) -> Path | None:
-    """Give the file that `Robot.load` reads; None for a robot of the catalogue."""
+    """Return the file that `Robot.load` reads; None for a robot of the catalogue."""
     return None if robot in catalogue() else Path(robot)
 
 
 def read_robot(robot: str | os.PathLike[str], base: str | None, tip: str | None) -> Drawing:
-    """Read a robot by catalogue name, from a YAML or from a URDF file. See `Robot.load`."""
+    """Read a robot by catalogue name, or from a YAML or URDF file; see `Robot.load`."""
     name = os.fspath(robot)
     suffix = Path(name).suffix.lower()
     if suffix in (".urdf", ".xacro") and name not in catalogue():
@@ -155,8 +160,10 @@ def read_robot(robot: str | os.PathLike[str], base: str | None, tip: str | None)
     for option, link in (("base", base), ("tip", tip)):
         if link is not None:
             raise RobotError(
-                f"{option}='{link}' names a link of a URDF file, but '{name}' is none; leave it out or give a "
-                ".urdf file."
+                f"'{link}' is a link of a URDF file, but '{name}' is not a URDF file",
+                value=link,
+                option=option,
+                remedy="leave it out or give a .urdf file",
             )
     if name in catalogue():
         text = (resources.files("pisigma.robot") / "catalogue" / f"{name}.yaml").read_text(encoding="utf-8")
@@ -164,32 +171,35 @@ def read_robot(robot: str | os.PathLike[str], base: str | None, tip: str | None)
     if suffix in (".yaml", ".yml"):
         return read_yaml(name, RobotDocument, RobotError).drawing()
     raise UnknownRobotError(
-        f"'{name}' is no robot of the catalogue and no .yaml or .urdf file: {nearest_choice(name, catalogue())}"
+        f"'{name}' is neither a robot of the catalogue nor a .yaml or .urdf file",
+        value=name,
+        remedy=nearest_choice(name, catalogue()),
     )
 
 
 def from_modified(
     dh: Float64[np.ndarray, "rows 5"], base: Float64[np.ndarray, " 6"]
 ) -> tuple[Float64[np.ndarray, "rows 5"], Float64[np.ndarray, " 6"]]:
-    """Regroup `Π RotX(alpha) · Trans(a, 0, 0) · RotZ(theta) · Trans(0, 0, d)` into standard rows, exactly.
+    """Convert modified rows `RotX(alpha) · Trans(a, 0, 0) · RotZ(theta) · Trans(0, 0, d)` to standard rows exactly.
 
-    What leads to a joint in the modified convention belongs to the row before in the standard one; alpha and a of the
-    first row go into the base.
+    Alpha and a of a modified row move to the standard row before; those of the first row move to the base.
 
     Args:
         dh: theta [rad], d, a [m], alpha, beta [rad] of modified rows.
         base: x, y, z [m], roll, pitch, yaw [rad].
 
     Returns:
-        Standard rows and the base that goes with them; the tool stays.
+        Standard rows and their base; the tool is unchanged.
 
     Raises:
-        RobotError: a row has a beta, which the modified convention does not know.
+        RobotError: a row has a beta, which the modified convention does not have.
     """
     if dh[:, 4].any():
+        row = int(dh[:, 4].nonzero()[0][0])
         raise RobotError(
-            f"row {int(dh[:, 4].nonzero()[0][0]) + 1}: the modified convention has no beta_deg; leave it out or use "
-            "the standard convention."
+            f"row {row + 1}: the modified convention has no beta_deg",
+            value=float(np.rad2deg(dh[row, 4])),
+            remedy="leave it out or use the standard convention",
         )
     standard = dh.copy()
     standard[:, 2:4] = np.roll(dh[:, 2:4], -1, axis=0)

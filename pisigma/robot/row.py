@@ -1,4 +1,4 @@
-"""What a serial robot is written down as: DH + Hayati rows with their joints, base and tool, in SI units."""
+"""DH and Hayati rows, their parameters and their joints, in SI units."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -16,24 +16,24 @@ DH_COLUMNS = ("theta", "d", "a", "alpha", "beta")
 FRAME_COLUMNS = ("x", "y", "z", "roll", "pitch", "yaw")
 """Order of the parameters of base and tool, everywhere; x, y, z [m], roll, pitch, yaw [rad]."""
 
-LARGEST = 1e9
-"""[mm, deg, or as a file states it] No robot, pose or measurement has a larger value."""
+MAX_MAGNITUDE = 1e9
+"""Largest magnitude of any value of a robot, pose or measurement, in the unit of its file (mm or deg)."""
 
-Bounded = Annotated[float, Field(ge=-LARGEST, le=LARGEST)]
-"""A number of a robot file."""
+Bounded = Annotated[float, Field(ge=-MAX_MAGNITUDE, le=MAX_MAGNITUDE)]
+"""A number in a robot file."""
 
-MOST_ROWS = 1000
-"""Of a robot."""
+MAX_ROWS = 1000
+"""Largest number of rows of a robot."""
 
 _LENGTHS = frozenset(("d", "a", "x", "y", "z"))
 
 
 def in_file_units(names: Sequence[str], values: Float64[np.ndarray, " names"]) -> dict[str, float]:
-    """Parameters in the units of files, by their columns there: `d` [m] as `d_mm`, `theta` [rad] as `theta_deg`.
+    """Convert parameters to the units of files, by file column: `d` [m] to `d_mm`, `theta` [rad] to `theta_deg`.
 
     Args:
-        names: of `DH_COLUMNS` or `FRAME_COLUMNS`.
-        values: the parameters [m or rad].
+        names: names of the parameters, from `DH_COLUMNS` or `FRAME_COLUMNS`.
+        values: parameters [m or rad].
     """
     return {
         f"{name}_mm" if name in _LENGTHS else f"{name}_deg": float(
@@ -45,17 +45,17 @@ def in_file_units(names: Sequence[str], values: Float64[np.ndarray, " names"]) -
 
 @dataclass(frozen=True)
 class Row:
-    """One DH + Hayati row `RotZ(theta + q) · Trans(a, 0, d) · RotX(alpha) · RotY(beta)`.
+    """One DH and Hayati row `RotZ(theta + q) · Trans(a, 0, d) · RotX(alpha) · RotY(beta)`.
 
     A prismatic joint adds q to d instead; a fixed row has no joint (an end effector, for example).
 
     Attributes:
-        name: unique in the robot, such as "theta_1".
+        name: unique name in the robot, such as "theta_1".
         type: "revolute", "prismatic" or "fixed".
-        direction: +1 or -1: how the controller counts; the joint moves by `direction · q`.
-        lower: smallest joint value [rad or m], as the controller counts; -inf where there is no limit.
+        direction: +1 or -1, the sign of the controller's values; the joint moves by `direction · q`.
+        lower: smallest joint value [rad or m], with the sign of the controller; -inf without a limit.
         upper: largest joint value [rad or m].
-        drawn_at: where the joint is drawn, in the frame before the row [m], which a URDF file says; the motion does not
+        drawn_at: position of the joint's origin in a URDF file, in the frame before the row [m]; the motion does not
             depend on it.
     """
 
@@ -68,13 +68,13 @@ class Row:
 
     @property
     def file_unit(self) -> str:
-        """Unit of its joint values in files: "deg", or "mm" of a joint that slides."""
+        """Unit of the joint values in files: "mm" for a prismatic joint, else "deg"."""
         return "mm" if self.type == "prismatic" else "deg"
 
     def in_file_unit(self, value: float) -> float:
-        """A joint value [rad or m] in the unit of files."""
+        """Convert a joint value [rad or m] to the unit of files."""
         return float(value * 1e3 if self.type == "prismatic" else np.rad2deg(value))
 
     def from_file_unit(self, value: float) -> float:
-        """A joint value in the unit of files as [rad or m]."""
+        """Convert a joint value in the unit of files to [rad or m]."""
         return float(value / 1e3 if self.type == "prismatic" else np.deg2rad(value))

@@ -1,4 +1,4 @@
-"""Rotations and rigid transforms, batched: leading dimensions are batch everywhere.
+"""Batched rotations and rigid transforms; leading dimensions are batch dimensions.
 
 Angles are in rad, lengths in m. `T_a_b` maps coordinates in b to coordinates in a.
 """
@@ -12,7 +12,7 @@ from pisigma.files.errors import PoseError
 
 
 def rotation_from_rpy(rpy: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
-    """Rotation `RotZ(roll) · RotY(pitch) · RotX(yaw)`, the order of the three papers.
+    """Return the rotation `RotZ(roll) · RotY(pitch) · RotX(yaw)`, the order of the three papers.
 
     Args:
         rpy: roll, pitch, yaw [rad].
@@ -28,7 +28,7 @@ def rotation_from_rpy(rpy: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3
 
 
 def rpy_from_rotation(R: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3"]:
-    """Roll, pitch, yaw [rad] of a rotation; at pitch = ±90 deg yaw is taken as 0.
+    """Return roll, pitch, yaw [rad] of a rotation; at pitch = ±90 deg yaw is set to 0.
 
     Inverse of `rotation_from_rpy` for pitch within ±90 deg.
     """
@@ -46,14 +46,14 @@ def rpy_from_rotation(R: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3
 def _where_regular(
     regular: Bool[Tensor, "*batch"], cosine: Float[Tensor, "*batch"], sine: Float[Tensor, "*batch"]
 ) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch"]]:
-    """Cosine and sine where regular, else 1 and 0, so that the gradient of their angle is finite."""
+    """Return cosine and sine where regular, else 1 and 0, so that the gradient of their angle is finite."""
     return torch.where(regular, cosine, torch.ones_like(cosine)), torch.where(
         regular, sine, torch.zeros_like(sine)
     )
 
 
 def rotation_from_quaternion(quaternion: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 3 3"]:
-    """Rotation of a quaternion (x, y, z, w), which is normalised first."""
+    """Return the rotation of a quaternion (x, y, z, w), which is normalised first."""
     x, y, z, w = (quaternion / quaternion.norm(dim=-1, keepdim=True)).unbind(-1)
     rows = [
         torch.stack([1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)], -1),
@@ -64,9 +64,9 @@ def rotation_from_quaternion(quaternion: Float[Tensor, "*batch 4"]) -> Float[Ten
 
 
 def quaternion_from_rotation(R: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 4"]:
-    """Quaternion (x, y, z, w) of a rotation, w >= 0; inverse of `rotation_from_quaternion`.
+    """Return the quaternion (x, y, z, w) of a rotation, w >= 0; inverse of `rotation_from_quaternion`.
 
-    The outer product 4·q·q^T is linear in R (Shepperd 1978, J. Guidance and Control 1(3)); its row with the
+    The outer product 4·q·q^T is linear in R (Shepperd 1978, J. Guidance and Control 1(3)). Its row with the
     largest diagonal entry is q up to length and sign, without cancellation for any angle.
     """
     (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = (row.unbind(-1) for row in R.unbind(-2))
@@ -85,7 +85,7 @@ def quaternion_from_rotation(R: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*
 
 
 def rotation_from_vector(vector: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
-    """Rotation of a rotation vector [rad] (Rodrigues), with finite gradients at zero."""
+    """Return the rotation of a rotation vector [rad] (Rodrigues), with finite gradients at zero."""
     square = (vector * vector).sum(-1)
     small = square < 1e-8
     safe = torch.where(small, torch.ones_like(square), square)
@@ -98,10 +98,10 @@ def rotation_from_vector(vector: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*b
 
 
 def rotation_vector(R: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3"]:
-    """Rotation vector [rad] of a rotation: axis times angle in [0, pi].
+    """Return the rotation vector [rad] of a rotation: axis times angle in [0, pi].
 
-    Near the identity the factor of the vector part of `R - R^T` is a series; near pi the axis comes from `R +
-    R^T`. Gradients are finite everywhere.
+    Near the identity the factor of the vector part of `R - R^T` is a series; near pi the axis is computed from
+    `R + R^T`. Gradients are finite everywhere.
     """
     twice_sine_axis = torch.stack(
         [R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]], -1
@@ -120,10 +120,10 @@ def rotation_vector(R: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3"]
 def _rotation_vector_near_pi(
     R: Float[Tensor, "*batch 3 3"], twice_sine_axis: Float[Tensor, "*batch 3"], angle: Float[Tensor, "*batch"]
 ) -> Float[Tensor, "*batch 3"]:
-    """Axis from the symmetric part: its largest column is `axis · axis_k (1 - cos)`; sign from `R - R^T`."""
+    """Compute the axis from the largest column of the symmetric part, `axis · axis_k (1 - cos)`; its sign from R - R^T."""
     symmetric = (R + R.mT) / 2 + torch.eye(3, dtype=R.dtype, device=R.device)
     trace = R[..., 0, 0] + R[..., 1, 1] + R[..., 2, 2]
-    # (R + R^T)/2 = cos·I + (1 - cos)·n n^T, so the sum above less (1 + cos)·I is (1 - cos)·n n^T.
+    # (R + R^T)/2 = cos·I + (1 - cos)·n n^T, so the sum above minus (1 + cos)·I is (1 - cos)·n n^T.
     cosine = (trace - 1) / 2
     outer = symmetric - (1 + cosine)[..., None, None] * torch.eye(3, dtype=R.dtype, device=R.device)
     largest = outer.diagonal(dim1=-2, dim2=-1).argmax(-1)
@@ -135,7 +135,7 @@ def _rotation_vector_near_pi(
 
 
 def skew(vector: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
-    """Matrix of the cross product: `skew(a) @ b = a × b`."""
+    """Return the matrix of the cross product: `skew(a) @ b = a × b`."""
     x, y, z = vector.unbind(-1)
     zero = torch.zeros_like(x)
     rows = [torch.stack([zero, -z, y], -1), torch.stack([z, zero, -x], -1), torch.stack([-y, x, zero], -1)]
@@ -145,7 +145,7 @@ def skew(vector: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
 def transform(
     rotation: Float[Tensor, "*batch 3 3"], translation: Float[Tensor, "*batch 3"]
 ) -> Float[Tensor, "*batch 4 4"]:
-    """Homogeneous transform of a rotation and a translation [m]; both broadcast."""
+    """Return the homogeneous transform of a rotation and a translation [m]; both broadcast."""
     batch = np.broadcast_shapes(rotation.shape[:-2], translation.shape[:-1])
     upper = torch.cat([rotation.expand(*batch, 3, 3), translation.expand(*batch, 3)[..., None]], -1)
     last_row = torch.eye(4, dtype=upper.dtype, device=upper.device)[3:].expand(*batch, 1, 4)
@@ -153,17 +153,17 @@ def transform(
 
 
 def transform_from_xyzrpy(xyzrpy: Float[Tensor, "*batch 6"]) -> Float[Tensor, "*batch 4 4"]:
-    """`Trans(x, y, z) · RotZ(roll) · RotY(pitch) · RotX(yaw)`; x, y, z [m], roll, pitch, yaw [rad]."""
+    """Return `Trans(x, y, z) · RotZ(roll) · RotY(pitch) · RotX(yaw)`; x, y, z [m], roll, pitch, yaw [rad]."""
     return transform(rotation_from_rpy(xyzrpy[..., 3:]), xyzrpy[..., :3])
 
 
 def xyzrpy_from_transform(T: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch 6"]:
-    """x, y, z [m] and roll, pitch, yaw [rad] of a transform; inverse of `transform_from_xyzrpy`."""
+    """Return x, y, z [m] and roll, pitch, yaw [rad] of a transform; inverse of `transform_from_xyzrpy`."""
     return torch.cat([T[..., :3, 3], rpy_from_rotation(T[..., :3, :3])], -1)
 
 
 def invert(T: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch 4 4"]:
-    """Inverse of rigid transforms, by transposition."""
+    """Invert rigid transforms by transposition."""
     R_inverse = T[..., :3, :3].mT
     return transform(R_inverse, -(R_inverse @ T[..., :3, 3:])[..., 0])
 
@@ -171,7 +171,7 @@ def invert(T: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch 4 4"]:
 def pose_error(
     T_a_wanted: Float[Tensor, "*batch 4 4"], T_a_actual: Float[Tensor, "*batch 4 4"]
 ) -> Float[Tensor, "*batch 6"]:
-    """What moves the actual pose onto the wanted one, in frame a.
+    """Return the displacement in frame a that moves the actual pose onto the wanted one.
 
     Returns:
         Translation wanted - actual [m] and the rotation vector of `R_wanted · R_actual^T` [rad].
@@ -182,45 +182,49 @@ def pose_error(
 
 
 def wrap_to_pi(angle: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
-    """The same angle [rad] in (-pi, pi]; an angle that is there already keeps every digit."""
+    """Wrap an angle [rad] to (-pi, pi]; an angle in that range is returned unchanged."""
     wrapped = torch.remainder(angle + torch.pi, 2 * torch.pi) - torch.pi
     wrapped = torch.where(wrapped <= -torch.pi, torch.full_like(wrapped, torch.pi), wrapped)
     return torch.where((angle > -torch.pi) & (angle <= torch.pi), angle, wrapped)
 
 
 def check_transforms(T: Tensor, name: str, tolerance: float = 1e-6) -> None:
-    """Refuse matrices that are no rigid transforms.
+    """Check that matrices are rigid transforms.
 
     Args:
-        T: the matrices; anything but a float tensor `(*batch, 4, 4)` is refused too.
-        name: what complaints call them.
+        T: the matrices, a float tensor `(*batch, 4, 4)`.
+        name: name of the matrices in messages.
         tolerance: largest deviation of `R^T R` from the identity and of the last row from (0, 0, 0, 1).
 
     Raises:
-        PoseError: the shape or type is wrong, an entry is not finite, a rotation is not orthonormal or
-            left-handed, or the last row is wrong; the message gives the index of the first such matrix.
+        PoseError: the shape or dtype is wrong, an entry is not finite, a rotation is not orthonormal or is left-handed,
+            or the last row is wrong; the message and `value` give the index of the first such matrix.
     """
     if T.ndim < 2 or T.shape[-2:] != (4, 4):
-        raise PoseError(
-            f"{name} has the shape {tuple(T.shape)}; give homogeneous transforms of shape (*batch, 4, 4)."
-        )
+        shape = tuple(T.shape)
+        expected = "homogeneous transforms of shape (*batch, 4, 4)"
+        raise PoseError(f"{name}: expected {expected}, got {shape}", expected=expected, value=shape)
     if not T.is_floating_point():
-        raise PoseError(f"{name} holds {T.dtype}; give float64 or float32, lengths in metres.")
-    for bad, what in transform_faults(T, tolerance):
+        problem, remedy = f"{name}: expected float64 or float32, got {T.dtype}", "give lengths in metres"
+        raise PoseError(problem, expected="float64 or float32", value=str(T.dtype), remedy=remedy)
+    for bad, expected, problem, remedy in transform_faults(T, tolerance):
         if bad.any():
             index = tuple(bad.nonzero()[0].tolist())
             place = f" at index {index if len(index) > 1 else index[0]}" if index else ""
-            raise PoseError(f"{name}{place} {what}.")
+            raise PoseError(f"{name}{place} {problem}", expected=expected, value=index, remedy=remedy)
 
 
 def transform_faults(
     T: Float[Tensor, "*batch 4 4"], tolerance: float
-) -> tuple[tuple[Bool[Tensor, "*batch"], str], ...]:
-    """For everything that may be wrong with a rigid transform, which matrices are wrong in that way, and a word on it.
+) -> tuple[tuple[Bool[Tensor, "*batch"], str, str, str], ...]:
+    """Return, for every possible fault of a rigid transform, which matrices have it, and texts for an error.
 
     Args:
         T: the matrices.
         tolerance: see `check_transforms`.
+
+    Returns:
+        Mask, what was expected, what is wrong (a predicate), and a remedy, for every fault.
     """
     eye = torch.eye(4, dtype=T.dtype, device=T.device)
     finite = torch.isfinite(T).all(-1).all(-1)
@@ -228,23 +232,32 @@ def transform_faults(
     skewness = (R.mT @ R - eye[:3, :3]).abs().amax((-1, -2))
     last_row = (T[..., 3, :] - eye[3]).abs().amax(-1)
     return (
-        (~finite, "has entries that are not finite numbers; give 16 finite numbers"),
-        (last_row > tolerance, "does not end with the row 0 0 0 1; give a homogeneous transform"),
+        (~finite, "finite numbers", "has entries that are not finite numbers", "give 16 finite numbers"),
+        (
+            last_row > tolerance,
+            "the last row 0 0 0 1",
+            "does not end with the row 0 0 0 1",
+            "give a homogeneous transform",
+        ),
         (
             skewness > tolerance,
-            "has a rotation part that is not orthonormal; normalise it or check its source",
+            "an orthonormal rotation",
+            "has a rotation that is not orthonormal",
+            "normalise it or check its source",
         ),
         (
             torch.linalg.det(R) < 0,
-            "has a left-handed rotation part (determinant -1); a reflection is no pose, check its axes",
+            "a right-handed rotation",
+            "has a left-handed rotation (determinant -1), which is a reflection",
+            "check its axes",
         ),
     )
 
 
 def nearest_rotation(M: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3 3"]:
-    """The rotation nearest to a matrix, in the Frobenius norm (orthogonal Procrustes, Kabsch's sign).
+    """Return the rotation nearest to a matrix in the Frobenius norm (orthogonal Procrustes, Kabsch's sign).
 
-    It is worked out on the host: there are few such matrices, and what costs is the number of operations.
+    It is computed on the CPU, because there are few such matrices and each operation on a device costs more.
     """
     U, _, Vh = np.linalg.svd(M.cpu().numpy())
     U[..., 2] *= np.sign(np.linalg.det(U @ Vh))[..., None]

@@ -1,6 +1,6 @@
-"""Rigid transforms of single frames as NumPy matrices, and their exact way into and out of six numbers.
+"""Rigid transforms of single frames as NumPy matrices, and their exact conversion to and from six numbers.
 
-Lengths in m, angles in rad. Multiples of 90 deg are exact both ways, so that a robot drawn with right angles
+Lengths are in m, angles in rad. Multiples of 90 deg are exact in both directions, so that a robot with right angles
 keeps them.
 """
 
@@ -13,11 +13,11 @@ from jaxtyping import Float64
 Frame = Float64[np.ndarray, "4 4"]
 
 ROUNDING = 2e-14
-"""Lengths [m] and angles [rad], off 0 or off a multiple of 90 deg by less, are taken for rounding errors."""
+"""Deviations of lengths from 0 [m] and of angles from multiples of 90 deg [rad] up to this are rounding errors."""
 
 
 def turn(axis: int, angle: float) -> Frame:
-    """Rotation by an angle [rad] about the x (0), y (1) or z (2) axis."""
+    """Return the rotation by an angle [rad] about the x (0), y (1) or z (2) axis."""
     cosine, sine = _cosine_sine(angle)
     T = np.eye(4)
     first, second = (axis + 1) % 3, (axis + 2) % 3
@@ -27,29 +27,29 @@ def turn(axis: int, angle: float) -> Frame:
 
 
 def shift(x: float, y: float, z: float) -> Frame:
-    """Translation [m]."""
+    """Return a translation [m]."""
     T = np.eye(4)
     T[:3, 3] = x, y, z
     return T
 
 
 def row_frame(theta: float, d: float, a: float, alpha: float, beta: float) -> Frame:
-    """`RotZ(theta) · Trans(a, 0, d) · RotX(alpha) · RotY(beta)`."""
+    """Return `RotZ(theta) · Trans(a, 0, d) · RotX(alpha) · RotY(beta)`."""
     T: Frame = turn(2, theta) @ shift(a, 0.0, d) @ turn(0, alpha) @ turn(1, beta)
     return T
 
 
 def frame_of(xyzrpy: Sequence[float] | Float64[np.ndarray, " 6"]) -> Frame:
-    """`Trans(x, y, z) · RotZ(roll) · RotY(pitch) · RotX(yaw)`, pisigma's order of base and tool."""
+    """Return `Trans(x, y, z) · RotZ(roll) · RotY(pitch) · RotX(yaw)`, the form of base and tool."""
     x, y, z, roll, pitch, yaw = (float(value) for value in xyzrpy)
     T: Frame = shift(x, y, z) @ turn(2, roll) @ turn(1, pitch) @ turn(0, yaw)
     return T
 
 
 def xyzrpy_of(T: Frame) -> Float64[np.ndarray, " 6"]:
-    """Inverse of `frame_of`, pitch within ±90 deg; also beside ±90 deg it gives the rotation back to rounding.
+    """Invert `frame_of` with pitch within ±90 deg, accurate to rounding near ±90 deg too.
 
-    There roll and yaw are only determined together: yaw is read from what is left when roll is undone.
+    There only the sum or difference of roll and yaw is determined: yaw is computed from the rotation without roll.
     """
     R = T[:3, :3]
     lying = math.hypot(R[0, 0], R[1, 0]) > ROUNDING
@@ -61,7 +61,7 @@ def xyzrpy_of(T: Frame) -> Float64[np.ndarray, " 6"]:
 
 
 def inverse(T: Frame) -> Frame:
-    """Inverse of a rigid transform."""
+    """Invert a rigid transform."""
     result = np.eye(4)
     result[:3, :3] = T[:3, :3].T
     result[:3, 3] = -T[:3, :3].T @ T[:3, 3]
@@ -69,12 +69,12 @@ def inverse(T: Frame) -> Frame:
 
 
 def clean_length(value: float) -> float:
-    """The length, 0 where it is a rounding error."""
+    """Replace a length that is a rounding error by 0."""
     return 0.0 if abs(value) <= ROUNDING else float(value)
 
 
 def clean_angle(value: float) -> float:
-    """The angle [rad] in (-pi, pi], a multiple of 90 deg where it is that but for a rounding error."""
+    """Replace an angle [rad] that is a multiple of 90 deg up to a rounding error by that multiple, in (-pi, pi]."""
     quarters = round(value / (math.pi / 2))
     if abs(value - quarters * (math.pi / 2)) > ROUNDING:
         return float(value)

@@ -1,9 +1,9 @@
-"""From a chain of joints with any axes to DH + Hayati rows with the same forward kinematics.
+"""Convert a chain of joints with arbitrary axes to DH and Hayati rows with the same forward kinematics.
 
-Every joint i gets a frame whose z axis is the joint's axis. From one to the next leads a row
-`RotZ(theta) · Trans(a, 0, d) · RotX(alpha) · RotY(beta)`, which has one number more than two lines need: beta
-is 0 (Denavit and Hartenberg 1955), unless the axes are nearly parallel; then d is 0 (Hayati and Mirmirani
-1985), because the common normal of nearly parallel lines may be anywhere.
+Every joint gets a frame whose z axis is the joint's axis. A row
+`RotZ(theta) · Trans(a, 0, d) · RotX(alpha) · RotY(beta)` leads from one frame to the next. It has one parameter more
+than two lines need, so beta is 0 (Denavit and Hartenberg 1955), unless the axes are nearly parallel; then d is 0
+(Hayati and Mirmirani 1985), because the common normal of nearly parallel lines is ill-conditioned.
 """
 
 import math
@@ -29,7 +29,7 @@ from pisigma.robot.urdf_frames import (
 )
 
 NEARLY_PARALLEL = 0.1
-"""Sine of the angle between two axes below which their row is Hayati's: a common normal is then at most ten
+"""Sine of the angle between two axes below which Hayati's row is used; DH rows then have common normals at most ten
 times as far away as the joints."""
 
 Vector = Float64[np.ndarray, " 3"]
@@ -38,11 +38,11 @@ Parameters = tuple[float, float, float, float, float]
 
 @dataclass(frozen=True, eq=False)
 class ChainRows:
-    """A chain as rows, and where these stand in its links.
+    """A chain as rows, with the frames of the rows in its joints.
 
     Attributes:
         drawing: rows, base and tool.
-        frames: per joint, the frame of its row in that of the joint; they share the axis and move together.
+        frames: for every joint, the frame of its row in the joint's frame; both share the axis and move together.
     """
 
     drawing: Drawing
@@ -50,18 +50,18 @@ class ChainRows:
 
 
 URDF_SOURCE = "URDF file "
-"""Beginning of the `source` of robots that were drawn in one, before its name."""
+"""Prefix of the `source` of robots read from a URDF file, before the file name."""
 
 
 def rows_of_chain(chain: Chain, nearly_parallel: float = NEARLY_PARALLEL) -> ChainRows:
-    """The chain as DH + Hayati rows, base and tool, equal in its forward kinematics to rounding.
+    """Convert a chain to DH and Hayati rows, base and tool, with the same forward kinematics up to rounding.
 
-    Joints count as in the file. Where an axis points along the negative side of its largest coordinate, its
-    row has direction -1. The last row takes in the tip where that stands on its axis, else the tool does.
+    Joint values have the sign of the file. If the largest component of an axis is negative, its row has direction -1.
+    The last row includes the transform to the tip if the tip is on its axis; otherwise the tool does.
 
     Args:
         chain: the chain.
-        nearly_parallel: sine of the angle between two axes below which their row is Hayati's.
+        nearly_parallel: sine of the angle between two axes below which Hayati's row is used.
     """
     joints = chain.joints
     axes = [_direction(joint) * joint.axis for joint in joints]
@@ -95,7 +95,7 @@ def rows_of_chain(chain: Chain, nearly_parallel: float = NEARLY_PARALLEL) -> Cha
 
 
 def _mimics(joints: tuple[ChainJoint, ...], rows: list[Row]) -> list[CoupledJointSection]:
-    """What joints that mimic others are coupled by, as a robot file would state it."""
+    """Return the coupling sections of a robot file that are equivalent to the mimic joints."""
     by_name = {row.name: row for row in rows}
     sections = []
     for joint, row in zip(joints, rows, strict=True):
@@ -110,7 +110,7 @@ def _mimics(joints: tuple[ChainJoint, ...], rows: list[Row]) -> list[CoupledJoin
 
 
 def _drawn_at(frame: Frame) -> tuple[float, float, float]:
-    """Where a joint's origin is in the frame of its row [m], which is given in that of the joint."""
+    """Return the position of a joint's origin [m] in the frame of its row; `frame` is the inverse pose."""
     x, y, z = (clean_length(value) for value in inverse(frame)[:3, 3])
     return x, y, z
 
@@ -120,7 +120,7 @@ def _direction(joint: ChainJoint) -> int:
 
 
 def _first_frame(joint: ChainJoint, axis: Vector) -> Frame:
-    """Frame of the first row in the base link: the base link itself where the axis is its z axis."""
+    """Return the frame of the first row in the base link: the base link itself if the axis is its z axis."""
     z, point = joint.origin[:3, :3] @ axis, joint.origin[:3, 3]
     upright = math.hypot(z[0], z[1]) <= ROUNDING
     if upright and (joint.type == "prismatic" or math.hypot(point[0], point[1]) <= ROUNDING):
@@ -130,7 +130,7 @@ def _first_frame(joint: ChainJoint, axis: Vector) -> Frame:
 
 
 def _turned_to(axis: Vector) -> Frame:
-    """A rotation that takes the z axis to a given one, about the axes y and then x."""
+    """Return a rotation about y and then x that maps the z axis to a given one."""
     x, y, z = (float(value) for value in axis)
     about_x, about_y = math.atan2(-y, z), math.atan2(x, math.hypot(y, z))
     T: Frame = turn(0, clean_angle(about_x)) @ turn(1, clean_angle(about_y))
@@ -138,16 +138,16 @@ def _turned_to(axis: Vector) -> Frame:
 
 
 def _point_of_axis(joints: tuple[ChainJoint, ...], axes: list[Vector], index: int, T: Frame) -> Vector:
-    """A point of a joint's axis in the frame of the row before.
+    """Return a point on a joint's axis in the frame of the row before.
 
-    A sliding joint has a direction only, and its axis may be put anywhere: on that of the next joint where
-    they are parallel, else through the row before.
+    The motion of a prismatic joint depends on the direction of its axis only. The axis is therefore placed on that of
+    the next joint if they are parallel, otherwise through the origin of the row before.
 
     Args:
         joints: all joints.
         axes: all axes, in the frames of the joints.
-        index: of the joint.
-        T: the joint's frame at rest in that of the row before.
+        index: index of the joint.
+        T: frame of the joint at rest in that of the row before.
     """
     point: Vector = T[:3, 3]
     if joints[index].type == "revolute":
@@ -162,7 +162,7 @@ def _point_of_axis(joints: tuple[ChainJoint, ...], axes: list[Vector], index: in
 
 
 def _row_to(z: Vector, point: Vector, nearly_parallel: float) -> Parameters:
-    """Row that leads from the z axis to a line, given by its direction and a point, in the row's frame."""
+    """Return the row that leads from the z axis to a line, given by its direction and a point in the row's frame."""
     sine = math.hypot(z[0], z[1])
     if sine < nearly_parallel:
         foot = point - point[2] / z[2] * z
@@ -182,7 +182,7 @@ def _row_to(z: Vector, point: Vector, nearly_parallel: float) -> Parameters:
 
 
 def _last_row(T_row_tip: Frame) -> Parameters:
-    """Row that leads to the tip where it stands on the last axis, else to the end of the last joint."""
+    """Return the row that leads to the tip if that is on the last axis, else an empty row."""
     off_axis = max(math.hypot(*T_row_tip[:2, 2]), math.hypot(*T_row_tip[:2, 3]))
     if off_axis > ROUNDING:
         return 0.0, 0.0, 0.0, 0.0, 0.0

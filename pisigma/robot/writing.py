@@ -1,4 +1,4 @@
-"""A robot as the text of a file: YAML or URDF."""
+"""Write robots as YAML or URDF text."""
 
 from collections.abc import Collection
 from dataclasses import replace
@@ -17,24 +17,24 @@ from pisigma.robot.urdf_frames import Frame, frame_of, row_frame, shift, turn, x
 
 
 def robot_to_yaml(robot: Robot) -> str:
-    """The robot as YAML text that `Robot.load` reads back, equal to within the rounding of the units.
+    """Format a robot as YAML text that `Robot.load` restores, up to the rounding of the unit conversion.
 
     Raises:
-        RobotError: a row has one limit only, which a file cannot hold.
+        RobotError: a row has only one limit, which the format cannot express.
     """
     return yaml_text(robot_document(robot))
 
 
 def robot_document(robot: Robot) -> dict[str, object]:
-    """The robot as the plain values of a YAML file.
+    """Return a robot as the plain values of a YAML file.
 
     Raises:
-        RobotError: a row has one limit only, which a file cannot hold.
+        RobotError: a row has only one limit, which the format cannot express.
     """
     rows = []
     axes = {axis.name: axis for axis in robot.axes}
     for joint, parameters in zip(robot.rows, robot.dh, strict=True):
-        # Files hold the limits of the controller's values, which a passive joint has none of.
+        # Files contain the limits of the controller's values, of which a passive joint has none.
         row = axes.get(joint.name, replace(joint, lower=-np.inf, upper=np.inf))
         entry: dict[str, object] = {"name": row.name, "type": row.type, "direction": row.direction}
         entry |= {"drawn_at_mm": [value * 1e3 for value in row.drawn_at]} if any(row.drawn_at) else {}
@@ -56,7 +56,9 @@ def _limits_entry(row: Row) -> dict[str, list[float]]:
     if not bounded.any():
         return {}
     if not bounded.all():
-        raise RobotError(f"row '{row.name}' has one limit only; a robot file holds both or none.")
+        raise RobotError(
+            f"row '{row.name}' has only one limit", expected="two limits or none", value=row.name
+        )
     return {f"limits_{row.file_unit}": [row.in_file_unit(row.lower), row.in_file_unit(row.upper)]}
 
 
@@ -64,28 +66,27 @@ BASE_LINK = "base_link"
 TOOL_LINK = "tool0"
 MASS, INERTIA, EFFORT, VELOCITY = "1", "0.01", "1000", "10"
 PLACEHOLDERS = (
-    f"Masses ({MASS} kg), inertias ({INERTIA} kg m2), efforts ({EFFORT}) and velocities ({VELOCITY}) are placeholders "
-    "and not the robot's: only the kinematics was calibrated. Put in the maker's before you simulate forces."
+    f"Masses ({MASS} kg), inertias ({INERTIA} kg m2), efforts ({EFFORT}) and velocities ({VELOCITY}) are placeholders, "
+    "not values of the robot: only the kinematics was calibrated. Enter those of the maker to simulate forces."
 )
 
 
 def robot_to_urdf(robot: Robot, comments: tuple[str, ...] = ()) -> str:
-    """The robot as URDF with the same forward kinematics from `base_link` to `tool0`.
+    """Format a robot as URDF with the same forward kinematics from `base_link` to `tool0`.
 
-    A joint stands where its row has it after `RotZ(theta) · Trans(0, 0, d)` and moves about or along its own z
-    axis, or the other way round where its direction is -1; `Trans(a, 0, 0) · RotX(alpha) · RotY(beta)` leads
-    on to the next. No common normal is needed, so parallel axes stay where they are. Base and tool are fixed
-    joints, links are named `link_1` and so on, joints like the rows. `effort` and `velocity`, which the
-    format asks for, and masses and inertias, without which MuJoCo refuses the file, are `PLACEHOLDERS`, which a comment
-    says. A coupled joint is followed by joints about or along the same axis,
-    one for each axis of the controller that moves it too, which mimic that axis.
+    The frame of a joint is that of its row after `RotZ(theta) · Trans(0, 0, d)`. The joint moves about or along its z
+    axis, in the opposite sense if its direction is -1; `Trans(a, 0, 0) · RotX(alpha) · RotY(beta)` leads to the next
+    joint. No common normal is needed, so parallel axes keep their positions. Base and tool are fixed joints, links are
+    named `link_1` and so on, joints like the rows. `effort` and `velocity`, which the format requires, and masses and
+    inertias, without which MuJoCo rejects the file, are `PLACEHOLDERS`, as a comment says. A coupled joint is followed
+    by one joint on the same axis for each other axis of the controller that moves it, which mimics that axis.
 
     Args:
         robot: the robot.
         comments: sentences to write at the top.
 
     Raises:
-        OutputError: a joint has limits, or a linkage drives it, so that the format cannot say it.
+        OutputError: URDF cannot express a joint's limits or the linkage that drives it.
     """
     root = ElementTree.Element("robot", name=robot.name)
     for sentence in (*comments, PLACEHOLDERS):
@@ -114,22 +115,23 @@ def robot_to_urdf(robot: Robot, comments: tuple[str, ...] = ()) -> str:
 
 
 _Mimic = tuple[str, float]
-"""The joint that another one mimics, and by how many [rad or m] it moves per [rad or m] of that one."""
+"""The mimicked joint, and the motion [rad or m] per [rad or m] of that joint."""
 
 
 def _at_rest(robot: Robot) -> Float64[np.ndarray, "rows 5"]:
-    """The rows of a robot where all of the controller's values are 0.
+    """Return the DH parameters of a robot with all controller values at 0.
 
     Raises:
-        OutputError: a linkage drives a joint, so that it does not follow in proportion.
+        OutputError: a linkage drives a joint, which is then not proportional to the controller's values.
     """
     if robot.coupling is None:
         return robot.dh
     if robot.coupling.four_bars:
         driven = robot.joints[robot.coupling.four_bars[0][0]].name
         raise OutputError(
-            f"robot '{robot.name}': a four-bar linkage drives the joint '{driven}', which URDF cannot say; write a "
-            "robot file (--format dh with .yaml) instead."
+            f"robot '{robot.name}': a four-bar linkage drives the joint '{driven}', which URDF cannot express",
+            value=driven,
+            remedy="write a robot file (--format dh with .yaml) instead",
         )
     dh = robot.dh.copy()
     for joint, row, offset in zip(robot.joints, robot.joint_rows, robot.coupling.offset, strict=True):
@@ -138,7 +140,7 @@ def _at_rest(robot: Robot) -> Float64[np.ndarray, "rows 5"]:
 
 
 def _movers(robot: Robot, row: Row) -> list[tuple[Row, _Mimic | None]]:
-    """The joints about one axis that move what stands behind a row: what is commanded first, then those that mimic."""
+    """Return the joints on the axis of a row: the commanded one first, then those that mimic other axes."""
     if robot.coupling is None or row.type == "fixed":
         return [(row, None)]
     factors = robot.coupling.matrix[[joint.name for joint in robot.joints].index(row.name)].tolist()
@@ -156,7 +158,7 @@ def _movers(robot: Robot, row: Row) -> list[tuple[Row, _Mimic | None]]:
 
 
 def _add_motion(element: ElementTree.Element, row: Row, mimic: _Mimic | None) -> None:
-    """Say how a joint moves."""
+    """Add axis, limits and mimic of a joint to its element."""
     if row.type != "fixed":
         ElementTree.SubElement(element, "axis", xyz=f"0 0 {row.direction}")
     if np.isfinite(row.upper):
@@ -168,7 +170,7 @@ def _add_motion(element: ElementTree.Element, row: Row, mimic: _Mimic | None) ->
 
 
 def add_inertia(inertial: Any) -> None:
-    """Put the mass and the inertia of the placeholders into an element."""
+    """Add the placeholder mass and inertia to an element."""
     for name, values in (
         ("mass", {"value": MASS}),
         (
@@ -182,7 +184,7 @@ def add_inertia(inertial: Any) -> None:
 def _joint(
     root: ElementTree.Element, name: str, kind: str, links: tuple[str, str], origin: Frame
 ) -> ElementTree.Element:
-    """Add a joint behind its child link, which is the second of its links."""
+    """Add a joint between two links (parent, child), preceded by its child link."""
     ElementTree.SubElement(root, "link", name=links[1])
     element = ElementTree.SubElement(root, "joint", name=name, type=kind)
     ElementTree.SubElement(element, "origin", origin_attributes(origin))
@@ -192,31 +194,38 @@ def _joint(
 
 
 def _type(row: Row, robot: str) -> str:
-    """What the format calls the joint."""
+    """Return the URDF type of a joint.
+
+    Raises:
+        OutputError: the joint lacks a limit that URDF requires.
+    """
     bounded = np.isfinite([row.lower, row.upper])
     if row.type == "fixed" or bounded.all():
         return row.type
     if row.type == "revolute" and not bounded.any():
         return "continuous"
     raise OutputError(
-        f"robot '{robot}', joint '{row.name}': URDF wants a lower and an upper limit of a {row.type} joint, "
-        f"but it has {'one only' if bounded.any() else 'none'}; give the robot both."
+        f"robot '{robot}', joint '{row.name}': URDF requires two limits for a {row.type} joint, "
+        f"got {'one' if bounded.any() else 'none'}",
+        expected="two limits",
+        value=row.name,
+        remedy="give the robot both limits",
     )
 
 
 def origin_attributes(T: Frame) -> dict[str, str]:
-    """`xyz` and `rpy` of a frame with all digits; `rpy` turns about the fixed axes x, y, z, in this order."""
+    """Return `xyz` and `rpy` of a frame with all digits; `rpy` are rotations about the fixed axes x, y, z in order."""
     x, y, z, roll, pitch, yaw = (repr(float(value) + 0.0) for value in xyzrpy_of(T))
     return {"xyz": f"{x} {y} {z}", "rpy": f"{yaw} {pitch} {roll}"}
 
 
 def unused_name(name: str, names: Collection[str]) -> str:
-    """The name, with lines under it until none of the others is the same."""
+    """Append underscores to a name until it differs from all others."""
     while name in names:
         name += "_"
     return name
 
 
 def comment_text(sentence: str) -> str:
-    """A sentence as the content of an XML comment."""
+    """Return a sentence as the content of an XML comment, which may not contain `--`."""
     return f" {' '.join(sentence.split()).replace('--', '- -')} "

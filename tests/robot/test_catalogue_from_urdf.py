@@ -1,4 +1,4 @@
-"""Robots of the catalogue that were taken from URDF files: the poses that these files give.
+"""Robots of the catalogue that come from URDF files have the poses of these files.
 
 The poses were computed from the files named in `source` by products of the joints' origins and axis rotations alone.
 """
@@ -46,7 +46,7 @@ POSES = {
 
 
 @pytest.mark.parametrize("name", POSES)
-def test_the_tool_is_where_the_urdf_file_has_it(name):
+def test_tool_poses_are_those_of_the_urdf_file(name):
     q, T = POSES[name]
     tolerance = 2e-5 if name == "xarm7" else 3e-9  # the file of xarm7 writes 1.5708 for right angles
     assert_close(pisigma.forward_kinematics(pisigma.Robot.load(name), q)[:3], np.array(T), atol=tolerance)

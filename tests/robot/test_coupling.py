@@ -1,10 +1,11 @@
-"""Coupled joints: the map from the controller's values to those of the joints, both ways, and its description."""
+"""Coupled joints: conversion between controller values and joint values, and its description in files."""
 
 import numpy as np
 import pytest
 import torch
 from testing.closeness import assert_close
 from testing.coupled import COUPLED, PALLETISER, coupled_robot
+from testing.refusals import refused
 
 from pisigma.files.errors import PoseError, RobotError
 from pisigma.robot import Robot
@@ -20,7 +21,7 @@ def drawn(robot: Robot, count: int = 200) -> np.ndarray:
     return np.random.default_rng(0).uniform(lower, upper, (count, len(lower)))
 
 
-def test_a_joint_follows_the_controller_as_the_file_says():
+def test_a_joint_follows_the_controller_values_as_stated():
     robot = coupled_robot()
     q = drawn(robot)
     expected = q.copy()
@@ -32,7 +33,7 @@ def test_a_joint_follows_the_controller_as_the_file_says():
 
 @pytest.mark.parametrize("text", [COUPLED, PALLETISER])
 @pytest.mark.parametrize("shape", [(), (1,), (3, 1, 2)])
-def test_the_controllers_values_come_back_from_arrays_and_tensors(text, shape):
+def test_controller_values_are_restored_for_arrays_and_tensors(text, shape):
     robot = coupled_robot(text)
     q = drawn(robot, int(np.prod(shape))).reshape(*shape, -1)
     assert_close(robot.to_controller(robot.to_dh(q)), q, atol=1e-12)
@@ -42,7 +43,7 @@ def test_the_controllers_values_come_back_from_arrays_and_tensors(text, shape):
 
 
 @pytest.mark.parametrize("text", [COUPLED, PALLETISER])
-def test_a_coupled_robot_survives_its_file(tmp_path, text):
+def test_a_coupled_robot_is_restored_from_its_file(tmp_path, text):
     robot = coupled_robot(text)
     file = tmp_path / "robot.yaml"
     file.write_text(robot_to_yaml(robot))
@@ -52,12 +53,12 @@ def test_a_coupled_robot_survives_its_file(tmp_path, text):
     assert_close(again.axis_limits, robot.axis_limits, atol=1e-14)
 
 
-def test_values_of_joints_are_not_taken_for_those_of_axes():
+def test_joint_values_are_not_accepted_as_axis_values():
     robot = coupled_robot(PALLETISER)
     q = np.zeros(robot.dof)
-    with pytest.raises(PoseError, match=f"{robot.dof - 1} values were wanted"):
+    with refused(PoseError, expected=f"{robot.dof - 1} values along the last axis", value=(robot.dof,)):
         robot.to_dh(q)
-    with pytest.raises(PoseError, match=f"{robot.dof - 1} values were wanted"):
+    with refused(PoseError, expected=f"{robot.dof - 1} values along the last axis", value=(robot.dof,)):
         forward_kinematics(robot, q)
 
 
@@ -70,23 +71,23 @@ def test_without_coupling_the_joints_are_the_axes():
 
 
 @pytest.mark.parametrize("sides", [(1.0, 1.0, 1.0), (1.0, -1.0, 0.0), (-1.0, -1.0, -1.0), (1.0, 0.0, 0.0)])
-def test_a_joint_comes_from_a_side_where_all_that_move_it_do(sides):
+def test_a_joint_has_an_approach_direction_if_all_its_axes_agree(sides):
     coupling = coupled_robot().coupling
     side = coupling.approach_to_dh(np.array([0.0, *sides[:2], 0.0, 0.0, 0.0]))
     assert_close(side[1:3], [sides[0], sides[2]], atol=0)
 
 
-def test_full_turns_bring_the_controllers_values_into_its_limits():
+def test_full_turns_bring_controller_values_into_their_limits():
     robot = coupled_robot()
     q = robot.to_dh(drawn(robot))
-    turned, inside = robot.coupling.turned_inside(q + 2 * np.pi * np.array([0, 1, -1, 0, 0, 0]))
+    turned, inside = robot.coupling.wrapped_inside(q + 2 * np.pi * np.array([0, 1, -1, 0, 0, 0]))
     assert inside.all()
     assert_close(turned, q, atol=1e-12)
     beyond = robot.to_dh(np.deg2rad([[0, 0, 224.0, 0, 0, 0]]))
-    assert not robot.coupling.turned_inside(beyond)[1].any()
+    assert not robot.coupling.wrapped_inside(beyond)[1].any()
 
 
-def test_a_parallelogram_turns_with_its_crank_and_other_lengths_do_not():
+def test_only_a_parallelogram_rotates_with_its_crank():
     x = np.linspace(-1.0, 1.0, 21)
     assert_close(FourBar(1.0, 0.4, 1.0, 0.4, 1.5).follow(x), x, atol=1e-14)
     bar = FourBar(1.0, 0.4, 1.003, 0.401, 1.5)
@@ -108,34 +109,29 @@ def test_the_slope_is_the_derivative():
         assert_close(slope[..., axis], difference, atol=1e-8)
 
 
+BAR = "four_bar: {ground_mm: 9, crank_mm: 1, coupler_mm: 1, rocker_mm: 1, zero_deg: 90}"
+
+
 @pytest.mark.parametrize(
-    ("old", "new", "complaint"),
+    ("old", "new", "expected", "value"),
     [
-        ("joint: theta_3", "joint: theta_9", "no joint 'theta_9'"),
-        ("theta_2: 1", "theta_8: 1", "no joint 'theta_8'"),
-        ("theta_2: 1, theta_3: 1}", "theta_2: 1, theta_3: 1}, offset_mm: 2", "state offset_deg"),
+        ("joint: theta_3", "joint: theta_9", "", "theta_9"),
+        ("theta_2: 1", "theta_8: 1", "", "theta_8"),
+        ("theta_3: 1}", "theta_3: 1}, offset_mm: 2", "offset_deg and limits_deg", "theta_3"),
+        ("theta_3: 1}}", "theta_3: 1}}\n  - {joint: theta_3, factors: {theta_3: 1}}", "", "theta_3"),
+        ("theta_2: 1, theta_3: 1", "theta_2: 1", "no limits", "theta_3"),
         (
-            "theta_2: 1, theta_3: 1}}",
-            "theta_2: 1, theta_3: 1}}\n  - {joint: theta_3, factors: {theta_3: 1}}",
-            "two",
+            "theta_3: 1}}",
+            "theta_3: 1}}\n  - {joint: theta_2, factors: {theta_2: 1, theta_3: 1}}",
+            "rank 6",
+            5,
         ),
-        ("theta_2: 1, theta_3: 1", "theta_2: 1", "passive"),
-        (
-            "theta_2: 1, theta_3: 1}}",
-            "theta_2: 1, theta_3: 1}}\n  - {joint: theta_2, factors: {theta_2: 1, theta_3: 1}}",
-            "give the same pose",
-        ),
-        (
-            "theta_2: 1, theta_3: 1}",
-            "theta_2: 1, theta_3: 1}, "
-            "four_bar: {ground_mm: 9, crank_mm: 1, coupler_mm: 1, rocker_mm: 1, zero_deg: 90}",
-            "does not close",
-        ),
+        ("theta_3: 1}", f"theta_3: 1}}, {BAR}", "a linkage that closes", 3),
     ],
 )
-def test_a_coupling_that_cannot_be_is_refused(old, new, complaint):
+def test_invalid_couplings_are_rejected(old, new, expected, value):
     assert old in COUPLED
-    with pytest.raises(RobotError, match=complaint):
+    with refused(RobotError, option="coupling", expected=expected, value=value):
         coupled_robot(COUPLED.replace(old, new))
 
 

@@ -1,4 +1,4 @@
-"""Rigid transforms that fit best: exact data give them back, nothing near fits better."""
+"""Fitted base and tool transforms: exact data restore them, and perturbations fit worse."""
 
 import pytest
 import torch
@@ -20,7 +20,7 @@ LEVER = 0.2
 
 @pytest.fixture
 def T(generator):
-    """Poses of a tool all over a cube."""
+    """Tool poses in a cube."""
     turns = 2 * torch.randn(40, 3, generator=generator, dtype=torch.float64)
     places = torch.rand(40, 3, generator=generator, dtype=torch.float64)
     return transform(rotation_from_vector(turns), places)
@@ -35,7 +35,7 @@ def measured_as(T, turned: bool) -> MeasuredPoses:
 
 
 @pytest.mark.parametrize("turned", [False, True])
-def test_exact_data_give_the_transforms_back(T, turned):
+def test_exact_data_restore_the_transforms(T, turned):
     tool = TOOL.clone() if turned else transform(torch.eye(3).double(), TOOL[:3, 3])
     assert_close(best_base(T, measured_as(BASE @ T, turned)), BASE, atol=1e-12)
     assert_close(best_tool(T, measured_as(T @ tool, turned)), tool, atol=1e-12)
@@ -46,7 +46,7 @@ def test_exact_data_give_the_transforms_back(T, turned):
 
 
 @pytest.mark.parametrize("turned", [False, True])
-def test_nothing_near_fits_better(T, generator, turned):
+def test_perturbed_transforms_fit_worse(T, generator, turned):
     spoilt = BASE @ T
     spoilt[:, :3, 3] += 0.05 * torch.randn(40, 3, generator=generator, dtype=torch.float64)
     rows = measured_as(spoilt, turned)

@@ -1,9 +1,9 @@
 """Robot files in the modified convention."""
 
 import numpy as np
-import pytest
 from testing.closeness import assert_close
 from testing.coupled import coupled_robot
+from testing.refusals import refused
 
 import pisigma
 from pisigma.files.errors import RobotError
@@ -38,6 +38,6 @@ def test_rows_are_converted_exactly():
     assert_close(pisigma.forward_kinematics(robot, q), T, atol=1e-15)
 
 
-def test_a_beta_is_refused():
-    with pytest.raises(RobotError, match="the modified convention has no beta_deg"):
+def test_a_beta_is_rejected():
+    with refused(RobotError, file="robot.yaml", value=1.0):
         coupled_robot(MODIFIED.replace("d_mm: 5, ", "d_mm: 5, beta_deg: 1, "))

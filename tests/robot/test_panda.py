@@ -1,4 +1,4 @@
-"""The catalogue's Panda counts its joints as the maker does."""
+"""The joint values of the catalogue's Panda are those of the maker."""
 
 import math
 
@@ -34,7 +34,7 @@ def flange_by_the_maker(q: np.ndarray) -> np.ndarray:
     return T
 
 
-def test_the_flange_is_where_the_maker_says():
+def test_the_flange_pose_is_that_of_the_maker():
     robot = Robot.load("panda")
     low, high = robot.limits.T
     for q in np.random.default_rng(0).uniform(low, high, (20, 7)):

@@ -1,4 +1,4 @@
-"""How large errors usually are, by class of robots."""
+"""Robot classes and their prior error sizes."""
 
 import pytest
 
@@ -10,10 +10,10 @@ from pisigma.robot.robot_class import COBOT, INDUSTRIAL, UNIVERSAL_ROBOTS, Robot
 @pytest.mark.parametrize(
     ("name", "expected"), [("ur10", UNIVERSAL_ROBOTS), ("fanuc_r2000", INDUSTRIAL), ("rb5", COBOT)]
 )
-def test_the_maker_says_the_class(name: str, expected: RobotClass) -> None:
+def test_the_maker_determines_the_class(name: str, expected: RobotClass) -> None:
     assert RobotClass.of(Robot.load(name)) is expected
 
 
 @pytest.mark.parametrize("usual", [INDUSTRIAL, UNIVERSAL_ROBOTS])
-def test_every_band_of_the_series_has_a_size(usual: RobotClass) -> None:
+def test_every_band_of_the_series_has_a_prior(usual: RobotClass) -> None:
     assert len(usual.bands) == len(FourierSeries(Robot.load("ur5"), usual.harmonics).group_names)

@@ -29,7 +29,7 @@ def moved(robot: Robot) -> Robot:
 
 
 @pytest.mark.parametrize("name", catalogue())
-def test_forward_kinematics_is_ours(name):
+def test_forward_kinematics_agrees(name):
     robot = moved(Robot.load(name))
     chain = robot.to_pytorch_kinematics()
     assert chain.get_joint_parameter_names() == [joint.name for joint in robot.joints]
@@ -39,7 +39,7 @@ def test_forward_kinematics_is_ours(name):
     assert_close(T, forward_kinematics(robot, q), atol=1e-12)
 
 
-def test_jacobian_and_limits_are_those_of_the_robot():
+def test_jacobian_and_limits_agree():
     robot = moved(Robot.load("kiro3"))
     chain = robot.to_pytorch_kinematics()
     q = joints_of(robot, 1)
@@ -52,7 +52,7 @@ def test_jacobian_and_limits_are_those_of_the_robot():
     assert_close(np.array(high)[finite], robot.limits[finite, 1], atol=0)
 
 
-def test_a_model_gives_its_identified_geometry():
+def test_a_model_has_its_identified_geometry():
     model = hand_made_model("ur10")
     q = joints_around("ur10", 5)
     for chain in (model.to_pytorch_kinematics(), pisigma.CorrectedIK(model).to_pytorch_kinematics()):

@@ -23,8 +23,8 @@ MODULES = {"mujoco": "mujoco", "pinocchio": "pinocchio", "drake": "pydrake"}
 @pytest.mark.parametrize("drawn", [False, True], ids=["a new file", "the file that it was drawn in"])
 @pytest.mark.parametrize("peer", MODULES)
 @pytest.mark.parametrize("name", ["ur5e", "panda", "kiro3", "fanuc_r2000"])
-def test_peers_have_the_tool_where_pisigma_has_it(peer, name, drawn, tmp_path, repository):
-    """Their interpreter is that of PISIGMA_PEERS, so that they need not fit pisigma's own packages."""
+def test_peers_compute_the_same_tool_pose(peer, name, drawn, tmp_path, repository):
+    """They run in the interpreter of PISIGMA_PEERS, so that they need not be compatible with pisigma's packages."""
     python = os.environ.get("PISIGMA_PEERS", sys.executable)
     if subprocess.run([python, "-c", f"import {MODULES[peer]}"], capture_output=True, check=False).returncode:
         pytest.skip(f"{peer} is not installed for {python}; name a Python that has it in PISIGMA_PEERS")

@@ -1,4 +1,4 @@
-"""From any chain of joints to DH + Hayati rows and out again: the same forward kinematics."""
+"""Chains converted to DH and Hayati rows and back keep their forward kinematics."""
 
 import math
 import tempfile
@@ -51,7 +51,7 @@ def load(text: str) -> Robot:
 
 
 def joint_values(robot: Robot, count: int = 5) -> torch.Tensor:
-    """All zero, and others."""
+    """Return zero and random joint values."""
     generator = torch.Generator().manual_seed(1)
     drawn = 6 * torch.rand((count - 1, robot.dof), generator=generator, dtype=torch.float64) - 3
     return torch.cat([torch.zeros(1, robot.dof, dtype=torch.float64), drawn])
@@ -75,7 +75,7 @@ def test_any_chain_keeps_its_forward_kinematics(chain):
 
 @settings(max_examples=60, deadline=None)
 @given(chains)
-def test_no_length_is_far_beyond_those_of_the_chain(chain):
+def test_no_length_is_much_larger_than_those_of_the_chain(chain):
     """A common normal of nearly parallel axes would be hundreds of metres away."""
     robot = load(urdf_text(chain))
     drawn = sum(float(np.linalg.norm(joint.xyz)) for joint in chain)
@@ -83,7 +83,7 @@ def test_no_length_is_far_beyond_those_of_the_chain(chain):
 
 
 @pytest.mark.parametrize("tilt", [0.0, 1e-9, 1e-6, 1e-3, math.pi, math.pi - 1e-6])
-def test_nearly_parallel_axes_get_the_row_of_hayati(tilt):
+def test_nearly_parallel_axes_get_hayati_rows(tilt):
     chain = [
         DrawnJoint("revolute", (0, 0, 0.3), (0, 0, 0)),
         DrawnJoint("revolute", (0.4, 0, 0.1), (0, tilt, 0)),
@@ -96,7 +96,7 @@ def test_nearly_parallel_axes_get_the_row_of_hayati(tilt):
 
 
 @pytest.mark.parametrize("twist", [0.2, math.pi / 2, -math.pi / 2, 2.0])
-def test_other_axes_get_the_row_of_denavit_and_hartenberg(twist):
+def test_other_axes_get_dh_rows(twist):
     chain = [
         DrawnJoint("revolute", (0, 0, 0.3), (0, 0, 0)),
         DrawnJoint("revolute", (0.4, 0, 0.1), (twist, 0, 0)),
@@ -120,7 +120,7 @@ def test_the_catalogue_through_urdf_and_back(name, tmp_path):
 
 @pytest.mark.parametrize("name", ["kiro3", "kiro4", "panda", "rb5", "ur10"])
 def test_right_angles_and_offsets_stay_exact(name):
-    """Closed forms and the fast forward kinematics live on exact zeros."""
+    """Closed forms and the fast forward kinematics rely on exact zeros."""
     again = load(robot_to_urdf(Robot.load(name)))
     quarters = again.dh[:, [0, 3, 4]] / (math.pi / 2)
     assert (quarters == np.round(quarters)).all()
@@ -142,14 +142,14 @@ def test_the_peer_agrees(chain):
     assert_close(written, drawn, atol=1e-10)
 
 
-def test_a_sliding_axis_lies_on_the_next_parallel_one():
+def test_a_prismatic_axis_is_placed_on_the_next_parallel_one():
     """The links of a SCARA keep their lengths, the second in its own row."""
     robot = load(robot_to_urdf(Robot.load("kiro3")))
     assert_close(robot.dh[:, 2], [0.32, 0.32, 0, 0], atol=1e-15)
 
 
-def test_a_calibrated_robot_goes_out_exactly(tmp_path):
-    """All five parameters, base and tool, fixed rows, both directions, axes off parallel by arc seconds."""
+def test_a_calibrated_robot_is_written_exactly(tmp_path):
+    """All five parameters, base and tool, fixed rows, both directions, axes that are parallel up to arc seconds."""
     nominal = Robot.load("ur10")
     random = np.random.default_rng(2)
     robot = nominal.with_geometry(

@@ -187,10 +187,10 @@ def _transform(pose: Pose) -> "np.ndarray":
     """The wanted pose T_base_tool as a batch of one; values that no pose has are refused."""
     from pisigma.files.errors import PoseError
     from pisigma.robot.kernels.array_kinematics import transform_of
-    from pisigma.robot.row import FRAME_COLUMNS, LARGEST
+    from pisigma.robot.row import FRAME_COLUMNS, MAX_MAGNITUDE
 
     for name, value in zip(FRAME_COLUMNS, pose, strict=True):
-        if not abs(value) <= LARGEST:
+        if not abs(value) <= MAX_MAGNITUDE:
             raise PoseError(
                 f"--pose: {name} {value:g} is no length [mm] or angle [deg] that a pose has; give X Y Z ROLL PITCH YAW."
             )

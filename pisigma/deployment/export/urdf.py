@@ -12,7 +12,8 @@ from pisigma.files.errors import OutputError, RobotError
 from pisigma.files.model_files import DRAWING
 from pisigma.robot.description import Robot
 from pisigma.robot.drawing import Drawing
-from pisigma.robot.urdf_chain import Chain, origin_of, parse_xml, read_chain, read_urdf
+from pisigma.robot.urdf_chain import Chain, origin_of, read_chain
+from pisigma.robot.urdf_file import parse_xml, read_urdf
 from pisigma.robot.urdf_frames import Frame, frame_of, inverse, row_frame
 from pisigma.robot.urdf_rows import URDF_SOURCE, ChainRows, rows_of_chain
 from pisigma.robot.writing import (

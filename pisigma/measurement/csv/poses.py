@@ -19,7 +19,7 @@ from pisigma.measurement.csv.rows import QUATERNION_TOLERANCE
 from pisigma.measurement.csv.table import content_lines, header_names, split_line
 from pisigma.measurement.fields import Fault, LeftOut
 from pisigma.measurement.readings import to_si
-from pisigma.robot.row import LARGEST
+from pisigma.robot.row import MAX_MAGNITUDE
 from pisigma.robot.se3 import rotation_from_quaternion, rotation_from_rpy, transform
 
 CHUNK_ROWS = 20_000
@@ -157,7 +157,7 @@ class _Layout:
                 except ValueError:
                     pass
                 else:
-                    if np.abs(numbers).max(initial=0.0) <= LARGEST:  # no NaN either
+                    if np.abs(numbers).max(initial=0.0) <= MAX_MAGNITUDE:  # no NaN either
                         return numbers, {}
         return self._checked_values(lines)
 
@@ -185,8 +185,8 @@ class _Layout:
             shown = cell.strip()[:_MAX_SHOWN]
             if not np.isfinite(_number(cell)):
                 return Fault("", name, "a finite number", shown, "write one such as -12.5")
-            if abs(_number(cell)) > LARGEST:
-                return Fault("", name, f"a value of up to {LARGEST:g}", shown, "correct it")
+            if abs(_number(cell)) > MAX_MAGNITUDE:
+                return Fault("", name, f"a value of up to {MAX_MAGNITUDE:g}", shown, "correct it")
         return None
 
     def poses(

@@ -14,7 +14,7 @@ from pisigma.measurement.readings import READINGS, from_si, to_si
 from pisigma.measurement.rules import rows_where
 from pisigma.robot import Robot, Row
 from pisigma.robot.kinematics.joint_limits import grossly_beyond
-from pisigma.robot.row import LARGEST
+from pisigma.robot.row import MAX_MAGNITUDE
 
 QUATERNION_TOLERANCE = 1e-3
 """Largest deviation of the norm of a quaternion from 1."""
@@ -104,8 +104,8 @@ def _numbers(cells: Sequence[str], column: Column, faults: Faults) -> Float64[np
         if (cell := cells[row].strip())
     )
     with np.errstate(invalid="ignore"):
-        large = rows_where(np.abs(values) > LARGEST)
-    expected = f"a value of up to {LARGEST:g} {column.unit}".rstrip()
+        large = rows_where(np.abs(values) > MAX_MAGNITUDE)
+    expected = f"a value of up to {MAX_MAGNITUDE:g} {column.unit}".rstrip()
     faults.add((row, Fault("", column.name, expected, float(values[row]), "correct it")) for row in large)
     return values
 

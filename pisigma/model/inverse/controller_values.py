@@ -145,7 +145,7 @@ class ControllerValues:
         """DH values turned so that the controller's are within its limits, and which of them cannot be."""
         rows = q.reshape(-1, q.shape[-1])
         beside = None if near is None else np.broadcast_to(near, q.shape).reshape(rows.shape)
-        turned, inside = self.coupling.turned_inside(rows, beside)
+        turned, inside = self.coupling.wrapped_inside(rows, beside)
         return turned.reshape(q.shape), (~inside & np.isfinite(rows).all(-1)).reshape(q.shape[:-1])
 
     def _other_branches(self, T: Any, q: Any, outside: Any, near: Any, options: dict[str, Any]) -> None:

@@ -352,7 +352,7 @@ class _Poses:
         if throw:
             check_transforms(T, "T_base_tool", tolerance)
         rows = T.reshape(-1, 4, 4)
-        fine = ~torch.stack([bad for bad, _ in transform_faults(rows, tolerance)]).any(0)
+        fine = ~torch.stack([bad for bad, *_ in transform_faults(rows, tolerance)]).any(0)
         rows = torch.where(fine[:, None, None], rows, torch.eye(4, dtype=torch.float64))
         return _Poses(rows, fine, single, tuple(T.shape[:-2]))
 

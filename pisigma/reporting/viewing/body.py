@@ -18,7 +18,8 @@ from pisigma.planning.surroundings.capsules import Capsules
 from pisigma.reporting.viewing.colors import Color
 from pisigma.reporting.viewing.surface import Surface, capsule, joined
 from pisigma.robot.description import Robot
-from pisigma.robot.urdf_chain import origin_of, parse_xml, read_chain, read_urdf
+from pisigma.robot.urdf_chain import origin_of, read_chain
+from pisigma.robot.urdf_file import parse_xml, read_urdf
 from pisigma.robot.urdf_frames import Frame, frame_of, shift
 
 if TYPE_CHECKING:  # names in full, which type checkers at run time find without these imports

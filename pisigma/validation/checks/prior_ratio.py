@@ -67,13 +67,13 @@ def class_of(checked: CheckedCalibration, large: Sequence[PriorRatio]) -> RobotC
     usual = _usual_class(checked)
     sizes = [(ratio.group, ratio.size) for ratio in large]
     at_least = [(ratio.group, ratio.size_at_least) for ratio in large]
-    if usual.holds(at_least) or checked.calibrator.robot_class is not None:
-        return usual if usual.holds(at_least) else None
+    if usual.allows(at_least) or checked.calibrator.robot_class is not None:
+        return usual if usual.allows(at_least) else None
     if any(group != PriorGroup.JOINT_OFFSET for group, size in at_least if size > usual.largest.of(group)):
         return None
     names = list(CLASSES)
     wider = [CLASSES[name] for name in names[names.index(usual.name) + 1 :]]
-    return next((one for those in (sizes, at_least) for one in wider if one.holds(those)), None)
+    return next((one for those in (sizes, at_least) for one in wider if one.allows(those)), None)
 
 
 def predicts_left_out_rows(checked: CheckedCalibration) -> bool:

@@ -5,7 +5,7 @@ import re
 from pisigma.deployment.export.controllers.controller_file import ControllerFile, FileText
 from pisigma.deployment.export.urdf import drawn_into
 from pisigma.files.errors import OutputError
-from pisigma.robot.urdf_chain import XACRO
+from pisigma.robot.urdf_file import XACRO
 
 
 def with_properties(urdf: str) -> str:

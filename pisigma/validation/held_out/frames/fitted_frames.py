@@ -13,7 +13,7 @@ from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.groups import groups_to_keep_whole, numbers_of_names
 from pisigma.model.calibrated_model import CalibratedModel, poses_of_rows
 from pisigma.robot.frame_fits import (
-    FIRST_DAMPING,
+    INITIAL_DAMPING,
     LEVER_SHARE,
     SETTLED,
     STEPS,
@@ -178,7 +178,7 @@ def fit_frames(
     if "tool" in fitted:
         tools = _each(best_tool, bases[frame] @ T, measured, target)
     columns, error = _columns(T, measured, (bases, frame), (tools, target), fitted)
-    damping = FIRST_DAMPING
+    damping = INITIAL_DAMPING
     for _ in range(STEPS if len(fitted) > 1 else 0):
         A = columns.flatten(0, 1)
         normal = A.mT @ A
