@@ -67,12 +67,12 @@ def fitted(
             posterior = fit.maximise_evidence(sizes, noise)
         else:
             posterior = fit.solve(prior, noise)
-            posterior = fit.solve(prior, fit.renewed_noise(posterior))
+            posterior = fit.solve(prior, fit.updated_noise(posterior))
         x, sizes, noise, effective = posterior.x, posterior.prior, posterior.noise, posterior.effective
     rows = linearised(design, posterior.x, posterior.effective, group)
     fit = regression(design, rows)
     there = fit.solve(posterior.prior, posterior.noise)
-    there = fit.solve(posterior.prior, fit.renewed_noise(there))
+    there = fit.solve(posterior.prior, fit.updated_noise(there))
     point = problem.nominal.index_add(0, problem.active, there.x[: design.active])
     return Refined(rows, design, there, fit, point, network(design, there.x), ROUNDS)
 

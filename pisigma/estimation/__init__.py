@@ -1,1 +1,1 @@
-"""The linear-Gaussian core: priors, evidence, posterior and its update, left-out and contradicting values; losses."""
+"""Linear-Gaussian estimation: priors, evidence, posteriors and their update, left-out values, wrong rows and losses."""

@@ -1,4 +1,4 @@
-"""Cholesky factors of symmetric matrices, and what is made of them in little memory."""
+"""Cholesky factors of symmetric matrices, and operations on them with little memory."""
 
 import ctypes
 import sys
@@ -11,18 +11,17 @@ from torch import Tensor
 from pisigma.files.errors import IdentificationError
 
 BLOCK = 192
-"""Triangular matrices are worked on in blocks of so many rows: small ones leave less of what is 0 in the products,
-large ones are multiplied faster."""
+"""Block size of operations on triangular matrices: small blocks multiply fewer zeros, large ones are faster."""
 MANY_UNKNOWNS = 1_000
-"""Matrices of more are large enough to make room for."""
+"""Number of unknowns above which free memory is returned before a matrix is allocated."""
 
 
 def factored(matrix: Callable[[], Float64[Tensor, "unknowns unknowns"]]) -> tuple[Tensor, Tensor]:
-    """Column scale, and Cholesky factor of a scaled symmetric matrix.
+    """Return the column scale and the Cholesky factor of the scaled symmetric matrix.
 
     Args:
-        matrix: makes it, stored row by row; its upper triangle is read. As the factor takes its memory, it is made
-            again where that fails.
+        matrix: function that returns the matrix, row-major; its upper triangle is read. The factor overwrites it, so it
+            is called again if the factorisation fails.
 
     Raises:
         IdentificationError: the matrix is not finite.
@@ -38,13 +37,15 @@ def factored(matrix: Callable[[], Float64[Tensor, "unknowns unknowns"]]) -> tupl
             return scale, factor
         if not bool(torch.isfinite(matrix()).all()):
             raise IdentificationError(
-                "the normal equations are not finite; look for values without limit in the measurements."
+                "the normal equations are not finite",
+                expected="finite measurements",
+                remedy="check the measurements for infinite or huge values",
             )
         jitter *= 10
 
 
 def covariance_factor(V: Float64[Tensor, "values values"]) -> Float64[Tensor, "values values"]:
-    """Cholesky factor of a covariance of values; rounding of far larger variances is made up for."""
+    """Return the Cholesky factor of a covariance of values, with jitter if rounding makes it indefinite."""
     jitter = 0.0
     while True:
         factor: Tensor
@@ -55,18 +56,18 @@ def covariance_factor(V: Float64[Tensor, "values values"]) -> Float64[Tensor, "v
 
 
 def log_determinant(scale: Tensor, factor: Tensor) -> float:
-    """Of a matrix from what `factored` gives."""
+    """Return the log determinant of a matrix from the results of `factored`."""
     return 2 * float(factor.diagonal().log().sum()) - 2 * float(scale.log().sum())
 
 
 def inverted(scale: Tensor, factor: Tensor) -> Float64[Tensor, "unknowns unknowns"]:
-    """Inverse of a matrix from what `factored` gives, in the place of the factor."""
-    inverse: Tensor = torch.cholesky_inverse(factor, out=factor).mT  # symmetric, and so stored row by row
+    """Return the inverse of a matrix from the results of `factored`, in the memory of the factor."""
+    inverse: Tensor = torch.cholesky_inverse(factor, out=factor).mT  # symmetric, so this is row-major
     return inverse.mul_(scale).mul_(scale[:, None])
 
 
 def invert_triangle(factor: Tensor) -> None:
-    """Put its inverse in the place of a lower triangular matrix: block by block, so that most of it are products."""
+    """Invert a lower triangular matrix in place, block by block, so that most of the work is matrix products."""
     stretches = blocks(len(factor), BLOCK)
     for number, rows in enumerate(stretches):
         diagonal = factor[rows, rows]
@@ -80,15 +81,15 @@ def invert_triangle(factor: Tensor) -> None:
 
 
 def blocks(count: int, size: int) -> list[slice]:
-    """Rows that are worked on together."""
+    """Return the slices of rows of all blocks."""
     return [slice(start, start + size) for start in range(0, count, size)]
 
 
 def return_free_memory(unknowns: int) -> None:
-    """Give free memory back to the system where the C library offers that (`malloc_trim` of glibc); else do nothing.
+    """Return free memory to the system if the C library can (`malloc_trim` of glibc), for many unknowns only.
 
-    After fits of thousands of unknowns more than 100 MB are free in pieces between what is in use, and the matrices of
-    the next fit would come on top of them.
+    After fits of thousands of unknowns more than 100 MB are free in fragments, and the matrices of the next fit would
+    be allocated in addition to them.
     """
     if unknowns > MANY_UNKNOWNS and sys.platform == "linux":
         trim = getattr(ctypes.CDLL(None), "malloc_trim", None)

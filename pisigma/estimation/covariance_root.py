@@ -1,4 +1,4 @@
-"""A root R of the covariance of all unknowns, `C = R R^T`, as a matrix or as the factors of few values."""
+"""Square root R of the covariance of all unknowns, `C = R R^T`, as a matrix or in factors for few values."""
 
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -10,15 +10,15 @@ from torch import Tensor
 
 @dataclass(frozen=True, eq=False)
 class FewValues:
-    """What n values leave of the prior of the weights: `D (I - Z^T L^-T (L + 1)^-1 Z)` with `L L^T = Z Z^T + 1`.
+    """Covariance root of the weights after n values: `D (I - Z^T L^-T (L + 1)^-1 Z)` with `L L^T = Z Z^T + 1`.
 
     Its product with its transpose is `D (Z^T Z + 1)^-1 D`: the update of Andrews 1968 (AIAA Journal 6(6), 1165-1166)
     for all values at once.
 
     Attributes:
         size: prior standard deviation of every weight, the diagonal of D.
-        Z: the values' derivatives by the weights, times D and over the noise.
-        factor: L, a lower triangle.
+        Z: derivatives of the values with respect to the weights, times D and divided by the noise.
+        factor: L, lower triangular.
     """
 
     size: Float64[Tensor, " weights"]
@@ -26,7 +26,7 @@ class FewValues:
     factor: Float64[Tensor, "values values"]
 
     def along(self, columns: Float64[Tensor, "*batch weights"]) -> Float64[Tensor, "*batch weights"]:
-        """`columns @ root`."""
+        """Return `columns @ root`."""
         scaled = columns.flatten(0, -2) * self.size
         once = self.factor + torch.eye(len(self.factor)).to(self.factor)
         inner = torch.linalg.solve_triangular(self.factor, self.Z @ scaled.t(), upper=False)
@@ -35,7 +35,7 @@ class FewValues:
         return result.reshape(columns.shape)
 
     def times(self, matrix: Float64[Tensor, "weights columns"]) -> Float64[Tensor, "weights columns"]:
-        """`root @ matrix`."""
+        """Return `root @ matrix`."""
         once = self.factor + torch.eye(len(self.factor)).to(self.factor)
         inner = torch.linalg.solve_triangular(once, self.Z @ matrix, upper=False)
         inner = torch.linalg.solve_triangular(self.factor.t(), inner, upper=True)
@@ -46,11 +46,11 @@ class FewValues:
 def after_values(
     along: Float64[Tensor, "*batch directions"], B: Float64[Tensor, "values directions"]
 ) -> Float64[Tensor, "*batch directions"]:
-    """`A R'` with R' the root after values are measured, whatever they are: `A R L^-T` with `L L^T = 1 + B^T B`.
+    """Return `A R'` for the root R' after a measurement of any values: `A R L^-T` with `L L^T = 1 + B^T B`.
 
     Args:
-        along: `A R` with the root R before.
-        B: derivatives of the values along the directions of R, over their noise.
+        along: `A R` with the root R before the measurement.
+        B: derivatives of the values along the directions of R, divided by their noise.
     """
     lower = torch.linalg.cholesky(torch.eye(B.shape[1]).to(B) + B.t() @ B)
     after: Tensor = torch.linalg.solve_triangular(lower, along.flatten(0, -2).t(), upper=False).t()
@@ -59,11 +59,11 @@ def after_values(
 
 @dataclass(frozen=True, eq=False)
 class CovarianceRoot:
-    """R: some directions of all unknowns, and beside them those of the weights alone that few values leave.
+    """R as columns for all unknowns, and in factors for columns of the weights only (for few values).
 
     Attributes:
-        directions: columns of R.
-        weights: the other columns, which are 0 for the parameters in front; None where there are none.
+        directions: columns of R for all unknowns.
+        weights: further columns, which are 0 for the parameters; None if there are none.
     """
 
     directions: Float64[Tensor, "unknowns directions"]
@@ -71,7 +71,7 @@ class CovarianceRoot:
 
     @cached_property
     def dense(self) -> Float64[Tensor, "unknowns directions"]:
-        """All of R."""
+        """R as a matrix."""
         if self.weights is None:
             return self.directions
         count = len(self.weights.size)
@@ -80,8 +80,8 @@ class CovarianceRoot:
         return torch.cat([self.directions, torch.cat([above, below])], 1)
 
     def along(self, columns: Float64[Tensor, "*batch unknowns"]) -> Float64[Tensor, "*batch directions"]:
-        """`columns @ R`."""
-        # one product of two matrices: torch would read R once for every row of columns that are a view
+        """Return `columns @ R`."""
+        # one product of two matrices, because torch would read R once for every row of a non-contiguous view
         result = columns.flatten(0, -2) @ self.directions
         if self.weights is not None:
             first = self.directions.shape[0] - len(self.weights.size)
@@ -91,7 +91,7 @@ class CovarianceRoot:
     def covariance_times(
         self, matrix: Float64[Tensor, "unknowns columns"]
     ) -> Float64[Tensor, "unknowns columns"]:
-        """`C @ matrix`."""
+        """Return `C @ matrix`."""
         result = self.directions @ (self.directions.t() @ matrix)
         if self.weights is not None:
             first = len(result) - len(self.weights.size)
@@ -104,12 +104,12 @@ class CovarianceRoot:
         scale: float,
         change: Float64[Tensor, "parameters active"],
     ) -> "CovarianceRoot":
-        """With more columns, a factor on the standard deviations, and the first unknowns in other coordinates.
+        """Return a root with more columns, scaled standard deviations, and the first unknowns in other coordinates.
 
         Args:
-            added: columns.
-            scale: the factor.
-            change: parameters in the other coordinates by the first unknowns.
+            added: columns to add.
+            scale: factor on the standard deviations.
+            change: matrix from the first unknowns to the parameters in the other coordinates.
         """
         (parameters, active), (unknowns, columns) = change.shape, self.directions.shape
         directions = change.new_empty((parameters + unknowns - active, columns + added.shape[1]))

@@ -1,4 +1,4 @@
-"""How much every group of unknowns has drifted since a calibration, by the evidence of new rows."""
+"""Estimate the drift of groups of unknowns since a calibration by the evidence of new rows."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -12,38 +12,38 @@ from pisigma.estimation.cholesky import covariance_factor
 from pisigma.estimation.regression import SensorCount
 
 SIZES = torch.logspace(-6, -0.5, 56, dtype=torch.float64)
-"""Sizes that are tried: 1 µm to 0.3 m, 0.0001 to 18 deg; of corrections, shares of ten times their usual size."""
-WORTH = 4.0
-"""[nats] By so much a drift has to raise the log evidence: prior odds of about 1 to 50 for a group of the arm."""
-WORTH_OF_WRONG = math.log(100)
-"""[nats] The same of a wrong configuration of any number of them: prior odds of 1 to 100 that one is."""
-SWEEPS = 3
+"""Drift sizes to try: 1 µm to 0.3 m, 0.0001 to 18 deg; for corrections, shares of ten times their usual size."""
+LOG_PRIOR_PENALTY = 4.0
+"""Increase of the log evidence that a drift needs [nats]: prior odds of about 1 to 50 for a group of the arm."""
+WRONG_ROW_PENALTY = math.log(100)
+"""The same for one wrong configuration among any number of them [nats]: prior odds of 1 to 100."""
+MAX_SWEEPS = 3
 NOISE_FACTORS = torch.linspace(-1.0, 1.6, 14, dtype=torch.float64).exp()
 """Factors on the noise of the calibration that are tried."""
 NOISE_SPREAD = 0.3
-"""Standard deviation of the logarithm of the noise beside that of the calibration."""
+"""Prior standard deviation of the log ratio of the noise to that of the calibration."""
 
 
 @dataclass(frozen=True, eq=False)
 class DriftGroup:
-    """Unknowns that drift by about as much: independent, of standard deviation `size · scale`.
+    """Unknowns that drift together: independent, with the standard deviation `size · scale`.
 
     Attributes:
-        what: has moved, such as "joint 3", "base" or "correction".
-        index: of its unknowns.
-        scale: of every unknown at size 1 [m or rad].
-        size: 0 where it has not drifted.
-        stands: whether the size is stated rather than estimated, as that of a base which stands elsewhere.
-        worth: [nats] by so much its drift has to raise the log evidence.
-        single: whether it is one motion, rather than many ways to err otherwise than before.
+        what: name of the group, such as "joint 3", "base" or "correction".
+        index: indices of its unknowns.
+        scale: standard deviation of every unknown at size 1 [m or rad].
+        size: size of the drift; 0 if the group has not drifted.
+        fixed_size: whether the size is given rather than estimated, as for a base that was relocated.
+        log_prior_penalty: increase of the log evidence that a drift of the group needs [nats].
+        single: whether the group is one motion rather than a set of many independent changes.
     """
 
     what: str
     index: Int64[Tensor, " members"]
     scale: Float64[Tensor, " members"]
     size: float = 0.0
-    stands: bool = False
-    worth: float = WORTH
+    fixed_size: bool = False
+    log_prior_penalty: float = LOG_PRIOR_PENALTY
     single: bool = True
 
     @property
@@ -54,15 +54,15 @@ class DriftGroup:
 
 @dataclass(frozen=True, eq=False)
 class LinearValues:
-    """Measured values, linear in the unknowns: `y = X u + e` with u counted from the most probable values of a model.
+    """Measured values, linear in the unknowns: `y = X u + e` with u relative to the most probable values of a model.
 
     Attributes:
         X: weighted derivatives.
         y: weighted residuals of the model.
-        sensor: number of every value's sensor.
-        configuration: number of the joint values at which every value was measured.
-        counts: of the sensors.
-        wrong: configurations that were measured wrongly, each with the factor on its noise.
+        sensor: index of every value's sensor.
+        configuration: index of the joint values at which every value was measured.
+        counts: number of values of every sensor.
+        wrong: configurations with wrong measurements, with the factors on their noise.
     """
 
     X: Float64[Tensor, "values unknowns"]
@@ -78,7 +78,7 @@ class LinearValues:
         return replace(self, **{name: getattr(self, name)[values] for name in names})
 
     def deviation(self, noise: Float64[Tensor, " sensors"]) -> Float64[Tensor, " values"]:
-        """Standard deviation of the noise of every value, by those of the sensors."""
+        """Return the noise standard deviation of every value from those of the sensors."""
         deviation = noise[self.sensor]
         for number, factor in self.wrong.items():
             wrong = (self.configuration == number) & ~self.exact
@@ -87,24 +87,24 @@ class LinearValues:
 
     @property
     def exact(self) -> Bool[Tensor, " values"]:
-        """Whether every value is exactly as stated, rather than measured."""
+        """For every value, whether its noise is exactly as stated."""
         return torch.tensor([one.exact for one in self.counts])[self.sensor]
 
     @property
-    def worth(self) -> float:
-        """[nats] By so much the wrong configurations together have to raise the log evidence."""
+    def log_prior_penalty(self) -> float:
+        """Increase of the log evidence that the wrong configurations need together [nats]."""
         count = len(torch.unique(self.configuration))
-        return len(self.wrong) * (WORTH_OF_WRONG + math.log(max(count, 1)))
+        return len(self.wrong) * (WRONG_ROW_PENALTY + math.log(max(count, 1)))
 
 
 @dataclass(frozen=True, eq=False)
 class Drift:
-    """Sizes of the drift of all groups, and the noise of the new rows.
+    """Drift sizes of all groups, and noise of the new rows.
 
     Attributes:
-        groups: with their sizes.
-        noise: per sensor [m or rad], or a factor where the rows state it.
-        log_evidence: of the new rows, with the prior odds of the drifts and of wrong configurations.
+        groups: groups with their sizes.
+        noise: noise of every sensor [m or rad], or a factor if the rows state it.
+        log_evidence: log evidence of the new rows, including the prior odds of drifts and wrong configurations.
     """
 
     groups: tuple[DriftGroup, ...]
@@ -113,13 +113,13 @@ class Drift:
 
 
 class DriftSearch:
-    """The evidence of new rows under a model's posterior that has drifted.
+    """Search for the drift sizes that maximise the evidence of new rows under a model's posterior.
 
-    With A the derivatives by the directions of the posterior's root, Z_g those by the unknowns of a group times their
-    scale, and u ~ N(0, R R^T + Σ_g drift), the values are normal with the covariance
-    `V = A A^T + Σ_g size_g² Z_g Z_g^T + noise²`. Sizes are chosen one after the other, each with all others as they
-    are: for the eigenvalues λ and coordinates b of a group in the metric of the rest, a size s raises the log evidence
-    by `Σ (s² λ b² / (1 + s² λ) - log(1 + s² λ)) / 2` (Tipping and Faul 2003, Fast marginal likelihood maximisation for
+    With A the derivatives along the directions of the posterior's root, Z_g those with respect to the unknowns of a
+    group times their scale, and u ~ N(0, R R^T + Σ_g drift), the values are normal with the covariance
+    `V = A A^T + Σ_g size_g² Z_g Z_g^T + noise²`. Sizes are optimised one at a time with all others fixed: for the
+    eigenvalues λ and coordinates b of a group in the metric of the other terms, a size s raises the log evidence by
+    `Σ (s² λ b² / (1 + s² λ) - log(1 + s² λ)) / 2` (Tipping and Faul 2003, Fast marginal likelihood maximisation for
     sparse Bayesian models, eq. 18, for groups instead of single columns).
     """
 
@@ -131,38 +131,38 @@ class DriftSearch:
         noise: Float64[Tensor, " sensors"],
         usual_noise: Float64[Tensor, " sensors"],
     ) -> None:
-        """Start with the sizes of some groups and a noise.
+        """Start with initial sizes and noise.
 
         Args:
-            values: the new rows.
-            A: their derivatives by the directions of the root.
-            groups: with sizes to start from.
-            noise: to start from.
-            usual_noise: that of the calibration.
+            values: values of the new rows.
+            A: their derivatives along the directions of the root.
+            groups: groups with initial sizes.
+            noise: initial noise of every sensor.
+            usual_noise: noise of the calibration.
         """
         self.values, self._K = values, A @ A.t()
         self._groups, self._noise, self._usual = list(groups), noise.clone(), usual_noise
-        self._Z = [fewest_columns(values.X[:, one.index] * one.scale) for one in groups]
+        self._Z = [compressed_columns(values.X[:, one.index] * one.scale) for one in groups]
         self.covariance = self._K + self.deviation.square().diag()
         for one, Z in zip(self._groups, self._Z, strict=True):
             self.covariance += one.size**2 * Z @ Z.t()
 
-    def estimate(self, sweeps: int = SWEEPS) -> None:
-        """Estimate sizes and noise, group after group and sensor after sensor."""
+    def estimate(self, sweeps: int = MAX_SWEEPS) -> None:
+        """Estimate sizes and noise, one group and one sensor at a time."""
         for _ in range(sweeps):
             before = [one.size for one in self._groups]
             for number, group in enumerate(self._groups):
-                if not group.stands:
+                if not group.fixed_size:
                     self._resize(number, self._best_size(number))
             for sensor, count in enumerate(self.values.counts):
                 if not count.exact and count.values:
-                    self._renew_noise(sensor, 1.0 if count.stated else 0.0)
+                    self._update_noise(sensor, 1.0 if count.stated else 0.0)
             if before == [one.size for one in self._groups]:
                 break
 
     @property
     def drift(self) -> Drift:
-        """Sizes and noise as they are now."""
+        """Present sizes and noise."""
         return Drift(tuple(self._groups), self._noise, self.log_evidence)
 
     @property
@@ -172,22 +172,22 @@ class DriftSearch:
 
     @property
     def deviation(self) -> Float64[Tensor, " values"]:
-        """Of every value's noise."""
+        """Noise standard deviation of every value."""
         return self.values.deviation(self._noise)
 
     def shift(
         self, number: int, held: bool = True
     ) -> tuple[Float64[Tensor, " members"], Float64[Tensor, "members members"]]:
-        """Estimate how far the unknowns of a group have moved, everything else as by its own size.
+        """Estimate how far the unknowns of a group have moved, with all other groups at their sizes.
 
         Args:
-            number: of the group.
-            held: by its size, too; else it may have moved by anything.
+            number: index of the group.
+            held: whether the prior of the group with its size is used; otherwise the group is unconstrained.
 
         Returns:
             The shifts [m or rad] and their covariance.
         """
-        group, (_, a, W) = self._groups[number], self._beside(number, reduced=False)
+        group, (_, a, W) = self._groups[number], self._whitened(number, reduced=False)
         normal = W.t() @ W
         if held:
             normal.diagonal().add_(group.size**-2)
@@ -197,15 +197,15 @@ class DriftSearch:
     def _best_size(self, number: int) -> float:
         raised = gains(SIZES, *self._coordinates(number))
         best = int(raised.argmax())
-        return float(SIZES[best]) if float(raised[best]) > self._groups[number].worth else 0.0
+        return float(SIZES[best]) if float(raised[best]) > self._groups[number].log_prior_penalty else 0.0
 
     def _coordinates(self, number: int) -> tuple[Tensor, Tensor]:
-        """Eigenvalues of a group's covariance in the metric of the rest, and squared coordinates of the values."""
-        _, a, W = self._beside(number)
+        """Return the eigenvalues of a group's covariance in the metric of the other terms, and squared coordinates."""
+        _, a, W = self._whitened(number)
         return coordinates(W, a)
 
-    def _beside(self, number: int, reduced: bool = True) -> tuple[Tensor, Tensor, Tensor]:
-        """A group's columns, and values and columns in the metric of everything else."""
+    def _whitened(self, number: int, reduced: bool = True) -> tuple[Tensor, Tensor, Tensor]:
+        """Return a group's columns, and values and columns in the metric of all other terms."""
         group, Z, y = self._groups[number], self._Z[number], self.values.y
         V = self.covariance - group.size**2 * Z @ Z.t()
         if not reduced:
@@ -218,8 +218,8 @@ class DriftSearch:
         self.covariance += (size**2 - group.size**2) * Z @ Z.t()
         self._groups[number] = replace(group, size=size)
 
-    def _renew_noise(self, sensor: int, least: float) -> None:
-        """Take the factor on the usual noise that has the highest evidence, with a log-normal prior."""
+    def _update_noise(self, sensor: int, least: float) -> None:
+        """Use the factor on the usual noise with the highest evidence under a log-normal prior."""
         variance, now = (
             self.values.deviation(torch.ones_like(self._noise)).square(),
             float(self._noise[sensor]),
@@ -237,14 +237,15 @@ class DriftSearch:
     def _log_evidence(self, V: Tensor) -> float:
         factor = covariance_factor(V)
         a = torch.linalg.solve_triangular(factor, self.values.y[:, None], upper=False)
-        odds = self.values.worth + sum(one.worth for one in self._groups if one.size > 0 and not one.stands)
+        estimated = [one for one in self._groups if one.size > 0 and not one.fixed_size]
+        odds = self.values.log_prior_penalty + sum(one.log_prior_penalty for one in estimated)
         return -0.5 * float(a.square().sum()) - float(factor.diagonal().log().sum()) - odds
 
 
 def coordinates(
     W: Float64[Tensor, "values columns"], a: Float64[Tensor, " values"]
 ) -> tuple[Float64[Tensor, " k"], Float64[Tensor, " k"]]:
-    """Eigenvalues of a group's covariance, and squared coordinates of the values, in the metric of everything else."""
+    """Return the eigenvalues of a group's covariance and the squared coordinates of whitened values a."""
     eigenvalues, U = torch.linalg.eigh(W.t() @ W)  # several times as fast as the singular values of W
     eigenvalues = eigenvalues.clamp(min=1e-15 * float(eigenvalues[-1]) + 1e-300)
     return eigenvalues, (U.t() @ (W.t() @ a)).square() / eigenvalues
@@ -255,14 +256,14 @@ def gains(
     eigenvalues: Float64[Tensor, "*groups k"],
     squares: Float64[Tensor, "*groups k"],
 ) -> Float64[Tensor, "sizes *groups"]:
-    """By how much sizes of a group, or of several, raise the log evidence; see `DriftSearch`."""
+    """Return the gain of log evidence for sizes of one or several groups; see `DriftSearch`."""
     ratio = sizes.square()[..., None] * eigenvalues
     raised: Tensor = 0.5 * (ratio / (1 + ratio) * squares - ratio.log1p()).sum(-1)
     return raised
 
 
-def fewest_columns(Z: Float64[Tensor, "values members"]) -> Float64[Tensor, "values columns"]:
-    """Columns with the same `Z Z^T`, no more than there are values."""
+def compressed_columns(Z: Float64[Tensor, "values members"]) -> Float64[Tensor, "values columns"]:
+    """Return columns with the same `Z Z^T`, at most as many as values."""
     if Z.shape[1] <= len(Z):
         return Z
     columns: Tensor = torch.linalg.qr(Z.t(), mode="r").R.t()

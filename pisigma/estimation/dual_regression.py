@@ -1,4 +1,4 @@
-"""Bayesian linear regression by the covariance of the values, as with Gaussian processes: for few values."""
+"""Bayesian linear regression in dual form, by the covariance of the values as in Gaussian processes: for few values."""
 
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
@@ -14,14 +14,14 @@ from pisigma.estimation.prior import GaussianPrior
 from pisigma.estimation.regression import AbstractRegression, Posterior, SensorCount
 
 DETERMINED = 1e-9
-"""Share of the precision of a value, or of the best determined unknown, below which others say nothing of it."""
-LARGEST_RATIO = 1e6
-"""Sum of the values' variances by the prior over that of the noise up to which traces of P are right to 1e-4."""
+"""Share of the precision of a value, or of the best determined unknown, below which it counts as undetermined."""
+MAX_VARIANCE_RATIO = 1e6
+"""Ratio of the values' prior variances to the noise variance up to which traces of P are accurate to 1e-4."""
 
 
 @dataclass(frozen=True, eq=False)
 class DualRegression(AbstractRegression):
-    """The values' covariance `V = Σ_g size_g² K_g + noise²` under the prior of the weights, beside the parameters.
+    """Regression by the values' covariance `V = Σ_g size_g² K_g + noise²` under the prior of the weights.
 
     With G the columns of the parameters and Z those of the weights, `K_g = Σ_i Z_i Z_i^T / base_i` over the
     weights of group g, and `P = V^-1 - V^-1 G (G^T V^-1 G + Λ)^-1 G^T V^-1`::
@@ -35,11 +35,11 @@ class DualRegression(AbstractRegression):
     Attributes:
         X: weighted columns, the parameters first.
         y: weighted values.
-        sensor: number of every value's sensor.
-        prior: whose groups and base the matrices K are of; its sizes do not matter.
+        sensor: index of every value's sensor.
+        prior: prior with the groups and base of the matrices K; its sizes do not matter.
         active: number of parameters.
-        K: of every group of weights, the lower triangle.
-        sensors: how many values there are.
+        K: matrix K of every group of weights, lower triangle.
+        sensors: number of values of every sensor.
     """
 
     X: Float64[Tensor, "values unknowns"]
@@ -73,7 +73,7 @@ class DualRegression(AbstractRegression):
         return Posterior(x, -0.5 * evidence, prior, noise, square, determined, misfit, used)
 
     def covariance_root(self, posterior: Posterior) -> CovarianceRoot:
-        """See `AbstractRegression.covariance_root`; the weights follow the parameters by `-Λ^-1 X^T V^-1 G`."""
+        """See `AbstractRegression.covariance_root`; weights depend on the parameters by `-Λ^-1 X^T V^-1 G`."""
         if self.is_ill(posterior.prior, posterior.noise):
             return self.primal.covariance_root(posterior)
         active, precision = self.active, posterior.prior.precision
@@ -94,12 +94,12 @@ class DualRegression(AbstractRegression):
 
     @cached_property
     def primal(self) -> PrimalRegression:
-        """The same values as normal equations."""
+        """The same regression as normal equations."""
         return PrimalRegression(*self.sums, self.sensors)
 
     @property
     def sums(self) -> tuple[Tensor, Tensor, tuple[float, ...]]:
-        """Sums of the normal equations, per sensor: `X^T X`, `X^T y` and `y^T y`."""
+        """Sums of the normal equations for every sensor: `X^T X`, `X^T y` and `y^T y`."""
         parts = [
             (self.X[rows], self.y[rows]) for rows in (self.sensor == k for k in range(len(self.sensors)))
         ]
@@ -107,13 +107,13 @@ class DualRegression(AbstractRegression):
         return normal, torch.stack([X.t() @ y for X, y in parts]), tuple(float(y @ y) for _, y in parts)
 
     def is_ill(self, prior: GaussianPrior, noise: tuple[float, ...]) -> bool:
-        """Whether the noise is so small beside the values that traces of P cancel; then normal equations are right."""
+        """Return whether traces of P cancel because the noise is very small; normal equations are then accurate."""
         diagonal = torch.arange(len(self.y)).add(1).cumsum(0) - 1
         trace = float(prior.sizes[prior.classes :].square() @ self.K[:, diagonal].sum(1))
-        return trace > LARGEST_RATIO * min(noise) ** 2
+        return trace > MAX_VARIANCE_RATIO * min(noise) ** 2
 
     def _covariance(self, prior: GaussianPrior, noise: tuple[float, ...]) -> Tensor:
-        """The upper triangle of V."""
+        """Return V, of which only the upper triangle is set."""
         V = self.y.new_zeros((len(self.y), len(self.y)))
         V.view(-1)[self._pairs] = prior.sizes[prior.classes :].square() @ self.K
         V.diagonal().add_(self.y.new_tensor(noise).square()[self.sensor])
@@ -121,18 +121,18 @@ class DualRegression(AbstractRegression):
 
     @cached_property
     def _pairs(self) -> Int64[Tensor, " pairs"]:
-        """Where the values' pairs stand in a matrix that is stored row by row."""
+        """Indices of the pairs of values in a row-major matrix."""
         return _upper_triangle(len(self.y))
 
     @cached_property
     def _counts(self) -> Float64[Tensor, " pairs"]:
-        """How often a pair stands in a symmetric matrix."""
+        """Number of entries of a symmetric matrix for each pair: 1 on the diagonal, else 2."""
         return torch.where(self._pairs % (len(self.y) + 1) == 0, 1.0, 2.0).to(self.y)
 
     def projection(
         self, prior: GaussianPrior, noise: tuple[float, ...]
     ) -> tuple[Tensor, Tensor, Tensor, float]:
-        """P, the parameters and their covariance, and `log |V| + log |G^T V^-1 G + Λ|`."""
+        """Return P, the parameters and their covariance, and `log |V| + log |G^T V^-1 G + Λ|`."""
         active = self.active
         factor = factored(lambda: self._covariance(prior, noise))
         log_det = log_determinant(*factor)
@@ -147,23 +147,23 @@ class DualRegression(AbstractRegression):
         return inverse - along @ covariance @ along.t(), parameters, covariance, log_det
 
     def _by_sensor(self, values: Tensor) -> tuple[float, ...]:
-        """Sums of the values of every sensor, those that are alike counted less."""
+        """Return the sum over the values of every sensor."""
         sums = torch.zeros(len(self.sensors)).to(values).index_add(0, self.sensor, values)
         return tuple(sums.tolist())
 
 
-def beside_unknown(
+def without_nuisance(
     V: Float64[Tensor, "values values"], G: Float64[Tensor, "values unknowns"]
 ) -> tuple[Tensor, Tensor, int]:
-    """What values with the covariance V say beside unknowns of which nothing is known before.
+    """Eliminate unknowns without a prior from values with the covariance V.
 
     Args:
-        V: covariance.
-        G: derivatives by the unknowns, some of which the values may not determine.
+        V: covariance of the values.
+        G: derivatives with respect to the unknowns, some of which the values may not determine.
 
     Returns:
-        `P = V^-1 - V^-1 G (G^T V^-1 G)^-1 G^T V^-1`; the unknowns by the values, `(G^T V^-1 G)^-1 G^T V^-1`; and how
-        many of them the values determine.
+        `P = V^-1 - V^-1 G (G^T V^-1 G)^-1 G^T V^-1`; the matrix from values to unknowns, `(G^T V^-1 G)^-1 G^T V^-1`;
+        and the number of unknowns that the values determine.
     """
     inverse = torch.cholesky_inverse(torch.linalg.cholesky(V))
     along = inverse @ G
@@ -176,7 +176,7 @@ def beside_unknown(
 
 
 def gram(X: Tensor, prior: GaussianPrior, group: int, active: int) -> Tensor:
-    """K of one group of weights, which stand behind the parameters."""
+    """Return K of one group of weights, whose columns come after those of the parameters."""
     columns = (prior.group == group).nonzero()[:, 0]
     columns = columns[columns >= active]
     Z = X[:, columns] * prior.base[columns].rsqrt()
@@ -185,18 +185,18 @@ def gram(X: Tensor, prior: GaussianPrior, group: int, active: int) -> Tensor:
 
 @lru_cache(maxsize=4)
 def _upper_triangle(size: int) -> Int64[Tensor, " pairs"]:
-    """Where the pairs of values stand in the upper triangle of a matrix that is stored row by row."""
+    """Return the indices of the pairs of values in the upper triangle of a row-major matrix."""
     pairs: Tensor = torch.tril_indices(size, size)
     return pairs[1] * size + pairs[0]
 
 
 def places_of_pairs(values: Int64[Tensor, " values"]) -> Int64[Tensor, " pairs"]:
-    """Where the pairs of some values, which ascend, stand among the pairs of all values."""
+    """Return the indices of the pairs of some values (ascending) among the pairs of all values."""
     first, second = values[torch.tril_indices(len(values), len(values))]
     pairs: Tensor = first * (first + 1) // 2 + second
     return pairs
 
 
 def stacked(K: list[Tensor], y: Tensor) -> Tensor:
-    """Matrices K of all groups; of none where there are no weights."""
+    """Stack the matrices K of all groups; the result is empty if there are no weights."""
     return torch.stack(K) if K else y.new_zeros((0, len(y) * (len(y) + 1) // 2))

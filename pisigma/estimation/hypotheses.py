@@ -1,4 +1,4 @@
-"""What moved before a session, by the evidence of its rows: one hypothesis for everything that can move by itself."""
+"""Find what moved before a session by the evidence of its rows, with one hypothesis per independent motion."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -16,28 +16,28 @@ from pisigma.estimation.drift import (
     SIZES,
     DriftGroup,
     LinearValues,
+    compressed_columns,
     coordinates,
-    fewest_columns,
     gains,
 )
 
 TRIED = SIZES[SIZES >= 1e-4]
 """Sizes of a motion, all equally probable: 0.1 mm to 0.3 m, 0.006 to 18 deg."""
 CERTAIN = 0.01
-"""Probability of "nothing (more) moved" below which something did."""
+"""Probability of "nothing (else) moved" below which something certainly moved."""
 NAMED = 0.8
-"""Probability from which on a motion is said to have happened."""
-MOST_MOVED = 3
+"""Probability above which a motion is reported as having happened."""
+MAX_MOTIONS = 3
 
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """One hypothesis: what moved, and its probability.
+    """A hypothesis about what moved, and its probability.
 
     Attributes:
-        group: the unknowns.
-        size: of the motion that is most probable, see `DriftGroup`.
-        probability: against nothing (more) and all other hypotheses.
+        group: unknowns that moved.
+        size: most probable size of the motion, see `DriftGroup`.
+        probability: posterior probability among all hypotheses, including that nothing (else) moved.
     """
 
     group: DriftGroup
@@ -47,14 +47,15 @@ class Motion:
 
 @dataclass(frozen=True, eq=False)
 class Explanation:
-    """What the hypotheses say of a session.
+    """Posterior of the hypotheses for a session.
 
     Attributes:
-        motions: that happened, the clearest first.
-        candidates: where something moved and it is not clear what, all hypotheses, the most probable first; else none.
+        motions: motions that happened, the clearest first.
+        candidates: all hypotheses, the most probable first, if something moved but it is not clear what; else empty.
         unchanged: probability that nothing moved.
         noise_factor: most probable factor on the usual noise.
-        log_evidence: of the rows, over all hypotheses beside the motions, and less what wrong rows are worth.
+        log_evidence: log evidence of the rows given the motions, over all other hypotheses, minus the penalties of the
+            motions and of wrong rows.
     """
 
     motions: tuple[Motion, ...]
@@ -65,12 +66,12 @@ class Explanation:
 
 
 class SessionEvidence:
-    """The evidence of a session's rows under a model's posterior, for everything that can have moved.
+    """Evidence of a session's rows under a model's posterior, for all hypotheses about what moved.
 
-    The values are normal with the covariance `V = A A^T + B B^T + (f σ)²`: A are their derivatives by the directions
-    of the posterior's root, so that geometry, frames and correction are as uncertain as the model knows them, and B
-    those by what stands anywhere, such as the base of a tracker that was carried away. A hypothesis adds `s² Z Z^T` for
-    its unknowns; its evidence is the mean over sizes s and noise factors f, each in closed form (see
+    The values are normal with the covariance `V = A A^T + B B^T + (f σ)²`. A are their derivatives along the directions
+    of the posterior's root, so that geometry, frames and correction have the uncertainty of the model; B are those with
+    respect to unknowns with a wide prior, such as the base of a tracker that was relocated. A hypothesis adds
+    `s² Z Z^T` for its unknowns; its evidence is the mean over sizes s and noise factors f, each in closed form (see
     `pisigma.estimation.drift.DriftSearch`). Bayes factors times prior odds give the probabilities (Kass
     and Raftery 1995, Bayes factors, J. Am. Stat. Assoc. 90(430)).
     """
@@ -83,14 +84,14 @@ class SessionEvidence:
         hypotheses: Sequence[DriftGroup],
         usual_noise: Float64[Tensor, " sensors"],
     ) -> None:
-        """Work out the covariance of the values where nothing moved.
+        """Compute the covariance of the values if nothing moved.
 
         Args:
-            values: rows of the session.
-            root: of the covariance of the unknowns by the model's posterior.
-            standing: what stands anywhere.
-            hypotheses: what can have moved by itself, each with its prior odds.
-            usual_noise: that of the calibration, per sensor.
+            values: values of the session.
+            root: covariance root of the unknowns in the model's posterior.
+            standing: groups with a wide prior, such as relocated frames.
+            hypotheses: groups that may have moved independently, with their prior odds.
+            usual_noise: noise of the calibration for every sensor.
         """
         self.values, self._usual_noise = values, usual_noise
         self.known = values.X @ root
@@ -100,17 +101,17 @@ class SessionEvidence:
         self._sigma = values.deviation(usual_noise)
         self._scaled = ~values.exact
         self._groups = tuple(hypotheses)
-        self._Z = [fewest_columns(values.X[:, one.index] * one.scale) for one in self._groups]
+        self._Z = [compressed_columns(values.X[:, one.index] * one.scale) for one in self._groups]
 
     def with_wrong(self, wrong: Mapping[int, float]) -> "SessionEvidence":
-        """Give the evidence of the same rows with other wrong configurations, see `LinearValues`."""
+        """Return the evidence of the same rows with other wrong configurations, see `LinearValues`."""
         other = copy(self)
         other.values = replace(self.values, wrong=wrong)
         other._sigma = other.values.deviation(self._usual_noise)
         return other
 
-    def beside(self, groups: Sequence[DriftGroup]) -> "SessionEvidence":
-        """Give the evidence of the same rows where some groups have moved by about their sizes, whatever else has."""
+    def with_moved(self, groups: Sequence[DriftGroup]) -> "SessionEvidence":
+        """Return the evidence of the same rows if some groups have moved by about their sizes."""
         other = copy(self)
         for one in groups:
             B = self.values.X[:, one.index] * one.deviation
@@ -118,7 +119,7 @@ class SessionEvidence:
         return other
 
     def explain(self) -> Explanation:
-        """Compare all hypotheses, and again beside what has moved clearly, until nothing more has."""
+        """Compare all hypotheses, and repeat with each clear motion added until nothing else has moved."""
         motions: list[Motion] = []
         unchanged = 1.0
         while True:
@@ -126,7 +127,7 @@ class SessionEvidence:
             unchanged = unchanged if motions else compared.unchanged
             clear, best = compared.unchanged < CERTAIN, compared.candidates[0]
             named = best.probability >= NAMED and best.group.single
-            if not (clear and named) or len(motions) == MOST_MOVED:
+            if not (clear and named) or len(motions) == MAX_MOTIONS:
                 candidates = compared.candidates if clear and not motions else ()
                 return replace(compared, unchanged=unchanged, candidates=candidates)
             motions.append(best)
@@ -134,11 +135,11 @@ class SessionEvidence:
     def shift(
         self, groups: Sequence[DriftGroup], noise_factor: float
     ) -> tuple[Float64[Tensor, " members"], Float64[Tensor, "members members"]]:
-        """Estimate how far the unknowns of some groups have moved, everything else being as the model knows it.
+        """Estimate how far the unknowns of some groups have moved, with all others as uncertain as in the model.
 
         Args:
-            groups: with the sizes of their priors; those that stand elsewhere may be among them.
-            noise_factor: on the usual noise.
+            groups: groups with the sizes of their priors; they may include relocated frames.
+            noise_factor: factor on the usual noise.
 
         Returns:
             The shifts [m or rad] and their covariance.
@@ -149,11 +150,11 @@ class SessionEvidence:
     def influence(
         self, groups: Sequence[DriftGroup], noise_factor: float
     ) -> tuple[Float64[Tensor, "members directions"], Float64[Tensor, "members members"]]:
-        """Say where the error of an estimate by `shift` comes from if nothing has moved.
+        """Return the sources of error of an estimate by `shift` if nothing has moved.
 
         Returns:
-            Its derivative by the directions of the posterior's root, which sessions have in common; and the covariance
-            of the rest, which is each session's own.
+            Its derivative with respect to the directions of the posterior's root, which sessions have in common, and
+            the covariance of the other errors, which are independent between sessions.
         """
         gain, _ = self._gain(groups, noise_factor)
         own = self._K - self.known @ self.known.t() + self._noise(noise_factor).square().diag()
@@ -162,17 +163,17 @@ class SessionEvidence:
     def covariance(
         self, groups: Sequence[DriftGroup], noise_factor: float
     ) -> Float64[Tensor, "values values"]:
-        """Give the covariance of the values where some groups have moved by about their sizes."""
-        return self.beside(groups)._K + self._noise(noise_factor).square().diag()
+        """Return the covariance of the values if some groups have moved by about their sizes."""
+        return self.with_moved(groups)._K + self._noise(noise_factor).square().diag()
 
     def error_score(self) -> float:
-        """Root mean square of all values over their standard deviations where nothing moved; about 1 is usual."""
+        """Return the RMS of all values divided by their standard deviations if nothing moved; about 1 is usual."""
         factor = covariance_factor(self._K + self._noise(1.0).square().diag())
         a = torch.linalg.solve_triangular(factor, self.values.y[:, None], upper=False)
         return float(a.square().mean().sqrt())
 
     def _compare(self, motions: Sequence[Motion]) -> Explanation:
-        """Compare all hypotheses beside some motions, and that nothing more has moved."""
+        """Compare all hypotheses given some motions, including that nothing else has moved."""
         K = self._K
         for one in motions:
             Z = self._Z[self._groups.index(one.group)]
@@ -189,7 +190,7 @@ class SessionEvidence:
         joint = evidence[:, None, None] + raised
         nothing = evidence.logsumexp(0)
         log_odds = joint.logsumexp((0, 2)) - math.log(len(TRIED)) - nothing
-        log_odds -= torch.tensor([group.worth for group in self._groups], dtype=torch.float64)
+        log_odds -= torch.tensor([group.log_prior_penalty for group in self._groups], dtype=torch.float64)
         log_odds[[self._groups.index(one.group) for one in motions]] = -math.inf
         log_odds = torch.cat([log_odds, log_odds.new_zeros(1)])
         *probability, unchanged = log_odds.softmax(0).tolist()
@@ -202,12 +203,12 @@ class SessionEvidence:
             unchanged=unchanged,
             noise_factor=float(NOISE_FACTORS[likely.argmax()]),
             log_evidence=float(nothing + log_odds.logsumexp(0))
-            - sum(one.group.worth for one in motions)
-            - self.values.worth,
+            - sum(one.group.log_prior_penalty for one in motions)
+            - self.values.log_prior_penalty,
         )
 
     def _raised(self, a: Tensor, W: Tensor) -> Float64[Tensor, "groups sizes"]:
-        """By how much every group of every size raises the log evidence; columns in the metric of everything else."""
+        """Return the gain of log evidence for every group and size; columns in the metric of all other variances."""
         raised = torch.empty(len(self._groups), len(TRIED), dtype=torch.float64)
         widths = torch.tensor([Z.shape[1] for Z in self._Z])
         single = widths == 1
@@ -221,13 +222,13 @@ class SessionEvidence:
         return raised
 
     def _noise(self, noise_factor: float) -> Float64[Tensor, " values"]:
-        """Standard deviation of every value; what is exactly stated has no factor."""
+        """Return the standard deviation of every value; values that are stated as exact have no factor."""
         return torch.where(self._scaled, noise_factor * self._sigma, self._sigma)
 
     def _gain(self, groups: Sequence[DriftGroup], noise_factor: float) -> tuple[Tensor, Tensor]:
-        """What an estimate of the unknowns of groups is by the values, and its covariance."""
+        """Return the gain matrix from values to an estimate of the groups' unknowns, and its covariance."""
         V = self._K + self._noise(noise_factor).square().diag()
-        for B in (self.values.X[:, one.index] * one.deviation for one in groups if one.stands):
+        for B in (self.values.X[:, one.index] * one.deviation for one in groups if one.fixed_size):
             V = V - B @ B.t()
         factor = covariance_factor(V)
         index, deviation = (

@@ -1,4 +1,4 @@
-"""Values that were left out of a linear fit and predicted by the others."""
+"""Leave-out errors of a linear fit: values that are left out and predicted by the others."""
 
 import math
 from collections.abc import Sequence
@@ -11,19 +11,19 @@ from torch import Tensor
 from pisigma.estimation.regression import SensorCount
 
 SINGULAR = 1e-6
-"""Share of a left-out value's variance below which no other value says anything of it."""
-LARGEST_SCALE = 1e4
+"""Share of a left-out value's variance below which no other value determines it."""
+MAX_SCALE = 1e4
 """Largest factor on variances."""
 
 
 @dataclass(frozen=True, eq=False)
 class LeftOut:
-    """Errors of values that were left out, in standard deviations of the noise.
+    """Errors of left-out values, in standard deviations of the noise.
 
     Attributes:
-        error: measured minus predicted.
-        spread: its predicted standard deviation, parameters and noise.
-        sensor: number of every value's sensor.
+        error: measured minus predicted value.
+        spread: predicted standard deviation of the error, from parameters and noise.
+        sensor: index of every value's sensor.
     """
 
     error: Float64[Tensor, " values"]
@@ -37,16 +37,17 @@ class LeftOut:
         sensor: Int64[Tensor, " values"],
         counts: Sequence[SensorCount],
     ) -> "LeftOut":
-        """Of the values of a fold, from a fit to all values: errors `M^-1 r` of the covariance `M^-1`.
+        """Compute the errors of the values of a fold from a fit to all values: `M^-1 r` with the covariance `M^-1`.
 
-        Where only these values determine an unknown, such as where a socket is, M is singular; that unknown counts as
-        fitted to them, and the errors are scaled by what that takes away (Cook and Weisberg 1982, section 2.2).
+        If only these values determine an unknown, such as the position of a socket, M is singular. That unknown counts
+        as fitted to them, and the errors are scaled by the lost degrees of freedom (Cook and Weisberg 1982, section
+        2.2).
 
         Args:
             M: block of `I - X C X^T` of the values, whitened.
             residual: r, whitened.
-            sensor: number of every value's sensor.
-            counts: of the sensors.
+            sensor: index of every value's sensor.
+            counts: number of values of every sensor.
         """
         factor, failed = torch.linalg.cholesky_ex(M)
         if len(M) and (failed or float(factor.diagonal().min()) ** 2 < SINGULAR):
@@ -62,16 +63,16 @@ class LeftOut:
 
     @staticmethod
     def joined(parts: "Sequence[LeftOut]") -> "LeftOut":
-        """One after the other."""
+        """Concatenate the errors of several folds."""
         names = ("error", "spread", "sensor")
         return LeftOut(*(torch.cat([getattr(part, name) for part in parts]) for name in names))
 
     def rms(self, noise: Sequence[float], unit: Sequence[float]) -> float:
-        """Root mean square in other standard deviations than those of the noise, such as that of another model."""
+        """Return the RMS error in units of other standard deviations than the noise, such as those of another model."""
         return float(self._squares(noise, unit).mean().sqrt())
 
     def gain(self, noise: Sequence[float], before: "LeftOut", noise_before: Sequence[float]) -> float:
-        """By how many standard errors the squares of the same values are smaller than another fit's."""
+        """Return by how many standard errors the squared errors are smaller than those of another fit."""
         return standard_errors(
             before._squares(noise_before, noise_before) - self._squares(noise, noise_before)
         )
@@ -82,19 +83,19 @@ class LeftOut:
 
 
 def standard_errors(values: Float64[Tensor, " values"]) -> float:
-    """The sum of independent values over its standard error; 0 where all are the same."""
+    """Return the sum of independent values divided by its standard error; 0 if all are equal."""
     scatter = (values.square().sum() - values.sum().square() / max(len(values), 1)).clamp(min=0).sqrt()
     return float(values.sum() / scatter) if float(scatter) > 0 else 0.0
 
 
 def left_out_scale(errors: LeftOut) -> float:
-    """Factor on the unknowns' covariance with which left-out values are missed by as much as predicted; 1 or more.
+    """Return the factor on the unknowns' covariance for which left-out errors are as large as predicted, at least 1.
 
-    With errors e and predicted deviations s in units of the noise, it solves `mean(e² / (1 + f (s² - 1))) = 1`.
-    What the model cannot express makes it larger than 1.
+    With errors e and predicted standard deviations s in units of the noise, it solves
+    `mean(e² / (1 + f (s² - 1))) = 1`. Effects that the model cannot express make it larger than 1.
     """
     square, extra = errors.error.square(), errors.spread.square() - 1
-    low, high = 0.0, math.log(LARGEST_SCALE)
+    low, high = 0.0, math.log(MAX_SCALE)
     if float((square / (1 + extra)).mean()) <= 1:
         return 1.0
     for _ in range(60):

@@ -1,4 +1,4 @@
-"""Normal populations: what their members have in common, by empirical Bayes."""
+"""Normal populations of robots, estimated by empirical Bayes."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -8,30 +8,31 @@ from jaxtyping import Float64
 from scipy.stats import chi2
 from torch import Tensor
 
-FEWEST_ROBOTS = 5
-"""Below, scatter between robots cannot be told from what each is uncertain by."""
+MIN_ROBOTS = 5
+"""With fewer robots, scatter between them cannot be distinguished from the uncertainty of each."""
 EM_STEPS = 60
 SEARCH_STEPS = 25
-"""So few do while odd robots are searched for."""
+"""Expectation-maximisation steps while outliers are searched for; these need not converge."""
 CLASS_ROBOTS = 0.02
-"""The class of the robot counts like so many robots in the variances of the fleet: hardly, as robots of one type are
-more alike, and only so much that what no rows determine stays as uncertain as in the class."""
+"""Weight of the robot class in the variances of the fleet, in robots: small, because robots of one type are more alike,
+but enough to keep unknowns that no rows determine as uncertain as in the class."""
 SEARCH_CLASS_ROBOTS = 0.2
-"""The same while odd robots are searched for: a fleet that a few robots make too narrow calls the others odd."""
-ROBOTS_AT_ONCE = 100
-"""Inverses of so many robots are kept at a time, 40 MB."""
-CONCENTRATIONS = 10
-ODD = 1e-3
-"""Probability that any robot of a fleet without odd ones is called odd."""
+"""The same weight while outliers are searched for: if a few robots made the fleet too narrow, all others would be
+outliers."""
+ROBOTS_PER_CHUNK = 100
+"""Number of robots whose inverse matrices are kept at a time (40 MB)."""
+MAX_CONCENTRATIONS = 10
+FALSE_ALARM = 1e-3
+"""Probability that any robot of a fleet without outliers is classified as one."""
 
 
 @dataclass(frozen=True, eq=False)
 class Information:
-    """What the values of one robot say of its unknowns.
+    """Information of the measured values of one robot on its unknowns.
 
     Attributes:
-        normal: information on the unknowns.
-        descent: its product with their most likely values.
+        normal: information matrix (normal matrix) of the unknowns.
+        descent: its product with the most likely values.
     """
 
     normal: Float64[Tensor, "unknowns unknowns"]
@@ -40,11 +41,11 @@ class Information:
 
 @dataclass(frozen=True, eq=False)
 class Population:
-    """Normal errors of the robots of a fleet.
+    """Normal distribution of the errors of the robots of a fleet.
 
     Attributes:
-        mean: of the unknowns [m or rad].
-        covariance: between robots: of geometric parameters in full, of the weights of the correction each by itself.
+        mean: mean of the unknowns [m or rad].
+        covariance: covariance between robots; full for geometric parameters, diagonal for weights of the correction.
         geometric: number of geometric parameters, which come first.
     """
 
@@ -53,21 +54,21 @@ class Population:
     geometric: int
 
     def of_another(self, robots: int) -> "Population":
-        """Give what is known of a robot besides those that the population was estimated from.
+        """Return the predictive distribution of a robot that was not used for the estimate.
 
-        With n of them the mean scatters by `Σ / n`, and the estimate of Σ is too small by `(n - 1) / n`: together
-        `(n + 1) / (n - 1)`.
+        With n robots the mean has the covariance `Σ / n`, and the estimate of Σ is biased by `(n - 1) / n`: together a
+        factor `(n + 1) / (n - 1)`.
 
         Args:
-            robots: how many there were.
+            robots: number of robots that the population was estimated from.
         """
         return replace(self, covariance=(robots + 1) / (robots - 1) * self.covariance)
 
     def surprise(self, robot: Information) -> tuple[float, int]:
-        """How far a robot is from the fleet: a sum of squares that is chi-squared for a robot of it, and of how many.
+        """Return the distance of a robot from the fleet: a sum of squares, chi-squared for its robots, and its degrees.
 
-        In the coordinates in which the covariance is the identity and the information diagonal, `λ`, the descent minus
-        what the mean lets expect has the variance `λ + λ²`.
+        In coordinates in which the covariance is the identity and the information diagonal, `λ`, the descent minus its
+        expectation for the mean has the variance `λ + λ²`.
         """
         root = torch.linalg.cholesky(self.covariance)
         information, axes = torch.linalg.eigh(root.t() @ robot.normal @ root)
@@ -77,7 +78,7 @@ class Population:
         return float(squares[identified].sum()), int(identified.sum())
 
     def log_evidence(self, robot: Information) -> float:
-        """Logarithm of the probability of a robot's rows, up to a constant of the robot."""
+        """Return the log probability of a robot's rows, up to a constant of the robot."""
         root = torch.linalg.cholesky(self.covariance)
         factor = torch.linalg.cholesky(torch.eye(len(root)).to(root) + root.t() @ robot.normal @ root)
         at_mean = robot.normal @ self.mean
@@ -88,24 +89,24 @@ class Population:
         return float(exponent - factor.diagonal().log().sum())
 
 
-def without_odd(
+def without_outliers(
     evidence: Sequence[Information], start: Population, usual: Float64[Tensor, " unknowns"]
 ) -> tuple[Population, tuple[int, ...]]:
-    """Estimate the population of the robots that are alike, and give the numbers of the others.
+    """Estimate the population of the robots without outliers, and return the indices of the outliers.
 
-    It begins with the half that is nearest to the median robot, which several odd ones that are alike do not stretch to
-    themselves, and takes in whatever is not odd beside those, until that no longer changes: concentration steps of
-    Rousseeuw and Van Driessen 1999 (Technometrics 41(3), 212-223). Half of the robots scatter less than all, so
-    distances count in units of the median robot's where that is farther than expected.
+    The search starts with the half of the robots nearest to the median, which a group of similar outliers cannot
+    attract, and adds all robots that are not outliers relative to them until the set no longer changes: concentration
+    steps of Rousseeuw and Van Driessen 1999 (Technometrics 41(3), 212-223). Because half of the robots scatter less
+    than all, distances are divided by that of the median robot if it is larger than expected.
 
     Args:
-        evidence: of the robots.
-        start: a population of usual robots.
-        usual: variances of the class of the robots.
+        evidence: information on every robot.
+        start: population of usual robots.
+        usual: variances of the robot class.
     """
     alike = _nearest_to_median(evidence, start)
     population = start
-    for _ in range(CONCENTRATIONS):
+    for _ in range(MAX_CONCENTRATIONS):
         chosen = [evidence[number] for number in alike]
         population = expectation_maximisation(chosen, start, usual, SEARCH_CLASS_ROBOTS, SEARCH_STEPS)
         surprises = [population.surprise(one) for one in evidence]
@@ -114,9 +115,9 @@ def without_odd(
         now = [
             number
             for number, (square, count) in enumerate(surprises)
-            if chi2.sf(square / unit, max(count, 1)) >= ODD / len(evidence)
+            if chi2.sf(square / unit, max(count, 1)) >= FALSE_ALARM / len(evidence)
         ]
-        if now == alike or len(now) < FEWEST_ROBOTS:
+        if now == alike or len(now) < MIN_ROBOTS:
             break
         alike = now
     population = expectation_maximisation([evidence[number] for number in alike], population, usual)
@@ -124,7 +125,7 @@ def without_odd(
 
 
 def _nearest_to_median(evidence: Sequence[Information], start: Population) -> list[int]:
-    """Numbers of the half of the robots that are nearest to the median one, in the directions that are measured."""
+    """Return the indices of the half of the robots nearest to the median robot, in measured directions."""
     precision = torch.linalg.inv(start.covariance)
     inverses = torch.linalg.inv(torch.stack([one.normal for one in evidence]) + precision)
     x = torch.einsum("rij,rj->ri", inverses, torch.stack([one.descent for one in evidence]))
@@ -133,7 +134,7 @@ def _nearest_to_median(evidence: Sequence[Information], start: Population) -> li
     population = Population(median, scatter.diag(), start.geometric)
     distances = [square / max(count, 1) for square, count in map(population.surprise, evidence)]
     order = sorted(range(len(evidence)), key=lambda number: distances[number])
-    return sorted(order[: max(FEWEST_ROBOTS, len(evidence) // 2 + 1)])
+    return sorted(order[: max(MIN_ROBOTS, len(evidence) // 2 + 1)])
 
 
 def expectation_maximisation(
@@ -143,14 +144,14 @@ def expectation_maximisation(
     class_robots: float = CLASS_ROBOTS,
     steps: int = EM_STEPS,
 ) -> Population:
-    """Mean and covariance of the robots' errors.
+    """Estimate mean and covariance of the robots' errors by expectation-maximisation.
 
     Args:
-        evidence: of the robots.
-        start: to begin with.
-        usual: variances of the class of the robots.
-        class_robots: so many robots the class counts like.
-        steps: how many.
+        evidence: information on every robot.
+        start: initial population.
+        usual: variances of the robot class.
+        class_robots: weight of the class, in robots.
+        steps: number of steps.
     """
     population = start
     for _ in range(steps):
@@ -161,21 +162,21 @@ def expectation_maximisation(
 def _maximised(
     evidence: Sequence[Information], now: Population, of_class: Float64[Tensor, " unknowns"], robots: float
 ) -> Population:
-    """One step of expectation and maximisation.
+    """Compute one step of expectation-maximisation.
 
-    The covariance of geometric parameters is drawn towards its diagonal, the more the fewer robots there are.
+    The covariance of geometric parameters is shrunk towards its diagonal, the more the fewer robots there are.
 
     Args:
-        evidence: of the robots.
-        now: the population.
-        of_class: squares that the class adds to those of the robots.
-        robots: how many they are together.
+        evidence: information on every robot.
+        now: present population.
+        of_class: squares that the class contributes.
+        robots: number of robots including the weight of the class.
     """
     size, count = now.geometric, len(evidence)
     precision = torch.linalg.inv(now.covariance)
     at_mean, x, scatter = precision @ now.mean, [], torch.zeros_like(precision)
-    for first in range(0, count, ROBOTS_AT_ONCE):
-        some = evidence[first : first + ROBOTS_AT_ONCE]
+    for first in range(0, count, ROBOTS_PER_CHUNK):
+        some = evidence[first : first + ROBOTS_PER_CHUNK]
         factors = torch.linalg.cholesky(torch.stack([one.normal for one in some]) + precision)
         inverses = torch.cholesky_inverse(factors)
         right = torch.stack([one.descent for one in some]) + at_mean

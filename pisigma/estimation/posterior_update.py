@@ -1,4 +1,4 @@
-"""The posterior of all unknowns after new values, as a root of its covariance."""
+"""Update of the posterior of all unknowns by new values, as a covariance root."""
 
 import torch
 from jaxtyping import Float64
@@ -7,30 +7,30 @@ from torch import Tensor
 from pisigma.estimation.cholesky import factored
 from pisigma.estimation.drift import Drift, LinearValues
 
-MOST_DIRECTIONS = 1.2
-"""Directions of a root that is kept, by the number of unknowns."""
+MAX_DIRECTIONS = 1.2
+"""Largest number of directions of a root, relative to the number of unknowns."""
 
 
 class PosteriorUpdate:
     """Kalman's update of a root R of a covariance: with A = X R / noise, `R (I + A^T A)^-1/2` is that of the posterior.
 
-    It is worked out from the eigenvalues of `A A^T` where there are few values, else from Cholesky's factor of
-    `I + A^T A`. Source: Bierman 1977, Factorization Methods for Discrete Sequential Estimation, chapter II.
+    It is computed from the eigenvalues of `A A^T` for few values, else from the Cholesky factor of `I + A^T A`.
+    Source: Bierman 1977, Factorization Methods for Discrete Sequential Estimation, chapter II.
 
     Attributes:
         shift: most probable change of the unknowns.
-        effective: how many directions the values determine.
+        effective: number of directions that the values determine.
     """
 
     def __init__(
         self, root: Float64[Tensor, "unknowns directions"], values: LinearValues, drift: Drift
     ) -> None:
-        """Update the covariance `root root^T`, and what has drifted on top of it.
+        """Update the covariance `root root^T` plus that of the drift.
 
         Args:
-            root: before the values.
-            values: of the new rows.
-            drift: since, and the noise of the values.
+            root: covariance root before the values.
+            values: new values.
+            drift: drift since then, and noise of the values.
         """
         self._root = root
         drifted = [group for group in drift.groups if group.size > 0]
@@ -58,7 +58,7 @@ class PosteriorUpdate:
         self.shift.index_add_(0, index, deviation * z[directions:])
 
     def root(self) -> Float64[Tensor, "unknowns directions"]:
-        """Root of the covariance of the posterior, of not many more directions than there are unknowns."""
+        """Return the covariance root of the posterior, with at most `MAX_DIRECTIONS` columns per unknown."""
         extra = torch.zeros(len(self._root), len(self._index), dtype=torch.float64)
         extra[self._index, torch.arange(len(self._index))] = self._deviation
         R = torch.cat([self._root, extra], 1)
@@ -69,7 +69,7 @@ class PosteriorUpdate:
             t = 1 + self._eigenvalues
             shrink = -1 / (t.sqrt() * (1 + t.sqrt()))
             root = R.addmm_((R @ self._along) * shrink, self._along.t())
-        if root.shape[1] <= MOST_DIRECTIONS * len(root):
+        if root.shape[1] <= MAX_DIRECTIONS * len(root):
             return root
         scale, factor = factored(lambda: root @ root.t())
         return torch.where(root.any(1)[:, None], factor / scale[:, None], 0.0)

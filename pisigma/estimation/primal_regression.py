@@ -1,4 +1,4 @@
-"""Bayesian linear regression by normal equations: for many values and fewer unknowns."""
+"""Bayesian linear regression by normal equations, for more values than unknowns."""
 
 import math
 from collections.abc import Sequence
@@ -26,12 +26,12 @@ class Solved:
     """The normal equations, divided by the noise's variance, with a prior: `D (Σ X^T X + precision) D = L L^T`.
 
     Attributes:
-        prior: of the unknowns.
-        noise: per sensor.
-        scale: the diagonal of D.
-        inverse: L^-1, a lower triangle, so that the covariance is `D L^-T L^-1 D`.
+        prior: prior of the unknowns.
+        noise: standard deviation for every sensor.
+        scale: diagonal of D.
+        inverse: L^-1, lower triangular, so that the covariance is `D L^-T L^-1 D`.
         log_det: logarithm of the determinant of `Σ X^T X + precision`.
-        x: the most probable values.
+        x: most probable values.
     """
 
     prior: GaussianPrior
@@ -48,7 +48,7 @@ class Solved:
         return deviation.square()
 
     def trace(self, matrix: Float64[Tensor, "unknowns unknowns"]) -> float:
-        """Trace of the product of a symmetric matrix and the covariance, of which one block is made at a time."""
+        """Return the trace of a symmetric matrix times the covariance, which is computed block by block."""
         trace = 0.0
         for rows in blocks(len(self.x), BLOCK):
             block = self.inverse[rows.start :, rows].t() @ self.inverse[rows.start :, : rows.stop]
@@ -60,14 +60,14 @@ class Solved:
 
 @dataclass(frozen=True, eq=False)
 class PrimalRegression(AbstractRegression):
-    """Normal equations of every sensor, before division by its noise's variance.
+    """Normal equations of every sensor, before division by its noise variance.
 
     Attributes:
-        normal: `Σ X^T X` per sensor, rows already weighted.
-        descent: `Σ X^T y`.
-        square: `Σ y^T y`.
-        sensors: how many values there are.
-        latest: what was solved last, which the evidence, left-out values and the covariance are all made from.
+        normal: `Σ X^T X` for every sensor, of weighted rows.
+        descent: `Σ X^T y` for every sensor.
+        square: `Σ y^T y` for every sensor.
+        sensors: number of values of every sensor.
+        latest: cache of the last solution, which evidence, left-out values and covariance share.
     """
 
     normal: Float64[Tensor, "sensors unknowns unknowns"]
@@ -99,7 +99,7 @@ class PrimalRegression(AbstractRegression):
         return CovarianceRoot(solved.inverse.t().mul_(solved.scale[:, None]))
 
     def solved_with(self, prior: GaussianPrior, noise: tuple[float, ...]) -> Solved:
-        """What was solved last, or else solve now."""
+        """Return the cached solution if prior and noise are the same, else solve."""
 
         def normal() -> Tensor:
             torch.mul(self.normal[0], noise[0] ** -2, out=memory)
@@ -123,7 +123,7 @@ class PrimalRegression(AbstractRegression):
         return self.latest[0]
 
     def _misfits(self, x: Float64[Tensor, " unknowns"]) -> tuple[float, ...]:
-        """`Σ (y - X x)²` per sensor."""
+        """Return `Σ (y - X x)²` for every sensor."""
         cross = (self.descent @ x).tolist()
         inner = [float(x @ (N @ x)) for N in self.normal]
         return tuple(
@@ -132,6 +132,6 @@ class PrimalRegression(AbstractRegression):
 
 
 def log_noise(sensors: Sequence[SensorCount], noise: Sequence[float]) -> float:
-    """`Σ log noise²` over all values."""
+    """Return `Σ log noise²` over all values."""
     pairs = zip(sensors, noise, strict=True)
     return sum(2 * sensor.values * math.log(sigma) for sensor, sigma in pairs)

@@ -1,4 +1,4 @@
-"""Bayesian linear regression: the posterior, and prior sizes and noise by the evidence."""
+"""Bayesian linear regression: posterior, and prior sizes and noise by maximum evidence."""
 
 import math
 from abc import ABC, abstractmethod
@@ -12,24 +12,24 @@ from pisigma.estimation.covariance_root import CovarianceRoot
 from pisigma.estimation.prior import GaussianPrior
 
 SMALLEST_NOISE = 1e-8
-"""[m or rad] Floor of the estimated noise: far below what instruments resolve."""
-LEAST_EFFECTIVE = 0.5
-"""Prior sizes of groups of which the data determine fewer unknowns do not matter."""
+"""Lower bound of the estimated noise [m or rad], far below the resolution of instruments."""
+MIN_EFFECTIVE = 0.5
+"""Number of unknowns of a group that the data have to determine for its prior size to matter."""
 
 
 @dataclass(frozen=True, eq=False)
 class Posterior:
-    """What the data say of the unknowns.
+    """Posterior of the unknowns.
 
     Attributes:
         x: most probable values.
-        log_evidence: of the data under the prior, up to a constant of the data.
-        prior: with its sizes as estimated.
-        noise: standard deviation per sensor [m or rad], or a factor on the stated ones.
-        square: `Σ base x²` of the unknowns of every group.
-        determined: how many unknowns of every group the data determine; the prior holds the others.
-        misfit: `Σ (y - X x)²` per sensor.
-        used: values of every sensor that the unknowns use up.
+        log_evidence: log evidence of the data under the prior, up to a constant of the data.
+        prior: prior with estimated sizes.
+        noise: standard deviation for every sensor [m or rad], or a factor on the stated ones.
+        square: `Σ base x²` over the unknowns of every group.
+        determined: effective number of unknowns of every group that the data determine; the prior determines the rest.
+        misfit: `Σ (y - X x)²` for every sensor.
+        used: effective number of values of every sensor that the unknowns absorb.
     """
 
     x: Float64[Tensor, " unknowns"]
@@ -43,18 +43,18 @@ class Posterior:
 
     @property
     def effective(self) -> float:
-        """Number of unknowns that the data determine, those without prior knowledge among them."""
+        """Effective number of unknowns that the data determine, including those without a prior."""
         return float(self.determined.sum()) + int((self.prior.base == 0).sum())
 
 
 @dataclass(frozen=True)
 class SensorCount:
-    """What a regression knows of one sensor.
+    """Number of values of a sensor, and properties of its noise.
 
     Attributes:
-        values: that count as independent.
-        stated: whether its rows state their noise, which then is at least as large.
-        exact: whether it is exactly as stated.
+        values: number of independent values.
+        stated: whether its rows state their noise, which is then a lower bound.
+        exact: whether the noise is exactly as stated.
         repetition: see `SensorValues.repetition`.
     """
 
@@ -68,29 +68,29 @@ class AbstractRegression(ABC):
     """Weighted linear regression `y = X x + e` of measured values on unknowns with a normal prior.
 
     Attributes:
-        sensors: how many values there are of every sensor.
+        sensors: number of values of every sensor.
     """
 
     sensors: tuple[SensorCount, ...]
 
     @abstractmethod
     def solve(self, prior: GaussianPrior, noise: tuple[float, ...]) -> Posterior:
-        """The posterior under a prior and noise; the log evidence is that of MacKay 1992, eq. (4.9)."""
+        """Compute the posterior for a prior and noise; the log evidence is that of MacKay 1992, eq. (4.9)."""
 
     @abstractmethod
     def covariance_root(self, posterior: Posterior) -> CovarianceRoot:
-        """Root of the covariance of the unknowns."""
+        """Return the covariance root of the unknowns."""
 
     def effective_share(self, posterior: Posterior) -> float:
-        """Share of the values that the unknowns use up; near 1 nothing is left that tells noise from error."""
+        """Return the share of the values that the unknowns absorb; near 1, noise cannot be estimated."""
         values = sum(sensor.values for sensor in self.sensors if not sensor.exact)
         return posterior.effective / max(values, 1.0)
 
-    def renewed_noise(self, posterior: Posterior) -> tuple[float, ...]:
-        """Noise of every sensor from its misfit and the values that the unknowns use up (Förstner 1979)."""
+    def updated_noise(self, posterior: Posterior) -> tuple[float, ...]:
+        """Estimate the noise of every sensor from its misfit and degrees of freedom (Förstner 1979)."""
         noise = list(posterior.noise)
         for k, sensor in enumerate(self.sensors):
-            if not sensor.exact and sensor.values > 0.5:  # without values it stays as it is
+            if not sensor.exact and sensor.values > 0.5:  # without values the noise is unchanged
                 sigma = math.sqrt(posterior.misfit[k] / max(sensor.values - posterior.used[k], 1.0))
                 noise[k] = max(sigma, 1.0 if sensor.stated else SMALLEST_NOISE)
         return tuple(noise)
@@ -101,10 +101,10 @@ class AbstractRegression(ABC):
         """Estimate prior sizes and noise together with the unknowns.
 
         Args:
-            prior: with sizes to start from.
-            noise: to start from.
-            iterations: updates at most.
-            tolerance: the search ends when the log evidence rises by less.
+            prior: prior with initial sizes.
+            noise: initial noise for every sensor.
+            iterations: largest number of updates.
+            tolerance: increase of the log evidence [nats] below which the iteration has converged.
 
         Returns:
             The posterior of the last update.
@@ -112,7 +112,7 @@ class AbstractRegression(ABC):
         posterior = self.solve(prior, tuple(max(sigma, SMALLEST_NOISE) for sigma in noise))
         for _ in range(iterations):
             prior = posterior.prior.updated(posterior.square, posterior.determined)
-            following = self.solve(prior, self.renewed_noise(posterior))
+            following = self.solve(prior, self.updated_noise(posterior))
             gain = following.log_evidence - posterior.log_evidence
             posterior = following
             if abs(gain) < tolerance:
@@ -121,7 +121,7 @@ class AbstractRegression(ABC):
 
 
 def root_of_sizes(posterior: Posterior, root: CovarianceRoot) -> Float64[Tensor, "unknowns groups"]:
-    """What the uncertainty of the prior's sizes adds to a root of the covariance C of the unknowns.
+    """Return the columns that the uncertainty of the prior sizes adds to a root of the covariance C of the unknowns.
 
     With `dx / d log s_g = 2 C Λ_g x` for the unknowns of group g and `var(log s_g) = 1 / (2 n_g)`, where n_g of
     them are determined by the data (first order; Kass and Steffey 1989, J. Amer. Statist. Assoc. 84(407), 717-726).
@@ -129,6 +129,6 @@ def root_of_sizes(posterior: Posterior, root: CovarianceRoot) -> Float64[Tensor,
     prior, x = posterior.prior, posterior.x
     groups = torch.zeros(len(x), len(prior.sizes), dtype=x.dtype, device=x.device)
     groups[torch.arange(len(x)), prior.group] = 1.0
-    certain = posterior.determined > LEAST_EFFECTIVE
+    certain = posterior.determined > MIN_EFFECTIVE
     moved = 2 * root.covariance_times((groups * (prior.precision * x)[:, None])[:, certain])
     return moved * (2 * posterior.determined[certain]).rsqrt()

@@ -1,4 +1,4 @@
-"""Configurations that were measured wrongly, by the evidence of all other rows and beside whatever has drifted."""
+"""Detect configurations with wrong measurements by the evidence of all rows, while unknowns may have drifted."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -13,11 +13,11 @@ from pisigma.estimation.drift import LinearValues, gains
 
 FACTORS = torch.logspace(0.5, 4.5, 17, dtype=torch.float64)
 """Factors on the noise of a wrong configuration that are tried."""
-SUSPECTS = 3
-NOTEWORTHY = 2.0
-"""[nats] Configurations that gain less while everything else stays as it is are no suspects."""
-LARGEST_SHARE = 0.25
-"""No more of the configurations are taken for wrong: of four that disagree nobody knows which is."""
+MAX_SUSPECTS = 3
+MIN_GAIN = 2.0
+"""Smallest gain of log evidence [nats] of a suspect configuration while everything else is unchanged."""
+MAX_WRONG_SHARE = 0.25
+"""Largest share of wrong configurations: of four that disagree it is not known which one is wrong."""
 
 
 What = TypeVar("What")
@@ -25,14 +25,14 @@ What = TypeVar("What")
 
 @dataclass(frozen=True, eq=False)
 class Explained(Generic[What]):
-    """The best explanation of some values.
+    """The best explanation of measured values.
 
     Attributes:
         what: the explanation.
-        values: those of wrong configurations with a larger noise.
-        log_evidence: of the values, with the prior odds of all that the explanation is made of.
-        covariance: of the values.
-        deviation: of the noise of every value.
+        values: the values; those of wrong configurations have a larger noise.
+        log_evidence: log evidence of the values, including the prior odds of the explanation.
+        covariance: covariance of the values.
+        deviation: standard deviation of the noise of every value.
     """
 
     what: What
@@ -45,21 +45,21 @@ class Explained(Generic[What]):
 def with_wrong_rows(
     explained: Explained[What], explain: Callable[[Mapping[int, float]], Explained[What]]
 ) -> Explained[What]:
-    """Take configurations for wrong as long as that raises the evidence by what it is worth.
+    """Mark configurations as wrong as long as that raises the log evidence by more than its prior penalty.
 
-    Beside a drift of many unknowns that was estimated from all rows, a wrong one looks usual. So those that stand out
-    most get a noise of their own, one by one, and the drift is estimated anew for each; compare the externally
+    If a drift of many unknowns is estimated from all rows, a wrong row is hard to detect. Therefore the most suspicious
+    configurations get a larger noise one at a time, and the drift is estimated again for each; compare the externally
     studentised residuals of Cook and Weisberg 1982, Residuals and Influence in Regression, section 2.2.
 
     Args:
-        explained: the values, some of which may count less already.
-        explain: gives the best explanation for other wrong configurations, see `LinearValues`.
+        explained: explanation of the values, with wrong configurations found so far.
+        explain: function that returns the best explanation for given wrong configurations, see `LinearValues`.
 
     Returns:
         The best explanation.
     """
     configurations = len(torch.unique(explained.values.configuration))
-    while len(explained.values.wrong) + 1 <= LARGEST_SHARE * configurations:
+    while len(explained.values.wrong) + 1 <= MAX_WRONG_SHARE * configurations:
         tried = [explain(wrong) for wrong in _suspects(explained)]
         best = max(tried, key=lambda one: one.log_evidence, default=explained)
         if best.log_evidence <= explained.log_evidence:
@@ -69,10 +69,10 @@ def with_wrong_rows(
 
 
 def _suspects(explained: Explained[What]) -> list[dict[int, float]]:
-    """The wrong configurations and one more, each of those that gain most by a noise of its own.
+    """Return the known wrong configurations plus one of those that gain most from a larger noise, for each of these.
 
-    A variance `f² σ²` that is added to the values of a configuration raises the log evidence as one along their
-    unit vectors does, see `DriftSearch`; in the metric of all values these are `V^-1` of the configuration.
+    Adding a variance `f² σ²` to the values of a configuration raises the log evidence like a drift along their unit
+    vectors, see `DriftSearch`; in the metric of all values these are `V^-1` of the configuration.
     """
     values = explained.values
     inverse = torch.cholesky_inverse(covariance_factor(explained.covariance))
@@ -87,9 +87,9 @@ def _suspects(explained: Explained[What]) -> list[dict[int, float]]:
         squares = (U.t() @ (a[chosen] * sigma)).square() / eigenvalues.clamp(min=1e-300)
         raised = gains(FACTORS, eigenvalues.clamp(min=0.0), squares)
         best = int(raised.argmax())
-        if float(raised[best]) > NOTEWORTHY:
+        if float(raised[best]) > MIN_GAIN:
             tried.append((float(raised[best]), number, float(FACTORS[best])))
     if len(tried) == len(torch.unique(values.configuration)):
-        return []  # what explains no row at all is wrong itself
-    tried = sorted(tried, reverse=True)[:SUSPECTS]
+        return []  # an explanation that fits no row at all is itself wrong
+    tried = sorted(tried, reverse=True)[:MAX_SUSPECTS]
     return [{**values.wrong, number: factor} for _, number, factor in tried]

@@ -12,7 +12,7 @@ from pisigma.joint_correction.feature import AbstractFeature, FeatureOptions, Fe
 from pisigma.joint_correction.onnx_graph import OnnxGraph
 from pisigma.measurement.conditions import JointState
 from pisigma.robot.description import Robot
-from pisigma.robot.kernels.forms import MOST_JOINTS, CompiledForm
+from pisigma.robot.kernels.forms import MAX_JOINTS, CompiledForm
 
 BAND_STARTS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128, 192, 256)
 """First harmonic of every band of few configurations: about two bands an octave."""
@@ -63,7 +63,7 @@ def add_series(arms: Any, correction: Any, first: int, memory: Any, q: Any) -> N
     """Add sums of sines and cosines of multiples of every joint's angle, four joints abreast.
 
     `correction.values` holds the number of harmonics, and for each the weights of the sines and of the cosines of
-    `MOST_JOINTS` joints.
+    `MAX_JOINTS` joints.
 
     Source: C. W. Clenshaw, A note on the summation of Chebyshev series, 1955: from the last multiple to the first,
     `b_k = w_k + 2 cos(θ) b_k+1 - b_k+2`; the sum is `b_1 cos(θ) - b_2` of cosines and `b_1 sin(θ)` of sines.
@@ -77,8 +77,8 @@ def add_series(arms: Any, correction: Any, first: int, memory: Any, q: Any) -> N
         s_0, s_1, s_2, s_3, c_0, c_1, c_2, c_3 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
         u_0, u_1, u_2, u_3, v_0, v_1, v_2, v_3 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
         for k in range(harmonics - 1, -1, -1):
-            start = first + 1 + 2 * MOST_JOINTS * k + j
-            a, b = values[start : start + 4], values[start + MOST_JOINTS : start + MOST_JOINTS + 4]
+            start = first + 1 + 2 * MAX_JOINTS * k + j
+            a, b = values[start : start + 4], values[start + MAX_JOINTS : start + MAX_JOINTS + 4]
             u_0, s_0 = s_0, t_0 * s_0 + (a[0] - u_0)
             u_1, s_1 = s_1, t_1 * s_1 + (a[1] - u_1)
             u_2, s_2 = s_2, t_2 * s_2 + (a[2] - u_2)
@@ -105,8 +105,8 @@ def add_series_slope(arms: Any, correction: Any, first: int, memory: Any, q: Any
         s_0, s_1, s_2, s_3, c_0, c_1, c_2, c_3 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
         u_0, u_1, u_2, u_3, v_0, v_1, v_2, v_3 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
         for k in range(harmonics - 1, -1, -1):
-            start, times = first + 1 + 2 * MOST_JOINTS * k + j, k + 1.0
-            a, b = values[start : start + 4], values[start + MOST_JOINTS : start + MOST_JOINTS + 4]
+            start, times = first + 1 + 2 * MAX_JOINTS * k + j, k + 1.0
+            a, b = values[start : start + 4], values[start + MAX_JOINTS : start + MAX_JOINTS + 4]
             u_0, s_0 = s_0, t_0 * s_0 - (times * b[0] + u_0)
             u_1, s_1 = s_1, t_1 * s_1 - (times * b[1] + u_1)
             u_2, s_2 = s_2, t_2 * s_2 - (times * b[2] + u_2)
@@ -178,7 +178,7 @@ class FourierSeries(AbstractFeature):
 
     def pack(self, weight: Float64[np.ndarray, "dof columns"]) -> Float64[np.ndarray, " values"]:
         """The number of harmonics, and for each the weights of the sines and of the cosines of all joints."""
-        lanes = np.zeros((self.harmonics, 2, MOST_JOINTS))
+        lanes = np.zeros((self.harmonics, 2, MAX_JOINTS))
         lanes[..., : len(weight)] = weight.reshape(-1, 2, self.harmonics).transpose(2, 1, 0)
         return np.concatenate([[self.harmonics], lanes.ravel()])
 

@@ -18,7 +18,7 @@ from pisigma.network.pi_sigma import PiSigma
 from pisigma.robot.kernels import arrays
 from pisigma.robot.kernels.array_kinematics import KINDS, arm_ends, arm_rows
 from pisigma.robot.kernels.description_file import write_description
-from pisigma.robot.kernels.forms import MOST_JOINTS, KernelForms
+from pisigma.robot.kernels.forms import MAX_JOINTS, KernelForms
 from pisigma.robot.kinematics.closed_form import AbstractClosedForm, closed_form_solver
 from pisigma.robot.se3 import invert
 
@@ -56,10 +56,10 @@ def describe(model: CalibratedModel) -> tuple[arrays.Description, tuple[str, ...
             compiled form, it has neither a closed-form inverse nor joint values to start from, or its joints are
             coupled: kernels take DH values, which nobody should command.
     """
-    if model.robot.dof > MOST_JOINTS:
+    if model.robot.dof > MAX_JOINTS:
         raise ModelError(
             f"model '{model.name}': its robot has {model.robot.dof} joints, but compiled models have "
-            f"{MOST_JOINTS} at most; use pisigma.load, which solves without kernels."
+            f"{MAX_JOINTS} at most; use pisigma.load, which solves without kernels."
         )
     if model.robot.coupling is not None:
         raise ModelError(

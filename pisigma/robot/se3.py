@@ -120,7 +120,7 @@ def rotation_vector(R: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3"]
 def _rotation_vector_near_pi(
     R: Float[Tensor, "*batch 3 3"], twice_sine_axis: Float[Tensor, "*batch 3"], angle: Float[Tensor, "*batch"]
 ) -> Float[Tensor, "*batch 3"]:
-    """Compute the axis from the largest column of the symmetric part, `axis · axis_k (1 - cos)`; its sign from R - R^T."""
+    """Compute the axis by the largest column of the symmetric part, `axis · axis_k (1 - cos)`; sign from R - R^T."""
     symmetric = (R + R.mT) / 2 + torch.eye(3, dtype=R.dtype, device=R.device)
     trace = R[..., 0, 0] + R[..., 1, 1] + R[..., 2, 2]
     # (R + R^T)/2 = cos·I + (1 - cos)·n n^T, so the sum above minus (1 + cos)·I is (1 - cos)·n n^T.

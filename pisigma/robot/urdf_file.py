@@ -89,13 +89,13 @@ def parse_xml(path: str | os.PathLike[str], everything: bool = False) -> Any:
             raise _is_xacro(path) from None
         line = problem.lineno if isinstance(problem, etree.XMLSyntaxError) else None
         what = re.sub(r", line \d+, column \d+.*", "", " ".join(str(problem).split())) or "it is empty"
-        problem = f"the file is truncated or not valid XML: {what}"
-        raise RobotError(problem, expected="a complete URDF file", at=Place(path, line)) from None
+        what = f"the file is truncated or not valid XML: {what}"
+        raise RobotError(what, expected="a complete URDF file", at=Place(path, line)) from None
     if any(_is_of_xacro(element) for element in root.iter()):
         _insert_properties(root, path)
     if etree.QName(root).localname != "robot":
-        problem = f"expected a URDF file, which starts with <robot name=...>, got <{root.tag}>"
-        raise RobotError(problem, expected="a URDF file", value=root.tag, at=Place(path))
+        what = f"expected a URDF file, which starts with <robot name=...>, got <{root.tag}>"
+        raise RobotError(what, expected="a URDF file", value=root.tag, at=Place(path))
     return root
 
 

@@ -7,7 +7,7 @@ import pytest
 import torch
 from testing.closeness import assert_close
 
-from pisigma.estimation.drift import SIZES, WORTH, Drift, DriftGroup, DriftSearch, LinearValues
+from pisigma.estimation.drift import LOG_PRIOR_PENALTY, SIZES, Drift, DriftGroup, DriftSearch, LinearValues
 from pisigma.estimation.regression import SensorCount
 
 NOISE, MOVED = 1e-4, 4e-3
@@ -65,7 +65,7 @@ def test_a_size_has_the_highest_evidence():
     number = sizes.index(max(sizes))
     for size in (0.0, *SIZES[::5].tolist()):
         assert dense_evidence(looked_at, [*sizes[:number], size, *sizes[number + 1 :]]) <= best + 1e-9
-    assert_close(drift.log_evidence, best - WORTH, rtol=1e-9)
+    assert_close(drift.log_evidence, best - LOG_PRIOR_PENALTY, rtol=1e-9)
 
 
 def test_a_shift_is_that_of_least_squares():

@@ -6,7 +6,7 @@ import torch
 from testing.closeness import assert_close
 
 from pisigma.estimation.drift import Drift, DriftGroup, LinearValues
-from pisigma.estimation.posterior_update import MOST_DIRECTIONS, PosteriorUpdate
+from pisigma.estimation.posterior_update import MAX_DIRECTIONS, PosteriorUpdate
 from pisigma.estimation.regression import SensorCount
 
 UNKNOWNS, DIRECTIONS, NOISE = 30, 32, 0.3
@@ -27,7 +27,7 @@ def test_the_posterior_is_that_of_kalman(count, drifted):
     gain = torch.linalg.solve(X @ C @ X.t() + NOISE**2 * torch.eye(count).double(), X @ C).t()
     assert_close(update.shift, gain @ y, atol=1e-9)
     after = update.root()
-    assert after.shape[1] <= MOST_DIRECTIONS * UNKNOWNS or drifted == 1
+    assert after.shape[1] <= MAX_DIRECTIONS * UNKNOWNS or drifted == 1
     assert_close(after @ after.t(), C - gain @ X @ C, atol=1e-9)
     assert_close(after[4].norm() > 0, drifted > 4)
     assert_close(update.effective, torch.trace(X @ gain), rtol=1e-9)

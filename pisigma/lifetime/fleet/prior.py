@@ -14,7 +14,7 @@ from pisigma.calibration.geometric.problem.setup import IdentifiedGeometry
 from pisigma.calibration.hybrid.arm import HybridArm, JointCoverage
 from pisigma.calibration.hybrid.uncertainty import PositionUncertainty
 from pisigma.estimation.covariance_root import CovarianceRoot
-from pisigma.estimation.population import FEWEST_ROBOTS, ODD, Information, Population, without_odd
+from pisigma.estimation.population import FALSE_ALARM, MIN_ROBOTS, Information, Population, without_outliers
 from pisigma.files.errors import FleetError
 from pisigma.joint_correction.feature import AbstractFeature
 from pisigma.joint_correction.joint_correction import JointCorrection
@@ -77,9 +77,9 @@ def fleet_prior(name: str, robot: Robot, fleet: Sequence[Measurements]) -> Fleet
         FleetError: there are too few robots.
         IdentificationError: the rows of a robot do not determine where it stands.
     """
-    if len(fleet) < FEWEST_ROBOTS:
+    if len(fleet) < MIN_ROBOTS:
         raise FleetError(
-            f"{FEWEST_ROBOTS} robots or more of one type were wanted to estimate what they have in common, got "
+            f"{MIN_ROBOTS} robots or more of one type were wanted to estimate what they have in common, got "
             f"{len(fleet)}."
         )
     posterior = RobotPosterior.of_robot(robot)
@@ -91,7 +91,7 @@ def fleet_prior(name: str, robot: Robot, fleet: Sequence[Measurements]) -> Fleet
     for _ in range(LINEARISATIONS):
         model = mean_robot(name, posterior, population, fleet, noise)
         evidence = [evidence_of(model, population.mean, rows) for rows in fleet]
-        population, odd = without_odd(evidence, first, usual)
+        population, odd = without_outliers(evidence, first, usual)
         noise = _medians([one.noise for one in evidence])
     model = mean_robot(name, posterior, population.of_another(len(fleet) - len(odd)), fleet, noise)
     return FleetPrior(model, population, space.names[: space.arm_size], odd)
@@ -190,7 +190,7 @@ def evidence_of(
     posterior = ModelPosterior.of(model)
     rows = posterior.renamed(rows)
     problem = recalibration_problem(model, posterior, rows, frame_keys(rows, ("base", "tool")))
-    problem = replace(problem, groups=tuple(group for group in problem.groups if group.stands))
+    problem = replace(problem, groups=tuple(group for group in problem.groups if group.fixed_size))
     adaptation = adapt(problem, posterior.noise)
     values, space = adaptation.values, problem.design.problem.space
     deviation = values.deviation(adaptation.drift.noise)
@@ -250,14 +250,14 @@ class FleetConsistency:
     @property
     def odd(self) -> bool:
         """Whether the fleet says little of the robot: less than the usual errors of its class."""
-        return self.probability < ODD and self.gain < 0
+        return self.probability < FALSE_ALARM and self.gain < 0
 
     @property
     def sentence(self) -> str:
         """The same in words."""
         if self.odd:
             return (
-                f"This robot is unlike the fleet: fewer than 1 in {1 / ODD:,.0f} of its robots are as far from the "
+                f"This robot is unlike the fleet: fewer than 1 in {1 / FALSE_ALARM:,.0f} of its robots are as far from the "
                 "mean, and the usual errors of its class explain its rows better. The fleet does not count where the "
                 "rows are enough for a calibration of their own."
             )

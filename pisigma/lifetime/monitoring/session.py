@@ -231,7 +231,7 @@ class _Solved:
 
     def unknowns(self, motions: tuple[DriftGroup, ...]) -> Float64[Tensor, " unknowns"]:
         """Most probable unknowns with what stands elsewhere and some motions; all else as in the model."""
-        standing = tuple(group for group in self.problem.groups if group.stands)
+        standing = tuple(group for group in self.problem.groups if group.fixed_size)
         drift = Drift((*standing, *motions), self.noise * self.explanation.noise_factor)
         shift: Tensor = PosteriorUpdate(self.problem.root[:, :0], self.values, drift).shift
         return self.problem.mean + shift
@@ -262,7 +262,7 @@ def _explained(
     problem: RecalibrationProblem, noise: Float64[Tensor, " sensors"], values: LinearValues
 ) -> _Solved:
     """The most probable explanation of a session's values, wrong rows among them."""
-    standing = [one for one in problem.groups if one.stands]
+    standing = [one for one in problem.groups if one.fixed_size]
     every = SessionEvidence(values, problem.root, standing, hypotheses(problem), noise)
 
     def explain(wrong: Mapping[int, float]) -> Explained[_Solved]:
@@ -307,7 +307,7 @@ def _judged(solved: _Solved, elsewhere: dict[FrameKey, float]) -> Session:
         rms_after=rms_after * optimism,
         rotation_ratio=1.0 if angle_after == 0 else angle / (angle_after * optimism),
         score_ratio=solved.score_ratio(frames, motions) / optimism if "corner" in every.kinds else 1.0,
-        error_score=evidence.beside(solved.moved_frames).error_score(),
+        error_score=evidence.with_moved(solved.moved_frames).error_score(),
         values=len(solved.values.y),
         standing=tuple(" ".join(owner).strip() for owner in elsewhere),
         observable=tuple(
@@ -325,7 +325,7 @@ def _moved(solved: _Solved, elsewhere: dict[FrameKey, float]) -> tuple[Movement,
     found = [(_freed(one), one.probability) for one in explanation.motions]
     for (kind, name), probability in elsewhere.items():
         whats = (kind, f"{kind} {name}")
-        found += [(one, probability) for one in problem.groups if one.stands and one.what in whats]
+        found += [(one, probability) for one in problem.groups if one.fixed_size and one.what in whats]
     if not found:
         return ()
     shift, covariance = solved.evidence.shift([group for group, _ in found], explanation.noise_factor)
@@ -342,7 +342,7 @@ def _moved(solved: _Solved, elsewhere: dict[FrameKey, float]) -> tuple[Movement,
 
 def _zeros(solved: _Solved) -> JointZeros:
     """Zeros of all joints together."""
-    evidence, noise_factor = solved.evidence.beside(solved.moved_frames), solved.explanation.noise_factor
+    evidence, noise_factor = solved.evidence.with_moved(solved.moved_frames), solved.explanation.noise_factor
     shift, covariance = evidence.shift(_joints(solved), noise_factor)
     influence, own = evidence.influence(_joints(solved), noise_factor)
     return JointZeros(shift, covariance.diagonal().sqrt(), influence, own)

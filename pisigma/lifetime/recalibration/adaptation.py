@@ -183,7 +183,7 @@ def linear_values(problem: RecalibrationProblem, rows: Rows) -> LinearValues:
 def _with_sizes(groups: tuple[DriftGroup, ...], like: tuple[DriftGroup, ...]) -> tuple[DriftGroup, ...]:
     """The groups with the sizes that those of the same names have."""
     sizes = {one.what: one.size for one in like}
-    return tuple(one if one.stands else replace(one, size=sizes.get(one.what, 0.0)) for one in groups)
+    return tuple(one if one.fixed_size else replace(one, size=sizes.get(one.what, 0.0)) for one in groups)
 
 
 def _searched(

@@ -161,7 +161,7 @@ def _of_frame(
     column = group.index - frame_slice(space, kind, name).start
     motion, covariance = torch.zeros(6).double(), torch.zeros(6, 6).double()
     motion[column], covariance[column[:, None], column] = shift, of_members
-    if group.stands:  # relocated: `shift` counts from the initial guess, not from the frame of the model
+    if group.fixed_size:  # relocated: `shift` counts from the initial guess, not from the frame of the model
         old, new = (transform_from_xyzrpy(torch.from_numpy(np.asarray(one[name]))) for one in (before, after))
         turn = rotation_vector(new[:3, :3] @ old[:3, :3].mT)
         motion = torch.cat([new[:3, 3] - old[:3, 3], turn])

@@ -84,7 +84,7 @@ class RecalibrationProblem:
 
     def without_arm(self) -> "RecalibrationProblem":
         """The same where the arm is exactly as it was: only what stands elsewhere is unknown."""
-        elsewhere = tuple(group for group in self.groups if group.stands)
+        elsewhere = tuple(group for group in self.groups if group.fixed_size)
         return replace(self, root=self.standing, groups=elsewhere, standing=self.root)
 
 
@@ -240,7 +240,7 @@ def _groups(
             elif name in measured:
                 turn = 1 / space.robot.reach
                 scale = torch.tensor([1.0, 1.0, 1.0, turn, turn, turn], dtype=torch.float64)
-                groups.append(DriftGroup(what, index[free[index]], scale[free[index]], worth=1.0))
+                groups.append(DriftGroup(what, index[free[index]], scale[free[index]], log_prior_penalty=1.0))
     for own in space.unknowns:
         for number, owner in enumerate(own.owners):
             if owner not in posterior.geometry.unknowns.get(own.name, {}):
@@ -250,14 +250,16 @@ def _groups(
     if len(posterior.weights):
         index = torch.arange(parameters, len(root))
         scale = LARGEST_CORRECTION * posterior.usual_weights
-        groups.append(DriftGroup("correction", index, scale, worth=WORTH_OF_CORRECTION, single=False))
+        groups.append(
+            DriftGroup("correction", index, scale, log_prior_penalty=WORTH_OF_CORRECTION, single=False)
+        )
     return tuple(group for group in groups if len(group.index))
 
 
 def _elsewhere(space: ParameterSpace, what: str, index: Tensor) -> DriftGroup:
     """What stands anywhere about its guess."""
     scale = [ELSEWHERE[space.parameters[number].unit] for number in index.tolist()]
-    return DriftGroup(what, index, torch.tensor(scale, dtype=torch.float64), 1.0, stands=True)
+    return DriftGroup(what, index, torch.tensor(scale, dtype=torch.float64), 1.0, fixed_size=True)
 
 
 def _arm_groups(space: ParameterSpace, free: Bool[Tensor, " parameters"]) -> list[DriftGroup]:
@@ -289,12 +291,14 @@ def hypotheses(problem: RecalibrationProblem) -> tuple[DriftGroup, ...]:
     parameters = problem.design.problem.space.parameters
     single: list[DriftGroup] = []
     for group in problem.groups:
-        if group.stands:
+        if group.fixed_size:
             continue
         if group.what not in ("lengths", "angles"):
-            single.append(replace(group, worth=WORTH))
+            single.append(replace(group, log_prior_penalty=WORTH))
             continue
         for index, scale in zip(group.index, group.scale, strict=True):
             worth = WORTH + math.log(10 * len(group.index))
-            single.append(DriftGroup(parameters[int(index)].name, index[None], scale[None], worth=worth))
+            single.append(
+                DriftGroup(parameters[int(index)].name, index[None], scale[None], log_prior_penalty=worth)
+            )
     return tuple(single)

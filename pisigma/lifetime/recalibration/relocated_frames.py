@@ -4,7 +4,7 @@ from collections.abc import Mapping, Set
 from contextlib import suppress
 
 from pisigma.calibration.geometric.initial_guess.initial_guess import chosen_rows
-from pisigma.estimation.drift import WORTH
+from pisigma.estimation.drift import LOG_PRIOR_PENALTY
 from pisigma.files.errors import IdentificationError
 from pisigma.lifetime.recalibration.adaptation import adapt
 from pisigma.lifetime.recalibration.recalibration_problem import FrameKey, recalibration_problem
@@ -47,7 +47,7 @@ def relocated_frames(
 
     def evidence(elsewhere: Set[FrameKey]) -> float:
         problem = recalibration_problem(model, posterior, rows, elsewhere)
-        return adapt(problem, noise).drift.log_evidence - WORTH * len(elsewhere)
+        return adapt(problem, noise).drift.log_evidence - LOG_PRIOR_PENALTY * len(elsewhere)
 
     still = adapt(recalibration_problem(model, posterior, rows, frozenset()), noise).drift
     if all(group.size < FAR for group in still.groups if group.what.startswith(("base", "tool"))):

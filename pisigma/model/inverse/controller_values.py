@@ -14,7 +14,7 @@ from pisigma.model.inverse.solution import AbstractInverse, Solution
 from pisigma.robot.kernels.array_kinematics import forward_kinematics, is_tensor, joint_jacobian
 from pisigma.robot.kinematics import tolerances
 from pisigma.robot.kinematics.status import Status
-from pisigma.robot.kinematics.task_axes import LEAN, TaskAxes
+from pisigma.robot.kinematics.task_axes import MAX_TILT, TaskAxes
 
 if TYPE_CHECKING:  # a name in full, which type checkers at run time find without this import
     import pisigma.robot.coupling
@@ -23,7 +23,7 @@ STARTS = 4
 """Stored joint values, those whose poses are nearest, that are tried one after the other."""
 IGNORED = 1e-6
 """Weight of the rotations about the tool's x and y axes where there are fewer than six axes: too few to choose them, so
-that they only decide between joint values that reach all else. The tool may lean by `LEAN` then, and no more."""
+that they only decide between joint values that reach all else. The tool may lean by `MAX_TILT` then, and no more."""
 Values = Float64[np.ndarray, "rows axes"]
 Motion = Callable[[Values], tuple[Any, Any]]
 """Pose `(rows, 4, 4)` and Jacobian `(rows, 6, axes)` of an arm by the controller's values."""
@@ -227,7 +227,7 @@ def solve(motion: Motion, T: Float64[np.ndarray, "rows 4 4"], start: Values) -> 
     weight = np.ones(6)
     weight[3:5] = 1.0 if q.shape[1] >= 6 else IGNORED
     error, J = _errors(motion, T, q)
-    for _ in range(tolerances.ITERATIONS):
+    for _ in range(tolerances.MAX_ITERATIONS):
         A, b = J * weight[:, None], error * weight
         normal = A.mT @ A
         damping = 1e-3 * (b * b).sum(-1) + 1e-15
@@ -238,7 +238,7 @@ def solve(motion: Motion, T: Float64[np.ndarray, "rows 4 4"], start: Values) -> 
         if np.abs(step).max(initial=0.0) < 1e-13:
             break
     reached = np.abs(error * (weight == 1.0)).max(-1) < tolerances.ACCEPTED
-    reached &= np.abs(error[:, 3:5]).max(-1) <= LEAN
+    reached &= np.abs(error[:, 3:5]).max(-1) <= MAX_TILT
     return Reached(q, reached, np.linalg.norm(error[:, :3], axis=-1), np.linalg.norm(error[:, 3:], axis=-1))
 
 

@@ -76,7 +76,7 @@ class NumericArm:
         Poses that cannot be met exactly are met within the tolerances of the axes.
         """
         q, reached = start, torch.zeros(len(T), dtype=torch.bool)
-        near, rounds = ~reached, tolerances.ITERATIONS
+        near, rounds = ~reached, tolerances.MAX_ITERATIONS
         for motion in self.motions:
             rows = (near & ~reached).nonzero()[:, 0]
             found = solve_numeric(
@@ -91,8 +91,8 @@ class NumericArm:
             )
             q = q.index_copy(0, rows, found.q)
             reached = reached.index_copy(0, rows, found.status != Status.NOT_CONVERGED)
-            close = (found.position_residual < tolerances.NEARLY * self.robot.reach) & (
-                found.rotation_residual < tolerances.NEARLY
+            close = (found.position_residual < tolerances.NEAR_MISS * self.robot.reach) & (
+                found.rotation_residual < tolerances.NEAR_MISS
             )
             near, rounds = near.index_copy(0, rows, close), EXACT_ITERATIONS
         rows = (~reached).nonzero()[:, 0]

@@ -208,7 +208,7 @@ class NumericIK:
         each = T[:, None].expand(*beside.shape[:-1], 4, 4).reshape(-1, 4, 4)
         off, _ = task_error(self.axes, each, forward_kinematics(robot, beside.reshape(-1, robot.dof)))
         off = off * off.new_tensor([*[1 / robot.reach] * 3, 1, 1, 1]) * off.new_tensor(self._arm.weights)
-        plausible = (off.norm(dim=-1) <= tolerances.BESIDE).reshape(reached.shape)
+        plausible = (off.norm(dim=-1) <= tolerances.BRANCH_MISS).reshape(reached.shape)
         q = torch.where(reached[..., None], q, torch.where(plausible[..., None], beside, torch.nan))
         known = torch.arange(q.shape[1]).expand(len(T), -1)
         return q, torch.where(reached & (not self._spare), known, -1)

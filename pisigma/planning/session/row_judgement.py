@@ -21,7 +21,7 @@ from pisigma.calibration.geometric.problem.setup import (
 from pisigma.calibration.hybrid.design import Design
 from pisigma.calibration.hybrid.gravity import USUAL, in_first_row
 from pisigma.calibration.hybrid.sensor_values import SensorValues, sensor_values
-from pisigma.estimation.dual_regression import DETERMINED, beside_unknown
+from pisigma.estimation.dual_regression import DETERMINED, without_nuisance
 from pisigma.files.errors import IdentificationError
 from pisigma.joint_correction.fourier_series import FourierSeries
 from pisigma.joint_correction.gravity_torques import GravityTorques
@@ -219,7 +219,7 @@ class RowModel:
         Z, G = X[:, ~free] * self._size[~free], X[:, free]
         V = Z @ Z.t()
         V.diagonal().add_(self.sigma[kept].square())
-        P, solution, determined = beside_unknown(V, G)
+        P, solution, determined = without_nuisance(V, G)
         x = torch.zeros_like(self._size)
         x[free], x[~free] = solution @ r, self._size[~free] * (Z.t() @ (P @ r))
         return P, x, determined

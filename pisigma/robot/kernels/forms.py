@@ -1,17 +1,17 @@
-"""Compiled forms that are handed to the kernels as plain functions: of features, and of closed forms of the inverse."""
+"""Compiled forms of features and closed-form inverses, which the kernels get as plain functions."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from types import FunctionType
 from typing import Any
 
-MOST_JOINTS = 8
-"""The largest number of joints; weights that are worked on side by side stand in rows of so many."""
+MAX_JOINTS = 8
+"""The largest number of joints, and the row length of weights that are vectorised over joints."""
 
 
 @dataclass(frozen=True)
 class CompiledForm:
-    """What numba compiles of a feature: plain functions, without decorator.
+    """The functions of a feature that numba compiles: plain functions without a decorator.
 
     Both are called as `function(arms, correction, first, memory, q)` with `kernels.arrays.Arms` and `Correction`, the
     index in `correction.values` of the first number that the feature's `pack` gave, `kernels.layout.MEMORY`, and the
@@ -31,20 +31,20 @@ class CompiledForm:
     frames: bool = False
 
 
-MOST_KINDS, MOST_VALUES = 16, 4_096
+MAX_KINDS, MAX_VALUES = 16, 4_096
 """The largest numbers of kinds of features, and of the values of all features of a correction."""
 
 FORMS: dict[str, CompiledForm] = {}
-"""Those of features by name, in the order in which they were registered."""
+"""Compiled forms of features by name, in the order of registration."""
 
 
 def register_compiled(name: str, form: CompiledForm) -> None:
-    """Have the kernels evaluate a feature, from when they are next compiled."""
+    """Register the compiled form of a feature, which the kernels evaluate when they are next compiled."""
     FORMS[name] = form
 
 
 def compiled_closed_forms() -> dict[str, Callable[..., None]]:
-    """The plain functions of registered closed forms by name, see `AbstractClosedForm.compiled`; imports torch."""
+    """Return the `AbstractClosedForm.compiled` functions of registered closed forms by name; imports torch."""
     from pisigma.robot.kinematics.closed_form.registry import CLOSED_FORMS
 
     return {name: form.compiled for name, form in CLOSED_FORMS.items() if form.compiled is not None}
@@ -52,11 +52,11 @@ def compiled_closed_forms() -> dict[str, Callable[..., None]]:
 
 @dataclass(frozen=True)
 class KernelForms:
-    """Names of what kernels evaluate, or of what an arm needs of them, in the order of their indices.
+    """Names of the forms that kernels evaluate or that an arm needs, in the order of their indices.
 
     Attributes:
-        features: of the joint correction.
-        closed_forms: of the inverse of the nominal arm.
+        features: features of the joint correction.
+        closed_forms: closed-form inverses of the nominal arm.
     """
 
     features: tuple[str, ...] = ()
@@ -64,33 +64,33 @@ class KernelForms:
 
     @staticmethod
     def registered() -> "KernelForms":
-        """What kernels evaluate that are compiled now."""
+        """Return all registered forms, which kernels compiled now evaluate."""
         return KernelForms(tuple(FORMS), tuple(compiled_closed_forms()))
 
     def cover(self, wanted: "KernelForms") -> bool:
-        """Whether all that is wanted is among them."""
+        """Return whether all wanted forms are among these."""
         return {*wanted.features} <= {*self.features} and {*wanted.closed_forms} <= {*self.closed_forms}
 
     def fingerprints(self, ready: "KernelForms") -> list[str]:
-        """Their names; of those that are not ready texts that are other ones where the plain functions change."""
+        """Return the names, or for forms that are not `ready`, texts that change with their functions."""
         names, known = (*self.features, *self.closed_forms), {*ready.features, *ready.closed_forms}
         return [name if name in known else _fingerprint(*_functions(name)) for name in names]
 
 
 def _functions(name: str) -> tuple[Callable[..., Any] | None, ...]:
-    """The plain functions of a feature or of a closed form."""
+    """Return the plain functions of a feature or of a closed form."""
     return (FORMS[name].add, FORMS[name].add_slope) if name in FORMS else (compiled_closed_forms()[name],)
 
 
 def compiled_plain(function: Callable[..., Any], kernel: Callable[[Any], Any]) -> Any:
-    """What a decorator of `kernels.rows` compiles of a plain function and of the plain functions that it calls."""
+    """Compile a plain function and those that it calls with a decorator of `kernels.rows`."""
     assert isinstance(function, FunctionType)
     calls = {name: compiled_plain(called, kernel) for name, called in _called(function)}
     return kernel(FunctionType(function.__code__, {**function.__globals__, **calls}, function.__name__))
 
 
 def _called(function: Callable[..., Any]) -> Iterator[tuple[str, FunctionType]]:
-    """The plain functions that a plain function calls, and under which names."""
+    """Yield the plain functions that a plain function calls, with their names."""
     assert isinstance(function, FunctionType)
     for name in function.__code__.co_names:
         if isinstance(called := function.__globals__.get(name), FunctionType):
@@ -98,7 +98,7 @@ def _called(function: Callable[..., Any]) -> Iterator[tuple[str, FunctionType]]:
 
 
 def _fingerprint(*functions: Callable[..., Any] | None) -> str:
-    """What plain functions and those that they call do."""
+    """Return a text that identifies the code of plain functions and of those that they call."""
     words = []
     for function in functions:
         if isinstance(function, FunctionType):

@@ -188,7 +188,7 @@ def _solve_nearest(description: Record, memory: Record) -> int:
     while True:
         branch, distance = _nearest(description, memory)
         if branch < 0 or (
-            best_rank == 0 and math.sqrt(distance) - tolerances.LARGEST_CORRECTION > math.sqrt(best_distance)
+            best_rank == 0 and math.sqrt(distance) - tolerances.MAX_CORRECTION > math.sqrt(best_distance)
         ):
             break
         others[branch, 0] = math.nan
@@ -213,7 +213,7 @@ def _continue(description: Record, memory: Record, chosen: int) -> int:
         wrap_into_limits(arms, memory.trial)
         nearest_turn(arms, memory.trial, memory.near, True)
         off = math.sqrt(distance_from(arms, memory.trial, memory.near))
-    if off <= tolerances.AWAY:
+    if off <= tolerances.FAR_AWAY:
         return chosen
     copy(memory.near, memory.q)
     if not search(description, memory, memory.pose, memory.q):

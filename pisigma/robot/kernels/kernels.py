@@ -11,7 +11,7 @@ from pisigma.robot.kernels.inverse import solve_every, solve_pose
 from pisigma.robot.kernels.joint_correction import beyond_measured, move
 from pisigma.robot.kernels.rows import Array, Record, fill, kernel
 from pisigma.robot.kernels.task_axes import state_task
-from pisigma.robot.kinematics.tolerances import POSE_TOLERANCE, POSE_TOLERANCE_SINGLE, ROUNDINGS
+from pisigma.robot.kinematics.tolerances import POSE_TOLERANCE, POSE_TOLERANCE_SINGLE, ROUNDING_UNITS
 
 Pointer = Any
 
@@ -97,7 +97,7 @@ def solve_poses(
     tolerance = POSE_TOLERANCE_SINGLE if single else POSE_TOLERANCE
     state_task(description.arms, memory, description.arms.reach[arrays.IDENTIFIED], axes)
     every = branch == arrays.EVERY_BRANCH and description.closed_form.kind == arrays.NO_CLOSED_FORM
-    memory.rounding = ROUNDINGS * (_EPSILON_SINGLE if single else _EPSILON)
+    memory.rounding = ROUNDING_UNITS * (_EPSILON_SINGLE if single else _EPSILON)
     for row in range(T.shape[0]):
         wrong = _check_pose(T[row], tolerance)
         if has_near:

@@ -1,6 +1,6 @@
-"""One struct for an arm and one for working memory: kernels get a pointer each, whatever the robot.
+"""The structs for an arm and for working memory, to which the kernels get one pointer each.
 
-Arrays are as long as the largest robot needs, with counts beside them, so that one compiled function serves all.
+Arrays are as long as the largest robot needs and have counts, so that one compiled function serves all robots.
 """
 
 from typing import Any
@@ -9,9 +9,9 @@ import numpy as np
 
 from pisigma.files.errors import ModelError
 from pisigma.robot.kernels.arrays import PARTS, Description
-from pisigma.robot.kernels.forms import MOST_JOINTS, MOST_KINDS, MOST_VALUES, KernelForms
+from pisigma.robot.kernels.forms import MAX_JOINTS, MAX_KINDS, MAX_VALUES, KernelForms
 
-DOF = MOST_JOINTS
+DOF = MAX_JOINTS
 ROWS, FACTORS, UNITS, STRETCHES, STARTS = 24, 24, 12, 96, 512
 """The largest numbers of rows, factors and product units, stretches and starts."""
 BRANCHES, CANDIDATES = 8, 16
@@ -22,7 +22,7 @@ GROUPS, SEEN, GROUP_INPUTS, SAMPLES, ENTRIES = 8, 512, 80, 2048, 2048 * 320
 """The largest numbers of groups of a network, inputs of all and of one, rows of a domain, and entries of these."""
 
 LANES = 16
-"""Poses whose forward kinematics is computed abreast."""
+"""Number of poses whose forward kinematics is vectorised."""
 
 _Field = tuple[str, Any, tuple[int, ...]]
 
@@ -39,12 +39,12 @@ _ARMS = _integers(dof=(), rows_used=(), corrected=(), kind=(ROWS,), revolute=(DO
     rows=(3, ROWS, 9), ends=(3, 2, 3, 4), reach=(3,), direction=(DOF,), limits=(DOF, 2)
 )
 _CORRECTION = _integers(
-    inputs=(), products=(), frames=(), periodic=(), orders=(UNITS,), first=(MOST_KINDS,)
+    inputs=(), products=(), frames=(), periodic=(), orders=(UNITS,), first=(MAX_KINDS,)
 ) + _floats(
     rate=(DOF,),
     middle=(DOF,),
     half=(DOF,),
-    values=(MOST_VALUES,),
+    values=(MAX_VALUES,),
     weight=(FACTORS, INPUTS, DOF),
     bias=(FACTORS, DOF),
 )
@@ -84,7 +84,7 @@ _STARTS = _integers(count=()) + _floats(q=(STARTS, DOF), points=(STARTS, 12), le
 
 _STRUCTS = (_ARMS, _CORRECTION, _COVERAGE, _NETWORK, _CLOSED_FORM, _STARTS)
 DESCRIPTION = np.dtype([(part, np.dtype(fields)) for part, fields in zip(PARTS, _STRUCTS, strict=True)])
-"""What kernels know of an arm: the fields of `compiled.arrays`, and counts."""
+"""Description of an arm for the kernels: the fields of `kernels.arrays`, and counts."""
 
 MEMORY = np.dtype(
     _floats(
@@ -153,19 +153,19 @@ MEMORY = np.dtype(
         height=(),  # 6, or 7 where the elbow angle counts too
     )
 )
-"""What kernels work in: overwritten all the time, and nothing in it outlives a pose."""
+"""Working memory of the kernels; nothing in it is kept from one pose to the next."""
 
 
 def pack(description: Description, name: str, forms: KernelForms) -> np.ndarray:
-    """A description as one struct, `(1,)` of `DESCRIPTION`.
+    """Pack a description into one struct, `(1,)` of `DESCRIPTION`.
 
     Args:
         description: the arm as arrays.
-        name: of the model, for complaints.
-        forms: what the kernels evaluate.
+        name: name of the model for messages.
+        forms: features and closed forms that the kernels evaluate.
 
     Raises:
-        ModelError: the arm is larger than the compiled kernels allow, or needs what they do not evaluate.
+        ModelError: the arm is larger than the compiled kernels allow, or needs a form that they do not evaluate.
     """
     packed = np.zeros(1, DESCRIPTION)
     for part, kind in PARTS.items():
@@ -176,8 +176,11 @@ def pack(description: Description, name: str, forms: KernelForms) -> np.ndarray:
                 n > most for n, most in zip(value.shape, room.shape, strict=True)
             ):
                 raise ModelError(
-                    f"model '{name}': {part}.{field} has the shape {value.shape}, but the compiled kernels have room "
-                    f"for {np.shape(room)}; use pisigma.load."
+                    f"model '{name}': {part}.{field} has the shape {value.shape}, but the compiled kernels allow "
+                    f"at most {np.shape(room)}",
+                    expected=f"{part}.{field} of shape {np.shape(room)} or smaller",
+                    value=value.shape,
+                    remedy="use pisigma.load",
                 )
             packed[part][field][(0, *(slice(n) for n in value.shape))] = value
     arms, correction = description.arms, description.correction
@@ -190,8 +193,9 @@ def pack(description: Description, name: str, forms: KernelForms) -> np.ndarray:
     if not forms.cover(wanted):
         lacking = {*wanted.features, *wanted.closed_forms} - {*forms.features, *forms.closed_forms}
         raise ModelError(
-            f"model '{name}': it uses {', '.join(map(repr, sorted(lacking)))}, which these kernels do not evaluate; "
-            "import what registers it, and install pisigma[compile]."
+            f"model '{name}' uses {', '.join(map(repr, sorted(lacking)))}, which these kernels do not evaluate",
+            value=", ".join(sorted(lacking)),
+            remedy="import the module that registers it, and install pisigma[compile]",
         )
     for feature, start in zip(wanted.features, correction.starts, strict=True):
         packed["correction"]["first"][0, forms.features.index(feature)] = start
@@ -200,8 +204,10 @@ def pack(description: Description, name: str, forms: KernelForms) -> np.ndarray:
     network = description.network
     if network.samples > SAMPLES:
         raise ModelError(
-            f"model '{name}': its domain has {network.samples} training rows, but the compiled kernels have room for "
-            f"{SAMPLES}; use pisigma.load."
+            f"model '{name}': its domain has {network.samples} training rows, but the compiled kernels allow {SAMPLES}",
+            expected=f"at most {SAMPLES} training rows",
+            value=network.samples,
+            remedy="use pisigma.load",
         )
     packed["network"]["inputs"] = len(network.source)
     packed["network"]["columns"] = len(network.column)
@@ -212,5 +218,5 @@ def pack(description: Description, name: str, forms: KernelForms) -> np.ndarray:
 
 
 def make_memory() -> np.ndarray:
-    """Fresh memory to work in, `(1,)` of `MEMORY`."""
+    """Allocate working memory, `(1,)` of `MEMORY`."""
     return np.zeros(1, MEMORY)

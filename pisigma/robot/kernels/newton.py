@@ -40,9 +40,9 @@ def newton(description: Record, memory: Record, arm: int, T: Array, q: Array, to
     _move_steeply(description, memory, arm, q)
     miss(arms, memory, T, memory.best)
     copy_rows(memory.J, memory.J_best)
-    old, damping, stalled = scaled_square(reach, memory.best), tolerances.FIRST_DAMPING, 0
-    for _ in range(tolerances.ITERATIONS):
-        if within(memory.best, tolerance, tolerance) or damping > tolerances.MOST_DAMPING:
+    old, damping, stalled = scaled_square(reach, memory.best), tolerances.INITIAL_DAMPING, 0
+    for _ in range(tolerances.MAX_ITERATIONS):
+        if within(memory.best, tolerance, tolerance) or damping > tolerances.MAX_DAMPING:
             break
         possible = damped_step(arms, reach, memory.J_best, memory.best, damping, memory)
         new = math.inf
@@ -53,14 +53,14 @@ def newton(description: Record, memory: Record, arm: int, T: Array, q: Array, to
             miss(arms, memory, T, memory.error)
             new = scaled_square(reach, memory.error)
         if new < old:
-            stalled = stalled + 1 if new > tolerances.STALLED * old else 0
-            if stalled == tolerances.MOST_STALLED:
+            stalled = stalled + 1 if new > tolerances.STALL_RATIO * old else 0
+            if stalled == tolerances.MAX_STALLED:
                 break
             old = new
             copy(memory.trial, q)
             copy(memory.error, memory.best)
             copy_rows(memory.J, memory.J_best)
-            damping = max(damping * tolerances.DAMPING_DOWN, tolerances.LEAST_DAMPING)
+            damping = max(damping * tolerances.DAMPING_DOWN, tolerances.MIN_DAMPING)
         else:
             damping *= tolerances.DAMPING_UP
 
@@ -138,7 +138,7 @@ def _search_exactly(description: Record, memory: Record, T: Array, q: Array) -> 
     newton(description, memory, IDENTIFIED, T, q, tolerances.TOLERANCE)
     if not arms.corrected:
         return within(memory.best, tolerances.ACCEPTED, tolerances.ACCEPTED)
-    if not within(memory.best, tolerances.NEARLY * arms.reach[IDENTIFIED], tolerances.NEARLY):
+    if not within(memory.best, tolerances.NEAR_MISS * arms.reach[IDENTIFIED], tolerances.NEAR_MISS):
         return False
     newton(description, memory, CORRECTED, T, q, tolerances.HYBRID_TOLERANCE)
     return within(memory.best, tolerances.ACCEPTED, tolerances.ACCEPTED)
@@ -200,7 +200,7 @@ def _converge(description: Record, memory: Record, T: Array, q: Array) -> bool:
             return square < 1e-26
         if square < 1e-30:
             return True
-        if not damped_step(arms, reach, memory.J, memory.error, tolerances.FIRST_DAMPING, memory):
+        if not damped_step(arms, reach, memory.J, memory.error, tolerances.INITIAL_DAMPING, memory):
             return False
         for j in range(dof):
             q[j] += memory.step[j]

@@ -12,7 +12,7 @@ from pisigma.robot.kernels.rotations import wrap
 from pisigma.robot.kernels.rows import Array, Record, copy, fill, kernel
 from pisigma.robot.kernels.task_axes import free_orientations, is_free, miss, orient, use_elbow
 from pisigma.robot.kinematics import tolerances
-from pisigma.robot.kinematics.tolerances import ATTEMPTS, BESIDE, REACH_ROUNDING
+from pisigma.robot.kinematics.tolerances import ATTEMPTS, BRANCH_MISS, REACH_ROUNDING
 
 _TURN = 0.2
 """[rad] By so much the elbow is turned at a time."""
@@ -154,7 +154,7 @@ def _is_near(description: Record, memory: Record, q: Array) -> bool:
     """Whether joint values of a nominal branch bring the identified arm near the pose; NaN do not."""
     move(description, memory, IDENTIFIED, q)
     miss(description.arms, memory, memory.pose, memory.error)
-    return scaled_square(description.arms.reach[IDENTIFIED], memory.error) <= BESIDE * BESIDE
+    return scaled_square(description.arms.reach[IDENTIFIED], memory.error) <= BRANCH_MISS * BRANCH_MISS
 
 
 @kernel
@@ -307,7 +307,7 @@ def _approach_preferred(description: Record, memory: Record, q: Array) -> bool:
     """Move joints to preferred values as `kinematics.numeric.approach_preferred`; whether they still reach the pose."""
     arms, arm = description.arms, CORRECTED if description.arms.corrected else IDENTIFIED
     reach, share, before = arms.reach[IDENTIFIED], 1.0, math.inf
-    for _ in range(tolerances.ROUNDS):
+    for _ in range(tolerances.MAX_STEPS):
         move(description, memory, arm, q)
         miss(arms, memory, memory.pose, memory.error)
         for j in range(arms.dof):
@@ -325,11 +325,11 @@ def _approach_preferred(description: Record, memory: Record, q: Array) -> bool:
             share *= 0.6
         before = moved
         for j in range(arms.dof):
-            q[j] += memory.trial[j] * min(1.0, tolerances.STRIDE / moved)
+            q[j] += memory.trial[j] * min(1.0, tolerances.MAX_STEP / moved)
             if not arms.limits[j, 0] <= q[j] <= arms.limits[j, 1]:
                 q[j] = min(max(q[j], arms.limits[j, 0]), arms.limits[j, 1])
                 memory.scale[j] = 0.0
-        if moved < tolerances.STILL:
+        if moved < tolerances.STEP_TOLERANCE:
             break
     newton(description, memory, arm, memory.pose, q, tolerances.HYBRID_TOLERANCE)
     return within(memory.best, tolerances.ACCEPTED, tolerances.ACCEPTED)

@@ -23,17 +23,17 @@ from pisigma.robot.kinematics.components import (
 )
 
 CHUNK = 16_384
-"""Poses worked on together: few enough that the components stay in the processor's cache."""
+"""Number of poses that are processed together, so that the components stay in the processor's cache."""
 
 
 @dataclass(frozen=True)
 class Geometry:
-    """Geometric parameters ready for computing: floats of a robot, or tensors to differentiate by.
+    """Geometric parameters: floats of a robot, or tensors for derivatives.
 
     Attributes:
-        dh: for every row theta [rad], d [m], a [m], alpha [rad], beta [rad].
-        base: x, y, z [m], roll, pitch, yaw [rad].
-        tool: the same for the tool.
+        dh: theta [rad], d [m], a [m], alpha [rad], beta [rad] of every row.
+        base: x, y, z [m], roll, pitch, yaw [rad] of the base.
+        tool: x, y, z [m], roll, pitch, yaw [rad] of the tool.
     """
 
     dh: Sequence[Sequence[Scalar]]
@@ -42,27 +42,27 @@ class Geometry:
 
     @staticmethod
     def of(robot: Robot) -> "Geometry":
-        """The geometry of a robot as plain floats."""
+        """Return the geometry of a robot as plain floats."""
         return Geometry(robot.dh.tolist(), robot.base.tolist(), robot.tool.tolist())
 
     @staticmethod
     def from_tensors(
         dh: Float[Tensor, "rows 5"], base: Float[Tensor, " 6"], tool: Float[Tensor, " 6"]
     ) -> "Geometry":
-        """A geometry that gradients flow through."""
+        """Make a geometry through which gradients flow."""
         return Geometry([tuple(row.unbind()) for row in dh.unbind()], base.unbind(), tool.unbind())
 
 
 @dataclass(frozen=True)
 class RowFrames:
-    """Where row i stands in the base frame.
+    """Frames within a row, in the base frame.
 
     Attributes:
         before: frame before the row; its z axis is the joint's axis.
-        turned: after RotZ(theta + q); its x axis is the common normal.
-        moved: after Trans(a, 0, d) too.
-        twisted: after RotX(alpha) too; its y axis is Hayati's.
-        after: after RotY(beta) too, so the next row's `before`.
+        turned: frame after RotZ(theta + q); its x axis is the common normal.
+        moved: frame after Trans(a, 0, d) as well.
+        twisted: frame after RotX(alpha) as well; its y axis is Hayati's.
+        after: frame after RotY(beta) as well, the next row's `before`.
     """
 
     before: Frame
@@ -73,12 +73,12 @@ class RowFrames:
 
 
 def iterate_rows(robot: Robot, geometry: Geometry, q: Sequence[Scalar]) -> Iterator[RowFrames]:
-    """Walk from the base to the last row (without the tool).
+    """Yield the frames of the rows from the base to the last one, without the tool.
 
     Args:
-        robot: says which rows move, and how.
-        geometry: the parameters to use, of the same rows.
-        q: one joint value [rad or m] per joint, each a tensor with the batch shape.
+        robot: robot with the types and directions of the rows.
+        geometry: parameters of the rows.
+        q: one joint value [rad or m] per joint, each a tensor of the batch shape.
     """
     values = iter(q)
     frame = follow_xyzrpy(IDENTITY, geometry.base)
@@ -97,21 +97,21 @@ def iterate_rows(robot: Robot, geometry: Geometry, q: Sequence[Scalar]) -> Itera
 def forward_kinematics(
     robot: Robot, q: Float[Tensor, "*batch dof"], geometry: Geometry | None = None
 ) -> Float[Tensor, "*batch 4 4"]:
-    """Tool pose of a robot: `base · Π RotZ(theta + q) Trans(a, 0, d) RotX(alpha) RotY(beta) · tool`.
+    """Compute the tool pose `base · Π RotZ(theta + q) Trans(a, 0, d) RotX(alpha) RotY(beta) · tool`.
 
     Source: Denavit and Hartenberg 1955 with the term of Hayati and Mirmirani 1985; a prismatic joint adds q
     to d. Gradients flow to q and to the tensors of a geometry, in reverse and in forward mode.
 
     Args:
         robot: the robot.
-        q: joint values [rad or m], as the controller counts.
-        geometry: other parameters for the same rows, such as tensors to differentiate by.
+        q: joint values [rad or m].
+        geometry: other parameters of the same rows, such as tensors for derivatives.
 
     Returns:
-        T_base_tool, contiguous, with q's dtype and device.
+        T_base_tool, contiguous, with the dtype and device of q.
 
     Raises:
-        PoseError: q has another number of columns than the robot has joints.
+        PoseError: the number of columns of q is not the number of joints.
     """
     robot.check_joint_count(q.shape[-1])
     geometry = geometry or Geometry.of(robot)
@@ -121,7 +121,7 @@ def forward_kinematics(
 
 
 def iterate_chunks(q: Float[Tensor, "*batch dof"]) -> Iterator[Float[Tensor, "poses dof"]]:
-    """The poses in a row, `CHUNK` at a time; one empty chunk where there are none."""
+    """Yield the flattened batch in chunks of `CHUNK` poses; an empty batch is one empty chunk."""
     flat = q.reshape(-1, q.shape[-1])
     for start in range(0, max(flat.shape[0], 1), CHUNK):
         yield flat[start : start + CHUNK]

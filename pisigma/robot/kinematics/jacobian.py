@@ -1,4 +1,4 @@
-"""Joint Jacobian of the tool pose, batched and in closed form."""
+"""Joint Jacobian of the tool pose, batched, in closed form."""
 
 from collections.abc import Sequence
 
@@ -24,7 +24,7 @@ from pisigma.robot.kinematics.forward import Geometry, iterate_chunks, iterate_r
 def joint_jacobian(
     robot: Robot, q: Float[Tensor, "*batch dof"]
 ) -> tuple[Float[Tensor, "*batch 4 4"], Float[Tensor, "*batch 6 dof"]]:
-    """Tool pose and geometric Jacobian, in the base frame and at the tool's origin.
+    """Compute the tool pose and the geometric Jacobian, in the base frame and at the tool's origin.
 
     Column j is `direction_j · [z × (p_tool - p); z]` for a revolute and `direction_j · [z; 0]` for a
     prismatic joint, with z and p the axis and origin of the frame before the joint's row (Siciliano et al.
@@ -36,11 +36,11 @@ def joint_jacobian(
 
     Returns:
         T_base_tool, and J with `J @ dq` = [translation [m]; rotation vector [rad]] of the tool, both in the
-        base frame. Both may be views of memory in which the batch runs fastest; call ``.contiguous()`` where
-        that matters.
+        base frame. Both may be views in which the batch dimension is contiguous; call ``.contiguous()`` where that
+        matters.
 
     Raises:
-        PoseError: q has another number of columns than the robot has joints.
+        PoseError: the number of columns of q is not the number of joints.
     """
     robot.check_joint_count(q.shape[-1])
     batch = q.shape[:-1]
@@ -53,7 +53,7 @@ def joint_jacobian(
 
 
 def _join(chunks: list[Tensor]) -> Tensor:
-    """Chunks one after the other, copied in the order in which they lie in memory, the batch fastest."""
+    """Concatenate chunks along the batch, which stays contiguous in memory."""
     return torch.cat([chunk.movedim(0, -1) for chunk in chunks], -1).movedim(-1, 0)
 
 
@@ -69,12 +69,12 @@ def _jacobian_chunk(
 def motion_components(
     robot: Robot, geometry: Geometry, q: Sequence[Scalar]
 ) -> tuple[Frame, list[list[Scalar]]]:
-    """Frame of the tool and the six rows of the joint Jacobian, as `joint_jacobian` gives them, on components.
+    """Compute the tool frame and the six rows of the joint Jacobian on components; see `joint_jacobian`.
 
     Args:
         robot: the robot.
         geometry: its parameters, or others for the same rows.
-        q: one joint value [rad or m] per joint, each a tensor with the batch shape.
+        q: one joint value [rad or m] per joint, each a tensor of the batch shape.
     """
     joints: list[Frame] = []
     frame = IDENTITY

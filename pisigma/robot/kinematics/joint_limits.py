@@ -1,4 +1,4 @@
-"""Joint limits: values moved inside by full turns where that can be, and those that cannot be of the joint at all."""
+"""Joint limits: wrap values into them by full turns, and detect values that cannot belong to the joint."""
 
 import numpy as np
 import torch
@@ -14,7 +14,7 @@ from pisigma.robot.se3 import wrap_to_pi
 def wrapped_difference(
     robot: Robot, q: Float[Tensor, "*#batch dof"], other: Float[Tensor, "*#batch dof"]
 ) -> Float[Tensor, "*_batch dof"]:
-    """`q - other` [rad or m], wrapped to (-pi, pi] for the joints that turn; the batches broadcast."""
+    """Return `q - other` [rad or m], wrapped to (-pi, pi] for revolute joints; the batches broadcast."""
     difference = q - other
     return torch.where(torch.tensor(robot.revolute, device=q.device), wrap_to_pi(difference), difference)
 
@@ -22,15 +22,15 @@ def wrapped_difference(
 def wrap_into_limits(
     robot: Robot, q: Float[Tensor, "*batch dof"]
 ) -> tuple[Float[Tensor, "*batch dof"], Bool[Tensor, "*batch"]]:
-    """Move revolute joints that are outside their limits by full turns where that brings them inside.
+    """Shift revolute joints that are outside their limits by full turns, if that brings them inside.
 
     Args:
-        robot: the robot, for the limits; where joints are coupled, those of the controller's values.
+        robot: the robot with the limits; for coupled joints, those of the controller's values.
         q: joint values [rad or m]; NaN stays NaN.
 
     Returns:
-        The joint values, and whether all joints of a pose are inside (False where one is NaN). A value that
-        no full turn brings inside is left as it came.
+        The joint values, and whether all joints of a pose are inside (False for NaN). A value that no full turn brings
+        inside is unchanged.
     """
     limits = torch.from_numpy(robot.limits).to(q)
     tolerance = max(LIMIT_TOLERANCE, 8 * torch.finfo(q.dtype).eps)
@@ -43,7 +43,7 @@ def wrap_into_limits(
     moved, every = torch.where(inside, moved, q), inside.all(-1)
     if robot.coupling is None:
         return moved, every
-    turned, allowed = robot.coupling.turned_inside(
+    turned, allowed = robot.coupling.wrapped_inside(
         moved.detach().double().cpu().numpy().reshape(-1, robot.dof)
     )
     return torch.from_numpy(turned).to(q).reshape(q.shape), every & torch.from_numpy(allowed).to(
@@ -54,13 +54,13 @@ def wrap_into_limits(
 def nearest_turn(
     robot: Robot, q: Float[Tensor, "*batch dof"], near: Float[Tensor, "... dof"], within_limits: bool
 ) -> Float[Tensor, "*batch dof"]:
-    """Move revolute joints by full turns as near to given values as they can come.
+    """Shift revolute joints by full turns to the values nearest to a reference.
 
     Args:
         robot: the robot.
         q: joint values [rad or m]; NaN stays NaN.
-        near: where they shall come near to [rad or m]; broadcasts.
-        within_limits: only to turns inside the joint limits; a joint that no turn brings inside stays.
+        near: reference values [rad or m]; broadcasts.
+        within_limits: consider only turns inside the joint limits; a joint without such a turn is unchanged.
     """
     turns = torch.round((near - q) / (2 * torch.pi))
     if within_limits:
@@ -74,20 +74,21 @@ def nearest_turn(
 
 
 GROSS_ANGLE = np.pi / 4
-"""[rad] A value that is farther outside is of another joint, unit or zero; drawings were off by up to 14 deg."""
+"""Excess over the limits [rad] above which a value belongs to another joint, unit or zero; stated limits of published
+robots were wrong by up to 14 deg."""
 GROSS_SHARE = 0.25
-"""Share of the stroke of a sliding joint for the same."""
+"""The same excess for a prismatic joint, as a share of its stroke."""
 
 
 def beyond_limits(
     q: Float64[np.ndarray, " rows"], axis: Row, slack: float = LIMIT_TOLERANCE
 ) -> Bool[np.ndarray, " rows"]:
-    """Which values [rad or m] lie farther than `slack` outside the limits of an axis."""
+    """Return which values [rad or m] exceed the limits of an axis by more than `slack`."""
     outside: np.ndarray = (q < axis.lower - slack) | (q > axis.upper + slack)
     return outside
 
 
 def grossly_beyond(q: Float64[np.ndarray, " rows"], axis: Row) -> Bool[np.ndarray, " rows"]:
-    """Which values cannot be those of an axis, whatever its drawing says of its limits."""
+    """Return which values cannot belong to an axis, even if its stated limits are inaccurate."""
     stroke = axis.upper - axis.lower
     return beyond_limits(q, axis, GROSS_SHARE * stroke if axis.type == "prismatic" else GROSS_ANGLE)

@@ -1,4 +1,4 @@
-"""Numeric inverse kinematics from a given start, for any robot: damped Newton, batched."""
+"""Numeric inverse kinematics from a start, for any robot: damped Gauss-Newton, batched."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -25,20 +25,19 @@ from pisigma.robot.kinematics.task_error import task_error, tolerated
 from pisigma.robot.se3 import check_transforms, pose_error
 
 Motion = Callable[[Tensor], tuple[Tensor, Tensor]]
-"""Pose T_base_tool and joint Jacobian of an arm at joint values, as `joint_jacobian` gives them."""
+"""Function that returns T_base_tool and the joint Jacobian at joint values, like `joint_jacobian`."""
 
 
 @dataclass(frozen=True, eq=False)
 class NumericSolution:
-    """What the iteration found for every pose.
+    """Result of the iteration for every pose.
 
     Attributes:
-        q: joint values [rad or m]; where the status is NOT_CONVERGED the best found, which do not reach the
-            pose.
+        q: joint values [rad or m]; if the status is NOT_CONVERGED, the best values found, which do not reach the pose.
         status: a `Status` for every pose: REACHED, SINGULAR, OUTSIDE_JOINT_LIMITS or NOT_CONVERGED.
         position_residual: distance of the tool from the wanted position [m].
-        rotation_residual: angle of the tool to the wanted orientation [rad].
-        iterations: Jacobians computed for the pose.
+        rotation_residual: angle between the tool and the wanted orientation [rad].
+        iterations: number of Jacobians computed for the pose.
     """
 
     q: Float[Tensor, "*batch dof"]
@@ -50,14 +49,14 @@ class NumericSolution:
 
 @dataclass
 class _Iterate:
-    """State of all poses, of which only the active ones are still worked on.
+    """State of the iteration for all poses, of which only the active ones are updated.
 
     Attributes:
         q: best joint values so far.
-        error: pose error there: translation [m], rotation vector [rad].
-        J: joint Jacobian there.
+        error: pose error at q: translation [m], rotation vector [rad].
+        J: joint Jacobian at q.
         damping: factor of the squared scaled error in the damping.
-        iterations: Jacobians computed.
+        iterations: number of Jacobians computed.
     """
 
     q: Float[Tensor, "poses dof"]
@@ -67,12 +66,12 @@ class _Iterate:
     iterations: Int64[Tensor, " poses"]
 
     def converged(self, tolerance: float) -> Bool[Tensor, " poses"]:
-        """Whether both residuals are below the tolerance [m, rad]."""
+        """Return whether both residuals are below the tolerance [m, rad]."""
         position, rotation = self.residuals()
         return (position < tolerance) & (rotation < tolerance)
 
     def residuals(self) -> tuple[Float[Tensor, " poses"], Float[Tensor, " poses"]]:
-        """Distance [m] and angle [rad] from the wanted pose."""
+        """Return distance [m] and angle [rad] from the wanted pose."""
         return torch.linalg.vector_norm(self.error[:, :3], dim=-1), torch.linalg.vector_norm(
             self.error[:, 3:], dim=-1
         )
@@ -84,36 +83,35 @@ def solve_numeric(
     start: Float[Tensor, "*starts dof"],
     *,
     tolerance: float | None = None,
-    max_iterations: int = tolerances.ITERATIONS,
+    max_iterations: int = tolerances.MAX_ITERATIONS,
     motion: Motion | None = None,
     axes: TaskAxes = WHOLE,
     weights: Sequence[float] | None = None,
 ) -> NumericSolution:
-    """Joint values near a start that take the tool to the poses.
+    """Find joint values near a start that reach the poses.
 
-    Each step solves `(JᵀJ + λ) dq = Jᵀe` with lengths in characteristic lengths and the damping λ in
-    proportion to the squared error (Sugihara 2011), so that convergence is quadratic at the end. The factor
-    grows after a step that makes the error larger, which is not taken, and shrinks after others, for each
-    pose on its own. Converged poses are worked on no more. Nothing is differentiated through; joint limits
-    are looked at when all is done.
+    Each step solves `(JᵀJ + λ) dq = Jᵀe`, with lengths in characteristic lengths and the damping λ proportional to the
+    squared error (Sugihara 2011), so that convergence is quadratic near the solution. For each pose, a step that
+    increases the error is rejected and the damping factor increased; otherwise the factor is decreased. Converged poses
+    are not updated any more. No gradients flow through the solution; joint limits are checked at the end only.
 
     Args:
-        robot: the robot, of any number of joints.
+        robot: the robot, with any number of joints.
         T: wanted T_base_tool, `(*batch, 4, 4)` [m].
-        start: joint values to begin with [rad or m]; batch dimensions broadcast with those of T.
-        tolerance: residuals to come below [m and rad]; None: 1e-13 in float64, 1e-5 in shorter types.
-        max_iterations: when to give up.
-        motion: where the tool of an arm with joint corrections is and how it moves; its Jacobian need not be
-            exact. None: that of the robot.
-        axes: which axes of the tool count.
-        weights: of these axes in least squares, 0 for one that does not count; None for `axes.weights`.
+        start: initial joint values [rad or m]; batch dimensions broadcast with those of T.
+        tolerance: residuals at which the iteration has converged [m and rad]; None: 1e-13 in float64, 1e-5 in float32.
+        max_iterations: largest number of steps.
+        motion: pose and Jacobian of an arm with joint corrections; its Jacobian need not be exact. None: those of the
+            robot.
+        axes: tool axes and tolerances of the task.
+        weights: weights of the six tool axes in least squares, 0 for an ignored one; None: `axes.weights`.
 
     Returns:
-        The solution nearest in the sense of the iteration. Where no solution was found the status is
-        NOT_CONVERGED and q, the best found, does not reach the pose: see the residuals.
+        The solution that the iteration converged to. If it did not, the status is NOT_CONVERGED and q, the best values
+        found, does not reach the pose: see the residuals.
 
     Raises:
-        PoseError: T is no stack of rigid transforms, or start is not finite or does not fit robot or T.
+        PoseError: T is not a stack of rigid transforms, or start is not finite or does not fit robot or T.
     """
     check_transforms(T, "T_base_tool")
     _check_start(robot, T, start)
@@ -124,13 +122,13 @@ def solve_numeric(
     with torch.no_grad():
         counted = T_flat.new_tensor(weights or axes.weights(robot.dof))
         task = TaskMotion(motion or partial(joint_jacobian, robot), axes, counted)
-        state = _begin(task, T_flat, start.detach().expand(*batch, robot.dof).reshape(-1, robot.dof))
+        state = _initial(task, T_flat, start.detach().expand(*batch, robot.dof).reshape(-1, robot.dof))
         active = (~state.converged(tolerance)).nonzero()[:, 0]
         for _ in range(max_iterations):
             if active.numel() == 0:
                 break
             _iterate(robot, task, T_flat, state, active)
-            stalled = state.damping[active] > tolerances.MOST_DAMPING
+            stalled = state.damping[active] > tolerances.MAX_DAMPING
             active = active[~(state.converged(tolerance)[active] | stalled)]
         return _finish(robot, state, tolerance, batch, task.rows)
 
@@ -138,30 +136,44 @@ def solve_numeric(
 def _check_start(robot: Robot, T: Tensor, start: Tensor) -> None:
     robot.check_joint_count(start.shape[-1])
     if start.dtype != T.dtype:
-        raise PoseError(f"start holds {start.dtype} but T_base_tool {T.dtype}; give both in the same type.")
+        expected = f"{T.dtype} as in T_base_tool"
+        raise PoseError(
+            f"expected {expected}, got {start.dtype}",
+            expected=expected,
+            value=str(start.dtype),
+            option="start",
+        )
     try:
         np.broadcast_shapes(T.shape[:-2], start.shape[:-1])
     except ValueError:
+        shapes = tuple(start.shape[:-1]), tuple(T.shape[:-2])
         raise PoseError(
-            f"start has the batch shape {tuple(start.shape[:-1])}, which does not broadcast with "
-            f"{tuple(T.shape[:-2])} of T_base_tool; give one start for each pose, or one for all."
+            f"the batch shape {shapes[0]} does not broadcast with that of T_base_tool, {shapes[1]}",
+            expected=f"a batch shape that broadcasts with {shapes[1]}",
+            value=shapes[0],
+            option="start",
+            remedy="give one start for each pose, or one for all",
         ) from None
     bad = ~torch.isfinite(start).all(-1)
     if bad.any():
+        index = tuple(bad.nonzero()[0].tolist())
         raise PoseError(
-            f"start at index {tuple(bad.nonzero()[0].tolist())} has joint values that are no finite numbers; "
-            "give a start for every pose, such as the nearest solution of another branch."
+            f"the joint values at index {index} are not finite",
+            expected="finite numbers",
+            value=index,
+            option="start",
+            remedy="give a start for every pose, such as the nearest solution of another branch",
         )
 
 
 @dataclass(frozen=True, eq=False)
 class TaskMotion:
-    """The pose errors of an arm in the axes that count, by their weights.
+    """Weighted pose errors of an arm in the tool axes of a task.
 
     Attributes:
-        motion: where the tool is and how it moves.
-        axes: which axes of the tool count.
-        weights: of them in least squares.
+        motion: function that returns pose and Jacobian.
+        axes: tool axes and tolerances of the task.
+        weights: weights of the six tool axes in least squares.
     """
 
     motion: Motion
@@ -170,13 +182,13 @@ class TaskMotion:
 
     @property
     def rows(self) -> int:
-        """How many axes count."""
+        """Number of axes with a weight other than 0."""
         return int(self.weights.count_nonzero())
 
     def errors(
         self, T: Float[Tensor, "poses 4 4"], q: Float[Tensor, "poses dof"]
     ) -> tuple[Float[Tensor, "poses 6"], Float[Tensor, "poses 6 dof"]]:
-        """Error from the wanted poses at joint values, and its Jacobian."""
+        """Return the weighted error from the wanted poses at joint values, and its Jacobian."""
         reached, J = self.motion(q)
         if self.axes.whole:
             return pose_error(T, reached), J.clone()
@@ -184,9 +196,9 @@ class TaskMotion:
         return self.weights * error, self.weights[:, None] * (turn @ J)
 
 
-def _begin(task: TaskMotion, T: Float[Tensor, "poses 4 4"], q: Float[Tensor, "poses dof"]) -> _Iterate:
+def _initial(task: TaskMotion, T: Float[Tensor, "poses 4 4"], q: Float[Tensor, "poses dof"]) -> _Iterate:
     error, J = task.errors(T, q)
-    damping = torch.full_like(q[:, 0], tolerances.FIRST_DAMPING)
+    damping = torch.full_like(q[:, 0], tolerances.INITIAL_DAMPING)
     return _Iterate(q.clone(), error, J, damping, torch.ones_like(damping, dtype=torch.int64))
 
 
@@ -197,14 +209,14 @@ def _iterate(
     state: _Iterate,
     active: Int64[Tensor, " active"],
 ) -> None:
-    """Try one step for the active poses and keep those that bring the tool nearer."""
+    """Try one step for the active poses, and keep the steps that decrease the error."""
     old = _scaled(robot, state.error[active])
     trial = state.q[active] + damped_step(robot, state.J[active], old, state.damping[active], task.rows)
     error, J = task.errors(T[active], trial)
     better = _scaled(robot, error).square().sum(-1) < old.square().sum(-1)
     state.iterations[active] += 1
     factor = torch.where(better, tolerances.DAMPING_DOWN, tolerances.DAMPING_UP).to(state.damping)
-    state.damping[active] = (state.damping[active] * factor).clamp(min=tolerances.LEAST_DAMPING)
+    state.damping[active] = (state.damping[active] * factor).clamp(min=tolerances.MIN_DAMPING)
     kept = active[better]
     state.q[kept], state.error[kept], state.J[kept] = trial[better], error[better], J[better]
 
@@ -220,14 +232,14 @@ def damped_step(
     damping: Float[Tensor, " poses"],
     rows: int = 6,
 ) -> Float[Tensor, "poses dof"]:
-    """The damped least-squares step [rad or m], from the smaller of the two forms of the normal equations.
+    """Compute the damped least-squares step [rad or m] from the smaller form of the normal equations.
 
     Args:
         robot: the robot.
         J: joint Jacobian.
         scaled_error: pose error with translation in characteristic lengths.
-        damping: factor of the squared error in the damping; rounding sets a floor under the product.
-        rows: how many rows of the Jacobian count; the others are 0.
+        damping: factor of the squared error in the damping; the product is kept above the rounding level.
+        rows: number of rows of the Jacobian that are not 0.
     """
     A = dimensionless_jacobian(robot, J).contiguous()
     small = A.mT @ A if robot.dof < rows else A @ A.mT
@@ -271,16 +283,19 @@ def solve_within_tolerances(
     motion: Motion,
     axes: TaskAxes,
 ) -> tuple[Float[Tensor, "poses dof"], Bool[Tensor, " poses"]]:
-    """Joint values that miss poses by as little as possible, each axis over its tolerance, and whether within all.
+    """Find joint values that minimise errors divided by their tolerances, for arms with too few joints for all axes.
 
-    It is for arms with too few joints for all axes that count. Those without tolerance are met exactly.
+    Axes without tolerance are met exactly.
 
     Args:
         robot: the robot.
         T: wanted T_base_tool [m].
-        start: joint values to begin with [rad or m].
-        motion: where the tool is and how it moves.
-        axes: which axes of the tool count, some of them within tolerances.
+        start: initial joint values [rad or m].
+        motion: function that returns pose and Jacobian.
+        axes: tool axes of the task, some of them with tolerances.
+
+    Returns:
+        Joint values [rad or m], and whether all errors are within the tolerances.
     """
     q = solve_numeric(robot, T, start, motion=motion, axes=axes, weights=axes.loose_weights).q
     exact, met = [float(value == 0) for value in axes.tolerance], torch.ones_like(q[:, 0], dtype=torch.bool)
@@ -300,25 +315,25 @@ def approach_preferred(
     preferred: Float[Tensor, "poses dof"],
     units: Float[Tensor, " dof"],
 ) -> Float[Tensor, "poses dof"]:
-    """Move joints as near to preferred values as the pose and the limits allow.
+    """Move the joints of a redundant arm as near to preferred values as pose and limits allow.
 
-    So the kernels choose among the many joint values of an arm with joints to spare. Every step solves
-    `min |(dq - pull) / units|` where `J dq = e` holds (sequential quadratic programming). A joint that comes to a
-    limit is held there. Where that leads away from the pose, the joint values stay.
+    The kernels select the joint values of redundant arms in the same way. Every step minimises `|(dq - pull) / units|`
+    subject to `J dq = e` (sequential quadratic programming). A joint that reaches a limit is fixed there. If the result
+    does not reach the pose, the joint values are unchanged.
 
     Args:
         robot: the robot.
-        task: the arm in the axes that count.
+        task: weighted pose errors of the arm.
         T: wanted poses.
         q: joint values that reach them [rad or m].
-        preferred: joint values to come near to [rad or m].
-        units: joint motions that count as one [rad or m].
+        preferred: preferred joint values [rad or m].
+        units: scale of the motion of every joint [rad or m].
     """
     length, limits = characteristic_length(robot), torch.from_numpy(robot.limits)
     rows = T.new_tensor([1 / length] * 3 + [1.0] * 3)
     scale, share = units.expand_as(q).clone(), torch.ones_like(q[:, :1])
     before, best, active = torch.full_like(share, torch.inf), q.clone(), torch.ones(len(q), dtype=torch.bool)
-    for _ in range(tolerances.ROUNDS):
+    for _ in range(tolerances.MAX_STEPS):
         if not active.any():
             break
         error, J = task.errors(T, best)
@@ -331,11 +346,11 @@ def approach_preferred(
         step = pull + scale * (A.mT @ torch.cholesky_solve(left[..., None], factor))[..., 0]
         moved = step.abs().amax(-1, keepdim=True)
         share, before = torch.where(moved > 0.7 * before, 0.6 * share, share), moved
-        trial = best + step * (tolerances.STRIDE / moved).clamp(max=1.0)
+        trial = best + step * (tolerances.MAX_STEP / moved).clamp(max=1.0)
         inside = torch.minimum(torch.maximum(trial, limits[:, 0]), limits[:, 1])
         scale = torch.where(active[:, None] & (inside != trial), 0.0, scale)
         best = torch.where(active[:, None], inside, best)
-        active &= (moved >= tolerances.STILL)[:, 0]
+        active &= (moved >= tolerances.STEP_TOLERANCE)[:, 0]
     start = torch.where(torch.isfinite(best).all(-1, keepdim=True), best, q)
     result = solve_numeric(
         robot, T, start, tolerance=tolerances.HYBRID_TOLERANCE, motion=task.motion, axes=task.axes

@@ -1,16 +1,15 @@
-"""Identification Jacobian: derivative of the tool pose by every geometric parameter, closed form and batched.
+"""Identification Jacobian: derivative of the tool pose with respect to all geometric parameters, batched.
 
-Every parameter is a shift along, or a turn about, an axis that the walk along the rows passes anyway:
+Every parameter is a translation along, or a rotation about, an axis that forward kinematics computes anyway:
 
-    theta_i  turns about z of the frame before the row       d_i  shifts along it
-    alpha_i  turns about x of the frame after RotZ           a_i  shifts along it
-    beta_i   turns about y of the frame after RotX
+    theta_i  rotates about z of the frame before the row       d_i  translates along it
+    alpha_i  rotates about x of the frame after RotZ           a_i  translates along it
+    beta_i   rotates about y of the frame after RotX
 
-A shift along u moves the tool by u; a turn about u through o moves it by `u × (p_tool - o)` and turns it by
-u. This is the error propagation of Lim et al. 1999, eqs. (8) to (33), written in the base frame instead of
-the tool's.
+A translation along u moves the tool by u; a rotation about u through o moves it by `u × (p_tool - o)` and rotates it
+about u. This is the error propagation of Lim et al. 1999, eqs. (8) to (33), in the base frame instead of the tool's.
 
-Axes and origins are kept as `(3, poses)` blocks of few large tensors: few operations for small batches, whole
+Axes and origins are stored as `(3, poses)` blocks of a few large tensors: few operations for small batches, whole
 cache lines for large ones.
 """
 
@@ -25,23 +24,23 @@ from torch import Tensor
 from pisigma.robot.description import Robot
 
 JACOBIAN_CHUNK = 2_048
-"""Poses worked on together, so that their Jacobian stays in the processor's cache."""
+"""Number of poses that are processed together, so that their Jacobian stays in the processor's cache."""
 
 
 AXES, ORIGIN = slice(6, 9), 9
-"""Where `_frame_axes` has x, y, z; and the origin."""
+"""Indices of x, y, z and of the origin in `_frame_axes`."""
 STARTS = torch.tensor((0, 0, 0, 1, 1, ORIGIN, 2, 6, 6, 6, 7, 10, ORIGIN, 8))
-"""Which of them the walk starts from, see `_walk_rows`: what the base turns about, and where the first row stands."""
+"""Indices in `_frame_axes` that start the recursion of `_walk_rows`: rotation axes of the base, then its frame."""
 
 
 @dataclass(frozen=True, eq=False)
 class ToolMotion:
-    """Where the tool is and how it moves with the parameters; the batch index is last.
+    """Tool pose and its derivative with respect to the parameters; the batch index is last.
 
     Attributes:
-        position: of the tool in the measuring frame [m].
-        rotation: of the tool in the measuring frame.
-        derivative: for every parameter the tool's shift [m] and, where asked for, its turn [rad], both in the
+        position: position of the tool in the measuring frame [m].
+        rotation: rotation of the tool in the measuring frame.
+        derivative: for every parameter the tool's translation [m] and, if requested, its rotation [rad], both in the
             measuring frame; the order is that of `motion_order`.
     """
 
@@ -51,13 +50,12 @@ class ToolMotion:
 
 
 def motion_order(rows: int) -> list[int]:
-    """Where the parameters stand in `ToolMotion.derivative`, which has all turns before all shifts.
+    """Return the indices of the parameters in `ToolMotion.derivative`, which has all rotations before all translations.
 
-    It has the turns about every third axis of `_walk_rows`, of which some are no parameter's.
+    The rotations are those about every third axis of `_walk_rows`, some of which belong to no parameter.
 
     Returns:
-        For theta, d, a, alpha, beta of every row, then base and tool (x, y, z, roll, pitch, yaw each), its
-        index.
+        The index of theta, d, a, alpha, beta of every row, then of base and tool (x, y, z, roll, pitch, yaw each).
     """
     d, a, base, tool = (start + 3 * rows + 9 for start in (0, rows, 2 * rows, 2 * rows + 3))
     order = [
@@ -69,19 +67,19 @@ def motion_order(rows: int) -> list[int]:
 def identification_jacobian(
     robot: Robot, q: Float[Tensor, "*batch dof"]
 ) -> tuple[Float[Tensor, "*batch 4 4"], Float[Tensor, "*batch 6 parameters"]]:
-    """Tool pose and its derivative by all geometric parameters.
+    """Compute the tool pose and its derivative with respect to all geometric parameters.
 
     Args:
         robot: the robot.
-        q: joint values [rad or m], as the controller counts.
+        q: joint values [rad or m].
 
     Returns:
-        T_base_tool, and J with `J @ dx` = [shift [m]; rotation vector [rad]] of the tool, both in the
+        T_base_tool, and J with `J @ dx` = [translation [m]; rotation vector [rad]] of the tool, both in the
         measuring frame. Columns: theta, d, a, alpha, beta of every row, then base and tool (x, y, z, roll,
         pitch, yaw each).
 
     Raises:
-        PoseError: q has another number of columns than the robot has joints.
+        PoseError: the number of columns of q is not the number of joints.
     """
     robot.check_joint_count(q.shape[-1])
     flat = q.reshape(-1, robot.dof)
@@ -109,17 +107,17 @@ def tool_motion(
     frame: Int64[Tensor, " poses"] | None = None,
     target: Int64[Tensor, " poses"] | None = None,
 ) -> ToolMotion:
-    """Tool pose and its derivative, with the batch index last.
+    """Compute the tool pose and its derivative, with the batch index last.
 
     Args:
-        robot: says which rows move.
-        dh: the parameters of the rows.
-        base: x, y, z [m], roll, pitch, yaw [rad]; one for all poses, or one a frame.
-        tool: the same; one for all poses, or one a target.
+        robot: robot with the types and directions of the rows.
+        dh: parameters of the rows.
+        base: x, y, z [m], roll, pitch, yaw [rad] of the base; one for all poses, or one per measuring frame.
+        tool: the same for the tool; one for all poses, or one per target.
         q: joint values [rad or m].
-        turning: whether the derivative of the rotation is wanted too.
-        frame: per pose the number of its base, where there is one a frame.
-        target: per pose the number of its tool, where there is one a target.
+        turning: whether to compute the derivative of the rotation too.
+        frame: index of the base for every pose, if there are several.
+        target: index of the tool for every pose, if there are several.
     """
     poses = q.shape[0]
     axes, bases = _frame_axes(torch.cat([base, tool], 1), q), base.shape[1]
@@ -136,7 +134,7 @@ def tool_motion(
     turns = frames[:, ::3]
     u, v = turns.unbind(2), (position - frames[:, 5])[:, None].unbind(2)
     of_turns = J[: shifts - 3].view(-1, 3, J.shape[1], poses)
-    for k in range(3):  # the cross product of the axes and the ways from the origins to the tool
+    for k in range(3):  # the cross product of the axes and the vectors from the origins to the tool
         i, j = (k + 1) % 3, (k + 2) % 3
         torch.mul(u[i], v[j], out=of_turns[:, :, k]).addcmul_(u[j], v[i], value=-1)
     base_steps = base_axes[3:6, :3].expand(-1, -1, poses)
@@ -152,7 +150,7 @@ def tool_motion(
 def flange_frames(
     robot: Robot, q: Float[Tensor, "poses dof"]
 ) -> tuple[Float[Tensor, "poses 3 3"], Float[Tensor, "poses 3"]]:
-    """Return orientation and position [m] behind the last row in the first row's frame, without base and tool."""
+    """Return rotation and position [m] after the last row in the frame of the first row, without base and tool."""
     last = _last(_walk_rows(robot, robot.dh, q, _frame_axes(q.new_zeros(6, 1), q)))
     return last[:3].permute(2, 1, 0).contiguous(), last[3].t().contiguous()
 
@@ -160,14 +158,14 @@ def flange_frames(
 def _walk_rows(
     robot: Robot, dh: Float64[np.ndarray, "rows 5"], q: Tensor, base_axes: Tensor
 ) -> Float[Tensor, "rows_and_2 7 3 poses"]:
-    """Walk from the base to the last row.
+    """Compute the frames from the base to the last row.
 
-    The turn about z is `(x, y) cos + (y, -x) sin`, and one small matrix leads from what a row has turned to the next.
+    The rotation about z is `(x, y) cos + (y, -x) sin`; one small matrix leads from a rotated frame to the next row.
 
     Returns:
-        One row further than the rows, x and y as the row before has turned them, then x, y, -x, the origin and z
-        before the row. Every third one is an axis that parameters turn about, through this origin. In front stand, in
-        the same way, what the base turns about (roll, pitch, yaw) and its origin.
+        For every row and the frame after the last one: x and y as rotated by the row before, then x, y, -x, origin and
+        z before the row. Every third vector is a rotation axis of a parameter, through this origin. The first entry
+        contains the rotation axes of the base (roll, pitch, yaw) and its origin in the same form.
     """
     frames = q.new_empty((len(robot.rows) + 2, 7, 3, q.shape[0]))
     starts = base_axes.index_select(0, STARTS.to(q.device))[:, :3]
@@ -193,14 +191,14 @@ def _walk_rows(
 
 
 def _last(frames: Float[Tensor, "rows_and_2 7 3 poses"]) -> Float[Tensor, "4 3 poses"]:
-    """Axes x, y, z and origin after the last row."""
+    """Return axes x, y, z and origin after the last row."""
     return torch.cat([frames[-1, 2:4], frames[-1, 6:], frames[-1, 5:6]])
 
 
 def _row_matrices(dh: Float64[np.ndarray, "rows 5"], like: Tensor) -> Float[Tensor, "rows 5 4"]:
-    """Per row x, y, -x, origin and z after it, by the origin and z before, and x and y turned.
+    """Return the matrix of every row from origin and z before it, and x and y rotated, to x, y, -x, origin, z after it.
 
-    `Trans(a, 0, d) · RotX(alpha) · RotY(beta)`; a joint that slides comes on top.
+    It is `Trans(a, 0, d) · RotX(alpha) · RotY(beta)`; the motion of a prismatic joint is added separately.
     """
     _, d, a, alpha, beta = dh.T
     ca, cb, sa, sb = np.cos(alpha), np.cos(beta), np.sin(alpha), np.sin(beta)
@@ -216,16 +214,17 @@ def _row_matrices(dh: Float64[np.ndarray, "rows 5"], like: Tensor) -> Float[Tens
 
 @lru_cache(maxsize=16)
 def _turning(robot: Robot) -> Float64[np.ndarray, "rows dof"]:
-    """By how much every row turns with the joints; remembered, as every step of a search asks for it."""
+    """Return the rotation of every row per joint value; cached, because every step of an iteration needs it."""
     turning = np.zeros((len(robot.rows), robot.dof))
     turning[robot.joint_rows, range(robot.dof)] = robot.directions * robot.revolute
     return turning
 
 
 def _frame_axes(xyzrpy: Float[Tensor, "6 frames"], like: Tensor) -> Float[Tensor, "11 4 frames"]:
-    """What bases or tools turn about (roll, pitch, yaw), shift along (x, y, z) and end as: x, y, z, origin, -x.
+    """Return rotation axes (roll, pitch, yaw), translation axes (x, y, z) and the frame x, y, z, origin, -x of frames.
 
-    All are stated by the axes x, y, z and the origin before `Trans(x, y, z) · RotZ(roll) · RotY(pitch) · RotX(yaw)`.
+    All are coefficients of the axes x, y, z and the origin before
+    `Trans(x, y, z) · RotZ(roll) · RotY(pitch) · RotX(yaw)`.
     """
     values = xyzrpy.cpu().numpy()
     (cr, cp, cy), (sr, sp, sy) = np.cos(values[3:]), np.sin(values[3:])
@@ -245,7 +244,7 @@ def _frame_axes(xyzrpy: Float[Tensor, "6 frames"], like: Tensor) -> Float[Tensor
 def _behind(
     frame: Float[Tensor, "4 3 poses"], axes: Float[Tensor, "size 4 ways"]
 ) -> Float[Tensor, "size 3 poses"]:
-    """Axes and origins that are given in a frame, seen from outside of it."""
+    """Transform axes and origins from a frame to the measuring frame."""
     if axes.shape[-1] > 1:
         result: Tensor = (axes[:, :, None] * frame).sum(1)
         return result

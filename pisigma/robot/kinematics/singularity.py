@@ -1,4 +1,4 @@
-"""How near joint values are to a singularity."""
+"""Distance of joint values from a singularity."""
 
 import torch
 from jaxtyping import Float
@@ -9,14 +9,14 @@ from pisigma.robot.kinematics.jacobian import joint_jacobian
 
 
 def characteristic_length(robot: Robot) -> float:
-    """What translations are divided by to compare with rotations: the robot's reach [m], or 1 m if 0."""
+    """Return the length that makes translations comparable with rotations: the reach [m], or 1 m if that is 0."""
     return robot.reach or 1.0
 
 
 def dimensionless_jacobian(robot: Robot, J: Float[Tensor, "*batch 6 dof"]) -> Float[Tensor, "*batch 6 dof"]:
-    """The joint Jacobian with all lengths in characteristic lengths.
+    """Return the joint Jacobian with all lengths in units of the characteristic length.
 
-    Rows of translation are divided by the length, columns of prismatic joints multiplied by it.
+    Rows of translation are divided by that length, columns of prismatic joints multiplied by it.
     """
     length = characteristic_length(robot)
     rows = J.new_tensor([1 / length] * 3 + [1.0] * 3)
@@ -25,10 +25,10 @@ def dimensionless_jacobian(robot: Robot, J: Float[Tensor, "*batch 6 dof"]) -> Fl
 
 
 def singularity_measure(robot: Robot, q: Float[Tensor, "*batch dof"]) -> Float[Tensor, "*batch"]:
-    """Smallest singular value of the joint Jacobian in characteristic lengths (`dimensionless_jacobian`).
+    """Return the smallest singular value of the joint Jacobian in characteristic lengths (`dimensionless_jacobian`).
 
-    0 at a singularity; at most about 1. It is near the sine of the angle that a joint is away from it, so
-    that 0.05 means some 3 deg.
+    It is 0 at a singularity and at most about 1. It is close to the sine of the angle by which a joint differs from its
+    singular value, so that 0.05 means about 3 deg.
 
     Args:
         robot: the robot.
@@ -44,6 +44,6 @@ def singularity_measure(robot: Robot, q: Float[Tensor, "*batch dof"]) -> Float[T
 def smallest_singular_value(
     robot: Robot, J: Float[Tensor, "*batch 6 dof"], rows: int = 6
 ) -> Float[Tensor, "*batch"]:
-    """What `singularity_measure` gives, from a joint Jacobian that is there already; all but so many rows are 0."""
+    """Return the `singularity_measure` of a known joint Jacobian, of which all but the given number of rows are 0."""
     values: Tensor = torch.linalg.svdvals(dimensionless_jacobian(robot, J).contiguous())
     return values[..., min(rows, robot.dof) - 1]

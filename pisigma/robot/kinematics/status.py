@@ -1,14 +1,14 @@
-"""What became of a wanted pose, as a number that fits in a tensor and a sentence that a person can act on."""
+"""Status of an inverse kinematics solution: a number that fits in a tensor, and a sentence that people can act on."""
 
 import enum
 
 
 class Status(enum.IntEnum):
-    """Outcome of inverse kinematics for one pose and one branch.
+    """Status of inverse kinematics for one pose and one branch.
 
-    Joint values are NaN where, and only where, the status is UNREACHABLE or INVALID_POSE. Where several apply, the
-    gravest counts, in the order REACHED, OUTSIDE_DOMAIN, SINGULAR, OUTSIDE_JOINT_LIMITS, then NOT_CONVERGED or
-    UNREACHABLE: a singular pose is never hidden, and the domain is seen in its measure too.
+    Joint values are NaN if and only if the status is UNREACHABLE or INVALID_POSE. If several apply, the most severe is
+    returned, in the order REACHED, OUTSIDE_DOMAIN, SINGULAR, OUTSIDE_JOINT_LIMITS, NOT_CONVERGED or UNREACHABLE: a
+    singular pose is never hidden, and the domain has a measure of its own.
     """
 
     REACHED = 0
@@ -21,40 +21,39 @@ class Status(enum.IntEnum):
 
     @property
     def sentence(self) -> str:
-        """What the status means and what to do about it."""
+        """Meaning of the status, and what to do about it."""
         return _SENTENCES[self]
 
     @property
     def reaches(self) -> bool:
-        """Whether the joint values given with this status take the tool to the pose, limits aside."""
+        """Whether joint values with this status reach the pose, regardless of limits."""
         return self not in (Status.UNREACHABLE, Status.NOT_CONVERGED, Status.INVALID_POSE)
 
 
 _SENTENCES = {
-    Status.REACHED: "The joint values reach the pose and lie within the joint limits.",
+    Status.REACHED: "The joint values reach the pose and are within the joint limits.",
     Status.SINGULAR: (
-        "The joint values reach the pose, but it is singular: a joint that is not determined there is given "
-        "as 0, and small moves of the tool need large moves of joints; choose another pose or branch, or go "
-        "through it by joint moves."
+        "The joint values reach the pose, but it is singular: joints that it does not determine are set to 0, and "
+        "small tool motions require large joint motions; choose another pose or branch, or pass it with joint moves."
     ),
     Status.OUTSIDE_JOINT_LIMITS: (
-        "The joint values would reach the pose, but at least one lies outside the joint limits; choose "
-        "another branch or pose."
+        "The joint values would reach the pose, but at least one is outside the joint limits; choose another branch or "
+        "pose."
     ),
     Status.OUTSIDE_DOMAIN: (
-        "The joint values reach the pose, but lie outside the region that the measurements covered, so the correction "
-        "there is extrapolated; look at the predicted accuracy, or measure there too."
+        "The joint values reach the pose, but are outside the region of the measurements, so the correction is "
+        "extrapolated; check the predicted accuracy, or measure there too."
     ),
     Status.UNREACHABLE: (
-        "No joint values reach the pose, in position and orientation, on this branch, or none were found; choose "
-        "another branch, ignore axes of the tool that the task leaves free or give them tolerances, or move the pose."
+        "No joint values on this branch reach the position and orientation, or none were found; choose another branch, "
+        "ignore tool axes that the task leaves free or give them tolerances, or move the pose."
     ),
     Status.NOT_CONVERGED: (
-        "The search stopped before it reached the pose, and the joint values given do not reach it; start "
-        "nearer, or check that the pose lies in the workspace."
+        "The iteration stopped before it reached the pose, and the joint values returned do not reach it; use a nearer "
+        "start, or check that the pose is in the workspace."
     ),
     Status.INVALID_POSE: (
-        "The matrix is no pose (not finite, no rotation, or no last row 0 0 0 1), or the joint values to be near "
-        "to are not finite; correct it."
+        "The matrix is not a valid pose (entries are not finite, the rotation is invalid, or the last row is not 0 0 0 "
+        "1), or the reference joint values are not finite; correct it."
     ),
 }

@@ -1,4 +1,4 @@
-"""Which axes of the tool a task asks for; known without torch."""
+"""Tool axes and tolerances of a task, without importing torch."""
 
 import math
 from collections.abc import Sequence
@@ -9,33 +9,34 @@ from typing import Any
 
 import numpy as np
 
-from pisigma.files.errors import PoseError, nearest_choice
+from pisigma.files.errors import PoseError, check_choice
 
 AXES = ("x", "y", "z", "roll", "pitch", "yaw")
-"""Motions of the tool along its x, y and z axes, and about its x, y and z axes."""
+"""Motions of the tool along and about its x, y and z axes."""
 
-LEAN = math.radians(10.0)
-"""How far the tool of an arm with four joints may lean where its roll and pitch are left to the arm [rad]."""
+MAX_TILT = math.radians(10.0)
+"""Largest tilt of the tool of an arm with four joints, whose roll and pitch are free [rad]."""
 
 _FREE = {3: ("roll", "pitch", "yaw"), 4: ("roll", "pitch"), 5: ("yaw",)}
 
 
 @dataclass(frozen=True)
 class TaskAxes:
-    """What a task asks of the tool, in the axes of the tool's frame.
+    """Requirements of a task on the tool pose, in the axes of the tool frame.
 
-    Errors are `R^T (p_wanted - p)` [m] along the wanted tool's axes, and about the axes of the tool reached the
-    rotation that brings it to the wanted one [rad]: a rotation vector or, where one axis is unlike the two others
-    (`pivot`), the twist about that axis and the swing of it, so that what is ignored has no part in what counts.
+    Position errors are `R^T (p_wanted - p)` [m] along the axes of the wanted tool. Rotation errors are the rotation
+    from the reached to the wanted tool [rad], about the axes of the reached one: a rotation vector or, if one axis
+    differs from the two others (`pivot`), the twist about that axis and its swing, so that ignored rotations do not
+    affect the others.
 
     Attributes:
-        tolerance: of `AXES` [m, rad]: 0 for an axis that counts exactly, infinity for one that is ignored, a positive
-            number for a deviation that is accepted where the pose cannot be reached exactly, and a negative one for an
-            axis that is left to the arm as long as it deviates by no more.
-        elbow_angle: of an arm with seven revolute joints [rad], counted about the line from the shoulder (the origin
-            of the second joint's axis) to the wrist (that of the sixth), from the plane through this line along the
-            first joint's axis to the elbow (that of the fourth): the arm angle of Kreutz-Delgado et al. 1992. None
-            where any will do.
+        tolerance: tolerances of `AXES` [m, rad]: 0 for an axis that has to be met exactly, infinity for one that is
+            ignored, a positive number for a deviation that is accepted if the pose cannot be reached exactly, and a
+            negative number for an axis that is free within that deviation.
+        elbow_angle: elbow angle of an arm with seven revolute joints [rad], the arm angle of Kreutz-Delgado et al.
+            1992: about the line from the shoulder (origin of the second joint's axis) to the wrist (that of the sixth),
+            from the plane through this line and the direction of the first axis to the elbow (origin of the fourth
+            axis). None if it is free.
     """
 
     tolerance: tuple[float, ...] = (0.0,) * 6
@@ -43,26 +44,26 @@ class TaskAxes:
 
     @cached_property
     def ignored(self) -> tuple[str, ...]:
-        """Names of the axes that do not count."""
+        """Names of the axes that are ignored or free."""
         return tuple(name for name, free in zip(AXES, self.free, strict=True) if free)
 
     @cached_property
     def free(self) -> tuple[bool, ...]:
-        """Which of `AXES` have no part in least squares and residuals."""
+        """Which of `AXES` are excluded from least squares and residuals."""
         return tuple(value < 0 or value == math.inf for value in self.tolerance)
 
     @cached_property
     def whole(self) -> bool:
-        """Whether all axes count exactly."""
+        """Whether all axes have to be met exactly."""
         return not any(self.tolerance)
 
     @property
     def has_tolerances(self) -> bool:
-        """Whether some axes may deviate within tolerances and still count."""
+        """Whether some axes have a positive finite tolerance."""
         return any(value != 0 and not free for value, free in zip(self.tolerance, self.free, strict=True))
 
     def weights(self, joints: int) -> tuple[float, ...]:
-        """1 for the axes that an arm can meet exactly: those with tolerances too, if it has joints enough; else 0."""
+        """Return 1 for the axes that an arm can meet exactly, with tolerances too if it has enough joints, else 0."""
         exact = self.tolerance.count(0.0)
         enough = exact < joints
         return tuple(
@@ -72,7 +73,7 @@ class TaskAxes:
 
     @property
     def loose_weights(self) -> tuple[float, ...]:
-        """Over their tolerances, the smallest of which has weight 1; exact axes then count a thousand times as much."""
+        """Inverse tolerances, scaled to 1 for the smallest one; weights of exact axes are then 1000 times as large."""
         least = min((value for value in self.tolerance if value > 0), default=1.0)
         share = 1e-3 if 0.0 in self.tolerance else 1.0
         return tuple(
@@ -82,13 +83,13 @@ class TaskAxes:
 
     @property
     def directions(self) -> tuple[bool, ...]:
-        """Of which axes of the tool the direction says how near a pose is; see `StoredStarts.nearest`."""
+        """Tool axes whose directions measure the distance between poses; see `StoredStarts.nearest`."""
         counted = self.free.count(False) > 3
         return tuple(self.whole or (counted and k == self.pivot) for k in range(3))
 
     @cached_property
     def pivot(self) -> int:
-        """Index (0 to 2) of the axis that rotation errors are split into twist about and swing of; -1 for none."""
+        """Index (0 to 2) of the axis for splitting rotation errors into twist and swing; -1 for none."""
         turns, free = self.tolerance[3:], self.free[3:]
         if any(free):
             alone = [k for k in range(3) if free.count(free[k]) == 1]
@@ -99,7 +100,7 @@ class TaskAxes:
 
     @cached_property
     def row(self) -> Any:
-        """For the kernels `(1, 8)`: tolerances, elbow angle (NaN for any) and pivot; `(0, 8)` where all axes count."""
+        """Kernel form `(1, 8)`: tolerances, elbow angle (NaN if free) and pivot; `(0, 8)` if all axes are exact."""
         if self.whole and self.elbow_angle is None:
             return np.zeros((0, 8))
         elbow = math.nan if self.elbow_angle is None else self.elbow_angle
@@ -107,16 +108,16 @@ class TaskAxes:
 
 
 WHOLE = TaskAxes()
-"""All six axes count exactly."""
+"""Task in which all six axes have to be met exactly."""
 
 
 def default_axes(joints: int) -> TaskAxes:
-    """What is asked of an arm unless a task is stated: all six axes from six joints on.
+    """Return the default task of an arm: all six axes for six or more joints.
 
-    With five the tool may turn about its z axis, with four it may also lean by up to `LEAN` (roll and pitch) but not
-    turn, and with three its orientation does not count.
+    With five joints the rotation about the tool's z axis is free. With four joints roll and pitch are free up to
+    `MAX_TILT`. With three joints the orientation is ignored.
     """
-    free = -LEAN if joints == 4 else math.inf
+    free = -MAX_TILT if joints == 4 else math.inf
     return TaskAxes(tuple(free if name in _FREE.get(joints, ()) else 0.0 for name in AXES))
 
 
@@ -127,24 +128,23 @@ def task_axes(
     tolerance_deg: float | Sequence[float] | None = None,
     elbow_angle: float | None = None,
 ) -> TaskAxes:
-    """What a task asks for, from how users state it; see `CorrectedIK.__call__`.
+    """Make the task from a user's options; see `CorrectedIK.__call__`.
 
     Args:
-        usual: what counts where that is not stated.
-        ignore_axes: names of `AXES`.
-        tolerance_mm: of the first three axes.
-        tolerance_deg: of the others.
-        elbow_angle: [rad]
+        usual: task whose values are used where an option is not stated.
+        ignore_axes: names of `AXES` to ignore.
+        tolerance_mm: tolerance of x, y and z [mm], one number or three.
+        tolerance_deg: tolerance of roll, pitch and yaw [deg], one number or three.
+        elbow_angle: elbow angle [rad].
 
     Raises:
-        PoseError: there is no such axis, or a tolerance is none.
+        PoseError: an axis does not exist, or a tolerance is not a number >= 0.
     """
     tolerance = list(usual.tolerance)
     if ignore_axes is not None:
         names = [ignore_axes] if isinstance(ignore_axes, str) else list(ignore_axes)
         for name in names:
-            if name not in AXES:
-                raise PoseError(f"ignore_axes: there is no axis '{name}'; {nearest_choice(name, AXES)}")
+            check_choice(PoseError, "ignore_axes", name, AXES)
         tolerance = [math.inf if name in names else 0.0 for name in AXES]
     for what, stated, unit, first in (
         ("tolerance_mm", tolerance_mm, 1e-3, 0),
@@ -157,9 +157,14 @@ def task_axes(
 
 
 def _three(what: str, stated: float | Sequence[float]) -> list[float]:
-    """A tolerance for each of three axes."""
+    """Return a tolerance for each of three axes.
+
+    Raises:
+        PoseError: the option `what` is neither one number >= 0 nor three.
+    """
     with suppress(TypeError, ValueError):
         values: list[float] = np.broadcast_to(np.asarray(stated, dtype=float), 3).tolist()
         if all(value >= 0 for value in values):
             return values
-    raise PoseError(f"{what}={stated!r}: give a number of at least 0, or three, one for each axis.")
+    expected = "a number >= 0, or three, one for each axis"
+    raise PoseError(f"expected {expected}, got {stated!r}", expected=expected, value=stated, option=what)

@@ -1,4 +1,4 @@
-"""Pose errors and Jacobians in the axes that a task asks for; see `kinematics.task_axes.TaskAxes`."""
+"""Pose errors and Jacobians in the tool axes of a task; see `kinematics.task_axes.TaskAxes`."""
 
 import math
 
@@ -13,20 +13,20 @@ from pisigma.robot.se3 import pose_error
 def task_error(
     axes: TaskAxes, T: Float[Tensor, "poses 4 4"], reached: Float[Tensor, "poses 4 4"]
 ) -> tuple[Float[Tensor, "poses 6"], Float[Tensor, "poses 6 6"]]:
-    """Errors of poses in all axes of the tool, and the matrices that take Jacobians of poses to those of the errors.
+    """Compute pose errors in all tool axes, and the matrices that convert pose Jacobians to Jacobians of the errors.
 
-    For a rotation D from the tool reached to the wanted one, and an axis k of it, the swing of the axis is
-    `atan2(|k × Dk|, k · Dk)` about `k × Dk`, and the twist about it `atan2(D_ji - D_ij, D_ii + D_jj)` with i, j, k
-    cyclic, which changes by `(k + Dk) · ω / (1 + k · Dk)`. Of rotation vectors and swings the derivatives are those of
-    small ones, as everywhere in Gauss-Newton steps here.
+    For the rotation D from the reached to the wanted tool and a tool axis k, the swing of the axis is
+    `atan2(|k × Dk|, k · Dk)` about `k × Dk`, and the twist about it is `atan2(D_ji - D_ij, D_ii + D_jj)` with i, j, k
+    cyclic, with the derivative `(k + Dk) · ω / (1 + k · Dk)`. Derivatives of rotation vectors and swings are those for
+    small rotations, as in all Gauss-Newton steps of this package.
 
     Args:
-        axes: what the task asks for.
+        axes: the task.
         T: wanted T_base_tool [m].
-        reached: T_base_tool reached [m].
+        reached: reached T_base_tool [m].
 
     Returns:
-        Errors [m, rad], in the order of `AXES`, and the matrices.
+        Errors [m, rad] in the order of `AXES`, and the matrices.
     """
     zero = torch.zeros_like(T[:, :3, :3])
     turn, D = reached[:, :3, :3].mT, reached[:, :3, :3].mT @ T[:, :3, :3]
@@ -52,7 +52,7 @@ def task_error(
 
 
 def tolerated(axes: TaskAxes, error: Float[Tensor, "*batch 6"]) -> Bool[Tensor, "*batch"]:
-    """Whether errors in the axes of the tool keep within all tolerances."""
+    """Return whether errors in the tool axes are within all tolerances."""
     allowed = [abs(value) * (1 + 1e-9) if value else math.inf for value in axes.tolerance]
     within: Tensor = (error.abs() <= error.new_tensor(allowed)).all(-1)
     return within

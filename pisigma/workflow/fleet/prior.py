@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from pisigma.estimation.population import FEWEST_ROBOTS
+from pisigma.estimation.population import MIN_ROBOTS
 from pisigma.files.errors import FleetError, MeasurementError, RobotError
 from pisigma.files.progress import Progress
 from pisigma.lifetime.fleet.members import Member, read_fleet
@@ -80,9 +80,9 @@ def estimate_fleet_prior(
             refused[one.id] = f"{some.source}: {causes[0].sentence}"
         else:
             rows[one.id] = some
-    if refused and len(rows) < FEWEST_ROBOTS:
+    if refused and len(rows) < MIN_ROBOTS:
         raise FleetError(
-            f"expected {FEWEST_ROBOTS} robots or more, got {len(rows)} with readable files; correct, among others: "
+            f"expected {MIN_ROBOTS} robots or more, got {len(rows)} with readable files; correct, among others: "
             f"{next(iter(refused.values()))}",
             value=len(rows),
         )

@@ -186,15 +186,15 @@ def test_noise_that_is_given_falls_below_it_never_and_of_what_is_certain_not_at_
     scaled = [part / sigma for part, sigma in zip(X, NOISE, strict=True)]
     small = [0.3 * target / sigma for target, sigma in zip(y, NOISE, strict=True)]
     fit = DenseRegression.between(scaled, small, stated=(True, False))
-    found = fit.renewed_noise(fit.solve(prior(), (1.0, 1.0)))
+    found = fit.updated_noise(fit.solve(prior(), (1.0, 1.0)))
     assert found[0] == 1.0
     assert 0.1 < found[1] < 0.6
     more = [10 * target for target in small]
     large = DenseRegression.between(scaled, more, stated=(True, True))
     posterior = large.solve(prior(), (1.0, 1.0))
-    assert large.renewed_noise(posterior)[0] > 2.0
+    assert large.updated_noise(posterior)[0] > 2.0
     exact = DenseRegression.between(scaled, more, stated=(True, True), exact=(True, False))
-    assert exact.renewed_noise(posterior)[0] == 1.0
+    assert exact.updated_noise(posterior)[0] == 1.0
 
 
 def test_noise_is_the_misfit_over_the_values_that_the_unknowns_leave() -> None:
@@ -205,7 +205,7 @@ def test_noise_is_the_misfit_over_the_values_that_the_unknowns_leave() -> None:
     used = float(((X @ C) * X).sum())
     assert_close(posterior.used[0], used, rtol=1e-10)
     expected = math.sqrt(float(residual.square().sum()) / (30 - used))
-    assert_close(fit.renewed_noise(posterior)[0], expected, rtol=1e-10)
+    assert_close(fit.updated_noise(posterior)[0], expected, rtol=1e-10)
 
 
 def test_share_of_the_values_that_are_used_up_counts_what_is_measured() -> None:

@@ -134,7 +134,7 @@ def test_identical_targets_come_to_the_regression_of_one() -> None:
     prior = design.prior((1.0,) * 4)
     found, expected = (form.solve(prior, (0.7,)) for form in (many, single))
     assert_close(found.log_evidence, expected.log_evidence, rtol=1e-10)
-    assert_close(many.renewed_noise(found)[0], single.renewed_noise(expected)[0], rtol=1e-10)
+    assert_close(many.updated_noise(found)[0], single.updated_noise(expected)[0], rtol=1e-10)
 
 
 def test_targets_that_err_each_for_themselves_count_in_full() -> None:

@@ -19,7 +19,7 @@ from pisigma.calibration.hybrid.search import Fitted
 from pisigma.calibration.hybrid.uncertainty import PositionUncertainty, position_uncertainty
 from pisigma.estimation.left_out import LARGEST_SCALE, LeftOut, left_out_scale
 from pisigma.estimation.prior import GaussianPrior
-from pisigma.estimation.regression import LEAST_EFFECTIVE, root_of_sizes
+from pisigma.estimation.regression import MIN_EFFECTIVE, root_of_sizes
 from pisigma.joint_correction.fourier_series import FourierSeries
 from pisigma.joint_correction.gravity_torques import GravityTorques
 from pisigma.joint_correction.joint_correction import JointCorrection
@@ -56,8 +56,8 @@ def test_uncertain_sizes_add_what_the_unknowns_move_with_them() -> None:
             ends.append(fit.solve(replace(prior, sizes=sizes), (0.4,)).x)
         slope = (ends[0] - ends[1]) / (2 * step)
         told = float((1 - prior.precision * covariance.diagonal())[prior.group == g].sum())
-        told_at_all.append(told > LEAST_EFFECTIVE)
-        if told > LEAST_EFFECTIVE:
+        told_at_all.append(told > MIN_EFFECTIVE)
+        if told > MIN_EFFECTIVE:
             expected += slope[:, None] * slope / (2 * told)
     assert told_at_all == [True, True, False]
     added = root_of_sizes(posterior, fit.covariance_root(posterior))

@@ -7,7 +7,7 @@ from scipy.stats import chi2
 from testing.fleet_robots import DRAWN, common_errors, rows_of
 from testing.models import no_type_checker
 
-from pisigma.estimation.population import Population, expectation_maximisation, without_odd
+from pisigma.estimation.population import Population, expectation_maximisation, without_outliers
 from pisigma.files.errors import FleetError
 from pisigma.lifetime.fleet.prior import FleetConsistency, RobotEvidence, fleet_prior
 from pisigma.lifetime.fleet.prior_summary import summarise_prior
@@ -117,7 +117,7 @@ def test_odd_robots_that_are_alike_do_not_hide_each_other(odd):
     x[20 - odd :] += 3.0
     evidence = [RobotEvidence(1e4 * torch.eye(3).double(), 1e4 * one, {}) for one in x]
     start = Population(torch.zeros(3).double(), 9 * torch.eye(3).double(), 2)
-    population, found = without_odd(evidence, start, 9 * torch.ones(3).double())
+    population, found = without_outliers(evidence, start, 9 * torch.ones(3).double())
     assert found == tuple(range(20 - odd, 20))
     assert (population.covariance.diagonal().sqrt() < 0.5).all()
 

@@ -37,7 +37,7 @@ def test_the_prior_is_the_posterior_of_the_model():
     elsewhere = recalibration_problem(model, posterior, rows, {("base", "")})
     base = elsewhere.design.problem.space.of("base")
     assert not elsewhere.root[base.start : base.stop].any()
-    assert [group.what for group in elsewhere.groups if group.stands] == ["base"]
+    assert [group.what for group in elsewhere.groups if group.fixed_size] == ["base"]
     still = problem.without_arm()
     assert still.root.shape[1] == 0
     assert still.groups == ()

@@ -1,4 +1,4 @@
-"""Robots for the tests of kinematics: the catalogue's, and made-up ones that use everything a row can say."""
+"""Robots for the tests of kinematics: those of the catalogue, and synthetic ones that use every feature of a row."""
 
 import importlib.util
 import math
@@ -18,7 +18,7 @@ NAMES = ("kiro3", "kiro4", "ur5", "ur10", "odd", "seven")
 
 
 def _build_odd() -> Robot:
-    """Both joint types, both directions, fixed rows at every place, all five parameters, base and tool."""
+    """Build a robot with both joint types and directions, fixed rows everywhere, all five parameters, base and tool."""
     rows = (
         Row("pedestal", "fixed"),
         Row("turn", "revolute", -1, -2.0, 2.0),
@@ -43,12 +43,12 @@ def _build_seven() -> Robot:
 
 
 def load(name: str) -> Robot:
-    """A robot of `NAMES`."""
+    """Load a robot of `NAMES`."""
     return {"odd": _build_odd, "seven": _build_seven}.get(name, lambda: Robot.load(name))()
 
 
 def dress(robot: Robot) -> Robot:
-    """The same kind of robot with other directions, offsets, base and tool, and a fixed row at each end."""
+    """Return a robot with other directions, offsets, base and tool, and a fixed row at each end."""
     rows = [
         replace(row, direction=(-1) ** i, lower=-np.inf, upper=np.inf) for i, row in enumerate(robot.rows)
     ]
@@ -70,7 +70,7 @@ def dress(robot: Robot) -> Robot:
 
 
 def random_joints(robot: Robot, generator: torch.Generator, *batch: int) -> torch.Tensor:
-    """Joint values within the limits, and within half a turn or half a metre where there are none."""
+    """Draw joint values within the limits, or within half a turn or half a metre if there are none."""
     limits = torch.tensor(robot.limits)
     half = torch.tensor([math.pi if revolute else 0.5 for revolute in robot.revolute])
     lower, upper = limits[:, 0].clamp(min=-half), limits[:, 1].clamp(max=half)
@@ -79,13 +79,13 @@ def random_joints(robot: Robot, generator: torch.Generator, *batch: int) -> torc
 
 @pytest.fixture(params=NAMES)
 def robot(request) -> Robot:
-    """Each robot of `NAMES` in turn."""
+    """Each robot of `NAMES`."""
     return load(request.param)
 
 
 @pytest.fixture(scope="session")
 def robots():
-    """The functions `load`, `dress` and `random_joints` under one roof."""
+    """The functions `load`, `dress` and `random_joints`."""
     return sys.modules[__name__]
 
 

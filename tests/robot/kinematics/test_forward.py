@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 from testing.closeness import assert_close
+from testing.refusals import refused
 from torch.func import jacfwd, jacrev, vmap
 
 from pisigma.files.errors import PoseError
@@ -38,7 +39,7 @@ def _place(x, y, z, roll, pitch, yaw) -> np.ndarray:
 
 
 def written_out(robot: Robot, q: np.ndarray) -> np.ndarray:
-    """The definition, one 4x4 product after the other."""
+    """Compute the definition by 4x4 products."""
     T, values = _place(*robot.base), iter(q)
     for row, (theta, d, a, alpha, beta) in zip(robot.rows, robot.dh, strict=True):
         moved = row.direction * next(values) if row.type != "fixed" else 0.0
@@ -138,7 +139,7 @@ def test_batched_equals_looped_in_every_shape_and_dtype(robot, robots, generator
             assert_close(actual, expected, atol=atol)
 
 
-def test_chunks_join_without_a_seam(robots, generator):
+def test_chunks_are_joined_correctly(robots, generator):
     robot = robots.load("ur5")
     q = robots.random_joints(robot, generator, 2 * CHUNK + 1)
     rows = torch.tensor([0, CHUNK - 1, CHUNK, 2 * CHUNK - 1, 2 * CHUNK])
@@ -150,8 +151,8 @@ def test_chunks_join_without_a_seam(robots, generator):
 
 
 @pytest.mark.parametrize("function", [forward_kinematics, joint_jacobian])
-def test_wrong_number_of_joint_values_is_refused_with_names(robots, function):
-    with pytest.raises(PoseError, match=r"'kiro3' has 4 joints \(theta_1, .*have 5 columns"):
+def test_a_wrong_number_of_joint_values_is_rejected(robots, function):
+    with refused(PoseError, expected="4 columns", value=5):
         function(robots.load("kiro3"), torch.zeros((2, 5), dtype=torch.float64))
 
 

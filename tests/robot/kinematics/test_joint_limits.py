@@ -1,4 +1,4 @@
-"""Full turns of joints."""
+"""Wrapping of joint values."""
 
 import math
 
@@ -9,7 +9,7 @@ from pisigma.robot import Robot
 from pisigma.robot.kinematics.joint_limits import wrapped_difference
 
 
-def test_differences_are_wrapped_for_joints_that_turn_only():
+def test_differences_are_wrapped_for_revolute_joints_only():
     robot = Robot.load("kiro3")
     q = torch.tensor([math.pi - 0.1, 0.5, 8.0, -3.0], dtype=torch.float64)
     nominal = torch.tensor([-math.pi + 0.1, 0.4, 1.0, 3.2], dtype=torch.float64)

@@ -1,4 +1,4 @@
-"""Closed-form inverses beside the formulas of the papers' appendices, as printed."""
+"""Closed-form inverses compared with the formulas of the papers' appendices, as printed."""
 
 import math
 
@@ -39,7 +39,7 @@ def test_appendix_a_as_printed_agrees(robots, generator):
 
 
 def appendix_b(p, R, cosine_sign, wrist_sign=1.0):
-    """Jeong et al. 1998, appendix B as printed (lengths in m); `wrist_sign` gives the other theta_4."""
+    """Jeong et al. 1998, appendix B as printed (lengths in m); `wrist_sign` selects the other theta_4."""
     a2, d4 = 0.600, 0.800
     (x, y, z), r = p.T, {(i + 1, j + 1): R[:, i, j] for i in range(3) for j in range(3)}
     t1 = np.arctan2(y, x)

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from testing.closeness import assert_close
+from testing.refusals import refused
 
 from pisigma.files.errors import ModelError
 from pisigma.model.calibrated_model import CalibratedModel
@@ -45,7 +46,7 @@ def mast_branches(form: Any, P: Any, only: int, rounding: float, q: Any) -> None
 
 
 class Mast(AbstractClosedForm):
-    """A joint that turns on one that slides along the same axis."""
+    """A revolute joint on a prismatic one along the same axis."""
 
     name = "mast"
     branches = ("only",)
@@ -98,9 +99,9 @@ def test_the_registered_form_inverts_the_forward_kinematics(mast, registered):
     assert solver.solve(T).status[:, 0].tolist() == [Status.REACHED, Status.UNREACHABLE]
 
 
-def test_forms_are_asked_in_their_order_and_registered_once(registered):
+def test_forms_are_tried_in_order_and_registered_once(registered):
     assert register_closed_form(Mast) is [*registry.CLOSED_FORMS.values()][-1]
-    with pytest.raises(ValueError, match="a closed form 'mast' already"):
+    with pytest.raises(ValueError, match="'mast'"):
         register_closed_form(type("Other", (Mast,), {}))
     assert type(closed_form_solver(Robot.load("kiro3"))) is Scara
 
@@ -116,8 +117,8 @@ def test_corrected_inverse_kinematics_solves_by_it(mast, registered):
     assert solution.status.tolist() == [Status.REACHED, Status.REACHED]
 
 
-def test_a_compiled_form_goes_into_the_kernels(mast, registered, monkeypatch):
-    """Only two closed forms are compiled here, not all kernels, which would need a minute."""
+def test_a_compiled_form_is_added_to_the_kernels(mast, registered, monkeypatch):
+    """Only two closed forms are compiled here, not all kernels, which would take a minute."""
     pytest.importorskip("numba")
     monkeypatch.setattr(registry, "CLOSED_FORMS", {"scara": Scara, "mast": Mast})
     monkeypatch.setattr(Mast, "compiled", staticmethod(mast_branches))
@@ -150,8 +151,8 @@ def test_the_key_of_machine_code_changes_with_a_registered_form(registered, monk
     assert KernelForms(("series",), ("scara", "mast")).fingerprints(ready)[2] != before[2]
 
 
-def test_kernels_without_a_form_say_what_registers_it(mast, registered, monkeypatch):
+def test_kernels_without_a_form_are_rejected(mast, registered, monkeypatch):
     monkeypatch.setattr(Mast, "compiled", staticmethod(mast_branches))
     description, _ = describe(model_of(mast, torch.tensor([[0.4, -1.2]]).double()))
-    with pytest.raises(ModelError, match="it uses 'mast', which these kernels do not evaluate"):
+    with refused(ModelError, value="mast"):
         pack(description, "mast", KernelForms())

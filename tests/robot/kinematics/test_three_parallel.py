@@ -17,7 +17,7 @@ RIGHT = math.pi / 2
 
 
 def _all_lengths() -> Robot:
-    """An arm that uses every length this family may have."""
+    """An arm that uses every length of this family."""
     arm = Robot.load("ur10")
     dh = arm.dh.copy()
     dh[:, 1] = [0.2, 0.13, -0.11, 0.15, 0.12, 0.09]
@@ -52,7 +52,7 @@ FAMILY = (
 
 
 def _distance(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
-    """Largest difference of joint values, full turns aside."""
+    """Return the largest difference of joint values modulo full turns."""
     return 2 * torch.sin((a - b) / 2).abs().amax(-1)
 
 
@@ -104,7 +104,7 @@ def test_batches_equal_single_poses_and_keep_the_dtype(batch, dtype, atol, robot
         assert_close(single.nan_to_num(0.0), q_one.nan_to_num(0.0), atol=atol)
 
 
-def test_names_say_where_shoulder_elbow_and_wrist_are(robots, generator):
+def test_branch_names_describe_shoulder_elbow_and_wrist(robots, generator):
     robot = robots.load("rb5")
     solver = closed_form_solver(robot)
     T = forward_kinematics(robot, robots.random_joints(robot, generator, 500))
@@ -136,7 +136,7 @@ SINGULAR_POSES = {
 
 @pytest.mark.parametrize("case", SINGULAR_POSES)
 @pytest.mark.parametrize("name", ["ur5", "rb5", "dressed ur5"])
-def test_singular_poses_are_reached_and_say_so(case, name, robots):
+def test_singular_poses_are_reached_with_their_status(case, name, robots):
     robot = _family(robots)[name]
     solver = closed_form_solver(robot)
     q = torch.tensor(SINGULAR_POSES[case], dtype=torch.float64)
@@ -154,14 +154,14 @@ def test_singular_poses_are_reached_and_say_so(case, name, robots):
 
 
 def _shoulder_singular(robot: Robot) -> torch.Tensor:
-    """Joint values with the point where axes 5 and 6 meet at no distance ahead of axis 1 (UR5's signs)."""
+    """Return joint values with the intersection of axes 5 and 6 not ahead of axis 1 (UR5's signs)."""
     d_5, (a_2, a_3) = robot.dh[4, 1], robot.dh[1:3, 2]
     t_2, t_3 = -1.2, 0.8
     t_234 = math.asin(-(a_2 * math.cos(t_2) + a_3 * math.cos(t_2 + t_3)) / d_5)
     return torch.tensor([0.3, t_2, t_3, t_234 - t_2 - t_3, 0.9, 0.2], dtype=torch.float64)
 
 
-def test_front_and_back_meet_where_the_wrist_is_not_ahead_of_axis_1(robots):
+def test_front_and_back_meet_if_the_wrist_is_not_ahead_of_axis_1(robots):
     robot = robots.load("ur5")
     dh = robot.dh.copy()
     dh[4, 1] = 0.8  # so that the wrist gets there with the elbow bent
@@ -193,7 +193,7 @@ def test_near_a_singularity_the_pose_is_still_reached_exactly(joint, offset, rob
 
 
 @pytest.mark.parametrize("name", ["ur5", "dressed ur5"])
-def test_joint_6_of_a_straight_wrist_is_given_as_zero(name, robots):
+def test_joint_6_of_a_straight_wrist_is_zero(name, robots):
     robot = _family(robots)[name]
     solver = closed_form_solver(robot)
     q = torch.tensor([0.4, -0.9, 1.1, 0.7, 0.0, 0.5], dtype=torch.float64)
@@ -206,7 +206,7 @@ def test_joint_6_of_a_straight_wrist_is_given_as_zero(name, robots):
 
 
 @pytest.mark.parametrize("bend", [0.0, math.pi])
-def test_a_straight_wrist_turns_where_joint_6_at_zero_would_not_reach(bend, robots):
+def test_a_straight_wrist_rotates_if_joint_6_at_zero_does_not_reach(bend, robots):
     """Arm and hand almost stretched in one line: the pose is reached only with axis 4 about where it is."""
     robot = robots.load("ur5")
     q = torch.tensor([0.4, -0.9, 1e-2, 3 * RIGHT, bend, 2.0], dtype=torch.float64)
@@ -219,7 +219,7 @@ def test_a_straight_wrist_turns_where_joint_6_at_zero_would_not_reach(bend, robo
     assert_close(again, T.expand_as(again), atol=1e-12)
 
 
-def test_what_is_out_of_reach_is_unreachable(robots):
+def test_poses_out_of_reach_are_unreachable(robots):
     T = transform_from_xyzrpy(
         torch.tensor([[1.3, 0.0, 0.3, 0.1, 0.2, 0.3], [0.0, 0.05, 0.3, 0.4, -0.3, 1.7]], dtype=torch.float64)
     )
@@ -228,8 +228,8 @@ def test_what_is_out_of_reach_is_unreachable(robots):
     assert torch.isnan(solutions.q[0]).all()
 
 
-def test_beside_axis_1_the_wrist_cannot_be(robots):
-    """The point where axes 5 and 6 meet keeps its distance from axis 1, d_2 + d_3 + d_4 at least."""
+def test_the_wrist_cannot_be_near_axis_1(robots):
+    """The intersection of axes 5 and 6 has at least the distance d_2 + d_3 + d_4 from axis 1."""
     robot = robots.load("ur5")
     T = transform_from_xyzrpy(torch.tensor([0.05, 0.0, 0.5 + 0.0823, 0.0, 0.0, 0.0], dtype=torch.float64))
     assert (closed_form_solver(robot).solve(T).status == Status.UNREACHABLE).all()
@@ -238,7 +238,7 @@ def test_beside_axis_1_the_wrist_cannot_be(robots):
 @pytest.mark.parametrize(
     ("row", "column", "value"), [(4, 2, 1e-6), (0, 4, 1e-12), (1, 3, 1e-9), (3, 3, 0.1), (2, 4, -1e-3)]
 )
-def test_the_smallest_length_twist_or_beta_takes_the_closed_form_away(row, column, value, robots):
+def test_any_length_twist_error_or_beta_excludes_the_closed_form(row, column, value, robots):
     robot = robots.load("ur10")
     dh = robot.dh.copy()
     dh[row, column] += value

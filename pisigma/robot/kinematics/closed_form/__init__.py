@@ -1,4 +1,4 @@
-"""Inverse kinematics in closed form, all branches, for families of robots; a registry."""
+"""Closed-form inverse kinematics with all branches for families of robots, and their registry."""
 
 from pisigma.robot.kinematics.closed_form.interface import AbstractClosedForm, InverseSolutions
 from pisigma.robot.kinematics.closed_form.registry import closed_form_solver, register_closed_form

@@ -1,8 +1,7 @@
-"""Rows rewritten with the twists of a textbook robot, so that one set of formulas serves its mirror images.
+"""Convert rows to the twists of a textbook robot, so that one set of formulas also covers its mirror images.
 
 `RotX(pi) · RotZ(t) · Trans(a, 0, d) = RotZ(-t) · Trans(a, 0, -d) · RotX(pi)`: a twist that differs by 180 deg
-from the textbook's changes the sign of t and d in all later rows, and what is left over is carried into the
-tool.
+from the textbook's changes the sign of t and d in all later rows; the remaining RotX becomes part of the tool.
 """
 
 import math
@@ -35,10 +34,10 @@ class CanonicalRows:
 
     Attributes:
         T_base_first: frame before the first joint; base and leading fixed rows.
-        T_last_tool: tool in the last joint's frame after its turn; the rest of its row, trailing fixed rows,
+        T_last_tool: tool in the last joint's frame after its rotation: remainder of its row, trailing fixed rows and
             tool.
-        sign: +1 or -1 per joint.
-        direction: +1 or -1 per joint, how the controller counts.
+        sign: +1 or -1 for every joint.
+        direction: +1 or -1 for every joint, the sign of the controller's values.
         offset: theta [rad] of a revolute and d [m] of a prismatic row.
         theta: sign · theta [rad] of every joint's row.
         d: sign · d [m] of every joint's row.
@@ -55,22 +54,22 @@ class CanonicalRows:
     a: tuple[float, ...]
 
     def joint_values(self, variables: Float[Tensor, "*batch dof"]) -> Float[Tensor, "*batch dof"]:
-        """Joint values as the controller counts, from the canonical variables."""
+        """Convert canonical variables to joint values [rad or m]."""
         sign, direction, offset = (x.to(variables) for x in (self.sign, self.direction, self.offset))
         return direction * (sign * variables - offset)
 
     def variable_at_zero(self, joint: int) -> float:
-        """The canonical variable of a joint whose joint value is 0."""
+        """Return the canonical variable of a joint whose joint value is 0."""
         return float(self.sign[joint] * self.offset[joint])
 
 
 def canonical_rows(robot: Robot, types: Sequence[JointType], twists: Sequence[float]) -> CanonicalRows | None:
-    """Rewrite the rows with the given twists [rad], or return None where the robot is of another kind.
+    """Convert the rows to the given twists [rad], or return None if the robot has other joints or twists.
 
     Args:
-        robot: the robot; fixed rows may stand before the first and behind the last joint only.
-        types: the joint types wanted.
-        twists: alpha of every joint's row but the last, up to 180 deg; beta must be 0 in these rows.
+        robot: the robot; fixed rows are allowed before the first and after the last joint only.
+        types: required joint types.
+        twists: alpha of every joint's row except the last, modulo 180 deg; beta must be 0 in these rows.
     """
     joint_rows = robot.joint_rows
     first, last = joint_rows[0], joint_rows[-1]

@@ -1,4 +1,4 @@
-"""What every closed form gives: all branches of a pose, each with its status."""
+"""Interface of closed forms, which return all branches of a pose with a status each."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
@@ -25,10 +25,10 @@ class InverseSolutions:
     """All solutions of all poses.
 
     Attributes:
-        q: joint values [rad or m], as the controller counts; revolute ones in (-pi, pi], or a full turn from
-            there where only that is within the limits. NaN where the status is UNREACHABLE, and only there.
+        q: joint values [rad or m]; revolute ones in (-pi, pi], or shifted by a full turn if only that is within the
+            limits. NaN if and only if the status is UNREACHABLE.
         status: a `Status` for every pose and branch.
-        branches: name of every branch, in the order of the branch axis.
+        branches: names of the branches, in the order of the branch dimension.
     """
 
     q: Float[Tensor, "*batch branches dof"]
@@ -41,20 +41,19 @@ class AbstractClosedForm(ABC):
     """A closed-form inverse of one robot.
 
     Attributes:
-        branches: names of the branches, in the order in which they come: 2 to the number of choices between two
-            solutions (forks), through which they count, the last one fastest.
-        robot: the robot it belongs to.
+        branches: names of the branches in order: the combinations of choices between two solutions (forks), with the
+            last fork varying fastest.
+        robot: the robot.
         rows: its rows with canonical twists.
-        margin: what is kept between cosines and 1: 0, but for `starts`.
-        name: of the form, which model files say.
-        compiled: the same formulas as a plain function that the kernels compile; None where there is none. It is called
-            as `compiled(form, P, only, rounding, q)` with `kernels.arrays.ClosedForm`, the pose `(4, 4)` of which
-            `_solve_components` gets the first three rows, the index of the only branch that is wanted or -1 for all,
-            and the relative size of what counts as rounding. It writes the canonical joint variables of branches that
-            reach the pose into `q`, `(branches, dof)`, whose first column is NaN before; with -2 those of the branches
-            that do not reach it too, as near to it as they come (see `starts`). It and the plain functions
-            that it calls work on numbers and entries of arrays, and call functions of `math`; each is decorated by
-            `typing.no_type_check`.
+        margin: distance that cosines keep from 1: 0, except for `starts`.
+        name: name of the form in model files.
+        compiled: the same formulas as a plain function that the kernels compile; None if there is none. It is called as
+            `compiled(form, P, only, rounding, q)` with `kernels.arrays.ClosedForm`, the pose `(4, 4)` (of which
+            `_solve_components` gets the first three rows), the index of the only requested branch or -1 for all, and
+            the relative size of rounding errors. It writes the canonical joint variables of branches that reach the
+            pose into `q`, `(branches, dof)`, whose first column is NaN before; with -2 also those of branches that do
+            not reach it, as near to it as possible (see `starts`). It and the functions that it calls may use numbers,
+            entries of arrays and functions of `math` only; each is decorated by `typing.no_type_check`.
     """
 
     name: ClassVar[str]
@@ -67,27 +66,27 @@ class AbstractClosedForm(ABC):
     @classmethod
     @abstractmethod
     def of(cls: type[Own], robot: Robot) -> Own | None:
-        """The solver for a robot, or None where the robot's rows are not of this family."""
+        """Return the solver for a robot, or None if its rows do not belong to this family."""
 
     @abstractmethod
     def _solve_components(
         self, T: Frame, signs: Sequence[Scalar]
     ) -> tuple[list[Scalar], Bool[Tensor, "..."], Bool[Tensor, "..."]]:
-        """Canonical joint variables, whether they reach the pose, and whether it is singular.
+        """Return canonical joint variables, whether they reach the pose, and whether it is singular.
 
         Args:
-            T: pose of the last joint's frame, turned, in the frame before the first joint, on components.
+            T: pose of the last joint's rotated frame in the frame before the first joint, on components.
             signs: +1 or -1 for every fork, numbers or tensors that broadcast with the components of T.
         """
 
     def solve(self, T: Tensor) -> InverseSolutions:
-        """All joint values that take the tool to the poses.
+        """Find all joint values that reach the poses.
 
         Args:
             T: T_base_tool, `(*batch, 4, 4)` [m].
 
         Raises:
-            PoseError: T is no stack of rigid transforms; the message gives the index.
+            PoseError: T is not a stack of rigid transforms; the message states the index.
         """
         check_transforms(T, "T_base_tool")
         q, inside, reached, singular = self._solve_branches(T)
@@ -99,9 +98,9 @@ class AbstractClosedForm(ABC):
     def nearest(
         self, T: Float[Tensor, "poses 4 4"], q: Float[Tensor, "poses dof"]
     ) -> tuple[Float[Tensor, "poses dof"], Int64[Tensor, " poses"]]:
-        """Joint values [rad or m] on the branch whose are nearest to others, and its index.
+        """Return the joint values [rad or m] of the branch nearest to reference values, and the index of the branch.
 
-        Where no branch reaches a pose they are NaN, and the index is 0.
+        If no branch reaches a pose, the values are NaN and the index is 0.
         """
         every = self.solve(T).q
         distance = wrapped_difference(self.robot, every, q[:, None]).square().sum(-1)
@@ -109,16 +108,16 @@ class AbstractClosedForm(ABC):
         return every[torch.arange(len(q)), index], index
 
     def frequent(self, index: Int64[Tensor, " poses"]) -> tuple[str, ...]:
-        """Names of the branches of these indices, the most frequent first."""
+        """Return the names of the branches with these indices, the most frequent first."""
         counts = torch.bincount(index, minlength=len(self.branches))
         order = counts.argsort(descending=True, stable=True).tolist()
         return tuple(self.branches[i] for i in order if counts[i] > 0)
 
     def starts(self, T: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch branches dof"]:
-        """Joint values of all branches, of those that do not reach a pose the nearest: almost stretched or folded.
+        """Return joint values of all branches; those that do not reach a pose are nearest to it, stretched or folded.
 
-        They are starts for an arm that differs a little from this one and may reach the pose. A small margin keeps them
-        from the singular joint values themselves, which no iteration leaves.
+        They are starts for an arm that differs slightly from this one and may reach the pose. A small margin keeps them
+        away from the singular joint values, which an iteration cannot leave.
 
         Args:
             T: T_base_tool [m].
@@ -126,9 +125,9 @@ class AbstractClosedForm(ABC):
         return replace(self, margin=NEAREST_MARGIN)._solve_branches(T)[0]
 
     def upright(self, T: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch 4 4"]:
-        """Poses as a SCARA can take them whose tool may lean.
+        """Return poses that a SCARA can reach if its tool may tilt.
 
-        They are turned about the tool's point until the last joint's axis is parallel to the first's.
+        They are rotated about the tool's origin until the last joint's axis is parallel to the first's.
         """
         axis = T[..., :3, :3] @ invert(self.rows.T_last_tool.to(T))[:3, 2]
         first = self.rows.T_base_first.to(T)[:3, 2].expand(axis.shape)
@@ -147,17 +146,17 @@ class AbstractClosedForm(ABC):
         Bool[Tensor, "*batch branches"],
         Bool[Tensor, "*batch branches"],
     ]:
-        """Joint values, and whether they are inside the limits, reach the pose, and are singular."""
+        """Return joint values, and whether they are inside the limits, reach the pose, and are singular."""
         T_first_base, T_tool_last = invert(self.rows.T_base_first.to(T)), invert(self.rows.T_last_tool.to(T))
         variables, reached, singular = self._solve_canonical(T_first_base @ T @ T_tool_last)
-        return (*self._turned(self.rows.joint_values(variables)), reached, singular)
+        return (*self._wrapped(self.rows.joint_values(variables)), reached, singular)
 
     def _solve_canonical(
         self, T: Float[Tensor, "*batch 4 4"]
     ) -> tuple[
         Float[Tensor, "*batch branches dof"], Bool[Tensor, "*batch branches"], Bool[Tensor, "*batch branches"]
     ]:
-        """Canonical joint variables of all branches, whether they reach the pose, and whether it is singular."""
+        """Return canonical joint variables of all branches, whether they reach the pose, and whether it is singular."""
         n, batch = len(self.branches).bit_length() - 1, T.shape[:-2]
         signs = [T.new_tensor([1.0, -1.0]).reshape([2 if i == k else 1 for i in range(n)]) for k in range(n)]
         each = T.reshape(*batch, *[1] * n, 4, 4)
@@ -167,9 +166,9 @@ class AbstractClosedForm(ABC):
         columns = [torch.as_tensor(v).to(T).expand(shape).reshape(*batch, 2**n) for v in variables]
         return torch.stack(columns, -1), flags[0], flags[1]
 
-    def _turned(
+    def _wrapped(
         self, q: Float[Tensor, "*batch dof"]
     ) -> tuple[Float[Tensor, "*batch dof"], Bool[Tensor, "*batch"]]:
-        """Joint values on the turn nearest to 0 or, where only that is within the limits, on another."""
+        """Wrap joint values to the turn nearest to 0, or to another one if only that is within the limits."""
         revolute = torch.tensor(self.robot.revolute, device=q.device)
         return wrap_into_limits(self.robot, torch.where(revolute, wrap_to_pi(q), q))

@@ -1,4 +1,4 @@
-"""Which closed form a robot has, decided from its rows: the registry of closed forms."""
+"""Registry of closed forms, and the choice of a form by the rows of a robot."""
 
 from pisigma.robot.description import Robot
 from pisigma.robot.kinematics.closed_form.interface import AbstractClosedForm
@@ -7,28 +7,28 @@ from pisigma.robot.kinematics.closed_form.spherical_wrist import SphericalWristA
 from pisigma.robot.kinematics.closed_form.three_parallel import ThreeParallelArm
 
 CLOSED_FORMS: dict[str, type[AbstractClosedForm]] = {}
-"""The registry, by name: the first form whose `of` takes a robot is its closed form."""
+"""Closed forms by name; the first whose `of` accepts a robot is used."""
 
 
 def register_closed_form(form: type[AbstractClosedForm]) -> type[AbstractClosedForm]:
-    """Add a closed form behind those that are registered; may be used as a decorator.
+    """Register a closed form after the existing ones; may be used as a decorator.
 
-    A form with compiled functions has the kernels made again where it is first used, which needs numba
+    A form with compiled functions makes the kernels recompile at its first use, which requires numba
     (`pip install 'pisigma[compile]'`).
 
     Raises:
         ValueError: another form has the name.
     """
     if CLOSED_FORMS.setdefault(form.name, form) is not form:
-        raise ValueError(f"there is a closed form '{form.name}' already; give yours another name.")
+        raise ValueError(f"a closed form '{form.name}' is already registered; choose another name.")
     return form
 
 
 def closed_form_solver(robot: Robot) -> AbstractClosedForm | None:
-    """The closed-form inverse of a robot, or None where no registered form takes it.
+    """Return the closed-form inverse of a robot, or None if no registered form accepts it.
 
-    The rows decide, exactly: twists that are off by a calibrated error, or a beta that is not 0, mean None.
-    Signs of twists, offsets, directions, base, tool, fixed rows before the first and behind the last joint do
+    The rows have to match exactly: twists with a calibrated error or a beta other than 0 result in None.
+    Signs of twists, offsets, directions, base, tool, fixed rows before the first and after the last joint do
     not matter, nor do twist and beta of the last row.
     """
     return next((solver for form in CLOSED_FORMS.values() if (solver := form.of(robot)) is not None), None)

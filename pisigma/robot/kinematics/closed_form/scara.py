@@ -1,4 +1,4 @@
-"""Closed form of planar SCARA robots: turn, turn, slide, turn about parallel axes."""
+"""Closed form of SCARA robots: joints R R P R with parallel axes."""
 
 import math
 from collections.abc import Sequence
@@ -19,7 +19,7 @@ from pisigma.robot.kinematics.tolerances import NEAREST_MARGIN, TILT_TOLERANCE
 
 @no_type_check
 def scara_branches(form: Any, P: Any, only: int, rounding: float, q: Any) -> None:
-    """Both branches; see `AbstractClosedForm.compiled`."""
+    """Compute both branches; see `AbstractClosedForm.compiled`."""
     nearest = only < -1
     margin = NEAREST_MARGIN if nearest else 0.0
     if not nearest and (math.hypot(P[0, 2], P[1, 2]) > max(TILT_TOLERANCE, rounding) or P[2, 2] <= 0):
@@ -44,13 +44,12 @@ def scara_branches(form: Any, P: Any, only: int, rounding: float, q: Any) -> Non
 class Scara(AbstractClosedForm):
     """R R P R with all axes parallel (twists 0 or 180 deg): appendix A of Jeong et al. 1998, for any lengths.
 
-    Branches: `elbow_positive` has a positive sine of the elbow angle, counted about the first row's axis from
+    Branches: `elbow_positive` has a positive sine of the elbow angle, measured about the first row's axis from
     link 1 to link 2, and `elbow_negative` a negative one; they are the two signs of `S_2`, in the appendix's
     order.
 
-    A pose whose tool axis is not parallel to the joint axes is UNREACHABLE. SINGULAR: the arm is stretched or
-    folded, where both branches meet; folded with equal links, axis 4 lies on axis 1 and joint 1 is given as
-    0.
+    A pose whose tool axis is not parallel to the joint axes is UNREACHABLE. A pose is SINGULAR if the arm is stretched
+    or folded, where both branches meet; if it is folded with equal links, axis 4 is on axis 1 and joint 1 is set to 0.
     """
 
     name = "scara"
@@ -59,14 +58,14 @@ class Scara(AbstractClosedForm):
 
     @classmethod
     def of(cls, robot: Robot) -> "Scara | None":
-        """The solver, or None where the rows are no R R P R with parallel axes and links longer than 0."""
+        """Return the solver, or None unless the joints are R R P R with parallel axes and links longer than 0."""
         rows = canonical_rows(robot, ("revolute", "revolute", "prismatic", "revolute"), (0.0, 0.0, 0.0))
         solver = rows and cls(robot, rows)
         return solver if solver and solver.rows.a[0] != 0 and solver._second_link[0] != 0 else None
 
     @property
     def _second_link(self) -> tuple[float, float]:
-        """Length [m] of link 2, from axis 2 to axis 4, and its angle [rad] at t_2 = 0."""
+        """Length [m] of link 2 from axis 2 to axis 4, and its angle [rad] at t_2 = 0."""
         x = self.rows.a[1] + self.rows.a[2] * math.cos(self.rows.theta[2])
         y = self.rows.a[2] * math.sin(self.rows.theta[2])
         return math.hypot(x, y), math.atan2(y, x)

@@ -1,4 +1,4 @@
-"""Closed form of six-joint arms whose last three axes meet in a point."""
+"""Closed form of six-joint arms with a spherical wrist: the last three axes intersect in a point."""
 
 import math
 from collections.abc import Sequence
@@ -30,7 +30,7 @@ _TWISTS = (-_RIGHT, 0.0, -_RIGHT, _RIGHT, -_RIGHT)
 
 @no_type_check
 def _spherical_joints(form: Any, P: Any, t: Any, only: int, branch: int, rounding: float, q: Any) -> None:
-    """Joints 4 to 6, of t = joints 1 to 3, both flips, from `M = R_03^T · R = RotZ(t_4) RotY(-t_5) RotZ(t_6)`."""
+    """Solve joints 4 to 6 for t = joints 1 to 3, both flips, by `M = R_03^T · R = RotZ(t_4) RotY(-t_5) RotZ(t_6)`."""
     t_1, t_2, t_3 = t
     c_1, s_1 = math.cos(t_1), math.sin(t_1)
     c, s = math.cos(t_2 + t_3), math.sin(t_2 + t_3)
@@ -56,7 +56,7 @@ def _spherical_joints(form: Any, P: Any, t: Any, only: int, branch: int, roundin
 
 @no_type_check
 def spherical_wrist_branches(form: Any, P: Any, only: int, rounding: float, q: Any) -> None:
-    """All eight branches; see `AbstractClosedForm.compiled`."""
+    """Compute all eight branches; see `AbstractClosedForm.compiled`."""
     a, d, nearest = form.a, form.d, only < -1
     margin = NEAREST_MARGIN if nearest else 0.0
     forearm, side = math.hypot(a[2], d[3]), d[1] + d[2]
@@ -85,24 +85,22 @@ def spherical_wrist_branches(form: Any, P: Any, only: int, rounding: float, q: A
 
 @dataclass(frozen=True, eq=False)
 class SphericalWristArm(AbstractClosedForm):
-    """Anthropomorphic arm with twists -90, 0, -90, 90, -90 deg (each up to 180 deg) and a spherical wrist.
+    """Anthropomorphic arm with twists -90, 0, -90, 90, -90 deg (each modulo 180 deg) and a spherical wrist.
 
-    Appendix B of Jeong et al. 1998 is the case `a_1 = a_3 = d_1 = d_6 = 0`. The wrist centre gives the first
-    three joints (Pieper 1968), the rotation that is left the last three. Lengths a_1, a_2, a_3, d_1, d_2,
-    d_3, d_4, a_6, d_6, offsets, directions, base and tool are free.
+    Appendix B of Jeong et al. 1998 is the case `a_1 = a_3 = d_1 = d_6 = 0`. The wrist centre determines the first
+    three joints (Pieper 1968), the remaining rotation the last three. Lengths a_1, a_2, a_3, d_1, d_2, d_3, d_4, a_6,
+    d_6, offsets, directions, base and tool are arbitrary.
 
     Branches are named `shoulder/elbow/wrist`:
 
-    - `front` or `back`: the wrist centre lies ahead of or behind axis 1, as seen in the plane of the arm.
-    - `elbow_up` or `elbow_down`: the elbow lies on the side of the line from shoulder to wrist centre where
-      the first axis points, or on the other, for a wrist centre that lies outwards from the shoulder.
-    - `no_flip` or `flip`: the bend `t_5` of the wrist, counted about the canonical axis, is positive or
-      negative.
+    - `front` or `back`: the wrist centre is ahead of or behind axis 1 in the plane of the arm.
+    - `elbow_up` or `elbow_down`: the elbow is on the side of the line from shoulder to wrist centre to which the first
+      axis points, or on the other side, if the wrist centre is farther out than the shoulder.
+    - `no_flip` or `flip`: the wrist angle `t_5`, about the canonical axis, is positive or negative.
 
-    SINGULAR: the elbow is stretched or folded (two branches meet), the wrist centre is on axis 1 (joint 1 is
-    not determined and given as 0 on the front branches), or the wrist is straight (joints 4 and 6 turn about
-    one axis; joint 4 is given as 0 on the `no_flip` branches). Near, but not at, such a place the exact
-    values are given.
+    A pose is SINGULAR if the elbow is stretched or folded (two branches meet), if the wrist centre is on axis 1 (joint
+    1 is not determined and set to 0 on the front branches), or if the wrist is straight (axes 4 and 6 coincide; joint 4
+    is set to 0 on the `no_flip` branches). Near a singularity, but not at it, the exact values are returned.
     """
 
     name = "spherical_wrist"
@@ -111,7 +109,7 @@ class SphericalWristArm(AbstractClosedForm):
 
     @classmethod
     def of(cls, robot: Robot) -> "SphericalWristArm | None":
-        """The solver, or None where the rows are no such arm or a link has no length."""
+        """Return the solver, or None if the rows are not those of such an arm or a link has no length."""
         rows = canonical_rows(robot, ("revolute",) * 6, _TWISTS)
         if (
             rows is None
@@ -136,7 +134,7 @@ class SphericalWristArm(AbstractClosedForm):
     def _solve_arm(
         self, p: tuple[Tensor, Tensor, Tensor], shoulder: Scalar, elbow: Scalar
     ) -> tuple[list[Tensor], Tensor, Tensor]:
-        """Joints 1 to 3 that bring the wrist centre to p."""
+        """Solve joints 1 to 3, which bring the wrist centre to p."""
         (a_1, a_2, a_3, *_), (d_1, d_2, d_3, d_4, *_) = self.rows.a, self.rows.d
         scale = abs(a_1) + abs(a_2) + math.hypot(a_3, d_4) + abs(d_2 + d_3)
         x, y, z = p
@@ -155,7 +153,7 @@ class SphericalWristArm(AbstractClosedForm):
         return [t_1, arm.first, arm.elbow - math.atan2(d_4, a_3)], arm.reached & beside_axis, singular
 
     def _solve_wrist(self, R: Columns, t_123: Sequence[Tensor], wrist: Scalar) -> tuple[list[Tensor], Tensor]:
-        """Joints 4 to 6 from `M = R_03ᵀ · R = RotZ(t_4) RotY(-t_5) RotZ(t_6)`; flipped, `t_5` is negative.
+        """Solve joints 4 to 6 by `M = R_03ᵀ · R = RotZ(t_4) RotY(-t_5) RotZ(t_6)`; `t_5` is negative if flipped.
 
         `R_03 = RotZ(t_1) RotX(-90 deg) RotZ(t_2 + t_3) RotX(-90 deg)`.
         """

@@ -1,4 +1,4 @@
-"""Closed form of six-joint arms whose axes 2, 3 and 4 are parallel: the usual collaborative robots."""
+"""Closed form of six-joint arms whose axes 2, 3 and 4 are parallel, such as most collaborative robots."""
 
 import math
 from collections.abc import Sequence
@@ -33,7 +33,7 @@ _TWISTS = (_RIGHT, 0.0, 0.0, _RIGHT, -_RIGHT)
 def _plane_joints(
     form: Any, P: Any, t: Any, x: float, upwards: float, free: bool, margin: float, rounding: float, q: Any
 ) -> None:
-    """Joints 2 to 4, of t = joints 1, 5, 6: the two links that carry axis 4; a straight wrist may turn for them."""
+    """Solve joints 2 to 4 for t = joints 1, 5, 6: two links that carry axis 4; a straight wrist may rotate for them."""
     t_1, t_5, t_6 = t
     a, y, zero = form.a, P[2, 3] - form.d[0], form.sign[1] * form.offset[1]
     along, across, b = a[3], -form.d[4], abs(a[2])
@@ -67,7 +67,7 @@ def _plane_joints(
 
 @no_type_check
 def three_parallel_branches(form: Any, P: Any, only: int, rounding: float, q: Any) -> None:
-    """All eight branches; see `AbstractClosedForm.compiled`."""
+    """Compute all eight branches; see `AbstractClosedForm.compiled`."""
     a, d, margin = form.a, form.d, NEAREST_MARGIN if only < -1 else 0.0
     side = d[1] + d[2] + d[3]
     scale = abs(a[0]) + abs(a[1]) + abs(a[2]) + math.hypot(a[3], d[4]) + abs(side)
@@ -103,26 +103,25 @@ def three_parallel_branches(form: Any, P: Any, only: int, rounding: float, q: An
 
 @dataclass(frozen=True, eq=False)
 class ThreeParallelArm(AbstractClosedForm):
-    """Arm with twists 90, 0, 0, 90, -90 deg (each up to 180 deg) whose axes 5 and 6 meet: UR, RB and the like.
+    """Arm with twists 90, 0, 0, 90, -90 deg (each modulo 180 deg) whose axes 5 and 6 meet, such as UR and RB robots.
 
-    Axis 2 is a normal of the plane in which joints 2 to 4 move. The height over it of the point where axes 5
-    and 6 meet gives joint 1, its direction in the wanted frame gives joints 5 and 6; what is left are two
-    links in the plane (Hawkins 2013, "Analytic inverse kinematics for the Universal Robots UR-5/UR-10 arms",
-    here for any a_1 to a_4, d_1 to d_6, a_6, offsets, directions, base and tool).
+    Axis 2 is normal to the plane in which joints 2 to 4 move. The height of the intersection of axes 5 and 6 above this
+    plane determines joint 1, the direction of axis 2 in the wanted frame determines joints 5 and 6; two links in the
+    plane remain (Hawkins 2013, "Analytic inverse kinematics for the Universal Robots UR-5/UR-10 arms", here for any a_1
+    to a_4, d_1 to d_6, a_6, offsets, directions, base and tool).
 
     Branches are named `shoulder/elbow/wrist`:
 
-    - `front` or `back`: the point where axes 5 and 6 meet lies ahead of or behind axis 1, as seen in the plane
-      of the arm.
-    - `elbow_up` or `elbow_down`: the elbow lies on the side of the line from axis 2 to axis 4 where the first
-      axis points, or on the other, for an axis 4 that lies outwards from axis 2.
-    - `no_flip` or `flip`: `t_5`, counted about the canonical axis, is positive or negative.
+    - `front` or `back`: the intersection of axes 5 and 6 is ahead of or behind axis 1 in the plane of the arm.
+    - `elbow_up` or `elbow_down`: the elbow is on the side of the line from axis 2 to axis 4 to which the first axis
+      points, or on the other side, if axis 4 is farther out than axis 2.
+    - `no_flip` or `flip`: `t_5`, about the canonical axis, is positive or negative.
 
-    SINGULAR: the elbow is stretched or folded (two branches meet), the point where axes 5 and 6 meet lies in
-    the plane of axis 1 that is parallel to axis 2 (front and back meet; on axis 1 itself joint 1 is not
-    determined and given as 0 on the front branches), or the wrist is straight (axes 4 and 6 are parallel).
-    There joint 6 is given as 0 where the elbow reaches so, else as what brings the elbow just within reach.
-    Near, but not at, such a place the exact values are given.
+    A pose is SINGULAR if the elbow is stretched or folded (two branches meet), if the intersection of axes 5 and 6 is
+    in the plane through axis 1 parallel to axis 2 (front and back meet; on axis 1 itself joint 1 is not determined and
+    set to 0 on the front branches), or if the wrist is straight (axes 4 and 6 are parallel). For a straight wrist joint
+    6 is set to 0 if the elbow then reaches the pose, otherwise to the value that brings the pose just within reach.
+    Near a singularity, but not at it, the exact values are returned.
     """
 
     name = "three_parallel"
@@ -131,7 +130,7 @@ class ThreeParallelArm(AbstractClosedForm):
 
     @classmethod
     def of(cls, robot: Robot) -> "ThreeParallelArm | None":
-        """The solver, or None where the rows are no such arm or a link has no length."""
+        """Return the solver, or None if the rows are not those of such an arm or a link has no length."""
         rows = canonical_rows(robot, ("revolute",) * 6, _TWISTS)
         if rows is None or rows.a[4] or not rows.a[1] or not rows.a[2]:
             return None
@@ -139,7 +138,7 @@ class ThreeParallelArm(AbstractClosedForm):
 
     @property
     def _scale(self) -> float:
-        """How long the arm is [m]: what lengths are compared with."""
+        """Length of the arm [m], the unit of rounding errors."""
         a, d = self.rows.a, self.rows.d
         return abs(a[0]) + abs(a[1]) + abs(a[2]) + math.hypot(a[3], d[4]) + abs(d[1] + d[2] + d[3])
 
@@ -165,7 +164,7 @@ class ThreeParallelArm(AbstractClosedForm):
         return [t_1, arm.first, t_3, t_234 - arm.first - t_3, t_5, t_6], arm.reached & beside, singular
 
     def _solve_wrist(self, R: Columns, t_1: Tensor, wrist: Scalar) -> tuple[Tensor, Tensor, Tensor]:
-        """Joints 5 and 6, and the size of `s_5`: axis 2 in the wanted frame is `(s_5 c_6, -s_5 s_6, c_5)`."""
+        """Solve joints 5 and 6, and |s_5|: axis 2 in the wanted frame is `(s_5 c_6, -s_5 s_6, c_5)`."""
         cos, sin = torch.cos(t_1), torch.sin(t_1)
         x, y, z = (sin * R[j][0] - cos * R[j][1] for j in range(3))
         sine = torch.hypot(x, y)
@@ -177,7 +176,7 @@ class ThreeParallelArm(AbstractClosedForm):
     def _solve_plane(
         self, R: Columns, t_1: Tensor, t_6: Tensor, x: Tensor, y: Tensor, upwards: Scalar
     ) -> tuple[TwoLink, Tensor]:
-        """The two links that carry axis 4, and `t_2 + t_3 + t_4`, from axis 5 `(s_234, -c_234)` in the plane."""
+        """Solve the two links that carry axis 4, and `t_2 + t_3 + t_4` from axis 5, `(s_234, -c_234)` in the plane."""
         cos, sin = torch.cos(t_6), torch.sin(t_6)
         axis = [-sin * R[0][i] - cos * R[1][i] for i in range(3)]
         t_234 = torch.atan2(torch.cos(t_1) * axis[0] + torch.sin(t_1) * axis[1], -axis[2])
@@ -195,7 +194,7 @@ class ThreeParallelArm(AbstractClosedForm):
         return arm, t_234
 
     def _turned_wrist(self, t_234: Tensor, t_5: Tensor, t_6: Tensor, x: Tensor, y: Tensor) -> Tensor:
-        """Joint 6 of a straight wrist that brings axis 4 just within the elbow's reach, on the side it was."""
+        """Return joint 6 of a straight wrist that brings axis 4 just within reach of the elbow, on the same side."""
         along, across = self.rows.a[3], -self.rows.d[4]
         hand, far = math.hypot(along, across), torch.hypot(x, y)
         if hand == 0.0:

@@ -1,4 +1,4 @@
-"""Joint 1, and two links in a plane, which closed forms share, and from what size on they take a number for 0."""
+"""Solutions for joint 1 and for two links in a plane, shared by closed forms, with their rounding tolerances."""
 
 import itertools
 import math
@@ -10,27 +10,27 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from pisigma.robot.kinematics.components import Scalar
-from pisigma.robot.kinematics.tolerances import ROUNDINGS
+from pisigma.robot.kinematics.tolerances import ROUNDING_UNITS
 
 ARM_BRANCHES = tuple(
     "/".join(choices)
     for choices in itertools.product(("front", "back"), ("elbow_up", "elbow_down"), ("no_flip", "flip"))
 )
-"""Names `shoulder/elbow/wrist` of the branches of arms with six joints."""
+"""Branch names `shoulder/elbow/wrist` of arms with six joints."""
 
 SINGULAR_TOLERANCE = 1e-6
-"""A solution is SINGULAR where the sine of its elbow angle or of its wrist's bend, or the distance of the
-wrist centre from axis 1 over the arm's reach, is smaller (in float32: than 1.2e-5)."""
+"""A solution is SINGULAR if the sine of its elbow angle or of its wrist angle, or the distance of the wrist centre from
+axis 1 divided by the arm's reach, is smaller (in float32: 1.2e-5)."""
 
 
 def singular_tolerance(dtype: torch.dtype) -> float:
-    """`SINGULAR_TOLERANCE`, or what rounding allows in a shorter float type."""
+    """Return `SINGULAR_TOLERANCE`, or a larger value for a shorter float type."""
     return max(SINGULAR_TOLERANCE, 100 * torch.finfo(dtype).eps)
 
 
 def rounding(dtype: torch.dtype) -> float:
-    """Relative size below which a cosine beyond 1 or a length is taken for rounding (1.1e-13 in float64)."""
-    return ROUNDINGS * torch.finfo(dtype).eps
+    """Return the relative size below which a cosine beyond 1 or a length is a rounding error (1.1e-13 in float64)."""
+    return ROUNDING_UNITS * torch.finfo(dtype).eps
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,19 +53,19 @@ class TwoLink:
 def solve_first_joint(
     x: Tensor, y: Tensor, side: float, scale: float, shoulder: Scalar, free: float, margin: float
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Joint 1, which brings a point to a distance `side` from the plane of the arm: `c_1 y - s_1 x = side`.
+    """Solve joint 1, which brings a point to a distance `side` from the plane of the arm: `c_1 y - s_1 x = side`.
 
     Args:
-        x: the point [m].
-        y: the point [m].
-        side: how far the point lies to the left of the arm's plane [m].
-        scale: length of the arm [m], which rounding is compared with.
-        shoulder: +1 where the point lies ahead of axis 1, -1 where it lies behind it; broadcasts.
-        free: azimuth [rad] of a point on axis 1, for which any would do.
-        margin: of the squared scale, what the square of how far ahead the point lies is not below.
+        x: x of the point [m].
+        y: y of the point [m].
+        side: distance of the point to the left of the arm's plane [m].
+        scale: length of the arm [m], the unit of rounding errors.
+        shoulder: +1 for a point ahead of axis 1, -1 for one behind it; broadcasts.
+        free: azimuth [rad] to use for a point on axis 1, for which it is arbitrary.
+        margin: smallest square of the distance ahead of axis 1, as a share of the squared scale.
 
     Returns:
-        The angle [rad], how far ahead of axis 1 the point lies in the plane [m], and whether there is such an angle.
+        The angle [rad], the distance of the point ahead of axis 1 in the plane [m], and whether a solution exists.
     """
     square = x * x + y * y - side * side
     reached = square >= -rounding(x.dtype) * scale * scale
@@ -80,19 +80,19 @@ def solve_first_joint(
 def solve_two_link(
     x: Tensor, y: Tensor, a: float, b: float, elbow_sign: Scalar, first_when_free: float, margin: float
 ) -> TwoLink:
-    """Angles of two links that end in a point: appendix A's `C_2`, `S_2`, `K_1`, `K_2` for any lengths.
+    """Solve the angles of two links that end at a point: appendix A's `C_2`, `S_2`, `K_1`, `K_2` for any lengths.
 
     Args:
-        x: the point [m].
-        y: the point [m].
+        x: x of the point [m].
+        y: y of the point [m].
         a: length of the first link [m], not 0; may be negative.
         b: length of the second link [m], positive.
         elbow_sign: +1 or -1, the sign of the sine of the elbow angle; broadcasts.
-        first_when_free: the first angle [rad] where the point lies on its axis, so that any would do.
-        margin: what is kept between the cosine of the elbow angle and 1.
+        first_when_free: first angle [rad] to use for a point on the first axis, for which it is arbitrary.
+        margin: distance that the cosine of the elbow angle keeps from 1.
 
     Returns:
-        The angles; where the point is out of reach they are those of the nearest arm and `reached` is False.
+        The angles; for a point out of reach they are those of the nearest arm and `reached` is False.
         A cosine beyond 1 by rounding counts as 1.
     """
     cosine = (x * x + y * y - (a * a + b * b)) / (2 * a * b)
@@ -109,7 +109,7 @@ def solve_two_link(
 def two_link(
     x: float, y: float, a: float, b: float, elbow_sign: float, free: float, rounding: float, margin: float
 ) -> tuple[float, float, bool]:
-    """The same as `solve_two_link` on plain numbers: the angles [rad], and whether the point is within reach."""
+    """Like `solve_two_link` on plain numbers: return the angles [rad], and whether the point is within reach."""
     cosine = (x * x + y * y - (a * a + b * b)) / (2 * a * b)
     reached = abs(cosine) <= 1 + rounding
     cosine = min(max(cosine, margin - 1), 1 - margin)
@@ -124,11 +124,11 @@ def two_link(
 def first_joint(
     P: Any, side: float, scale: float, zero: float, rounding: float, margin: float
 ) -> tuple[float, float, bool, bool]:
-    """What joint 1 of an arm brings a point to, whose distance from the plane of the arm is `side` [m].
+    """Locate a point relative to axis 1 of an arm from whose plane it has the distance `side` [m].
 
     Returns:
-        The distance [m] ahead of axis 1, the azimuth [rad], whether there is such a joint value, and whether the point
-        lies on the axis, so that any would do.
+        The distance [m] ahead of axis 1, the azimuth [rad], whether a solution exists, and whether the point is on the
+        axis, so that joint 1 is arbitrary.
     """
     x, y = P[0, 3], P[1, 3]
     square = x * x + y * y - side * side
