@@ -257,9 +257,9 @@ class FleetConsistency:
         """The same in words."""
         if self.odd:
             return (
-                f"This robot is unlike the fleet: fewer than 1 in {1 / FALSE_ALARM:,.0f} of its robots are as far from the "
-                "mean, and the usual errors of its class explain its rows better. The fleet does not count where the "
-                "rows are enough for a calibration of their own."
+                f"This robot is unlike the fleet: fewer than 1 in {1 / FALSE_ALARM:,.0f} of its robots are as far from "
+                "the mean, and the usual errors of its class explain its rows better. The fleet does not count where "
+                "the rows are enough for a calibration of their own."
             )
         share = f"{100 * self.probability:.0f} %" if self.probability >= 0.01 else "fewer than 1 %"
         return f"This robot is like the fleet: {share} of its robots are as far from the mean, or farther."

@@ -13,10 +13,10 @@ from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.groups import groups_to_keep_whole, numbers_of_names
 from pisigma.model.calibrated_model import CalibratedModel, poses_of_rows
 from pisigma.robot.frame_fits import (
+    CONVERGENCE_TOLERANCE,
     INITIAL_DAMPING,
     LEVER_SHARE,
-    SETTLED,
-    STEPS,
+    MAX_ITERATIONS,
     MeasuredPoses,
     best_base,
     best_tool,
@@ -179,7 +179,7 @@ def fit_frames(
         tools = _each(best_tool, bases[frame] @ T, measured, target)
     columns, error = _columns(T, measured, (bases, frame), (tools, target), fitted)
     damping = INITIAL_DAMPING
-    for _ in range(STEPS if len(fitted) > 1 else 0):
+    for _ in range(MAX_ITERATIONS if len(fitted) > 1 else 0):
         A = columns.flatten(0, 1)
         normal = A.mT @ A
         damped = normal + torch.diag(damping * normal.diagonal() + 1e-12 * len(T))
@@ -188,7 +188,7 @@ def fit_frames(
         tried = _columns(T, measured, (moved[0], frame), (moved[1], target), fitted)
         gain = float(error.square().sum() - tried[1].square().sum())
         if gain > 0:
-            settled = gain <= SETTLED * float(error.square().sum())
+            settled = gain <= CONVERGENCE_TOLERANCE * float(error.square().sum())
             (bases, tools), (columns, error), damping = moved, tried, damping / 10
             if settled:
                 break
