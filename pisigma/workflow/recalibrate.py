@@ -17,7 +17,7 @@ from pisigma.files.errors import IdentificationError, ModelError
 from pisigma.files.model_files import model_hash
 from pisigma.files.progress import Progress, stage
 from pisigma.lifetime.recalibration.adaptation import Adaptation, adapt
-from pisigma.lifetime.recalibration.candidates import FAR_BETTER, CandidateChoice, choose_candidate
+from pisigma.lifetime.recalibration.candidates import CLEAR_RATIO, CandidateChoice, choose_candidate
 from pisigma.lifetime.recalibration.movement import Movement, movements_text, significant_movements
 from pisigma.lifetime.recalibration.recalibrated_model import (
     KIND,
@@ -259,7 +259,7 @@ def _believable(judged: CandidateChoice, robot: Robot) -> bool:
     error, kept = judged.rms["recalibrated"], judged.rms[judged.kept]
     if error is None or kept is None:
         return not judged.rows
-    return error <= min(PLAUSIBLE_SHARE * robot.reach, FAR_BETTER * kept)
+    return error <= min(PLAUSIBLE_SHARE * robot.reach, CLEAR_RATIO * kept)
 
 
 def _summary(

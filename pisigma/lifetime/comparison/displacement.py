@@ -1,4 +1,4 @@
-"""By how much one of two models has the tool elsewhere than the other, over the workspace or along a program."""
+"""Displacement of the tool between two models, over the workspace or along a program."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -19,12 +19,12 @@ class Displacement:
     """Distances between the poses that two models predict for the same joint values.
 
     Attributes:
-        source: what the poses are.
-        q: joint values [rad or m], of poses that both models predict.
-        number: of every pose among all of the source, from 1.
-        place: position of the tool in the robot's base under the first model [m].
-        errors: length [m] and angle [rad] from the first model's pose to the second's.
-        not_predicted: how many poses are left out because a model predicts nothing there.
+        source: description of the poses.
+        q: joint values of poses that both models predict [rad or m].
+        number: number of every pose among all of the source, from 1.
+        place: position of the tool in the robot's base frame under the first model [m].
+        errors: distance [m] and angle [rad] between the poses of both models.
+        not_predicted: number of poses that are left out because a model does not predict them.
     """
 
     source: str
@@ -36,12 +36,12 @@ class Displacement:
 
     @staticmethod
     def at(pair: ModelPair, q: Float64[Tensor, "poses dof"], source: str) -> "Displacement":
-        """Compare a pair at joint values.
+        """Compare a pair of models at joint values.
 
         Args:
             pair: the models.
             q: joint values [rad or m].
-            source: what they are, such as a file.
+            source: description of the joint values, such as a file.
 
         Raises:
             ModelError: there is no pose that both models predict.
@@ -50,8 +50,9 @@ class Displacement:
         there = torch.isfinite(by).all(1)
         if not bool(there.any()):
             raise ModelError(
-                f"{pair.first.name} and {pair.second.name} predict no pose of {source}; give poses that the robot "
-                "reaches."
+                f"{pair.first.name} and {pair.second.name} predict no pose of {source}",
+                value=source,
+                remedy="give poses that the robot reaches",
             )
         base = frames_of(pair.first, pair.owner[0])[0]
         place = (invert(base) @ pair.poses(q[there])[0])[:, :3, 3]
@@ -61,14 +62,14 @@ class Displacement:
 
     @property
     def largest(self) -> int:
-        """Number of the pose with the largest distance."""
+        """Index of the pose with the largest distance."""
         return int(self.errors.position.argmax())
 
     def to_json(self, robot: Robot) -> dict[str, Any]:
-        """Return the figures as plain values: statistics in mm and deg, and where the largest distance is.
+        """Return plain values: statistics in mm and deg, and where the largest distance is.
 
         Args:
-            robot: says what the controller's joint values are.
+            robot: robot by which joint values are converted to those of the controller.
         """
         values = robot.to_controller(self.q[self.largest].numpy()).tolist()
         return {

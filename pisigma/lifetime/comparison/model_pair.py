@@ -1,4 +1,4 @@
-"""Two models of one robot, with bases and tools that can be compared."""
+"""Pairs of models of one robot, with their bases and tools aligned."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -16,16 +16,16 @@ from pisigma.robot.frame_fits import LEVER_SHARE, MeasuredPoses, best_base_and_t
 from pisigma.robot.se3 import pose_error, transform_from_xyzrpy
 
 FrameChoice = Literal["fitted", "fixed"]
-"""Whether base and tool of the second model are fitted to those of the first, or are the same by their names."""
+"""Whether base and tool of the second model are fitted to those of the first, or are the same by name."""
 
 POINTS = 60
-"""Joint vectors at which models are compared with their uncertainties, from both models alike."""
+"""Joint configurations at which models are compared with their uncertainties, half from each model."""
 SAMPLES = 3_000
-"""Of the workspace."""
-FITTED = 300
-"""Of these, base and tool are fitted to so many."""
-DRAWN_ALIKE = 0.02
-"""[rad, or of the reach] Drawings that differ by less are of one robot."""
+"""Samples of the workspace."""
+FITTED_SAMPLES = 300
+"""Samples to which base and tool are fitted."""
+MAX_NOMINAL_DIFFERENCE = 0.02
+"""[rad, or share of the reach] Difference of nominal parameters up to which models belong to one robot."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,12 +33,12 @@ class ModelPair:
     """Two models of one robot.
 
     Attributes:
-        first: that the other is compared with.
-        second: the other.
-        frames: how bases and tools are treated.
-        owner: per model the names of the frame and the target that it is compared in.
-        T_base: moves poses of the second into the frame of the first; the identity where frames are fixed.
-        T_tool: the tool of the first as seen from that of the second; likewise.
+        first: reference model.
+        second: model that is compared with it.
+        frames: how bases and tools are aligned.
+        owner: names of the frame and the target that each model is compared in.
+        T_base: transform from the frame of the second model to that of the first; the identity for fixed frames.
+        T_tool: pose of the first model's tool in the tool frame of the second; the identity for fixed frames.
     """
 
     first: CalibratedModel
@@ -53,24 +53,24 @@ class ModelPair:
         """Pair two models.
 
         Args:
-            first: that the other is compared with.
-            second: the other.
-            frames: "fitted" moves base and tool of the second so that the arms agree best.
+            first: reference model.
+            second: model that is compared with it.
+            frames: "fitted" moves base and tool of the second model such that the arms agree best.
 
         Raises:
-            ModelError: they are models of different robots, have no frame or target in common where these are fixed, or
-                keep no joint values at which both predict a pose.
+            ModelError: the models belong to different robots, have no frame or target in common where these are fixed,
+                or keep no joint values at which both predict a pose.
         """
         _check_one_robot(first, second)
         owner = _owners(first, second, frames)
         eye = torch.eye(4, dtype=torch.float64)
         pair = ModelPair(first, second, frames, owner, eye, eye)
-        T_first, T_second = pair.poses(pair.workspace[:: SAMPLES // FITTED])
+        T_first, T_second = pair.poses(pair.workspace[:: SAMPLES // FITTED_SAMPLES])
         there = torch.isfinite(T_first + T_second).all(-1).all(-1)
         if not bool(there.any()):
             raise ModelError(
-                f"models {first.name} and {second.name} keep no joint values at which both predict a pose; make them "
-                "again with `pisigma calibrate` or `pisigma train`."
+                f"models {first.name} and {second.name} keep no joint values at which both predict a pose",
+                remedy="make them again with `pisigma calibrate` or `pisigma train`",
             )
         if frames == "fixed":
             return pair
@@ -80,7 +80,7 @@ class ModelPair:
 
     @property
     def points(self) -> Float64[Tensor, "points dof"]:
-        """Joint values [rad or m] that the models keep of their training rows, from both alike."""
+        """Joint values that the models keep of their training rows, half from each [rad or m]."""
         generator = torch.Generator().manual_seed(0)
         drawn = [
             model.starts[torch.randperm(len(model.starts), generator=generator)[: POINTS // 2]]
@@ -90,7 +90,7 @@ class ModelPair:
 
     @property
     def workspace(self) -> Float64[Tensor, "samples dof"]:
-        """Joint values that both models keep, and others drawn within the ranges that both have in common."""
+        """Joint values that the models keep, and random ones within their common ranges [rad or m]."""
         kept = torch.unique(torch.cat([self.first.starts, self.second.starts]), dim=0)
         ranges = [(model.starts.amin(0), model.starts.amax(0)) for model in (self.first, self.second)]
         low, high = torch.maximum(ranges[0][0], ranges[1][0]), torch.minimum(ranges[0][1], ranges[1][1])
@@ -105,7 +105,7 @@ class ModelPair:
     def poses(
         self, q: Float64[Tensor, "poses dof"]
     ) -> tuple[Float64[Tensor, "poses 4 4"], Float64[Tensor, "poses 4 4"]]:
-        """Poses of the tool that both models predict, in the frame of the first; NaN where one predicts none."""
+        """Predict the tool poses of both models in the frame of the first [m]; NaN where a model predicts none."""
         first, second = (
             poses_of_rows(model, Measurements(q=q, frame=(frame,) * len(q), target=(target,) * len(q)))
             for model, (frame, target) in zip((self.first, self.second), self.owner, strict=True)
@@ -114,7 +114,7 @@ class ModelPair:
 
     @torch.no_grad()
     def displacement(self, q: Float64[Tensor, "poses dof"]) -> Float64[Tensor, "poses 6"]:
-        """By how much the second model has the tool elsewhere: shift [m], and turn as a rotation vector [rad]."""
+        """Compute the displacement of the tool in the second model: translation [m] and rotation vector [rad]."""
         first, second = self.poses(q)
         there = torch.isfinite(first + second).all(-1).all(-1)[:, None, None]
         eye = torch.eye(4, dtype=torch.float64)
@@ -122,7 +122,7 @@ class ModelPair:
         return torch.where(there[..., 0], error, torch.nan)
 
     def frames_of_second(self) -> tuple[Float64[Tensor, "4 4"], Float64[Tensor, "4 4"]]:
-        """Base and tool of the second model where they are compared with those of the first."""
+        """Return base and tool of the second model, aligned with those of the first."""
         base, tool = frames_of(self.second, self.owner[1])
         return self.T_base @ base, tool @ self.T_tool
 
@@ -130,7 +130,7 @@ class ModelPair:
 def frames_of(
     model: CalibratedModel, owner: tuple[str, str]
 ) -> tuple[Float64[Tensor, "4 4"], Float64[Tensor, "4 4"]]:
-    """Base and tool of the geometry that a model predicts with, by the names of a frame and a target."""
+    """Return base and tool of the geometry that a model predicts with, by the names of a frame and a target."""
     robot = model.identified
     bases, tools = (
         (model.bases, model.tools) if model.hybrid is None else (model.hybrid_bases, model.hybrid_tools)
@@ -141,14 +141,14 @@ def frames_of(
 
 
 def as_drawn(model: CalibratedModel) -> Robot:
-    """The robot that a model was made of."""
+    """Return the nominal robot of a model."""
     return model.drawn or model.robot
 
 
 def _owners(
     first: CalibratedModel, second: CalibratedModel, frames: FrameChoice
 ) -> tuple[tuple[str, str], tuple[str, str]]:
-    """Frame and target that every model is compared in: the first that both have, else the first of each."""
+    """Return frame and target that each model is compared in: the first common one, else the first of each."""
     owners: tuple[list[str], list[str]] = ([], [])
     for what, mine, others in (
         ("frame", first.bases, second.bases),
@@ -159,7 +159,10 @@ def _owners(
         if not common and frames == "fixed" and "" not in (names[0][0], names[1][0]):
             raise ModelError(
                 f"models {first.name} and {second.name} have no {what} in common ({', '.join(names[0])} and "
-                f"{', '.join(names[1])}); compare them with fitted frames."
+                f"{', '.join(names[1])})",
+                option=what,
+                value=f"{', '.join(names[0])} and {', '.join(names[1])}",
+                remedy="compare them with fitted frames",
             )
         for own, chosen in zip(owners, names, strict=True):
             own.append(common[0] if common else chosen[0])
@@ -167,42 +170,44 @@ def _owners(
 
 
 def _check_one_robot(first: CalibratedModel, second: CalibratedModel) -> None:
-    """Refuse models of different robots, with what is different."""
+    """Refuse models of different robots."""
     robots = as_drawn(first), as_drawn(second)
     what = _difference(*robots)
     if what:
         raise ModelError(
-            f"models {first.name} (robot '{robots[0].name}') and {second.name} (robot '{robots[1].name}') are of "
-            f"different robots: {what}; give two models of one robot."
+            f"models {first.name} (robot '{robots[0].name}') and {second.name} (robot '{robots[1].name}') belong to "
+            f"different robots: {what}",
+            value=what,
+            remedy="give two models of one robot",
         )
 
 
 def _difference(one: Robot, other: Robot) -> str:
-    """Say what two robots as drawn differ in; "" where they are one."""
+    """Describe how two nominal robots differ; "" where they are the same robot."""
     if one.dof != other.dof:
         return f"one has {one.dof} joints and the other {other.dof}"
     types = [[row.type for row in robot.rows] for robot in (one, other)]
     if types[0] != types[1]:
         return f"their rows are {', '.join(types[0])} and {', '.join(types[1])}"
     if tuple(one.directions) != tuple(other.directions):
-        return "a joint turns the other way"
+        return "a joint has the opposite direction"
     if not _coupled_alike(one, other):
-        return "their controllers couple the joints differently"
+        return "their joint couplings differ"
     scale = np.array([1.0, one.reach, one.reach, 1.0, 1.0])
     by = one.dh - other.dh
-    by[:, [0, 3, 4]] = 2 * np.sin(by[:, [0, 3, 4]] / 2)  # angles are the same after a full turn
+    by[:, [0, 3, 4]] = 2 * np.sin(by[:, [0, 3, 4]] / 2)  # angles modulo one revolution
     apart = np.abs(by) / scale
     row, column = np.unravel_index(int(apart.argmax()), apart.shape)
-    if apart[row, column] <= DRAWN_ALIKE:
+    if apart[row, column] <= MAX_NOMINAL_DIFFERENCE:
         return ""
     name = ("theta", "d", "a", "alpha", "beta")[int(column)]
     unit, factor = ("mm", 1e3) if name in ("d", "a") else ("deg", float(np.rad2deg(1.0)))
     values = [f"{robot.dh[row, column] * factor:.6g}" for robot in (one, other)]
-    return f"{name} of row '{one.rows[row].name}' is drawn as {values[0]} and as {values[1]} {unit}"
+    return f"the nominal {name} of row '{one.rows[row].name}' is {values[0]} and {values[1]} {unit}"
 
 
 def _coupled_alike(one: Robot, other: Robot) -> bool:
-    """Whether the controllers' values mean the same joint values."""
+    """Return whether both controllers' values correspond to the same joint values."""
     if len(one.axes) != len(other.axes):
         return False
     values = np.eye(len(one.axes))

@@ -1,4 +1,4 @@
-"""Which parameters of two models differ by more than both models' uncertainties allow."""
+"""Parameters of two models that differ significantly, given the uncertainties of both."""
 
 import math
 from collections.abc import Sequence
@@ -18,9 +18,9 @@ from pisigma.model.accuracy import parameter_posterior
 from pisigma.model.calibrated_model import CalibratedModel
 
 LEVEL = 0.01
-"""Probability with which anything at all is called different where two models differ by chance alone."""
+"""Family-wise significance level: probability of calling any parameter different where two models differ by chance."""
 FACTORS = dict(SHOWN_UNITS.values())
-"""By "mm" or "deg" what an SI value is multiplied by."""
+"""Factors from SI by the shown unit, such as "mm" or "deg"."""
 
 
 @dataclass(frozen=True)
@@ -28,16 +28,16 @@ class ParameterDifference:
     """One parameter of the arm in two models.
 
     Attributes:
-        name: such as "theta_3".
+        name: name such as "theta_3", a DH parameter.
         unit: "mm", "deg", "px" or "1", of all figures.
-        first: its value in the first model.
-        second: its value in the second.
-        deviations: standard deviation of each by the posteriors; None where the model holds none.
-        shift: by how much it differs if nothing else does but the parameters that differ, and base and tool where these
-            are fitted; None without posteriors, and where it moves the tool as those do.
+        first: value in the first model.
+        second: value in the second model.
+        deviations: posterior standard deviations; None where a model keeps no posterior.
+        shift: estimated difference given the significant ones, with base and tool free where these are fitted; None
+            without posteriors, and where the parameter moves the tool as those do.
         deviation: standard deviation of the shift.
-        p: probability of such a shift or a larger one by chance, times the number of parameters that are tested.
-        alike: the names of parameters that have the very same effect.
+        p: probability of such a shift or a larger one by chance, times the number of tested parameters (Bonferroni).
+        alike: names of parameters with the same effect on the tool.
     """
 
     name: str
@@ -52,18 +52,18 @@ class ParameterDifference:
 
     @property
     def difference(self) -> float:
-        """The second value less the first, of angles the short way round."""
+        """Second value minus the first; angles wrapped to ±180 deg."""
         by = self.second - self.first
         return (by + 180.0) % 360.0 - 180.0 if self.unit == "deg" else by
 
 
 @dataclass(frozen=True)
 class Remainder:
-    """What is left of the differences beside base, tool and the parameters that differ.
+    """Test of the displacement that base, tool and the significant parameters do not explain.
 
     Attributes:
-        p: probability of that much or more by chance.
-        significant: whether that is below the level.
+        p: probability of such a displacement or a larger one by chance.
+        significant: whether p is below the level.
     """
 
     p: float
@@ -72,14 +72,14 @@ class Remainder:
 
 @dataclass(frozen=True)
 class ParameterDifferences:
-    """The parameters of two models side by side, and which of them differ.
+    """Parameters of two models side by side, and the significant differences.
 
     Attributes:
-        parameters: all of the arm.
-        differing: the parameters that differ, with their shifts estimated together; a joint's counts in its direction.
-        frames: how far the second model has base and tool elsewhere, in length and in angle; of fitted frames only.
-        remainder: None without posteriors.
-        level: probability that anything is called different by chance.
+        parameters: all DH parameters of the arm.
+        differing: significant differences, estimated together; a joint zero counts in the direction of the joint.
+        frames: distances and angles by which base and tool of the second model differ; for fitted frames only.
+        remainder: test of the remaining displacement; None without posteriors.
+        level: family-wise significance level.
     """
 
     parameters: tuple[ParameterDifference, ...]
@@ -92,16 +92,15 @@ class ParameterDifferences:
 def parameter_differences(pair: ModelPair, level: float = LEVEL) -> ParameterDifferences:
     """Test which parameters of two models differ.
 
-    By differences e of the parameters the second model has the tool elsewhere, by `d = J e`. Under posteriors of the
-    covariances `C1` and `C2`, d is normal with the covariance `X1 C1 X1^T + X2 C2 X2^T`, where X are derivatives by all
-    unknowns, the weights of a joint correction among them. So corrections may be of different kinds, and what no
-    measurement determines counts for nothing. Base and tool are free where frames are fitted. The parameter whose
-    shift alone explains most of d is tested, at the level over the number of parameters (Bonferroni); then the next
-    beside it, until none is significant.
+    Differences e of the parameters displace the tool by `d = J e`. Under posteriors with covariances `C1` and `C2`, d
+    is normal with the covariance `X1 C1 X1^T + X2 C2 X2^T`, where X are derivatives by all unknowns including the weights
+    of a joint correction. The corrections may therefore be of different kinds, and unobservable differences do not
+    count. Base and tool are free where frames are fitted. The parameter whose shift alone explains most of d is tested,
+    at the level over the number of parameters (Bonferroni); then the next one in addition, until none is significant.
 
     Args:
         pair: the models.
-        level: probability with which anything is called different that is not.
+        level: family-wise significance level.
     """
     parameters = _side_by_side(pair)
     if any(model.uncertainty is None and not _is_drawn(model) for model in (pair.first, pair.second)):
@@ -125,7 +124,7 @@ def _tested(
     chosen: Sequence[int],
     parameters: Sequence[ParameterDifference],
 ) -> ParameterDifference:
-    """Test a parameter beside those that differ, itself and its equals left out."""
+    """Test a parameter given the significant ones, without itself and those with the same effect."""
     alike = effects.alike(number)
     estimate = effects.shift(number, [one for one in chosen if one not in (number, *alike)])
     if estimate is None:
@@ -143,7 +142,7 @@ def _tested(
 
 
 def _side_by_side(pair: ModelPair) -> tuple[ParameterDifference, ...]:
-    """Values and their standard deviations, without tests."""
+    """Return the values and their standard deviations, without tests."""
     space = ParameterSpace(as_drawn(pair.first))
     models = pair.first, pair.second
     values = [model.identified.dh.ravel() for model in models]
@@ -158,7 +157,7 @@ def _side_by_side(pair: ModelPair) -> tuple[ParameterDifference, ...]:
 
 
 def _deviations(model: CalibratedModel, count: int) -> Tensor | None:
-    """Standard deviations of the parameters of the arm; those of a robot as drawn are 0."""
+    """Return the standard deviations of the arm's parameters; 0 for a nominal robot."""
     posterior = parameter_posterior(model)
     if posterior is not None:
         return posterior.standard_errors[:count]
@@ -166,7 +165,7 @@ def _deviations(model: CalibratedModel, count: int) -> Tensor | None:
 
 
 def _is_drawn(model: CalibratedModel) -> bool:
-    """Whether a model is the robot as drawn, which is what it is and has no uncertainty."""
+    """Return whether a model is the nominal robot, which has no uncertainty."""
     if model.network is not None or model.hybrid is not None:
         return False
     return bool(np.array_equal(model.identified.dh, as_drawn(model).dh))

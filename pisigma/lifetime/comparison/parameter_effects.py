@@ -1,4 +1,4 @@
-"""Effects of parameters on the tool, in the metric of what two models do not know."""
+"""Effects of parameters on the tool, whitened by the uncertainties of two models."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -19,12 +19,12 @@ from pisigma.robot.frame_fits import LEVER_SHARE
 from pisigma.robot.kinematics.parameter_jacobian import identification_jacobian
 from pisigma.robot.se3 import rotation_from_vector, rotation_vector, skew, xyzrpy_from_transform
 
-FLOOR = 2e-5
-"""[m] Standard deviation of predicted coordinates that no posterior knows of, as a robot's repeatability."""
-SAME_MOTION = 0.01
-"""Share of a parameter's effect below which what is left of it beside others does not count: nearly parallel axes."""
-ALIKE = 1 - SAME_MOTION**2
-"""Parameters whose effects are correlated by more than this are exchangeable."""
+MODEL_ERROR = 2e-5
+"""[m] Standard deviation of predicted coordinates in addition to the posteriors, about a robot's repeatability."""
+MIN_DISTINCT_SHARE = 0.01
+"""Share of a parameter's effect that is distinct from others, below which it is unobservable: nearly parallel axes."""
+ALIKE = 1 - MIN_DISTINCT_SHARE**2
+"""Correlation of effects above which parameters are exchangeable."""
 FRAME_UNITS = ("m", "m", "m", "rad", "rad", "rad")
 FRAME_MOTIONS = ("along x", "along y", "along z", "about x", "about y", "about z")
 
@@ -34,11 +34,11 @@ Frames = tuple[Float64[Tensor, "4 4"], Float64[Tensor, "4 4"]]
 
 @dataclass(frozen=True)
 class Difference:
-    """By how much one parameter differs.
+    """Difference of one parameter between two models.
 
     Attributes:
-        shift: with its name, such as "joint 3" or "a_2"; that of a joint's zero counts in the joint's direction.
-        alike: names of parameters that have the same effect on the tool, so that it may be these instead.
+        shift: difference with its name, such as "joint 3" or "a_2"; a joint zero counts in the joint's direction.
+        alike: names of parameters with the same effect on the tool, which may differ instead.
     """
 
     shift: Movement
@@ -46,26 +46,26 @@ class Difference:
 
     @property
     def sentence(self) -> str:
-        """It in words, with half the 95 % interval."""
+        """Clause such as "joint 3 by 0.25 ± 0.01 deg"."""
         alike = f" (or {' or '.join(self.alike)}, to the same effect)" if self.alike else ""
         return f"{self.shift.what}{alike} by {self.shift.size}"
 
     def to_json(self) -> dict[str, object]:
-        """Return it as plain values, the unit in the name of the shift."""
+        """Return plain values; see `Movement.to_json`."""
         return {**self.shift.to_json(), "alike": list(self.alike)}
 
 
 class ParameterEffects:
-    """By how much the second model has the tool elsewhere, and effects of parameters on it, both whitened.
+    """Displacement of the tool between two models, and the effects of parameters on it, both whitened.
 
     With d the displacement at the points of a pair and J its derivatives by the parameters, values are `L^-1 d` and
     columns `L^-1 J`, where `L L^T` is the covariance of d under both posteriors. The parameters are those of the arm
-    (theta, d, a, alpha, beta of every row), then shift and turn of the base, about its origin and along the axes of the
-    measuring frame, and those of the tool, along its own axes.
+    (theta, d, a, alpha, beta of every row), then translation and rotation of the base, about its origin and along the
+    axes of the measuring frame, and those of the tool, along its own axes.
 
     Attributes:
-        tested: indices of the parameters that are tested: one of several that are exchangeable, and none that moves the
-            tool as base and tool do, where these are free.
+        tested: indices of the tested parameters: one of several exchangeable ones, and none that moves the tool as base
+            and tool do where these are free.
     """
 
     def __init__(self, pair: ModelPair) -> None:
@@ -89,7 +89,7 @@ class ParameterEffects:
         X, G, y = ((weight * one).flatten(0, 1) for one in (columns, torch.cat(spread, -1), d[..., None]))
         covariance = G @ G.t()
         S = covariance.clone()
-        S.diagonal().add_(FLOOR**2)
+        S.diagonal().add_(MODEL_ERROR**2)
         L = torch.linalg.cholesky(S)
         self._y, self._W, half = (
             torch.linalg.solve_triangular(L, one, upper=False) for one in (y, X, covariance)
@@ -108,38 +108,38 @@ class ParameterEffects:
         self.tested = (first & self._observable).nonzero()[:, 0].tolist()
 
     def alike(self, number: int) -> tuple[int, ...]:
-        """Other parameters that have the very same effect as one."""
+        """Return the other parameters with the same effect as one."""
         return tuple(other for other in self._alike[number].nonzero()[:, 0].tolist() if other != number)
 
-    def shift(self, number: int, beside: Sequence[int]) -> tuple[float, float] | None:
-        """Estimate the shift [m or rad] of one parameter beside others, and its standard deviation.
+    def shift(self, number: int, given: Sequence[int]) -> tuple[float, float] | None:
+        """Estimate the shift of one parameter given others, and its standard deviation [m or rad].
 
         Returns:
-            None where it moves the tool as those do.
+            None where the parameter moves the tool as the others do.
         """
-        left, observable = self._left(beside)
+        left, observable = self._left(given)
         if not bool(observable[number]):
             return None
         size = float(left[:, number].norm())
         return float(left[:, number] @ self._y[:, 0]) / size**2, 1 / size
 
-    def scores(self, beside: Sequence[int]) -> Float64[Tensor, " parameters"]:
-        """Shift over its standard deviation of every tested parameter beside others; 0 of those not tested."""
-        left, observable = self._left(beside)
+    def scores(self, given: Sequence[int]) -> Float64[Tensor, " parameters"]:
+        """Compute shift over standard deviation of every tested parameter given others; 0 for those not tested."""
+        left, observable = self._left(given)
         tested = torch.zeros_like(observable)
         tested[self.tested] = True
         scores: Tensor = (left.t() @ self._y)[:, 0] / left.norm(dim=0).clamp(min=1e-300)
         scores[~(tested & observable)] = 0.0
         return scores
 
-    def remainder(self, beside: Sequence[int]) -> float:
-        """Probability of what is left of the displacement beside parameters, or of more, by chance.
+    def remainder(self, given: Sequence[int]) -> float:
+        """Compute the probability by chance of the displacement that the given parameters do not explain.
 
-        The sum of squares is compared with that of normal values of the covariance that the posteriors have, by
+        The sum of squares is compared with that of normal values with the covariance of the posteriors, by
         Satterthwaite's approximation (1946, Biometrics Bulletin 2(6), 110-114).
         """
-        square = float(self._without(self._y, beside).square().sum())
-        M = self._without(self._without(self._M, beside).t(), beside)
+        square = float(self._without(self._y, given).square().sum())
+        M = self._without(self._without(self._M, given).t(), given)
         mean, half_variance = float(M.trace()), float(M.square().sum())
         if half_variance == 0.0:
             return float(square <= len(self._y))
@@ -147,11 +147,11 @@ class ParameterEffects:
         return float(torch.special.gammaincc(of_both[0], of_both[1]))
 
     def differing(self, chosen: Sequence[int]) -> tuple[tuple[Difference, ...], tuple[Movement, ...]]:
-        """Estimate shifts of chosen parameters together with base and tool.
+        """Estimate the shifts of chosen parameters together with base and tool.
 
         Returns:
-            The shifts of the parameters, those of joints' zeros in the direction of the joint; and how far the second
-            model has base and tool elsewhere, in length and angle, nothing where frames are fixed.
+            The shifts of the parameters, those of joint zeros in the direction of the joint; and the distances and
+            angles by which base and tool of the second model differ, empty where frames are fixed.
         """
         inverse = torch.linalg.pinv(self._W[:, [*chosen, *self._free]])
         shift, covariance = (inverse @ self._y)[:, 0], inverse @ inverse.t()
@@ -163,7 +163,7 @@ class ParameterEffects:
         return differing, self._frames(shift[first:], covariance[first:, first:]) if self._free else ()
 
     def _difference(self, number: int, shift: float, deviation: float) -> Difference:
-        """A shift of a parameter with its name and unit."""
+        """Return a shift of a parameter with its name and unit."""
         unit, factor = SHOWN_UNITS[self._unit(number)]
         name = self._name(number)
         if self._is_zero(number):
@@ -179,7 +179,7 @@ class ParameterEffects:
         return f"{('base', 'tool')[what]} {FRAME_MOTIONS[motion]}"
 
     def _is_zero(self, number: int) -> bool:
-        """Whether a parameter is the zero of a joint: theta, or d of a joint that slides."""
+        """Return whether a parameter is a joint zero: theta, or d of a prismatic joint."""
         row, column = divmod(number, 5)
         if number >= self._arm or column > 1:
             return False
@@ -193,7 +193,7 @@ class ParameterEffects:
     def _frames(
         self, shift: Float64[Tensor, "12"], covariance: Float64[Tensor, "12 12"]
     ) -> tuple[Movement, ...]:
-        """How far the second model has base and tool elsewhere: the motion that was fitted, and the linear rest."""
+        """Return how far base and tool of both models differ: the fitted motion plus the linear estimate."""
         pair, (base, _) = self._pair, frames_of(self._pair.first, self._pair.owner[0])
         X, Y, origin = pair.T_base, pair.T_tool, base[:3, 3]
         moved = []
@@ -214,17 +214,17 @@ class ParameterEffects:
         return tuple(moved)
 
     def _left(
-        self, beside: Sequence[int]
+        self, given: Sequence[int]
     ) -> tuple[Float64[Tensor, "values parameters"], Bool[Tensor, " parameters"]]:
-        """What is left of all columns beside others and free frames, and of which enough is to be tested."""
-        left = self._without(self._W, beside)
-        return left, left.norm(dim=0) > SAME_MOTION * self._W.norm(dim=0)
+        """Project out given parameters and free frames; return columns and which of them are observable."""
+        left = self._without(self._W, given)
+        return left, left.norm(dim=0) > MIN_DISTINCT_SHARE * self._W.norm(dim=0)
 
     def _without(
-        self, columns: Float64[Tensor, "values columns"], beside: Sequence[int]
+        self, columns: Float64[Tensor, "values columns"], given: Sequence[int]
     ) -> Float64[Tensor, "values columns"]:
-        """What is left of columns beside those of parameters, and of base and tool where these are free."""
-        others = [*self._free, *beside]
+        """Project out the columns of given parameters, and of base and tool where these are free."""
+        others = [*self._free, *given]
         if not others:
             return columns
         Q = torch.linalg.qr(self._W[:, others])[0]
@@ -237,14 +237,14 @@ def _geometry(frames: Frames) -> list[Float64[np.ndarray, " 6"]]:
 
 
 def _corrected(model: CalibratedModel, q: Float64[Tensor, "poses dof"]) -> Float64[Tensor, "poses dof"]:
-    """Joint values that go through the geometry of a model."""
+    """Return corrected joint values, which enter the geometry of a model."""
     return q if model.hybrid is None else corrected_joints(model.hybrid, Measurements(q=q))
 
 
 def _spread(
     model: CalibratedModel, owner: tuple[str, str], frames: Frames, q: Float64[Tensor, "poses dof"]
 ) -> Float64[Tensor, "poses 6 directions"]:
-    """Root of the covariance of predicted poses, of a tool and in a frame that may have been moved."""
+    """Return the root of the covariance of predicted poses, for a tool and frame that may have been moved."""
     known = model.uncertainty
     if known is None:
         return torch.zeros((len(q), 6, 0), dtype=torch.float64)
@@ -263,7 +263,7 @@ def _spread(
 def _frame_columns(
     T: Float64[Tensor, "poses 4 4"], base: Float64[Tensor, "3"]
 ) -> Float64[Tensor, "poses 6 12"]:
-    """Derivatives of tool poses by shift and turn of the base, about its origin, and of the tool, along its axes."""
+    """Compute derivatives of tool poses by translation and rotation of the base, about its origin, and of the tool."""
     R, none = T[:, :3, :3], torch.zeros_like(T[:, :3, :3])
     eye = torch.eye(3, dtype=T.dtype).expand_as(R)
     shift = torch.cat([eye, -skew(T[:, :3, 3] - base), R, none], -1)

@@ -1,4 +1,4 @@
-"""What robots of one type have in common, by empirical Bayes, and how like the others of its fleet one robot is."""
+"""Fleet prior: distribution of the errors of robots of one type by empirical Bayes, and consistency with it."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -19,7 +19,11 @@ from pisigma.files.errors import FleetError
 from pisigma.joint_correction.feature import AbstractFeature
 from pisigma.joint_correction.joint_correction import JointCorrection
 from pisigma.lifetime.recalibration.adaptation import adapt
-from pisigma.lifetime.recalibration.recalibration_problem import ELSEWHERE, frame_keys, recalibration_problem
+from pisigma.lifetime.recalibration.recalibration_problem import (
+    RELOCATION_PRIOR,
+    frame_keys,
+    recalibration_problem,
+)
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel, Provenance
 from pisigma.model.geometric_model import branches_of
@@ -29,17 +33,18 @@ from pisigma.planning.robot_posterior import Instrument, RobotPosterior
 from pisigma.robot.description import Robot
 
 LINEARISATIONS = 2
+"""Linearisations at the mean robot."""
 
 
 @dataclass(frozen=True, eq=False)
 class FleetPrior:
-    """What a fleet has in common.
+    """Distribution of the errors of a fleet.
 
     Attributes:
-        model: the mean robot, as uncertain as another robot of the fleet.
-        population: the scatter between robots.
-        names: of the geometric parameters.
-        odd: numbers of the robots that are unlike the others and did not count.
+        model: mean robot, with the uncertainty of another robot of the fleet.
+        population: mean and covariance of the errors between robots.
+        names: names of the geometric parameters.
+        odd: indices of robots that are inconsistent with the others and did not count.
     """
 
     model: CalibratedModel
@@ -50,37 +55,36 @@ class FleetPrior:
 
 @dataclass(frozen=True, eq=False)
 class RobotEvidence(Information):
-    """What the rows of one robot say of the unknowns of its arm, base and tool integrated out.
+    """Information of the rows of one robot on the unknowns of its arm, with base and tool marginalised.
 
     Attributes:
-        noise: per sensor, see `Adaptation.noise`.
+        noise: noise of each sensor, see `Adaptation.noise`.
     """
 
     noise: Mapping[str, float]
 
 
 def fleet_prior(name: str, robot: Robot, fleet: Sequence[Measurements]) -> FleetPrior:
-    """Estimate what the robots of a fleet have in common.
+    """Estimate the distribution of the errors of a fleet.
 
-    Every robot has errors `u ~ N(μ, Σ)` and rows that are linear in them. The expectation-maximisation of Dempster,
-    Laird and Rubin 1977 (J. Royal Statistical Society B 39(1), 1-38) finds μ and Σ, so that each robot counts by what
-    its rows determine; the usual errors of the robot's class count a little, see
-    `pisigma.estimation.population.CLASS_ROBOTS`. Robots whose rows the
-    others make too improbable are left out, and the rest is estimated anew.
+    Every robot has errors `u ~ N(μ, Σ)` and rows that are linear in them. Expectation-maximisation (Dempster, Laird and
+    Rubin 1977, J. Royal Statistical Society B 39(1), 1-38) finds μ and Σ, so that each robot counts as far as its rows
+    determine its errors. The usual errors of the robot's class have a small weight, see
+    `pisigma.estimation.population.CLASS_ROBOTS`. Robots whose rows are too improbable given the others are left out,
+    and the others are estimated again.
 
     Args:
-        name: of the fleet.
-        robot: as drawn, the same for all.
+        name: name of the fleet.
+        robot: nominal robot, the same for all.
         fleet: rows of each robot.
 
     Raises:
         FleetError: there are too few robots.
-        IdentificationError: the rows of a robot do not determine where it stands.
+        IdentificationError: the rows of a robot do not determine its base and tool.
     """
     if len(fleet) < MIN_ROBOTS:
         raise FleetError(
-            f"{MIN_ROBOTS} robots or more of one type were wanted to estimate what they have in common, got "
-            f"{len(fleet)}."
+            expected=f"{MIN_ROBOTS} robots or more of one type", value=len(fleet), option="fleet"
         )
     posterior = RobotPosterior.of_robot(robot)
     space = posterior.uncertainty.space
@@ -98,7 +102,7 @@ def fleet_prior(name: str, robot: Robot, fleet: Sequence[Measurements]) -> Fleet
 
 
 def class_population(robot: Robot) -> Population:
-    """Give the robots of the class of a robot, see `pisigma.robot.robot_class`."""
+    """Return the distribution of errors of a robot's class, see `pisigma.robot.robot_class`."""
     uncertainty = RobotPosterior.of_robot(robot).uncertainty
     usual = of_arm(uncertainty.root, uncertainty.space).square().sum(1)
     return Population(torch.zeros_like(usual), usual.diag(), uncertainty.space.arm_size)
@@ -107,7 +111,7 @@ def class_population(robot: Robot) -> Population:
 def of_arm(
     root: Float64[Tensor, "unknowns directions"], space: ParameterSpace
 ) -> Float64[Tensor, "arm directions"]:
-    """Select the rows of geometric parameters and of weights, without those of base, tool and sensors."""
+    """Select the rows of the arm's parameters and weights, without those of base, tool and sensors."""
     return torch.cat([root[: space.arm_size], root[len(space.parameters) :]])
 
 
@@ -118,14 +122,14 @@ def mean_robot(
     fleet: Sequence[Measurements],
     noise: Mapping[str, float],
 ) -> CalibratedModel:
-    """Give the mean robot of a population, which is uncertain by the scatter between robots.
+    """Make the mean robot of a population, with the covariance between robots as its uncertainty.
 
     Args:
-        name: of the model.
-        posterior: of the robot as drawn, with the unknowns of the population.
+        name: name of the model.
+        posterior: prior of the nominal robot, with the unknowns of the population.
         population: errors of the robots.
-        fleet: rows of robots, which say where they were measured.
-        noise: per sensor, see `Adaptation.noise`.
+        fleet: rows of robots, by which the measured joint values are known.
+        noise: noise of each sensor, see `Adaptation.noise`.
     """
     usual, size = posterior.uncertainty, population.geometric
     space, drawn = usual.space, usual.space.robot
@@ -171,7 +175,7 @@ def mean_robot(
 def _correction(
     robot: Robot, features: tuple[AbstractFeature, ...], weights: Float64[Tensor, " weights"]
 ) -> JointCorrection:
-    """The joint correction with some weights, of the used columns of all features."""
+    """Make the joint correction with given weights of the used columns of all features."""
     correction, start = JointCorrection(robot, list(features), ()), 0
     with torch.no_grad():
         for parameter, feature in zip(correction.linear, features, strict=True):
@@ -186,7 +190,7 @@ def _correction(
 def evidence_of(
     model: CalibratedModel, mean: Float64[Tensor, " unknowns"], rows: Measurements
 ) -> RobotEvidence:
-    """Say what the rows of a robot say, linearised at its most probable errors; the mean is that of the model."""
+    """Compute the information of a robot's rows, linearised at its most probable errors."""
     posterior = ModelPosterior.of(model)
     rows = posterior.renamed(rows)
     problem = recalibration_problem(model, posterior, rows, frame_keys(rows, ("base", "tool")))
@@ -198,7 +202,7 @@ def evidence_of(
     others = X[:, space.arm_size : len(space.parameters)]
     kept = torch.cat([X[:, : space.arm_size], X[:, len(space.parameters) :]], 1)
     inner = others.t() @ others
-    inner.diagonal().add_(ELSEWHERE["m"] ** -2)
+    inner.diagonal().add_(RELOCATION_PRIOR["m"] ** -2)
     taken = torch.linalg.solve(inner, others.t() @ torch.cat([kept, y[:, None]], 1))
     normal = kept.t() @ kept - kept.t() @ others @ taken[:, :-1]
     descent = kept.t() @ y - kept.t() @ others @ taken[:, -1]
@@ -207,7 +211,7 @@ def evidence_of(
 
 
 def _medians(noises: Sequence[Mapping[str, float]]) -> dict[str, float]:
-    """Median noise per sensor."""
+    """Return the median noise of each sensor."""
     names = dict.fromkeys(name for noise in noises for name in noise)
     values = {name: sorted(noise[name] for noise in noises if name in noise) for name in names}
     return {name: those[len(those) // 2] for name, those in values.items()}
@@ -215,11 +219,11 @@ def _medians(noises: Sequence[Mapping[str, float]]) -> dict[str, float]:
 
 @dataclass(frozen=True)
 class FleetConsistency:
-    """How like the other robots of a fleet one is.
+    """Consistency of a robot with the others of its fleet.
 
     Attributes:
-        probability: that a robot of the fleet is as far from its mean, or farther.
-        gain: log evidence of its rows as those of a robot of the fleet, minus that as those of any of its class.
+        probability: probability that a robot of the fleet is as far from its mean, or farther.
+        gain: log evidence of its rows under the fleet prior, minus that under the prior of its class.
     """
 
     probability: float
@@ -227,14 +231,14 @@ class FleetConsistency:
 
     @staticmethod
     def of(model: CalibratedModel, rows: Measurements) -> "FleetConsistency":
-        """See how far the robot of some rows is from the mean of a fleet prior.
+        """Compare a robot with the mean of a fleet prior.
 
         Args:
-            model: of the prior.
-            rows: of the robot.
+            model: model of the prior.
+            rows: rows of the robot.
 
         Raises:
-            IdentificationError: the rows do not determine where the robot stands.
+            IdentificationError: the rows do not determine the robot's base and tool.
         """
         posterior = ModelPosterior.of(model)
         root = of_arm(posterior.root, posterior.space)
@@ -249,17 +253,17 @@ class FleetConsistency:
 
     @property
     def odd(self) -> bool:
-        """Whether the fleet says little of the robot: less than the usual errors of its class."""
+        """Whether the robot is inconsistent with the fleet, and its class explains the rows better."""
         return self.probability < FALSE_ALARM and self.gain < 0
 
     @property
     def sentence(self) -> str:
-        """The same in words."""
+        """The same as a sentence."""
         if self.odd:
             return (
-                f"This robot is unlike the fleet: fewer than 1 in {1 / FALSE_ALARM:,.0f} of its robots are as far from "
-                "the mean, and the usual errors of its class explain its rows better. The fleet does not count where "
-                "the rows are enough for a calibration of their own."
+                f"This robot is inconsistent with the fleet: fewer than 1 in {1 / FALSE_ALARM:,.0f} of its robots are as far "
+                "from the mean, and the usual errors of its class explain the rows better. The fleet prior is not used "
+                "if the rows suffice for a calibration without it."
             )
         share = f"{100 * self.probability:.0f} %" if self.probability >= 0.01 else "fewer than 1 %"
-        return f"This robot is like the fleet: {share} of its robots are as far from the mean, or farther."
+        return f"This robot is consistent with the fleet: {share} of its robots are as far from the mean, or farther."

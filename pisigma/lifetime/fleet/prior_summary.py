@@ -1,4 +1,4 @@
-"""The figures of a fleet prior as one typed value, which its card, tables and JSON render."""
+"""Typed figures of a fleet prior, which its card, tables and JSON render."""
 
 import math
 from collections.abc import Sequence
@@ -13,12 +13,12 @@ from pisigma.validation.held_out.summary import AbstractSummary
 
 
 class CommonFigures(Section):
-    """What the robots have in common of one parameter.
+    """Distribution of one parameter's error in the fleet.
 
     Attributes:
-        name: such as "theta_1".
+        name: name such as "theta_1".
         unit: "mm" or "deg".
-        mean: of the errors.
+        mean: mean error.
         deviation: standard deviation between robots.
     """
 
@@ -32,8 +32,8 @@ class SpectrumFigures(Section):
     """Standard deviation between robots of the weights of a feature.
 
     Attributes:
-        group: such as "harmonics 1 to 1".
-        deg: root mean square over the weights of the group [deg, or the same of lengths over the reach].
+        group: name such as "harmonics 1 to 1".
+        deg: root mean square over the weights of the group [deg; lengths are divided by the reach].
     """
 
     group: str
@@ -45,12 +45,12 @@ class FleetPriorSummary(AbstractSummary):
 
     Attributes:
         robots: number of robots that count.
-        odd: ids of those that are unlike the others and do not.
-        refused: by id why the file of a robot cannot be read, which does not count either.
-        remarks: on the rows of robots that count, a sentence each.
-        rows: of all robots.
-        parameters: what they have in common.
-        spectrum: of the joint correction.
+        odd: ids of robots that are inconsistent with the others and do not count.
+        refused: reasons by id of robots whose files cannot be read and that do not count.
+        remarks: remarks on the rows of robots that count, one sentence each.
+        rows: number of rows of all robots.
+        parameters: distributions of the geometric parameters.
+        spectrum: standard deviations of the joint correction's weights.
     """
 
     kinds = (FLEET_PRIOR,)
@@ -65,18 +65,18 @@ class FleetPriorSummary(AbstractSummary):
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """What to heed, a sentence each."""
-        odd = (f"Robot '{name}' is unlike the others and did not count." for name in self.odd)
+        """Warnings, one sentence each."""
+        odd = (f"Robot '{name}' is inconsistent with the others and did not count." for name in self.odd)
         refused = (f"Robot '{name}' did not count: {reason}" for name, reason in self.refused.items())
         return (*odd, *refused, *self.remarks)
 
 
 def summarise_prior(prior: FleetPrior, ids: Sequence[str]) -> FleetPriorSummary:
-    """Give all figures.
+    """Collect all figures of a fleet prior.
 
     Args:
-        prior: of the fleet.
-        ids: of its robots.
+        prior: the prior.
+        ids: ids of the robots.
     """
     population, uncertainty = prior.population, prior.model.uncertainty
     assert uncertainty is not None

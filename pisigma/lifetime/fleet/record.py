@@ -1,4 +1,4 @@
-"""What came of the robots of a fleet: one small file each, which a later call goes on from, and a table of all."""
+"""Results of the robots of a fleet: one small file each, from which a later call resumes, and a table of all."""
 
 import io
 import json
@@ -8,25 +8,27 @@ from pathlib import Path
 
 from pydantic import TypeAdapter, ValidationError
 
-from pisigma.files.errors import FleetError
+from pisigma.files.errors import FleetError, Place
 from pisigma.files.output_file import write_whole
 
 REFUSED = "refused"
-MARK = "fleet.json"
-"""In the folder of a fleet, with the ids of its robots, so that no other folder is written into."""
+"""Verdict on a session whose file cannot be used."""
+MARKER_FILE = "fleet.json"
+"""File in the folder of a fleet with the ids of its robots; folders without it are not written into."""
 RESULTS = "results.parquet"
+"""Name of the table of all results."""
 
 
 @dataclass(frozen=True)
 class ParameterValue:
-    """A geometric parameter that was estimated.
+    """An estimated geometric parameter.
 
     Attributes:
-        name: such as "theta_1".
-        unit: "mm" or "deg"; of the three figures.
-        value: as identified.
-        change: from its nominal value.
-        standard_error: of the estimate; None where there is none.
+        name: name such as "theta_1".
+        unit: "mm" or "deg", of the three figures.
+        value: identified value.
+        change: difference from the nominal value.
+        standard_error: standard error of the estimate; None where there is none.
     """
 
     name: str
@@ -38,24 +40,24 @@ class ParameterValue:
 
 @dataclass(frozen=True)
 class SessionRecord:
-    """What came of one session.
+    """Result of one session.
 
     Attributes:
-        session: its name.
-        date: as ISO 8601 writes it; "" where it is not known.
+        session: name of the session.
+        date: date (ISO 8601); "" where it is unknown.
         file: name of the file of measurements.
-        rows: that were measured and count; 0 where the file was refused.
-        verdict: "calibrated"; of a recalibration which model was kept ("old", "recalibrated" or "scratch"); of a
+        rows: number of rows that count; 0 where the file was refused.
+        verdict: "calibrated"; for a recalibration the model that was kept ("old", "recalibrated" or "scratch"); for a
             monitored session "unchanged", "moved" or "unclear"; or "refused".
-        sentence: the same in words; of a refused session the reason.
-        model: folder of the model, in the folder of the fleet; "" where none was written.
-        rms_mm: RMS error of the position [mm] of the rows that were calibrated with, or of those left out by a
-            recalibration, or of the monitored rows under the model.
-        held_out_rms_mm: of the cross-validation [mm]; None without one.
-        recalibrate: whether recalibrating pays.
-        moved: whether something has clearly moved since the session before.
-        parameters: that were estimated.
-        warnings: what to heed, a sentence each.
+        sentence: the verdict as a sentence; for a refused session the reason.
+        model: folder of the model, relative to the folder of the fleet; "" where none was written.
+        rms_mm: RMS position error [mm] of the rows that were calibrated with, of the rows held out by a recalibration,
+            or of the monitored rows under the model.
+        held_out_rms_mm: RMS position error of the cross-validation [mm]; None without one.
+        recalibrate: whether a recalibration is recommended.
+        moved: whether a movement since the session before is significant.
+        parameters: estimated parameters.
+        warnings: warnings, one sentence each.
     """
 
     session: str
@@ -74,23 +76,23 @@ class SessionRecord:
 
     @property
     def refused(self) -> bool:
-        """Whether nothing came of it."""
+        """Whether the file of the session was refused."""
         return self.verdict == REFUSED
 
     @property
     def error_mm(self) -> float | None:
-        """RMS error of the position [mm], of the cross-validation where there was one."""
+        """RMS position error [mm], of the cross-validation where there was one."""
         return self.rms_mm if self.held_out_rms_mm is None else self.held_out_rms_mm
 
 
 @dataclass(frozen=True)
 class RobotRecord:
-    """What came of a robot.
+    """Results of a robot.
 
     Attributes:
-        robot: its id.
-        key: SHA-256 of all that it was worked out from; another one is worked out anew.
-        sessions: by date, up to one that was refused.
+        robot: id of the robot.
+        key: SHA-256 of all inputs; a robot with another key is processed again.
+        sessions: results sorted by date, up to one that was refused.
     """
 
     robot: str
@@ -107,12 +109,12 @@ _RECORD = TypeAdapter(RobotRecord)
 
 
 def record_path(out: Path, robot: str) -> Path:
-    """Where the record of a robot is kept."""
+    """Return the path of the record of a robot."""
     return out / "records" / f"{robot}.json"
 
 
 def write_record(out: Path, record: RobotRecord) -> None:
-    """Write a record whole or not at all.
+    """Write a record atomically.
 
     Raises:
         OutputError: it cannot be written.
@@ -123,7 +125,7 @@ def write_record(out: Path, record: RobotRecord) -> None:
 
 
 def read_record(path: Path) -> RobotRecord | None:
-    """Read a record; None where there is none that can be read, so that the robot is worked out anew."""
+    """Read a record; None where it is missing or unreadable, so that the robot is processed again."""
     try:
         return _RECORD.validate_json(path.read_bytes()) if path.is_file() else None
     except (OSError, ValidationError):
@@ -131,34 +133,35 @@ def read_record(path: Path) -> RobotRecord | None:
 
 
 def expect_robots(out: Path, robots: Collection[str]) -> None:
-    """Note in the folder of a fleet which robots it has, beside those that earlier calls noted.
+    """Add robots to the list in the folder of a fleet.
 
     Raises:
         OutputError: it cannot be written.
     """
-    before = expected_robots(out) if (out / MARK).is_file() else ()
+    before = expected_robots(out) if (out / MARKER_FILE).is_file() else ()
     everyone = sorted({*before, *robots})
-    write_whole(out / MARK, json.dumps({"format": 1, "robots": everyone}, indent=1) + "\n")
+    write_whole(out / MARKER_FILE, json.dumps({"format": 1, "robots": everyone}, indent=1) + "\n")
 
 
 def expected_robots(out: Path) -> tuple[str, ...]:
-    """Read which robots a fleet has, by their ids.
+    """Read the ids of the robots of a fleet.
 
     Raises:
-        FleetError: the folder is not that of a fleet.
+        FleetError: the folder is not the folder of a fleet.
     """
     try:
-        content = json.loads((out / MARK).read_text(encoding="utf-8"))
+        content = json.loads((out / MARKER_FILE).read_text(encoding="utf-8"))
         return tuple(str(robot) for robot in content["robots"])
     except (OSError, ValueError, KeyError, TypeError):
-        raise FleetError(f"{out}: is not the folder of a fleet; make one with `pisigma fleet run`.") from None
+        problem, remedy = "not the folder of a fleet", "make one with `pisigma fleet run`"
+        raise FleetError(problem, at=Place(out), remedy=remedy) from None
 
 
 def read_records(out: Path) -> tuple[RobotRecord, ...]:
-    """Read the records of all robots that have one, by their ids.
+    """Read the records of all robots that have one, sorted by id.
 
     Raises:
-        FleetError: the folder is not that of a fleet.
+        FleetError: the folder is not the folder of a fleet.
     """
     expected_robots(out)
     found = (read_record(path) for path in sorted((out / "records").glob("*.json")))
@@ -166,10 +169,10 @@ def read_records(out: Path) -> tuple[RobotRecord, ...]:
 
 
 def write_results(path: Path, records: Sequence[RobotRecord]) -> None:
-    """Write one row per robot and session, ordered by both; parameters and warnings are lists in their columns.
+    """Write one row per robot and session, sorted by both; parameters and warnings are list columns.
 
     Raises:
-        OutputError: it cannot be written; what was there stays.
+        OutputError: the file cannot be written; an existing one is kept.
         ImportError: pyarrow is not installed.
     """
     import pyarrow

@@ -1,4 +1,4 @@
-"""How a fleet stands: which robots err most, drift, were not measured for long, were refused or are missing."""
+"""Status of a fleet: robots that have the largest errors, drift, are overdue, were refused or are missing."""
 
 import datetime
 from collections.abc import Sequence
@@ -11,15 +11,15 @@ from pisigma.measurement.dates import WANTED, is_date
 
 @dataclass(frozen=True)
 class RobotStatus:
-    """How a robot stands.
+    """Status of a robot.
 
     Attributes:
-        robot: its id.
-        last: its last session that was not refused; None where there is none.
-        refused: its session that was refused; None where none was.
-        days: since its last session [days]; None where that has no date.
+        robot: id of the robot.
+        last: last session that was not refused; None where there is none.
+        refused: session that was refused; None where none was.
+        days: days since the last session; None where that has no date.
         overdue: whether that is too long.
-        compared: whether its last session was compared with one before it, or there is none before.
+        compared: whether the last session was compared with an earlier one, or there is no earlier one.
     """
 
     robot: str
@@ -31,13 +31,13 @@ class RobotStatus:
 
     @property
     def drifting(self) -> bool:
-        """Whether something has moved since the session before, or recalibrating pays."""
+        """Whether something moved since the session before, or a recalibration is recommended."""
         last = self.last
         return last is not None and (last.recalibrate or last.moved or last.verdict in ("moved", "unclear"))
 
     @property
     def state(self) -> str:
-        """The first that holds of: refused, missing (not worked out yet), drifting, overdue, fine."""
+        """The first that applies of: refused, missing (not processed yet), drifting, overdue, fine."""
         if self.refused is not None:
             return "refused"
         if self.last is None:
@@ -47,13 +47,13 @@ class RobotStatus:
 
 @dataclass(frozen=True)
 class FleetStatus:
-    """How a fleet stands.
+    """Status of a fleet.
 
     Attributes:
-        robots: by their ids.
-        today: day that it is seen from.
+        robots: status of each robot, sorted by id.
+        today: date of the status.
         overdue_days: days without a session after which a robot is overdue.
-        warnings: sessions with dates that cannot be, which are not counted from.
+        warnings: warnings on sessions with impossible dates, which are ignored.
     """
 
     robots: tuple[RobotStatus, ...]
@@ -65,13 +65,13 @@ class FleetStatus:
     def of(
         records: Sequence[RobotRecord], today: datetime.date, overdue_days: int, expected: Sequence[str] = ()
     ) -> "FleetStatus":
-        """See a fleet from a day.
+        """Compute the status of a fleet.
 
         Args:
-            records: of its robots.
-            today: the day.
+            records: records of the robots.
+            today: date of the status.
             overdue_days: days without a session after which a robot is overdue.
-            expected: ids of its robots; those without a record are missing.
+            expected: ids of all robots; those without a record are missing.
         """
         robots = [_status(one, today, overdue_days) for one in records]
         missing = set(expected) - {one.robot for one in records}
@@ -87,7 +87,7 @@ class FleetStatus:
 
     @property
     def worst_first(self) -> tuple[RobotStatus, ...]:
-        """The robots with an error, the largest first."""
+        """Robots with known errors, the largest first."""
         judged = [one for one in self.robots if one.last is not None and one.last.error_mm is not None]
         return tuple(sorted(judged, key=lambda one: -_rms(one)))
 
@@ -97,7 +97,7 @@ class FleetStatus:
         return any(one.state in ("refused", "missing", "drifting") for one in self.robots)
 
     def in_state(self, state: str) -> tuple[RobotStatus, ...]:
-        """The robots of a state."""
+        """Return the robots in a state."""
         return tuple(one for one in self.robots if one.state == state)
 
     def to_json(self) -> dict[str, Any]:
@@ -125,7 +125,7 @@ def _rms(one: RobotStatus) -> float:
 
 
 def _status(record: RobotRecord, today: datetime.date, overdue_days: int) -> RobotStatus:
-    """How one robot stands."""
+    """Compute the status of one robot."""
     done = [one for one in record.sessions if not one.refused]
     last = done[-1] if done else None
     date = last.date if last is not None and is_date(last.date) else None

@@ -1,4 +1,4 @@
-"""Changes of a value over sessions: jumps that stay, single sessions that are off, and a steady drift besides."""
+"""Changes of a value over sessions: lasting jumps, single outlying sessions, and a steady drift."""
 
 import math
 from dataclasses import dataclass
@@ -8,37 +8,37 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
-SPARE = 2
-"""Values beyond what is fitted to them."""
-MOST_EVENTS = 8
-"""A value that changes more often drifts."""
-ROUNDS = 5
-"""Of exchanging events for others, at most."""
-LEAST = 1e-9
+MIN_DEGREES_OF_FREEDOM = 2
+"""Values in excess of the fitted coefficients."""
+MAX_EVENTS = 8
+"""Changes of a value above which it is described by a drift."""
+MAX_EXCHANGES = 5
+"""Passes of exchanging events for better ones."""
+MIN_SQUARE = 1e-9
 """Squared length of a column below which it is a combination of others."""
 
 
 @dataclass(frozen=True)
 class Event:
-    """A change at one of the values.
+    """A change in a series of values.
 
     Attributes:
-        number: of the first value after it.
-        alone: whether that value alone is off; else all later ones are, too.
+        number: index of the first value after the change.
+        alone: whether that value alone is changed, rather than all later ones as well.
     """
 
     number: int
     alone: bool
 
     def column(self, count: int) -> Float64[Tensor, " count"]:
-        """1 where the values are others, of so many."""
+        """Return the column of the event: 1 for changed values, 0 for the others."""
         order = torch.arange(count)
         return (order == self.number if self.alone else order >= self.number).double()
 
 
 @dataclass(frozen=True, eq=False)
 class Series:
-    """Values with their covariance, fitted by generalised least squares."""
+    """A series of values with their covariance, fitted by generalised least squares."""
 
     values: Float64[Tensor, " values"]
     covariance: Float64[Tensor, "values values"]
@@ -49,12 +49,12 @@ class Series:
         return root
 
     def whitened(self, columns: Float64[Tensor, "values columns"]) -> Float64[Tensor, "values columns"]:
-        """Columns over the standard deviations of the values."""
+        """Whiten columns by the covariance of the values."""
         result: Tensor = torch.linalg.solve_triangular(self._root, columns, upper=False)
         return result
 
     def fit(self, columns: Float64[Tensor, "values columns"]) -> tuple[list[float], list[float]]:
-        """Coefficients of columns, and their standard deviations."""
+        """Fit the coefficients of columns; return them and their standard deviations."""
         y, A = self.whitened(self.values[:, None]), self.whitened(columns)
         of_coefficients = torch.linalg.inv(A.t() @ A)
         return (of_coefficients @ A.t() @ y)[:, 0].tolist(), of_coefficients.diagonal().sqrt().tolist()
@@ -62,18 +62,18 @@ class Series:
     def with_events(
         self, columns: Float64[Tensor, "values columns"], events: tuple[Event, ...]
     ) -> Float64[Tensor, "values more"]:
-        """Columns and those of events."""
+        """Append the columns of events."""
         return torch.cat([columns, *(one.column(len(self.values))[:, None] for one in events)], 1)
 
     def events(self, steady: Tensor, drift: Tensor) -> tuple[tuple[Event, ...], bool]:
-        """Find the jumps, and whether there is a drift beside them.
+        """Find the events, and whether there is a drift in addition.
 
-        Both with and without a drift events are added one by one, each that explains most, while it explains more than
-        one that is chosen among so many does by chance. Compared are twice the logarithms of the likelihood with the
-        penalties of the Bayesian information criterion (Schwarz 1978, Annals of Statistics 6, 461-464).
+        Both with and without a drift, events are added one by one, each time the one that explains most, as long as it
+        explains more than the best of as many candidates would by chance. The two fits are compared by the Bayesian
+        information criterion (Schwarz 1978, Annals of Statistics 6, 461-464).
 
         Args:
-            steady: columns that are there in any case.
+            steady: columns of every fit.
             drift: columns of a drift.
         """
         still, left = self._added(steady)
@@ -82,10 +82,10 @@ class Series:
         return (beside, True) if drifts else (still, False)
 
     def _added(self, columns: Tensor) -> tuple[tuple[Event, ...], float]:
-        """Events beside some columns, and what they leave with their penalty."""
+        """Add events to columns; return them, and the remaining square sum plus penalty."""
         count, chosen = len(self.values), tuple[Event, ...]()
         penalty = 2 * math.log(max(len(self._tried), 1)) + math.log(count)
-        while columns.shape[1] + len(chosen) + SPARE < count and len(chosen) < MOST_EVENTS:
+        while columns.shape[1] + len(chosen) + MIN_DEGREES_OF_FREEDOM < count and len(chosen) < MAX_EVENTS:
             best, gain = self._best(columns, chosen)
             if not gain > penalty:
                 break
@@ -94,8 +94,8 @@ class Series:
         return chosen, float(left.square().sum()) + penalty * len(chosen)
 
     def _exchanged(self, columns: Tensor, chosen: tuple[Event, ...]) -> tuple[Event, ...]:
-        """Events of which none explains more where another one takes its place beside the others."""
-        for _ in range(ROUNDS):
+        """Exchange events for better ones, given the others, until none improves."""
+        for _ in range(MAX_EXCHANGES):
             before = chosen
             for number in range(len(chosen)):
                 others = chosen[:number] + chosen[number + 1 :]
@@ -105,24 +105,26 @@ class Series:
         return chosen
 
     def _best(self, columns: Tensor, chosen: tuple[Event, ...]) -> tuple[Event, float]:
-        """The event that explains most beside others, and what squares it takes away."""
+        """Return the event that explains most given others, and by how much it lowers the square sum."""
         left, Q = self._left(columns, chosen)
         tried = self.whitened(torch.stack([one.column(len(self.values)) for one in self._tried], 1))
         tried = tried - Q @ (Q.t() @ tried)
         square = tried.square().sum(0)
-        gain = torch.where(square > LEAST, (tried.t() @ left).square() / square.clamp(min=LEAST), 0.0)
+        gain = torch.where(
+            square > MIN_SQUARE, (tried.t() @ left).square() / square.clamp(min=MIN_SQUARE), 0.0
+        )
         number = int(gain.argmax())
         return self._tried[number], float(gain[number])
 
     def _left(self, columns: Tensor, events: tuple[Event, ...]) -> tuple[Tensor, Tensor]:
-        """What is left of the values, over their standard deviations, and axes of what was fitted."""
+        """Return the whitened residuals of the values, and an orthonormal basis of the fitted columns."""
         y, A = self.whitened(self.values[:, None])[:, 0], self.whitened(self.with_events(columns, events))
         Q = torch.linalg.qr(A)[0]
         return y - Q @ (Q.t() @ y), Q
 
     @cached_property
     def _tried(self) -> tuple[Event, ...]:
-        """A jump before every value but the first, and every value alone but the first and the last."""
+        """Candidate events: a jump before every value but the first, every value alone but the first and the last."""
         count = len(self.values)
         return (
             *(Event(number, False) for number in range(1, count)),

@@ -1,4 +1,4 @@
-"""Control charts over sessions: EWMA and CUSUM of what should not change, with a stated rate of false alarms."""
+"""Control charts over sessions: EWMA and CUSUM with a stated rate of false alarms."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -13,14 +13,17 @@ from torch import Tensor
 from pisigma.measurement.sensors.sensor import ShownUnit
 
 FALSE_ALARMS_PER_YEAR = 0.05
-"""Of all charts of a robot together, where nothing changes."""
+"""False alarms of all charts of a robot together, where nothing changes."""
 SESSIONS_PER_YEAR = 12
+"""Sessions by which a rate per year is converted to one per session."""
 WEIGHT = 0.2
-"""Of the newest session in the moving average."""
+"""Weight of the newest session in the moving average."""
 ALLOWANCE = 0.5
-"""[standard deviations of a session] Shifts of half of it do not add to the cumulative sum."""
+"""[standard deviations of a score] Part of a score that does not add to the cumulative sums."""
 STATES = 101
+"""States of the Markov chain by which the limit of the EWMA is computed."""
 OVERSHOOT = 1.166
+"""Mean overshoot of a cumulative sum over its limit for normal scores, on both sides (Siegmund 1985)."""
 
 AlarmKind = Literal["EWMA", "CUSUM"]
 
@@ -30,8 +33,8 @@ class Limits:
     """Limits of the statistics of a chart [standard deviations].
 
     Attributes:
-        ewma: of the exponentially weighted moving average.
-        cusum: of the cumulative sums.
+        ewma: limit of the exponentially weighted moving average.
+        cusum: limit of the cumulative sums.
     """
 
     ewma: float
@@ -40,16 +43,16 @@ class Limits:
 
 @dataclass(frozen=True, eq=False)
 class Chart:
-    """One quantity over sessions, each compared with what the earlier ones and the model let expect.
+    """Control chart of one quantity, each session compared with its prediction from the earlier ones and the model.
 
     Attributes:
-        what: is charted, such as "joint 2" or "error".
-        unit: of the values.
-        values: per session; NaN where it says nothing of the quantity.
-        deviations: their standard deviations where nothing changes.
-        scores: of the sessions, independent and of standard deviation 1 where nothing changes.
-        limits: of EWMA and CUSUM.
-        one_sided: whether only a rise counts.
+        what: charted quantity, such as "joint 2" or "error".
+        unit: unit of the values.
+        values: value in each session; NaN where the session does not determine it.
+        deviations: standard deviations of the values where nothing changes.
+        scores: scores of the sessions, independent and of standard deviation 1 where nothing changes.
+        limits: limits of EWMA and CUSUM.
+        one_sided: whether only an increase counts.
     """
 
     what: str
@@ -62,7 +65,7 @@ class Chart:
 
     @cached_property
     def ewma(self) -> Float64[Tensor, " sessions"]:
-        """Moving average of the scores [standard deviations of a score]; Roberts 1959, Technometrics 1(3)."""
+        """Exponentially weighted moving average of the scores; Roberts 1959, Technometrics 1(3)."""
         average, averages = 0.0, []
         for score in self.scores.tolist():
             average = average if math.isnan(score) else (1 - WEIGHT) * average + WEIGHT * score
@@ -71,7 +74,7 @@ class Chart:
 
     @cached_property
     def cusum(self) -> Float64[Tensor, "sessions 2"]:
-        """Cumulative sums of rises and of falls; Page 1954, Biometrika 41."""
+        """Cumulative sums of increases and of decreases; Page 1954, Biometrika 41."""
         rise = fall = 0.0
         sums = []
         for score in self.scores.tolist():
@@ -82,22 +85,22 @@ class Chart:
 
     @property
     def ewma_share(self) -> Float64[Tensor, " sessions"]:
-        """Moving average over its limit; more than 1 is an alarm."""
+        """Moving average over its limit; above 1 it is an alarm."""
         return (self.ewma if self.one_sided else self.ewma.abs()) / self.limits.ewma
 
     @property
     def cusum_share(self) -> Float64[Tensor, " sessions"]:
-        """The larger cumulative sum over its limit; more than 1 is an alarm."""
+        """Larger cumulative sum over its limit; above 1 it is an alarm."""
         return (self.cusum[:, 0] if self.one_sided else self.cusum.amax(1)) / self.limits.cusum
 
     @cached_property
     def outside(self) -> dict[AlarmKind, Bool[Tensor, " sessions"]]:
-        """By statistic, the sessions at which it is outside its limit."""
+        """Sessions at which each statistic is outside its limit."""
         return {"EWMA": self.ewma_share > 1, "CUSUM": self.cusum_share > 1}
 
     @property
     def alarm(self) -> int | None:
-        """Number of the session from which on a statistic has been outside its limit until now; None if neither is."""
+        """Index of the first session since which a statistic has been outside its limit; None where neither is."""
         outside = torch.stack(list(self.outside.values())).any(0)
         if not len(outside) or not bool(outside[-1]):
             return None
@@ -106,11 +109,11 @@ class Chart:
 
     @property
     def kinds(self) -> tuple[AlarmKind, ...]:
-        """Which statistics are outside their limits at the last session."""
+        """Statistics that are outside their limits at the last session."""
         return tuple(kind for kind, outside in self.outside.items() if len(outside) and bool(outside[-1]))
 
     def to_json(self, dates: Sequence[str]) -> dict[str, Any]:
-        """The chart of sessions of these dates as plain values; what is no number is None."""
+        """Return the chart as plain values, NaN as None; `dates` are those of the sessions."""
         values = {
             f"values_{self.unit}": self.values,
             f"deviations_{self.unit}": self.deviations,
@@ -129,10 +132,10 @@ class Chart:
 def innovations(
     values: Float64[Tensor, " sessions"], covariance: Float64[Tensor, "sessions sessions"]
 ) -> Float64[Tensor, " sessions"]:
-    """Independent scores of values that err together, such as by the same error of the model.
+    """Compute independent scores of correlated values, such as those with the same error of the model.
 
-    With the covariance `L L^T` the scores are `L^-1 values`: every value minus what the earlier ones let expect, over
-    the standard deviation of that. NaN stays NaN.
+    With the covariance `L L^T` the scores are `L^-1 values`: every value minus its prediction from the earlier ones,
+    over the standard deviation of the difference. NaN stays NaN.
     """
     scores = torch.full_like(values, torch.nan)
     there = torch.isfinite(values).nonzero()[:, 0]
@@ -143,14 +146,14 @@ def innovations(
 
 @cache
 def limits_of(charts: int, one_sided: bool = False) -> Limits:
-    """Limits with which all charts of a robot give `FALSE_ALARMS_PER_YEAR` together.
+    """Compute the limits with which all charts of a robot together have `FALSE_ALARMS_PER_YEAR`.
 
     The mean number of sessions to a false alarm is that of Brook and Evans 1972 (Biometrika 59(3)) for the moving
-    average, as a chain of states, and Siegmund's 1985 (Sequential Analysis, eq. 2.57) for the sums.
+    average, as a Markov chain, and of Siegmund 1985 (Sequential Analysis, eq. 2.57) for the sums.
 
     Args:
-        charts: how many there are, each with both statistics.
-        one_sided: whether only a rise counts.
+        charts: number of charts, each with both statistics.
+        one_sided: whether only an increase counts.
     """
     sessions = 2 * charts * SESSIONS_PER_YEAR / FALSE_ALARMS_PER_YEAR
     sides = 1 if one_sided else 2
@@ -161,26 +164,26 @@ def limits_of(charts: int, one_sided: bool = False) -> Limits:
 
 
 def ewma_sessions(limit: float, one_sided: bool) -> float:
-    """Mean number of sessions until the moving average passes a limit, or either limit."""
+    """Compute the mean number of sessions until the moving average passes its limit (one-sided) or either limit."""
     low = -4.0 * math.sqrt(WEIGHT / (2 - WEIGHT)) if one_sided else -limit
     edges = torch.linspace(low, limit, STATES + 1, dtype=torch.float64)
     middle = (edges[1:] + edges[:-1]) / 2
     until = torch.special.ndtr((edges - (1 - WEIGHT) * middle[:, None]) / WEIGHT)
     moves = until.diff(dim=1)
-    if one_sided:  # what falls lower stays in the lowest state
+    if one_sided:  # lower values stay in the lowest state
         moves[:, 0] += until[:, 0]
     mean = torch.linalg.solve(torch.eye(STATES, dtype=torch.float64) - moves, torch.ones_like(middle))
     return float(mean[int(middle.abs().argmin())])
 
 
 def cusum_sessions(limit: float) -> float:
-    """Mean number of sessions until a cumulative sum passes its limit."""
+    """Compute the mean number of sessions until a cumulative sum passes its limit."""
     b = 2 * ALLOWANCE * (limit + OVERSHOOT)
     return (math.exp(b) - b - 1) / (2 * ALLOWANCE**2)
 
 
 def _solved(sessions_of: Callable[[float], float], wanted: float, low: float, high: float) -> float:
-    """The limit with a wanted mean number of sessions, by bisection."""
+    """Find the limit with a given mean number of sessions by bisection."""
     for _ in range(40):
         middle = (low + high) / 2
         low, high = (middle, high) if sessions_of(middle) < wanted else (low, middle)

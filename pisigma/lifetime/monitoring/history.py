@@ -1,4 +1,4 @@
-"""What a model's sessions were judged to be, in a small SQLite file beside the model folder."""
+"""History of the sessions of a model, in a SQLite file next to the model folder."""
 
 import io
 import os
@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from pydantic import TypeAdapter, ValidationError
 
-from pisigma.files.errors import OutputError
+from pisigma.files.errors import OutputError, Place
 from pisigma.lifetime.monitoring.session import JointZeros, Session
 from pisigma.measurement.copies import RowValues, copies_of_known
 from pisigma.measurement.dataset import Measurements
@@ -21,8 +21,8 @@ from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.training_rows import again_warnings
 
 SUFFIX = ".history.sqlite"
-LONGEST_WAIT = 10.0
-"""[s] For another process that writes."""
+MAX_WAIT = 10.0
+"""[s] Time to wait for another process that writes."""
 _TABLE = """CREATE TABLE IF NOT EXISTS sessions (
     model TEXT NOT NULL, rows TEXT NOT NULL, file TEXT NOT NULL, date TEXT NOT NULL, temperature_c REAL,
     session TEXT NOT NULL, zeros BLOB NOT NULL, PRIMARY KEY (model, rows))"""
@@ -32,17 +32,17 @@ _VALUES = ("numbers", "steps", "kind", "file")
 
 @dataclass(frozen=True, eq=False)
 class Record:
-    """A session with its day.
+    """A session with its date.
 
     Attributes:
-        file: that the rows came from.
-        date: of the measurement, as ISO 8601 writes it.
-        rows_sha256: of the rows.
-        temperature_c: mean of the rows [deg C]; None where they do not state it.
-        session: what it says.
-        zeros: of the joints.
-        values: joint values and readings of its rows, by which they are recognised when they come again; None in
-            histories of earlier versions.
+        file: file of the rows.
+        date: date of the measurement (ISO 8601).
+        rows_sha256: SHA-256 of the rows.
+        temperature_c: mean temperature of the rows [°C]; None where they do not state it.
+        session: result of the session.
+        zeros: zeros of the joints.
+        values: joint values and readings of the rows, by which repeated rows are recognised; None in histories of
+            earlier versions.
     """
 
     file: str
@@ -54,7 +54,7 @@ class Record:
     values: RowValues | None = None
 
     def to_json(self) -> dict[str, Any]:
-        """The session as plain values, in mm."""
+        """Return the session as plain values, lengths in mm."""
         session = self.session
         return {
             "file": self.file,
@@ -74,27 +74,27 @@ class Record:
 
 
 def history_path(model: str | os.PathLike[str]) -> Path:
-    """Where the history of a model folder is kept: `MODEL.history.sqlite` beside it."""
+    """Return the path of the history of a model folder: `MODEL.history.sqlite` next to it."""
     folder = Path(os.path.realpath(model))
     return folder.with_name(folder.name + SUFFIX)
 
 
 def store_sessions(path: Path, model: str, records: Sequence[Record]) -> tuple[Record, ...]:
-    """Add sessions to a history and give all of it.
+    """Store sessions in a history and return all sessions of the model.
 
-    All are added in one transaction, or none where the process ends before. A session with the same rows takes the
-    place of the one that is there.
+    All are stored in one transaction, or none if the process ends before. A session with the same rows replaces the
+    stored one.
 
     Args:
-        path: of the history; made where missing.
-        model: hash of the model, whose sessions alone are given back.
-        records: to add.
+        path: path of the history; created where missing.
+        model: hash of the model.
+        records: sessions to store.
 
     Returns:
-        All sessions of the model, by their dates.
+        All sessions of the model, sorted by date.
 
     Raises:
-        OutputError: the file is no history or cannot be written.
+        OutputError: the file is not a history or cannot be written.
     """
     with _opened(path) as database:
         with database:  # one transaction
@@ -113,10 +113,10 @@ def store_sessions(path: Path, model: str, records: Sequence[Record]) -> tuple[R
 
 
 def read_sessions(path: Path, model: str) -> tuple[Record, ...]:
-    """Give all sessions of a model in a history, which may not be there yet, by their dates.
+    """Read all sessions of a model, sorted by date; empty where there is no history yet.
 
     Raises:
-        OutputError: the file is no history.
+        OutputError: the file is not a history.
     """
     if not path.exists():
         return ()
@@ -138,19 +138,20 @@ def _records(database: sqlite3.Connection, model: str) -> tuple[Record, ...]:
 
 
 def in_order(records: Sequence[Record]) -> tuple[Record, ...]:
-    """Sessions by their dates; of one day by their files."""
+    """Sort sessions by date, and by file within a day."""
     return tuple(sorted(records, key=lambda one: (one.date, one.file, one.rows_sha256)))
 
 
 @contextmanager
 def _opened(path: Path) -> Iterator[sqlite3.Connection]:
     try:
-        with closing(sqlite3.connect(path, timeout=LONGEST_WAIT)) as database:
+        with closing(sqlite3.connect(path, timeout=MAX_WAIT)) as database:
             yield database
     except (sqlite3.Error, ValidationError, ValueError, KeyError) as problem:
         raise OutputError(
-            f"{path}: the history of the model cannot be used ({problem}); move the file away to begin a new one, or "
-            "monitor without a history (--no-history)."
+            f"the history of the model cannot be used: {problem}",
+            at=Place(path),
+            remedy="move the file away to start a new one, or monitor without a history (--no-history)",
         ) from None
 
 
@@ -184,23 +185,26 @@ def new_rows(
     earlier: Sequence[Record],
     judged: Sequence[Record],
 ) -> tuple[Measurements, tuple[str, ...]]:
-    """Leave out rows that the model was made of, and those of other sessions; says which.
+    """Leave out rows that the model was calibrated with, and rows of other sessions.
 
     Args:
         model: the model.
-        rows: of a session.
-        date: of it.
+        rows: rows of a session.
+        date: date of the session.
         earlier: sessions of the history; one with exactly these rows is replaced, see `store_sessions`.
         judged: sessions of this call.
+
+    Returns:
+        The other rows, and a warning for each set of rows that was left out.
     """
     sha256 = rows_hash(rows)
     warnings = [
-        f"{Path(rows.source).name} of {date} has the rows of {one.file} of {one.date}, and takes its place."
+        f"{Path(rows.source).name} of {date} has the same rows as {one.file} of {one.date}, and replaces it."
         for one in earlier
         if one.rows_sha256 == sha256 and one.date != date
     ]
     others = [*(one for one in earlier if one.rows_sha256 != sha256), *judged]
-    those = [(model.made_of, f"those that {model.name} was made of")]
+    those = [(model.made_of, f"those that {model.name} was calibrated with")]
     those += [(one.values, f"those of {one.file} of {one.date}") for one in others]
     for values, of in those:
         if values is not None and rows.rows:
@@ -211,5 +215,5 @@ def new_rows(
 
 
 def rows_hash(rows: Measurements) -> str:
-    """Hash of rows, whatever their date."""
+    """Compute the hash of rows without their dates."""
     return replace(rows, date=None).content_hash()

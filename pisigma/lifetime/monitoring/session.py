@@ -1,4 +1,4 @@
-"""One session of measurements against a model: unchanged, or what moved, and whether recalibrating pays."""
+"""Comparison of one session of measurements with a model: what moved, if anything, and whether to recalibrate."""
 
 import math
 from collections.abc import Mapping, Set
@@ -24,7 +24,7 @@ from pisigma.lifetime.recalibration.recalibration_problem import (
     hypotheses,
     recalibration_problem,
 )
-from pisigma.lifetime.recalibration.relocated_frames import FAR
+from pisigma.lifetime.recalibration.relocated_frames import MIN_MOVE
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.groups import held_out_groups
 from pisigma.model.calibrated_model import CalibratedModel
@@ -32,30 +32,30 @@ from pisigma.model.model_posterior import ModelPosterior
 from pisigma.validation.held_out.calibration_validation import errors_under
 
 Verdict = Literal["unchanged", "moved", "unclear"]
-ANYWHERE = 0.02
-"""[rad, or of the reach] Prior standard deviation of a joint's zero that is estimated for the chart: about 1 deg."""
+ZERO_PRIOR = 0.02
+"""[rad, or share of the reach] Prior standard deviation of joint zeros that are estimated for charts, about 1 deg."""
 UNOBSERVABLE = 0.005
-"""[rad, or of the reach] A zero that is known no better after a session is called unobservable: about 0.3 deg."""
-PAYS = 1.05
-"""Recalibrating pays where it is expected to make errors smaller by this factor or more."""
-USUAL = 2.0
+"""[rad, or share of the reach] Posterior standard deviation above which a joint zero is unobservable, about 0.3 deg."""
+MIN_GAIN_RATIO = 1.05
+"""Expected ratio of errors before and after a recalibration above which it is recommended."""
+MAX_NOISE_FACTOR = 2.0
 """Factor on the noise of the calibration up to which an explanation is complete."""
-LEAST_NAMED = 0.05
-"""Probability from which on an unclear explanation is mentioned."""
-MOST_ROUNDS = 4
-SETTLED = 1.0
-"""Rounds end when predicted values move by less than this share of the noise."""
+MIN_NAMED_PROBABILITY = 0.05
+"""Probability above which an ambiguous explanation is named."""
+MAX_LINEARISATIONS = 4
+CONVERGENCE_TOLERANCE = 1.0
+"""RMS change of predicted values, over their noise, below which linearisation ends."""
 
 
 @dataclass(frozen=True, eq=False)
 class JointZeros:
-    """Shifts of all joints' zeros in a session, each estimated beside all others, for charts over many sessions.
+    """Shifts of all joint zeros in a session, estimated together, for charts over many sessions.
 
     Attributes:
-        shift: [rad or m].
-        deviation: standard deviations, with the uncertainty of the model and the prior of about 1 deg.
+        shift: shifts [rad or m].
+        deviation: standard deviations, including the uncertainty of the model and the prior of about 1 deg [rad or m].
         influence: derivatives of the shifts by the directions of the model's uncertainty, which all sessions share.
-        own: covariance of what else makes the shifts err: the noise of this session, and what stands elsewhere in it.
+        own: covariance due to the noise and the moved bases and tools of this session.
     """
 
     shift: Float64[Tensor, " dof"]
@@ -66,23 +66,23 @@ class JointZeros:
 
 @dataclass(frozen=True)
 class Session:
-    """What a session says of a robot.
+    """Result of comparing a session with a model.
 
     Attributes:
         rows: number of rows.
         unchanged: probability that nothing moved.
-        moved: what moved, the arm first.
-        candidates: names and probabilities of what may have moved where that is unclear, else none.
-        rms: root mean square of the errors under the model, with frames as they stand now [m].
-        rms_after: the same expected after recalibrating [m].
-        rotation_ratio: errors of the orientation by those expected after recalibrating; 1 where none was measured.
-        error_score: root mean square of the errors over their standard deviations; 1 is usual.
+        moved: movements, those of the arm first.
+        candidates: names and probabilities of possible movements where these are ambiguous; otherwise empty.
+        rms: RMS position error under the model, with the present base and tool [m].
+        rms_after: RMS position error expected after a recalibration [m].
+        rotation_ratio: orientation errors over those expected after a recalibration; 1 where none was measured.
+        error_score: RMS of the errors over their standard deviations; about 1 where nothing changed.
         values: number of measured values.
-        standing: names of bases and tools that stand elsewhere than when the model was made.
-        observable: per joint, whether the rows say anything of its zero.
-        outliers: places of rows that do not count, because they do not go with the others whatever has moved.
-        score_ratio: with images, whose poses have more noise than error, values over their standard deviations by those
-            expected after recalibrating; else 1.
+        standing: names of bases and tools that were moved since the model was made.
+        observable: whether the rows determine the zero of each joint.
+        outliers: places of rows that do not count because they contradict the others under any movement.
+        score_ratio: for images, whose poses have more noise than error: RMS of values over their standard deviations,
+            divided by that expected after a recalibration; otherwise 1.
     """
 
     rows: int
@@ -101,23 +101,30 @@ class Session:
 
     @property
     def verdict(self) -> Verdict:
-        """Whether nothing moved, something did, or something did and it is not clear what."""
+        """Whether nothing moved ("unchanged"), something did ("moved"), or the movement is ambiguous ("unclear")."""
         if self.moved:
             return "moved"
         return "unclear" if self.candidates else "unchanged"
 
     @property
     def recalibrate(self) -> bool:
-        """Whether the arm changed so much that recalibrating pays."""
+        """Whether the arm changed so much that a recalibration is recommended."""
         arm = any(not is_frame(one.what) for one in self.moved) or bool(self.candidates)
-        return arm and (self.rms > PAYS * self.rms_after or max(self.rotation_ratio, self.score_ratio) > PAYS)
+        return arm and (
+            self.rms > MIN_GAIN_RATIO * self.rms_after
+            or max(self.rotation_ratio, self.score_ratio) > MIN_GAIN_RATIO
+        )
 
     @property
     def sentence(self) -> str:
-        """The verdict in words."""
+        """The verdict as a clause with a full stop."""
         if self.verdict == "unclear":
-            named = (f"{what} ({share:.0%})" for what, share in self.candidates[:3] if share >= LEAST_NAMED)
-            return f"something changed, and these rows do not show what: {' or '.join(named)}."
+            named = (
+                f"{what} ({share:.0%})"
+                for what, share in self.candidates[:3]
+                if share >= MIN_NAMED_PROBABILITY
+            )
+            return f"something changed, but these rows cannot distinguish what: {' or '.join(named)}."
         if self.verdict == "unchanged":
             return "nothing moved beyond its uncertainty."
         moved = (f"{one.sentence} ({shown_probability(one.probability)})" for one in self.moved)
@@ -125,14 +132,14 @@ class Session:
 
     @property
     def unobservable(self) -> tuple[str, ...]:
-        """Sentences on the joints whose zeros these rows cannot determine, and why."""
+        """Sentences on the joints whose zeros the rows do not determine, and why."""
         last, sentences = len(self.observable), []
         for number, observable in enumerate(self.observable, 1):
             frame = {1: "base", last: "tool"}.get(number, "")
             if not observable and frame and any(name.split()[0] == frame for name in self.standing):
                 sentences.append(
-                    f"Joint {number} cannot be told from the {frame}, which stands elsewhere than when the model was "
-                    "made."
+                    f"The zero of joint {number} cannot be distinguished from the {frame}, which was moved since the "
+                    "model was made."
                 )
             elif not observable:
                 sentences.append(f"Joint {number} is unobservable: these rows do not determine its zero.")
@@ -140,7 +147,7 @@ class Session:
 
     @property
     def gain(self) -> float:
-        """By how much recalibrating is expected to make the errors of such rows smaller [m]."""
+        """Expected decrease of the RMS error of such rows by a recalibration [m]."""
         return max(self.rms - self.rms_after, 0.0)
 
 
@@ -150,16 +157,19 @@ def judge_session(
     rows: Measurements,
     stated: Set[FrameKey] | None = None,
 ) -> tuple[Session, JointZeros]:
-    """Compare everything that can have moved since a model was made.
+    """Compare all movements that are possible since a model was made, by their evidence.
 
     Args:
         model: the model.
-        posterior: of it.
-        rows: of one session, frames and targets by the names of the model.
-        stated: bases and tools that stand elsewhere than when the model was made; None to find them by evidence.
+        posterior: posterior of the model.
+        rows: rows of one session, frames and targets by the names of the model.
+        stated: bases and tools that were moved since the model was made; None to find them by evidence.
+
+    Returns:
+        The result of the session, and the zeros of all joints for charts.
 
     Raises:
-        IdentificationError: nothing usable was measured, or too little to guess where something stands.
+        IdentificationError: nothing usable was measured, or too little to guess a moved base or tool.
         PoseError: the joint values do not fit the robot.
     """
     solved = _solve(model, posterior, rows, stated or frozenset())
@@ -172,7 +182,7 @@ def judge_session(
 def _elsewhere(
     model: CalibratedModel, posterior: ModelPosterior, rows: Measurements, still: "_Solved"
 ) -> tuple["_Solved", dict[FrameKey, float]]:
-    """Find which bases and tools stand elsewhere: the base, the tool, or both where neither explains the rows."""
+    """Find which bases and tools were moved: the base, the tool, or both where neither alone explains the rows."""
     geometry = posterior.geometry
     bases = frozenset(("base", name) for name in rows.frame if name in geometry.bases)
     tools = frozenset(("tool", name) for name in rows.target if name in geometry.tools)
@@ -180,7 +190,7 @@ def _elsewhere(
     for owners in (bases, tools, bases | tools):
         if not owners or (owners == bases | tools and any(one.fits for one in tried.values())):
             continue
-        with suppress(IdentificationError):  # so few rows cannot say where these stand
+        with suppress(IdentificationError):  # too few rows to determine these
             tried[owners] = _solve(model, posterior, rows, owners)
     log = torch.tensor([one.explanation.log_evidence for one in tried.values()])
     share = dict(zip(tried, log.softmax(0).tolist(), strict=True))
@@ -190,7 +200,7 @@ def _elsewhere(
 
 @dataclass(frozen=True, eq=False)
 class _Solved:
-    """A session, linearised where the most probable explanation puts it."""
+    """A session, linearised at the most probable explanation."""
 
     problem: RecalibrationProblem
     values: LinearValues
@@ -200,37 +210,37 @@ class _Solved:
 
     @property
     def fits(self) -> bool:
-        """Whether the rows err about as much as they usually do."""
-        return self.explanation.noise_factor <= USUAL
+        """Whether the noise is about that of the calibration."""
+        return self.explanation.noise_factor <= MAX_NOISE_FACTOR
 
     @property
     def suspected(self) -> tuple[Motion, ...]:
-        """What moved, or the likeliest where that is unclear."""
+        """Movements, or the most probable one where these are ambiguous."""
         return self.explanation.motions or self.explanation.candidates[:1]
 
     @property
     def moved_frames(self) -> list[DriftGroup]:
-        """Bases and tools that moved, beside which joints and errors are charted: the arm is as it was."""
+        """Bases and tools that moved, which are free in the charts of joints and errors."""
         return [_freed(one) for one in self.explanation.motions if is_frame(one.group.what)]
 
     @property
     def frame_moved(self) -> bool:
-        """Whether a base or a tool seems to stand so far off that its motion is not linear."""
-        return any(is_frame(one.group.what) and one.size >= FAR for one in self.suspected)
+        """Whether a base or a tool has moved so far that its motion is not linear."""
+        return any(is_frame(one.group.what) and one.size >= MIN_MOVE for one in self.suspected)
 
     def arm_with(self, motions: tuple[DriftGroup, ...]) -> AdaptedArm:
-        """The arm with what stands elsewhere, and some motions, as these rows have it; all else as in the model."""
+        """Return the arm with moved bases and tools and some movements fitted; all else as in the model."""
         return AdaptedArm.at(self.problem, self.unknowns(motions))
 
     def score_ratio(self, before: tuple[DriftGroup, ...], after: tuple[DriftGroup, ...]) -> float:
-        """Divide the values that some motions leave, over their standard deviations, by those that others leave."""
+        """Compute the ratio of the RMS standardised residuals that two sets of movements leave."""
         values, deviation = self.values, self.values.deviation(self.noise)
         left = [values.y - values.X @ (self.unknowns(those) - self.problem.mean) for those in (before, after)]
         first, second = (float((one / deviation).square().mean().sqrt()) for one in left)
         return first / second if second > 0 else 1.0
 
     def unknowns(self, motions: tuple[DriftGroup, ...]) -> Float64[Tensor, " unknowns"]:
-        """Most probable unknowns with what stands elsewhere and some motions; all else as in the model."""
+        """Return the mean of the unknowns with moved bases and tools and some movements; all else as in the model."""
         standing = tuple(group for group in self.problem.groups if group.fixed_size)
         drift = Drift((*standing, *motions), self.noise * self.explanation.noise_factor)
         shift: Tensor = PosteriorUpdate(self.problem.root[:, :0], self.values, drift).shift
@@ -240,20 +250,22 @@ class _Solved:
 def _solve(
     model: CalibratedModel, posterior: ModelPosterior, rows: Measurements, elsewhere: Set[FrameKey]
 ) -> _Solved:
-    """Linearise, explain, and go on from there until the linearisation holds."""
+    """Linearise and explain repeatedly until the linearisation converges."""
     problem = recalibration_problem(model, posterior, rows, elsewhere)
     noise = noise_of_sensors(problem, posterior.noise)
     group = held_out_groups(problem.setup.measurements)
     x = problem.mean
     wrong: Mapping[int, float] = {}
-    for _ in range(MOST_ROUNDS):
+    for _ in range(MAX_LINEARISATIONS):
         values = linear_values(problem, linearised(problem.design, x, 0.0, group))
         solved = _explained(problem, noise, replace(values, wrong=wrong))
         values, wrong = solved.values, solved.values.wrong
         there = solved.unknowns(tuple(_sized(one) for one in solved.suspected))
         step = values.X @ (there - x) / values.deviation(noise)
         x = there
-        if float(step.square().mean().sqrt()) < SETTLED or (solved.frame_moved and not elsewhere):
+        if float(step.square().mean().sqrt()) < CONVERGENCE_TOLERANCE or (
+            solved.frame_moved and not elsewhere
+        ):
             break
     return solved
 
@@ -261,7 +273,7 @@ def _solve(
 def _explained(
     problem: RecalibrationProblem, noise: Float64[Tensor, " sensors"], values: LinearValues
 ) -> _Solved:
-    """The most probable explanation of a session's values, wrong rows among them."""
+    """Find the most probable explanation of the values of a session, including wrong rows."""
     standing = [one for one in problem.groups if one.fixed_size]
     every = SessionEvidence(values, problem.root, standing, hypotheses(problem), noise)
 
@@ -281,12 +293,12 @@ def _sized(motion: Motion) -> DriftGroup:
 
 
 def _freed(motion: Motion) -> DriftGroup:
-    """Let what moved be anywhere near."""
-    return replace(motion.group, size=max(motion.size, ANYWHERE))
+    """Return the group of a movement with a prior of at least `ZERO_PRIOR`."""
+    return replace(motion.group, size=max(motion.size, ZERO_PRIOR))
 
 
 def _judged(solved: _Solved, elsewhere: dict[FrameKey, float]) -> Session:
-    """Work out what there is to say."""
+    """Compute the result of a session."""
     every, wrong = solved.problem.setup.measurements, solved.problem.wrong_rows(solved.values)
     rows = every.select((~wrong).nonzero()[:, 0])
     explanation, evidence = solved.explanation, solved.evidence
@@ -297,7 +309,9 @@ def _judged(solved: _Solved, elsewhere: dict[FrameKey, float]) -> Session:
     (rms, angle), (rms_after, angle_after) = (_rms(arm, rows) for arm in (before, solved.arm_with(motions)))
     count = len(solved.values.y)
     determined = sum(len(group.index) for group in of_arm if group.single)
-    optimism = math.sqrt(count / max(count - determined, 1))  # the rows themselves determined what moved
+    optimism = math.sqrt(
+        count / max(count - determined, 1)
+    )  # residuals are too small, as the rows determined the movement
     return Session(
         rows=every.rows,
         unchanged=explanation.unchanged,
@@ -320,7 +334,7 @@ def _judged(solved: _Solved, elsewhere: dict[FrameKey, float]) -> Session:
 
 
 def _moved(solved: _Solved, elsewhere: dict[FrameKey, float]) -> tuple[Movement, ...]:
-    """How far everything that moved has, all estimated together; the arm first."""
+    """Estimate all movements together, those of the arm first."""
     problem, explanation = solved.problem, solved.explanation
     found = [(_freed(one), one.probability) for one in explanation.motions]
     for (kind, name), probability in elsewhere.items():
@@ -341,7 +355,7 @@ def _moved(solved: _Solved, elsewhere: dict[FrameKey, float]) -> tuple[Movement,
 
 
 def _zeros(solved: _Solved) -> JointZeros:
-    """Zeros of all joints together."""
+    """Estimate the zeros of all joints together."""
     evidence, noise_factor = solved.evidence.with_moved(solved.moved_frames), solved.explanation.noise_factor
     shift, covariance = evidence.shift(_joints(solved), noise_factor)
     influence, own = evidence.influence(_joints(solved), noise_factor)
@@ -349,9 +363,9 @@ def _zeros(solved: _Solved) -> JointZeros:
 
 
 def _joints(solved: _Solved) -> list[DriftGroup]:
-    """The zeros of all joints, which may stand anywhere."""
+    """Return the groups of all joint zeros with the prior `ZERO_PRIOR`."""
     groups = solved.problem.groups
-    return [replace(group, size=ANYWHERE) for group in groups if group.what.startswith("joint ")]
+    return [replace(group, size=ZERO_PRIOR) for group in groups if group.what.startswith("joint ")]
 
 
 def shown_probability(probability: float | None) -> str:
@@ -362,12 +376,12 @@ def shown_probability(probability: float | None) -> str:
 
 
 def is_frame(what: str) -> bool:
-    """Whether what moved is a base or a tool."""
+    """Return whether `what` names a base or a tool."""
     return what.split()[0] in ("base", "tool")
 
 
 def _rms(arm: AdaptedArm, rows: Measurements) -> tuple[float, float]:
-    """Root mean squares of the errors of lengths [m] and of angles [rad], 0 where none was measured."""
+    """Compute the RMS errors of lengths [m] and of angles [rad]; 0 where none was measured."""
     errors = errors_under(arm, rows)
     return _root_mean_square(errors.position), _root_mean_square(errors.rotation)
 

@@ -1,4 +1,4 @@
-"""Sessions over the months: charts of joints and errors, drift with time and temperature, a limit's forecast."""
+"""Sessions over months: charts of joints and errors, drift with time and temperature, and a forecast for a limit."""
 
 import datetime
 import math
@@ -18,24 +18,25 @@ from pisigma.lifetime.recalibration.movement import CLEAR, NORMAL_95
 from pisigma.measurement.sensors.sensor import SHOWN_UNITS, ShownUnit
 
 DAYS_PER_MONTH = 365.25 / 12
-FEWEST = 4
-"""Sessions on different days that a drift is estimated from."""
-FEWEST_KELVINS = 3.0
-"""Standard deviation of the temperatures from which on a dependence on them is estimated."""
-MOST_MONTHS = 120.0
-"""Beyond ten years no forecast is made."""
+"""Mean length of a month [days]."""
+MIN_SESSIONS = 4
+"""Sessions on different days from which a drift is estimated."""
+MIN_TEMPERATURE_SPREAD = 3.0
+"""[K] Standard deviation of the temperatures above which a dependence on them is estimated."""
+MAX_MONTHS = 120.0
+"""Range of forecasts: ten years."""
 
 
 @dataclass(frozen=True)
 class Trend:
-    """How a joint's zero, or the error, changes.
+    """Drift of a joint zero with time or temperature.
 
     Attributes:
-        what: changes.
+        what: quantity that drifts, such as "joint 2".
         over: "month" or "kelvin".
-        unit: of the change for one of these.
-        slope: the change.
-        deviation: its standard deviation.
+        unit: unit of the change per month or kelvin.
+        slope: change per month or kelvin [`unit`].
+        deviation: standard deviation of the slope [`unit`].
     """
 
     what: str
@@ -46,39 +47,39 @@ class Trend:
 
     @property
     def clear(self) -> bool:
-        """Whether it is more than chance."""
+        """Whether the drift is significant."""
         return abs(self.slope) > CLEAR * self.deviation
 
     @property
     def interval(self) -> tuple[float, float]:
-        """95 % interval of the change."""
+        """95 % confidence interval of the slope."""
         half = NORMAL_95 * self.deviation
         return self.slope - half, self.slope + half
 
     @property
     def sentence(self) -> str:
-        """It in words."""
+        """The same as a sentence."""
         half = NORMAL_95 * self.deviation
-        return f"{self.what} drifts by {self.slope:.4f} ± {half:.4f} {self.unit} a {self.over}"
+        return f"{self.what} drifts by {self.slope:.4f} ± {half:.4f} {self.unit} per {self.over}"
 
     def to_json(self) -> dict[str, Any]:
-        """The change with its interval as plain values."""
+        """Return slope and interval as plain values."""
         slope = {f"{self.unit}_per_{self.over}": self.slope}
         return {"what": self.what, **slope, "interval": list(self.interval), "clear": self.clear}
 
 
 @dataclass(frozen=True)
 class Jump:
-    """A change of a joint's zero between two sessions, as by a collision, or in one of them alone.
+    """Jump of a joint zero between two sessions, as after a collision, or in a single session.
 
     Attributes:
-        what: changed.
-        unit: of the change.
-        size: the change.
-        deviation: its standard deviation.
-        before: day of the last session before it.
-        after: day of the first session after it.
-        alone: whether that session alone is off.
+        what: quantity that jumped, such as "joint 2".
+        unit: unit of the jump.
+        size: size of the jump [`unit`].
+        deviation: standard deviation of the size [`unit`].
+        before: date of the last session before it.
+        after: date of the first session after it.
+        alone: whether that session alone deviates.
     """
 
     what: str
@@ -91,14 +92,14 @@ class Jump:
 
     @property
     def sentence(self) -> str:
-        """It in words."""
+        """The same as a sentence."""
         half = NORMAL_95 * self.deviation
         if self.alone:
-            return f"{self.what} was {self.size:.4f} ± {half:.4f} {self.unit} off on {self.after} alone"
+            return f"{self.what} deviated by {self.size:.4f} ± {half:.4f} {self.unit} on {self.after} only"
         return f"{self.what} jumped by {self.size:.4f} ± {half:.4f} {self.unit} between {self.before} and {self.after}"
 
     def to_json(self) -> dict[str, Any]:
-        """The jump and the sessions that it lies between as plain values."""
+        """Return the jump and the dates around it as plain values."""
         return {
             "what": self.what,
             f"size_{self.unit}": self.size,
@@ -111,13 +112,13 @@ class Jump:
 
 @dataclass(frozen=True)
 class Forecast:
-    """When the error passes a limit.
+    """Forecast of the date on which the RMS error passes a limit.
 
     Attributes:
-        limit_mm: the limit.
-        passed: whether the error of the last session is above it.
-        date: when the trend passes it; None where it does not within ten years.
-        earliest: beginning of the 95 % interval of that; None likewise.
+        limit_mm: the limit [mm].
+        passed: whether the error of the last session is above the limit.
+        date: date on which the trend passes it; None where it does not within ten years.
+        earliest: start of the 95 % confidence interval of the date; None likewise.
     """
 
     limit_mm: float
@@ -127,22 +128,20 @@ class Forecast:
 
     @property
     def sentence(self) -> str:
-        """It in words."""
+        """The same as a sentence."""
         if self.passed:
             return f"The RMS error of the last session is above the limit of {self.limit_mm:g} mm."
         if self.date is None:
-            return f"No trend says that the RMS error will pass {self.limit_mm:g} mm within ten years."
-        return (
-            f"The RMS error will pass {self.limit_mm:g} mm about {self.date}, or as early as {self.earliest}."
-        )
+            return f"There is no significant trend by which the RMS error passes {self.limit_mm:g} mm within ten years."
+        return f"The RMS error will pass {self.limit_mm:g} mm around {self.date}, possibly as early as {self.earliest}."
 
 
 def charts_of(revolute: Sequence[bool], records: Sequence[Record]) -> tuple[Chart, ...]:
-    """Chart the zeros of all joints and the error.
+    """Make control charts of all joint zeros and of the error.
 
     Args:
-        revolute: per joint of the robot, whether it turns.
-        records: by their dates.
+        revolute: whether each joint of the robot is revolute.
+        records: sessions sorted by date.
     """
     count = len(revolute) + 1
     charts = []
@@ -163,15 +162,15 @@ def charts_of(revolute: Sequence[bool], records: Sequence[Record]) -> tuple[Char
 
 
 def trends_of(revolute: Sequence[bool], records: Sequence[Record]) -> tuple[Trend, ...]:
-    """Estimate how the zeros of the joints change with time, and with temperature where the sessions state it.
+    """Estimate the drift of joint zeros with time, and with temperature where the sessions state it.
 
-    Where a zero jumped, or was off in single sessions, its drift is estimated beside that.
+    Jumps and single deviating sessions are fitted together with the drift.
 
     Args:
-        revolute: per joint of the robot, whether it turns.
-        records: by their dates.
+        revolute: whether each joint of the robot is revolute.
+        records: sessions sorted by date.
     """
-    if len(torch.unique(months_of(records))) < FEWEST:
+    if len(torch.unique(months_of(records))) < MIN_SESSIONS:
         return ()
     overs, trends = _overs(records), list[Trend]()
     for joint in range(len(revolute)):
@@ -188,13 +187,13 @@ def trends_of(revolute: Sequence[bool], records: Sequence[Record]) -> tuple[Tren
 
 
 def jumps_of(revolute: Sequence[bool], records: Sequence[Record]) -> tuple[Jump, ...]:
-    """Find between which sessions the zeros of joints jumped, where that explains them better than a drift.
+    """Find jumps of joint zeros between sessions, where these explain them better than a drift.
 
     Args:
-        revolute: per joint of the robot, whether it turns.
-        records: by their dates.
+        revolute: whether each joint of the robot is revolute.
+        records: sessions sorted by date.
     """
-    if len(torch.unique(months_of(records))) < FEWEST:
+    if len(torch.unique(months_of(records))) < MIN_SESSIONS:
         return ()
     overs, jumps = _overs(records), list[Jump]()
     for joint in range(len(revolute)):
@@ -216,26 +215,26 @@ def jumps_of(revolute: Sequence[bool], records: Sequence[Record]) -> tuple[Jump,
 
 
 def _overs(records: Sequence[Record]) -> list[tuple[Literal["month", "kelvin"], Tensor]]:
-    """What zeros may change with: time and, where the sessions state various ones, temperature."""
+    """Return the quantities that zeros may drift with: time, and temperature where it varies."""
     temperature = torch.tensor(
         [math.nan if one.temperature_c is None else one.temperature_c for one in records], dtype=torch.float64
     )
     overs: list[tuple[Literal["month", "kelvin"], Tensor]] = [("month", months_of(records))]
-    if bool(torch.isfinite(temperature).all()) and float(temperature.std()) >= FEWEST_KELVINS:
+    if bool(torch.isfinite(temperature).all()) and float(temperature.std()) >= MIN_TEMPERATURE_SPREAD:
         overs.append(("kelvin", temperature))
     return overs
 
 
 @dataclass(frozen=True, eq=False)
 class _Zero:
-    """The zero of a joint over the sessions that show it.
+    """Zero of a joint over the sessions that determine it.
 
     Attributes:
         series: its shifts [rad or m].
-        sessions: numbers of these sessions.
-        columns: 1, months and, where they vary, temperatures about their means.
-        events: jumps, and sessions that are off.
-        drifts: whether time explains more beside these.
+        sessions: indices of these sessions.
+        columns: 1, months and, where they vary, temperatures minus their means.
+        events: jumps, and single deviating sessions.
+        drifts: whether there is a drift with time in addition.
     """
 
     series: Series
@@ -246,10 +245,10 @@ class _Zero:
 
     @staticmethod
     def of(records: Sequence[Record], joint: int, overs: Sequence[tuple[str, Tensor]]) -> "_Zero | None":
-        """Find its changes; None where too few sessions show it."""
+        """Find the changes of a joint zero; None where too few sessions determine it."""
         values, covariance = _joint_values(records, joint)
         there = torch.isfinite(values).nonzero()[:, 0]
-        if len(there) < FEWEST + len(overs) - 1:
+        if len(there) < MIN_SESSIONS + len(overs) - 1:
             return None
         columns = [torch.ones(len(records), dtype=torch.float64), *(over - over.mean() for _, over in overs)]
         A = torch.stack(columns, 1)[there]
@@ -259,18 +258,18 @@ class _Zero:
         return _Zero(series, there.tolist(), A, events, drifts)
 
     def fit(self, drifts: bool) -> tuple[list[float], list[float]]:
-        """Coefficients and their standard deviations, those of the events last."""
+        """Fit coefficients; return them and their standard deviations, those of the events last."""
         columns = self.columns if drifts else self.columns[:, torch.arange(self.columns.shape[1]) != 1]
         return self.series.fit(self.series.with_events(columns, self.events))
 
 
 def forecast_of(records: Sequence[Record], limit_mm: float) -> Forecast:
-    """Forecast when the RMS error of a session passes a limit, by a straight line through those of all sessions."""
+    """Forecast when the RMS error of a session passes a limit, by a straight line through all sessions."""
     months, last = months_of(records), records[-1]
     rms = torch.tensor([one.session.rms * 1e3 for one in records], dtype=torch.float64)
     passed = bool(rms[-1] > limit_mm)
     date = earliest = None
-    if not passed and bool((rms > 0).all()) and len(torch.unique(months)) >= FEWEST:
+    if not passed and bool((rms > 0).all()) and len(torch.unique(months)) >= MIN_SESSIONS:
         spread = rms * torch.tensor([math.sqrt(0.5 / one.session.values) for one in records]).double()
         usual = rms * torch.tensor([_log_spread(one) for one in records]).double()
         columns = torch.stack([torch.ones_like(months), months - months[-1]], 1)
@@ -282,7 +281,9 @@ def forecast_of(records: Sequence[Record], limit_mm: float) -> Forecast:
         now = float((columns[-1] * torch.tensor(coefficients)).sum())
         left = ((rms - columns @ torch.tensor(coefficients).double()) / spread).square().sum()
         spare = max(len(rms) - columns.shape[1], 1)
-        deviation *= max(1.0, math.sqrt(float(left) / spare))  # sessions scatter by more than few rows do
+        deviation *= max(
+            1.0, math.sqrt(float(left) / spare)
+        )  # sessions scatter more than their few rows explain
         if slope > NORMAL_95 * deviation:
             date = _after(last.date, (limit_mm - now) / slope)
             earliest = _after(last.date, (limit_mm - now) / (slope + NORMAL_95 * deviation))
@@ -290,15 +291,15 @@ def forecast_of(records: Sequence[Record], limit_mm: float) -> Forecast:
 
 
 def months_of(records: Sequence[Record]) -> Float64[Tensor, " sessions"]:
-    """Months since the first session."""
+    """Compute the months since the first session."""
     days = [datetime.date.fromisoformat(one.date).toordinal() for one in records]
     return (torch.tensor(days, dtype=torch.float64) - days[0]) / DAYS_PER_MONTH
 
 
 def _joint_values(records: Sequence[Record], joint: int) -> tuple[Tensor, Tensor]:
-    """Shifts of a joint's zero in all sessions [rad or m], NaN where unobservable, and their covariance.
+    """Return the shifts of a joint zero in all sessions [rad or m], NaN where unobservable, and their covariance.
 
-    Sessions have the model's uncertainty in common, so that their shifts err together.
+    The shifts are correlated, because all sessions share the uncertainty of the model.
     """
     values = [float(one.zeros.shift[joint]) if one.session.observable[joint] else math.nan for one in records]
     influence = torch.stack([one.zeros.influence[joint] for one in records])
@@ -307,18 +308,18 @@ def _joint_values(records: Sequence[Record], joint: int) -> tuple[Tensor, Tensor
 
 
 def _error_score(record: Record) -> float:
-    """Logarithm of the errors over what was expected, over its standard deviation."""
+    """Compute the logarithm of the errors over the expected ones, divided by its standard deviation."""
     return math.log(max(record.session.error_score, 1e-9)) / _log_spread(record)
 
 
 def _log_spread(record: Record) -> float:
-    """Standard deviation of the logarithm of a session's error: that of its noise, and of its few values."""
+    """Compute the standard deviation of the logarithm of a session's error, from its noise and its number of values."""
     return math.sqrt(NOISE_SPREAD**2 + 0.5 / record.session.values)
 
 
 def _after(date: str, months: float) -> str | None:
-    """The day some months after another; None beyond what is forecast."""
-    if months > MOST_MONTHS:
+    """Return the date some months after another; None beyond the range of forecasts."""
+    if months > MAX_MONTHS:
         return None
     days = datetime.timedelta(days=max(months, 0.0) * DAYS_PER_MONTH)
     return (datetime.date.fromisoformat(date) + days).isoformat()

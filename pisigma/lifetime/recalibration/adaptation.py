@@ -1,4 +1,4 @@
-"""A model adapted to new rows: the posterior of all unknowns, its drift by evidence, in rounds of linearisations."""
+"""Adaptation of a model to new rows: posterior of all unknowns and sizes of their drift, by repeated linearisation."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -22,22 +22,22 @@ from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.groups import held_out_groups
 from pisigma.measurement.sensors.registry import measured_errors
 
-MOST_ROUNDS = 5
-SETTLED = 0.05
-"""Rounds end when predicted values move by less than this share of the noise."""
-MOST_VALUES = 360
-"""Sizes of the drift are estimated from so many values at most; all values count in the end."""
+MAX_LINEARISATIONS = 5
+CONVERGENCE_TOLERANCE = 0.05
+"""RMS change of predicted values, over their noise, below which linearisation ends."""
+MAX_VALUES = 360
+"""Values from which the sizes of the drift are estimated; the posterior uses all values."""
 FIRST_NOISE = {"m": 1e-4, "rad": 1e-4}
-"""[m or rad] Of sensors that the calibration did not have, to start from."""
+"""[m or rad] Initial noise of sensors that the calibration did not have."""
 
 
 @dataclass(frozen=True, eq=False)
 class AdaptedArm:
-    """Geometry, frames and correction for some values of the unknowns.
+    """Geometry, frames and joint correction at given values of the unknowns.
 
     Attributes:
-        geometry: in the user's coordinates.
-        correction: of the joints; None where the model has none.
+        geometry: identified geometry in the user's coordinates.
+        correction: joint correction; None where the model has none.
     """
 
     geometry: IdentifiedGeometry
@@ -45,7 +45,7 @@ class AdaptedArm:
 
     @staticmethod
     def at(problem: RecalibrationProblem, x: Float64[Tensor, " unknowns"]) -> "AdaptedArm":
-        """Put unknowns of a problem into the arm, parameters counted from `design.problem.nominal`."""
+        """Return the arm at unknowns x of a problem, parameters counted from `design.problem.nominal`."""
         design = problem.design
         point = design.problem.nominal.index_add(0, design.problem.active, x[: design.active])
         return AdaptedArm(
@@ -53,7 +53,7 @@ class AdaptedArm:
         )
 
     def errors_of(self, measurements: Measurements) -> dict[str, Float64[Tensor, "rows components"]]:
-        """Measured - predicted values of any measurements; see `CalibrationResult.errors_of`."""
+        """Compute measured - predicted values; see `CalibrationResult.errors_of`."""
         moved = measurements
         if self.correction is not None:
             with torch.no_grad():
@@ -65,17 +65,18 @@ class AdaptedArm:
 
 @dataclass(frozen=True, eq=False)
 class Adaptation:
-    """A model as new rows have it.
+    """A model adapted to new rows.
 
     Attributes:
-        problem: that it solves.
-        arm: geometry, frames and correction.
-        drift: sizes of what has drifted, and the noise.
+        problem: the problem that was solved.
+        arm: geometry, frames and joint correction.
+        drift: sizes of the drift of each group, and the noise.
         shift: change of all unknowns, parameters relative to the anchors.
-        effective: how many directions the new rows determine.
-        rounds: linearisations made.
-        search: the evidence at the solution, for what moved.
-        values: all that count at the solution.
+        effective: number of directions that the new rows determine.
+        rounds: number of linearisations.
+        search: evidence at the solution, by which movements are estimated.
+        values: values that count at the solution.
+        update: posterior update at the solution.
     """
 
     problem: RecalibrationProblem
@@ -90,25 +91,25 @@ class Adaptation:
 
     @property
     def wrong_rows(self) -> list[int]:
-        """Rows of the measurements that do not count: so far off that the loss drops them, or wrong by evidence."""
+        """Rows that do not count: dropped by the loss as far off, or wrong by evidence."""
         rows: list[int] = self.problem.setup.rows[self.problem.wrong_rows(self.values)].tolist()
         return rows
 
     @cached_property
     def root(self) -> Float64[Tensor, "unknowns directions"]:
-        """Root of the covariance of all unknowns in the user's coordinates, parameters first."""
+        """Root of the posterior covariance of all unknowns in the user's coordinates, parameters first."""
         root = torch.cat([self.update.root(), self.problem.standing], 1)
         active = self.problem.design.active
         return torch.cat([self.problem.change @ root[:active], root[active:]])
 
     @property
     def noise(self) -> dict[str, float]:
-        """Per sensor, its noise [m or rad], or a factor where the rows state it."""
+        """Noise of each sensor [m or rad]; a factor where the rows state it."""
         names = (sensor.name for sensor in self.problem.design.problem.sensors)
         return dict(zip(names, self.drift.noise.tolist(), strict=True))
 
     def errors_of(self, measurements: Measurements) -> dict[str, Float64[Tensor, "rows components"]]:
-        """Measured - predicted values of any measurements; see `CalibrationResult.errors_of`."""
+        """Compute measured - predicted values; see `CalibrationResult.errors_of`."""
         return self.arm.errors_of(measurements)
 
 
@@ -118,9 +119,9 @@ def adapt(
     """Adapt a model to new rows.
 
     Args:
-        problem: the rows and the prior.
-        usual_noise: per sensor, that of the calibration.
-        start: sizes and noise to start from, such as those of other rows of the session.
+        problem: rows and prior.
+        usual_noise: noise of each sensor in the calibration [m or rad].
+        start: initial sizes and noise, such as those of other rows of the session; None for zero drift.
     """
     design, mean = problem.design, problem.mean
     usual = noise_of_sensors(problem, usual_noise)
@@ -130,7 +131,7 @@ def adapt(
     drift = start or Drift(problem.groups, usual)
     drift = replace(drift, groups=_with_sizes(problem.groups, drift.groups))
     rounds = 0
-    while rounds < MOST_ROUNDS:
+    while rounds < MAX_LINEARISATIONS:
         rounds += 1
         rows = linearised(design, x, effective, group)
         values = replace(linear_values(problem, rows), wrong=wrong)
@@ -140,7 +141,7 @@ def adapt(
         update = PosteriorUpdate(problem.root, values, drift)
         step = values.X @ (mean + update.shift - x) / values.deviation(drift.noise)
         x, effective = mean + update.shift, update.effective
-        if float(step.square().mean().sqrt()) < SETTLED:
+        if float(step.square().mean().sqrt()) < CONVERGENCE_TOLERANCE:
             break
     return Adaptation(
         problem=problem,
@@ -158,7 +159,7 @@ def adapt(
 def noise_of_sensors(
     problem: RecalibrationProblem, usual_noise: Mapping[str, float]
 ) -> Float64[Tensor, " sensors"]:
-    """Usual noise of all sensors of a problem [m or rad], or a factor where the rows state it."""
+    """Return the usual noise of all sensors of a problem [m or rad]; a factor where the rows state it."""
     return torch.tensor(
         [
             usual_noise.get(sensor.name, 1.0 if sensor.sigma is not None else FIRST_NOISE[sensor.unit])
@@ -169,7 +170,7 @@ def noise_of_sensors(
 
 
 def linear_values(problem: RecalibrationProblem, rows: Rows) -> LinearValues:
-    """Put the values of all sensors together, their residuals those of the model."""
+    """Concatenate the values of all sensors, with residuals relative to the model."""
     X, y, sensor, configuration = [], [], [], []
     for number, one in enumerate(rows.values):
         columns = (problem.design.columns(one, slice(None)) * one.root[:, None, None]).flatten(0, 1)
@@ -181,7 +182,7 @@ def linear_values(problem: RecalibrationProblem, rows: Rows) -> LinearValues:
 
 
 def _with_sizes(groups: tuple[DriftGroup, ...], like: tuple[DriftGroup, ...]) -> tuple[DriftGroup, ...]:
-    """The groups with the sizes that those of the same names have."""
+    """Return the groups with the sizes of the groups of the same names."""
     sizes = {one.what: one.size for one in like}
     return tuple(one if one.fixed_size else replace(one, size=sizes.get(one.what, 0.0)) for one in groups)
 
@@ -189,9 +190,9 @@ def _with_sizes(groups: tuple[DriftGroup, ...], like: tuple[DriftGroup, ...]) ->
 def _searched(
     problem: RecalibrationProblem, values: LinearValues, drift: Drift, usual: Float64[Tensor, " sensors"]
 ) -> DriftSearch:
-    """The sizes of the drift and the wrong rows by evidence, of some of the values where there are many."""
-    if len(values.y) > MOST_VALUES:
-        values = values.select(chosen_rows(len(values.y), MOST_VALUES).sort().values)
+    """Estimate sizes of the drift and wrong rows by evidence, from a selection of the values where there are many."""
+    if len(values.y) > MAX_VALUES:
+        values = values.select(chosen_rows(len(values.y), MAX_VALUES).sort().values)
     A = values.X @ problem.root
 
     def explain(wrong: Mapping[int, float]) -> Explained[DriftSearch]:

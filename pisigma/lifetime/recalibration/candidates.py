@@ -1,4 +1,4 @@
-"""Which model predicts left-out rows best: the old one with new frames, the recalibrated one, or one from scratch."""
+"""Candidate models of a recalibration, compared by cross-validation."""
 
 import math
 from collections.abc import Callable, Mapping, Set
@@ -29,28 +29,28 @@ NAMES: dict[Kept, str] = {
     "scratch": "A calibration from scratch",
 }
 OF_FLEET: dict[Kept, str] = NAMES | {
-    "recalibrated": "The calibration that begins with the fleet",
-    "old": "The mean robot of the fleet with the base and the tool of the rows",
+    "recalibrated": "The calibration that starts from the fleet prior",
+    "old": "The mean robot of the fleet with base and tool of the new rows",
 }
-"""The same where the model is the prior of a fleet."""
+"""Names of the candidates where the model is a fleet prior."""
 FOLDS = 5
-ABOUT_AS_GOOD = 1.05
-"""The recalibrated model is kept where left-out errors of others are smaller by no more than this factor."""
-FAR_BETTER = 2.0
-"""A candidate whose root mean square is smaller by this factor is better, however its rows are distributed."""
-STRAY = 5.0
-"""Rows that every candidate misses by so many times the usual error say nothing of the candidates."""
+MIN_RATIO = 1.05
+"""Ratio of RMS errors below which another candidate does not replace the recalibrated model."""
+CLEAR_RATIO = 2.0
+"""Ratio of RMS errors above which a candidate is better, whatever the distribution of the errors."""
+OUTLIER_FACTOR = 5.0
+"""Factor over the median error above which rows that every candidate misses are ignored."""
 
 
 @dataclass(frozen=True)
 class CandidateChoice:
-    """Errors of left-out rows under every candidate, and the one that is kept.
+    """Cross-validated errors of the candidates, and the one that is kept.
 
     Attributes:
-        kept: recalibrated, unless another one is better by more than 5 % and more than chance.
-        rms: by candidate the root mean square of the errors of left-out rows [m]; None where the rows are too few.
-        rows: number of rows that count.
-        names: of the candidates, as sentences begin with them.
+        kept: "recalibrated", unless another candidate is better by more than 5 % and by more than chance.
+        rms: RMS error of held-out rows under each candidate [m]; None where the rows are too few for it.
+        rows: number of held-out rows that count.
+        names: names of the candidates, at the start of a sentence.
     """
 
     kept: Kept
@@ -60,25 +60,25 @@ class CandidateChoice:
 
     @property
     def with_least_error(self) -> "CandidateChoice":
-        """The same where the candidate with the least error is kept, by however little."""
+        """The choice of the candidate with the smallest error, by however little."""
         sizes = {name: size for name, size in self.rms.items() if size is not None}
         return replace(self, kept=min(sizes, key=lambda name: sizes[name])) if sizes else self
 
     @property
     def sentence(self) -> str:
-        """Which candidate won, and by how much."""
+        """Which candidate is kept, with the errors of all."""
         if not self.rows:
-            return f"{self.names[self.kept]} is kept: the rows are too few to leave any out."
+            return f"{self.names[self.kept]} is kept: there are too few rows for a cross-validation."
         sizes = {name: size * 1e3 for name, size in self.rms.items() if size is not None}
         if self.kept not in sizes:
-            return f"{self.names[self.kept]} is kept: the rows are too few to predict left-out ones with it."
+            return f"{self.names[self.kept]} is kept: there are too few rows to cross-validate it."
         others = " and ".join(
             f"{size:.3g} mm under {self.names[name][:1].lower()}{self.names[name][1:]}"
             for name, size in sizes.items()
             if name != self.kept
         )
         return (
-            f"{self.names[self.kept]} is kept: the RMS error of {self.rows} left-out rows is "
+            f"{self.names[self.kept]} is kept: the RMS error of {self.rows} rows held out in cross-validation is "
             f"{sizes[self.kept]:.3g} mm{f', against {others}' if others else ''}."
         )
 
@@ -91,15 +91,15 @@ def choose_candidate(
     calibrator: Calibrator,
     progress: Progress,
 ) -> CandidateChoice:
-    """Leave out one fold of the rows after the other and predict it by every candidate.
+    """Predict every fold of the rows by every candidate without it, and choose the candidate to keep.
 
     Args:
-        model: the model.
-        whole: adapted to all rows.
-        elsewhere: bases and tools that stand elsewhere.
-        rows: frames and targets by the names of the model.
-        calibrator: from scratch.
-        progress: called with the fold that is being judged.
+        model: the model that is recalibrated.
+        whole: adaptation of it to all rows.
+        elsewhere: bases and tools that were moved since the model was made.
+        rows: new rows, frames and targets by the names of the model.
+        calibrator: calibrator for the calibration from scratch.
+        progress: called with the fold that is being predicted.
     """
     posterior, noise = whole.problem.posterior, whole.noise
     folds = min(FOLDS, int(groups_to_keep_whole(rows).max()) + 1)
@@ -118,16 +118,18 @@ def choose_candidate(
         for name, candidate in candidates.items():
             try:
                 errors[name][test] = errors_under(candidate(), rows.select(test)).position
-            except IdentificationError:  # so few rows do not determine it
+            except IdentificationError:  # too few rows to identify it
                 errors[name][test] = torch.inf
     return replace(_decided(errors), names=OF_FLEET if model.kind == FLEET_PRIOR else NAMES)
 
 
 def _decided(errors: Mapping[Kept, Float64[Tensor, " rows"]]) -> CandidateChoice:
-    """The candidate that is kept."""
+    """Choose the candidate to keep from the errors of held-out rows [m]."""
     smallest = torch.stack(list(errors.values())).amin(0)
     judged = torch.isfinite(smallest)
-    counted = judged & (smallest <= STRAY * smallest[judged].median()) if bool(judged.any()) else judged
+    counted = (
+        judged & (smallest <= OUTLIER_FACTOR * smallest[judged].median()) if bool(judged.any()) else judged
+    )
     rms: dict[Kept, float | None] = {}
     for name, lengths in errors.items():
         size = float(lengths[counted].square().mean().sqrt()) if bool(counted.any()) else float("inf")
@@ -142,26 +144,28 @@ def _decided(errors: Mapping[Kept, Float64[Tensor, " rows"]]) -> CandidateChoice
 
 
 def _clearly_better(errors: Float64[Tensor, " rows"], than: Float64[Tensor, " rows"]) -> bool:
-    """Whether the RMS of errors is smaller by more than 5 %, and by far or rows are smaller by more than chance.
+    """Return whether the RMS of errors is smaller by more than 5 %, and by a factor of 2 or by more than chance.
 
-    Paired t-tests, 0.5 % each, since the recalibrated model also knows the arm where these rows do not lie: of the
-    squares, and of the logarithms where a few large squares hide what most rows say.
-    Squares of errors by metres have so heavy tails that neither shows what their size alone does.
+    Paired t-tests at the level of 0.5 % each, because the recalibrated model also knows the arm where these rows are
+    not: of the squares, and of the logarithms, since a few large squares can hide what most rows show. Errors of metres
+    have tails so heavy that neither test is significant, hence the factor of 2.
     """
     count = len(errors)
     if not bool(torch.isfinite(than).all()):
         return True
-    if count < 2 or ABOUT_AS_GOOD**2 * float(errors.square().sum()) >= float(than.square().sum()):
+    if count < 2 or MIN_RATIO**2 * float(errors.square().sum()) >= float(than.square().sum()):
         return False
-    if FAR_BETTER**2 * float(errors.square().sum()) <= float(than.square().sum()):
+    if CLEAR_RATIO**2 * float(errors.square().sum()) <= float(than.square().sum()):
         return True
-    quantile = 2.58 + 7 / (count - 1)  # of Student's distribution, to 6 % from four degrees of freedom on
+    quantile = 2.58 + 7 / (
+        count - 1
+    )  # quantile of Student's t distribution, to 6 % from four degrees of freedom
     gains = than.square() - errors.square(), (than / errors).clamp(1e-9, 1e9).log()
     return any(float(gain.mean()) > quantile * float(gain.std()) / math.sqrt(count) for gain in gains)
 
 
 def _predictable(rows: Measurements, test: Tensor, training: Measurements) -> Tensor:
-    """Which test rows have a frame, a target and an anchor that the training rows have too."""
+    """Return which test rows have a frame, a target and an anchor that the training rows have as well."""
     frames = set(training.frame)
     framed = torch.tensor([rows.frame[row] in frames for row in test.tolist()])
     try:

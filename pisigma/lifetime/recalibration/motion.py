@@ -1,4 +1,4 @@
-"""What has moved since a model was made, where the model holds a posterior that says how sure that is."""
+"""Movements since a model was made, for models that keep a posterior."""
 
 from collections.abc import Collection
 from contextlib import suppress
@@ -22,29 +22,29 @@ from pisigma.validation.setup_faults.explanations import PLAUSIBLE_SHARE
 from pisigma.validation.setup_faults.faults_as_drawn import measured_rows, spread
 from pisigma.validation.setup_faults.setup_faults import judged_values
 
-MOST_ROWS = 60
-"""Rows that the question is decided on; its covariance is of all their values."""
+MAX_ROWS = 60
+"""Rows that are used, since the covariance of all their values is needed."""
 
 
 def judged_motion(
     model: CalibratedModel, rows: Measurements, fitted: Collection[FrameKind] = ()
 ) -> Session | None:
-    """Say which joint, length, base or tool has moved since a model was made; see `judge_session`.
+    """Find the joints, lengths, base or tool that moved since a model was made; see `judge_session`.
 
     Args:
         model: the model.
-        rows: in frames and of targets that the model has or that are fitted.
-        fitted: what stands elsewhere for certain.
+        rows: rows whose frames and targets the model has or are fitted.
+        fitted: bases or tools that are known to have moved.
 
     Returns:
-        What it says, without what is fitted; None where the model holds no posterior, where the rows do not determine
-        what is fitted, and where it is not to be trusted, see `session_diagnostics`.
+        The session without movements of what is fitted; None where the model keeps no posterior, where the rows do not
+        determine what is fitted, and where the rows are implausible, see `session_diagnostics`.
     """
     with suppress(IdentificationError, ModelError):
         posterior = ModelPosterior.of(model)
         some = judged_values(model, rows)
         if rows.position is not None:
-            some = replace(some.select(spread(measured_rows(rows), MOST_ROWS)), pair=None, distance=None)
+            some = replace(some.select(spread(measured_rows(rows), MAX_ROWS)), pair=None, distance=None)
         some = posterior.renamed(some)
         with torch.no_grad():
             session, _ = judge_session(model, posterior, some, frame_keys(some, fitted) if fitted else None)
@@ -57,12 +57,12 @@ def judged_motion(
 def session_diagnostics(
     model: CalibratedModel, rows: Measurements, session: Session
 ) -> tuple[Diagnostic, ...]:
-    """Say why what a session shows is not to be trusted, although the checks of its rows found nothing.
+    """Return why a session is implausible, although the checks of its rows found nothing.
 
     Args:
-        model: that it was compared with.
-        rows: of the session.
-        session: what it says.
+        model: model that it was compared with.
+        rows: rows of the session.
+        session: result of the comparison.
     """
     if len(session.outliers) > MIN_WRONG_SHARE * rows.rows:
         wrong = [rows.place(row) in session.outliers for row in range(rows.rows)]
@@ -70,16 +70,16 @@ def session_diagnostics(
     limit = PLAUSIBLE_SHARE * model.robot.reach
     if session.rms_after > limit:
         sentence = (
-            f"{rows.source}: the errors are {session.rms * 1e3:.4g} mm, and no motion explains them that leaves less "
-            f"than {limit * 1e3:.3g} mm: another robot than that of model '{model.name}' was measured, or a column or "
-            "a unit is wrong; run `pisigma verify` on them."
+            f"{rows.source}: the RMS error is {session.rms * 1e3:.4g} mm, and no movement explains it to less than "
+            f"{limit * 1e3:.3g} mm: another robot than that of model '{model.name}' was measured, or a column or unit "
+            "is wrong; run `pisigma verify` on these rows."
         )
         return (Diagnostic(kind="implausible_errors", severity="implausible", sentence=sentence),)
     return beyond_wear(model.robot, session.moved)
 
 
 def motion_sentence(motion: Session, comparison: ModelComparison) -> str:
-    """Say what of the arm has moved, how sure that is, and what recalibrating is expected to gain."""
+    """Describe movements of the arm, their probability, and the expected gain of a recalibration."""
     means = (length_text(comparison.models[index].position.statistics["mean"] / 1e3) for index in (-1, 0))
     errors = (length_text(rms) for rms in (motion.rms, motion.rms_after))
     return (
@@ -89,7 +89,7 @@ def motion_sentence(motion: Session, comparison: ModelComparison) -> str:
 
 
 def motion_warnings(motion: Session) -> tuple[str, ...]:
-    """Say what has moved so little that it changes no verdict, or that something has and it is not clear what."""
+    """Describe movements that do not change the verdict, or a change that cannot be attributed."""
     if motion.verdict == "unchanged":
         return ()
     return (
@@ -100,7 +100,7 @@ def motion_warnings(motion: Session) -> tuple[str, ...]:
 
 
 def motion_text(motion: Session) -> str:
-    """Say what has moved, such as "Joint 3 has moved by 0.24 ± 0.01 deg (probability more than 99.9 %)"."""
+    """Describe movements, such as "Joint 3 has moved by 0.24 ± 0.01 deg (probability more than 99.9 %)"."""
     amounts: dict[tuple[str, float | None], list[str]] = {}
     for one in motion.moved:
         amounts.setdefault((one.what, one.probability), []).append(one.size)
@@ -112,7 +112,7 @@ def motion_text(motion: Session) -> str:
 
 
 def _subject(what: str) -> str:
-    """Say that a base or a tool, a joint or a geometric parameter such as "d_4" is another one."""
+    """Return subject and verb for a base, a tool, a joint or a geometric parameter such as "d_4"."""
     if is_frame(what):
         return f"the {what} has moved"
     return f"the parameter {what} has changed" if "_" in what else f"{what} has moved"

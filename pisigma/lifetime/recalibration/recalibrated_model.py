@@ -1,4 +1,4 @@
-"""The model that an adaptation to new rows makes of a model."""
+"""Model made from a parent model and its adaptation to new rows."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -29,20 +29,20 @@ from pisigma.validation.held_out.pose_statistics import image_deviation
 from pisigma.validation.setup_faults.explanations import PLAUSIBLE_SHARE
 
 KIND = "recalibration"
-SUSPICIOUS = 5.0
-"""Left-out rows are missed by so many times what single positions scattered by when the model was made."""
+SUSPICIOUS_FACTOR = 5.0
+"""Factor of the errors of held-out rows over the scatter of single positions in the calibration that is suspicious."""
 
 
 def recalibrated_model(model: CalibratedModel, adaptation: Adaptation, rows: Measurements) -> CalibratedModel:
-    """Make the model that new rows were added to; it has a posterior again.
+    """Make the recalibrated model, which keeps a posterior again.
 
-    The geometric calibration that a hybrid keeps beside its own geometry is taken along: its parameters change by as
-    much, and its bases and tools are moved as those of the hybrid are.
+    The geometric calibration that a hybrid keeps in addition to its own geometry is updated as well: its parameters
+    change by the same amounts, and its bases and tools move as those of the hybrid.
 
     Args:
-        model: as it was.
-        adaptation: of it to the rows.
-        rows: the rows.
+        model: parent model.
+        adaptation: adaptation of the parent to the rows.
+        rows: new rows.
     """
     known, drawn = model.uncertainty, model.drawn
     assert known is not None
@@ -91,13 +91,13 @@ def recalibrated_model(model: CalibratedModel, adaptation: Adaptation, rows: Mea
 
 
 def _taken_along(frames: Frames, from_: Frames, onto: Frames, before: bool) -> Frames:
-    """Frames moved as others are; those that are new are as the others.
+    """Move frames as others have moved; new ones are taken from the others.
 
     Args:
-        frames: to be moved.
-        from_: the others as they were.
-        onto: the others as they are.
-        before: whether the motion stands before the frame, as that of a base, or behind it.
+        frames: frames to move.
+        from_: the others before the motion.
+        onto: the others after the motion.
+        before: whether the motion multiplies from the left, as for a base, or from the right.
     """
     T = {name: _transforms(those) for name, those in (("own", frames), ("from", from_), ("onto", onto))}
     moved: Frames = {}
@@ -124,14 +124,14 @@ def recalibration_diagnostics(
     wrong: Sequence[int],
     moved: Sequence[Movement],
 ) -> tuple[Diagnostic, ...]:
-    """Say why the result is not to be trusted, although the checks of the rows found nothing.
+    """Return why the result is implausible, although the checks of the rows found nothing.
 
     Args:
-        parent: the model that the rows were added to.
-        judged: errors of left-out rows.
+        parent: model that was recalibrated.
+        judged: errors of held-out rows.
         rows: all rows.
-        wrong: numbers of those that were left out.
-        moved: what is said to have moved.
+        wrong: indices of the rows that were left out.
+        moved: movements that were found.
     """
     if len(wrong) > MIN_WRONG_SHARE * rows.rows:
         chosen = torch.zeros(rows.rows, dtype=torch.bool)
@@ -145,23 +145,23 @@ def recalibration_diagnostics(
 
 
 def _left_out(parent: CalibratedModel, judged: CandidateChoice, rows: Measurements) -> tuple[Diagnostic, ...]:
-    """Left-out rows that no candidate predicts."""
+    """Return a diagnostic where no candidate predicts the held-out rows."""
     error, limit = judged.rms[judged.kept], PLAUSIBLE_SHARE * parent.robot.reach
     if error is None:
         return ()
     noise = {} if parent.uncertainty is None else parent.uncertainty.noise
     usual = max(math.sqrt(3) * noise.get("position", 0.0), image_deviation(rows))
-    missed = f"{rows.source}: left-out rows are missed by {error * 1e3:.3g} mm"
+    missed = f"{rows.source}: the RMS error of held-out rows is {error * 1e3:.3g} mm"
     if error > limit:
         sentence = (
-            f"{missed}, more than {PLAUSIBLE_SHARE:.0%} of the reach of robot '{parent.robot.name}': they are not of "
-            "this robot, or their columns or units are wrong; run `pisigma verify` on them."
+            f"{missed}, more than {PLAUSIBLE_SHARE:.0%} of the reach of robot '{parent.robot.name}': another robot was "
+            "measured, or columns or units are wrong; run `pisigma verify` on these rows."
         )
-    elif error > SUSPICIOUS * usual > 0 and parent.kind != FLEET_PRIOR:
+    elif error > SUSPICIOUS_FACTOR * usual > 0 and parent.kind != FLEET_PRIOR:
         sentence = (
             f"{missed}, while single positions scattered by {usual * 1e3:.2g} mm when the model was made: rows may be "
-            "wrong or of another specimen, or more has changed than so few rows can say. Check the rows with `pisigma "
-            "verify`, or measure more of them."
+            "wrong or from another robot, or more has changed than these few rows can determine. Check the rows with "
+            "`pisigma verify`, or measure more of them."
         )
     else:
         return ()

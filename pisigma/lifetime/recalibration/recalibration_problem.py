@@ -1,4 +1,4 @@
-"""The problem of a recalibration: new rows, and the posterior of a model as the prior of all unknowns."""
+"""Recalibration problem: new rows, and the posterior of a model as prior of all unknowns."""
 
 import math
 from collections.abc import Collection, Sequence, Set
@@ -31,36 +31,36 @@ from pisigma.model.calibrated_model import CalibratedModel, Frames
 from pisigma.model.model_posterior import ModelPosterior
 
 FrameKey = tuple[str, str]
-"""What can stand elsewhere: ("base", frame) or ("tool", target)."""
-ELSEWHERE: dict[ParameterUnit, float] = {"m": 0.1, "rad": 0.1, "px": 100.0, "1": 1.0}
-"""Standard deviation of a base, a tool or a sensor's unknown that stands anywhere, about its guess, by its unit."""
-LARGEST_CORRECTION = 10.0
-"""Size 1 of the drift of a correction, in root mean squares of its weights."""
+"""Key of a base or a tool: ("base", frame) or ("tool", target)."""
+RELOCATION_PRIOR: dict[ParameterUnit, float] = {"m": 0.1, "rad": 0.1, "px": 100.0, "1": 1.0}
+"""Prior standard deviation of a moved base, a moved tool or a new sensor unknown around its guess, by unit."""
+CORRECTION_SCALE = 10.0
+"""Drift of a correction at size 1, as a multiple of the RMS of its weights."""
 WORTH_OF_CORRECTION = 12.0
-"""[nats] Its many weights explain what a model gets wrong of few rows by chance, so it has to show more clearly."""
+"""[nats] Penalty on a drift of the correction, whose many weights explain errors of few rows by chance."""
 WORTH = math.log(100)
-"""[nats] Prior odds of 1 to 100 that a thing moved since the calibration, against that nothing did."""
+"""[nats] Prior odds of 1 to 100 that a given joint, base or tool moved since the calibration, against no movement."""
 
 
 def frame_keys(rows: Measurements, kinds: Collection[str]) -> frozenset[FrameKey]:
-    """List the owners among rows: their frames for the kind "base", and their targets for the kind "tool"."""
+    """Return the keys of the bases (frames) and tools (targets) of rows, for the given kinds."""
     names = {"base": rows.frame, "tool": rows.target}
     return frozenset((kind, name) for kind in kinds for name in names[kind])
 
 
 @dataclass(frozen=True, eq=False)
 class RecalibrationProblem:
-    """New rows, the unknowns, and what is known of them before.
+    """New rows, the unknowns, and their prior.
 
     Attributes:
-        posterior: of the model.
-        setup: the rows, relative to where bases and tools stand.
-        design: the unknowns: all parameters of the model and the rows, and the weights of the correction.
-        mean: of the unknowns, parameters counted from `design.problem.nominal`.
-        root: of their covariance, parameters relative to the anchors of the setup.
+        posterior: posterior of the model.
+        setup: rows, relative to the present bases and tools.
+        design: unknowns: all parameters of the model and the rows, and the weights of the correction.
+        mean: prior mean of the unknowns, parameters counted from `design.problem.nominal`.
+        root: root of their prior covariance, parameters relative to the anchors of the setup.
         change: derivative of the parameters in the user's coordinates by those of the problem.
-        groups: that may drift, with no size, and those that stand elsewhere.
-        standing: root of the covariance of what is not to change.
+        groups: groups that may drift, with size 0, and moved bases and tools.
+        standing: root of the covariance of unknowns that are held fixed.
     """
 
     posterior: ModelPosterior
@@ -74,16 +74,16 @@ class RecalibrationProblem:
 
     @cached_property
     def configuration(self) -> Int64[Tensor, " rows"]:
-        """Number of every row's joint values; the two rows of a pair have one."""
+        """Index of every row's configuration; the two rows of a pair share one."""
         return groups_to_keep_whole(self.setup.measurements)
 
     def wrong_rows(self, values: LinearValues) -> Bool[Tensor, " rows"]:
-        """Which rows do not count: so far off that the loss drops them, or of configurations that are wrong."""
+        """Return which rows do not count: dropped by the loss as far off, or of wrong configurations."""
         wrong = ~torch.isin(self.configuration, values.configuration)
         return wrong | torch.isin(self.configuration, torch.tensor([*values.wrong]))
 
     def without_arm(self) -> "RecalibrationProblem":
-        """The same where the arm is exactly as it was: only what stands elsewhere is unknown."""
+        """Return the problem with the arm held fixed: only moved bases and tools are unknown."""
         elsewhere = tuple(group for group in self.groups if group.fixed_size)
         return replace(self, root=self.standing, groups=elsewhere, standing=self.root)
 
@@ -91,17 +91,17 @@ class RecalibrationProblem:
 def recalibration_problem(
     model: CalibratedModel, posterior: ModelPosterior, rows: Measurements, elsewhere: Set[FrameKey]
 ) -> RecalibrationProblem:
-    """State the problem.
+    """Set up the problem.
 
     Args:
         model: the model.
-        posterior: of it.
-        rows: new ones, frames and targets by the names of the model.
-        elsewhere: bases and tools that stand elsewhere than when the model was made; those that it does not have need
-            not be named.
+        posterior: posterior of the model.
+        rows: new rows, frames and targets by the names of the model.
+        elsewhere: bases and tools that were moved since the model was made; those that the model does not have need not
+            be named.
 
     Raises:
-        IdentificationError: nothing usable was measured, or too little to guess where something stands.
+        IdentificationError: nothing usable was measured, or too little to guess a moved base or tool.
         PoseError: the joint values do not fit the robot.
     """
     posterior.space.robot.check_joint_count(rows.q.shape[1])
@@ -131,10 +131,10 @@ def recalibration_problem(
 
 
 def _joined_space(space: ParameterSpace, rows: Measurements) -> ParameterSpace:
-    """The parameters of a model and of rows.
+    """Return the parameters of a model and of rows.
 
-    Frames and targets that the model has come first. Owners of sensors' unknowns are in the order of the rows, in
-    which the sensors number them, and then those that the rows lack, in the frames where they stood before.
+    Frames and targets of the model come first. Owners of sensor unknowns are in the order of the rows, in which the
+    sensors number them, followed by those that the rows lack, in their previous frames.
     """
     of_rows = {own.name: own for own in unknown_groups(rows)}
     before = {own.name: own for own in space.unknowns}
@@ -157,7 +157,7 @@ def _guess(
     rows: Measurements,
     new: Set[FrameKey],
 ) -> InitialGuess:
-    """Where everything but the arm is: as in the model, and guessed where it does not say that."""
+    """Return bases, tools and sensor unknowns as in the model; those that were moved or are new are guessed."""
     geometry = posterior.geometry
     bases, tools = dict(geometry.bases), dict(geometry.tools)
     unknowns = {group: dict(owners) for group, owners in geometry.unknowns.items()}
@@ -204,12 +204,12 @@ def _guess(
 
 
 def _new_frames(kind: str, names: Sequence[str], frames: np.ndarray, new: Set[FrameKey]) -> Frames:
-    """Guessed bases or tools of those that stand elsewhere."""
+    """Select the guesses of moved bases or tools."""
     return {name: frame for name, frame in zip(names, frames, strict=True) if (kind, name) in new}
 
 
 def frame_slice(space: ParameterSpace, group: str, name: str) -> slice:
-    """Say where the parameters of a base or a tool stand."""
+    """Return the slice of the parameters of a base or a tool."""
     number = (space.frames if group == "base" else space.targets).index(name)
     first = space.of(group).start + 6 * number
     return slice(first, first + 6)
@@ -223,7 +223,7 @@ def _groups(
     new: Set[FrameKey],
     free_unknowns: Collection[int],
 ) -> tuple[DriftGroup, ...]:
-    """What may have drifted: the arm, bases and tools, and the correction; and what stands elsewhere."""
+    """Return the groups that may have drifted (arm, bases, tools, correction), and those that were moved."""
     parameters = len(space.parameters)
     free = root[:parameters].any(1)
     groups = _arm_groups(space, free)
@@ -249,21 +249,19 @@ def _groups(
                 groups.append(_elsewhere(space, f"{own.name} {owner}", index))
     if len(posterior.weights):
         index = torch.arange(parameters, len(root))
-        scale = LARGEST_CORRECTION * posterior.usual_weights
-        groups.append(
-            DriftGroup("correction", index, scale, log_prior_penalty=WORTH_OF_CORRECTION, single=False)
-        )
+        scale = CORRECTION_SCALE * posterior.usual_weights
+        groups.append(DriftGroup("correction", index, scale, log_prior_penalty=WORTH_OF_CORRECTION, single=False))
     return tuple(group for group in groups if len(group.index))
 
 
 def _elsewhere(space: ParameterSpace, what: str, index: Tensor) -> DriftGroup:
-    """What stands anywhere about its guess."""
-    scale = [ELSEWHERE[space.parameters[number].unit] for number in index.tolist()]
+    """Return the group of a moved base or tool, with a wide prior around its guess."""
+    scale = [RELOCATION_PRIOR[space.parameters[number].unit] for number in index.tolist()]
     return DriftGroup(what, index, torch.tensor(scale, dtype=torch.float64), 1.0, fixed_size=True)
 
 
 def _arm_groups(space: ParameterSpace, free: Bool[Tensor, " parameters"]) -> list[DriftGroup]:
-    """The zeros of single joints, and all other lengths and angles that were identified."""
+    """Return the groups of single joint zeros, and of all other identified lengths and angles."""
     robot = space.robot
     zeros = {
         5 * row + (0 if turns else 1): 1.0 if turns else robot.reach
@@ -282,11 +280,11 @@ def _arm_groups(space: ParameterSpace, free: Bool[Tensor, " parameters"]) -> lis
 
 
 def hypotheses(problem: RecalibrationProblem) -> tuple[DriftGroup, ...]:
-    """Everything that can have moved by itself: joints, bases, tools, single lengths and angles; or the correction.
+    """List all single movements: of a joint, base, tool, single length or angle, or of the correction.
 
-    The correction stands for joints that err otherwise than before in many ways, which no single motion explains. Zeros
-    of joints slip more often than arms are bent: all lengths together have a tenth of the odds of a joint, and so have
-    all angles.
+    A change of the correction represents joint errors that changed in many ways, which no single movement explains.
+    Joint zeros slip more often than arms are bent: all lengths together have a tenth of the odds of a joint, and so
+    have all angles.
     """
     parameters = problem.design.problem.space.parameters
     single: list[DriftGroup] = []

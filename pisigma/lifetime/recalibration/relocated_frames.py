@@ -1,4 +1,4 @@
-"""Whether bases and tools stand elsewhere than when a model was made, by the evidence of new rows."""
+"""Bases and tools that were moved since a model was made, by the evidence of new rows."""
 
 from collections.abc import Mapping, Set
 from contextlib import suppress
@@ -12,34 +12,34 @@ from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel, Frames
 from pisigma.model.model_posterior import ModelPosterior
 
-MOST_ROWS = 30
-"""Rows that the question is decided on."""
-FAR = 1e-3
-"""[m, or of the reach] A base or a tool that drifted by less is where it was, but for the drift."""
+MAX_ROWS = 30
+"""Rows that are used for the decision."""
+MIN_MOVE = 1e-3
+"""[m, or share of the reach] Size of the drift below which a base or a tool was not moved."""
 
 
 def relocated_frames(
     model: CalibratedModel, posterior: ModelPosterior, rows: Measurements, noise: Mapping[str, float]
 ) -> frozenset[FrameKey]:
-    """Find which of the bases and tools that a model has stand elsewhere.
+    """Find the bases and tools of a model that were moved.
 
-    Each hypothesis lets joints, geometry and correction drift; it has the evidence of the rows with the base, the tool,
-    both or none anywhere about a guess in closed form.
+    Under each hypothesis joints, geometry and correction may drift, and the base, the tool, both or none have a wide
+    prior around a closed-form guess. The hypothesis with the largest evidence is chosen.
 
     Args:
         model: the model.
-        posterior: of it.
-        rows: new ones, frames and targets by the names of the model.
-        noise: of the calibration, per sensor.
+        posterior: posterior of the model.
+        rows: new rows, frames and targets by the names of the model.
+        noise: noise of each sensor in the calibration.
 
     Returns:
-        Those that stand elsewhere; frames and targets that the model does not have are not among them.
+        The bases and tools that were moved, without frames and targets that the model does not have.
 
     Raises:
         IdentificationError: see `recalibration_problem`.
     """
-    if rows.rows > MOST_ROWS and rows.pair is None:
-        rows = rows.select(chosen_rows(rows.rows, MOST_ROWS).sort().values)
+    if rows.rows > MAX_ROWS and rows.pair is None:
+        rows = rows.select(chosen_rows(rows.rows, MAX_ROWS).sort().values)
     bases, tools = (
         frozenset((kind, name) for name in dict.fromkeys(names) if name in frames)
         for kind, names, frames in _kinds(rows, posterior)
@@ -50,10 +50,10 @@ def relocated_frames(
         return adapt(problem, noise).drift.log_evidence - LOG_PRIOR_PENALTY * len(elsewhere)
 
     still = adapt(recalibration_problem(model, posterior, rows, frozenset()), noise).drift
-    if all(group.size < FAR for group in still.groups if group.what.startswith(("base", "tool"))):
+    if all(group.size < MIN_MOVE for group in still.groups if group.what.startswith(("base", "tool"))):
         return frozenset()
     tried = {frozenset[FrameKey](): still.log_evidence}
-    with suppress(IdentificationError):  # so few rows cannot say where these stand
+    with suppress(IdentificationError):  # too few rows to determine these
         tried |= {owners: evidence(owners) for owners in (bases, tools, bases | tools) if owners}
     return max(tried, key=lambda owners: tried[owners])
 

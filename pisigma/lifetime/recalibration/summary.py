@@ -1,4 +1,4 @@
-"""The figures of a recalibration as one typed value, which cards, tables and JSON render and a model folder keeps."""
+"""Typed figures of a recalibration, which cards, tables and JSON render and a model folder keeps."""
 
 from pisigma.files.yaml_file import Section
 from pisigma.lifetime.recalibration.candidates import Kept
@@ -8,19 +8,19 @@ from pisigma.validation.held_out.summary import AbstractSummary
 
 
 class LeftOutFigures(Section):
-    """Errors of left-out rows under one candidate; None where the rows are too few for it."""
+    """RMS position error of held-out rows under one candidate [mm]; None where the rows are too few for it."""
 
     rms_mm: float | None
 
 
 class WrongRowFigures(Section):
-    """One row that was left out, because it does not go with the others whatever has drifted.
+    """A row that was left out because it contradicts the others under any drift.
 
     Attributes:
-        row: number in the measurements, from 0.
+        row: index in the measurements, from 0.
         place: file and line.
-        residual_mm: length of its error under the model that the other rows give [mm].
-        residual_deg: the same of an orientation [deg].
+        residual_mm: length of its error under the model from the other rows [mm].
+        residual_deg: angle of its orientation error [deg].
     """
 
     row: int
@@ -30,30 +30,30 @@ class WrongRowFigures(Section):
 
     @property
     def sentence(self) -> str:
-        """Which row was left out, and why."""
+        """Which row was left out, why, and what to do."""
         sizes = ((self.residual_mm, "mm"), (self.residual_deg, "deg"))
         missed = " and ".join(f"{size:.3g} {unit}" for size, unit in sizes if size is not None)
-        return f"{self.place} was left out: it is off by {missed} from what the other rows say; measure it again."
+        return f"{self.place} was left out: it deviates by {missed} from the prediction of the others; measure it again."
 
 
 class RecalibrationSummary(AbstractSummary):
     """All figures of a recalibration.
 
     Attributes:
-        parent: the model that the rows were added to; its `sha256` is that of its `model.yaml`.
-        date: of the recalibration, such as "2026-11-22".
+        parent: model that was recalibrated; its `sha256` is that of its `model.yaml`.
+        date: date of the recalibration, such as "2026-11-22".
         rows: number of rows that count.
-        outliers: the other ones.
-        kept: which candidate the model is.
-        verdict: which candidate won and by how much, in a sentence.
-        left_out: number of rows that were left out in turn and count.
-        cross_validation: errors of left-out rows, by candidate.
-        changed: what moved, in a sentence.
-        moved: what moved clearly.
-        elsewhere: bases and tools that stand elsewhere than when the parent was made.
-        effective_parameters: how many directions of the unknowns the rows determine.
-        noise: per sensor, its standard deviation [m or rad], or a factor where the rows state it.
-        warnings: what to heed, a sentence each.
+        outliers: rows that were left out.
+        kept: candidate that was kept.
+        verdict: sentence on which candidate was kept, with the errors of all.
+        left_out: number of rows that were held out in cross-validation and count.
+        cross_validation: errors of held-out rows by candidate.
+        changed: sentence on what moved.
+        moved: significant movements.
+        elsewhere: bases and tools that were moved since the parent was made.
+        effective_parameters: number of directions of the unknowns that the rows determine.
+        noise: standard deviation of each sensor [m or rad]; a factor where the rows state it.
+        warnings: warnings, one sentence each.
     """
 
     kinds = ("recalibration",)

@@ -1,4 +1,4 @@
-"""Whether what is said to have moved is more than wear or a collision can change."""
+"""Check of movements against what wear or a collision can change."""
 
 import math
 from collections.abc import Sequence
@@ -12,11 +12,13 @@ from pisigma.validation.setup_faults.cause import joined
 
 
 def beyond_wear(robot: Robot, moved: Sequence[Movement]) -> tuple[Diagnostic, ...]:
-    """Say which changes no wear and no collision makes; bases, tools and the zero of a single joint move by any size.
+    """Return a diagnostic of changes larger than wear or a collision causes.
+
+    Bases, tools and the zero of a single joint may move by any amount.
 
     Args:
-        robot: whose class has the limits, see `RobotClass.change`.
-        moved: what is said to have moved.
+        robot: robot, whose class has the limits; see `RobotClass.change`.
+        moved: movements that were found.
     """
     of_class = RobotClass.of(robot)
     far = [one for one in moved if not is_frame(one.what) and _is_beyond(one, of_class.change)]
@@ -27,8 +29,8 @@ def beyond_wear(robot: Robot, moved: Sequence[Movement]) -> tuple[Diagnostic, ..
         Diagnostic(
             kind="beyond_wear",
             severity="implausible",
-            sentence=f"The rows ask for changes that neither wear nor a collision makes of a robot of the class "
-            f"'{of_class.name}': {changes}. Check units and scale, the order and the signs of the columns, and whether "
+            sentence=f"The rows imply changes that neither wear nor a collision causes in a robot of class "
+            f"'{of_class.name}': {changes}. Check units and scale, the order and signs of the columns, and whether "
             "this robot was measured.",
         ),
     )

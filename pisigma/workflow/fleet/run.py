@@ -21,7 +21,7 @@ from pisigma.files.plugins import loaded
 from pisigma.files.progress import Progress
 from pisigma.lifetime.fleet.members import Member, read_fleet
 from pisigma.lifetime.fleet.record import (
-    MARK,
+    MARKER_FILE,
     RESULTS,
     RobotRecord,
     expect_robots,
@@ -180,7 +180,7 @@ def _prepare(folder: Path, source: Path, members: tuple[Member, ...]) -> None:
     inputs = [source, *(one.data for member in members for one in member.sessions)]
     inputs += [member.model for member in members if member.model is not None]
     inputs += [Path(file) for member in members if member.cameras for file in member.cameras.files]
-    mark = folder / MARK
+    mark = folder / MARKER_FILE
     try:
         check_conflicts(folder, inputs)
         if folder.exists() and not folder.is_dir():
