@@ -172,38 +172,38 @@ def _owners(
 def _check_one_robot(first: CalibratedModel, second: CalibratedModel) -> None:
     """Refuse models of different robots."""
     robots = as_drawn(first), as_drawn(second)
-    what = _difference(*robots)
-    if what:
+    quantity, what = _difference(*robots)
+    if quantity:
         raise ModelError(
             f"models {first.name} (robot '{robots[0].name}') and {second.name} (robot '{robots[1].name}') belong to "
             f"different robots: {what}",
-            value=what,
+            value=quantity,
             remedy="give two models of one robot",
         )
 
 
-def _difference(one: Robot, other: Robot) -> str:
-    """Describe how two nominal robots differ; "" where they are the same robot."""
+def _difference(one: Robot, other: Robot) -> tuple[str, str]:
+    """Return the quantity in which two nominal robots differ, and how; both "" where they are the same robot."""
     if one.dof != other.dof:
-        return f"one has {one.dof} joints and the other {other.dof}"
+        return "joints", f"one has {one.dof} joints and the other {other.dof}"
     types = [[row.type for row in robot.rows] for robot in (one, other)]
     if types[0] != types[1]:
-        return f"their rows are {', '.join(types[0])} and {', '.join(types[1])}"
+        return "rows", f"their rows are {', '.join(types[0])} and {', '.join(types[1])}"
     if tuple(one.directions) != tuple(other.directions):
-        return "a joint has the opposite direction"
+        return "directions", "a joint has the opposite direction"
     if not _coupled_alike(one, other):
-        return "their joint couplings differ"
+        return "coupling", "their joint couplings differ"
     scale = np.array([1.0, one.reach, one.reach, 1.0, 1.0])
     by = one.dh - other.dh
     by[:, [0, 3, 4]] = 2 * np.sin(by[:, [0, 3, 4]] / 2)  # angles modulo one revolution
     apart = np.abs(by) / scale
     row, column = np.unravel_index(int(apart.argmax()), apart.shape)
     if apart[row, column] <= MAX_NOMINAL_DIFFERENCE:
-        return ""
+        return "", ""
     name = ("theta", "d", "a", "alpha", "beta")[int(column)]
     unit, factor = ("mm", 1e3) if name in ("d", "a") else ("deg", float(np.rad2deg(1.0)))
     values = [f"{robot.dh[row, column] * factor:.6g}" for robot in (one, other)]
-    return f"the nominal {name} of row '{one.rows[row].name}' is {values[0]} and {values[1]} {unit}"
+    return name, f"the nominal {name} of row '{one.rows[row].name}' is {values[0]} and {values[1]} {unit}"
 
 
 def _coupled_alike(one: Robot, other: Robot) -> bool:

@@ -33,7 +33,10 @@ class WrongRowFigures(Section):
         """Which row was left out, why, and what to do."""
         sizes = ((self.residual_mm, "mm"), (self.residual_deg, "deg"))
         missed = " and ".join(f"{size:.3g} {unit}" for size, unit in sizes if size is not None)
-        return f"{self.place} was left out: it deviates by {missed} from the prediction of the others; measure it again."
+        return (
+            f"{self.place} was left out: it deviates by {missed} from its prediction by the others; "
+            "measure it again."
+        )
 
 
 class RecalibrationSummary(AbstractSummary):

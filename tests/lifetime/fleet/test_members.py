@@ -1,6 +1,7 @@
-"""Manifests and folders of robots, and what is wrong with them."""
+"""Manifests and folders of robots, and their faults."""
 
 import pytest
+from testing.refusals import assert_fields, refused
 
 from pisigma.files.errors import FleetError, MeasurementError
 from pisigma.lifetime.fleet.members import read_fleet
@@ -40,11 +41,11 @@ def test_cameras_and_boards_of_corners(tmp_path):
     assert a.cameras.files == (wrist, beside, board)
     assert settings_for(FleetSettings(), a).cameras == a.cameras
     assert b.cameras is None
-    with pytest.raises(FleetError, match="line 2: the columns 'camera' and 'board' belong together"):
+    with refused(FleetError, file="fleet.csv", line=2, column="board"):
         read_fleet(write(tmp_path, f"{header}a,ur5,a.csv,wrist.yaml,\n"))
 
 
-def test_a_tree_of_folders_is_a_fleet(tmp_path):
+def test_a_fleet_of_folders(tmp_path):
     for name in ("cell1", "cell2", ".git"):
         (tmp_path / name).mkdir()
         (tmp_path / name / "2026-01-01.csv").write_text("", encoding="utf-8")
@@ -58,45 +59,41 @@ def test_a_tree_of_folders_is_a_fleet(tmp_path):
         ("cell3", "ur5"),
     ]
     undescribed, described, file = read_fleet(tmp_path)
-    assert "cell1: holds none of robot.yaml" in undescribed.fault
-    assert (described.fault, "cell3.csv: holds none" in file.fault) == ("", True)
+    assert_fields(undescribed.error, file="cell1")
+    assert (described.fault, described.error) == ("", None)
+    assert_fields(file.error, file="cell3.csv")
 
 
 @pytest.mark.parametrize(
-    ("text", "complaint"),
+    ("text", "line", "column", "value"),
     [
-        ("id,robot,date\na,ur5,\n", "line 1: column 'data' is missing"),
-        ("id,robot,data,dats\na,ur5,a.csv,\n", "line 1: column 'dats' is unknown; did you mean 'date'"),
-        (
-            "id;robot;data\na;ur5;a.csv\n",
-            "line 1, column 'id;robot;data': fields are separated by semicolons",
-        ),
-        ("id,robot,data\n../a,ur5,a.csv\n", "line 2: '../a' cannot be the id of a robot"),
-        ("id,robot,data\na,ur5,a.csv\nA,ur5,b.csv\n", "the ids 'a' and 'A' differ by capitals only"),
-        ("id,robot,data\na,,a.csv\n", "line 2: the field 'robot' is empty"),
-        ("id,robot,data\na,ur5,\n", "line 2: the field 'data' is empty"),
-        ("id,robot,data\na,ur5\n", "line 2: 3 fields were wanted, got 2"),
-        (
-            "id,robot,data,date\na,ur5,a.csv,May\n",
-            "line 2: expected a day from 1970-01-01 to today",
-        ),
-        ("id,robot,data\na,ur5,a.csv\na,ur5,b.csv\n", "line 2: robot 'a': has several sessions, and not all"),
-        ("id,robot,data\na,ur5,x/a.csv\na,ur5,y/a.csv\n", "has two sessions 'a'"),
+        ("id,robot,date\na,ur5,\n", 1, "data", None),
+        ("id,robot,data,dats\na,ur5,a.csv,\n", 1, "dats", "dats"),
+        ("id;robot;data\na;ur5;a.csv\n", 1, "id;robot;data", None),
+        ("id,robot,data\n../a,ur5,a.csv\n", 2, None, "../a"),
+        ("id,robot,data\na,ur5,a.csv\nA,ur5,b.csv\n", None, None, "A"),
+        ("id,robot,data\na,,a.csv\n", 2, "robot", None),
+        ("id,robot,data\na,ur5,\n", 2, "data", None),
+        ("id,robot,data\na,ur5\n", 2, None, 2),
+        ("id,robot,data,date\na,ur5,a.csv,May\n", 2, "date", "May"),
+        ("id,robot,data\na,ur5,a.csv\na,ur5,b.csv\n", 2, None, "a"),
+        ("id,robot,data\na,ur5,x/b.csv\na,ur5,y/b.csv\n", 2, None, "b"),
         (
             "id,robot,data,date\na,ur5,a.csv,2026-01-01\na,ur5,./a.csv,2026-02-01\n",
-            "the sessions '2026-01-01' and '2026-02-01' are of the same file 'a.csv'",
+            2,
+            None,
+            "a.csv",
         ),
-        (
-            "id,robot,data\na,ur5,of cell 7.csv\n",
-            "the session of 'of cell 7.csv' cannot be called 'of cell 7'",
-        ),
-        ("id,robot,data\na,ur5,a.csv\na,ur10,b.csv\n", "several different entries in the column 'robot'"),
+        ("id,robot,data\na,ur5,of cell 7.csv\n", 2, None, "of cell 7"),
+        ("id,robot,data\nb,ur5,a.csv\nb,ur10,b.csv\n", 2, "robot", "b"),
     ],
 )
-def test_what_is_wrong_with_a_manifest_is_said_with_its_line(tmp_path, text, complaint):
+def test_faults_of_a_manifest_are_reported_with_line_and_column(tmp_path, text, line, column, value):
     with pytest.raises((FleetError, MeasurementError)) as raised:
         read_fleet(write(tmp_path, text))
-    assert complaint in str(raised.value)
+    assert_fields(raised.value, file="fleet.csv", line=line, column=column)
+    if value is not None:
+        assert_fields(raised.value, value=value)
 
 
 @pytest.mark.parametrize("file", ["cell1.csv", "Cell1.csv"])
@@ -104,10 +101,11 @@ def test_a_folder_and_a_file_of_one_name_are_refused(tmp_path, file):
     (tmp_path / "cell1").mkdir()
     for path in (tmp_path / "cell1" / "2026-03-01.csv", tmp_path / file):
         path.write_text("")
-    with pytest.raises(FleetError, match="rename one"):
+    with refused(FleetError) as caught:
         read_fleet(tmp_path, "ur5")
+    assert caught.value.value.casefold() == "cell1"
 
 
-def test_an_empty_folder_is_no_fleet(tmp_path):
-    with pytest.raises(FleetError, match="holds no robot"):
+def test_an_empty_folder_is_refused(tmp_path):
+    with refused(FleetError, file=str(tmp_path), value="no robot"):
         read_fleet(tmp_path)

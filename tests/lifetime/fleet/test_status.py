@@ -1,4 +1,4 @@
-"""How a fleet stands."""
+"""Status of a fleet."""
 
 import datetime
 
@@ -45,11 +45,11 @@ def test_every_robot_has_its_state():
     assert STATUS.action
 
 
-def test_the_worst_come_first():
+def test_robots_are_sorted_by_error():
     assert [one.robot for one in STATUS.worst_first] == ["moved", "pays", "old", "fine"]
 
 
-def test_json_names_what_is_to_be_done():
+def test_json_lists_the_robots_by_state():
     figures = STATUS.to_json()
     assert figures["drifting"] == ["moved", "pays"]
     assert figures["overdue"] == [{"robot": "old", "days": 386}]
@@ -64,18 +64,18 @@ def test_tables_have_all_robots():
     assert rows["bad"] == ("2026-01-01", "", "", "", "", "refused")
 
 
-def test_a_joint_that_moved_drifts_though_its_model_is_up_to_date():
+def test_a_moved_joint_counts_as_drift_after_a_recalibration():
     sessions = session("2026-01-01", "calibrated"), session("2026-11-01", "recalibrated", 0.1, moved=True)
     status = FleetStatus.of([RobotRecord("r", "", sessions)], TODAY, 180)
     assert status.robots[0].state == "drifting"
     assert status.robots[0].compared
 
 
-def test_sessions_that_were_calibrated_each_by_itself_say_nothing_of_drift():
+def test_separately_calibrated_sessions_do_not_show_drift():
     sessions = session("2026-01-01", "calibrated"), session("2026-11-01", "calibrated")
     status = FleetStatus.of([RobotRecord(name, "", sessions) for name in "ab"], TODAY, 180)
     assert status.to_json()["not_compared"] == ["a", "b"]
-    assert not_compared(status).startswith("2 robots have several sessions")
+    assert not_compared(status).startswith("2 robots")
     assert not_compared(STATUS) == ""
 
 
@@ -84,7 +84,7 @@ def test_the_error_of_a_cross_validation_counts():
     assert robot_table(FleetStatus.of([figures], TODAY, 180).robots).rows[0][4] == "0.110"
 
 
-def test_a_date_that_cannot_be_is_named_and_not_counted_from():
+def test_an_impossible_date_is_reported_and_ignored():
     record = RobotRecord("slip", "", (session("2206-01-01", "calibrated", 0.1),))
     seen = FleetStatus.of([record], TODAY, 180)
     assert seen.robots[0].days is None

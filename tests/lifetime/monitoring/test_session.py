@@ -68,7 +68,7 @@ def test_two_joints_that_moved_are_both_named():
 
 
 @pytest.mark.parametrize("joint", [0, 3])
-def test_an_instrument_elsewhere_is_told_from_a_joint(joint):
+def test_an_instrument_elsewhere_is_distinguished_from_a_joint(joint):
     session, _ = judged(rows_later(12, 5, moved_joint(joint, 0.1), ELSEWHERE))
     expected = ["joint 3"] if joint else []
     assert [one.what for one in session.moved] == [*expected, "base", "base"]

@@ -10,7 +10,7 @@ from testing.closeness import assert_close
 from pisigma.calibration.hybrid.calibrator import HybridCalibrator
 from pisigma.lifetime.recalibration.adaptation import adapt
 from pisigma.lifetime.recalibration.candidates import (
-    ABOUT_AS_GOOD,
+    MIN_RATIO,
     CandidateChoice,
     _decided,
     choose_candidate,
@@ -40,7 +40,7 @@ def test_a_row_that_is_off_by_far_does_not_save_a_candidate_that_is_worse_everyw
     assert decided(recalibrated=hopeless, old=[31.0] * 10, scratch=[0.9, 1.1] * 5).kept == "scratch"
 
 
-def test_a_candidate_that_is_far_better_is_kept_however_its_rows_are_distributed():
+def test_a_much_better_candidate_is_kept_whatever_the_distribution():
     by_metres = [40.0, 1e-3, 0.3, 4.0, 6.0, 9.0]
     by_luck = [2e-3, 0.2, 3e-3, 0.5, 4e-4, 0.3]
     assert decided(recalibrated=by_metres, old=by_metres, scratch=by_luck).kept == "scratch"
@@ -58,10 +58,10 @@ def test_a_row_that_every_candidate_misses_does_not_count():
     assert_close(judged.rms["recalibrated"], 1.0)
 
 
-def test_without_left_out_rows_the_recalibrated_model_is_kept():
+def test_without_held_out_rows_the_recalibrated_model_is_kept():
     judged = decided(recalibrated=[math.nan] * 2, old=[math.nan] * 2, scratch=[math.nan] * 2)
     assert (judged.kept, judged.rows) == ("recalibrated", 0)
-    assert judged.sentence == "The recalibrated model is kept: the rows are too few to leave any out."
+    assert not any(character.isdigit() for character in judged.sentence)  # no errors are known
 
 
 @pytest.mark.parametrize("count", [5, 10])
@@ -76,4 +76,4 @@ def test_left_out_rows_decide(count):
     kept, old = judged.rms["recalibrated"], judged.rms["old"]
     assert kept is not None
     assert old is not None
-    assert ABOUT_AS_GOOD * kept < old
+    assert MIN_RATIO * kept < old
