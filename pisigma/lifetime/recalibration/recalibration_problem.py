@@ -36,9 +36,9 @@ RELOCATION_PRIOR: dict[ParameterUnit, float] = {"m": 0.1, "rad": 0.1, "px": 100.
 """Prior standard deviation of a moved base, a moved tool or a new sensor unknown around its guess, by unit."""
 CORRECTION_SCALE = 10.0
 """Drift of a correction at size 1, as a multiple of the RMS of its weights."""
-WORTH_OF_CORRECTION = 12.0
+CORRECTION_PENALTY = 12.0
 """[nats] Penalty on a drift of the correction, whose many weights explain errors of few rows by chance."""
-WORTH = math.log(100)
+MOVEMENT_PENALTY = math.log(100)
 """[nats] Prior odds of 1 to 100 that a given joint, base or tool moved since the calibration, against no movement."""
 
 
@@ -250,7 +250,9 @@ def _groups(
     if len(posterior.weights):
         index = torch.arange(parameters, len(root))
         scale = CORRECTION_SCALE * posterior.usual_weights
-        groups.append(DriftGroup("correction", index, scale, log_prior_penalty=WORTH_OF_CORRECTION, single=False))
+        groups.append(
+            DriftGroup("correction", index, scale, log_prior_penalty=CORRECTION_PENALTY, single=False)
+        )
     return tuple(group for group in groups if len(group.index))
 
 
@@ -292,11 +294,11 @@ def hypotheses(problem: RecalibrationProblem) -> tuple[DriftGroup, ...]:
         if group.fixed_size:
             continue
         if group.what not in ("lengths", "angles"):
-            single.append(replace(group, log_prior_penalty=WORTH))
+            single.append(replace(group, log_prior_penalty=MOVEMENT_PENALTY))
             continue
         for index, scale in zip(group.index, group.scale, strict=True):
-            worth = WORTH + math.log(10 * len(group.index))
+            penalty = MOVEMENT_PENALTY + math.log(10 * len(group.index))
             single.append(
-                DriftGroup(parameters[int(index)].name, index[None], scale[None], log_prior_penalty=worth)
+                DriftGroup(parameters[int(index)].name, index[None], scale[None], log_prior_penalty=penalty)
             )
     return tuple(single)
