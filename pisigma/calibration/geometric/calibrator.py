@@ -1,4 +1,4 @@
-"""The geometric calibrator."""
+"""Geometric calibration by least squares."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -41,7 +41,7 @@ from pisigma.calibration.geometric.problem.setup import (
 )
 from pisigma.calibration.geometric.result import CalibrationResult, SolvedCalibration
 from pisigma.estimation.loss import AbstractLoss, HampelLoss
-from pisigma.files.errors import IdentificationError
+from pisigma.files.errors import IdentificationError, check_choice
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.sensors.socket import PairOfSockets
 from pisigma.robot.description import Robot
@@ -49,38 +49,39 @@ from pisigma.robot.robot_class import CLASSES
 from pisigma.robot.row import FRAME_COLUMNS
 
 ROUGH_ROWS = 4_096
-"""Rows that the initial guess and the first steps are worked out from."""
+"""Rows used for the initial guess and the first steps."""
 ROUGH_STEPS = 3
-"""Steps without the prior, which show the noise before the prior is weighed against it."""
+"""Steps without the prior, which show the noise relative to which the prior is then weighted."""
 
 
 @dataclass(frozen=True)
 class GeometricCalibrator:
-    """Identifies DH + Hayati parameters, base and tool from measured poses or positions, by least squares.
+    """Identifies DH + Hayati parameters, base and tool from measured poses or positions by least squares.
 
-    No initial guess is asked for: base and tool start in closed form, the arm at its nominal values.
+    No initial guess is needed: base and tool start from a closed-form solution, the arm at its nominal values.
 
     Attributes:
         robot: the nominal robot.
-        free: "identifiable": all that the data can determine; "joint_offsets": theta of turning and d of sliding
-            joints; or names of parameters, such as "a_2". Base and tool come on top, see below.
-        base: "free", or "fixed" to the robot's own (then only parameters that `free` names are estimated).
+        free: "identifiable" (all that the data determine), "joint_offsets" (theta of revolute and d of prismatic
+            joints), or names of parameters, such as "a_2". Base and tool are added to these, see below.
+        base: "free", or "fixed" to the robot's (then only those of its parameters that `free` names are estimated).
         tool: the same for the tool; "position" frees x, y and z only.
-        elimination: how redundant parameters are left out: "exact" (rank and pivoted QR), "pairwise" (the
-            paper's Pearson correlation), or "none". The predicted poses do not depend on it.
-        prior: standard deviations of the parameters' errors, or None. With it, what the data cannot determine
-            stays at its nominal value.
-        prior_sizes: "estimated": by the data, one factor on the prior for each of joint offsets, lengths, lengths
-            drawn as 0, and angles between axes; "widened": one for lengths and one for angles, and only where
-            the errors are larger than the prior says; "stated": as it is.
-        frames: per frame of touches, about where the robot's base is in it: x, y, z [m], roll, pitch, yaw
-            [rad], such as the planned placement of a jig. Needed only where the touches do not determine it.
+        elimination: how redundant parameters are removed: "exact" (rank and pivoted QR), "pairwise" (Pearson
+            correlation, as in Park et al. 2022), or "none". The predicted poses do not depend on it.
+        prior: standard deviations of the errors of the parameters, or None. With a prior, parameters that the data do
+            not determine stay at their nominal values.
+        prior_sizes: "estimated" (one factor on the prior is estimated for each of joint offsets, lengths, lengths that
+            are nominally 0, and angles between axes), "widened" (one factor >= 1 for lengths and one for angles), or
+            "stated" (the prior is used as it is).
+        frames: approximate base in frames with touches: x, y, z [m], roll, pitch, yaw [rad], such as the planned
+            placement of a jig. Needed only if the touches do not determine it.
         socket_distances: distances between two sockets [m], which determine the scale:
             `{("plate/0", "plate/1"): 0.05}`.
         socket_sigma: standard deviation of these distances [m].
-        loss: `HampelLoss()` gives rows that are far off less weight or none; `SquaredLoss()` does not.
-        maximum_iterations: steps tried at most.
-        robot_class: "industrial", "cobot" or "hobby": how large errors can be; None: as the maker and the data say.
+        loss: `HampelLoss()` reduces the weight of outliers, down to 0; `SquaredLoss()` does not.
+        maximum_iterations: maximum number of steps.
+        robot_class: "industrial", "cobot" or "hobby", which limits the errors; None to derive it from the manufacturer
+            and the data.
     """
 
     robot: Robot
@@ -98,7 +99,7 @@ class GeometricCalibrator:
     robot_class: str | None = None
 
     def __post_init__(self) -> None:
-        """Refuse options that do not exist."""
+        """Refuse invalid options."""
         for name, choices in (
             ("base", ("free", "fixed")),
             ("tool", ("free", "position", "fixed")),
@@ -107,37 +108,42 @@ class GeometricCalibrator:
             ("robot_class", (None, *CLASSES)),
         ):
             if getattr(self, name) not in choices:
-                raise IdentificationError(
-                    f"{name}='{getattr(self, name)}' is no choice; valid: {', '.join(filter(None, choices))}."
-                )
+                check_choice(IdentificationError, name, getattr(self, name), [one for one in choices if one])
         if isinstance(self.free, str) and self.free not in ("identifiable", "joint_offsets"):
-            valid = "identifiable, joint_offsets, or a list of parameter names"
-            raise IdentificationError(f"free='{self.free}' is not valid; valid: {valid}.")
+            raise IdentificationError(
+                option="free",
+                expected="'identifiable', 'joint_offsets' or a list of parameter names",
+                value=self.free,
+            )
         if not isinstance(self.free, str) and "" in self.free:
             raise IdentificationError(
-                f"free={tuple(self.free)}: a name is empty; give names of parameters such as a_2, with one "
-                "comma between two."
+                option="free",
+                expected="names of parameters such as a_2, separated by single commas",
+                value=tuple(self.free),
             )
         for name, base in self.frames.items():
             if len(base) != 6 or not all(math.isfinite(value) for value in base):
                 raise IdentificationError(
-                    f"frames: six numbers were wanted for '{name}', x, y, z [m], roll, pitch, yaw [rad], got "
-                    f"{tuple(base)}."
+                    option="frames",
+                    expected=f"six finite numbers for '{name}': x, y, z [m], roll, pitch, yaw [rad]",
+                    value=tuple(base),
                 )
         if not self.socket_sigma > 0:
-            raise IdentificationError(f"expected socket_sigma > 0 [m], got {self.socket_sigma:g}.")
+            raise IdentificationError(
+                option="socket_sigma", expected="a standard deviation > 0 m", value=self.socket_sigma
+            )
 
     @torch.inference_mode()
     def fit(self, measurements: Measurements) -> CalibrationResult:
-        """Calibrate; see `solve` for what is raised."""
+        """Calibrate; see `solve` for the errors raised."""
         return self.solve(measurements).result()
 
     def solve(self, measurements: Measurements) -> SolvedCalibration:
-        """Calibrate, and keep the problem and its solution for what is built upon them.
+        """Calibrate, and return the problem with its solution.
 
         Raises:
-            IdentificationError: the measurements do not determine what is asked for, or are so far from the best
-                fit that they cannot be of this robot; the message says what to measure or what to fix.
+            IdentificationError: the measurements do not determine the parameters, or are so far from the best fit that
+                they cannot belong to this robot; the message says what to measure or to correct.
             PoseError: the joint values do not fit the robot.
         """
         setup = self.build(measurements)
@@ -156,10 +162,10 @@ class GeometricCalibrator:
         return SolvedCalibration(measurements, setup, problem, rough.before(fine), findings, geometry)
 
     def build(self, measurements: Measurements) -> CalibrationSetup:
-        """The problem and its start, without solving it.
+        """Build the problem and its start values, without solving it.
 
         Raises:
-            IdentificationError: nothing usable was measured, or too little for base and tool.
+            IdentificationError: there are no usable measurements, or too few for base and tool.
             PoseError: the joint values do not fit the robot.
         """
         options = SetupOptions(
@@ -174,7 +180,7 @@ class GeometricCalibrator:
         return build_setup(self.robot, measurements, options, self.prior, self.loss)
 
     def _finds(self, group: str) -> bool:
-        """Whether a start of bases or tools is wanted: they are free, or named (of a base all six)."""
+        """Say whether bases or tools need a start: they are free, or named (all six parameters of a base)."""
         if getattr(self, group) != "fixed":
             return True
         if isinstance(self.free, str):
@@ -183,7 +189,7 @@ class GeometricCalibrator:
         return {f"{group}_{column}" for column in columns} <= set(self.free)
 
     def candidates(self, space: ParameterSpace) -> list[int]:
-        """Indices of the parameters that may be estimated.
+        """List the indices of the parameters that may be estimated.
 
         Raises:
             IdentificationError: `free` names a parameter that does not exist.
@@ -204,7 +210,7 @@ class GeometricCalibrator:
         """Choose the parameters to start with.
 
         Returns:
-            What is found out about the parameters; indices of those that may be estimated, and of those that are.
+            Result of the rank analysis, indices of the parameters that may be estimated, and of those that are.
 
         Raises:
             IdentificationError: the measurements do not determine them.
@@ -228,7 +234,7 @@ class GeometricCalibrator:
         sizes: Float64[np.ndarray, " candidates"],
         redundancy: Redundancy,
     ) -> list[int]:
-        """Indices of the parameters to start with."""
+        """List the indices of the parameters to start with."""
         if self.elimination == "exact":
             return [space.index(name) for name in redundancy.kept]
         names = redundancy.names
@@ -239,12 +245,12 @@ class GeometricCalibrator:
     def _solve_roughly(
         self, setup: CalibrationSetup, findings: Findings, candidates: list[int], active: list[int]
     ) -> tuple[Solution[Tensor], Findings, list[int]]:
-        """Solve roughly without the prior, and add what the data determine there.
+        """Take some steps without the prior, and add parameters that the data determine there.
 
-        The rough steps show the noise that the prior is weighed against; a few thousand rows are enough for them.
+        These steps show the noise relative to which the prior is weighted; a few thousand rows suffice for them.
 
         Returns:
-            The end of these steps, the findings with what was added, and indices of all free parameters.
+            The solution after these steps, the findings with the added parameters, and indices of all free parameters.
         """
         problem = setup.problem.with_active(active)
         if problem.rows > ROUGH_ROWS:

@@ -1,4 +1,4 @@
-"""Rows that a calibration takes for wrong."""
+"""Outliers of a calibration."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -13,12 +13,12 @@ from pisigma.measurement.sensors.sensor import AbstractSensor
 
 @dataclass(frozen=True)
 class Outlier:
-    """A row that counted for less than half.
+    """A row with less than half of the full weight.
 
     Attributes:
-        row: its number in the measurements, from 0.
-        place: file and line, or source and row, as complaints name the row.
-        sensor: which value of the row.
+        row: number in the measurements, from 0.
+        place: file and line, or source and row, as in error messages.
+        sensor: kind of sensor of the value.
         residual: length of the residual [m or rad].
         deviations: the same in standard deviations of one value.
         unit: "m" or "rad".
@@ -41,16 +41,16 @@ def outliers_of(
     deviations: Float64[Tensor, " values"],
     weight: Float64[Tensor, " values"],
 ) -> list[Outlier]:
-    """Name the rows of a sensor that count for less than half.
+    """List the rows of a sensor with less than half of the full weight.
 
     Args:
-        setup: whose problem the rows are of.
-        measurements: that it was made from.
-        sensor: that saw them.
-        rows: their numbers in the problem.
-        length: of their residuals [m or rad].
+        setup: setup with the problem of the rows.
+        measurements: measurements that the setup was made from.
+        sensor: the sensor.
+        rows: numbers of the rows in the problem.
+        length: lengths of their residuals [m or rad].
         deviations: the same in standard deviations of one value.
-        weight: how much they count.
+        weight: weights of the rows.
     """
     outliers = []
     for k in (weight < 0.5).nonzero()[:, 0].tolist():

@@ -1,4 +1,4 @@
-"""The table of parameters: nominal and estimated values, standard errors, and what is to be said of each."""
+"""Table of parameters: nominal and estimated values, standard errors, and a remark on each."""
 
 from dataclasses import dataclass
 
@@ -20,9 +20,9 @@ from pisigma.robot.row import FRAME_COLUMNS
 from pisigma.robot.se3 import wrap_to_pi
 
 LOST = 1e-10
-"""Information, columns scaled to 1, with a smaller eigenvalue does not determine some direction."""
+"""Smallest eigenvalue of the scaled information (unit diagonal) below which a direction is undetermined."""
 HELD = 0.7
-"""A parameter whose standard error is more than this share of its prior's is not determined by the data."""
+"""Standard error over the prior standard deviation above which the data hardly determine a parameter."""
 
 
 @dataclass(frozen=True)
@@ -30,13 +30,13 @@ class ParameterEstimate:
     """One row of the parameter table, in SI units.
 
     Attributes:
-        name: such as "theta_1".
+        name: name of the parameter, such as "theta_1".
         unit: "m" or "rad".
-        nominal: as drawn.
-        estimated: as identified.
-        change: estimated - nominal.
-        standard_error: of the estimate; NaN where it was not estimated.
-        remark: "identified", what it is only identified together with, or why it was not estimated.
+        nominal: nominal value.
+        estimated: estimated value.
+        change: estimated minus nominal value.
+        standard_error: standard error of the estimate; NaN if it was not estimated.
+        remark: "identified", the combination that is identified, or why it was not estimated.
         label: the remark in a few words, for tables.
     """
 
@@ -63,15 +63,15 @@ def parameter_table(
     geometry: IdentifiedGeometry,
     covariance: Float64[np.ndarray, "parameters parameters"],
 ) -> tuple[ParameterEstimate, ...]:
-    """List all parameters with their nominal and estimated values and standard errors, and say what each is worth.
+    """List all parameters with their nominal and estimated values, standard errors and a remark.
 
     Args:
         setup: the problem at its start.
-        problem: with its free parameters.
-        findings: what the rank analysis says about them.
-        here: the problem's linearisation at the solution.
+        problem: the problem with its free parameters.
+        findings: result of the rank analysis.
+        here: linearisation of the problem at the solution.
         geometry: the solution in the user's coordinates.
-        covariance: of all parameters in these coordinates.
+        covariance: covariance of all parameters in these coordinates.
     """
     space, robot = problem.space, problem.space.robot
     bases, tools = np.tile(robot.base, (len(space.frames), 1)), np.tile(robot.tool, (len(space.targets), 1))
@@ -91,11 +91,11 @@ def parameter_table(
         free = index in active or bool(errors[index] > 0)
         remark, label = _remark(parameter.name, free, index in findings.extended, findings.redundancy)
         if free and held[index]:
-            remark += "; the data hardly determine it, the prior holds it"
+            remark += "; the data hardly determine it, so it stays near its prior value"
             label = "held by the prior" if label == "identified" else f"{label}; prior"
         if undetermined[index]:
             free, label = False, "outliers"
-            remark = "too few rows that count show it, the others are outliers"
+            remark = "too few rows determine it, because the others are outliers"
         error = float(errors[index]) if free else float("nan")
         name, unit = parameter.name, parameter.unit
         rows.append(ParameterEstimate(name, unit, before, after, moved, error, remark, label))
@@ -105,9 +105,9 @@ def parameter_table(
 def _without_rows(
     problem: CalibrationProblem, normal: Float64[Tensor, "active active"], findings: Findings
 ) -> list[int]:
-    """Free parameters that the rows left over do not hold: those that none shows, and bases not wholly determined.
+    """List free parameters that the rows without outliers do not determine, although all rows together would.
 
-    Not those that all rows together would not show either.
+    These are parameters without effect in these rows, and bases that they determine only partially.
     """
     active = problem.active.cpu()
     names = [problem.space.names[i] for i in active.tolist()]
@@ -126,13 +126,13 @@ def _without_rows(
 
 
 def _determines_all(information: Float64[Tensor, "own own"]) -> bool:
-    """Whether information holds its parameters in every direction."""
+    """Say whether information determines its parameters in every direction."""
     scale = information.diagonal().clamp(min=1e-300).rsqrt()
     return float(torch.linalg.eigvalsh(information * scale * scale[:, None])[0]) >= LOST
 
 
 def _prior_precision(problem: CalibrationProblem, here: Linearisation[Tensor]) -> np.ndarray:
-    """1 / variance of all parameters by the prior, 0 where they are not free."""
+    """Return the prior precision (1 / variance) of all parameters; 0 for those that are not free."""
     full = torch.zeros_like(problem.precision)
     full[problem.active] = view_of(here).scaled(problem.precision[problem.active], problem.prior_group)
     precision: np.ndarray = full.cpu().numpy()
@@ -140,7 +140,7 @@ def _prior_precision(problem: CalibrationProblem, here: Linearisation[Tensor]) -
 
 
 def _remark(name: str, free: bool, extended: bool, redundancy: Redundancy) -> tuple[str, str]:
-    """What is to be said of a parameter, in full and in a few words."""
+    """Write the remark on a parameter, as a sentence and in a few words."""
     if name not in redundancy.names:
         remark = "identified" if free else "fixed"
         return remark, remark
@@ -148,7 +148,7 @@ def _remark(name: str, free: bool, extended: bool, redundancy: Redundancy) -> tu
         remark = "identified at the solution, though redundant at the nominal geometry"
         return remark, "only at solution"
     if name in redundancy.no_effect:
-        return "without effect on what was measured", "no effect"
+        return "without effect on the measured values", "no effect"
     if (sentence := redundancy.group(name)) is not None:
         return sentence, "in a sum"
     remark = "identified" if free else "left out"

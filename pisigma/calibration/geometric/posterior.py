@@ -1,4 +1,4 @@
-"""What a calibration says of all its parameters together: values, and a covariance with every correlation."""
+"""Joint posterior of all parameters of a calibration: values and covariance."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,14 +17,14 @@ from pisigma.files.errors import IdentificationError, nearest_choice
 class ParameterPosterior:
     """Normal distribution of all parameters, in the user's coordinates.
 
-    They are geometry, bases of all frames, tools of all targets, and what the sensors found out about themselves
-    (sockets, anchors, zeros), in the frame of their owner.
+    The parameters are the geometry, the bases of all frames, the tools of all targets, and the unknowns of the sensors
+    (sockets, anchors, zeros) in the frame of their owner.
 
     Attributes:
-        parameters: the parameters in their order, with their names and units.
-        mean: their values [m or rad]; NaN where a model from before these were kept does not hold one.
-        root: `R` with the covariance `R R^T` [m and rad], of all parameters (0 for those that were not free) and then
-            of the weights of a joint correction where there is one, which have no names.
+        parameters: the parameters in order, with names and units.
+        mean: their values [m or rad]; NaN if a model of an earlier version does not store one.
+        root: root `R` of the covariance `R R^T` [m and rad] of all parameters (0 for those that were not free),
+            followed by the weights of a joint correction, if there is one, which have no names.
     """
 
     parameters: tuple[Parameter, ...]
@@ -35,7 +35,7 @@ class ParameterPosterior:
     def of(
         space: ParameterSpace, geometry: IdentifiedGeometry, root: Float64[Tensor, "unknowns directions"]
     ) -> "ParameterPosterior":
-        """Put together the parameters of a space, their values in the user's coordinates and their covariance."""
+        """Make the posterior of the parameters of a space, with their values in the user's coordinates."""
         return ParameterPosterior(space.parameters, geometry.values_of(space), root)
 
     @cached_property
@@ -45,31 +45,31 @@ class ParameterPosterior:
 
     @property
     def weights(self) -> int:
-        """Number of weights of a joint correction behind the parameters."""
+        """Number of weights of a joint correction, which follow the parameters."""
         return len(self.root) - len(self.parameters)
 
     @cached_property
     def covariance(self) -> Float64[Tensor, "unknowns unknowns"]:
-        """Covariance of all parameters and then all weights [m and rad]."""
+        """Covariance of all parameters, followed by all weights [m and rad]."""
         return self.root @ self.root.t()
 
     @property
     def standard_errors(self) -> Float64[Tensor, " parameters"]:
-        """Standard deviation of every parameter [m or rad], 0 where it was not free."""
+        """Standard deviation of every parameter [m or rad]; 0 if it was not free."""
         errors: Tensor = torch.linalg.vector_norm(self.root[: len(self.parameters)], dim=1)
         return errors
 
     def select(self, names: Sequence[str]) -> "ParameterPosterior":
-        """Return the distribution of some of the parameters, whatever the others are.
+        """Return the marginal distribution of some of the parameters.
 
         Raises:
-            IdentificationError: there is no parameter of one of the names.
+            IdentificationError: there is no parameter with one of the names.
         """
         number = {name: index for index, name in enumerate(self.names)}
         for name in names:
             if name not in number:
                 raise IdentificationError(
-                    f"there is no parameter '{name}'; {nearest_choice(name, self.names)}"
+                    f"there is no parameter '{name}'", value=name, remedy=nearest_choice(name, self.names)
                 )
         rows = [number[name] for name in names]
         return ParameterPosterior(

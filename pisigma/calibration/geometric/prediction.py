@@ -1,4 +1,4 @@
-"""Where a robot says that targets were, in measurements that it need not have been fitted to."""
+"""Predicted poses of targets, in the frames of measurements."""
 
 import numpy as np
 import torch
@@ -18,12 +18,12 @@ def predicted_poses(
     tools: dict[str, Float64[np.ndarray, " 6"]],
     measurements: Measurements,
 ) -> Float64[Tensor, "rows 4 4"]:
-    """Where a robot says that the targets were, each in the frame of its row.
+    """Predict the poses of the targets, each in the frame of its row.
 
     Args:
-        robot: its rows are used, its base and tool are not.
-        bases: per frame x, y, z [m], roll, pitch, yaw [rad].
-        tools: the same per target.
+        robot: the robot; its base and tool are not used.
+        bases: base in every frame: x, y, z [m], roll, pitch, yaw [rad].
+        tools: tool of every target, in the same form.
         measurements: joint values, frames and targets.
 
     Raises:
@@ -47,8 +47,10 @@ def _of_rows(
         if name not in frames:
             row = names.index(name)
             raise IdentificationError(
-                f"{measurements.place(row)}: {what} '{name}' was not calibrated; "
-                f"{nearest_choice(name, order)}"
+                f"{what} '{name}' was not calibrated",
+                value=name,
+                at=measurements.at(row, what),
+                remedy=nearest_choice(name, order),
             )
     T = transform_from_xyzrpy(torch.from_numpy(np.stack([frames[name] for name in order])))
     index = torch.tensor([order.index(name) for name in names], dtype=torch.int64)

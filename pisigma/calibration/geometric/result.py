@@ -1,4 +1,4 @@
-"""What a calibration comes to: the robot, its parameters with their errors, and what the data cannot determine."""
+"""Result of a geometric calibration: the robot, its parameters with their errors, and what is not identifiable."""
 
 import math
 from dataclasses import dataclass
@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
+from pisigma.calibration.geometric.identifiability.calibration_warning import CalibrationWarning
 from pisigma.calibration.geometric.identifiability.observability import (
     Observability,
     find_weak_directions,
@@ -41,20 +42,20 @@ from pisigma.measurement.sensors.registry import measured_errors
 from pisigma.robot.description import Robot
 
 DISAGREEING = 10.0
-"""Angles whose variance had to be enlarged by more are worth a warning."""
+"""Factor on the variance of angles above which a warning is given."""
 
 
 @dataclass(frozen=True)
 class PriorRatio:
-    """How many times as large as the prior says the errors of some parameters are.
+    """Estimated size of the errors of a group of parameters over their prior standard deviation.
 
     Attributes:
         kind: "length" or "angle".
         group: the group of parameters.
-        prior: the smallest standard deviation that the prior states for one of the group [m or rad].
-        value: the estimated ratio.
-        at_least: two standard deviations below it. The estimate from n effective parameters has a relative standard
-            deviation of about `1 / sqrt(2 n)`, so this is `exp(-sqrt(2 / n))` times the estimate.
+        prior: smallest prior standard deviation of a parameter of the group [m or rad].
+        value: the estimated ratio [1].
+        at_least: the ratio minus two standard deviations. An estimate from n effective parameters has a relative
+            standard deviation of about `1 / sqrt(2 n)`, so this is `exp(-sqrt(2 / n))` times the estimate.
     """
 
     kind: Literal["length", "angle"]
@@ -70,23 +71,23 @@ class PriorRatio:
 
     @property
     def size_at_least(self) -> float:
-        """The same, two standard deviations below it."""
+        """The same minus two standard deviations [m or rad]."""
         return self.at_least * self.prior
 
 
 @dataclass(frozen=True)
 class SensorNoise:
-    """Noise of one kind of sensor, as the residuals show it.
+    """Noise of one kind of sensor, estimated from the residuals.
 
     Attributes:
         sensor: "position", "rotation", "touch", "socket", "distance", "pair", or the name of a registered sensor.
-        sigma: standard deviation of one value [m or rad]; where the rows state their own, the factor on it.
-        unit: "m" or "rad", or "stated" for a factor on what the rows state.
+        sigma: standard deviation of one value [m or rad], or the factor on those that the rows state.
+        unit: "m" or "rad", or "stated" for a factor.
         values: number of measured values.
-        used: how many of them the parameters used up.
-        rms: root mean square of the residuals' lengths, all rows [m or rad].
-        quantity: "m" where the sensor measures lengths, "rad" where it measures angles.
-        components: values a row.
+        used: effective number of parameters estimated from them.
+        rms: root mean square length of the residuals of all rows [m or rad].
+        quantity: "m" for lengths, "rad" for angles.
+        components: number of values per row.
     """
 
     sensor: str
@@ -104,11 +105,11 @@ class SolvedCalibration:
     """A calibration problem with its solution.
 
     Attributes:
-        measurements: all rows, also those that could not be used.
-        setup: start, and what base and tool are relative to.
-        problem: with its free parameters.
-        solution: of it.
-        findings: on the parameters.
+        measurements: all rows, including those that could not be used.
+        setup: start values, and the frames that bases and tools are relative to.
+        problem: the problem with its free parameters.
+        solution: its solution.
+        findings: result of the rank analysis.
         geometry: the solution in the user's coordinates.
     """
 
@@ -126,12 +127,12 @@ class SolvedCalibration:
 
     @cached_property
     def refined(self) -> Linearisation[Tensor]:
-        """The problem at its solution, the noise estimated from all good rows."""
+        """The problem at its solution, with the noise estimated from all rows without outliers."""
         return self.problem.refined(self.solution.linearisation)
 
     @cached_property
     def covariance(self) -> Float64[np.ndarray, "parameters parameters"]:
-        """Covariance of all parameters in the user's coordinates (SI), zero where they were not free."""
+        """Covariance of all parameters in the user's coordinates (SI); 0 for those that were not free."""
         change = self.geometry.change[:, self.problem.active.cpu()]
         covariance: np.ndarray = (change @ covariance_of(self.refined.normal).cpu() @ change.mT).numpy()
         return covariance
@@ -140,6 +141,7 @@ class SolvedCalibration:
     def root(self) -> Float64[Tensor, "parameters directions"]:
         """`R` with the covariance `R R^T` of all parameters in the user's coordinates."""
         covariance = covariance_of(self.refined.normal).cpu()
+        # The eigenvectors of the correlation matrix: those of the covariance would mix metres and radians.
         scale = covariance.diagonal().clamp(min=0.0).sqrt()
         inverse = torch.where(scale > 0, 1 / scale, 0.0)
         values, axes = torch.linalg.eigh(covariance * inverse * inverse[:, None])
@@ -150,14 +152,14 @@ class SolvedCalibration:
 
 @dataclass(frozen=True, eq=False)
 class CalibrationResult:
-    """A geometric calibration. Whatever predictions do not need is worked out when it is asked for.
+    """A geometric calibration. Everything that predictions do not need is computed on demand.
 
     Attributes:
         robot: the calibrated robot, with the base of the first frame and the tool of the first target.
-        bases: per frame x, y, z [m], roll, pitch, yaw [rad].
-        tools: the same per target.
-        unknowns: by group and owner, what the sensors found out about themselves, in the owner's frame: of a
-            "socket" x, y, z [m], of an "anchor" x, y, z and what its sensor shows at no distance [m].
+        bases: base in every frame: x, y, z [m], roll, pitch, yaw [rad].
+        tools: tool of every target, in the same form.
+        unknowns: estimated unknowns of the sensors by group and owner, in the owner's frame: for a "socket" x, y, z
+            [m], for an "anchor" x, y, z and the reading of its sensor at distance zero [m].
         solved: the problem with its solution.
     """
 
@@ -182,50 +184,50 @@ class CalibrationResult:
 
     @property
     def covariance(self) -> Float64[np.ndarray, "parameters parameters"]:
-        """Covariance of all parameters in their order (SI), zero where they were not free."""
+        """Covariance of all parameters in their order (SI); 0 for those that were not free."""
         return self.solved.covariance
 
     @cached_property
     def posterior(self) -> ParameterPosterior:
-        """What is known of all parameters together, in the user's coordinates; see `ParameterPosterior`."""
+        """Joint posterior of all parameters in the user's coordinates; see `ParameterPosterior`."""
         solved = self.solved
         return ParameterPosterior.of(solved.problem.space, solved.geometry, solved.root)
 
     @cached_property
     def residuals(self) -> dict[str, Float64[np.ndarray, "rows components"]]:
-        """Per sensor, measured - predicted of every row [m or rad], NaN where it measured nothing."""
+        """Residuals of every row by sensor, measured minus predicted [m or rad]; NaN where it has no value."""
         return _residuals(self.solved)
 
     @cached_property
     def outliers(self) -> tuple[Outlier, ...]:
-        """Rows that counted for less than half, the worst first."""
+        """Rows with less than half of the full weight, the worst first."""
         return _outliers(self.solved)
 
     @cached_property
     def noise(self) -> tuple[SensorNoise, ...]:
-        """Noise of every sensor whose values are measured rather than stated."""
+        """Noise of every sensor with measured values (not stated ones)."""
         return _noise(self.solved)
 
     @property
     def redundancy(self) -> Redundancy:
-        """Rank, chosen parameters and dependencies at the start."""
+        """Rank, identifiable parameters and dependencies at the start."""
         return self.solved.findings.redundancy
 
     @cached_property
     def pairwise(self) -> PairwiseRedundancy:
-        """Redundancy the paper's way, by Pearson correlation."""
+        """Redundancy by the Pearson correlation of pairs, as in Park et al. 2022."""
         findings = self.solved.findings
         return find_pairwise_redundancy(findings.information, findings.sizes)
 
     @property
     def extended(self) -> tuple[str, ...]:
-        """Names of parameters that were added because at the solution the data do determine them."""
+        """Names of parameters that were added because the data determine them at the solution."""
         names = self.solved.problem.space.names
         return tuple(names[i] for i in self.solved.findings.extended)
 
     @cached_property
     def weak_directions(self) -> tuple[str, ...]:
-        """Directions that the data hardly determine, in words; there the nominal value stands."""
+        """Weakly identifiable directions, one sentence each; they stay near their nominal values."""
         return find_weak_directions(self.solved.problem, self.solved.refined)
 
     @cached_property
@@ -239,12 +241,12 @@ class CalibrationResult:
 
     @property
     def iterations(self) -> int:
-        """Steps tried."""
+        """Number of steps tried."""
         return self.solved.solution.iterations
 
     @property
     def cost(self) -> float:
-        """Sum of squared residuals over variances, with loss and prior."""
+        """Cost at the solution: sum of squared residuals over variances, with loss and prior."""
         return float(self.solved.refined.cost)
 
     @property
@@ -254,20 +256,25 @@ class CalibrationResult:
 
     @cached_property
     def rms_path(self) -> tuple[float, ...]:
-        """RMS of the first sensor's residuals' lengths at every point passed [m or rad], the start first."""
+        """RMS residual length of the first sensor at every accepted point, starting with the start [m or rad]."""
         return self.solved.solution.path
 
     @cached_property
-    def warnings(self) -> tuple[str, ...]:
-        """What to measure next, and what does not fit, in sentences."""
+    def warning_details(self) -> tuple[CalibrationWarning, ...]:
+        """What the measurements do not determine, what to measure next, and what does not fit."""
         return (
             *what_to_measure(self.solved.setup, self.solved.findings.wanted),
             *_warnings(self.solved),
         )
 
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """The sentences of `warning_details`."""
+        return tuple(warning.sentence for warning in self.warning_details)
+
     @cached_property
     def prior_ratios(self) -> tuple[PriorRatio, ...]:
-        """How many times as large as the prior says the errors are, by group of parameters that have a prior."""
+        """Estimated errors over their prior standard deviations, by group of parameters with a prior."""
         problem, view = self.solved.problem, view_of(self.solved.refined)
         precision, group = problem.precision[problem.active], problem.prior_group
         covariance = covariance_of(self.solved.refined.normal)
@@ -284,15 +291,15 @@ class CalibrationResult:
 
     @property
     def rank(self) -> int:
-        """How many independent combinations of the parameters the data determine, at the nominal geometry.
+        """Number of independent combinations of the parameters that the data determine at the nominal geometry.
 
-        Counted after the sensors' own unknowns, which may take any value.
+        The sensors' unknowns are eliminated and not counted.
         """
         return self.redundancy.rank
 
     @property
     def condition_number(self) -> float:
-        """Of the Jacobian of the free parameters, in mm and mrad."""
+        """Condition number of the Jacobian of the free parameters, in mm and mrad."""
         return self.observability.condition_number
 
     @property
@@ -301,7 +308,7 @@ class CalibrationResult:
         return tuple(parameter.name for parameter in self.parameters if parameter.free)
 
     def parameter(self, name: str) -> ParameterEstimate:
-        """The row of the parameter table with that name.
+        """Return the row of the parameter table with a name.
 
         Raises:
             KeyError: there is none.
@@ -312,16 +319,16 @@ class CalibrationResult:
         raise KeyError(name)
 
     def predicted_poses(self, measurements: Measurements) -> Float64[Tensor, "rows 4 4"]:
-        """Where the targets were, each in the frame of its row; see `pisigma.calibration.geometric.prediction`."""
+        """Predict the poses of the targets, each in the frame of its row; see `prediction.predicted_poses`."""
         return predicted_poses(self.robot, self.bases, self.tools, measurements)
 
     def errors_of(self, measurements: Measurements) -> dict[str, Float64[Tensor, "rows components"]]:
-        """Measured - predicted of any measurements in calibrated frames with calibrated targets, such as held-out ones.
+        """Compute the errors of any measurements in calibrated frames with calibrated targets, such as held-out rows.
 
         Returns:
-            By sensor [m or rad], NaN where a row has no value; see
-            `pisigma.measurement.sensors.registry.measured_errors`. A socket that was not calibrated is where its
-            own rows meet on average.
+            Measured minus predicted by sensor [m or rad]; NaN where a row has no value; see
+            `pisigma.measurement.sensors.registry.measured_errors`. A socket that was not calibrated is at the mean
+            predicted position of its rows.
 
         Raises:
             IdentificationError: a row has a frame, a target or an anchor that was not calibrated.
@@ -329,21 +336,22 @@ class CalibrationResult:
         return measured_errors(self.predicted_poses(measurements), measurements, self.unknowns)
 
 
-def _warnings(solved: SolvedCalibration) -> tuple[str, ...]:
-    """Sentences on angles that disagree with lengths, and on frames that do not fit."""
+def _warnings(solved: SolvedCalibration) -> tuple[CalibrationWarning, ...]:
+    """Warn of angles that disagree with lengths, and of frames that do not fit."""
     disagreement = float(view_of(solved.refined).disagreement.max())
-    sentences = []
+    warnings = []
     if disagreement > DISAGREEING:
-        sentences.append(
-            "the measured angles disagree with the measured lengths by far more than their noise, so they count with "
-            f"1/{disagreement:.2g} of their weight; look for a wrist that wobbles, or for an orientation error of "
-            "the sensor that depends on the pose."
+        sentence = (
+            "the measured angles disagree with the measured lengths by far more than their noise, so their weight was "
+            f"reduced to 1/{disagreement:.2g}; check for a wobbling wrist, or an orientation error of the sensor that "
+            "depends on the pose."
         )
-    return (*sentences, *misfitting_frames(solved.problem, solved.refined))
+        warnings.append(CalibrationWarning("angle_disagreement", "", sentence))
+    return (*warnings, *misfitting_frames(solved.problem, solved.refined))
 
 
 def _residuals(solved: SolvedCalibration) -> dict[str, Float64[np.ndarray, "rows components"]]:
-    """Residuals turned back into the measuring frames."""
+    """Rotate the residuals back into the measuring frames."""
     measurements, setup, problem = solved.measurements, solved.setup, solved.problem
     R = setup.anchors.bases[:, :3, :3].to(problem.frame.device)[problem.frame]
     residuals = {}

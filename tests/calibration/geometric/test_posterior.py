@@ -3,6 +3,7 @@
 import pytest
 import torch
 from testing.closeness import assert_close
+from testing.refusals import refused
 from testing.sensors import mixed_data, true_robot, wire_data
 
 from pisigma.calibration.geometric.calibrator import GeometricCalibrator
@@ -54,7 +55,7 @@ def test_sensors_unknowns_are_among_them(result: CalibrationResult) -> None:
 
 
 def test_a_name_that_is_none_is_refused(result: CalibrationResult) -> None:
-    with pytest.raises(IdentificationError, match="there is no parameter 'a_22'"):
+    with refused(IdentificationError, value="a_22"):
         result.posterior.select(["a_22"])
 
 

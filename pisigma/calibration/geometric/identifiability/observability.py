@@ -1,4 +1,4 @@
-"""How well a set of poses determines parameters: indices O1 to O5, and the weak directions in words."""
+"""How well a set of poses determines parameters: observability indices O1 to O5, and weak directions."""
 
 from dataclasses import dataclass, replace
 
@@ -11,17 +11,16 @@ from pisigma.calibration.geometric.problem.noise import view_of
 from pisigma.calibration.geometric.problem.problem import CalibrationProblem
 
 ROUNDING = 1e-12
-"""Information of less than this share of the largest cannot be distinguished from none."""
+"""Eigenvalue of the information over the largest one below which it is zero to rounding."""
 SHOWN = 0.25
-"""Parameters with at least this share of a direction are named."""
+"""Component of a direction above which its parameter is named."""
 
 
 @dataclass(frozen=True)
 class Observability:
-    """How well poses determine the chosen parameters: from the singular values s_1 ≥ ... ≥ s_L of their Jacobian.
+    """Observability indices of the free parameters, from the singular values s_1 ≥ ... ≥ s_L of their Jacobian.
 
-    The scaling: parameters in mm and mrad, positions in mm, rotations in mrad; the Jacobian is not divided
-    by noise.
+    Parameters are in mm and mrad, positions in mm and rotations in mrad; the Jacobian is not divided by the noise.
 
     Attributes:
         O1: `(s_1 · ... · s_L)^(1/L) / sqrt(poses)` (Borm and Menq 1991).
@@ -44,11 +43,11 @@ class Observability:
 
 
 def observability_of(gram: Float64[Tensor, "chosen chosen"], poses: int) -> Observability:
-    """The indices for the parameters of a Gram matrix `J^T J`; all 0 where the data do not see one of them.
+    """Compute the indices from a Gram matrix `J^T J`; all are 0 if the data do not determine one parameter.
 
     Args:
-        gram: of the Jacobian scaled as said above.
-        poses: number of rows measured.
+        gram: Gram matrix of the Jacobian, scaled as in `Observability`.
+        poses: number of measured rows.
     """
     square = torch.linalg.eigvalsh(gram).flip(0)
     if len(square) == 0 or float(square[-1]) <= 1e-15 * float(square[0]):
@@ -64,14 +63,13 @@ def observability_of(gram: Float64[Tensor, "chosen chosen"], poses: int) -> Obse
 
 
 def find_weak_directions(problem: CalibrationProblem, here: Linearisation[Tensor]) -> tuple[str, ...]:
-    """Find directions of the free arm parameters that the data determine less well than the prior does.
+    """Find directions of the free arm parameters that the prior determines better than the data, one sentence each.
 
-    Base and tool are marginalised: what they can mimic does not count as determined. The directions are
-    eigenvectors of the data's information in units of the prior's standard deviations (1 mm and 1 mrad
-    where there is none).
+    Base and tool are marginalised. The directions are eigenvectors of the data's information in units of the prior
+    standard deviations (1 mm and 1 mrad if there is no prior).
 
     Args:
-        problem: with its free parameters.
+        problem: the problem with its free parameters.
         here: its linearisation at the solution.
     """
     view, stated = view_of(here), problem.precision[problem.active]
@@ -85,6 +83,7 @@ def find_weak_directions(problem: CalibrationProblem, here: Linearisation[Tensor
     arm = problem.active < problem.space.arm_size
     if not bool(arm.any()):
         return ()
+    # The Schur complement is the information on the arm with base and tool marginalised.
     cross = data[arm][:, ~arm]
     schur = (
         data[arm][:, arm]
@@ -92,7 +91,7 @@ def find_weak_directions(problem: CalibrationProblem, here: Linearisation[Tensor
     )
     values, vectors = torch.linalg.eigh((schur + schur.mT) / 2)
     names = [problem.space.names[i] for i in problem.active[arm].tolist()]
-    end = "it stays near its nominal value" if held else "without a prior it may be anything"
+    end = "it stays near its nominal value" if held else "without a prior it is undetermined"
     sentences = []
     rounding = ROUNDING * float(values[-1])
     for value, vector in zip(values.tolist(), vectors.t(), strict=True):
@@ -106,7 +105,7 @@ def find_weak_directions(problem: CalibrationProblem, here: Linearisation[Tensor
 
 
 def _in_words(vector: Tensor, names: list[str]) -> str:
-    """The large components of a direction, in units of the tolerances."""
+    """Write the large components of a direction, in units of the tolerances."""
     order = vector.abs().argsort(descending=True).tolist()
     sign = 1.0 if float(vector[order[0]]) > 0 else -1.0
     text = ""

@@ -1,4 +1,4 @@
-"""Redundant parameters the paper's way: Pearson correlation of the Jacobian's columns."""
+"""Redundant parameters by the method of Park et al. 2022: Pearson correlation of the columns of the Jacobian."""
 
 from dataclasses import dataclass
 
@@ -9,7 +9,7 @@ from pisigma.calibration.geometric.identifiability.redundancy import NO_EFFECT, 
 from pisigma.calibration.geometric.problem.information import Information
 
 CORRELATION_TOLERANCE = 1e-6
-"""Correlations within this of ±1 count as ±1."""
+"""Largest difference from ±1 of a correlation that counts as ±1."""
 PAPER_ORDER = ("a", "d", "alpha", "theta", "beta", "base", "tool")
 
 
@@ -18,15 +18,15 @@ class CorrelationTable:
     """Pearson correlations of the columns of parameters of one unit.
 
     Attributes:
-        names: the parameters.
-        values: symmetric, 1 on the diagonal; NaN for parameters without effect.
+        names: names of the parameters.
+        values: symmetric matrix with 1 on the diagonal; NaN for parameters without effect.
     """
 
     names: tuple[str, ...]
     values: Float64[np.ndarray, "parameters parameters"]
 
     def __str__(self) -> str:
-        """The table as text, as the paper prints it."""
+        """Write the table as text, in the form of the paper."""
         width = max(8, *(len(name) + 2 for name in self.names))
         lines = [" " * width + "".join(name.rjust(width) for name in self.names)]
         for name, row in zip(self.names, self.values, strict=True):
@@ -42,10 +42,10 @@ class PairwiseRedundancy:
     Attributes:
         lengths: correlations of the length parameters.
         angles: correlations of the angle parameters.
-        sets: parameters that act alike; a leading "-" says against the first of its set.
+        sets: sets of parameters with proportional columns; a leading "-" marks the opposite sign of the first one.
         no_effect: parameters that change no measured value.
-        kept: all parameters but the redundant ones, one of each set among them.
-        tolerance: by how much a correlation may miss ±1.
+        kept: all parameters without the redundant ones; one of each set is kept.
+        tolerance: see `CORRELATION_TOLERANCE`.
     """
 
     lengths: CorrelationTable
@@ -63,8 +63,8 @@ def find_pairwise_redundancy(
 ) -> PairwiseRedundancy:
     """Find redundant pairs by Park et al. 2022, section 3.2: |r| = 1 between columns of the Jacobian.
 
-    Lengths and angles are looked at apart. It cannot see dependencies of three and more parameters that are
-    not pairs; `find_redundancy` does.
+    Lengths and angles are compared separately. Dependencies of three or more parameters without dependent pairs are
+    not found; `find_redundancy` finds them.
 
     Args:
         information: the condensed Jacobian.
@@ -111,7 +111,7 @@ def _correlations(centred: np.ndarray, acting: np.ndarray) -> np.ndarray:
 
 
 def _sets(correlations: np.ndarray, tolerance: float) -> list[tuple[list[int], list[int]]]:
-    """Sets of two or more parameters that act alike: their indices, and their signs against the first."""
+    """Find sets of two or more parameters with proportional columns: their indices, and signs relative to the first."""
     sets, taken = [], set()
     for first in range(len(correlations)):
         if first in taken:

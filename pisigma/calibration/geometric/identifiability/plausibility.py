@@ -1,27 +1,28 @@
-"""Fits that no calibration error explains: of another robot, in other units, with swapped frame names."""
+"""Detection of fits that no calibration error explains: another robot, wrong units, or swapped frame names."""
 
 import numpy as np
 import torch
 from jaxtyping import Float64
 from torch import Tensor
 
+from pisigma.calibration.geometric.identifiability.calibration_warning import CalibrationWarning
 from pisigma.calibration.geometric.problem.least_squares import Linearisation
 from pisigma.calibration.geometric.problem.noise import view_of
 from pisigma.calibration.geometric.problem.problem import CalibrationProblem
-from pisigma.files.errors import ImplausibleError
+from pisigma.files.errors import ImplausibleError, Place
 
 IMPLAUSIBLE_SHARE = 0.01
-"""Share of the robot's reach that half of the rows must be within, once the arm was fitted."""
+"""Median residual as a share of the reach above which a fitted arm is implausible."""
 
 DISTANCES = ("distance", "pair")
-"""Sensors of distances, which are judged like positions."""
+"""Sensors of distances, which are judged as positions."""
 
 LONG_SHARE = 0.1
-"""Links longer than this share of the reach are long."""
+"""Length of a link as a share of the reach above which the link is long."""
 RUINED_SHARE = 0.5
-"""A long link that changes by more than this share was not that long."""
+"""Relative change of a long link above which the fit is implausible."""
 FAR_OFF = 10.0
-"""Times the other frames' residuals."""
+"""Residual over the median residual of the other frames above which a row is far off."""
 NOTICED = 1e-6
 """[m] Smaller residuals are never far off."""
 OFF_SHARE = 0.2
@@ -29,19 +30,18 @@ OFF_SHARE = 0.2
 
 
 def refuse_implausible(problem: CalibrationProblem, here: Linearisation[Tensor], source: str) -> None:
-    """Refuse a fit of the arm that leaves most positions or distances far from their prediction, or ruins the arm.
+    """Refuse a fit of the arm with large residuals of most positions or distances, or with impossible links.
 
-    Where no parameter of the arm is free (base and tool alone), nothing is refused: the arm may be far off. Touches and
-    corners are not judged here.
+    If no parameter of the arm is free (only base and tool), nothing is refused. Touches and corners are not judged.
 
     Args:
-        problem: with its free parameters.
+        problem: the problem with its free parameters.
         here: its linearisation at the solution.
-        source: what complaints call the measurements.
+        source: name of the measurements in error messages.
 
     Raises:
         ImplausibleError: the median residual of positions, balls in sockets or distances is more than 1 % of the
-            reach, or a link is half as long again as drawn, or less than half as long.
+            reach, or a long link changed by more than half of its length.
     """
     _refuse_ruined_links(problem, here.point, source)
     robot = problem.space.robot
@@ -56,15 +56,17 @@ def refuse_implausible(problem: CalibrationProblem, here: Linearisation[Tensor],
     size = float(sizes.median()) if len(sizes) else 0.0
     if size > IMPLAUSIBLE_SHARE * robot.reach:
         raise ImplausibleError(
-            f"{source}: with the best fit a typical row is still {size * 1e3:.3g} mm per axis from where robot "
-            f"'{robot.name}' says, {size / robot.reach:.1%} of its reach, which no calibration error explains; "
-            "check the units (millimetres in a _m column?), stated distances, order and directions of the joints, "
-            "and whether this robot was measured."
+            f"with the best fit, the median residual is still {size * 1e3:.3g} mm per axis, {size / robot.reach:.1%} "
+            f"of the reach of robot '{robot.name}', which no calibration error explains",
+            value=size,
+            at=Place(source),
+            remedy="check the units (millimetres in a _m column?), stated distances, order and directions of the "
+            "joints, and whether this robot was measured",
         )
 
 
 def _refuse_ruined_links(problem: CalibrationProblem, point: Tensor, source: str) -> None:
-    """Refuse an arm whose long lengths changed by half, as where metres stand in a column of millimetres.
+    """Refuse an arm with long links that changed by half, as with metres in a column of millimetres.
 
     Raises:
         ImplausibleError: see above.
@@ -75,19 +77,24 @@ def _refuse_ruined_links(problem: CalibrationProblem, point: Tensor, source: str
     long = is_length[: len(drawn)] & (np.abs(drawn) > LONG_SHARE * robot.reach)
     ruined = long & (np.abs(fitted - drawn) > RUINED_SHARE * np.abs(drawn))
     for number in np.flatnonzero(ruined)[:1].tolist():
+        name = problem.space.names[number]
         raise ImplausibleError(
-            f"{source}: the best fit makes {problem.space.names[number]} of robot '{robot.name}' "
-            f"{float(fitted[number]) * 1e3:.4g} mm instead of {float(drawn[number]) * 1e3:.4g} mm, which no "
-            "calibration error explains; check the units (metres in a _mm column?), stated distances, order and "
-            "directions of the joints, and whether this robot was measured."
+            f"the best fit makes {name} of robot '{robot.name}' {float(fitted[number]) * 1e3:.4g} mm instead of "
+            f"{float(drawn[number]) * 1e3:.4g} mm, which no calibration error explains",
+            value=name,
+            at=Place(source),
+            remedy="check the units (metres in a _mm column?), stated distances, order and directions of the joints, "
+            "and whether this robot was measured",
         )
 
 
-def misfitting_frames(problem: CalibrationProblem, here: Linearisation[Tensor]) -> tuple[str, ...]:
-    """Say which frames' residuals are far off those of the others.
+def misfitting_frames(
+    problem: CalibrationProblem, here: Linearisation[Tensor]
+) -> tuple[CalibrationWarning, ...]:
+    """Warn of frames with far larger residuals than the others.
 
     Args:
-        problem: with its free parameters.
+        problem: the problem with its free parameters.
         here: its linearisation at the solution.
     """
     frames = problem.space.frames
@@ -106,15 +113,19 @@ def misfitting_frames(problem: CalibrationProblem, here: Linearisation[Tensor]) 
             off.append((number, float(theirs[wrong].median()), int(wrong.sum()), len(theirs)))
             others.append(usual)
     return tuple(
-        f"{wrong} of {count} rows of frame '{frames[number]}' are off by {size * 1e3:.3g} mm, where "
-        f"{usual * 1e3:.3g} mm is usual in the other frames; check whether rows of it are named after another "
-        "frame, or whether what it stands on was moved."
+        CalibrationWarning(
+            "frame_misfit",
+            frames[number],
+            f"{wrong} of {count} rows of frame '{frames[number]}' are off by {size * 1e3:.3g} mm, while the median of "
+            f"the other frames is {usual * 1e3:.3g} mm; check whether rows have the wrong frame name, or whether this "
+            "frame was moved.",
+        )
         for (number, size, wrong, count), usual in zip(off, others, strict=True)
     )
 
 
 def residual_sizes(problem: CalibrationProblem, here: Linearisation[Tensor]) -> Float64[Tensor, " rows"]:
-    """Length of every row's residual per component [m], NaN where no length was measured."""
+    """Compute the length of every row's residual per component [m]; NaN where no length was measured."""
     sizes = problem.q.new_full((problem.rows,), torch.nan)
     for sensor, sums in zip(problem.sensors, view_of(here).sums, strict=True):
         if sensor.unit == "m" and not sensor.certain:

@@ -1,4 +1,4 @@
-"""Which parameters the data can tell apart: rank, choice, dependencies in words, additions."""
+"""Identifiability of parameters: rank, an identifiable subset, linear dependencies, and rank extension."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,30 +11,30 @@ from pisigma.calibration.geometric.problem.information import Information
 from pisigma.calibration.geometric.problem.parameters import Parameter
 
 RANK_TOLERANCE = 1e-6
-"""Singular values of the column-scaled Jacobian below this share of the largest count as zero."""
+"""Singular value of the column-scaled Jacobian over the largest one below which it counts as zero."""
 NO_EFFECT = 1e-9
-"""Columns smaller than this share of the largest count as zero."""
+"""Length of a column over the longest one below which it counts as zero."""
 PREFERENCE = ("base", "tool", "theta", "a", "d", "alpha", "beta")
-"""Which parameters are kept first; each class counts ten times as much as the next."""
+"""Order in which parameters are kept; each class has ten times the weight of the next."""
 _WEIGHT = {group: 10.0**-rank for rank, group in enumerate(PREFERENCE)}
 CLEARLY_SEEN = 1.0
-"""A parameter is added when the data alone determine it to this many mm or mrad."""
+"""Standard deviation [mm or mrad] by the data alone below which a parameter is added."""
 EXPLAINED = 0.5
-"""All visible ones are added when they explain this share of what is left of the residuals."""
+"""Share of the residual sum of squares that all further parameters must explain to be added,"""
 SIGNIFICANT = 20.0
-"""And when the F statistic of that is at least so large."""
+"""and the F statistic that this must have."""
 VISIBLE = 1e-7
-"""Columns with less than this share of their length beside the kept ones count as dependent."""
+"""Share of a column's length orthogonal to the kept columns below which it counts as dependent."""
 
 
 @dataclass(frozen=True)
 class Dependency:
-    """A combination of parameters of which the data determine only the sum.
+    """A linear combination of parameters that is identifiable although the single parameters are not.
 
     Attributes:
-        names: the parameter that is kept, then those that act like it.
-        coefficients: of the sum, in SI units; 1 for the first.
-        sentence: the same in words.
+        names: the parameter that is kept, followed by those that depend on it.
+        coefficients: coefficients of the combination in SI units; 1 for the first.
+        sentence: the same as a sentence.
     """
 
     names: tuple[str, ...]
@@ -44,17 +44,17 @@ class Dependency:
 
 @dataclass(frozen=True, eq=False)
 class Redundancy:
-    """What the Jacobian at the start says of the parameters.
+    """Redundancy of the parameters by the Jacobian at the start.
 
-    Turns of base and tool are meant as small turns about their own axes.
+    Angles of base and tool are small rotations about their own axes.
 
     Attributes:
         information: the condensed Jacobian.
-        rank: how many independent combinations of them the data determine.
-        tolerance: of the rank, as a share of the largest singular value.
-        kept: the parameters that were chosen, `rank` of them.
-        removed: those that act like combinations of kept ones.
-        no_effect: those that change no measured value at all.
+        rank: number of independent combinations of parameters that the data determine.
+        tolerance: tolerance of the rank, relative to the largest singular value.
+        kept: the identifiable subset that was chosen, with `rank` parameters.
+        removed: parameters whose columns are combinations of those of the kept ones.
+        no_effect: parameters that change no measured value.
     """
 
     information: Information
@@ -66,7 +66,7 @@ class Redundancy:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The parameters that were looked at."""
+        """Names of the analysed parameters."""
         return self.information.names
 
     @cached_property
@@ -78,24 +78,24 @@ class Redundancy:
 
     @cached_property
     def dependencies(self) -> tuple[Dependency, ...]:
-        """The combinations that are identified where single values are not, one for every kept parameter with any."""
+        """The identifiable combinations, one for every kept parameter with dependent ones."""
         return _dependencies(self.information, self.kept, self.removed)
 
     def group(self, name: str) -> str | None:
-        """The sentence of a dependency that a parameter is part of, the shortest if several."""
+        """Return the sentence of the dependency of a parameter, the shortest if there are several; None without."""
         having = [dependency for dependency in self.dependencies if name in dependency.names]
         return min(having, key=lambda dependency: len(dependency.names)).sentence if having else None
 
 
 @dataclass(frozen=True, eq=False)
 class Findings:
-    """What the rank analysis says about the parameters.
+    """Result of the rank analysis.
 
     Attributes:
         sizes: values of the candidates at the start.
-        redundancy: what the Jacobian there says of them.
+        redundancy: their redundancy there.
         extended: indices of parameters that were added later.
-        wanted: how many numbers have to be estimated; see `sufficiency.free_parameters`.
+        wanted: number of unknowns to estimate; see `sufficiency.free_parameters`.
     """
 
     sizes: Float64[np.ndarray, " candidates"]
@@ -112,16 +112,15 @@ class Findings:
 def find_redundancy(
     information: Information, sizes: Float64[np.ndarray, " parameters"], tolerance: float = RANK_TOLERANCE
 ) -> Redundancy:
-    """Find the rank, a choice of independent parameters and the dependencies of the others on them.
+    """Find the rank, an identifiable subset of the parameters and the dependencies of the others on it.
 
-    The columns are scaled to length one; the rank is that of the singular values. The choice is the first
-    `rank` pivots of a QR factorisation with column pivoting (Businger and Golub 1965) of the columns times
-    their preference.
+    The rank is that of the Jacobian with columns of unit length. The subset is the first `rank` pivots of a QR
+    factorisation with column pivoting (Businger and Golub 1965) of these columns times their preference.
 
     Args:
         information: the condensed Jacobian.
-        sizes: nominal values; of equal columns that with the larger one is kept (a group of parallel axes
-            keeps the d that is a real offset).
+        sizes: nominal values. Of parameters with equal columns the one with the larger value is kept: parallel axes
+            keep the d that is a real offset.
         tolerance: see `RANK_TOLERANCE`.
     """
     jacobian, names = information.jacobian, np.array(information.names)
@@ -139,7 +138,7 @@ def find_redundancy(
 
 
 def _lengths(jacobian: Float64[np.ndarray, "rank columns"]) -> Float64[np.ndarray, " columns"]:
-    """Return the lengths of the columns, 0 of those that change no measured value."""
+    """Return the lengths of the columns, with 0 for parameters without effect."""
     lengths: np.ndarray = np.sqrt(np.square(jacobian).sum(0))
     lengths[lengths <= NO_EFFECT * lengths.max(initial=0.0)] = 0.0
     return lengths
@@ -151,13 +150,13 @@ def _singular_values(A: Float64[np.ndarray, "rows columns"]) -> Float64[np.ndarr
 
 
 def _rank(R: Float64[np.ndarray, "rank columns"], tolerance: float) -> int:
-    """Count the singular values above a share of the largest, of a triangle whose columns have length one, or none.
+    """Compute the numerical rank of a triangle with columns of unit length (or zero).
 
-    The largest lies between one and the root of the number of columns. So the rank is k where what is below the k-th
-    row is shorter than the tolerance, and the inverse of what is beside it is short enough; nearly always that shows
-    it, and the singular values need not be worked out.
+    The largest singular value is between 1 and the square root of the number of columns. So the rank is k if the block
+    below row k is shorter than the tolerance and the inverse of the leading k x k block is short enough. This bound
+    nearly always decides, so the singular values need not be computed.
     """
-    from scipy.linalg.lapack import dtrtri  # here, since models are loaded without scipy
+    from scipy.linalg.lapack import dtrtri  # imported here, because models are loaded without scipy
 
     below = np.sqrt(np.square(R).sum(1)[::-1].cumsum()[::-1])
     rank = int((below > tolerance).sum())
@@ -171,7 +170,7 @@ def _rank(R: Float64[np.ndarray, "rank columns"], tolerance: float) -> int:
 def preferences(
     parameters: Sequence[Parameter], sizes: Float64[np.ndarray, " parameters"]
 ) -> Float64[np.ndarray, " parameters"]:
-    """How much parameters are wanted among those that are kept; their order decides ties, the earlier wins."""
+    """Compute weights by which parameters are kept; of equal ones the earlier is kept."""
     weights = np.array([_WEIGHT[parameter.group] for parameter in parameters])
     result: np.ndarray = weights * (1 + 1e-3 * (np.abs(sizes) > 1e-9) - 1e-6 * np.arange(len(weights)))
     return result
@@ -181,7 +180,7 @@ def pivoted_triangle(
     A: Float64[np.ndarray, "rows columns"],
 ) -> tuple[Float64[np.ndarray, "rank columns"], Int64[np.ndarray, " columns"]]:
     """Return R and the pivots of a QR factorisation with column pivoting (LAPACK's `geqp3`)."""
-    from scipy.linalg.lapack import dgeqp3  # here, since models are loaded without scipy
+    from scipy.linalg.lapack import dgeqp3  # imported here, because models are loaded without scipy
 
     R, pivots = dgeqp3(A)[:2]
     return np.triu(R[: A.shape[1]]), pivots.astype(np.int64) - 1
@@ -196,6 +195,7 @@ def _dependencies(
     kept, removed = ([number[name] for name in names] for names in (kept_names, removed_names))
     J = information.jacobian
     lengths = np.linalg.norm(J, axis=0)
+    # Every removed column as a combination of the kept ones, all with unit length so that 1e-6 is negligible.
     scaled, *_ = np.linalg.lstsq(J[:, kept] / lengths[kept], J[:, removed] / lengths[removed], rcond=None)
     usual = np.array([parameter.usual_error for parameter in information.parameters])
     dependencies = []
@@ -214,7 +214,7 @@ def _dependencies(
 
 
 def sentence_of(members: list[Parameter], coefficients: list[float]) -> str:
-    """Say that only a sum is identified: "d_2 + d_3 + d_4 is identified, the single values are not"."""
+    """Write that only a combination is identifiable: "d_2 + d_3 + d_4 is identified, the single values are not"."""
     terms = sorted(zip(members, coefficients, strict=True), key=lambda term: (term[1] < 0, term[0].name))
     text = ""
     for member, coefficient in terms:
@@ -228,20 +228,20 @@ def sentence_of(members: list[Parameter], coefficients: list[float]) -> str:
 
 
 def rank_extension(information: Information, kept: int) -> list[int]:
-    """Find columns that the data determine besides those kept.
+    """Find columns that the data determine in addition to the kept ones.
 
-    Nominal axes are parallel or meet exactly; real ones do not, so that dependencies of the nominal robot
-    are not quite dependencies of the real one. Columns are added one by one while the data determine the next to
-    a usual error; or all that are visible, if the residuals show that they are needed (as with exact data).
+    Nominal axes are exactly parallel or intersect exactly, but real ones do not, so dependencies of the nominal robot
+    hold only approximately for the real one. Columns are added one by one while the data determine the next one to a
+    usual error, or all of them if the residuals show that they are needed (as with exact data).
 
     Args:
-        information: of all candidates at about the solution, its rows in standard deviations.
-        kept: so many columns, the first ones, are estimated anyway.
+        information: information on all candidates near the solution, with rows in standard deviations.
+        kept: number of leading columns that are estimated anyway.
 
     Returns:
-        Columns to add, the clearest first.
+        Columns to add, the best determined first.
     """
-    # below the rows of the kept columns, the triangle holds what the others and the residuals are beside them
+    # Below the rows of the kept columns, the triangle contains the components orthogonal to these.
     rest, left = information.jacobian[kept:, kept:], information.residual[kept:]
     pivots = _pivots(rest, VISIBLE * np.linalg.norm(information.jacobian[:, kept:], axis=0))
     clear = sum(size >= 1 / CLEARLY_SEEN for _, size in pivots)
@@ -251,7 +251,7 @@ def rank_extension(information: Information, kept: int) -> list[int]:
 
 
 def _pivots(rest: np.ndarray, rounding: np.ndarray) -> list[tuple[int, float]]:
-    """Pivots of a QR factorisation with column pivoting, with the length each has beside those before it."""
+    """Compute the pivots of a QR factorisation with column pivoting, and their lengths orthogonal to earlier ones."""
     rest = rest.copy()
     pivots: list[tuple[int, float]] = []
     while rest.shape[1]:
@@ -268,7 +268,7 @@ def _pivots(rest: np.ndarray, rounding: np.ndarray) -> list[tuple[int, float]]:
 
 
 def _needed(columns: np.ndarray, left: np.ndarray, freedom: int) -> bool:
-    """Whether the columns explain most of the residuals that are left."""
+    """Say whether the columns explain most of the remaining residuals, by share and F statistic."""
     extra = columns.shape[1]
     if extra == 0 or freedom <= extra:
         return False

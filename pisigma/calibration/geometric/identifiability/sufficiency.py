@@ -1,44 +1,45 @@
-"""Whether measurements suffice for what is asked of them, what they cannot determine, and what to measure next."""
+"""Whether measurements determine the free parameters, what they leave undetermined, and what to measure next."""
 
 import numpy as np
 import torch
 
+from pisigma.calibration.geometric.identifiability.calibration_warning import CalibrationWarning
 from pisigma.calibration.geometric.identifiability.redundancy import Redundancy
 from pisigma.calibration.geometric.problem.information import Information
 from pisigma.calibration.geometric.problem.problem import CalibrationProblem
 from pisigma.calibration.geometric.problem.setup import CalibrationSetup
-from pisigma.files.errors import IdentificationError
+from pisigma.files.errors import IdentificationError, Place
 from pisigma.measurement.sensors.intrinsics import SCALE_COLUMN, BoardScaleSensor, IntrinsicsSensor, texts_of
 from pisigma.robot.description import Robot
 from pisigma.robot.kinematics.forward import forward_kinematics
 
 LITTLE_MOTION = 0.1
-"""[rad or m] A joint that moves less hardly shows its errors."""
+"""[rad or m] Range of a joint below which its errors are hardly identifiable."""
 NEAR_AXIS = 5e-3
-"""Share of the reach: a target nearer to the last axis hardly shows that joint's errors."""
+"""Distance of a target from the last axis, as a share of the reach, below which that joint's errors hardly show."""
 GOOD_RATIO = 3
-"""Values a parameter that a calibration should have."""
-SEEN_AT_ALL = 1e-3
-"""A length whose column is shorter than this share of the longest does not hold the scale."""
+"""Values per parameter that a calibration should have."""
+MIN_EFFECT = 1e-3
+"""Length of a parameter's column over the longest one above which the parameter can determine the scale."""
 SAME_FACE = 1e-6
-"""[m] Coordinates within this are of one face."""
+"""[m] Largest difference of coordinates on one face."""
 TOUCHES_WITHOUT_SCALE = (
-    "the touches of every frame and axis are at one coordinate, which a robot of any size can meet, so the scale stays "
-    "as drawn; touch faces at different coordinates along an axis."
+    "the touches of every frame and axis are at one coordinate, which a robot of any size fits, so the scale stays "
+    "nominal; touch faces at different coordinates along an axis."
 )
 SOCKETS_WITHOUT_SCALE = (
-    "sockets alone are met by a robot of any size, so the scale stays as drawn; give the distance between two sockets "
-    "(socket_distances), or measure one length otherwise."
+    "sockets alone fit a robot of any size, so the scale stays nominal; give the distance between two sockets "
+    "(socket_distances), or measure a length with another sensor."
 )
 
 
 def free_parameters(redundancy: Redundancy, explicit: bool, unknowns: int) -> int:
-    """Return how many numbers have to be estimated.
+    """Return the number of unknowns to estimate.
 
     Args:
-        redundancy: of the candidates at the start.
+        redundancy: redundancy of the candidates at the start.
         explicit: whether the candidates were named one by one.
-        unknowns: number of the sensors' unknowns, such as where sockets are.
+        unknowns: number of the sensors' unknowns, such as the positions of sockets.
     """
     acting = len(redundancy.names) - len(redundancy.no_effect)
     return (acting if explicit else redundancy.rank) + unknowns
@@ -51,10 +52,10 @@ def refuse_too_few(
 
     Args:
         problem: rows and sensors.
-        redundancy: see `free_parameters`, as for the next two.
-        explicit: see there.
-        unknowns: see there.
-        source: what complaints call the data.
+        redundancy: see `free_parameters`.
+        explicit: see `free_parameters`.
+        unknowns: see `free_parameters`.
+        source: name of the data in error messages.
 
     Raises:
         IdentificationError: there are not more values than parameters.
@@ -62,30 +63,34 @@ def refuse_too_few(
     values = distinct_values(problem)
     if values > free_parameters(redundancy, explicit, unknowns):
         return
-    # not the rank, which is at most that of the few values
+    # Not the rank, which is at most the number of values.
     most = free_parameters(redundancy, True, unknowns)
     raise IdentificationError(
-        f"{source}: {distinct_rows(problem)} different poses give {values} values for {most} free "
-        "parameters, which leaves nothing to distinguish noise from error; measure about "
-        f"{_missing_poses(problem, most)} more poses, or free fewer parameters."
+        f"expected more values than the {most} free parameters, got {values} values of {distinct_rows(problem)} "
+        "different poses",
+        expected=f"more than {most} values",
+        value=values,
+        at=Place(source),
+        remedy=f"measure about {_missing_poses(problem, most)} more poses, or free fewer parameters",
     )
 
 
-def what_to_measure(setup: CalibrationSetup, wanted: int) -> tuple[str, ...]:
-    """Say what to measure next, in sentences, where the data hardly determine what is free.
+def what_to_measure(setup: CalibrationSetup, wanted: int) -> tuple[CalibrationWarning, ...]:
+    """Warn of free parameters that the data hardly determine, and say what to measure next.
 
     Args:
         setup: the problem at its start.
-        wanted: how many numbers have to be estimated.
+        wanted: number of unknowns to estimate.
     """
     problem = setup.problem
     values = distinct_values(problem)
     few = []
     if values < GOOD_RATIO * wanted:
-        few.append(
+        sentence = (
             f"{values} values are few for {wanted} free parameters; measure about "
             f"{_missing_poses(problem, wanted)} more poses."
         )
+        few.append(CalibrationWarning("few_values", "", sentence))
     robot = problem.space.robot
     return (*few, *_still_joints(robot, problem), *_targets_on_axis(robot, problem), *_undetermined(setup))
 
@@ -96,32 +101,33 @@ def _missing_poses(problem: CalibrationProblem, wanted: int) -> int:
 
 
 def distinct_rows(problem: CalibrationProblem) -> int:
-    """Number of rows that differ in joint values, frame or target."""
+    """Count the rows that differ in joint values, frame or target."""
     return problem.q.shape[0] if problem.pose is None else int(problem.pose.max()) + 1
 
 
 def distinct_values(problem: CalibrationProblem) -> int:
-    """Number of measured values, repeats counted once."""
+    """Count the measured values, with repeats counted once."""
     share = distinct_rows(problem) / problem.q.shape[0]
     return round(sum(problem.values_measured) * share)
 
 
-def _still_joints(robot: Robot, problem: CalibrationProblem) -> list[str]:
-    """A sentence for every joint that hardly moves."""
+def _still_joints(robot: Robot, problem: CalibrationProblem) -> list[CalibrationWarning]:
+    """Warn of every joint that hardly moves."""
     span = (problem.q.amax(0) - problem.q.amin(0)).tolist()
-    sentences = []
+    warnings = []
     for joint, moved in zip(robot.joints, span, strict=True):
         if moved < LITTLE_MOTION:
             text = f"{np.rad2deg(moved):.3g} deg" if joint.type == "revolute" else f"{moved * 1e3:.3g} mm"
-            sentences.append(
-                f"joint {joint.name} moves by {text} only, so its errors cannot be distinguished from its "
-                "neighbours'; measure poses that move it through more of its range."
+            sentence = (
+                f"joint {joint.name} moves by only {text}, so its errors cannot be distinguished from those of its "
+                "neighbours; measure poses over more of its range."
             )
-    return sentences
+            warnings.append(CalibrationWarning("still_joint", joint.name, sentence))
+    return warnings
 
 
-def _targets_on_axis(robot: Robot, problem: CalibrationProblem) -> list[str]:
-    """A sentence for targets that are all too near to the last axis, where positions alone are measured."""
+def _targets_on_axis(robot: Robot, problem: CalibrationProblem) -> list[CalibrationWarning]:
+    """Warn if all targets are too near to the last axis and only positions were measured."""
     if any(sensor.turning for sensor in problem.sensors) or robot.joints[-1].type != "revolute":
         return []
     last = robot.joint_rows[-1]
@@ -136,23 +142,24 @@ def _targets_on_axis(robot: Robot, problem: CalibrationProblem) -> list[str]:
     if max(offs) >= NEAR_AXIS * robot.reach:
         return []
     which = f"target {names[int(np.argmax(offs))]}" if len(names) > 1 else "the target"
-    return [
-        f"{which} is {max(offs) * 1e3:.2g} mm from the axis of joint {robot.joints[-1].name}, so positions "
-        "say next to nothing about that joint and its axis; mount it "
-        f"{0.05 * robot.reach * 1e3:.0f} mm or more beside the axis, or measure orientations too."
-    ]
+    sentence = (
+        f"{which} is {max(offs) * 1e3:.2g} mm from the axis of joint {robot.joints[-1].name}, so positions hardly "
+        f"depend on the errors of this joint and its axis; mount it at least {0.05 * robot.reach * 1e3:.0f} mm away "
+        "from the axis, or measure orientations too."
+    )
+    return [CalibrationWarning("target_on_axis", robot.joints[-1].name, sentence)]
 
 
-def _undetermined(setup: CalibrationSetup) -> tuple[str, ...]:
-    """Say what a set-up cannot determine whatever its poses are, and what to measure for it."""
+def _undetermined(setup: CalibrationSetup) -> tuple[CalibrationWarning, ...]:
+    """Warn of what a setup cannot determine with any poses, and say what to measure for it."""
     return (*_scale(setup), *_touched_frames(setup), *_floating_frames(setup))
 
 
 def determines_scale(setup: CalibrationSetup) -> bool:
-    """Say whether any length was measured.
+    """Say whether the measurements determine the scale.
 
-    Sockets are met by a robot of any size; touches determine lengths by faces at different coordinates. Orientations
-    alone do not, but do not pretend to.
+    Sockets fit a robot of any size; touches determine lengths by faces at different coordinates. Orientations alone do
+    not determine the scale, but lengths then have no effect either, so nothing must be fixed.
     """
     data = setup.measurements
     lengths = _lengths(setup)
@@ -169,15 +176,18 @@ def determines_scale(setup: CalibrationSetup) -> bool:
 def candidates_at_start(
     setup: CalibrationSetup, candidates: list[int], information: Information
 ) -> tuple[list[int], Information]:
-    """What the data say of the candidates at the start, after the sensors' own unknowns.
+    """Compute the information on the candidates at the start, with the sensors' unknowns eliminated.
 
-    Where they do not determine the scale, the longest length that they see keeps its nominal value: errors of the
-    nominal geometry would pretend to determine it, and a robot that shrinks to a point meets all sockets.
+    If the data do not determine the scale, the longest length with an effect keeps its nominal value. Otherwise errors
+    of the nominal geometry would seem to determine it, and a robot that shrinks to a point fits all sockets.
 
     Args:
         setup: the problem at its start.
         candidates: indices of the parameters that may be estimated.
-        information: of the sensors' unknowns and of them.
+        information: information on the sensors' unknowns and the candidates.
+
+    Returns:
+        The candidates, without the length that sets the scale, and the information on them.
     """
     at_start = after_unknowns(setup, information)
     if determines_scale(setup):
@@ -185,7 +195,7 @@ def candidates_at_start(
     size = np.linalg.norm(at_start.jacobian, axis=0)
     values = np.abs(setup.start.cpu().numpy()[candidates])
     arm = [parameter.group in ("d", "a") for parameter in at_start.parameters]
-    lengths = np.where(np.array(arm) & (size > SEEN_AT_ALL * size.max(initial=0.0)), values, 0.0)
+    lengths = np.where(np.array(arm) & (size > MIN_EFFECT * size.max(initial=0.0)), values, 0.0)
     if not lengths.any():
         return candidates, at_start
     longest = int(lengths.argmax())
@@ -193,11 +203,11 @@ def candidates_at_start(
 
 
 def after_unknowns(setup: CalibrationSetup, information: Information) -> Information:
-    """What is left for arm, bases and tools after the sensors' own unknowns; of floating bases nothing.
+    """Eliminate the sensors' unknowns, and set the columns of floating bases to zero.
 
-    What was measured in a floating frame is met as well after any motion of base and sensors together. The first-order
-    change of a socket's residuals by such a motion is not zero, but it only turns them; so it would pretend to
-    determine a base, or joint 1.
+    Measurements in a floating frame do not change if base and sensors move together. The first-order change of a
+    socket's residuals by such a motion is not zero, but a mere rotation of the residuals, so it would seem to determine
+    a base, or joint 1.
     """
     parameters = setup.problem.space.names
     unknowns, floating = (
@@ -211,59 +221,61 @@ def after_unknowns(setup: CalibrationSetup, information: Information) -> Informa
 
 
 def _scale_of_boards(setup: CalibrationSetup) -> str:
-    """Say that nothing but boards gives the scale, and how sure it is."""
+    """Write that only boards determine the scale, and how accurately."""
     stated = [float(text) for text in texts_of(setup.measurements, SCALE_COLUMN) if text]
     how_sure = (
-        f"its squares are stated to {max(stated):.2g} of their length, which is "
+        f"the stated standard deviation of its squares is {max(stated):.2g} of their length, which is "
         f"{max(stated) * setup.problem.space.robot.reach * 1e3:.2g} mm at the reach of the robot"
         if stated
-        else "how sure its squares are is not stated (square_sigma_mm), so no predicted error contains it"
+        else "the standard deviation of its squares is not stated (square_sigma_mm), so no predicted error includes it"
     )
     return (
-        "every length rests on the board that the camera sees: if its squares are 0.1 % too large, so is the robot, "
-        f"and no residual shows it; {how_sure}. Measure the board with a calliper, or one known distance with another "
-        "sensor."
+        "only the board determines the scale: if its squares are 0.1 % too large, so is the robot, and no residual "
+        f"shows it; {how_sure}. Measure the board with a calliper, or one known distance with another sensor."
     )
 
 
 def _lengths(setup: CalibrationSetup) -> set[str]:
-    """Names of the sensors that measure lengths, or state them."""
+    """List the sensors that measure lengths."""
     stated = (IntrinsicsSensor.name, BoardScaleSensor.name)
     return {
         sensor.name for sensor in setup.problem.sensors if sensor.unit == "m" and sensor.name not in stated
     }
 
 
-def _scale(setup: CalibrationSetup) -> list[str]:
+def _scale(setup: CalibrationSetup) -> list[CalibrationWarning]:
     if _lengths(setup) == {"corner"}:
-        return [_scale_of_boards(setup)]
+        return [CalibrationWarning("scale_of_boards", "", _scale_of_boards(setup))]
     if determines_scale(setup):
         return []
-    return [TOUCHES_WITHOUT_SCALE if "touch" in setup.measurements.kinds else SOCKETS_WITHOUT_SCALE]
+    if "touch" in setup.measurements.kinds:
+        return [CalibrationWarning("scale_of_touches", "", TOUCHES_WITHOUT_SCALE)]
+    return [CalibrationWarning("scale_of_sockets", "", SOCKETS_WITHOUT_SCALE)]
 
 
-def _touched_frames(setup: CalibrationSetup) -> list[str]:
-    """A sentence for every frame that is touched along some axes only."""
+def _touched_frames(setup: CalibrationSetup) -> list[CalibrationWarning]:
+    """Warn of every frame that is touched along some axes only."""
     data = setup.measurements
     if data.touch is None or data.touch_axis is None or not setup.problem.space.of("base"):
         return []
     other = (data.measured("position") | data.measured("pose")).tolist()
-    sentences = []
+    warnings = []
     for frame in setup.problem.space.frames:
         rows = [row for row, name in enumerate(data.frame) if name == frame]
         axes = {data.touch_axis[row] for row in rows if data.touch_axis[row]}
         lacking = [axis for axis in "xyz" if axis not in axes]
         if axes and lacking and not any(other[row] for row in rows):
-            sentences.append(
-                f"frame '{frame}' was touched along {' and '.join(sorted(axes))} only, so where it stands along "
-                f"{' and '.join(lacking)} is not determined; touch faces that are square to "
-                f"{'it' if len(lacking) == 1 else 'them'} too."
+            sentence = (
+                f"frame '{frame}' was touched only along {' and '.join(sorted(axes))}, so its position along "
+                f"{' and '.join(lacking)} is not determined; also touch faces that are normal to "
+                f"{'this axis' if len(lacking) == 1 else 'these axes'}."
             )
-    return sentences
+            warnings.append(CalibrationWarning("touched_frame", frame, sentence))
+    return warnings
 
 
 def floating_frames(setup: CalibrationSetup) -> list[str]:
-    """Name the frames in which nothing measured has a stated position: whatever is there may move as a whole."""
+    """List the frames in which no measurement has a stated position, so that everything in them may move together."""
     data, sensors = setup.measurements, setup.problem.sensors
     if all(sensor.holds_frame for sensor in sensors):
         return []
@@ -275,7 +287,7 @@ def floating_frames(setup: CalibrationSetup) -> list[str]:
 
 
 def floating_bases(setup: CalibrationSetup) -> list[int]:
-    """Indices of the parameters of bases in floating frames, which stay where they start."""
+    """List the indices of the parameters of bases in floating frames, which keep their start values."""
     space, floating = setup.problem.space, floating_frames(setup)
     return [
         index
@@ -285,14 +297,15 @@ def floating_bases(setup: CalibrationSetup) -> list[int]:
     ]
 
 
-def _floating_frames(setup: CalibrationSetup) -> list[str]:
+def _floating_frames(setup: CalibrationSetup) -> list[CalibrationWarning]:
     floating = floating_frames(setup)
     if not floating:
         return []
     names = " and ".join(f"'{frame}'" for frame in floating)
     where = f"frame{'s' if len(floating) > 1 else ''} {names}" if any(floating) else "the frame"
-    return [
-        f"nothing that was measured in {where} has a stated position, so where the robot's base is there is not "
-        "determined: predicted positions are right among each other, up to one motion of them all; measure three "
-        "positions, touches, or distances from anchors at stated positions for that."
-    ]
+    sentence = (
+        f"no measurement in {where} has a stated position, so the pose of the robot's base there is not determined: "
+        "predicted positions are correct relative to each other, up to a common rigid motion; measure three positions, "
+        "touches, or distances from anchors at stated positions."
+    )
+    return [CalibrationWarning("floating_frame", ", ".join(floating), sentence)]

@@ -1,4 +1,4 @@
-"""Where the measuring frame and the measured point are: base and tool of a robot taken as it is."""
+"""Fit of base and tool of a robot with a fixed arm."""
 
 import math
 from dataclasses import dataclass
@@ -19,20 +19,20 @@ from pisigma.robot.description import Robot
 from pisigma.robot.se3 import rpy_from_rotation
 
 GUESS_STEPS = 2
-"""Steps by which a guess in closed form is polished where it is not clear."""
+"""Steps that refine a closed-form guess with large residuals."""
 CLEAR_FIT = 5e-3
-"""A start that ends with an RMS below this share of the reach is taken without trying others."""
+"""RMS residual as a share of the reach below which a result is accepted without trying other starts."""
 
 
 @dataclass(frozen=True, eq=False)
 class BaseToolFit:
-    """Base and tool that fit the measurements best, the arm itself being taken as it is.
+    """Base and tool that fit the measurements best, with a fixed arm.
 
     Attributes:
         robot: the robot with base and tool set; with several targets the tool of the first.
-        tools: for every target x, y, z [m], roll, pitch, yaw [rad] of its tool.
-        problem: what was solved.
-        solution: of it.
+        tools: tool of every target: x, y, z [m], roll, pitch, yaw [rad].
+        problem: the least-squares problem.
+        solution: its solution.
     """
 
     robot: Robot
@@ -42,18 +42,18 @@ class BaseToolFit:
 
     @property
     def rms_position(self) -> float:
-        """Root mean square of the position errors' lengths [m]."""
+        """Root mean square length of the position errors [m]."""
         return _rms_position(self.problem, self.solution.linearisation.point)
 
     @property
     def rms_rotation(self) -> float:
-        """Root mean square of the rotation errors' angles [rad]; NaN where none was measured."""
+        """Root mean square angle of the rotation errors [rad]; NaN if none was measured."""
         state = self.solution.linearisation.point
         return _rms_rotation(self.problem, state) if self.problem.turned else float("nan")
 
     @property
     def status(self) -> str:
-        """How the least squares ended, and how many unknowns the data leave open."""
+        """How the least squares ended, and how many unknowns the data do not determine."""
         normal = self.solution.linearisation.normal
         if len(normal) == 0:
             return "nothing was free"
@@ -63,8 +63,8 @@ class BaseToolFit:
         if rank == free:
             return self.solution.status.value
         return (
-            f"{self.solution.status.value}; the data see only {rank} of the {free} unknowns of base and tool, "
-            "the others stay where they started (poses with more different wrist orientations would determine them)"
+            f"{self.solution.status.value}; the data determine only {rank} of the {free} unknowns of base and tool, "
+            "the others keep their start values (poses with more different wrist orientations would determine them)"
         )
 
 
@@ -77,20 +77,19 @@ def fit_base_and_tool(
 ) -> BaseToolFit:
     """Fit base and tool of a robot to measured poses or positions; no initial guess is needed.
 
-    The start is closed form (see `base_and_tool_starts`), then least squares on base (6) and tool: 6 where
-    rotations were measured; else the position of every target, and the tool's orientation stays as it is. The
-    weights are 1 / sigma where the measurements give it; else positions and rotations are weighted by 1 /
-    their own scatter.
+    A closed-form start (see `base_and_tool_starts`) is refined by least squares on base (6) and tool: 6 parameters if
+    rotations were measured; else the position of every target, with the orientation of the tool fixed. The weights are
+    1 / sigma if the measurements state it; otherwise the inverse of the scatter of positions and of rotations.
 
     Args:
-        robot: the robot; its base and tool are no guess, they only decide what the data leave open.
-        measurements: rows with `position`, and `rotation` where measured; all in one frame.
-        free_base: whether to fit the base; else the robot's is taken as it is.
-        free_tool: whether to fit the tool; else the robot's is taken as it is.
-        maximum_iterations: steps of the least squares.
+        robot: the robot; its base and tool are not used as a guess, they only set what the data do not determine.
+        measurements: rows with `position`, and `rotation` if measured, all in one frame.
+        free_base: whether to fit the base; else that of the robot is used.
+        free_tool: whether to fit the tool; else that of the robot is used.
+        maximum_iterations: maximum number of steps.
 
     Raises:
-        IdentificationError: no positions, several frames, or too few rows for what has to be fitted.
+        IdentificationError: there are no positions, several frames, or too few rows.
         PoseError: the joint values do not fit the robot.
     """
     problem = build_base_and_tool_problem(robot, measurements, free_base, free_tool)
@@ -109,13 +108,13 @@ def fit_base_and_tool(
 def guess_base_and_tool(
     robot: Robot, measurements: Measurements, free_base: bool, free_tool: bool
 ) -> tuple[Float64[np.ndarray, " 6"], dict[str, Float64[np.ndarray, " 6"]]]:
-    """Guess base and tools in closed form, polished where that does not meet the positions clearly.
+    """Guess base and tools in closed form, with a refinement if the residuals are large.
 
     Args:
-        robot: see `fit_base_and_tool`, as for the others.
-        measurements: see there.
-        free_base: see there.
-        free_tool: see there.
+        robot: see `fit_base_and_tool`.
+        measurements: see `fit_base_and_tool`.
+        free_base: see `fit_base_and_tool`.
+        free_tool: see `fit_base_and_tool`.
 
     Returns:
         The base, and the tool of every target: x, y, z [m], roll, pitch, yaw [rad].
@@ -134,7 +133,7 @@ def guess_base_and_tool(
 def _base_and_tools(
     robot: Robot, problem: BaseToolProblem, state: BaseToolState
 ) -> tuple[Float64[np.ndarray, " 6"], dict[str, Float64[np.ndarray, " 6"]]]:
-    """The base and every target's tool; where no rotation was measured the tool stays turned as it is."""
+    """Return the base and every target's tool; the tool keeps its orientation if no rotation was measured."""
     rpy_base, rpy_tool = rpy_from_rotation(torch.stack([state.R_base, state.R_tool])).cpu().numpy()
     if not problem.turned:
         rpy_tool = robot.tool[3:]
@@ -146,7 +145,7 @@ def _base_and_tools(
 
 
 def _solved(robot: Robot, problem: BaseToolProblem, maximum_iterations: int) -> Solution[BaseToolState]:
-    """The best end of a search from any start."""
+    """Return the best solution of all starts."""
     best: tuple[float, Solution[BaseToolState], bool] | None = None
     for start in base_and_tool_starts(robot, problem):
         solution = levenberg_marquardt(problem, start, maximum_iterations)
@@ -160,10 +159,10 @@ def _solved(robot: Robot, problem: BaseToolProblem, maximum_iterations: int) -> 
 
 
 def _off(robot: Robot, problem: BaseToolProblem, solution: Solution[BaseToolState]) -> tuple[float, bool]:
-    """How far off the end of a search is [m], and whether its positions are clearly met.
+    """Compute the size of the residuals of a solution [m], and say whether those of positions are small.
 
-    An angle counts as what it moves at the end of the arm. It is not the cost, which every search divides by its own
-    noise.
+    Angles are converted to lengths at the reach of the arm. The cost cannot be compared, because every search divides
+    it by its own noise.
     """
     shift = _rms_position(problem, solution.linearisation.point)
     turn = robot.reach * _rms_rotation(problem, solution.linearisation.point) if problem.turned else 0.0

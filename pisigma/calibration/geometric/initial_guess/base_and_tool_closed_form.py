@@ -1,4 +1,4 @@
-"""Closed-form starts for base and tool: no guess is asked for."""
+"""Closed-form starts for base and tool, which need no guess."""
 
 import itertools
 from collections.abc import Iterator
@@ -11,22 +11,22 @@ from pisigma.calibration.geometric.initial_guess.base_and_tool_problem import Ba
 from pisigma.robot.description import Robot
 from pisigma.robot.se3 import nearest_rotation, rotation_from_rpy
 
-ALTERNATIONS = 60
+MAX_ITERATIONS = 60
 LINEAR_ROWS = 13
-"""Rows from which base and tool follow from a linear system."""
+"""Rows that determine base and tool by a linear system."""
 DEPENDENT = 1e-9
-"""Singular values of the linear system below this share of the largest count as zero."""
-LEFT_OPEN = 1e-9
-"""Weight of the rotation that is taken where points leave it open, beside theirs."""
+"""Singular value of the linear system over the largest one below which it counts as zero."""
+UNDETERMINED = 1e-9
+"""Relative weight of the given rotation, which sets what points do not determine."""
 SINGLE = 0.9
-"""A second singular value above this share of the first may mean that the rotations are not unique."""
+"""Second over first singular value above which the rotations may not be unique."""
 
 
 def base_and_tool_starts(robot: Robot, problem: BaseToolProblem) -> Iterator[BaseToolState]:
-    """Starts to be polished and compared; one is enough except with positions of few or special poses.
+    """Yield starts to refine and compare; one suffices except for positions of few or special poses.
 
     Args:
-        robot: gives the tool, which decides what the data leave open, and what is not free.
+        robot: the robot, whose base and tool are used if they are not free or not determined.
         problem: flange poses and measurements.
     """
     like = problem.position
@@ -67,15 +67,14 @@ def start_from_poses(
     rotation: Float64[Tensor, "rows 3 3"],
     R_tool_nominal: Float64[Tensor, "3 3"],
 ) -> tuple[Float64[Tensor, "3 3"], Float64[Tensor, " 3"], Float64[Tensor, "3 3"], Float64[Tensor, " 3"]]:
-    """Solve measured = base · flange · tool for base and tool (robot-world and hand-eye).
+    """Solve measured = base · flange · tool for base and tool (robot-world and hand-eye calibration).
 
-    With Z the inverse of the tool's rotation, `R_measured · Z · R_flange^T = R_base`, so
-    `K vec(Z) = rows · vec(R_base)` with `K = Σ R_measured ⊗ R_flange` (Shah 2013, J. Mechanisms Robotics
-    5(3), in row-major order). Where the leading singular value of K is not single (all axes parallel, as in
-    a SCARA) its vectors are no rotations; therefore the pair that maximises `vec(R_base)^T K vec(Z)` is
-    found by alternating projections onto the rotations: from the singular vector, and where that is not
-    unique, from the nominal tool and the 24 rotations of a cube too, the nominal one winning ties.
-    Translations then are linear.
+    With the inverse Z of the tool's rotation, `R_measured · Z · R_flange^T = R_base`, so
+    `K vec(Z) = rows · vec(R_base)` with `K = Σ R_measured ⊗ R_flange` (Shah 2013, J. Mechanisms Robotics 5(3), in
+    row-major order). If the leading singular value of K is not single (all axes parallel, as in a SCARA), its vectors
+    are not rotations. Therefore the pair that maximises `vec(R_base)^T K vec(Z)` is found by alternating projections
+    onto the rotations, starting at the singular vector and, if this is not unique, also at the nominal tool, which is
+    preferred among equal ones, and the 24 rotations of a cube. The translations are then linear.
 
     Returns:
         R_base, p_base [m], R_tool, p_tool [m].
@@ -89,7 +88,7 @@ def start_from_poses(
         starts = torch.cat([R_tool_nominal.mT[None], starts, _cube_rotations(K)])
     Z = nearest_rotation(starts)
     agreement = torch.zeros(len(Z)).to(K)
-    for _ in range(ALTERNATIONS):
+    for _ in range(MAX_ITERATIONS):
         R_base = nearest_rotation((Z.reshape(-1, 9) @ K.mT).reshape(-1, 3, 3))
         Z = nearest_rotation((R_base.reshape(-1, 9) @ K).reshape(-1, 3, 3))
         before = agreement
@@ -108,14 +107,14 @@ def starts_from_positions(
     nominal_point: Float64[Tensor, " 3"],
     reach: float,
 ) -> Iterator[tuple[Float64[Tensor, "3 3"], Float64[Tensor, " 3"], Float64[Tensor, " 3"]]]:
-    """Candidates for `position = R_base (R_flange · point + p_flange) + p_base`, to be polished and compared.
+    """Yield starts for `position = R_base (R_flange · point + p_flange) + p_base`, to refine and compare.
 
-    The first is that of `start_from_products`, where there are enough rows. The others assume a point (the
-    nominal one, none, a tenth of the reach along each axis) and find the base by Procrustes; they serve
-    where the linear system is singular, as with parallel axes or few rows.
+    The first is that of `start_from_products`, if there are enough rows. The others assume a point (the nominal one,
+    zero, a tenth of the reach along each axis) and fit the base by Procrustes analysis, for singular linear systems, as
+    with parallel axes or few rows.
 
-    Returns:
-        R_base, p_base [m], point [m], each.
+    Yields:
+        R_base, p_base [m], point [m].
     """
     if position.shape[0] >= LINEAR_ROWS:
         yield start_from_products(R_flange, p_flange, position)
@@ -133,8 +132,8 @@ def start_from_products(
 ) -> tuple[Float64[Tensor, "3 3"], Float64[Tensor, " 3"], Float64[Tensor, " 3"]]:
     """Solve `position = R_base (R_flange · point + p_flange) + p_base` for base and point.
 
-    Written out, every coordinate is linear in 13 unknowns: the products of `R_base`'s row with the point
-    (9), the row itself (3) and the shift (1).
+    Every coordinate is linear in 13 unknowns: the products of a row of `R_base` with the point (9), the row itself (3)
+    and the shift (1).
 
     Returns:
         R_base, p_base [m], point [m].
@@ -150,9 +149,9 @@ def base_by_points(
     position: Float64[Tensor, "rows 3"],
     like: Float64[Tensor, "3 3"] | None = None,
 ) -> tuple[Float64[Tensor, "3 3"], Float64[Tensor, " 3"]]:
-    """Rotation and position [m] of the base that puts points, seen from it, best onto measured positions.
+    """Fit rotation and position [m] of the base to points in the base and their measured positions.
 
-    Where they are on one line, or fewer than three, the rotation is `like` one, as far as they leave it open.
+    If the points are on one line, or fewer than three, `like` sets the rotation that they do not determine.
     """
     R_base = _procrustes(points, position, like)
     return R_base, (position - points @ R_base.mT).mean(0)
@@ -168,7 +167,7 @@ def _tool_start(
     turned: bool,
     R_tool: Tensor,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """The tool for a fixed base: the mean of what each row says."""
+    """Fit the tool with a fixed base, as the mean over the rows."""
     in_base = (position - p_base) @ R_base
     point = (R_flange.mT @ (in_base - p_flange)[..., None])[..., 0].mean(0)
     if turned:
@@ -177,23 +176,23 @@ def _tool_start(
 
 
 def _mean_turn(R_base: Tensor, R_flange: Tensor, rotation: Tensor) -> Tensor:
-    """The tool's rotation for a fixed rotation of the base."""
+    """Fit the rotation of the tool with a fixed rotation of the base."""
     return nearest_rotation((R_flange.mT @ R_base.mT @ rotation).sum(0))
 
 
 def _procrustes(points: Tensor, position: Tensor, like: Tensor | None = None) -> Tensor:
-    """The rotation that turns the points best onto the positions, both about their means; see `base_by_points`."""
+    """Fit the rotation of the points to the positions, both relative to their means; see `base_by_points`."""
     M = (position - position.mean(0)).mT @ (points - points.mean(0))
-    return nearest_rotation(M if like is None else M + like * (LEFT_OPEN * M.norm()).clamp(min=1e-12))
+    return nearest_rotation(M if like is None else M + like * (UNDETERMINED * M.norm()).clamp(min=1e-12))
 
 
 def _least_squares(
     A: Float64[Tensor, "rows columns"], b: Float64[Tensor, "rows values"]
 ) -> Float64[Tensor, "columns values"]:
-    """Solve `A x = b` in least squares; the shortest solution where columns depend on others.
+    """Solve `A x = b` in least squares; the minimum-norm solution if columns are dependent.
 
-    That needs singular values, which are not worked out where the inverse of the triangle is short enough to show that
-    none is to be left out.
+    The singular values needed for that are only computed if the inverse of the triangle does not already show that
+    none is negligible.
     """
     Q, R = torch.linalg.qr(A)
     inverse = torch.linalg.solve_triangular(R, torch.eye(R.shape[-1]).to(R), upper=True)
@@ -209,9 +208,10 @@ def _translations(
     p_flange: Float64[Tensor, "rows 3"],
     position: Float64[Tensor, "rows 3"],
 ) -> tuple[Float64[Tensor, " 3"], Float64[Tensor, " 3"]]:
-    """Positions of base and tool for a fixed rotation of the base; they are linear then.
+    """Fit the positions of base and tool with a fixed rotation of the base, which is a linear problem.
 
-    In the base's axes the regressor of a row is `[1 R_flange]`, and rotations are orthogonal.
+    In the axes of the base, the regressor of a row is `[1 R_flange]`. As rotations are orthogonal, the normal matrix
+    depends only on the mean of R_flange.
     """
     b = position @ R_base - p_flange
     turns, same = R_flange.mean(0), torch.eye(3).to(position)
@@ -222,7 +222,7 @@ def _translations(
 
 
 def _cube_rotations(like: Tensor) -> Tensor:
-    """The 24 rotations that map a cube onto itself."""
+    """Return the 24 rotations that map a cube onto itself."""
     rotations = []
     for order in itertools.permutations(range(3)):
         for signs in itertools.product((1.0, -1.0), repeat=3):

@@ -1,4 +1,4 @@
-"""Base and tool as a small least-squares problem, the arm being taken as it is."""
+"""Base and tool of a fixed arm as a small least-squares problem."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -9,7 +9,7 @@ from torch import Tensor
 
 from pisigma.calibration.geometric.problem.least_squares import AbstractLeastSquares, Linearisation
 from pisigma.calibration.geometric.problem.noise import SMALLEST_NOISE
-from pisigma.files.errors import IdentificationError
+from pisigma.files.errors import IdentificationError, Place
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.sensors.pose import rotation_difference
 from pisigma.robot.description import Robot
@@ -19,13 +19,13 @@ from pisigma.robot.se3 import rotation_from_vector, skew
 
 @dataclass(frozen=True, eq=False)
 class BaseToolState:
-    """Base and tool while they are being fitted.
+    """Base and tool during the fit.
 
     Attributes:
         R_base: rotation of the base.
         p_base: position of the base [m].
         R_tool: rotation of the tool.
-        points: per target, its place behind the last row [m].
+        points: position of every target in the frame of the last row [m].
     """
 
     R_base: Float64[Tensor, "3 3"]
@@ -36,7 +36,7 @@ class BaseToolState:
 
 @dataclass(frozen=True, eq=False)
 class _View:
-    """Normal matrix, descent and cost, and the standard deviation, of positions and of rotations."""
+    """Normal matrix, descent and cost of positions and of rotations, and their standard deviations."""
 
     blocks: tuple[tuple[Tensor, Tensor, float], ...]
     noise: tuple[float, float]
@@ -44,23 +44,23 @@ class _View:
 
 @dataclass(frozen=True, eq=False)
 class BaseToolProblem(AbstractLeastSquares[BaseToolState]):
-    """Flange poses and what was measured there.
+    """Flange poses and measurements.
 
-    The unknowns are base shift [m], base turn [rad] about its own origin, both in the measuring frame, the
-    points (3 a target) [m] and the tool's turn [rad], both in the frame of the last row.
+    The unknowns are the shift [m] and rotation [rad] of the base (about its origin, in the measuring frame), and the
+    points (3 per target) [m] and the rotation [rad] of the tool in the frame of the last row.
 
     Attributes:
-        R_flange: rotation behind the last row, from the first row's frame.
-        p_flange: its position [m].
+        R_flange: rotations of the last row's frame in the first row's frame.
+        p_flange: its positions [m].
         position: measured positions [m].
         rotation: measured rotations where `rotated`, the identity elsewhere.
         rotated: whether a row has a measured rotation.
-        target: index of the row's target.
+        target: index of every row's target.
         targets: names of the targets.
-        sigma_position: per row [m]; None: the scatter is estimated.
-        sigma_rotation: per row [rad]; None: the scatter is estimated.
-        free_base: whether the base is to be fitted.
-        free_tool: whether the tool is to be fitted.
+        sigma_position: standard deviation of every row [m]; None to estimate the scatter.
+        sigma_rotation: standard deviation of every row [rad]; None to estimate the scatter.
+        free_base: whether to fit the base.
+        free_tool: whether to fit the tool.
     """
 
     R_flange: Float64[Tensor, "rows 3 3"]
@@ -96,16 +96,16 @@ class BaseToolProblem(AbstractLeastSquares[BaseToolState]):
         return torch.full((len(self.active),), 1e-3, dtype=torch.float64, device=self.position.device)
 
     def residuals(self, state: BaseToolState) -> tuple[Float64[Tensor, "rows 3"], Float64[Tensor, "rows 3"]]:
-        """Measured minus predicted: positions [m] and rotation vectors [rad], in the measuring frame."""
+        """Compute measured minus predicted positions [m] and rotation vectors [rad], in the measuring frame."""
         position = self.position_residual(state)
         return position, self.rotation_residual(state) if self.turned else torch.zeros_like(position)
 
     def position_residual(self, state: BaseToolState) -> Float64[Tensor, "rows 3"]:
-        """Measured minus predicted positions [m]."""
+        """Compute measured minus predicted positions [m]."""
         return self.position - (self._arm(state) @ state.R_base.mT + state.p_base)
 
     def rotation_residual(self, state: BaseToolState) -> Float64[Tensor, "rows 3"]:
-        """Rotation vectors from the predicted to the measured rotation [rad], 0 where none was measured."""
+        """Compute rotation vectors from predicted to measured rotations [rad]; 0 where none was measured."""
         predicted = state.R_base @ self.R_flange @ state.R_tool
         turn = rotation_difference(self.rotation.permute(1, 2, 0), predicted.permute(1, 2, 0))
         return (turn * self.rotated).t()
@@ -113,7 +113,7 @@ class BaseToolProblem(AbstractLeastSquares[BaseToolState]):
     def linearise(
         self, point: BaseToolState, like: Linearisation[BaseToolState] | None
     ) -> Linearisation[BaseToolState]:
-        """Sum up the normal equations of positions and of rotations, apart."""
+        """Sum the normal equations of positions and of rotations separately."""
         noise = (1.0, 1.0) if like is None else _view_of(like).noise
         R_base_flange = point.R_base @ self.R_flange
         blocks = [(self._shifts(point, R_base_flange), self.position_residual(point), self.sigma_position)]
@@ -131,7 +131,7 @@ class BaseToolProblem(AbstractLeastSquares[BaseToolState]):
     def renewed(
         self, linearisation: Linearisation[BaseToolState]
     ) -> tuple[Linearisation[BaseToolState], bool]:
-        """Weight positions and rotations by 1 / their own scatter, where no sigma is stated."""
+        """Weight positions and rotations by the inverse of their scatter if no standard deviation is stated."""
         view = _view_of(linearisation)
         values = (3 * len(self.position), 3 * self._rotations)
         stated = (self.sigma_position is not None, self.sigma_rotation is not None)
@@ -152,7 +152,7 @@ class BaseToolProblem(AbstractLeastSquares[BaseToolState]):
         return Linearisation(point, cost, descent, normal, cost, rounding, view)
 
     def moved(self, point: BaseToolState, step: Float64[Tensor, " active"]) -> BaseToolState:
-        """Turn and shift base and tool."""
+        """Rotate and shift base and tool."""
         full = step.new_zeros(9 + 3 * len(self.targets)).index_copy(0, self.active, step)
         return BaseToolState(
             R_base=rotation_from_vector(full[3:6]) @ point.R_base,
@@ -162,7 +162,7 @@ class BaseToolProblem(AbstractLeastSquares[BaseToolState]):
         )
 
     def _arm(self, state: BaseToolState) -> Tensor:
-        """Where the target is in the first row's frame."""
+        """Compute the positions of the targets in the first row's frame."""
         return self.p_flange + (self.R_flange @ state.points[self.target, :, None])[..., 0]
 
     @cached_property
@@ -171,11 +171,11 @@ class BaseToolProblem(AbstractLeastSquares[BaseToolState]):
 
     @cached_property
     def _rounding(self) -> float:
-        """What rounding may do to a position [m]."""
+        """Rounding error of a position [m]."""
         return 2 * torch.finfo(self.position.dtype).eps * (float(self.p_flange.abs().max()) + 1e-3)
 
     def _shifts(self, state: BaseToolState, R_base_flange: Tensor) -> Tensor:
-        """Derivative of the positions by all unknowns."""
+        """Compute the derivative of the positions by all unknowns."""
         rows, targets = self.position.shape[0], len(self.targets)
         J = self.position.new_zeros((rows, 3, 9 + 3 * targets))
         J[..., :3] = torch.eye(3, dtype=J.dtype, device=J.device)
@@ -188,7 +188,7 @@ class BaseToolProblem(AbstractLeastSquares[BaseToolState]):
         return J
 
     def _turns(self, R_base_flange: Tensor) -> Tensor:
-        """Derivative of the rotations by all unknowns."""
+        """Compute the derivative of the rotations by all unknowns."""
         J = self.position.new_zeros((self.position.shape[0], 3, 9 + 3 * len(self.targets)))
         rotated = self.rotated[:, None, None]
         J[..., 3:6] = rotated * torch.eye(3, dtype=J.dtype, device=J.device)
@@ -204,21 +204,26 @@ def _view_of(linearisation: Linearisation[BaseToolState]) -> _View:
 def build_base_and_tool_problem(
     robot: Robot, measurements: Measurements, free_base: bool = True, free_tool: bool = True
 ) -> BaseToolProblem:
-    """Gather the rows that can be used.
+    """Build the problem from the rows with positions.
 
     Raises:
-        IdentificationError: no positions, several frames, or too few values for the unknowns.
+        IdentificationError: there are no positions, several frames, or too few values for the unknowns.
     """
     if measurements.position is None:
         raise IdentificationError(
-            f"{measurements.source}: base and tool need measured positions or poses, and there are none; "
-            "give the columns x_mm, y_mm, z_mm."
+            expected="measured positions or poses for base and tool",
+            value="none",
+            at=Place(measurements.source),
+            remedy="give the columns x_mm, y_mm, z_mm",
         )
     frames = sorted(set(measurements.frame))
     if len(frames) > 1:
         raise IdentificationError(
-            f"{measurements.source}: one measuring frame was wanted, but there are {len(frames)} "
-            f"({', '.join(frames)}); give the rows of one frame at a time."
+            f"expected one measuring frame, got {len(frames)} ({', '.join(frames)})",
+            expected="one measuring frame",
+            value=len(frames),
+            at=Place(measurements.source),
+            remedy="give the rows of one frame at a time",
         )
     keep = torch.isfinite(measurements.position).all(-1)
     names = measurements.target or ("",) * measurements.q.shape[0]
@@ -246,7 +251,7 @@ def build_base_and_tool_problem(
 
 
 def _rotations(measurements: Measurements, keep: Tensor) -> tuple[Tensor, Tensor]:
-    """Measured rotations of the rows to keep, the identity where there is none, and where there is one."""
+    """Return the measured rotations of the rows to keep (the identity without one), and where there is one."""
     eye = torch.eye(3, dtype=measurements.q.dtype, device=measurements.q.device)
     if measurements.rotation is None:
         count = int(keep.sum())
@@ -257,7 +262,7 @@ def _rotations(measurements: Measurements, keep: Tensor) -> tuple[Tensor, Tensor
 
 
 def _given(sigma: Tensor | None, keep: Tensor, used: Tensor) -> Tensor | None:
-    """Standard deviations of the rows to keep; None where not all used ones are stated."""
+    """Return the standard deviations of the rows to keep; None if not all used ones are stated."""
     if sigma is None or not bool(torch.isfinite(sigma[keep][used]).all()):
         return None
     return torch.where(used, sigma[keep], 1.0)
@@ -268,6 +273,10 @@ def _check_size(problem: BaseToolProblem, measurements: Measurements) -> None:
     values = 3 * rows + 3 * int(problem.rotated.sum())
     if values < len(problem.active) or rows == 0:
         raise IdentificationError(
-            f"{measurements.source}: {rows} rows with positions give {values} values, but base and tool have "
-            f"{len(problem.active)} unknowns; measure more poses, spread over the workspace."
+            f"expected at least {len(problem.active)} values for as many unknowns of base and tool, got {values} "
+            f"values of {rows} rows with positions",
+            expected=f"at least {len(problem.active)} values",
+            value=values,
+            at=Place(measurements.source),
+            remedy="measure more poses, spread over the workspace",
         )

@@ -1,4 +1,4 @@
-"""The initial guess of everything but the arm: bases, tools and the sensors' unknowns."""
+"""Initial guess of bases, tools and the sensors' unknowns, with the nominal arm."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -17,7 +17,7 @@ from pisigma.calibration.geometric.initial_guess.tool_from_distances import (
     tools_from_distances,
 )
 from pisigma.calibration.geometric.problem.parameters import ParameterSpace
-from pisigma.files.errors import IdentificationError, nearest_choice
+from pisigma.files.errors import IdentificationError, Place, nearest_choice
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.sensors.registry import SENSORS
 from pisigma.measurement.sensors.sensor import names_of, numbers_of
@@ -34,21 +34,22 @@ from pisigma.robot.se3 import (
 )
 
 GUESS_ROWS = 1_024
-"""Rows from which base and tool are guessed."""
+"""Rows used to guess base and tool."""
 FEW = 9
-"""Positions below which a frame's base is guessed with tools of other frames, not with tools of its own."""
+"""Positions below which a frame's base is guessed with the tools of other frames."""
 ENOUGH = 5
-"""Positions in a touched frame from which base and tool are found in closed form."""
-LEAST_TURN = 0.02
-"""Directions of the tool that the orientations in sockets determine less than this stay as drawn."""
-FEWEST_TOUCHES = 4
-"""Touches along an axis from which its direction is found."""
+"""Positions in a touched frame that suffice for base and tool in closed form."""
+MIN_TURN = 0.02
+"""Singular value per row below which orientations in sockets do not determine a direction of the tool, which then
+stays nominal."""
+MIN_TOUCHES = 4
+"""Touches along an axis needed to determine its direction."""
 CLEAR = 0.03
-"""The least spread of the tips, as a share of their largest, from which a direction is found."""
-POLISH = 10
-"""Steps after the linear solution of a touched frame."""
+"""Smallest over largest spread of the tips needed to determine a direction."""
+REFINEMENTS = 10
+"""Gauss-Newton steps after the linear solution of a touched frame."""
 NEAR = 0.05
-"""A guess must meet the touches to this share of the robot's reach."""
+"""Largest RMS residual of the touches with a guess, as a share of the reach."""
 BASE_UNKNOWNS = 6
 
 
@@ -57,9 +58,9 @@ class InitialGuess:
     """Initial values in the user's coordinates.
 
     Attributes:
-        bases: per frame, x, y, z [m], roll, pitch, yaw [rad].
-        tools: per target, the same.
-        unknowns: by group of the sensors' unknowns, those of every owner in its frame [m or rad].
+        bases: base in every frame: x, y, z [m], roll, pitch, yaw [rad].
+        tools: tool of every target, in the same form.
+        unknowns: unknowns of every owner in its frame, by group of the sensors' unknowns [m or rad].
         free_unknowns: which of them are to be identified; the others are stated by the measurements.
     """
 
@@ -77,24 +78,23 @@ def guess(
     turn_tool: bool,
     stated: Mapping[str, tuple[float, ...]],
 ) -> InitialGuess:
-    """Guess where everything is, the arm being taken as drawn.
+    """Guess bases, tools and the sensors' unknowns with the nominal arm.
 
-    Frames with positions get base and tool in closed form; then sockets, wires and pairs determine tools that have
-    none yet; touches, and wires from anchors at stated places, determine their frame by the tool; then the sensors
-    guess their own unknowns, such as sockets at the mean of the tool's positions and anchors by multilateration. A
-    frame without any of these (sockets and unknown anchors only) starts at the robot's own base, which it cannot
-    determine.
+    Frames with positions get base and tool in closed form. Then sockets, wires and pairs determine the remaining tools;
+    touches, and wires from anchors at stated positions, determine their frame with the tool; and the sensors guess
+    their unknowns, such as sockets at the mean position of the tool and anchors by multilateration. A frame without
+    any of these (only sockets and unknown anchors) does not determine the base and starts at the robot's.
 
     Args:
         space: names and robot.
         measurements: usable rows; those of pairs come first.
-        free_base: whether bases are to be identified; else they are as stated, or the robot's.
-        free_tool: whether tools are.
-        turn_tool: whether their rotations are.
+        free_base: whether to identify bases; else they are as stated, or the robot's.
+        free_tool: whether to identify tools.
+        turn_tool: whether to identify their rotations.
         stated: bases of frames that the user states.
 
     Raises:
-        IdentificationError: too little was measured for a guess, or something that cannot be.
+        IdentificationError: there are too few measurements for a guess, or implausible ones.
     """
     _check_frame_names(stated, space.frames, measurements.source)
     if free_base:
@@ -142,7 +142,7 @@ def _from_positions(
     free_tool: bool,
     stated: dict[str, np.ndarray],
 ) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
-    """Bases and tools of frames with positions."""
+    """Guess bases and tools of frames with positions, starting with the frame with most positions."""
     bases, tools = dict(stated), dict[str, np.ndarray]()
     if measurements.position is None:
         return bases, tools
@@ -176,7 +176,7 @@ def _from_positions(
 def _base_by_tools(
     robot: Robot, measurements: Measurements, tools: Mapping[str, np.ndarray]
 ) -> Float64[np.ndarray, " 6"]:
-    """The base of a frame with few positions, by the tools of other frames."""
+    """Fit the base of a frame with few positions, with the tools of other frames."""
     assert measurements.position is not None
     arm = robot.with_geometry(base=np.zeros(6), tool=np.zeros(6))
     T = forward_kinematics(arm, measurements.q.cpu())
@@ -187,7 +187,7 @@ def _base_by_tools(
 
 
 def chosen_rows(rows: int, most: int) -> Int64[Tensor, " chosen"]:
-    """All rows, or so many of them in a random order that is always the same."""
+    """Return all rows, or at most `most` of them in a fixed random order."""
     if rows <= most:
         return torch.arange(rows)
     return torch.randperm(rows, generator=torch.Generator().manual_seed(0))[:most]
@@ -196,7 +196,7 @@ def chosen_rows(rows: int, most: int) -> Int64[Tensor, " chosen"]:
 def _touched_rows(
     space: ParameterSpace, measurements: Measurements, bases: Mapping[str, np.ndarray]
 ) -> dict[str, Bool[Tensor, " rows"]]:
-    """The touches of frames that have no base yet."""
+    """Return the touches of frames without a base."""
     if measurements.touch is None:
         return {}
     touches = measurements.measured("touch").cpu()
@@ -211,7 +211,7 @@ def _from_sockets(
     T_flange: Float64[Tensor, "rows 4 4"],
     tools: Mapping[str, np.ndarray],
 ) -> dict[str, np.ndarray]:
-    """All tools, those that have no guess yet by the sockets that their ball sat in."""
+    """Add tools without a guess, from the sockets that their ball was measured in."""
     tools = dict(tools)
     socket = numbers_of(measurements.socket, names_of(measurements.socket), measurements.rows)
     target = numbers_of(measurements.target, space.targets, measurements.rows)
@@ -238,7 +238,7 @@ def _from_touches(
     rows: Bool[Tensor, " rows"],
     tip: Float64[Tensor, "rows 3"],
 ) -> np.ndarray:
-    """The base of one frame by its touches."""
+    """Guess the base of one frame from its touches."""
     assert measurements.touch is not None
     part = measurements.select(rows.nonzero()[:, 0].to(measurements.q.device))
     axis = numbers_of(part.touch_axis, ("x", "y", "z"), part.rows)
@@ -255,20 +255,20 @@ def tool_from_sockets(
     socket: Int64[Tensor, " rows"],
     guess: Float64[Tensor, " 3"],
 ) -> Float64[Tensor, " 3"]:
-    """Find the ball behind the flange such that the rows of every socket meet best.
+    """Compute the position of a ball on the flange such that the rows of every socket agree best.
 
-    `R · ball + p - socket = 0` is linear in both; the sockets drop out with the means over their rows.
-    Directions that the orientations hardly determine stay at the guess.
+    `R · ball + p - socket = 0` is linear in ball and socket; subtracting the means over the rows of every socket
+    eliminates the sockets. Directions that the orientations hardly determine keep their guess.
 
     Args:
-        R: orientations of the flange, one target's rows.
-        p: its positions [m].
+        R: orientations of the flange in the rows of one target.
+        p: positions of the flange [m].
         socket: number of every row's socket.
-        guess: where the ball is as drawn [m].
+        guess: nominal position of the ball [m].
     """
     turn = _centred(R.flatten(1), socket).view(-1, 3, 3).flatten(0, 1)
     off = -_centred(p + (R @ guess), socket).flatten()
-    rtol = LEAST_TURN * len(R) ** 0.5 / max(float(torch.linalg.matrix_norm(turn, 2)), 1e-12)
+    rtol = MIN_TURN * len(R) ** 0.5 / max(float(torch.linalg.matrix_norm(turn, 2)), 1e-12)
     ball: Tensor = guess + torch.linalg.pinv(turn, rtol=min(rtol, 1.0)) @ off
     return ball
 
@@ -283,20 +283,19 @@ def touched_base(
     touch: Float64[Tensor, " touches"],
     guess: Float64[Tensor, " 6"],
 ) -> tuple[Float64[Tensor, " 6"], float]:
-    """Find T_frame_robot from touches, the tips being given in the robot's frame.
+    """Compute T_frame_robot from touches, with the tips in the robot's frame.
 
-    `touch = R[axis] · tip + p[axis]` is linear in R and p for every axis on its own; from two axes the third
-    follows. Then all six unknowns are polished together. Where the linear solution is unclear, the guess is
-    polished instead.
+    `touch = R[axis] · tip + p[axis]` is linear in R and p for every axis separately; the third axis follows from two.
+    Then all six unknowns are refined together. The refinement also starts at the guess, and the better result is used.
 
     Args:
-        tip: where the robot as drawn has its tip [m].
-        axis: which axis of the frame was touched along.
-        touch: the coordinate there [m].
-        guess: the robot's own base, x, y, z [m], roll, pitch, yaw [rad].
+        tip: nominal positions of the tip [m].
+        axis: axis of the frame along which each touch was measured.
+        touch: measured coordinates [m].
+        guess: the robot's base, x, y, z [m], roll, pitch, yaw [rad].
 
     Returns:
-        The base, and the root mean square by which it misses the touches [m].
+        The base, and the RMS residual of the touches [m].
     """
     starts = [(rotation_from_rpy(guess[3:]), guess[:3])]
     linear = _linear_rotation(tip, axis, touch)
@@ -304,7 +303,7 @@ def touched_base(
         starts.insert(0, (linear, torch.zeros(3).to(tip)))
     best, miss = guess, float("inf")
     for R, p in starts:
-        R, p, rms = _polished(tip, axis, touch, R, p)
+        R, p, rms = _refined(tip, axis, touch, R, p)
         if rms < miss:
             best, miss = torch.cat([p, rpy_from_rotation(R)]), rms
     return best, miss
@@ -315,7 +314,7 @@ def _linear_rotation(tip: Tensor, axis: Tensor, touch: Tensor) -> Tensor | None:
     for k in range(3):
         points, values = tip[axis == k], touch[axis == k]
         rows.append(None)
-        if len(points) < FEWEST_TOUCHES:
+        if len(points) < MIN_TOUCHES:
             continue
         centred = points - points.mean(0)
         singular = torch.linalg.svdvals(centred)
@@ -330,11 +329,11 @@ def _linear_rotation(tip: Tensor, axis: Tensor, touch: Tensor) -> Tensor | None:
     return nearest_rotation(torch.stack(directions)) if len(directions) == 3 else None
 
 
-def _polished(tip: Tensor, axis: Tensor, touch: Tensor, R: Tensor, p: Tensor) -> tuple[Tensor, Tensor, float]:
+def _refined(tip: Tensor, axis: Tensor, touch: Tensor, R: Tensor, p: Tensor) -> tuple[Tensor, Tensor, float]:
     rows = torch.arange(len(tip))
     eye = torch.eye(3).to(tip)[axis]
     residual = touch - (tip @ R.mT + p)[rows, axis]
-    for _ in range(POLISH):
+    for _ in range(REFINEMENTS):
         turned = tip @ R.mT
         J = torch.cat([eye, (-skew(turned))[rows, axis]], -1)
         step = torch.linalg.pinv(J, rtol=1e-6) @ residual
@@ -344,7 +343,7 @@ def _polished(tip: Tensor, axis: Tensor, touch: Tensor, R: Tensor, p: Tensor) ->
 
 
 def _check_touched_base(measurements: Measurements, name: str, rms: float, reach: float) -> None:
-    """Refuse a guess of a touched frame that is nowhere near its touches.
+    """Refuse a guess of a touched frame with large residuals.
 
     Raises:
         IdentificationError: see above.
@@ -353,14 +352,17 @@ def _check_touched_base(measurements: Measurements, name: str, rms: float, reach
         return
     counts = ", ".join(f"{(measurements.touch_axis or ()).count(axis)} along {axis}" for axis in "xyz")
     raise IdentificationError(
-        f"{measurements.source}: the touches of frame '{name}' ({counts}) do not determine where it stands (the best "
-        f"fit misses them by {rms * 1e3:.3g} mm); check that they are all of this frame, or say about where "
-        f"the robot's base is in it, frames={{'{name}': (x, y, z, roll, pitch, yaw)}}."
+        f"the touches of frame '{name}' ({counts}) do not determine its pose (the best fit has an RMS error of "
+        f"{rms * 1e3:.3g} mm)",
+        value=name,
+        at=Place(measurements.source),
+        remedy="check that all touches belong to this frame, or give the approximate base of the robot in it, "
+        f"frames={{'{name}': (x, y, z, roll, pitch, yaw)}}",
     )
 
 
 def _check_frame_values(measurements: Measurements, names: tuple[str, ...]) -> None:
-    """Refuse frames with touches that are used up by the six unknowns of the frame.
+    """Refuse frames with no more touches than the six unknowns of the frame.
 
     Raises:
         IdentificationError: see above.
@@ -374,16 +376,18 @@ def _check_frame_values(measurements: Measurements, names: tuple[str, ...]) -> N
         touches = sum(touch[row] for row in rows)
         if not touches or any(other[row] for row in rows) or touches > BASE_UNKNOWNS:
             continue
-        times = "once" if touches == 1 else f"{touches} times"
         raise IdentificationError(
-            f"{measurements.source}: frame '{name}' was touched {times} only, which does not even determine where it "
-            f"stands ({BASE_UNKNOWNS} unknowns); touch it about {3 * BASE_UNKNOWNS} times along x, y and z, or leave "
-            "its rows out."
+            f"expected more than {BASE_UNKNOWNS} touches of frame '{name}', which has {BASE_UNKNOWNS} unknowns, got "
+            f"{touches}",
+            expected=f"more than {BASE_UNKNOWNS} touches of frame '{name}'",
+            value=touches,
+            at=Place(measurements.source),
+            remedy=f"touch it about {3 * BASE_UNKNOWNS} times along x, y and z, or leave out its rows",
         )
 
 
 def _check_frame_names(stated: Mapping[str, object], frames: tuple[str, ...], source: str) -> None:
-    """Refuse guesses of frames that were not measured in.
+    """Refuse guesses of frames without measurements.
 
     Raises:
         IdentificationError: see above.
@@ -391,6 +395,9 @@ def _check_frame_names(stated: Mapping[str, object], frames: tuple[str, ...], so
     for name in stated:
         if name not in frames:
             raise IdentificationError(
-                f"{source}: frames states a guess of '{name}', but no row is in a frame of that name; "
-                f"{nearest_choice(name, frames)}"
+                f"no row is in the frame '{name}'",
+                option="frames",
+                value=name,
+                at=Place(source),
+                remedy=nearest_choice(name, frames),
             )

@@ -1,4 +1,4 @@
-"""The initial guess by wires and pairs of poses: of tools, before their distances are judged, and of frames."""
+"""Initial guess of tools and frames from distances: wires and pairs of poses."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -10,7 +10,7 @@ from torch import Tensor
 
 from pisigma.calibration.geometric.initial_guess.base_and_tool_closed_form import base_by_points
 from pisigma.calibration.geometric.problem.parameters import ParameterSpace
-from pisigma.files.errors import ImplausibleError
+from pisigma.files.errors import ImplausibleError, Place
 from pisigma.measurement.csv.columns import MISNAMED_UNITS
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.sensors.anchor import FEWEST, LARGEST_MISS, anchor_from_distances, stated_position
@@ -18,36 +18,35 @@ from pisigma.measurement.sensors.sensor import names_of, numbers_of
 from pisigma.robot.description import Robot
 from pisigma.robot.se3 import rotation_from_rpy, rpy_from_rotation
 
-STEPS = 60
-"""Damped steps."""
-SHORTEST = 1e-6
-"""[m] Shorter steps are the last ones."""
+MAX_ITERATIONS = 60
+CONVERGENCE_TOLERANCE = 1e-6
+"""[m] Length of a step at convergence."""
 WEAK = 0.01
-"""Directions of the tool that distances determine less than this stay near the drawn ones."""
+"""Weight per row of the nominal tool, which holds directions that distances hardly determine."""
 HELD = 1e4
-"""The same where the tool is known."""
+"""The same if the tool is known."""
 OUTLYING = 3.0
-"""Median errors beyond which a distance counts less, so that single mistakes do not pull the tool."""
+"""Error over the median error above which the weight of a distance is reduced, so that single mistakes have little
+effect."""
 FAR_START = 0.3
-"""[reach] How far from the drawn tool, each way along its axes, others begin where that leads nowhere."""
-LARGEST_SHIFT, LARGEST_CLEAR_SHIFT = 0.35, 1.0
-"""[reach] No tool is farther from the drawn one; distances that ask for it are mistakes, unless it meets so many that
-they leave no doubt."""
+"""[reach] Distance from the nominal tool, in both directions of its axes, of further starts."""
+MAX_SHIFT, MAX_CLEAR_SHIFT = 0.35, 1.0
+"""[reach] Largest distance of a tool from the nominal one, and the same if many distances agree clearly with it."""
 MANY_TIMES = 3
-"""As many distances as unknowns leave a doubt; so many times as many do not."""
+"""Distances per unknown that leave no doubt."""
 DOUBTFUL = 0.01
-"""Share of the tool's motion that a typical distance is off before other units are tried."""
+"""Median error of the distances over the median motion of the tool above which other units are tried."""
 COLLAPSED = 0.25
-"""Share of the errors that is left, at most, where a unit explains them."""
-MANY = 0.25
+"""Share of the errors that may remain in another unit."""
+MAX_WRONG_SHARE = 0.25
 """Share of the distances that may be off by more than `LARGEST_MISS`."""
 
 
 @dataclass(frozen=True, eq=False)
 class _Distances:
-    """Distances of one target's rows to anchors, and to the next rows (anchor -1).
+    """Distances of one target's rows to anchors, and to the other rows of pairs (anchor -1).
 
-    The tool's point is `R · tool + p`, less `R_end · tool + p_end` in pairs, less an anchor otherwise.
+    The length of `R · tool + p - anchor` is measured; in pairs, R and p are differences of both rows.
     """
 
     R: Float64[Tensor, "rows 3 3"]
@@ -57,11 +56,11 @@ class _Distances:
 
     @property
     def unknowns(self) -> int:
-        """How many there are: the tool, and every anchor with its zero."""
+        """Number of unknowns: the tool, and every anchor with its zero offset."""
         return 3 + 4 * (int(self.anchor.max()) + 1)
 
     def start(self, tool: Float64[Tensor, " 3"]) -> Float64[Tensor, " unknowns"]:
-        """Return a tool and the anchors that suit it."""
+        """Return a tool and the anchors fitted with it."""
         points = (self.R @ tool) + self.p
         anchors = [
             anchor_from_distances(points[self.anchor == k], self.measured[self.anchor == k])
@@ -89,34 +88,34 @@ class _Distances:
     def fitted(
         self, drawn: Float64[Tensor, " 3"], held: bool, reach: float
     ) -> tuple[Float64[Tensor, " 3"], Float64[Tensor, " rows"]]:
-        """Return the tool that suits the distances best, near the drawn one or else far off, and what is left [m]."""
-        best = self._polished(drawn, drawn, held)
+        """Fit the tool to the distances, starting near the nominal one, then far off; return it and residuals [m]."""
+        best = self._refined(drawn, drawn, held)
         ways = torch.cat([torch.eye(3), -torch.eye(3)]).double() * FAR_START * reach
         for way in () if held else ways:
             if not self.is_doubtful(*best):
                 break
-            other = self._polished(drawn + way, drawn, held)
+            other = self._refined(drawn + way, drawn, held)
             best = min(best, other, key=lambda fit: float(fit[1].abs().median()))
         return best
 
     def is_doubtful(self, tool: Float64[Tensor, " 3"], residual: Float64[Tensor, " rows"]) -> bool:
-        """Say whether a typical distance is off by much of the tool's motion."""
+        """Say whether the median error is large relative to the motion of the tool."""
         points = self.R @ tool + self.p
         motion = (points - points.mean(0)).norm(dim=-1).median()
         return float(residual.abs().median()) > DOUBTFUL * float(motion)
 
-    def _polished(
+    def _refined(
         self, start: Float64[Tensor, " 3"], drawn: Float64[Tensor, " 3"], held: bool
     ) -> tuple[Float64[Tensor, " 3"], Float64[Tensor, " rows"]]:
-        """Return the tool after damped steps in which outlying distances count less, and what is left [m]."""
+        """Refine the tool by robust Levenberg-Marquardt steps; return it and the residuals [m]."""
         unknown = self.start(start)
         pull = torch.zeros_like(unknown)
         pull[:3] = (HELD if held else WEAK) ** 2 * len(self.measured)
         damping = 1e-3
-        for _ in range(STEPS):
+        for _ in range(MAX_ITERATIONS):
             residual, J = self.linearised(unknown)
             limit = OUTLYING * residual.abs().median().clamp(min=1e-9)
-            weight = (limit / residual.abs()).clamp(max=1.0)
+            weight = (limit / residual.abs()).clamp(max=1.0)  # Huber's
             off = torch.cat([unknown[:3] - drawn, torch.zeros_like(unknown[3:])])
             normal = (J.mT * weight) @ J + torch.diag(pull)
             gradient = (J.mT * weight) @ residual - pull * off
@@ -126,7 +125,7 @@ class _Distances:
                 unknown, damping = unknown + step, max(damping / 10, 1e-9)
             else:
                 damping *= 10
-            if float(step.abs().max()) < SHORTEST:
+            if float(step.abs().max()) < CONVERGENCE_TOLERANCE:
                 break
         return unknown[:3], self.linearised(unknown)[0]
 
@@ -138,19 +137,19 @@ def tools_from_distances(
     tools: Mapping[str, np.ndarray],
     free_tool: bool,
 ) -> dict[str, np.ndarray]:
-    """Return all tools, those that have no guess yet by the wires and pairs that suit them best, anchors with them.
+    """Add tools without a guess, fitted to wires and pairs together with the anchors.
 
-    Distances between points of one arm do not depend on the base. Single wrong distances count little.
+    Distances between points of one arm do not depend on the base. Single wrong distances have little effect.
 
     Args:
         space: names and robot.
-        measurements: the rows; those of pairs come first, side by side.
-        T_flange: where the robot as drawn has the flange, in its own base.
+        measurements: the rows; those of pairs come first, next to each other.
+        T_flange: nominal poses of the flange in the base of the robot.
         tools: guesses by other sensors.
-        free_tool: whether tools are to be identified.
+        free_tool: whether to identify tools.
 
     Raises:
-        ImplausibleError: distances do not suit any tool, as where they are in another unit.
+        ImplausibleError: distances do not fit with any tool, for example because of a wrong unit.
     """
     tools, drawn, reach = dict(tools), space.robot.tool, space.robot.reach
     for name in space.targets:
@@ -162,15 +161,18 @@ def tools_from_distances(
         tool, residual = distances.fitted(position, held, reach)
         _refuse_other_units(space.robot, distances, (tool, residual), (position, held), measurements.source)
         off = int((residual.abs() > LARGEST_MISS * reach).sum())
-        if off > MANY * len(residual):
+        if off > MAX_WRONG_SHARE * len(residual):
             raise ImplausibleError(
-                f"{measurements.source}: expected distances that robot '{space.robot.name}' has at these joint values, "
-                f"got {off} of {len(residual)} that are off by more than {LARGEST_MISS * reach * 1e3:.3g} mm whatever "
-                "the tool is; check whether distances and joint values are of the same rows, and whether this robot "
-                "was measured."
+                f"expected distances of robot '{space.robot.name}' at these joint values, got {off} of {len(residual)} "
+                f"that are off by more than {LARGEST_MISS * reach * 1e3:.3g} mm for any tool",
+                expected="distances of this robot",
+                value=off,
+                at=Place(measurements.source),
+                remedy="check that distances and joint values belong to the same rows, and that this robot was "
+                "measured",
             )
         clear = len(residual) >= MANY_TIMES * distances.unknowns and not distances.is_doubtful(tool, residual)
-        largest = (LARGEST_CLEAR_SHIFT if clear else LARGEST_SHIFT) * reach
+        largest = (MAX_CLEAR_SHIFT if clear else MAX_SHIFT) * reach
         if not held and float((tool - position).norm()) <= largest:
             tools[name] = np.concatenate([tool.numpy(), drawn[3:]])
     return tools
@@ -182,13 +184,13 @@ def base_from_anchors(
     tip: Float64[Tensor, "rows 3"],
     drawn: Float64[np.ndarray, " 6"],
 ) -> Float64[np.ndarray, " 6"]:
-    """Return T_frame_robot by the anchors that are stated in a frame, from where wires see them.
+    """Compute T_frame_robot from anchors at stated positions, whose positions in the robot's base the wires determine.
 
     Args:
         measurements: the rows.
         frame: name of the frame.
-        tip: where the robot as drawn has its tip, in its own base [m].
-        drawn: the robot's base, x, y, z [m], roll, pitch, yaw [rad]; it counts where the anchors leave the base open.
+        tip: nominal positions of the tip in the base of the robot [m].
+        drawn: base of the robot, x, y, z [m], roll, pitch, yaw [rad], for what the anchors do not determine.
     """
     seen, stated = [], []
     for name in names_of(measurements.anchor):
@@ -216,7 +218,7 @@ def _refuse_other_units(
     start: tuple[Float64[Tensor, " 3"], bool],
     source: str,
 ) -> None:
-    """Refuse distances that are far nearer to the robot's in another unit, errors being compared in the measured one.
+    """Refuse distances that fit far better in another unit; errors are compared in the measured unit.
 
     Raises:
         ImplausibleError: see above.
@@ -238,14 +240,17 @@ def _refuse_other_units(
     )
     if miss < LARGEST_MISS * robot.reach and miss / factor < COLLAPSED * typical:
         raise ImplausibleError(
-            f"{source}: expected distances that robot '{robot.name}' has at these joint values, got {are} taken for "
-            f"{named}: a typical distance is off by {typical * 1e3:.3g} mm, and multiplied by {factor:.4g} by "
-            f"{miss * 1e3:.3g} mm; correct the unit in the column names."
+            f"expected distances of robot '{robot.name}' at these joint values, got {are} that are named {named}: the "
+            f"median error is {typical * 1e3:.3g} mm, and {miss * 1e3:.3g} mm for distances multiplied by {factor:.4g}",
+            expected=f"distances in {named}",
+            value=are,
+            at=Place(source),
+            remedy="correct the unit in the column names",
         )
 
 
 def _distances_of(measurements: Measurements, T: Tensor, target: str) -> _Distances:
-    """Wires with enough distances, and pairs of which both rows have the target."""
+    """Collect wires with enough distances, and pairs of which both rows have the target."""
     R, p = T[:, :3, :3], T[:, :3, 3]
     if measurements.distance is None:
         return _Distances(R[:0], p[:0], torch.zeros(0, dtype=torch.int64), p[:0, 0])
@@ -266,6 +271,6 @@ def _distances_of(measurements: Measurements, T: Tensor, target: str) -> _Distan
 
 
 def _cost(residual: Tensor, limit: Tensor) -> float:
-    """Huber's: squares up to a limit, then lines."""
+    """Compute Huber's cost: quadratic up to a limit, then linear."""
     size = residual.abs()
     return float(torch.where(size <= limit, size.square(), 2 * limit * size - limit.square()).sum())

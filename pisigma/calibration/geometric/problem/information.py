@@ -1,4 +1,4 @@
-"""The identification Jacobian of a whole data set, condensed to a small triangular matrix."""
+"""Identification Jacobian of a whole data set, condensed to a small triangular matrix."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -13,21 +13,21 @@ from pisigma.calibration.geometric.problem.noise import SensorView
 from pisigma.calibration.geometric.problem.parameters import Parameter
 from pisigma.calibration.geometric.problem.problem import CalibrationProblem
 
-SEEN = 1e-10
-"""Columns that lie in others but for this share are taken to lie in them."""
+DEPENDENT = 1e-10
+"""Share of a column's length outside the span of others below which it is in the span."""
 
 
 @dataclass(frozen=True, eq=False)
 class Information:
-    """What the data say of each parameter, in units of its usual error (1 mm, 1 mrad).
+    """Information of the data on each parameter, in units of its usual error (1 mm, 1 mrad).
 
-    With J the identification Jacobian of all rows (in mm and mrad, or in standard deviations) and r the
-    residuals, `[J r 1] = Q · root`.
+    With the identification Jacobian J of all rows (in mm and mrad, or in standard deviations) and the residuals r,
+    `[J r 1] = Q · root`.
 
     Attributes:
-        parameters: what the columns of J belong to.
-        root: upper triangular; its last column belongs to ones, that before it to the residuals.
-        values: number of rows of J, less those that other parameters took.
+        parameters: parameters of the columns of J.
+        root: upper triangular matrix; its last column belongs to the ones, and the one before it to the residuals.
+        values: number of rows of J minus the number of eliminated directions.
         poses: number of measured rows.
     """
 
@@ -43,44 +43,44 @@ class Information:
 
     @property
     def jacobian(self) -> Float64[np.ndarray, "rank parameters"]:
-        """A small matrix with the same Gram matrix as J."""
+        """Small matrix with the same Gram matrix as J."""
         return self.root[:, :-2]
 
     @property
     def residual(self) -> Float64[np.ndarray, " rank"]:
-        """A small vector with the same products with `jacobian` and itself as r has with J and itself."""
+        """Small vector with the same products with `jacobian` and itself as r with J and itself."""
         return self.root[:, -2]
 
     @property
     def centred(self) -> Float64[np.ndarray, "rank parameters"]:
-        """The same after the mean of every column of J was taken off."""
+        """The condensed Jacobian after subtracting the mean of every column of J."""
         ones_first: np.ndarray = np.linalg.qr(np.roll(self.root, 1, axis=1), mode="r")  # type: ignore[assignment]
         return ones_first[1:, 1:-1]
 
     def without(self, column: int) -> "Information":
-        """The same without one parameter."""
+        """Return the information without one parameter."""
         parameters = self.parameters[:column] + self.parameters[column + 1 :]
         return replace(self, parameters=parameters, root=np.delete(self.root, column, 1))
 
     def after(self, nuisance: list[int], silent: Sequence[int] = ()) -> "Information":
-        """What is left for the other parameters when these columns may take any value.
+        """Eliminate nuisance parameters: project the other columns onto the complement of theirs.
 
         Args:
-            nuisance: numbers of the columns; they are left out.
-            silent: numbers of more of them, which stay, as zeros.
+            nuisance: numbers of columns that are eliminated and removed.
+            silent: numbers of columns that are eliminated and kept as zeros.
         """
         if not nuisance and not silent:
             return self
         taken = self.jacobian[:, [*nuisance, *silent]]
         lengths = np.linalg.norm(taken, axis=0)
         U, singular, _ = np.linalg.svd(taken / np.where(lengths > 0, lengths, 1.0), full_matrices=False)
-        U = U[:, singular > SEEN * singular.max(initial=0.0)]
+        U = U[:, singular > DEPENDENT * singular.max(initial=0.0)]
         kept = [i for i in range(len(self.parameters)) if i not in set(nuisance)]
         rest = np.delete(self.root, nuisance, 1)
         sizes = np.linalg.norm(rest, axis=0)
-        for _ in range(2):
+        for _ in range(2):  # twice is enough: one projection leaves rounding errors of the size of the column
             rest = rest - U @ (U.T @ rest)
-        rest[:, np.linalg.norm(rest, axis=0) <= SEEN * sizes] = 0.0
+        rest[:, np.linalg.norm(rest, axis=0) <= DEPENDENT * sizes] = 0.0
         rest[:, [kept.index(column) for column in silent]] = 0.0
         root: np.ndarray = np.linalg.qr(rest, mode="r")  # type: ignore[assignment]
         parameters = tuple(self.parameters[i] for i in kept)
@@ -95,13 +95,13 @@ def information(
 ) -> Information:
     """Condense the Jacobian at a point by QR factorisations, chunk by chunk.
 
-    No normal equations are formed, so that singular values down to 1e-15 of the largest stay right.
+    Normal equations are avoided, so that singular values down to 1e-15 of the largest remain accurate.
 
     Args:
-        problem: rows and sensors; the prior does not enter.
+        problem: rows and sensors; the prior is not used.
         point: values of all parameters.
-        candidates: indices of the parameters to look at.
-        view: gives the rows' weights, in 1 / standard deviations; in 1/mm and 1/mrad where None.
+        candidates: indices of the parameters to analyse.
+        view: noise for weights of 1 / standard deviation; None for weights of 1/mm and 1/mrad.
     """
     index = torch.tensor(candidates, dtype=torch.int64, device=point.device)
     blocks: list[Tensor] = []
@@ -133,7 +133,7 @@ def information(
 def _row_weights(
     problem: CalibrationProblem, view: SensorView, number: int, rows: slice
 ) -> Float64[Tensor, " poses"]:
-    """1 / standard deviation of each row for a sensor, 0 where it saw nothing [1/m or 1/rad]."""
+    """Compute 1 / standard deviation of each row for a sensor [1/m or 1/rad]; 0 where it has no value."""
     sensor = problem.sensors[number]
     distance = view.sums[number].distance[rows] / view.scales[number]
     root = problem.loss_of(sensor).weight(distance, sensor.components).sqrt()

@@ -1,4 +1,4 @@
-"""Levenberg-Marquardt on normal equations; problem, solver and solution are apart."""
+"""Levenberg-Marquardt method on normal equations, with separate problem, solver and solution."""
 
 import math
 from abc import ABC, abstractmethod
@@ -16,22 +16,22 @@ Point = TypeVar("Point")
 START_DAMPING = 1e-3
 SMALLEST_DAMPING = 1e-9
 LARGEST_DAMPING = 1e12
-SWINGING = 50
-"""Steps after which the noise stays as it is: few rows may let it swing between two estimates for ever."""
-PATIENCE = 2
-"""Steps that may raise the cost before the search goes back."""
+MAX_NOISE_UPDATES = 50
+"""Steps after which the noise is no longer updated: with few rows it may oscillate between two estimates."""
+MAX_UPHILL_STEPS = 2
+"""Steps that may raise the cost before the search returns to the best point."""
 SHORTEST_STEP = 1e-3
-"""[standard errors] A step shorter than this in every direction ends the search."""
+"""[standard errors] Length of a step below which the search has converged."""
 
 
 class SolutionStatus(Enum):
-    """How a search ended; the value is a sentence."""
+    """How a search ended; the value is the predicate of a sentence."""
 
-    CONVERGED = "converged: a step moves nothing by more than a thousandth of its standard error any more"
+    CONVERGED = "converged: the last step changed no parameter by more than 0.001 of its standard error"
     EXACT = "converged: the residuals are at rounding level"
-    STALLED = "stopped: no step lowers the cost any more, though the residuals are above rounding level"
+    STALLED = "stopped: no step lowers the cost, although the residuals are above rounding level"
     ITERATION_LIMIT = (
-        "stopped at the iteration limit; allow more iterations or look for gross errors in the data"
+        "stopped at the iteration limit; allow more iterations, or look for gross errors in the data"
     )
 
     @property
@@ -42,16 +42,16 @@ class SolutionStatus(Enum):
 
 @dataclass(frozen=True, eq=False)
 class Linearisation(Generic[Point]):
-    """A least-squares problem linearised from one point, with cost `Σ (r / sigma)²`.
+    """A least-squares problem with cost `Σ (r / sigma)²`, linearised at a point.
 
     Attributes:
-        point: where.
-        cost: without unit.
+        point: the point.
+        cost: cost at the point [1].
         descent: minus half the gradient of the cost by the unknowns.
         normal: half its Gauss-Newton Hessian, whose inverse is the covariance of the unknowns.
-        misfit: the part of the cost that the data make (the rest is a prior's).
-        rounding: the misfit that rounding errors alone may make.
-        detail: what the problem wants to remember.
+        misfit: part of the cost due to the data; the remainder is due to the prior.
+        rounding: misfit that rounding errors alone can cause.
+        detail: data of the problem, for its own use.
     """
 
     point: Point
@@ -64,43 +64,43 @@ class Linearisation(Generic[Point]):
 
 
 class AbstractLeastSquares(ABC, Generic[Point]):
-    """What the solver needs to know of a problem."""
+    """Interface of a problem for the solver."""
 
     @abstractmethod
     def linearise(self, point: Point, like: Linearisation[Point] | None) -> Linearisation[Point]:
-        """See the problem from a point, with the noise of `like` (a guess of its own where None)."""
+        """Linearise the problem at a point with the noise of `like`, or with a default noise if None."""
 
     def begin(self, point: Point) -> Linearisation[Point]:
-        """See the problem from a start, with the noise that its residuals show."""
+        """Linearise the problem at a start, with the noise estimated from its residuals."""
         return self.renewed(self.linearise(point, None))[0]
 
     @abstractmethod
     def renewed(self, linearisation: Linearisation[Point]) -> tuple[Linearisation[Point], bool]:
-        """The same with the noise estimated from its residuals, and whether the noise has settled."""
+        """Estimate the noise from the residuals; return the linearisation with it, and whether it has converged."""
 
     @abstractmethod
     def moved(self, point: Point, step: Float[Tensor, " unknowns"]) -> Point:
-        """The point after a step."""
+        """Return the point after a step."""
 
     @property
     @abstractmethod
     def step_scale(self) -> Float[Tensor, " unknowns"]:
-        """A usual size of every unknown, which the damping is measured with."""
+        """Usual size of every unknown, relative to which the damping is defined."""
 
     def rms(self, linearisation: Linearisation[Point]) -> Float[Tensor, ""]:
-        """A size of the residuals, by which the path of a search is shown; in standard deviations unless said."""
+        """Return the size of the residuals for the path of a search, by default in standard deviations."""
         return linearisation.misfit.sqrt()
 
 
 @dataclass(frozen=True, eq=False)
 class Solution(Generic[Point]):
-    """Where a search ended.
+    """Result of a search.
 
     Attributes:
-        linearisation: the problem seen from the end point, the noise renewed.
-        iterations: steps tried.
+        linearisation: the problem linearised at the best point, with the noise estimated there.
+        iterations: number of steps tried.
         status: why the search ended.
-        path: size of the residuals at every point passed, the start first; see `AbstractLeastSquares.rms`.
+        path: size of the residuals at every accepted point, starting with the start; see `AbstractLeastSquares.rms`.
     """
 
     linearisation: Linearisation[Point]
@@ -109,7 +109,7 @@ class Solution(Generic[Point]):
     path: tuple[float, ...]
 
     def before(self, other: "Solution[Point]") -> "Solution[Point]":
-        """The end of a search that went on from where this one ended."""
+        """Return the result of a search that continued this one, with the iterations and the path of both."""
         return replace(other, iterations=self.iterations + other.iterations, path=self.path + other.path[1:])
 
 
@@ -121,18 +121,18 @@ def levenberg_marquardt(
 ) -> Solution[Point]:
     """Minimise by Levenberg-Marquardt steps `(normal + damping / step_scale²) step = descent`.
 
-    The damping is measured against `step_scale` in units of the noise, which is estimated anew at every
-    point: as the residuals shrink, so does it, and exact data are met quadratically even where the normal
-    matrix is singular (Yamashita and Fukushima 2001). The linear system is solved by Cholesky after scaling
-    its columns. A step that raises the cost is followed further once or twice, because curved valleys are
-    left and met again that way; if the best cost is not undercut by then, the search goes back there with a
-    hundredfold damping (watchdog technique, Chamberlain et al. 1982).
+    The damping is relative to `step_scale` in units of the noise, which is estimated again at every point. It shrinks
+    with the residuals, so convergence for exact data is quadratic even if the normal matrix is singular (Yamashita and
+    Fukushima 2001). The linear system is solved by Cholesky factorisation after column scaling. A step that raises the
+    cost is accepted once or twice, because the search can leave a curved valley and meet it again; if the cost does not
+    fall below the best one, the search returns to the best point with a hundred times larger damping (watchdog
+    technique, Chamberlain et al. 1982).
 
     Args:
-        problem: what to minimise.
-        start: where to begin, or the problem as already seen from there.
-        maximum_iterations: steps tried at most.
-        close_enough: length [standard errors] of a step that is not taken any more; the search has converged then.
+        problem: the problem to minimise.
+        start: start point, or the problem linearised there.
+        maximum_iterations: maximum number of steps.
+        close_enough: length of a step [standard errors] below which it is not taken and the search has converged.
 
     Returns:
         The best point, with the reason for stopping (see `SolutionStatus`).
@@ -143,21 +143,21 @@ def levenberg_marquardt(
     while status is None and search.iterations < maximum_iterations:
         search.propose()
         near = search.at_best and search.decrement < close_enough**2
-        status = SolutionStatus.CONVERGED if near else search.go()
+        status = SolutionStatus.CONVERGED if near else search.advance()
     ended = status or SolutionStatus.ITERATION_LIMIT
     return Solution(search.best, search.iterations, ended, tuple(search.path))
 
 
 class _Search(Generic[Point]):
-    """A search that goes on.
+    """State of a search.
 
     Attributes:
         best: the best point.
-        here: where the next step starts.
+        here: start of the next step.
         at_best: whether that is the best point.
-        iterations: steps tried.
-        decrement: by how much the next step lowers the cost if the problem is linear [squared standard errors].
-        path: size of the residuals at every point passed.
+        iterations: number of steps tried.
+        decrement: decrease of the cost by the next step for a linear problem [squared standard errors].
+        path: size of the residuals at every accepted point.
     """
 
     def __init__(self, problem: AbstractLeastSquares[Point], best: Linearisation[Point]) -> None:
@@ -167,12 +167,12 @@ class _Search(Generic[Point]):
         self.path = [float(problem.rms(best))]
 
     def propose(self) -> None:
-        """Work out the next step."""
+        """Compute the next step."""
         self.step = solve_damped(self.here, self.problem.step_scale, self.damping)
         self.decrement = float((self.here.normal @ self.step) @ self.step)
 
-    def go(self) -> SolutionStatus | None:
-        """Take the step, and decide where to go on, or why the search is over."""
+    def advance(self) -> SolutionStatus | None:
+        """Try the step, and choose the start of the next one, or return why the search has ended."""
         self.iterations += 1
         there = self.problem.linearise(self.problem.moved(self.here.point, self.step), self.best)
         if not bool(there.cost <= self.best.cost):
@@ -183,9 +183,9 @@ class _Search(Generic[Point]):
         return SolutionStatus.CONVERGED if settled and self.decrement <= SHORTEST_STEP**2 else None
 
     def _descend(self, there: Linearisation[Point]) -> bool:
-        """Go on from where the cost is lower, and say whether the noise has settled."""
+        """Accept a point with a lower cost, and return whether the noise has converged."""
         settled = True
-        if self.iterations <= SWINGING:
+        if self.iterations <= MAX_NOISE_UPDATES:
             there, settled = self.problem.renewed(there)
         self.best = self.here = there
         self.damping = max(self.damping / 10, SMALLEST_DAMPING)
@@ -194,7 +194,7 @@ class _Search(Generic[Point]):
         return settled
 
     def _climb(self, there: Linearisation[Point]) -> SolutionStatus | None:
-        """Follow a higher cost or go back, or say why the search is over."""
+        """Accept a higher cost or return to the best point, or return why the search has ended."""
         small = self.decrement <= max(SHORTEST_STEP**2, 1e-10 * float(self.best.cost))
         if bool(self.best.misfit <= 1e4 * self.best.rounding):
             return SolutionStatus.EXACT
@@ -202,9 +202,9 @@ class _Search(Generic[Point]):
             return SolutionStatus.CONVERGED
         if self.damping > LARGEST_DAMPING:
             return SolutionStatus.STALLED
-        # there is no descent such as where a loss rejects every row
+        # The descent is zero, for example, if the loss rejects every row.
         going = math.isfinite(float(there.cost)) and bool(there.descent.any())
-        self.at_best = not (going and self.uphill < PATIENCE)
+        self.at_best = not (going and self.uphill < MAX_UPHILL_STEPS)
         if self.at_best:
             self.here, self.uphill, self.damping = self.best, 0, max(100 * self.damping, 0.1)
         else:
@@ -217,22 +217,23 @@ def solve_damped(
     step_scale: Float[Tensor, " unknowns"],
     damping: float,
 ) -> Float[Tensor, " unknowns"]:
-    """Solve `(normal + damping / step_scale²) step = descent` by Cholesky with column scaling.
+    """Solve `(normal + damping / step_scale²) step = descent` by Cholesky factorisation with column scaling.
 
     Raises:
-        IdentificationError: they are not finite.
+        IdentificationError: the normal equations are not finite.
     """
     normal, descent = linearisation.normal, linearisation.descent
     diagonal = normal.diagonal()
-    # a product of two columns is finite where their squares are
+    # The product of two columns is finite if their squares are, so the diagonal suffices.
     if not math.isfinite(float((diagonal + descent).sum())):
         raise IdentificationError(
-            "the normal equations are not finite; look for huge values, or standard deviations of next to nothing, in "
-            "the measurements."
+            "the normal equations are not finite",
+            remedy="look for huge values, or standard deviations near 0, in the measurements",
         )
     while True:
         damped = diagonal + damping / step_scale.square()
         scale = damped.rsqrt()
+        # Unit diagonal: metres and radians become comparable, and the factorisation as stable as it can be.
         scaled = normal * (scale * scale[:, None])
         scaled.diagonal().copy_(damped * scale.square() + 1e-14)
         factor, failed = torch.linalg.cholesky_ex(scaled)
@@ -243,7 +244,7 @@ def solve_damped(
 
 
 def covariance_of(normal: Float64[Tensor, "active active"]) -> Float64[Tensor, "active active"]:
-    """Invert a normal matrix, with column scaling; directions that it does not hold get no variance."""
+    """Invert a normal matrix with column scaling; undetermined directions get variance 0."""
     diagonal = normal.diagonal()
     scale = diagonal.masked_fill(diagonal <= 0, 1.0).rsqrt_()
     scales = scale * scale[:, None]

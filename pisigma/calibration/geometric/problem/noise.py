@@ -1,4 +1,4 @@
-"""What the residuals say of the noise, of repeated poses and of the prior."""
+"""Estimation of the noise of sensors from residuals: robust scales, repeated poses, angles against lengths."""
 
 import math
 from collections.abc import Sequence
@@ -16,27 +16,27 @@ from pisigma.estimation.loss import AbstractLoss
 from pisigma.measurement.sensors.sensor import AbstractSensor
 
 SMALLEST_NOISE = 1e-14
-"""[m or rad] Floor of the estimated noise: what rounding does to a pose."""
+"""[m or rad] Floor of the estimated noise: rounding errors of a pose."""
 ALWAYS_GOOD = 1e-10
-"""[m or rad] Rows nearer to their prediction than this never count as wrong."""
+"""[m or rad] Residuals below this are never outliers."""
 
 
 UNDETERMINED = 1e-12
-"""Share of the information of angles with which lengths are taken to determine what they do not see."""
-LARGEST_DISAGREEMENT = 1e6
-"""Angles of more than so many times their variance say nothing."""
+"""Information added to that of lengths, relative to the total, where lengths determine nothing."""
+MAX_DISAGREEMENT = 1e6
+"""Largest factor on the variance of angles, with which they have no effect."""
 
 
 @dataclass(frozen=True, eq=False)
 class SensorSums:
-    """What one sensor contributes at one point, before division by its noise's variance.
+    """Contribution of one sensor at one point, before division by the variance of its noise.
 
     Attributes:
         normal: `Σ w J J^T / sigma_row²` over its rows.
         descent: `Σ w J r / sigma_row²`.
-        residual: measured minus predicted, 0 where nothing was measured [m or rad].
-        distance: length of the residual over sigma_row, 0 where nothing was measured.
-        measured: number of rows that were measured.
+        residual: measured minus predicted [m or rad]; 0 where nothing was measured.
+        distance: length of the residual over sigma_row; 0 where nothing was measured.
+        measured: number of measured rows.
     """
 
     normal: Float64[Tensor, "active active"]
@@ -47,13 +47,13 @@ class SensorSums:
 
     @property
     def rms(self) -> Float64[Tensor, ""]:
-        """Root mean square of the residuals' lengths [m or rad]."""
+        """Root mean square length of the residuals [m or rad]."""
         size: Tensor = torch.linalg.vector_norm(self.residual)
         return size / math.sqrt(max(self.measured, 1))
 
 
 def joined_sums(chunks: Sequence[SensorSums]) -> SensorSums:
-    """Add up what a sensor contributes in chunks of rows, one behind the other."""
+    """Join the contributions of a sensor in successive chunks of rows."""
     first, *others = chunks
     if not others:
         return first
@@ -68,17 +68,16 @@ def joined_sums(chunks: Sequence[SensorSums]) -> SensorSums:
 
 @dataclass(frozen=True, eq=False)
 class SensorView:
-    """All sensors at one point, with the noise they are believed to have.
+    """All sensors at one point, with their estimated noise.
 
     Attributes:
-        sums: per sensor.
-        noise: per sensor, its standard deviation [m or rad], or a factor of 1 or more where the rows give
-            their own.
-        repetition: per sensor, 1 or more: by how much repeats of a pose, and several targets in it, say less than
-            so many poses, because what the model gets wrong there is the same in all of them.
-        disagreement: per sensor, 1 or more: factor on the variance of angles with which they agree with the measured
-            lengths; see `angle_disagreement`.
-        prior_scale: of the prior's standard deviations, per group of parameters.
+        sums: contributions per sensor.
+        noise: standard deviation per sensor [m or rad], or a factor >= 1 on those that the rows state.
+        repetition: factor >= 1 on the variance per sensor, because repeats of a pose and several targets in it share
+            the errors of the model and are not independent; see `group_variance_ratio`.
+        disagreement: factor >= 1 on the variance per sensor with which angles agree with the measured lengths; see
+            `angle_disagreement`.
+        prior_scale: scale of the prior standard deviations, per group of parameters.
     """
 
     sums: tuple[SensorSums, ...]
@@ -89,30 +88,30 @@ class SensorView:
 
     @staticmethod
     def without_noise(sums: tuple[SensorSums, ...]) -> "SensorView":
-        """All sensors as if their values had a standard deviation of 1, the prior being as stated."""
+        """Return all sensors with standard deviations of 1 and the stated prior."""
         ones = sums[0].normal.new_ones(max(len(sums), len(PriorGroup)))
         sensors = ones[: len(sums)]
         return SensorView(sums, sensors, sensors, sensors, ones[: len(PriorGroup)])
 
     @cached_property
     def scales(self) -> Float64[Tensor, " sensors"]:
-        """What distances are divided by for the loss."""
+        """Scales of the distances for the loss."""
         return self.noise.clamp(min=ALWAYS_GOOD)
 
     @cached_property
     def variances(self) -> Float64[Tensor, " sensors"]:
-        """What the sensors' sums are divided by."""
+        """Variances of the sensors' values, with all factors."""
         return self.noise.square() * self.repetition * self.disagreement
 
     def scaled(
         self, precision: Float64[Tensor, " active"], group: Int64[Tensor, " active"]
     ) -> Float64[Tensor, " active"]:
-        """1 / variance of parameters by the prior at its present scale."""
+        """Return the prior precision of parameters with the current scale."""
         return scaled_precision(precision, group, self.prior_scale)
 
 
 def view_of(linearisation: Linearisation[Tensor]) -> SensorView:
-    """The sensors' part of a linearisation that a `CalibrationProblem` made."""
+    """Return the sensors' part of a linearisation of a `CalibrationProblem`."""
     assert isinstance(linearisation.detail, SensorView)
     return linearisation.detail
 
@@ -120,7 +119,7 @@ def view_of(linearisation: Linearisation[Tensor]) -> SensorView:
 def values_used(
     view: SensorView, covariance: Float64[Tensor, "active active"]
 ) -> Float64[Tensor, " sensors"]:
-    """How many values of every sensor the parameters use up (Förstner 1979); the prior spares some."""
+    """Compute the effective number of parameters estimated from every sensor's values (Förstner 1979)."""
     used = [(sums.normal * covariance).sum() for sums in view.sums]
     return torch.stack(used) / view.variances
 
@@ -132,9 +131,14 @@ def loss_scale(
     used: Float64[Tensor, " sensors"],
     refine: bool,
 ) -> Float64[Tensor, " sensors"]:
-    """Standard deviation of every sensor's values, or factor of 1 or more on those that its rows give.
+    """Estimate the standard deviation of every sensor's values, or a factor >= 1 on those that its rows state.
 
-    `refine` uses all good rows instead of the median.
+    Args:
+        sensors: the sensors.
+        loss: loss function, which defines the estimators.
+        view: residuals and current noise.
+        used: effective number of parameters per sensor.
+        refine: use all rows without outliers instead of the median.
     """
     scales = []
     for k, sensor in enumerate(sensors):
@@ -153,7 +157,7 @@ def loss_scale(
 
 
 def rejecting(sensors: Sequence[AbstractSensor], losses: Sequence[AbstractLoss], view: SensorView) -> bool:
-    """Say whether the loss rejects any row of a sensor."""
+    """Say whether the loss gives any row of a sensor weight 0."""
     of_each = zip(sensors, losses, view.sums, view.scales, strict=True)
     return any(
         bool((loss.weight(sums.distance / scale, sensor.components) == 0).any())
@@ -162,7 +166,7 @@ def rejecting(sensors: Sequence[AbstractSensor], losses: Sequence[AbstractLoss],
 
 
 def renumbered(keys: Int64[Tensor, " rows"]) -> Int64[Tensor, " rows"]:
-    """Numbers from 0 on, equal where the keys are equal."""
+    """Map keys to numbers from 0, equal for equal keys."""
     numbers: Tensor = torch.unique(keys, return_inverse=True)[1]
     return numbers
 
@@ -175,18 +179,18 @@ def group_variance_ratio(
     pose: Int64[Tensor, " rows"] | None,
     configuration: Int64[Tensor, " rows"] | None = None,
 ) -> Float64[Tensor, " sensors"]:
-    """Variance of the poses' mean residuals over that of independent rows (Kish 1965: design effect).
+    """Compute the variance of mean residuals of poses over that of independent rows (design effect, Kish 1965).
 
-    Targets on one tool share what the model gets wrong with the joints; by how much the mean residuals of
-    configurations vary more than those of poses comes on top, at most by the number of targets.
+    Targets on one tool share the model's errors of the joints. Therefore the ratio is multiplied by the variance of
+    mean residuals of configurations over that of poses, if it is larger than 1.
 
     Args:
-        sensors: per sensor, which rows it saw.
-        loss: weights the rows within a pose.
+        sensors: the sensors, with the rows that have values.
+        loss: loss function for the weights of rows within a pose.
         view: residuals and noise.
-        used: values that the parameters use up, per sensor; they come off the poses, not off their repeats.
-        pose: number of every row's pose; None where none is repeated.
-        configuration: number of every row's joint values and frame; None where none has several targets.
+        used: effective number of parameters per sensor, which reduces the degrees of freedom of the poses.
+        pose: number of every row's pose; None if none is repeated.
+        configuration: number of every row's joint values and frame; None if none has several targets.
     """
     ratios = []
     for k, (sensor, sums) in enumerate(zip(sensors, view.sums, strict=True)):
@@ -215,21 +219,21 @@ def angle_disagreement(
     held: Float64[Tensor, " active"],
     pull: Float64[Tensor, " active"],
 ) -> Float64[Tensor, " sensors"]:
-    """Estimate by which factor the variance of measured angles is to be enlarged, per sensor.
+    """Estimate the factor on the variance of measured angles, per sensor.
 
-    What the geometry does not explain of orientations, such as the wobble of a wrist, depends on the pose. Rows taken
-    as independent then claim to determine the geometry far better than they do, and pull the predicted positions away
-    from the measured ones. Let x be the parameters by lengths and prior alone, with the information A, and y those by
-    angles too. Taking angles in moves predicted lengths by `(x - y)^T Q (x - y)`, Q being the information of the
-    lengths alone, where `tr(Q (cov x - cov y))` is expected. The factor, 1 or more, makes both equal; it is the moment
-    estimator of random-effects meta-analysis (DerSimonian and Laird 1986, Controlled Clinical Trials 7(3), 177-188),
-    with the cost of predicted lengths as its weight.
+    Orientation errors that the geometry does not explain, such as the wobble of a wrist, depend on the pose. If rows
+    are treated as independent, they seem to determine the geometry far better than they do, and pull the predicted
+    positions away from the measured ones. Let x be the parameters estimated from lengths and prior alone, with the
+    information A, and y those estimated from angles too. Including the angles changes predicted lengths by
+    `(x - y)^T Q (x - y)`, with the information Q of the lengths alone, while `tr(Q (cov x - cov y))` is expected. The
+    factor, which is at least 1, makes both equal. It is the moment estimator of random-effects meta-analysis
+    (DerSimonian and Laird 1986, Controlled Clinical Trials 7(3), 177-188), weighted by the cost of predicted lengths.
 
     Args:
         sensors: the sensors.
         view: normal equations and noise.
-        held: the prior's precision of every free parameter.
-        pull: what the prior adds to the descent.
+        held: prior precision of every free parameter.
+        pull: contribution of the prior to the descent.
     """
     angular = [sensor.unit == "rad" and not sensor.certain for sensor in sensors]
     lengths = [sensor.unit != "rad" and not sensor.certain for sensor in sensors]
@@ -258,24 +262,24 @@ def _angle_disagreement(
     angles: Float64[np.ndarray, " active"],
     held: Float64[np.ndarray, " active"],
 ) -> float:
-    """Return the factor: normal matrix and descent by lengths, the same by angles, and the prior."""
+    """Compute the factor from normal matrix and descent of lengths, those of angles, and the prior precision."""
     A = Q + np.diag(held)
     scale = (A + R).diagonal()
     scale = 1 / np.sqrt(np.where(scale > 0, scale, 1.0))
     root = np.linalg.cholesky(A * scale * scale[:, None] + UNDETERMINED * np.eye(len(scale)))
     white = np.linalg.inv(root) * scale
-    # in these coordinates A is the identity and R diagonal
+    # In these coordinates A is the identity and R diagonal, so a factor on R costs no new factorisation.
     gain, axes = np.linalg.eigh(white @ R @ white.T)
     white = axes.T @ white
     Q, lengths, angles = white @ Q @ white.T, white @ lengths, white @ angles
 
     def excess(logarithm: float) -> float:
-        """By what share angles of so much more variance move the lengths too far."""
+        """Compute observed minus expected change of the lengths for a factor `exp(logarithm)` on the variance."""
         share = gain.clip(0.0) / (gain.clip(0.0) + math.exp(logarithm))
         moved = share * lengths - (1 - share) * angles * math.exp(-logarithm)
         return float(moved @ Q @ moved) - float(Q.diagonal() @ share)
 
-    low, high = 0.0, math.log(LARGEST_DISAGREEMENT)
+    low, high = 0.0, math.log(MAX_DISAGREEMENT)
     if excess(low) <= 0:
         return 1.0
     while high - low > 1e-3:
@@ -289,7 +293,7 @@ def _group_squares(
     weight: Float64[Tensor, " rows"],
     group: Int64[Tensor, " rows"] | None,
 ) -> tuple[Float64[Tensor, ""], Int64[Tensor, ""]]:
-    """Sum of the squared mean residuals of groups of rows, by weight, and of how many values it is."""
+    """Sum the squared weighted mean residuals of groups of rows; return the sum and its number of values."""
     components = residual.shape[0]
     if group is None:
         return (residual.square() * weight).sum(), (weight > 0).sum() * components

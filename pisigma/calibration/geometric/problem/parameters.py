@@ -1,4 +1,4 @@
-"""The parameters of an identification: names, units, expected errors, and how they make up a geometry."""
+"""Parameters of an identification: names, units, prior, and their arrangement in one vector."""
 
 import math
 from collections.abc import Mapping
@@ -21,24 +21,24 @@ from pisigma.robot.row import DH_COLUMNS, FRAME_COLUMNS
 
 LENGTHS = frozenset({"d", "a", "x", "y", "z"})
 EVERYWHERE, NOWHERE = -1, -2
-"""Instead of a frame or a target: a parameter that moves the tool in all rows, or in none."""
+"""In place of the index of a frame or target: the parameter moves the tool in all rows, or in none."""
 USUAL_LENGTH = 1e-3
-"""[m] Scale of length parameters where no prior gives one."""
+"""[m] Scale of length parameters without a prior."""
 USUAL_ANGLE = 1e-3
-"""[rad]"""
+"""[rad] Scale of angle parameters without a prior."""
 USUAL_ERRORS: dict[ParameterUnit, float] = {"m": USUAL_LENGTH, "rad": USUAL_ANGLE, "px": 1.0, "1": 1e-3}
 SMALLEST_PRIOR = 1e-12
-"""[m or rad] A parameter with less uncertainty is fixed: leave it out of `free`."""
+"""[m or rad] Smallest prior standard deviation; leave more certain parameters out of `free`."""
 
 PriorSizes = Literal["stated", "widened", "estimated"]
-"""Whether the prior's sizes stand, may only grow, or are estimated."""
+"""Whether the prior scales are 1, at least 1, or estimated."""
 
 
 @dataclass(frozen=True)
 class Prior:
-    """What the maker's tolerances say: standard deviations of the parameters' errors, by class.
+    """Prior of the geometric errors from manufacturing tolerances: standard deviations by kind of parameter.
 
-    Base and tool have none, they are wherever they were put.
+    Base and tool have no prior.
 
     Attributes:
         theta: joint offsets [rad].
@@ -55,25 +55,28 @@ class Prior:
     beta: float = 1e-3
 
     def __post_init__(self) -> None:
-        """Refuse standard deviations that are none."""
+        """Refuse invalid standard deviations."""
         for name in DH_COLUMNS:
             value = getattr(self, name)
             if not (math.isfinite(value) and value >= SMALLEST_PRIOR):
+                unit = "m" if name in LENGTHS else "rad"
                 raise IdentificationError(
-                    f"prior '{name}': a standard deviation in {'m' if name in LENGTHS else 'rad'} of "
-                    f"{SMALLEST_PRIOR:g} or more was wanted, got {value:g}; use prior=None for none."
+                    option=f"prior '{name}'",
+                    expected=f"a standard deviation >= {SMALLEST_PRIOR:g} {unit}",
+                    value=value,
+                    remedy="use prior=None for no prior",
                 )
 
 
 @dataclass(frozen=True)
 class Parameter:
-    """One number that can be identified.
+    """One parameter that can be identified.
 
     Attributes:
-        name: such as "theta_1", "d_EE", "base_x" or, with several targets, "tool_B_x".
+        name: name, such as "theta_1", "d_EE", "base_x" or, with several targets, "tool_B_x".
         group: "theta", "d", "a", "alpha", "beta", "base", "tool", or that of a sensor's unknowns, such as "socket".
-        unit: "m", "rad", "px", or "1" of a plain number.
-        owner: the row, frame or target it belongs to, or such as the socket.
+        unit: "m", "rad", "px", or "1" for a number without unit.
+        owner: row, frame, target or object (such as a socket) that it belongs to.
     """
 
     name: str
@@ -83,19 +86,19 @@ class Parameter:
 
     @property
     def usual_error(self) -> float:
-        """A usual size of its error, for scaling: 1 mm, 1 mrad, 1 px or 1e-3."""
+        """Usual size of its error, for scaling: 1 mm, 1 mrad, 1 px or 1e-3."""
         return USUAL_ERRORS[self.unit]
 
 
 @dataclass(frozen=True, eq=False)
 class ParameterSpace:
-    """All parameters of a robot measured in some frames with some targets, in their order.
+    """All parameters of a robot that is measured in some frames with some targets, in order.
 
     Attributes:
         robot: the nominal robot.
         frames: names of the measuring frames, each with its own base.
         targets: names of the targets, each with its own tool.
-        unknowns: what the sensors have to find out about themselves, such as where sockets are.
+        unknowns: unknowns of the sensors, such as the positions of sockets.
     """
 
     robot: Robot
@@ -163,7 +166,7 @@ class ParameterSpace:
 
     @cached_property
     def prior_groups(self) -> Int64[Tensor, "2 parameters"]:
-        """Which size of the prior every parameter has: as drawn 0, and as drawn otherwise; see `prior_group_of`."""
+        """Prior group of every parameter if it is nominally 0, and if not; see `prior_group_of`."""
         others = [int(PriorGroup.JOINT_OFFSET)] * (len(self.parameters) - self.arm_size)
         of_row = ([prior_group_of(column, drawn) for column in DH_COLUMNS] for drawn in (False, True))
         return torch.tensor([groups * len(self.robot.rows) + others for groups in of_row])
@@ -174,27 +177,29 @@ class ParameterSpace:
         return len(self.frames) == len(self.targets) == 1 and not self.unknowns
 
     def most_independent(self, turning: bool) -> int:
-        """How many numbers of arm, bases and tools can be told apart at most, whatever is measured in whatever poses.
+        """Return the largest number of identifiable parameters of arm, bases and tools, for any measurements.
 
-        A turning axis is a line in space (4 numbers), a sliding one a direction (2), a target a pose (6) or a point
-        (3) behind them, and a frame but the first a pose (6). With one frame and one pose that is `4 R + 2 P + 6` for R
-        turning and P sliding joints (Everett, Driels and Mooring 1987, ICRA).
+        A revolute axis is a line in space (4 parameters), a prismatic one a direction (2), a target a pose (6) or a
+        point (3), and every frame except the first a pose (6). With one frame and one pose this is `4 R + 2 P + 6` for
+        R revolute and P prismatic joints (Everett, Driels and Mooring 1987, ICRA).
 
         Args:
-            turning: whether the tool's orientation is seen.
+            turning: whether the orientation of the tool is measured.
         """
         axes = sum(2 if joint.type == "prismatic" else 4 for joint in self.robot.joints)
         return axes + (6 if turning else 3) * len(self.targets) + 6 * (len(self.frames) - 1)
 
     def index(self, name: str) -> int:
-        """Where a parameter stands.
+        """Return the index of a parameter.
 
         Raises:
-            IdentificationError: there is none of that name.
+            IdentificationError: there is no parameter with this name.
         """
         if name not in self._numbers:
             raise IdentificationError(
-                f"robot '{self.robot.name}' has no parameter '{name}'; {nearest_choice(name, self.names)}"
+                f"robot '{self.robot.name}' has no parameter '{name}'",
+                value=name,
+                remedy=nearest_choice(name, self.names),
             )
         return self._numbers[name]
 
@@ -203,10 +208,10 @@ class ParameterSpace:
         return {name: number for number, name in enumerate(self.names)}
 
     def indices(self, name: str) -> list[int]:
-        """Where a parameter stands; with several frames or targets "base_x" and "tool_x" mean all of theirs.
+        """Return the indices of a parameter; with several frames or targets, "base_x" and "tool_x" stand for all.
 
         Raises:
-            IdentificationError: there is none of that name.
+            IdentificationError: there is no parameter with this name.
         """
         group, _, column = name.partition("_")
         several = {"base": len(self.frames) > 1, "tool": len(self.targets) > 1}.get(group, False)
@@ -215,11 +220,11 @@ class ParameterSpace:
         return list(self.of(group))[FRAME_COLUMNS.index(column) :: 6]
 
     def of(self, group: str) -> range:
-        """Indices of all parameters of a group behind the arm's: "base", "tool", or of sensors' unknowns."""
-        return self._stretches[group]
+        """Return the indices of all parameters of a group: "base", "tool", or a group of sensors' unknowns."""
+        return self._ranges[group]
 
     @cached_property
-    def _stretches(self) -> dict[str, range]:
+    def _ranges(self) -> dict[str, range]:
         sizes = {"base": 6 * len(self.frames), "tool": 6 * len(self.targets)}
         sizes |= {own.name: len(own.columns) * len(own.owners) for own in self.unknowns}
         start, stretches = self.arm_size, {}
@@ -234,7 +239,7 @@ class ParameterSpace:
         tools: Float64[np.ndarray, "targets 6"],
         unknowns: Mapping[str, Float64[np.ndarray, "owners columns"]] = MappingProxyType({}),
     ) -> Float64[Tensor, " parameters"]:
-        """All parameters as one vector: the robot's rows, and these; unknowns of groups that are not here are 0."""
+        """Join the robot's rows and these values to a vector of all parameters; missing groups of unknowns are 0."""
         blocks = [self.robot.dh, bases, tools]
         for own in self.unknowns:
             blocks.append(unknowns.get(own.name, np.zeros((len(own.owners), len(own.columns)))))
@@ -247,12 +252,12 @@ class ParameterSpace:
         Float64[Tensor, "frames 6"],
         Float64[Tensor, "targets 6"],
     ]:
-        """Rows, bases and tools of a vector of all parameters."""
+        """Split a vector of all parameters into rows, bases and tools."""
         bases, tools = (values[self.of(group).start : self.of(group).stop] for group in ("base", "tool"))
         return values[: self.arm_size].view(-1, 5), bases.view(-1, 6), tools.view(-1, 6)
 
     def sensor_unknowns(self, values: Float64[Tensor, " parameters"]) -> Unknowns:
-        """What a vector of all parameters says of the sensors' unknowns."""
+        """Return the sensors' unknowns of a vector of all parameters."""
         return {
             own.name: values[self.of(own.name).start : self.of(own.name).stop].view(-1, len(own.columns)).t()
             for own in self.unknowns
@@ -261,7 +266,7 @@ class ParameterSpace:
     def positions_of(
         self, group: str, active: Int64[Tensor, " active"]
     ) -> tuple[Int64[Tensor, " own"], Int64[Tensor, " own"], Int64[Tensor, " own"]]:
-        """Where a group of unknowns stands among some parameters: position, index of the owner, and column."""
+        """Find the parameters of a group of unknowns among some: position, index of the owner, and column."""
         size = next(len(own.columns) for own in self.unknowns if own.name == group)
         stretch = self.of(group)
         positions = ((active >= stretch.start) & (active < stretch.stop)).nonzero()[:, 0]
@@ -269,7 +274,7 @@ class ParameterSpace:
         return positions, number // size, number % size
 
     def precision(self, prior: Prior | None) -> Float64[np.ndarray, " parameters"]:
-        """1 / variance of every parameter's error by the prior; 0 where it says nothing."""
+        """Return the prior precision (1 / variance) of every parameter; 0 for those without a prior."""
         precision = np.zeros(len(self.parameters))
         if prior is not None:
             of_row = [getattr(prior, column) ** -2 for column in DH_COLUMNS]
@@ -278,7 +283,7 @@ class ParameterSpace:
 
 
 def row_labels(robot: Robot) -> tuple[str, ...]:
-    """What names end in: the joint's number, or a fixed row's name ("EE" for an end effector)."""
+    """Return the suffixes of parameter names: the joint number, or a fixed row's name ("EE" for an end effector)."""
     labels, joint = [], 0
     for row in robot.rows:
         joint += row.type != "fixed"

@@ -1,4 +1,4 @@
-"""How large the parameters' errors are in units of the prior's standard deviations, by groups of parameters."""
+"""Scales of the prior: sizes of the parameter errors over their prior standard deviations, by group of parameters."""
 
 from enum import IntEnum
 
@@ -8,30 +8,30 @@ from torch import Tensor
 
 from pisigma.calibration.geometric.problem.least_squares import covariance_of
 
-PRIOR_ROUNDS, PRIOR_SETTLED = 8, 1e-3
-"""At one point the prior's sizes are estimated anew so often at most, or until they change by a smaller share."""
-LEAST_EFFECTIVE = 0.1
-"""The prior of a group of which the data determine less than so many parameters stays as it is."""
+MAX_ITERATIONS, CONVERGENCE_TOLERANCE = 8, 1e-3
+"""Iterations of the prior scales at one point, and their relative change at convergence."""
+MIN_EFFECTIVE = 0.1
+"""Effective number of parameters of a group below which its prior scale is not estimated."""
 SMALLEST_PRIOR = 0.03
-"""An estimated prior is not narrower than this share of the stated one."""
+"""Smallest estimated prior scale."""
 
 
 class PriorGroup(IntEnum):
-    """Parameters whose errors are believed to be of one size, because they come from the same cause.
+    """Groups of parameters whose errors have a common prior scale, because they have the same cause.
 
-    Few groups, because only several parameters determine a size: one for every parameter (relevance vectors,
-    Tipping 2001) fits the noise. Lengths that are drawn and that are not are apart, because joining them made
-    weak data worse, while it made no difference whether d and a, or alpha and beta, are apart.
+    There are few groups, because a scale needs several parameters: one for every parameter (relevance vectors, Tipping
+    2001) fits the noise. Lengths that are nominally 0 have their own group, because joining them with the others made
+    calibrations of weak data worse; it made no difference whether d and a, or alpha and beta, are separated.
     """
 
     JOINT_OFFSET = 0
-    """theta: where the zeros of the joints were set."""
+    """theta: zeros of the joints."""
     LENGTH = 1
-    """d and a that are drawn: how long links are."""
+    """d and a that are nominally not 0: lengths of links."""
     NO_LENGTH = 2
-    """d and a drawn as 0, or shorter than their tolerance: how nearly axes meet or are in line."""
+    """d and a that are nominally 0 or below their tolerance: distances of axes that should meet or be in line."""
     BETWEEN_AXES = 3
-    """alpha and beta: how square and parallel axes are."""
+    """alpha and beta: angles between axes."""
 
 
 LENGTH_GROUPS = (PriorGroup.LENGTH, PriorGroup.NO_LENGTH)
@@ -39,10 +39,10 @@ LENGTH_GROUPS = (PriorGroup.LENGTH, PriorGroup.NO_LENGTH)
 
 
 def prior_group_of(column: str, drawn: bool) -> int:
-    """The group of a parameter whose prior is sized by the data.
+    """Return the group of a parameter.
 
     Args:
-        column: "theta", "d", "a", "alpha" or "beta"; of others, which have no prior, any group will do.
+        column: "theta", "d", "a", "alpha" or "beta"; others have no prior, so that their group does not matter.
         drawn: whether its nominal value is larger than its tolerance.
     """
     if column in ("d", "a"):
@@ -56,15 +56,15 @@ def effective_parameters(
     prior_scale: Float64[Tensor, " groups"],
     covariance: Float64[Tensor, "active active"],
 ) -> Float64[Tensor, " groups"]:
-    """How many parameters with a prior the data determine, per group: each counts by how much of it they do.
+    """Compute the effective number of parameters with a prior, per group.
 
-    `γ = Σ (1 - variance after / variance before)` of MacKay 1992, Neural Computation 4(3), eq. 4.5.
+    `γ = Σ (1 - posterior variance / prior variance)` (MacKay 1992, Neural Computation 4(3), eq. 4.5).
 
     Args:
-        precision: 1 / variance as the prior states it, 0 where it says nothing.
+        precision: 1 / variance of the stated prior; 0 for parameters without a prior.
         group: every parameter's group.
-        prior_scale: the scale of the prior.
-        covariance: of the parameters.
+        prior_scale: scale of the prior per group.
+        covariance: posterior covariance of the parameters.
     """
     variance = covariance.diagonal()
     lost = scaled_precision(precision, group, prior_scale) * variance
@@ -76,14 +76,14 @@ def scaled_precision(
     group: Int64[Tensor, " active"],
     prior_scale: Float64[Tensor, " groups"],
 ) -> Float64[Tensor, " active"]:
-    """1 / variance of parameters by the prior at a scale of its standard deviations per group."""
+    """Compute the prior precision with the standard deviations multiplied by a scale per group."""
     return precision / prior_scale.square()[group]
 
 
 def _group_totals(
     values: Float64[Tensor, " active"], group: Int64[Tensor, " active"]
 ) -> Float64[Tensor, " groups"]:
-    """Sum of the parameters' values per group of the prior."""
+    """Sum values of the parameters per group."""
     return values.new_zeros(len(PriorGroup)).index_add(0, group, values)
 
 
@@ -95,20 +95,20 @@ def prior_scales(
     covariance: Float64[Tensor, "active active"],
     floor: float = 1.0,
 ) -> Float64[Tensor, " groups"]:
-    """How many times as large as stated the parameters' errors turn out, per group of parameters.
+    """Estimate the prior scale of every group: its errors over their stated standard deviations.
 
-    MacKay's update (1992, Neural Computation 4(3), eq. 4.7) with the `effective_parameters` of every group.
+    This is MacKay's update (1992, Neural Computation 4(3), eq. 4.7) with the `effective_parameters` of every group.
 
     Args:
-        off: distance of the parameters from their nominal values [m or rad].
-        precision: 1 / variance as the prior states it, 0 where it says nothing.
+        off: difference of the parameters from their nominal values [m or rad].
+        precision: 1 / variance of the stated prior; 0 for parameters without a prior.
         group: every parameter's group.
-        before: the scale of the prior so far.
-        covariance: of the parameters.
-        floor: smallest answer; 1 where smaller errors than stated do not tighten the prior.
+        before: current scale of the prior.
+        covariance: posterior covariance of the parameters.
+        floor: smallest scale; 1 if errors smaller than stated should not narrow the prior.
     """
     squares = _group_totals(off.square() * precision, group)
-    least = 1.0 if floor == 1.0 else LEAST_EFFECTIVE
+    least = 1.0 if floor == 1.0 else MIN_EFFECTIVE
     effective = effective_parameters(precision, group, before, covariance)
     sized = (squares / effective).clamp(min=floor**2).sqrt()
     return torch.where(effective > least, sized, before)
@@ -122,27 +122,28 @@ def settled_scales(
     before: Float64[Tensor, " groups"],
     floor: float,
 ) -> Float64[Tensor, " groups"]:
-    """Estimate the prior's sizes together with the step that they lead to, until they have settled.
+    """Iterate the prior scales together with the step that they lead to, until convergence.
 
     Args:
-        normal: of the data, without the prior.
-        pull: right-hand side of the normal equations, as seen from the nominal values.
-        precision: see `prior_scales`, as for the next three.
-        group: see there.
-        before: see there.
-        floor: see there.
+        normal: normal matrix of the data, without the prior.
+        pull: right-hand side of the normal equations relative to the nominal values.
+        precision: see `prior_scales`.
+        group: see `prior_scales`.
+        before: see `prior_scales`.
+        floor: see `prior_scales`.
     """
     scale = before
-    for _ in range(PRIOR_ROUNDS):
+    for _ in range(MAX_ITERATIONS):
+        # The linearised problem has its solution `covariance @ pull` at hand, so no new residuals are needed.
         held, before = normal.clone(), scale
         held.diagonal().add_(scaled_precision(precision, group, before))
         covariance = covariance_of(held)
         scale = prior_scales(covariance @ pull, precision, group, before, covariance, floor)
-        if alike(before, scale, PRIOR_SETTLED):
+        if alike(before, scale, CONVERGENCE_TOLERANCE):
             break
     return scale
 
 
 def alike(before: Tensor, after: Tensor, share: float) -> bool:
-    """Whether two estimates of noise and of the prior's sizes differ by less than a share."""
+    """Say whether two estimates (of noise or prior scales) differ by less than a relative tolerance."""
     return bool(((after / before - 1).abs() < share).all())

@@ -1,4 +1,4 @@
-"""The calibration as a least-squares problem: normal equations summed over chunks of poses."""
+"""Calibration as a least-squares problem, with normal equations that are summed over chunks of poses."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -38,14 +38,14 @@ from pisigma.measurement.sensors.sensor import AbstractSensor, Unknowns
 from pisigma.robot.kinematics.parameter_jacobian import JACOBIAN_CHUNK, ToolMotion, tool_motion
 
 CERTAIN_LOSS = SquaredLoss()
-SETTLED = 1e-2
-"""Estimates of noise and prior sizes have settled that change by a smaller share from point to point."""
+CONVERGENCE_TOLERANCE = 1e-2
+"""Relative change of noise and prior scales from point to point at convergence."""
 
 
 class MotionMemory:
-    """The motion at the last point, which the rank analysis, the search and its next stage all ask for.
+    """Cache of the tool motion at the last point, which the rank analysis, the search and its next stage all need.
 
-    What the motion was made from is compared by identity; so points are replaced and never changed in place.
+    The inputs of the motion are compared by identity; therefore points are replaced and never changed in place.
     """
 
     def __init__(self) -> None:
@@ -53,41 +53,41 @@ class MotionMemory:
         self._motion: ToolMotion | None = None
 
     def motion(self, made_from: tuple[object, ...], make: Callable[[], ToolMotion]) -> ToolMotion:
-        """Return the motion of all rows that was made from the same objects, or else a new one.
+        """Return the cached motion if it was made from the same objects, or else a new one.
 
         Args:
             made_from: the objects.
-            make: works the motion out.
+            make: function that computes the motion.
         """
         same = len(made_from) == len(self._made_from) and all(
             one is other for one, other in zip(made_from, self._made_from, strict=True)
         )
         if not same or self._motion is None:
-            self._made_from, self._motion = made_from, None  # given back before more memory is asked for
+            self._made_from, self._motion = made_from, None  # release the memory before more is allocated
             self._motion = make()
         return self._motion
 
 
 @dataclass(frozen=True, eq=False)
 class CalibrationProblem(AbstractLeastSquares[Tensor]):
-    """Rows, sensors, the parameters that are free and what the prior says of them.
+    """Rows, sensors, free parameters and their prior.
 
     Attributes:
         space: the parameters; a point is a vector of all of them.
-        q: joint values [rad or m] of the rows.
+        q: joint values of the rows [rad or m].
         frame: index of every row's frame.
         target: index of every row's target.
-        sensors: what was measured in the rows.
-        loss: how rows far from their prediction count.
-        nominal: values of all parameters that the prior is about.
-        precision: 1 / variance of their errors by the prior, 0 where it says nothing.
+        sensors: measurements of the rows by sensor.
+        loss: loss function.
+        nominal: prior means of all parameters.
+        precision: prior precision (1 / variance); 0 for parameters without a prior.
         active: indices of the free parameters.
-        pose: number of every row's pose (joint values, frame, target), None where no pose is repeated.
-        configuration: number of every row's joint values and frame, None where none is seen of several targets.
-        pairs: so many pairs of rows, the first ones, are measured together.
-        stated: what rows state beside their joint values (see `JointState`), for corrections that depend on it.
-        prior_sizes: "stated": the prior as it is; "widened": wider where errors are larger; "estimated": either way.
-        memory: the last motion; shared with problems that differ in their free parameters or prior only.
+        pose: number of every row's pose (joint values, frame, target); None if no pose is repeated.
+        configuration: number of every row's joint values and frame; None if none has several targets.
+        pairs: number of pairs of rows that are measured together, which come first.
+        stated: conditions stated in the rows (see `JointState`), for corrections that depend on them.
+        prior_sizes: "stated": prior scales of 1; "widened": at least 1; "estimated": any.
+        memory: cache of the last motion, shared by problems that differ only in free parameters or prior.
     """
 
     space: ParameterSpace
@@ -123,7 +123,7 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
 
     @cached_property
     def prior_group(self) -> Int64[Tensor, " active"]:
-        """Which size of the prior every free parameter has: of its `PriorGroup`, or for lengths and for angles."""
+        """Group of the prior scale of every free parameter: its `PriorGroup`, or one for lengths and one for angles."""
         active = self.active
         if self.prior_sizes != "estimated":
             return self.space.is_length.to(active.device)[active].long()
@@ -131,15 +131,15 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         return self.space.prior_groups.to(active.device)[drawn, active]
 
     def with_active(self, active: Sequence[int]) -> "CalibrationProblem":
-        """The same with other free parameters."""
+        """Return the problem with other free parameters."""
         return replace(self, active=torch.tensor(sorted(active), dtype=torch.int64, device=self.q.device))
 
     def without_prior(self) -> "CalibrationProblem":
-        """The same without a prior."""
+        """Return the problem without a prior."""
         return replace(self, precision=torch.zeros_like(self.precision))
 
     def with_partners(self, rows: Int64[Tensor, " chosen"]) -> Int64[Tensor, " _rows"]:
-        """Some rows and, of pairs, the other ones; in ascending order where there are pairs."""
+        """Add the other rows of pairs to some rows; in ascending order if there are pairs."""
         if not self.pairs:
             return rows
         partner = torch.where(rows < 2 * self.pairs, rows ^ 1, rows)
@@ -147,7 +147,7 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         return both
 
     def select(self, rows: Int64[Tensor, " chosen"]) -> "CalibrationProblem":
-        """Some of the rows; of a pair both."""
+        """Select some of the rows, with both rows of a pair."""
         rows = self.with_partners(rows)
         return replace(
             self,
@@ -164,19 +164,19 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
 
     @cached_property
     def state(self) -> JointState:
-        """Joint values of the rows, and what is stated beside them."""
+        """Joint values and stated conditions of the rows."""
         return JointState(self.q, self.stated)
 
     def moved(self, point: Tensor, step: Tensor) -> Tensor:
-        """The parameters after a step of the free ones."""
+        """Return the parameters after a step of the free ones."""
         return point.index_add(0, self.active, step)
 
     def rms(self, linearisation: Linearisation[Tensor]) -> Float64[Tensor, ""]:
-        """Root mean square of the first sensor's residuals' lengths [m or rad]."""
+        """Return the RMS residual length of the first sensor [m or rad]."""
         return view_of(linearisation).sums[0].rms
 
     def linearise(self, point: Tensor, like: Linearisation[Tensor] | None) -> Linearisation[Tensor]:
-        """Sum up the normal equations; rows are weighted by the noise of `like`, all alike where None."""
+        """Sum the normal equations, with rows weighted by the noise of `like`, or equally if None."""
         before = None if like is None else view_of(like)
         unknowns = self.space.sensor_unknowns(point)
         chunks = []
@@ -188,9 +188,9 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         return self.combined(point, view)
 
     def begin(self, point: Tensor) -> Linearisation[Tensor]:
-        """See the problem from a start, the rows being weighted by what they show of the noise.
+        """Linearise the problem at a start, with rows weighted by the noise estimated from them.
 
-        Gross errors would decide the first step otherwise, where the loss rejects any.
+        If the loss rejects rows, they are linearised twice; otherwise gross errors would dominate the first step.
         """
         weighted = self.renewed(self.linearise(point, None))[0]
         losses = [self.loss_of(sensor) for sensor in self.sensors]
@@ -199,11 +199,11 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         return self.renewed(self.linearise(point, weighted))[0]
 
     def renewed(self, linearisation: Linearisation[Tensor]) -> tuple[Linearisation[Tensor], bool]:
-        """Estimate the noise robustly, what repeats are worth, and how wide the prior has to be."""
+        """Estimate noise (robustly), the weight of repeats, and the prior scales."""
         return self._renewed(linearisation, refine=False)
 
     def refined(self, linearisation: Linearisation[Tensor]) -> Linearisation[Tensor]:
-        """The same with the noise estimated from all good rows, for the end of a search."""
+        """Estimate the same with the noise from all rows without outliers, for the end of a search."""
         return self._renewed(linearisation, refine=True)[0]
 
     def _renewed(
@@ -231,12 +231,12 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
             torch.cat([one.noise, one.repetition, one.disagreement, one.prior_scale])
             for one in (view, renewed)
         )
-        return self.combined(linearisation.point, renewed), alike(before, after, SETTLED)
+        return self.combined(linearisation.point, renewed), alike(before, after, CONVERGENCE_TOLERANCE)
 
     def _prior_scales(
         self, view: SensorView, off: Tensor, covariance: Tensor, refine: bool
     ) -> Float64[Tensor, " groups"]:
-        """Estimate the prior's sizes; during a search with the step they lead to, the residuals being linear in it."""
+        """Estimate the prior scales; during a search together with the step they lead to, for linear residuals."""
         floor, prior = (
             1.0 if self.prior_sizes == "widened" else SMALLEST_PRIOR,
             (self._prior, self.prior_group),
@@ -249,27 +249,27 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
 
     @cached_property
     def _sized(self) -> bool:
-        """Whether there is a prior whose sizes are estimated."""
+        """Whether there is a prior with estimated scales."""
         return self.prior_sizes != "stated" and bool((self._prior > 0).any())
 
     def _off(self, point: Tensor) -> Float64[Tensor, " active"]:
-        """Distance of the free parameters from where the prior has them."""
+        """Return the difference of the free parameters from their prior means."""
         return (point - self.nominal)[self.active]
 
     def loss_of(self, sensor: AbstractSensor) -> AbstractLoss:
-        """How a sensor's rows count."""
+        """Return the loss function of a sensor."""
         return CERTAIN_LOSS if sensor.certain else self.loss
 
     def chunks(self) -> list[slice]:
-        """Rows that are worked on together."""
+        """Split the rows into chunks that are processed together."""
         starts = range(0, self.rows, JACOBIAN_CHUNK)
         return [slice(start, min(start + JACOBIAN_CHUNK, self.rows)) for start in starts]
 
     def motion(self, point: Tensor, rows: slice, active: Tensor) -> ToolMotion:
-        """Tool pose of some rows and its derivative by some parameters.
+        """Compute the tool poses of some rows and their derivatives by some parameters.
 
-        The columns are 0 for base and tool in rows of other frames and targets, and for parameters that do not
-        move the tool.
+        The columns are 0 for bases and tools in rows of other frames and targets, and for parameters that do not move
+        the tool.
         """
         make = partial(self._motion, point, rows)
         made_from = (point, self.space, self.q, self.frame, self.target, self.turning)
@@ -285,7 +285,7 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         return ToolMotion(motion.position, motion.rotation, J)
 
     def _motion(self, point: Tensor, rows: slice) -> ToolMotion:
-        """Tool pose of some rows and its derivative by every kind of parameter."""
+        """Compute the tool poses of some rows and their derivatives by every kind of parameter."""
         dh, bases, tools = self.space.split(point)
         frame, target = (
             None if len(owners) == 1 else number[rows]
@@ -297,7 +297,7 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
     def derivative(
         self, sensor: AbstractSensor, motion: ToolMotion, unknowns: Unknowns, rows: slice, active: Tensor
     ) -> Tensor:
-        """Derivative of a sensor's values by the parameters that the motion was made for."""
+        """Compute the derivative of a sensor's values by the parameters that the motion was computed for."""
         J = sensor.derivative(motion, unknowns, rows)
         for block in sensor.unknown_derivatives(motion, unknowns, rows):
             positions, owner, column = self.space.positions_of(block.group, active)
@@ -307,7 +307,7 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         return J
 
     def combined(self, point: Tensor, view: SensorView) -> Linearisation[Tensor]:
-        """Divide the sums by their variances and add the prior."""
+        """Combine the sensors' sums, divided by their variances, and the prior to a linearisation."""
         off = self._off(point)
         precision = view.scaled(self._prior, self.prior_group)
         pull = off * precision
@@ -326,7 +326,7 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
     def _data_sums(
         self, view: SensorView
     ) -> tuple[Float64[Tensor, "active active"], Float64[Tensor, " active"]]:
-        """Divide the sums by their variances; the prior is not in it."""
+        """Add up the sensors' sums, divided by their variances, without the prior."""
         terms = [
             (sums.normal / variance, sums.descent / variance)
             for sums, variance in zip(view.sums, view.variances, strict=True)
@@ -339,7 +339,7 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
 
     @cached_property
     def _rounding(self) -> Float64[Tensor, " sensors"]:
-        """Sum of squares of what rounding makes of every sensor's residuals [m² or rad²]."""
+        """Sum of squared residuals that rounding causes, per sensor [m² or rad²]."""
         sizes = (self.space.robot.reach if sensor.unit == "m" else 1.0 for sensor in self.sensors)
         pairs = zip(self.values_measured, sizes, strict=True)
         epsilon = torch.finfo(self.q.dtype).eps
@@ -365,7 +365,7 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
     def _sums(
         self, number: int, view: SensorView | None, motion: ToolMotion, unknowns: Unknowns, rows: slice
     ) -> SensorSums:
-        """What one sensor contributes in some rows, weighted by its noise, or all alike where that is None."""
+        """Compute the sums of one sensor in some rows, weighted by its noise, or equally if `view` is None."""
         sensor, everywhere = self.sensors[number], self.measured_everywhere[number]
         residual = sensor.residual(motion, unknowns, rows)
         if not everywhere:
@@ -382,7 +382,8 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         if not everywhere:
             root = torch.where(sensor.present[rows], root, 0.0)
         J = self.derivative(sensor, motion, unknowns, rows, self.active)
-        A = J.new_empty((J.shape[0] + 1, *J.shape[1:]))  # the residual is its last row
+        # With the residual as its last row, one product A A^T gives the normal matrix and the right-hand side.
+        A = J.new_empty((J.shape[0] + 1, *J.shape[1:]))
         torch.mul(J, root, out=A[:-1])
         torch.mul(residual, root, out=A[-1])
         A = A.flatten(1)

@@ -1,4 +1,4 @@
-"""The calibration problem with its initial guess, and points of the problem in the user's coordinates."""
+"""Construction of the calibration problem with its initial guess, and its solutions in the user's coordinates."""
 
 import math
 from collections.abc import Mapping
@@ -15,7 +15,7 @@ from pisigma.calibration.geometric.problem.noise import renumbered
 from pisigma.calibration.geometric.problem.parameters import ParameterSpace, Prior, PriorSizes
 from pisigma.calibration.geometric.problem.problem import CalibrationProblem
 from pisigma.estimation.loss import AbstractLoss
-from pisigma.files.errors import IdentificationError
+from pisigma.files.errors import IdentificationError, Place
 from pisigma.measurement.conditions import JointState, repeat_key
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.fields import KINDS
@@ -27,17 +27,17 @@ from pisigma.robot.description import Robot
 from pisigma.robot.se3 import invert, rotation_from_rpy, rpy_from_rotation, transform_from_xyzrpy
 
 MULTIPLIER, FACTOR = 6_364_136_223_846_793_005, 1_442_695_040_888_963_407
-"""Of the linear congruential generator by which joint values are mixed (Knuth, MMIX)."""
+"""Constants of the linear congruential generator for hashing joint values (Knuth, MMIX)."""
 
 
 @dataclass(frozen=True, eq=False)
 class Anchors:
-    """Where base and tool started; parameters are changes from there, so no angle nears its singularity.
+    """Start values of bases and tools; parameters are changes relative to these, far from the singularity of rpy.
 
     Attributes:
-        bases: per frame, what stands before the base of the problem: `base = anchor · base_of_problem`. Points that
-            sensors have to find are behind it too.
-        tools: per target, what stands behind the tool's rotation: `R_tool = R_of_problem · anchor`.
+        bases: anchor of every frame: `base = anchor · base_of_problem`. Points that sensors estimate are relative to it
+            too.
+        tools: anchor of every target's rotation: `R_tool = R_of_problem · anchor`.
     """
 
     bases: Float64[Tensor, "frames 4 4"]
@@ -49,12 +49,12 @@ class CalibrationSetup:
     """A problem ready to be solved.
 
     Attributes:
-        problem: with no parameter free yet.
-        start: values of all parameters.
-        anchors: what base and tool are relative to.
-        rows: which rows of the measurements the problem has, in its order.
-        unknown_frames: by group of the sensors' unknowns, the index of every owner's frame.
-        free_unknowns: indices of the sensors' unknowns that are to be identified, such as where sockets are.
+        problem: the problem, without free parameters yet.
+        start: start values of all parameters.
+        anchors: frames that bases and tools are relative to.
+        rows: numbers of the rows of the problem in the measurements, in its order.
+        unknown_frames: index of every owner's frame, by group of the sensors' unknowns.
+        free_unknowns: indices of the sensors' unknowns to identify, such as positions of sockets.
         measurements: the rows of the problem, in its order.
     """
 
@@ -69,13 +69,13 @@ class CalibrationSetup:
 
 @dataclass(frozen=True)
 class SetupOptions:
-    """What the user says of base, tool and sensors.
+    """Settings of base, tool and sensors.
 
     Attributes:
-        free_base: whether bases are to be identified.
-        free_tool: whether tools are to be identified.
-        turn_tool: whether their rotations are.
-        frames: initial guesses of bases by frame; x, y, z [m], roll, pitch, yaw [rad].
+        free_base: whether to identify bases.
+        free_tool: whether to identify tools.
+        turn_tool: whether to identify the rotations of tools.
+        frames: initial guesses of bases by frame: x, y, z [m], roll, pitch, yaw [rad].
         socket_distances: distances between two sockets [m].
         socket_sigma: their standard deviation [m].
         prior_sizes: see `CalibrationProblem`.
@@ -97,11 +97,10 @@ def build_setup(
     prior: Prior | None,
     loss: AbstractLoss,
 ) -> CalibrationSetup:
-    """Guess where everything but the arm is, and state the problem relative to it.
+    """Guess bases, tools and the sensors' unknowns, and build the problem relative to them.
 
     Raises:
-        IdentificationError: nothing usable was measured, too little for what has to be identified, or something
-            that cannot be.
+        IdentificationError: there are no usable measurements, too few to identify everything, or implausible ones.
         PoseError: the joint values do not fit the robot.
     """
     robot.check_joint_count(measurements.q.shape[1])
@@ -126,15 +125,15 @@ def setup_around(
     prior: Prior | None,
     loss: AbstractLoss,
 ) -> CalibrationSetup:
-    """State the problem relative to where everything but the arm is.
+    """Build the problem relative to an initial guess.
 
     Args:
         space: the parameters.
         guessed: bases, tools and sensors' unknowns.
-        usable: from `usable_rows`.
-        options: what the user says.
-        prior: of the arm's errors.
-        loss: how far-off rows count.
+        usable: result of `usable_rows`.
+        options: settings of base, tool and sensors.
+        prior: prior of the geometric errors.
+        loss: loss function.
     """
     rows, measurements = usable
     device = measurements.q.device
@@ -175,19 +174,22 @@ def setup_around(
 
 
 def usable_rows(measurements: Measurements) -> tuple[Tensor, Measurements]:
-    """Select the rows in which something was measured; those of pairs come first, side by side.
+    """Select the rows with measured values; those of pairs come first, next to each other.
 
     Returns:
         Their numbers, and the rows.
 
     Raises:
-        IdentificationError: no row has a measured value, or all are of one pose.
+        IdentificationError: no row has a measured value, or all have the same joint values.
     """
     usable = torch.stack([measurements.measured(kind) for kind in (*KINDS, *READINGS)]).any(0)
     if not bool(usable.any()):
         raise IdentificationError(
-            f"{measurements.source}: none of its {len(usable)} rows has a measured value; give positions or poses "
-            "(columns x_mm, y_mm, z_mm), touches, sockets or distances."
+            f"none of the {len(usable)} rows has a measured value",
+            expected="measured values",
+            value=0,
+            at=Place(measurements.source),
+            remedy="give positions or poses (columns x_mm, y_mm, z_mm), touches, sockets or distances",
         )
     rows = pairs_first(measurements, usable.nonzero()[:, 0])
     whole = len(rows) == len(usable) and measurements.pair is None
@@ -195,24 +197,27 @@ def usable_rows(measurements: Measurements) -> tuple[Tensor, Measurements]:
     q = chosen.q
     if q.shape[0] > 1 and float((q - q[0]).abs().max()) < 1e-9:
         raise IdentificationError(
-            f"{measurements.source}: all {q.shape[0]} rows are one pose, which determines the noise but no "
-            "parameter; measure at other joint values, spread over the workspace."
+            f"all {q.shape[0]} rows have the same joint values, which determine the noise but no parameter",
+            expected="different joint values",
+            value=q.shape[0],
+            at=Place(measurements.source),
+            remedy="measure at other joint values, spread over the workspace",
         )
     return rows, chosen
 
 
 def repeated(q: Tensor, *names: Tensor) -> Tensor | None:
-    """Number every row's joint values (with payload, to 1e-9) and names, such as of frame and target.
+    """Number the rows by joint values (with payload, to 1e-9) and names, such as frame and target.
 
     Returns:
-        None where no two rows are the same.
+        None if all rows differ.
     """
     numbers = renumbered(_mixed_keys(q, *names))
     return None if int(numbers.max()) + 1 == len(q) else numbers
 
 
 def _mixed_keys(q: Float64[Tensor, "rows dof"], *names: Tensor) -> Int64[Tensor, " rows"]:
-    """Mix every row's joint values (to 1e-9) and names into one number, which is the same where they are."""
+    """Hash every row's joint values (to 1e-9) and names to one integer."""
     keys, dof = (q * 1e9).round().long(), q.shape[1]
     factors = [FACTOR * pow(MULTIPLIER, dof - 1 - joint, 2**64) for joint in range(dof)]
     signed = [(factor + 2**63) % 2**64 - 2**63 for factor in factors]
@@ -228,7 +233,7 @@ def _anchored(
     options: SetupOptions,
     unknown_frames: Mapping[str, Int64[Tensor, " owners"]],
 ) -> tuple[Anchors, Float64[Tensor, " parameters"]]:
-    """Bases start at their anchor, tools where they are, turned like their anchor; what is fixed has none."""
+    """Choose the anchors, and compute the start relative to them: identity for free bases and free tool rotations."""
     bases, tools = guessed.bases.copy(), guessed.tools.copy()
     anchors = Anchors(
         torch.eye(4).double().repeat(len(bases), 1, 1), torch.eye(3).double().repeat(len(tools), 1, 1)
@@ -251,7 +256,7 @@ def _anchored(
 def _moved(
     T: Float64[Tensor, "owners 4 4"], values: Float64[Tensor, "owners columns"], has_point: bool
 ) -> Float64[Tensor, "owners columns"]:
-    """Unknowns of sensors whose points were moved."""
+    """Transform the points among the sensors' unknowns."""
     if not has_point:
         return values
     points = (T[:, :3, :3] @ values[:, :3, None])[..., 0] + T[:, :3, 3]
@@ -260,15 +265,15 @@ def _moved(
 
 @dataclass(frozen=True, eq=False)
 class IdentifiedGeometry:
-    """A robot, where it stood, what it carried and what its sensors found out about themselves.
+    """Identified robot, bases, tools and unknowns of the sensors, in the user's coordinates.
 
     Attributes:
-        robot: with the base of the first frame and the tool of the first target.
-        bases: per frame x, y, z [m], roll, pitch, yaw [rad].
-        tools: the same per target.
-        unknowns: by group and owner, the sensors' unknowns in the owner's frame, such as
+        robot: the robot, with the base of the first frame and the tool of the first target.
+        bases: base in every frame: x, y, z [m], roll, pitch, yaw [rad].
+        tools: tool of every target, in the same form.
+        unknowns: unknowns of the sensors by group and owner, in the owner's frame, such as
             `unknowns["socket"]["plate/0"]` [m or rad].
-        setup: the problem that it solves; None where that is not at hand any more.
+        setup: setup of the problem that it solves; None if it is not available.
         point: the solution in the problem's coordinates.
     """
 
@@ -281,13 +286,13 @@ class IdentifiedGeometry:
 
     @cached_property
     def change(self) -> Float64[Tensor, "parameters parameters"]:
-        """`d(all parameters in these coordinates) / d(the problem's)`; there is one with a problem only."""
+        """Derivative of all parameters in these coordinates by those of the problem; requires `setup` and `point`."""
         assert self.setup is not None
         assert self.point is not None
         return coordinate_change(self.setup, self.point.cpu())
 
     def values_of(self, space: ParameterSpace) -> Float64[Tensor, " parameters"]:
-        """Return all parameters of a space as one vector; NaN for sensors' unknowns that are not here."""
+        """Return all parameters of a space as one vector; NaN for missing unknowns of sensors."""
         unknowns = []
         for own in space.unknowns:
             missing, values = np.full(len(own.columns), np.nan), self.unknowns.get(own.name, {})
@@ -297,7 +302,7 @@ class IdentifiedGeometry:
 
 
 def identified_geometry(setup: CalibrationSetup, point: Float64[Tensor, " parameters"]) -> IdentifiedGeometry:
-    """Put the anchors back; as rotation vectors, small turns mean the same with and without them."""
+    """Convert a point of the problem to the user's coordinates."""
     space = setup.problem.space
     dh, bases, tools = behind_anchors(setup, point)
     return IdentifiedGeometry(
@@ -332,8 +337,8 @@ def coordinate_change(
     """Return the derivative of all parameters in the user's coordinates by those of the problem.
 
     Args:
-        setup: with the anchors that the problem's bases and tools are relative to.
-        point: where the derivative is taken, in the problem's coordinates.
+        setup: setup with the anchors that bases and tools of the problem are relative to.
+        point: point of the derivative, in the problem's coordinates.
     """
     space, anchors = setup.problem.space, setup.anchors
     _, bases, tools = space.split(point)
@@ -342,6 +347,7 @@ def coordinate_change(
     for k, anchor in enumerate(anchors.bases.cpu()):
         first = space.of("base").start + 6 * k
         change[first : first + 3, first : first + 3] = anchor[:3, :3]
+        # Angular velocities agree in both coordinates up to the anchor; the axes convert them from and to rpy.
         back = torch.linalg.pinv(turning_axes(user_bases[k, 3:]), rtol=1e-9)
         turns = slice(first + 3, first + 6)
         change[turns, turns] = back @ anchor[:3, :3] @ turning_axes(bases[k, 3:])
@@ -370,7 +376,7 @@ def unknowns_in_frames(
 
 
 def turning_axes(rpy: Float64[Tensor, " 3"]) -> Float64[Tensor, "3 3"]:
-    """The axes that roll, pitch and yaw turn about, as columns: `RotZ(roll) · RotY(pitch) · RotX(yaw)`."""
+    """Return the rotation axes of roll, pitch and yaw as columns, for `RotZ(roll) · RotY(pitch) · RotX(yaw)`."""
     roll, pitch, _ = rpy.tolist()
     (cr, cp), (sr, sp) = ((turn(roll), turn(pitch)) for turn in (math.cos, math.sin))
     return rpy.new_tensor([[0.0, -sr, cr * cp], [0.0, cr, sr * cp], [1.0, 0.0, -sp]])

@@ -5,7 +5,7 @@ import torch
 from testing.closeness import assert_close
 
 from pisigma.calibration.geometric.problem.least_squares import (
-    SWINGING,
+    MAX_NOISE_UPDATES,
     AbstractLeastSquares,
     Linearisation,
     SolutionStatus,
@@ -103,7 +103,7 @@ def test_the_iteration_limit_is_said() -> None:
 def test_a_noise_that_swings_is_taken_as_it_is_in_the_end() -> None:
     solution = levenberg_marquardt(Swinging(), torch.zeros(1, dtype=torch.float64), maximum_iterations=100)
     assert solution.status is SolutionStatus.CONVERGED
-    assert SWINGING < solution.iterations < SWINGING + 10
+    assert MAX_NOISE_UPDATES < solution.iterations < MAX_NOISE_UPDATES + 10
     assert_close(solution.linearisation.point.abs(), torch.ones(1), atol=1e-3)
 
 
