@@ -79,4 +79,4 @@ def test_frontal_views_are_warned_of(settings: PlanSettings):
     with no_type_checker():
         frontal = plan("ur5", replace(settings, count=5, check=0, candidates=20), cell)
     text = " ".join(frontal.warnings)
-    assert "oblique, which hardly determines" in text
+    assert "deg from frontal" in text
