@@ -1,4 +1,4 @@
-"""Whether every command says the same of rows with a mistake."""
+"""Whether all commands agree on rows with a mistake."""
 
 from pathlib import Path
 
@@ -7,11 +7,11 @@ from gate.table import Mistake, right_rows
 
 
 def disagreements(mistake: Mistake, folder: Path) -> list[str]:
-    """List the commands that end otherwise than the table says, in words."""
+    """List the commands whose result differs from the table."""
     rows, found = mistake.change(right_rows()), []
     for command in COMMANDS:
         got = answer(command, rows, folder)
         stopped, wanted = got.status in (2, 3), bool(mistake.kinds)
-        if got.status not in (0, 2, 3) or (stopped != wanted and command not in mistake.unseen):
+        if got.status not in (0, 2, 3) or (stopped != wanted and command not in mistake.unnoticed):
             found.append(f"{command}: status {got.status}, {got.said[:200]}")
     return found

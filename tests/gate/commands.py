@@ -1,4 +1,4 @@
-"""Every command that takes rows, called in this process: its exit status, and what it says of the rows."""
+"""Every command that reads rows, called in this process: its exit status, and its diagnostics."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -34,7 +34,7 @@ ROBOT = "rb5"
 
 @dataclass(frozen=True)
 class Answer:
-    """What a command says: 0, 2 or 3, and why."""
+    """Result of a command: exit status 0, 2 or 3, and the reason."""
 
     status: int
     said: str = ""
@@ -113,7 +113,7 @@ def _fleet(rows: Measurements, folder: Path) -> Answer:
 
 
 def model_folder(folder: Path) -> Path:
-    """Write the model that rows are added to, where it is not there yet."""
+    """Write the model that rows are added to, unless it exists."""
     path = folder / "model"
     if not path.exists():
         path.mkdir()

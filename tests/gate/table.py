@@ -1,4 +1,4 @@
-"""Forty mistakes in the rows of a session, which every command that takes rows has to notice."""
+"""Forty mistakes in the rows of a session, which every command that reads rows has to notice."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -16,8 +16,8 @@ from pisigma.robot.kinematics.forward import forward_kinematics
 
 Change = Callable[[Measurements], Measurements]
 ROWS = 16
-NO_MODEL = "so few rows show it by a model only, and this command has none"
-PARTS = "a calibration has a base, a tool and an arm to fit to these rows, which take it up"
+NO_MODEL = "so few rows show it only against a model, and this command has none"
+ABSORBED = "a calibration fits base, tool and arm to these rows, which absorbs it"
 FITTED = "base and tool are fitted to the rows"
 
 
@@ -26,20 +26,20 @@ class Mistake:
     """One mistake.
 
     Attributes:
-        name: what went wrong.
-        change: right rows to those with the mistake.
-        kinds: of the diagnostics that may name it, of checks against a model.
-        unseen: by command, why it need not notice.
+        name: description of the mistake.
+        change: function that puts the mistake into right rows.
+        kinds: kinds of diagnostics that may name it in checks against a model; "*" for any.
+        unnoticed: commands that need not notice it, and why.
     """
 
     name: str
     change: Change
     kinds: tuple[str, ...] = ("setup_fault",)
-    unseen: Mapping[str, str] = field(default_factory=dict)
+    unnoticed: Mapping[str, str] = field(default_factory=dict)
 
 
 def right_rows(seed: int = 2) -> Measurements:
-    """Rows without a mistake, of the robot of the model."""
+    """Return rows without a mistake, of the model's robot."""
     return replace(rows_later(ROWS, seed), line=tuple(range(2, ROWS + 2)), source="rows.csv")
 
 
@@ -95,7 +95,7 @@ def permuted(order: Callable[[int], torch.Tensor]) -> Change:
 
 
 def of_other_arm(dh: Callable[[np.ndarray], np.ndarray]) -> Change:
-    """Positions of an arm with another geometry, in the frame and with the tool of the model."""
+    """Replace positions by those of an arm with another geometry, in the model's frame and with its tool."""
 
     def change(rows: Measurements) -> Measurements:
         model = model_before()
@@ -127,7 +127,7 @@ def in_some(chosen: Callable[[torch.Tensor], torch.Tensor], change: Change) -> C
 
 
 def scattered(rows: Measurements) -> Measurements:
-    """Twenty millimetres in any direction."""
+    """Displace positions by 20 mm in random directions."""
     assert rows.position is not None
     noise = torch.from_numpy(np.random.default_rng(3).normal(size=(rows.rows, 3)))
     return replace(rows, position=rows.position + 0.02 * noise / noise.norm(dim=1, keepdim=True))
@@ -146,9 +146,8 @@ def some_third(rows: torch.Tensor) -> torch.Tensor:
 
 
 SPECIMEN = of_other_arm(lambda dh: dh + dh_errors(Robot.load("rb5"), 2e-3, 4e-3, np.random.default_rng(7)))
-MIXED = {"kinds": ("mixed_rows",), "unseen": {"calibrate": NO_MODEL}}
-SCALED = {"kinds": ("scale",), "unseen": {"calibrate": PARTS}}
-TAKEN_UP = {"calibrate": PARTS}
+MIXED = {"kinds": ("mixed_rows",), "unnoticed": {"calibrate": NO_MODEL}}
+SCALED = {"kinds": ("scale",), "unnoticed": {"calibrate": ABSORBED}}
 
 MISTAKES: tuple[Mistake, ...] = (
     Mistake("inches named mm", positions(1 / 25.4)),
@@ -200,4 +199,4 @@ MOVES: tuple[Mistake, ...] = (
     Mistake("base carried by 6 m", moved((6.0, 0.0, 0.0)), (), {"compare": FITTED}),
     Mistake("joint 3 zeroed again, 10 deg off", joints(add=[0, 0, math.radians(10), 0, 0, 0]), ()),
 )
-"""What is no mistake: it may have moved by any size."""
+"""Movements that are not mistakes, of any size."""

@@ -1,4 +1,4 @@
-"""A recalibration that is killed while it writes its model, as a small case of `chain_kills.py`."""
+"""A recalibration that is killed while it writes its model: a small case of `chain_kills.py`."""
 
 from hostile.chain_kills import Chain
 

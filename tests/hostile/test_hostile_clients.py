@@ -1,4 +1,4 @@
-"""A seeded run of hostile byte streams against one server: it answers what it has to and keeps serving."""
+"""A seeded run of hostile byte streams against one server, which answers valid requests and keeps serving."""
 
 import random
 import socket
@@ -29,7 +29,7 @@ def test_no_stream_does_harm(protocol, repository):
     assert not bad, "\n".join(bad)
 
 
-def test_the_check_sees_wrong_answers(repository):
+def test_the_check_notices_wrong_answers(repository):
     rng = random.Random(SEED)
     with running(repository / "models" / "kiro4") as server, no_type_checker():
         ik = pisigma.load(repository / "models" / "kiro4")

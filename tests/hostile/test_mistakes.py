@@ -1,4 +1,4 @@
-"""Mistakes in measured files are stopped and their cause is named; clean files are not stopped."""
+"""Mistakes in measured files are stopped and their cause is named; clean files are trusted."""
 
 import re
 from dataclasses import replace
@@ -15,29 +15,21 @@ from pisigma.validation.setup_faults.faults_as_drawn import find_faults_as_drawn
 pytestmark = pytest.mark.usefixtures("without_type_checker")
 
 FEW = {
-    "ur5": (
-        "sign of q5",
-        "q5 and q6 swapped",
-        "joint 5 logged constant",
-        "q4 in the column of q5",
-        "a row lost half-way",
-    ),
+    "ur5": ("q5 and q6 swapped", "joint 5 logged constant", "a row lost half-way"),
     "ur10": (
         "sign of q6",
         "reversed Euler order",
         "quaternion wxyz",
-        "quaternion conjugated",
         "rotation vector as angles",
-        "rows shifted by one",
-        "rows in another order",
         "left-handed frame",
     ),
 }
+"""One mistake for each class: joint order, log, row order; sign, rotation conventions, handedness."""
 
 
 @pytest.mark.parametrize(("robot", "name"), [(robot, name) for robot, names in FEW.items() for name in names])
 def test_mistakes_are_stopped_with_their_cause(robot, name, shared_data, tmp_path):
-    """`python tests/hostile/mistakes.py` makes all 60."""
+    """`python tests/hostile/mistakes.py` runs all 60."""
     _, file, every, mistakes = next(one for one in SETS if one[0] == robot)
     nominal, clean = clean_rows(shared_data, robot, file, every)
     mistake = next(one for one in mistakes if one.name == name)
@@ -59,8 +51,8 @@ def fanuc(shared_data: Path) -> tuple[Robot, Measurements]:
     return robot, Measurements.read_csv(shared_data / "fanuc_r2000" / "positions.csv", robot)
 
 
-def test_targets_are_named_as_they_fit(shared_data, tmp_path):
-    """Reflectors under one name are counted, mislabelled rows are listed with the name that they fit."""
+def test_wrong_target_names_are_found(shared_data, tmp_path):
+    """Reflectors under one name are counted, and mislabelled rows are listed with the name that fits."""
     robot, rows = fanuc(shared_data)
     clean = answer(Mistake("none", unchanged, ""), robot, rows, tmp_path)
     assert clean.status == 0
@@ -70,8 +62,8 @@ def test_targets_are_named_as_they_fit(shared_data, tmp_path):
     turned = {"A": "B", "B": "C", "C": "A"}
     wrong = tuple(turned[name] if row % 37 == 0 else name for row, name in enumerate(rows.target))
     (mixed,) = find_faults_as_drawn(robot, replace(rows, target=wrong))
-    assert "20 of 720 rows fit another target" in mixed.clause
-    assert "line 2 fits 'A' instead of 'B'" in mixed.advice
+    assert "20 of 720" in mixed.clause
+    assert re.search(r"line 2 .*'A'.*'B'", mixed.advice)
     mislabelled = Mistake("", lambda clean, robot: replace(clean, target=wrong), "")
     got = answer(mislabelled, robot, rows, tmp_path)
     assert got.status in (2, 3)

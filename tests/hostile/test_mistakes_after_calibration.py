@@ -1,4 +1,4 @@
-"""`verify` and `evaluate` judge orientations as they judge positions: a mistake in them is named, and not accepted."""
+"""`verify` and `evaluate` check orientations like positions: a mistake in them is named, and not accepted."""
 
 import re
 from dataclasses import replace
@@ -6,6 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 from hostile.mistakes import POSES, SETS, clean_rows
+from testing.models import no_type_checker
 
 from pisigma.workflow import calibrate
 from pisigma.workflow.evaluate import evaluate
@@ -19,7 +20,7 @@ pytestmark = pytest.mark.usefixtures("without_type_checker")
 def poses(shared_data):
     """A UR10, rows to calibrate with, and others."""
     robot, file, _, _ = SETS[1]
-    nominal, clean = clean_rows(shared_data, robot, file, 6)
+    nominal, clean = clean_rows(shared_data, robot, file, 12)
     even = torch.arange(clean.rows) % 2 == 0
     return nominal, clean.select(even), clean.select(~even)
 
@@ -28,10 +29,16 @@ def calibrated(nominal, rows):
     return calibrate.calibrate(nominal, rows, CalibrationSettings(model="geometric", folds=0)).model
 
 
+@pytest.fixture(scope="module")
+def model(poses):
+    """The model of the poses to calibrate with."""
+    with no_type_checker():
+        return calibrated(*poses[:2])
+
+
 @pytest.mark.parametrize("name", ["sign of q6", "quaternion wxyz"])
-def test_orientations_are_judged(poses, name):
-    nominal, training, rows = poses
-    model = calibrated(nominal, training)
+def test_orientations_are_checked(poses, model, name):
+    nominal, _, rows = poses
     mistake = next(one for one in POSES if one.name == name)
     wrong = mistake.change(rows, nominal)
     verification, evaluation = verify(model, wrong), evaluate(model, wrong)
@@ -41,10 +48,9 @@ def test_orientations_are_judged(poses, name):
     assert re.search(mistake.words, evaluation.diagnostics[0].sentence, re.IGNORECASE)
 
 
-def test_orientations_that_no_model_knows_are_not_judged(poses):
-    """A model of positions does not say how its tool is turned, so that poses show nothing of it."""
+def test_orientations_that_the_model_does_not_determine_are_not_checked(poses, model):
+    """A model calibrated with positions does not determine its tool's orientation."""
     nominal, training, rows = poses
-    for measured in (training, replace(training, rotation=None)):
-        model = calibrated(nominal, measured)
-        assert verify(model, rows).verdict == "better"
-        assert evaluate(model, rows).accepted
+    for one in (model, calibrated(nominal, replace(training, rotation=None))):
+        assert verify(one, rows).verdict == "better"
+        assert evaluate(one, rows).accepted

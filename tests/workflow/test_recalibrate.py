@@ -90,7 +90,7 @@ def test_a_wrong_row_beside_a_collision_is_left_out_and_named(after_collision):
 
 
 def test_a_row_that_no_error_explains_is_left_out_and_named():
-    rows = rows_later(25, 2)
+    rows = rows_later(14, 2)
     wrong = rows.position.clone()
     wrong[4] += torch.tensor([0.3, -0.1, 0.2])
     wrong[9, 0] += 0.005
@@ -99,7 +99,7 @@ def test_a_row_that_no_error_explains_is_left_out_and_named():
         (4, rows.place(4)),
         (9, rows.place(9)),
     ]
-    assert result.summary.rows == 23
+    assert result.summary.rows == 12
     assert not result.moved
 
 
@@ -114,13 +114,12 @@ def test_rows_of_another_arm_are_not_trusted(tmp_path):
     assert not (tmp_path / "no").exists()
 
 
-@pytest.mark.parametrize(("name", "rows"), [("ur5", 10), ("ur5", 30)])
-def test_rows_of_another_robot_of_the_catalogue_are_named(name, rows, tmp_path):
-    """With many rows, a calibration from scratch predicts held-out rows well, with other link lengths."""
-    q = rows_later(rows, 4).q
-    later = Measurements(q, forward_kinematics(Robot.load(name), q)[:, :3, 3])
+def test_rows_of_another_robot_of_the_catalogue_are_named(tmp_path):
+    """There are enough rows for a calibration from scratch to predict held-out ones, with other link lengths."""
+    q = rows_later(30, 4).q
+    later = Measurements(q, forward_kinematics(Robot.load("ur5"), q)[:, :3, 3])
     result = recalibrate(model_before(), later)
-    assert [(one.kind, one.cause) for one in result.summary.diagnostics[:1]] == [("other_robot", name)]
+    assert [(one.kind, one.cause) for one in result.summary.diagnostics[:1]] == [("other_robot", "ur5")]
     with refused(AcceptanceError, file=tmp_path / "another"):
         result.save(tmp_path / "another")
 

@@ -23,7 +23,7 @@ from pisigma.workflow.verify import read_for_verification, verify
 
 pytestmark = pytest.mark.usefixtures("without_type_checker")
 
-ROWS = 50
+ROWS = 30
 FRAME = transform_from_xyzrpy(torch.tensor([0.3, -0.2, 0.1, 0.5, 0.2, -0.3], dtype=torch.float64))
 
 

@@ -37,7 +37,7 @@ def in_this_process(monkeypatch):
 def plant(tmp_path):
     """Three robots, of which the file of one is bad."""
     for number in range(2):
-        rows_later(30, number).write_csv(tmp_path / f"{number}.csv", model_before().robot)
+        rows_later(20, number).write_csv(tmp_path / f"{number}.csv", model_before().robot)
     (tmp_path / "bad.csv").write_text("q1_deg\nx\n", encoding="utf-8")
     lines = (
         "id,robot,data,date,options",
@@ -89,7 +89,7 @@ def test_sessions_recalibrate_or_are_monitored(plant):
     save_model(model_before(), save_folder)
     for month, moved in ((11, 0.0), (12, math.radians(0.25))):
         shift = (0.0, 0.0, moved, 0.0, 0.0, 0.0)
-        rows_later(12, month, shift).write_csv(plant / f"2025-{month}-01.csv", model_before().robot)
+        rows_later(10, month, shift).write_csv(plant / f"2025-{month}-01.csv", model_before().robot)
     rows = "".join(f"a,rb5,2025-{month}-01.csv,first\n" for month in (11, 12))
     (plant / "aged.csv").write_text(f"id,robot,data,model\n{rows}", encoding="utf-8")
     monitored = run_fleet(plant / "aged.csv", plant / "watched", FleetSettings(task="monitor", jobs=1))
