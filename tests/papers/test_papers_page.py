@@ -1,4 +1,4 @@
-"""`training/README.md` is what its generator makes of the stored results, whole, and with every table of the papers."""
+"""`training/README.md` is generated from the stored results, with every table of the papers."""
 
 import json
 import os
@@ -23,9 +23,9 @@ from stored_results import read_results, result_text
 
 TABLES = {"jeong1998": 2, "park2022": 10, "jigs": 10}
 PICTURES = {"jeong1998": 8, "park2022": 11, "jigs": 6}
-"""How many tables and figures the papers have."""
-LARGEST = 150_000
-"""Bytes of a picture."""
+"""Numbers of tables and figures of the papers."""
+MAX_BYTES = 150_000
+"""Maximum size of a picture [bytes]."""
 
 
 @pytest.fixture(scope="module")
@@ -58,7 +58,7 @@ def test_the_pictures_are_those_that_the_page_shows(training, remade, page):
         assert {path.name for path in (folder / FIGURES).iterdir()} == shown
         for path in (folder / FIGURES).iterdir():
             assert path.read_bytes().startswith(b"\x89PNG")
-            assert 5_000 < path.stat().st_size < LARGEST, path.name
+            assert 5_000 < path.stat().st_size < MAX_BYTES, path.name
 
 
 def test_every_recipe_has_a_stored_result_and_a_part_of_the_page(training, page):

@@ -1,6 +1,7 @@
-"""Planning of touches: what is linearised is right, exchanges are what they say, and the plan is a good one."""
+"""Planning of touches: linearisation, exchanges, and the quality of the plan."""
 
 import math
+import re
 
 import numpy as np
 import pytest
