@@ -1,4 +1,4 @@
-"""Leaving out other members of redundant sets: the same predictions, other values."""
+"""Elimination of other members of redundant sets gives the same predictions with other values."""
 
 import json
 

@@ -1,4 +1,4 @@
-"""The report of touched jigs: figures mean what the paper's do, and report, card and pictures belong together."""
+"""The report of touched jigs: its figures are defined as in the paper, and it agrees with card and pictures."""
 
 import json
 
@@ -28,7 +28,7 @@ def recipe(repository):
 
 @pytest.fixture(scope="module")
 def trained(repository, tmp_path_factory):
-    """What running gives for a small form of the shipped recipe: the folder and the report."""
+    """Folder and report of a small version of the shipped recipe."""
     folder = tmp_path_factory.mktemp("jigs")
     text = (repository / "training" / JIGS).read_text(encoding="utf-8")
     for old, new in (
@@ -79,7 +79,7 @@ def test_an_error_of_a_jigs_base_is_seen_from_that_jig_only(recipe):
     assert_close(accuracy.seen_from["jig_2"], torch.tensor([[-1e-3, 0, 2e-3]] * 4), atol=1e-9)
 
 
-def test_the_two_ways_of_seeing_differ_by_a_turn_where_the_base_is_right(recipe):
+def test_errors_in_the_robot_and_jig_frames_differ_by_a_rotation_where_the_base_is_right(recipe):
     bench = Bench.of(recipe)
     bases = {placement.name: placement.true_base.to_si() for placement in recipe.placements}
     accuracy = measure_accuracy(bench, JigCalibration(nominal_calibration(recipe).arm, bases))
@@ -103,7 +103,7 @@ def test_ratios_are_averages_over_averages():
 
 
 def test_the_default_is_no_worse_than_the_true_models_parameters_by_least_squares(recipe):
-    """Of all 50 seeds the ratios are 0.98 and 0.99; seed by seed either can win."""
+    """Over all 50 seeds the ratios are 0.98 and 0.99; for a single seed either can be better."""
     bench, found = Bench.of(recipe), {"paper": [], "default": []}
     with no_type_checker():
         for seed in range(8):
@@ -118,7 +118,7 @@ def test_the_default_is_no_worse_than_the_true_models_parameters_by_least_square
     assert workspace <= 1.0
 
 
-def test_one_jig_alone_is_no_comparison(recipe):
+def test_one_jig_alone_is_refused(recipe):
     with refused(RecipeError, option="placements", value=1):
         run_jigs(recipe.model_copy(update={"placements": recipe.placements[:1]}))
 
@@ -156,7 +156,7 @@ def test_the_model_has_a_card_with_its_pictures(trained):
         assert sentence in card
 
 
-def test_the_model_holds_both_jigs_and_brings_the_tool_there(trained, recipe):
+def test_the_model_has_both_jigs_and_reaches_their_test_points(trained, recipe):
     solve, true_robot = pisigma.load(trained[0]), recipe.true_robot()
     assert sorted(solve.model.bases) == ["jig_1", "jig_2"]
     bases = {p.name: p.true_T_jig_base for p in recipe.placements}

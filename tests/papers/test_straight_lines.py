@@ -1,4 +1,4 @@
-"""Straight lines: exact with the true parameters, and off by what geometry says with wrong ones."""
+"""Straight lines are exact with the true parameters, and have the predicted deviations with wrong ones."""
 
 import math
 
@@ -46,7 +46,7 @@ def test_with_the_true_parameters_lines_are_straight(rows: dict):
         assert_close(line.largest_across, 0.0, atol=1e-9)
 
 
-def test_taught_ends_are_met_and_the_middle_is_not():
+def test_taught_end_points_are_exact_and_the_middle_deviates():
     true, controller = true_robot(ERRORS), Controller(NOMINAL, NOMINAL, BRANCH)
     line = move_l(true, controller, LINE, steps=21)
     assert_close(line.deviation[[0, -1]], torch.zeros(2, 3), atol=1e-9)
@@ -57,7 +57,7 @@ def test_taught_ends_are_met_and_the_middle_is_not():
     assert_close(line.largest_across, away[:, [0, 2]].norm(dim=-1).max(), rtol=1e-12)
 
 
-def test_only_the_start_of_an_i_move_is_met():
+def test_only_the_start_of_an_i_move_is_exact():
     true, controller = true_robot(ERRORS), Controller(NOMINAL, NOMINAL, BRANCH)
     line = i_move(true, controller, LINE[0], SHIFT)
     assert_close(line.deviation[0], torch.zeros(3), atol=1e-9)
@@ -72,7 +72,7 @@ def test_a_wrong_tool_does_not_bend_lines_of_one_orientation():
     assert_close(i_move(true, controller, LINE[0], SHIFT).deviation, torch.zeros(101, 3), atol=1e-9)
 
 
-def test_a_wrong_zero_of_the_first_joint_turns_an_i_move():
+def test_a_wrong_zero_of_the_first_joint_rotates_an_i_move():
     angle = 0.5
     true, controller = true_robot({"theta_1": {"theta_deg": angle}}), Controller(NOMINAL, NOMINAL, BRANCH)
     line = i_move(true, controller, LINE[0], SHIFT)

@@ -1,7 +1,6 @@
 """Planning of touches: linearisation, exchanges, and the quality of the plan."""
 
 import math
-import re
 
 import numpy as np
 import pytest
@@ -150,7 +149,7 @@ def test_all_candidates_can_be_planned():
     assert len(plan.path) == 1
 
 
-def test_what_cannot_be_planned_is_refused():
+def test_impossible_plans_are_refused():
     problem, found = random_problem(5, 2, 0), candidates(3)
     Ts = torch.stack([placement.T_jig_base for placement in PLACEMENTS])
     for count in (0, 6):
