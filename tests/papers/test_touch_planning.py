@@ -159,7 +159,7 @@ def test_impossible_plans_are_refused():
         build_planning_problem(ROBOT, found, Ts, found.q[:0], FREE)
     with refused(IdentificationError, option="free", value="tool_x"):
         build_planning_problem(ROBOT, found, Ts, found.q, ("a_1", "tool_x"))
-    with pytest.raises(IdentificationError, match="no parameter 'a_9'"):
+    with refused(IdentificationError, value="a_9"):
         build_planning_problem(ROBOT, found, Ts, found.q, ("a_9",))
 
 

@@ -262,8 +262,8 @@ class FleetConsistency:
         if self.odd:
             return (
                 f"This robot is inconsistent with the fleet: fewer than 1 in {1 / FALSE_ALARM:,.0f} of its robots are "
-                "as far from the mean, and the usual errors of its class explain the rows better. The fleet prior is not used "
-                "if the rows suffice for a calibration without it."
+                "as far from the mean, and the usual errors of its class explain the rows better. The fleet prior is "
+                "not used if the rows suffice for a calibration without it."
             )
         share = f"{100 * self.probability:.0f} %" if self.probability >= 0.01 else "fewer than 1 %"
         return f"This robot is consistent with the fleet: {share} of its robots are as far from the mean, or farther."
