@@ -17,15 +17,8 @@ from torch import Tensor
 from pisigma.files.errors import MeasurementError, Place
 from pisigma.measurement.csv.reading import read_fields
 from pisigma.measurement.csv.writing import write_fields
-from pisigma.measurement.fields import (
-    KINDS,
-    Kind,
-    LeftOut,
-    MeasuredFields,
-    OnBadRow,
-    RowPlace,
-    joined_fields,
-)
+from pisigma.measurement.faults import RowPlace
+from pisigma.measurement.fields import KINDS, Kind, LeftOut, MeasuredFields, OnBadRow, joined_fields
 from pisigma.measurement.readings import READINGS
 from pisigma.measurement.rules import check_fields
 from pisigma.robot import Robot

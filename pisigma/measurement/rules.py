@@ -11,7 +11,8 @@ from torch import Tensor
 
 from pisigma.files.errors import MeasurementError, Place, nearest_choice
 from pisigma.measurement.dates import WANTED, is_date
-from pisigma.measurement.fields import NUMBERS, TEXTS, Fault, MeasuredFields
+from pisigma.measurement.faults import Fault
+from pisigma.measurement.fields import NUMBERS, TEXTS, MeasuredFields
 from pisigma.measurement.readings import READINGS, Unit, from_si, reading_numbers, reading_texts
 
 AXES = ("x", "y", "z")

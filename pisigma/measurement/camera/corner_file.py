@@ -20,7 +20,8 @@ from pisigma.measurement.csv.columns import CORNERS, POSITION
 from pisigma.measurement.csv.reading import fields_of, number_column, text_column
 from pisigma.measurement.csv.table import Table, read_table
 from pisigma.measurement.dataset import Measurements, join
-from pisigma.measurement.fields import Fault, MeasuredFields, RowPlace
+from pisigma.measurement.faults import Fault, RowPlace
+from pisigma.measurement.fields import MeasuredFields
 from pisigma.measurement.sensors.intrinsics import NOISE_COLUMN
 from pisigma.robot.description import Robot
 

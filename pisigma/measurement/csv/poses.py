@@ -17,7 +17,8 @@ from pisigma.measurement.csv.columns import POSITION, QUATERNION, RPY, Column, f
 from pisigma.measurement.csv.header import check_separators
 from pisigma.measurement.csv.rows import QUATERNION_TOLERANCE
 from pisigma.measurement.csv.table import content_lines, header_names, split_line
-from pisigma.measurement.fields import Fault, LeftOut
+from pisigma.measurement.faults import Fault
+from pisigma.measurement.fields import LeftOut
 from pisigma.measurement.readings import to_si
 from pisigma.robot.row import MAX_MAGNITUDE
 from pisigma.robot.se3 import rotation_from_quaternion, rotation_from_rpy, transform

@@ -126,7 +126,7 @@ def _labels(layout: Layout) -> Labels:
     """Return the columns that messages name, the first one of a field of several, and their units."""
     names = {quantity: layout.column(quantity).name for quantity in layout.index}
     groups = {field.name: field.quantities for field in number_fields() if len(field.quantities) > 1}
-    groups |= {sensor: (*readings.numbers, *readings.texts) for sensor, readings in READINGS.items()}
+    groups |= {sensor: readings.numbers for sensor, readings in READINGS.items()}
     for name, group in groups.items():
         if set(group) <= set(layout.index):
             names[name] = layout.column(group[0]).name

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float64
 from pisigma.measurement.csv.columns import QUATERNION, Column, quoted
 from pisigma.measurement.csv.header import Layout
 from pisigma.measurement.csv.table import Faults, Table
-from pisigma.measurement.fields import Fault
+from pisigma.measurement.faults import Fault
 from pisigma.measurement.readings import READINGS, from_si, to_si
 from pisigma.measurement.rules import rows_where
 from pisigma.robot import Robot, Row

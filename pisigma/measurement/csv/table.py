@@ -10,7 +10,7 @@ from jaxtyping import Bool
 
 from pisigma.files.errors import MeasurementError, Place, printable
 from pisigma.files.input_file import read_text
-from pisigma.measurement.fields import Fault
+from pisigma.measurement.faults import Fault
 
 SPREADSHEET_ERRORS = frozenset(
     ("#N/A", "#NV", "#REF!", "#VALUE!", "#DIV/0!", "#NAME?", "#NUM!", "#NULL!", "#SPILL!", "#CALC!")

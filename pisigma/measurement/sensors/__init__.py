@@ -1,4 +1,4 @@
-"""What sensors measure: columns of files, residuals, derivatives and held-out errors, one file a sensor."""
+"""Sensors: columns of files, residuals, derivatives and held-out errors, one file per sensor."""
 
 from pisigma.measurement.readings import ReadingColumn, Readings, RowFault, SensorReadings
 from pisigma.measurement.sensors.registry import SENSORS, register_sensor

@@ -1,4 +1,4 @@
-"""Cameras: the pose that the corners of a board in one image give, weighted by its whole covariance."""
+"""Cameras: the pose of a board from the corners in one image, weighted by its full covariance."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float, Float64, Int64
 from torch import Tensor
 
 from pisigma.measurement.dataset import Measurements
+from pisigma.measurement.faults import Fault
 from pisigma.measurement.readings import ReadingColumn, Readings, RowFault, SensorReadings
 from pisigma.measurement.sensors.intrinsics import (
     CAMERA_COLUMN,
@@ -39,31 +40,38 @@ from pisigma.robot.se3 import rotation_from_vector
 
 WEIGHT_COLUMN = "corner_weight"
 WEIGHTS = 21
-"""Numbers of a lower triangular matrix of six rows."""
+"""Number of entries of a lower triangular matrix with six rows."""
 
 
 def weight_text(weight: Float64[np.ndarray, "6 6"]) -> str:
-    """Return what a cell of the weights' column holds: the lower triangle, row by row, with blanks between."""
+    """Return the text of a cell of weights: the lower triangle, row by row, separated by blanks."""
     return " ".join(f"{value:.17g}" for value in weight[np.tril_indices(6)])
 
 
 def _row_faults(readings: Readings) -> Iterator[RowFault]:
-    """Find rows with noise or weights alone, and noise or weights that are none."""
+    """Find rows with only one of noise and weights, and rows with invalid ones."""
     noise = np.asarray(readings[NOISE_COLUMN])
     texts = readings[WEIGHT_COLUMN]
     weighted = np.array([bool(numbers_in(str(text), WEIGHTS)) for text in texts])
     yield (
         np.isfinite(noise) != weighted,
-        lambda row: f"a noise and {WEIGHTS} weights with blanks between were wanted, got '{texts[row]}'",
+        lambda row: Fault(
+            column=WEIGHT_COLUMN,
+            expected=f"a noise and {WEIGHTS} weights separated by blanks",
+            value=str(texts[row]),
+        ),
     )
-    yield noise <= 0, lambda row: f"a positive noise was wanted, got {noise[row] * 1e3:.6g} mm"
+    yield (
+        noise <= 0,
+        lambda row: Fault(expected="a noise > 0 mm", value=float(f"{noise[row] * 1e3:.6g}")),
+    )
     for name, count in ((INTRINSICS_COLUMN, SIZE), (SCALE_COLUMN, 1)):
         stated = [str(text) for text in readings[name]]
         wrong = np.array([bool(text) and not numbers_in(text, count) for text in stated])
         yield (
             wrong,
-            lambda row, name=name, count=count, stated=stated: (  # type: ignore[misc]
-                f"{name}: {count} numbers with blanks between were wanted, got '{stated[row][:40]}'"
+            lambda row, name=name, count=count, stated=stated: Fault(  # type: ignore[misc]
+                column=name, expected=f"{count} numbers separated by blanks", value=stated[row][:40]
             ),
         )
 
@@ -72,21 +80,21 @@ def _row_faults(readings: Readings) -> Iterator[RowFault]:
 class CornerSensor(AbstractSensor):
     """A camera that sees a board: `W · (position; rotation vector)` of measured against predicted poses.
 
-    An image determines some directions of its pose much better than others, and shift and turn together. So the row
-    of an image states, beside the pose, a lower triangular W with `W^T W` the inverse covariance of (position [m],
-    turn [rad]) in the axes of the row's frame. The covariance is the sum of what the corners leave open and of the
-    robot's repeatability: the pose error that all corners of an image share is thereby eliminated in closed form.
-    Values are the noise of one corner, as a length at the board, times W times the errors.
+    An image determines some directions of its pose much better than others, and position and rotation are correlated.
+    The row of an image therefore states, in addition to the pose, a lower triangular W with `W^T W` the inverse
+    covariance of (position [m], rotation vector [rad]) in the axes of the row's frame. The covariance is the sum of
+    that of the corners and of the robot's repeatability; the pose error that all corners of an image share is thereby
+    eliminated in closed form. Values are the noise of one corner, as a length at the board, times W times the errors.
 
     Attributes:
         position: measured positions [m].
         rotation: measured rotations, the row index last.
-        weight: noise times W for errors seen from the base's anchor [1, and m/rad].
-        present: whether a row has one.
-        camera: index of the camera among those whose intrinsics are identified, -1 where a row has none.
-        at: the intrinsics that the poses were solved with.
+        weight: noise times W for errors in the frame of the base's anchor [1, and m/rad].
+        present: which rows are from an image.
+        camera: index of the camera among those whose intrinsics are estimated, -1 in rows without one.
+        at: intrinsics with which the poses were solved.
         by_intrinsics: derivative of the weighted measured pose by the intrinsics.
-        board: index of the board, -1 where a row has none.
+        board: index of the board, -1 in rows without one.
         by_scale: derivative of the weighted measured pose by the scale of the board [m].
         sigma: None; the noise is estimated.
     """
@@ -123,8 +131,9 @@ class CornerSensor(AbstractSensor):
         rotation = torch.where(present[:, None, None], R.mT @ data.rotation @ rows.tools.mT, eye)
         position = torch.where(present, ((data.position - p)[:, None] @ R)[:, 0].t(), 0.0)
         weight = _scaled_weights(data)
-        turned = (weight.view(-1, 6, 2, 3) @ R[:, None]).view(-1, 6, 6)
-        turned = torch.where(present[:, None, None], turned, 0.0)
+        # errors are in the frame of the base's anchor, weights in the axes of the row's frame
+        rotated = (weight.view(-1, 6, 2, 3) @ R[:, None]).view(-1, 6, 6)
+        rotated = torch.where(present[:, None, None], rotated, 0.0)
         images = ImageIntrinsics.of(texts_of(data, INTRINSICS_COLUMN))
         of_camera, of_board = cameras(data), boards(data)
         at, by = (torch.from_numpy(values).to(R) for values in (images.at, images.by))
@@ -132,7 +141,7 @@ class CornerSensor(AbstractSensor):
         return cls(
             position,
             rotation.permute(1, 2, 0).contiguous(),
-            turned.permute(1, 2, 0),
+            rotated.permute(1, 2, 0),
             present,
             camera=rows.numbers(of_camera, names_of(of_camera)),
             at=at.t(),
@@ -143,8 +152,8 @@ class CornerSensor(AbstractSensor):
 
     def residual(self, motion: ToolMotion, unknowns: Unknowns, rows: slice) -> Values:
         """Return the weighted errors of the poses [m]."""
-        off = torch.cat([self.position[:, rows] - motion.position, self._turned(motion, rows)])
-        residual: Tensor = torch.einsum("ijn,jn->in", self.weight[..., rows], off)
+        error = torch.cat([self.position[:, rows] - motion.position, self._rotation_error(motion, rows)])
+        residual: Tensor = torch.einsum("ijn,jn->in", self.weight[..., rows], error)
         if "camera" in unknowns:
             moved = unknowns["camera"][:, self.camera[rows]] - self.at[:, rows]
             residual += torch.einsum("ijn,jn->in", self.by_intrinsics[..., rows], moved)
@@ -153,44 +162,44 @@ class CornerSensor(AbstractSensor):
         return residual
 
     def derivative(self, motion: ToolMotion, unknowns: Unknowns, rows: slice) -> Derivative:
-        """Return the weighted shift and turn of the tool.
+        """Return the weighted shift and rotation of the tool.
 
-        A turn ω of the predicted pose lowers the rotation vector r by `ω + r × ω / 2 + r × (r × ω) / 12`, the inverse
-        right Jacobian of SO(3) to the third order in r (Chirikjian 2012, eq. 10.86).
+        A rotation ω of the predicted pose changes the rotation vector r by `-(ω + r × ω / 2 + r × (r × ω) / 12)`, the
+        inverse right Jacobian of SO(3) to third order in r (Chirikjian 2012, eq. 10.86).
         """
-        r = self._turned(motion, rows)[None].expand(len(motion.derivative), -1, -1)
-        turn = motion.derivative[:, 3:]
-        once = torch.linalg.cross(r, turn, dim=1)
-        turn = turn + once / 2 + torch.linalg.cross(r, once, dim=1) / 12
-        shift_and_turn = torch.cat([motion.derivative[:, :3], turn], 1)
-        derivative: Tensor = torch.einsum("ijn,pjn->pin", self.weight[..., rows], shift_and_turn)
+        r = self._rotation_error(motion, rows)[None].expand(len(motion.derivative), -1, -1)
+        omega = motion.derivative[:, 3:]
+        once = torch.linalg.cross(r, omega, dim=1)
+        rotation = omega + once / 2 + torch.linalg.cross(r, once, dim=1) / 12
+        shift_and_rotation = torch.cat([motion.derivative[:, :3], rotation], 1)
+        derivative: Tensor = torch.einsum("ijn,pjn->pin", self.weight[..., rows], shift_and_rotation)
         return derivative
 
     def unknown_derivatives(
         self, motion: ToolMotion, unknowns: Unknowns, rows: slice
     ) -> tuple[UnknownDerivative, ...]:
-        """Return minus the change of the measured pose with the intrinsics and the scale of the board."""
+        """Return the negative derivative of the measured pose by the intrinsics and the scale of the board."""
         of_camera = UnknownDerivative(
             "camera", self.camera[rows], -self.by_intrinsics[..., rows].transpose(0, 1)
         )
         of_board = UnknownDerivative("board", self.board[rows], -self.by_scale[None, :, rows])
         return tuple(one for one in (of_camera, of_board) if one.group in unknowns)
 
-    def _turned(self, motion: ToolMotion, rows: slice) -> Float[Tensor, "3 poses"]:
+    def _rotation_error(self, motion: ToolMotion, rows: slice) -> Float[Tensor, "3 poses"]:
         return rotation_difference(self.rotation[..., rows], motion.rotation)
 
 
 def position_deviations(measurements: Measurements) -> Float64[Tensor, "rows 3"]:
-    """Return standard deviations of positions [1: per noise of a corner], NaN in rows that no image gave."""
+    """Return standard deviations of positions relative to the noise of a corner; NaN in rows of other sensors."""
     weight = _scaled_weights(measurements)
-    by_image = measurements.measured("corner")
+    from_image = measurements.measured("corner")
     eye = torch.eye(6).to(weight)
-    spread = torch.linalg.inv(torch.where(by_image[:, None, None], weight, eye))
-    return torch.where(by_image[:, None], spread[:, :3].norm(dim=-1), torch.nan)
+    root = torch.linalg.inv(torch.where(from_image[:, None, None], weight, eye))
+    return torch.where(from_image[:, None], root[:, :3].norm(dim=-1), torch.nan)
 
 
 def _scaled_weights(measurements: Measurements) -> Float64[Tensor, "rows 6 6"]:
-    """Noise times W of every row, 0 in rows that no image gave."""
+    """Return the noise times W of every row, 0 in rows that are not from images."""
     scaled = measurements.q.new_zeros(measurements.rows, 6, 6)
     noise, texts = (measurements.readings.get(name) for name in (NOISE_COLUMN, WEIGHT_COLUMN))
     if isinstance(noise, Tensor) and isinstance(texts, tuple):
@@ -206,9 +215,8 @@ def as_poses(
     """Return rows of images as plain poses, without the weights of their corners.
 
     Args:
-        measurements: with rows of images or without.
-        unknowns: by group and owner, what was identified; images of a camera or a board that is not here are as they
-            were read.
+        measurements: measurements with or without rows of images.
+        unknowns: estimates by group and owner; poses of other cameras and boards are not changed.
     """
     names = (NOISE_COLUMN, WEIGHT_COLUMN, CAMERA_COLUMN, INTRINSICS_COLUMN, SCALE_COLUMN)
     others = {name: values for name, values in measurements.readings.items() if name not in names}
@@ -232,24 +240,24 @@ def as_poses(
 
 
 def with_held_camera(measurements: Measurements, length: float, angle: float) -> Measurements:
-    """Return rows of images as with certain intrinsics and board, but with more noise of their poses.
+    """Return rows of images with fixed intrinsics and board scale, and with additional noise of their poses.
 
     Args:
         measurements: the rows.
-        length: standard deviation of each coordinate that is added [m].
-        angle: and of a turn about each axis [rad].
+        length: standard deviation of the additional noise of each coordinate [m].
+        angle: standard deviation of the additional noise of the rotation about each axis [rad].
     """
     texts = measurements.readings.get(WEIGHT_COLUMN)
     if not isinstance(texts, tuple):
         return measurements
-    more = np.diag([length**2] * 3 + [angle**2] * 3)
+    added = np.diag([length**2] * 3 + [angle**2] * 3)
     weights = []
     for text in texts:
         numbers = numbers_in(text, WEIGHTS)
         if numbers:
             W = np.zeros((6, 6))
             W[np.tril_indices(6)] = numbers
-            lower = np.linalg.cholesky(np.linalg.inv(W.T @ W) + more)
+            lower = np.linalg.cholesky(np.linalg.inv(W.T @ W) + added)
             text = weight_text(np.linalg.inv(lower))
         weights.append(text)
     others = {

@@ -1,4 +1,4 @@
-"""What images say of their camera's intrinsics and of the scale of their board, whatever the poses are."""
+"""Information of images on their camera's intrinsics and on the scale of their board, with poses eliminated."""
 
 import math
 from collections.abc import Collection, Mapping
@@ -39,24 +39,23 @@ CAMERA_UNITS: dict[str, OtherUnit] = {
     name: "px" if name in PIXELS else "1" for name in (*PIXELS, "k1", "k2", "p1", "p2", "k3")
 }
 NUMBERS = len(CAMERA_UNITS)
-UNSTATED = 1e3
-"""Times as large as stated, deviations say nothing beside what the images show."""
+UNINFORMATIVE = 1e3
+"""Factor on given standard deviations with which they have no influence compared with the images."""
 USUAL_SCALE = 1e-3
-"""Standard deviation of the scale of a board that states none: so much printers and paper are off."""
+"""Standard deviation of the scale of a board without a given one: the error of printers and paper."""
 
 
 @dataclass(frozen=True, eq=False)
 class ImageIntrinsics:
-    """What the corners of images say of their camera's intrinsics k, linearised at `at`.
+    """Information of the corners of images on their camera's intrinsics k, linearised at `at`.
 
     Attributes:
         by: derivative of the measured position and rotation vector, in the axes of the row's frame, by k.
-        root: with `residual` what the corners say of k whatever the poses are: `root (k - at) = residual` with unit
-            variances.
-        residual: see root.
-        at: where the images were linearised.
-        stated: what the file of the camera says.
-        sigma: its standard deviations, 0 of what is held.
+        root: equations of k with the poses eliminated: `root (k - at) = residual` with unit variances.
+        residual: see `root`.
+        at: intrinsics at which the images were linearised.
+        stated: intrinsics of the camera file, the prior mean.
+        sigma: prior standard deviations, 0 for fixed ones.
     """
 
     by: Float64[np.ndarray, "*rows 6 9"]
@@ -67,35 +66,35 @@ class ImageIntrinsics:
     sigma: Float64[np.ndarray, "*rows 9"]
 
     def select(self, rows: Bool[np.ndarray, " rows"]) -> "ImageIntrinsics":
-        """Return some of the images."""
+        """Return the chosen images."""
         return ImageIntrinsics(*(getattr(self, item.name)[rows] for item in fields(self)))
 
     @property
     def texts(self) -> tuple[str, ...]:
-        """What cells of the column of intrinsics hold: all numbers of an image with blanks between."""
+        """Texts of the column of intrinsics: all numbers of an image, separated by blanks."""
         blocks = [getattr(self, item.name).reshape(len(self.at), -1) for item in fields(self)]
         return tuple(" ".join(f"{value:.17g}" for value in row) for row in np.concatenate(blocks, 1))
 
     @staticmethod
     def of(texts: tuple[str, ...]) -> "ImageIntrinsics":
-        """Return what cells hold, 0 where one is empty."""
+        """Parse texts of the column of intrinsics; 0 for empty ones."""
         empty = [0.0] * SIZE
         block = np.array([numbers_in(text, SIZE) or empty for text in texts]).reshape(-1, 19, NUMBERS)
         return ImageIntrinsics(block[:, :6], block[:, 6:15], *(block[:, row] for row in range(15, 19)))
 
 
 SIZE = 19 * NUMBERS
-"""Numbers of a cell of the column of intrinsics."""
+"""Number of values in a cell of the column of intrinsics."""
 
 
 def intrinsics_information(
     images: ImageIntrinsics,
 ) -> tuple[Float64[np.ndarray, "9 9"], Float64[np.ndarray, " 9"]]:
-    """Add up what the images of one camera and its stated deviations say of its intrinsics, whatever the poses are.
+    """Add up the information of the images of one camera and of its prior on its intrinsics, with poses eliminated.
 
     Returns:
-        U [1/px, and 1 from k1 on], with `U^T U` the information (0 of intrinsics that are held), and the mean [px, and
-        1 from k1 on].
+        U [1/px; 1 for distortion] with `U^T U` the information (0 for fixed intrinsics), and the mean [px; 1 for
+        distortion].
     """
     sigma, at = images.sigma[0], images.at[0]
     free = np.flatnonzero(sigma > 0)
@@ -110,18 +109,18 @@ def intrinsics_information(
 
 
 def without_stated(measurements: Measurements, counted: Mapping[str, Collection[str]]) -> Measurements:
-    """Return rows of images that say of some cameras and boards only what their corners show.
+    """Return rows of images without the priors of some cameras and boards.
 
     Args:
-        measurements: with rows of images or without.
-        counted: by group the owners whose stated deviations a model has counted already.
+        measurements: measurements with or without rows of images.
+        counted: cameras and boards, by group, whose priors a model already includes.
     """
     if CAMERA_COLUMN not in measurements.readings:
         return measurements
     stated, scales = (texts_of(measurements, name) for name in (INTRINSICS_COLUMN, SCALE_COLUMN))
     images, names = ImageIntrinsics.of(stated), cameras(measurements) or ("",) * len(stated)
     is_counted = np.array([name in counted.get("camera", ()) for name in names])
-    images = replace(images, sigma=np.where(is_counted[:, None], UNSTATED, 1.0) * images.sigma)
+    images = replace(images, sigma=np.where(is_counted[:, None], UNINFORMATIVE, 1.0) * images.sigma)
     texts = {
         INTRINSICS_COLUMN: tuple(
             text if name else "" for name, text in zip(names, images.texts, strict=True)
@@ -135,7 +134,7 @@ def without_stated(measurements: Measurements, counted: Mapping[str, Collection[
 
 
 def numbers_in(text: str, count: int) -> list[float]:
-    """Return so many numbers with blanks between; none where the text holds anything else."""
+    """Parse `count` numbers separated by blanks; empty if the text is anything else."""
     try:
         numbers = [float(word) for word in text.split()]
     except ValueError:
@@ -144,12 +143,12 @@ def numbers_in(text: str, count: int) -> list[float]:
 
 
 def texts_of(measurements: Measurements, name: str) -> tuple[str, ...]:
-    """Return a column of names that sensors add, "" in every row where it is not there."""
+    """Return a text column of a registered sensor; "" in every row if it does not exist."""
     return measurements.as_fields().text(name)
 
 
 def cameras(measurements: Measurements) -> tuple[str, ...] | None:
-    """Name per row the camera whose intrinsics are to be identified, "" where there is none; None in all of them."""
+    """Return per row the camera whose intrinsics are estimated, or ""; None if there is none in any row."""
     stated = zip(
         texts_of(measurements, CAMERA_COLUMN), texts_of(measurements, INTRINSICS_COLUMN), strict=True
     )
@@ -158,9 +157,9 @@ def cameras(measurements: Measurements) -> tuple[str, ...] | None:
 
 
 def boards(measurements: Measurements) -> tuple[str, ...] | None:
-    """Name per row the board of an image, which is its frame or its target, whichever is not the camera.
+    """Return per row the board of an image: its frame or its target, whichever is not the camera.
 
-    Where a model names neither, it is called "board".
+    Boards without a name are named "board".
     """
     cells = zip(texts_of(measurements, CAMERA_COLUMN), measurements.frame, measurements.target, strict=True)
     names = tuple(
@@ -170,9 +169,9 @@ def boards(measurements: Measurements) -> tuple[str, ...] | None:
 
 
 def scale_deviations(measurements: Measurements) -> Float64[Tensor, " boards"]:
-    """Return per board the prior standard deviation of its scale [1], 0 where the scale is held.
+    """Return the relative prior standard deviation of the scale of every board, 0 for fixed scales.
 
-    It is held where no deviation is stated and no other row has a length that could correct it.
+    A scale is fixed if no deviation is given and no other row has a length that could determine it.
     """
     names, stated = boards(measurements), texts_of(measurements, SCALE_COLUMN)
     other_lengths = bool((~measurements.measured("corner") & ~measurements.measured("rotation")).any())
@@ -183,17 +182,17 @@ def scale_deviations(measurements: Measurements) -> Float64[Tensor, " boards"]:
 
 @dataclass(frozen=True, eq=False)
 class IntrinsicsSensor(AbstractSensor):
-    """What all images of a camera and its calibration say of its intrinsics, in one row of the camera.
+    """Information of all images of a camera and of its prior on its intrinsics, as the value of one row.
 
-    The poses of the boards are eliminated from the images (variable projection, Golub and Pereyra 1973); what is left
-    adds up over images, and the stated deviations are added to it. Values are the noise of one corner, as a length at
-    the board, times `U (mean - k)` with `U^T U` the sum of the information.
+    The poses of the boards are eliminated from the images (variable projection, Golub and Pereyra 1973); the remaining
+    information is summed over the images and the prior. Values are the noise of one corner, as a length at the board,
+    times `U (mean - k)` with `U^T U` the information.
 
     Attributes:
-        owner: index of the camera of every row, -1 where the row holds none.
+        owner: index of the camera of every row, -1 in rows without a value.
         root: noise times U [m per px or 1].
-        mean: what all of it says of k [px or 1].
-        present: whether a row holds a camera's.
+        mean: combined estimate of k [px or 1].
+        present: which rows have the value of a camera.
         sigma: the noise [m].
     """
 
@@ -210,7 +209,7 @@ class IntrinsicsSensor(AbstractSensor):
 
     @classmethod
     def build(cls, rows: SensorRows) -> "IntrinsicsSensor | None":
-        """Add up the information of every camera; None where no intrinsics are to be identified."""
+        """Add up the information on every camera; None if no intrinsics are estimated."""
         data, names = rows.measurements, cameras(rows.measurements)
         if names is None or not bool(rows.by_corners.any()):
             return None
@@ -229,12 +228,12 @@ class IntrinsicsSensor(AbstractSensor):
 
     def residual(self, motion: ToolMotion, unknowns: Unknowns, rows: slice) -> Values:
         """Return the weighted errors of the intrinsics [m]."""
-        off = self.mean[:, rows] - unknowns["camera"][:, self.owner[rows]]
-        residual: Tensor = torch.einsum("ijn,jn->in", self.root[..., rows], off)
+        error = self.mean[:, rows] - unknowns["camera"][:, self.owner[rows]]
+        residual: Tensor = torch.einsum("ijn,jn->in", self.root[..., rows], error)
         return residual
 
     def derivative(self, motion: ToolMotion, unknowns: Unknowns, rows: slice) -> Derivative:
-        """Return 0: the tool has no part in it."""
+        """Return 0, as the values do not depend on the tool."""
         return torch.zeros_like(motion.derivative[:, :1]).expand(-1, NUMBERS, -1)
 
     def unknown_derivatives(
@@ -245,7 +244,7 @@ class IntrinsicsSensor(AbstractSensor):
 
     @classmethod
     def unknowns(cls, measurements: Measurements) -> UnknownGroup | None:
-        """Name the cameras whose intrinsics are to be identified."""
+        """Return the cameras whose intrinsics are estimated."""
         owners, frames = owners_of(measurements, cameras(measurements))
         return (
             UnknownGroup("camera", tuple(CAMERA_UNITS), owners, frames, units=CAMERA_UNITS)
@@ -255,7 +254,7 @@ class IntrinsicsSensor(AbstractSensor):
 
     @classmethod
     def initial_guess(cls, measurements: Measurements, T: Poses, reach: float) -> InitialUnknowns | None:
-        """Start at the stated intrinsics; those without a deviation stay."""
+        """Start at the prior mean of the intrinsics; those without a standard deviation are fixed."""
         names = cameras(measurements)
         if names is None:
             return None
@@ -268,15 +267,15 @@ class IntrinsicsSensor(AbstractSensor):
 
 @dataclass(frozen=True, eq=False)
 class BoardScaleSensor(AbstractSensor):
-    """How sure the stated scale of a board is, in one row of the board.
+    """The prior of the scale of a board, as the value of one row.
 
-    The unknown s makes every length of the board `1 + s` times as long as stated.
+    With the unknown s, every length of the board is `1 + s` times its given length.
 
     Attributes:
-        owner: index of the board of every row, -1 where the row holds none.
-        weight: the noise over the prior standard deviation of s [m].
-        present: whether a row holds a board's.
-        sigma: of the values [m]: the noise of one corner as a length at the board.
+        owner: index of the board of every row, -1 in rows without a value.
+        weight: the noise divided by the prior standard deviation of s [m].
+        present: which rows have the value of a board.
+        sigma: standard deviation of the values [m]: the noise of one corner as a length at the board.
     """
 
     name = "board scale"
@@ -291,7 +290,7 @@ class BoardScaleSensor(AbstractSensor):
 
     @classmethod
     def build(cls, rows: SensorRows) -> "BoardScaleSensor | None":
-        """Put every board that may be of another scale into its first row; None where there is none."""
+        """Assign every board with a free scale to its first row; None if there is none."""
         data, names = rows.measurements, boards(rows.measurements)
         deviations = scale_deviations(data)
         if names is None or not bool((deviations > 0).any()) or not bool(rows.by_corners.any()):
@@ -305,13 +304,13 @@ class BoardScaleSensor(AbstractSensor):
         return cls(owner, weight, owner >= 0, noise)
 
     def residual(self, motion: ToolMotion, unknowns: Unknowns, rows: slice) -> Values:
-        """Return minus the scale by its deviation, as a share of the noise [m]."""
+        """Return the negative scale divided by its standard deviation, times the noise [m]."""
         scale = unknowns["board"][:, self.owner[rows]]
         residual: Tensor = -scale * self.weight[rows]
         return residual
 
     def derivative(self, motion: ToolMotion, unknowns: Unknowns, rows: slice) -> Derivative:
-        """Return 0: the tool has no part in it."""
+        """Return 0, as the values do not depend on the tool."""
         return torch.zeros_like(motion.derivative[:, :1])
 
     def unknown_derivatives(
@@ -322,13 +321,13 @@ class BoardScaleSensor(AbstractSensor):
 
     @classmethod
     def unknowns(cls, measurements: Measurements) -> UnknownGroup | None:
-        """Name the boards."""
+        """Return the boards."""
         owners, frames = owners_of(measurements, boards(measurements))
         return UnknownGroup("board", ("scale",), owners, frames, units={"scale": "1"}) if owners else None
 
     @classmethod
     def initial_guess(cls, measurements: Measurements, T: Poses, reach: float) -> InitialUnknowns | None:
-        """Start at the stated scale."""
+        """Start at the given scale."""
         if boards(measurements) is None:
             return None
         free = scale_deviations(measurements)[:, None] > 0

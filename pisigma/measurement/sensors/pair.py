@@ -22,17 +22,17 @@ from pisigma.measurement.sensors.sensor import (
 )
 from pisigma.robot.kinematics.parameter_jacobian import ToolMotion
 
-LARGEST_MISS = 0.2
-"""[reach] By the robot as drawn, a measured distance between two poses is not wrong by more."""
+MAX_NOMINAL_ERROR = 0.2
+"""[reach] Largest plausible error of a distance between two poses of the nominal robot."""
 
 
 @dataclass(frozen=True, eq=False)
 class PairSensor(AbstractSensor):
-    """The distance between the tools of two rows, which are neighbours; the first of them counts.
+    """The distance between the tools of two neighbouring rows, as a value of the first one.
 
     Attributes:
         measured: the distance [m].
-        present: whether a row is the first of a pair; then it has an even number.
+        present: which rows are the first of a pair; these have even numbers.
         sigma: standard deviation of every row [m], or None.
     """
 
@@ -47,7 +47,7 @@ class PairSensor(AbstractSensor):
 
     @classmethod
     def build(cls, rows: SensorRows) -> "PairSensor | None":
-        """Gather the pairs, whose rows come first, side by side."""
+        """Gather the pairs, whose rows come first and are neighbours."""
         data = rows.measurements
         if data.distance is None or data.pair is None:
             return None
@@ -62,43 +62,45 @@ class PairSensor(AbstractSensor):
         return residual[None]
 
     def derivative(self, motion: ToolMotion, unknowns: Unknowns, rows: slice) -> Derivative:
-        """Return the shift of the first tool against the second along their line."""
+        """Return the relative shift of the tools along their connecting line."""
         return along(unit_vectors(_apart(motion.position)), _apart(motion.derivative[:, :3]))
 
     def partner_derivative(self, motion: ToolMotion) -> Derivative:
-        """Return minus the shift of the next row's tool along the line."""
+        """Return the negative shift of the next row's tool along the line."""
         return -along(unit_vectors(_apart(motion.position)), _following(motion.derivative[:, :3]))
 
     @classmethod
     def initial_guess(cls, measurements: Measurements, T: Poses, reach: float) -> InitialUnknowns | None:
-        """Guess nothing.
+        """Check the distances; there are no unknowns to guess.
 
         Raises:
-            IdentificationError: a distance is far from what the robot as drawn has.
+            IdentificationError: a distance differs too much from that of the nominal robot.
         """
         if measurements.pair is None or measurements.distance is None:
             return None
         rows = torch.arange(0, 2 * len(names_of(measurements.pair)), 2)
         apart = (T[rows, :3, 3] - T[rows + 1, :3, 3]).norm(dim=-1)
         distance = measurements.distance.cpu()[rows]
-        miss = (distance - apart).abs()
-        if len(miss) == 0 or float(miss.max()) <= LARGEST_MISS * reach:
+        error = (distance - apart).abs()
+        if len(error) == 0 or float(error.max()) <= MAX_NOMINAL_ERROR * reach:
             return None
-        worst = int(miss.argmax())
+        worst = int(error.argmax())
         row = int(rows[worst])
         raise IdentificationError(
-            f"{measurements.place(row)}: pair '{measurements.pair[row]}' is {float(distance[worst]) * 1e3:.6g} mm "
-            f"apart, but the guessed robot has its two tool points {float(apart[worst]) * 1e3:.4g} mm apart; "
-            "correct the distance or the names of the pairs."
+            expected=f"about {float(apart[worst]) * 1e3:.4g} mm between the tool points of pair "
+            f"'{measurements.pair[row]}', as for the nominal robot",
+            value=float(f"{float(distance[worst]) * 1e3:.6g}"),
+            at=measurements.at(row, "distance"),
+            remedy="correct the distance or the names of the pairs",
         )
 
 
 def _following(values: Tensor) -> Tensor:
-    """Of every row, what the next one has."""
+    """Return the values of the next row, for every row."""
     return torch.cat([values[..., 1:], values[..., :1]], -1)
 
 
 def _apart(values: Tensor) -> Tensor:
-    """Of every row minus that of the next; it is used in the first rows of pairs only."""
+    """Return the value of every row minus that of the next; only used for the first rows of pairs."""
     apart: Tensor = values - _following(values)
     return apart

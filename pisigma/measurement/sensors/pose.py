@@ -11,7 +11,7 @@ from pisigma.robot.kinematics.parameter_jacobian import ToolMotion
 from pisigma.robot.se3 import rotation_vector
 
 NEARLY_OPPOSITE = -0.99
-"""Cosine of the turn below which its axis comes from the symmetric part."""
+"""Cosine of the rotation angle below which the axis is computed from the symmetric part."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -19,8 +19,8 @@ class PositionSensor(AbstractSensor):
     """A tracker that measures a reflector: three coordinates in its frame.
 
     Attributes:
-        measured: positions [m].
-        present: whether a row has one.
+        measured: measured positions [m].
+        present: which rows have a position.
         sigma: standard deviation of a coordinate [m] of every row, or None.
     """
 
@@ -33,7 +33,7 @@ class PositionSensor(AbstractSensor):
 
     @classmethod
     def build(cls, rows: SensorRows) -> "PositionSensor | None":
-        """Gather the positions, as seen from the bases' anchors."""
+        """Gather the positions in the frames of the bases' anchors."""
         data = rows.measurements
         present = (data.measured("position") | data.measured("pose")) & ~rows.by_corners
         if data.position is None or not bool(present.any()):
@@ -47,17 +47,17 @@ class PositionSensor(AbstractSensor):
         return self.measured[:, rows] - motion.position
 
     def derivative(self, motion: ToolMotion, unknowns: Unknowns, rows: slice) -> Derivative:
-        """Return the tool's shift."""
+        """Return the shift of the tool."""
         return motion.derivative[:, :3]
 
 
 @dataclass(frozen=True, eq=False)
 class RotationSensor(AbstractSensor):
-    """The orientation that a 6D tracker measures, as a rotation vector from the predicted to the measured one.
+    """The orientation of a 6D tracker, as a rotation vector from the predicted to the measured one.
 
     Attributes:
-        measured: rotations, the row index last.
-        present: whether a row has one.
+        measured: measured rotations, the row index last.
+        present: which rows have an orientation.
         sigma: standard deviation of an angle [rad] of every row, or None.
     """
 
@@ -71,7 +71,7 @@ class RotationSensor(AbstractSensor):
 
     @classmethod
     def build(cls, rows: SensorRows) -> "RotationSensor | None":
-        """Gather the orientations, as seen from the bases' anchors and freed of the tools' anchors."""
+        """Gather the orientations relative to the bases' and the tools' anchors."""
         data = rows.measurements
         present = (data.measured("rotation") | data.measured("pose")) & ~rows.by_corners
         if data.rotation is None or not bool(present.any()):
@@ -86,10 +86,10 @@ class RotationSensor(AbstractSensor):
         return rotation_difference(self.measured[..., rows], motion.rotation)
 
     def derivative(self, motion: ToolMotion, unknowns: Unknowns, rows: slice) -> Derivative:
-        """Return the tool's turn.
+        """Return the rotation vectors of the tool's motion.
 
-        The residual r falls by `J_r(r)^-1 turn` rather than by the turn; as `J_r^-T r = r`, the cost's
-        gradient is exact with the turn itself, and the Gauss-Newton matrix is right to second order in r.
+        The exact derivative of the residual r is `-J_r(r)^-1` times that rotation vector. As `J_r^-T r = r`, the
+        gradient of the cost is exact without J_r, and the Gauss-Newton matrix is correct to second order in r.
         """
         return motion.derivative[:, 3:]
 
@@ -97,10 +97,10 @@ class RotationSensor(AbstractSensor):
 def rotation_difference(
     measured: Float[Tensor, "3 3 rows"], predicted: Float[Tensor, "3 3 rows"]
 ) -> Float[Tensor, "3 rows"]:
-    """Return the rotation vectors of measured · predicted^T [rad], as `rotation_vector` has them.
+    """Return the rotation vectors of measured · predicted^T [rad], equal to those of `rotation_vector`.
 
-    Of the product R only its trace and `R - R^T` are worked out, which determine every turn that is not nearly half
-    a one: with m and p the columns of the rotations, the vector part of `R - R^T` is `Σ p × m`.
+    Only the trace of the product R and `R - R^T` are computed, which determine all rotations except those near 180 deg:
+    with m and p the columns of the rotations, the vector part of `R - R^T` is `Σ p × m`.
     """
     twice_sine_axis = torch.linalg.cross(predicted, measured, dim=0).sum(1)
     cosine = ((measured * predicted).sum((0, 1)) - 1) / 2
@@ -108,7 +108,7 @@ def rotation_difference(
         return rotation_vector(torch.einsum("ijn,kjn->nik", measured, predicted)).t()
     sine_square = twice_sine_axis.square().sum(0) / 4
     sine = sine_square.sqrt()
-    # near no turn the quotient is 0 / 0, so its series stands in
+    # near 0 the quotient is 0 / 0, so its series is used there
     factor = torch.where(sine_square > 1e-8, torch.atan2(sine, cosine) / (2 * sine), 0.5 + sine_square / 12)
-    turn: Tensor = twice_sine_axis * factor
-    return turn
+    difference: Tensor = twice_sine_axis * factor
+    return difference

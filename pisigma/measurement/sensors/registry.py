@@ -1,4 +1,4 @@
-"""The registry of sensors: a new kind of sensor is a file of its own and one line here."""
+"""The registry of sensors: a new kind of sensor is a file and one line here."""
 
 import math
 from collections.abc import Mapping
@@ -25,39 +25,41 @@ from pisigma.robot.kinematics.parameter_jacobian import ToolMotion
 from pisigma.robot.se3 import transform
 
 SENSORS: dict[str, type[AbstractSensor]] = {}
-"""All kinds of sensors by name, in the order in which their residuals are added up."""
+"""All kinds of sensors by name, in the order of their residuals."""
 
-GROSS, ROUNDS = 4.0, 3
-"""Rows that are farther off than so many times the median of their owner's do not count for where it is, found in so
-many rounds."""
+OUTLIER_FACTOR, MAX_ITERATIONS = 4.0, 3
+"""Residual relative to the owner's median above which a row is an outlier for the owner's unknowns, and number of
+iterations of the search for outliers."""
 
 IdentifiedUnknowns = Mapping[str, Mapping[str, Float64[np.ndarray, " columns"]]]
-"""By group and owner, what was identified of a sensor's own, in the frame of the owner [m or rad]."""
+"""Estimated unknowns of sensors by group and owner, in the frame of the owner [m or rad]."""
 
 
 def register_sensor(sensor: type[AbstractSensor]) -> type[AbstractSensor]:
-    """Register a kind of sensor with measurement files, calibration and judging; also a class decorator.
+    """Register a kind of sensor for measurement files, calibration and validation; also a class decorator.
 
     Args:
-        sensor: a final subclass of `AbstractSensor`. Its `readings` say which columns it adds to measurement files;
+        sensor: a final subclass of `AbstractSensor`. Its `readings` are the columns that it adds to measurement files;
             only the sensors that come with pisigma may have none.
 
     Returns:
         The same class.
 
     Raises:
-        MeasurementError: there is a sensor of that name already, or one of its columns exists already.
+        MeasurementError: a sensor of that name or one of its columns already exists.
     """
     if sensor.name in SENSORS:
         raise MeasurementError(
-            f"a sensor called '{sensor.name}' is registered already; give yours another name."
+            f"a sensor '{sensor.name}' is already registered", value=sensor.name, remedy="choose another name"
         )
     if sensor.readings is not None:
         for column in sensor.readings.columns:
             for name in (f"{column.name}_{unit}" if unit else column.name for unit in column.units):
                 if find_column(name) is not None:
                     raise MeasurementError(
-                        f"sensor '{sensor.name}': measurement files have a column '{name}' already; name it otherwise."
+                        f"measurement files already have a column '{name}' of the sensor '{sensor.name}'",
+                        value=name,
+                        remedy="choose another name",
                     )
         READINGS[sensor.name] = sensor.readings
     SENSORS[sensor.name] = sensor
@@ -79,23 +81,23 @@ for _sensor in (
 
 
 def build_sensors(rows: SensorRows) -> list[AbstractSensor]:
-    """Gather the measured values of every kind.
+    """Gather the measured values of every kind of sensor.
 
     Raises:
-        IdentificationError: a standard deviation is stated in some rows of a kind only.
+        IdentificationError: only some rows of a kind state a standard deviation.
     """
     built = (sensor.build(rows) for sensor in SENSORS.values())
     return [sensor for sensor in built if sensor is not None]
 
 
 def unknown_groups(measurements: Measurements) -> tuple[UnknownGroup, ...]:
-    """Name what the sensors of some rows have to find out about themselves."""
+    """Return the groups of unknowns of the sensors of some rows."""
     groups = (sensor.unknowns(measurements) for sensor in SENSORS.values())
     return tuple(group for group in groups if group is not None)
 
 
 def pairs_first(measurements: Measurements, rows: Int64[Tensor, " rows"]) -> Int64[Tensor, " rows"]:
-    """Sort rows such that those of pairs come first, side by side; the others keep their order."""
+    """Sort rows such that pairs come first, with their rows next to each other; the others keep their order."""
     if measurements.pair is None:
         return rows
     order = names_of(measurements.pair)
@@ -107,18 +109,18 @@ def pairs_first(measurements: Measurements, rows: Int64[Tensor, " rows"]) -> Int
 def measured_errors(
     T: Float64[Tensor, "rows 4 4"], measurements: Measurements, unknowns: IdentifiedUnknowns | None
 ) -> dict[str, Float64[Tensor, "rows components"]]:
-    """Measured minus predicted values for tool poses that some model predicts.
+    """Return measured minus predicted values for the tool poses that a model predicts.
 
     Args:
-        T: where the model has the target, in the frame of every row.
-        measurements: what was measured.
-        unknowns: what was identified of the sensors' own; see `AbstractSensor.uncalibrated` for owners that are not
-            here. None for those that fit the rows best; the errors of n values that p unknowns of an owner were fitted
-            to are multiplied by `sqrt(n / (n - p))` then, and NaN where nothing is left of them.
+        T: poses of the target by the model, in the frame of every row.
+        measurements: the measurements.
+        unknowns: estimated unknowns of the sensors; for other owners see `AbstractSensor.uncalibrated`. None for
+            unknowns that are fitted to the rows; errors of n values with p fitted unknowns of an owner are then
+            multiplied by `sqrt(n / (n - p))`, and NaN without degrees of freedom.
 
     Returns:
-        By sensor [m or rad], NaN in rows without a value; the error of a pair stands in both of its rows, and that of
-        an image is that of its pose. Sensors that no row has are left out.
+        Errors by sensor [m or rad], NaN in rows without a value; the error of a pair is in both of its rows, and that
+        of an image is that of its pose. Sensors without rows are left out.
 
     Raises:
         IdentificationError: the rows of an owner that was not calibrated do not determine its unknowns.
@@ -157,10 +159,10 @@ def measured_errors(
 def _fitting_best(
     sensor: AbstractSensor, group: UnknownGroup, data: Measurements, motion: ToolMotion
 ) -> tuple[Float64[Tensor, "columns owners"], Float64[Tensor, " rows"]]:
-    """The unknowns of all owners that fit their rows best, but for gross errors, and the factor on the errors."""
+    """Return the unknowns of all owners fitted to their rows without outliers, and the factor on the errors."""
     T = transform(motion.rotation.permute(2, 0, 1), motion.position.t())
     kept, count = torch.ones(len(T), dtype=torch.bool), len(group.owners)
-    for _ in range(ROUNDS):
+    for _ in range(MAX_ITERATIONS):
         some = kept.nonzero()[:, 0]
         guess = type(sensor).initial_guess(data.select(some), T[some], math.inf)
         there = type(sensor).unknowns(data.select(some))
@@ -173,7 +175,7 @@ def _fitting_best(
         counted, kept = kept, kept.clone()
         for number in range(count):
             own = sensor.present & (owner == number)
-            kept[own] = size[own] <= GROSS * size[own].quantile(0.5)
+            kept[own] = size[own] <= OUTLIER_FACTOR * size[own].quantile(0.5)
         if torch.equal(kept, counted):
             break
     values = torch.bincount(owner[sensor.present & counted], minlength=count) * sensor.components

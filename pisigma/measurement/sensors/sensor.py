@@ -1,4 +1,4 @@
-"""The interface of sensors: from rows of measurements to residual blocks with derivatives by the chain rule."""
+"""The interface of sensors: residuals of rows of measurements, and their derivatives by the chain rule."""
 
 import math
 from abc import ABC, abstractmethod
@@ -24,33 +24,33 @@ SHOWN_UNITS: Mapping[str, tuple[ShownUnit, float]] = {
     "px": ("px", 1.0),
     "1": ("1", 1.0),
 }
-"""In which unit figures of a unit are shown, and how many of it make one."""
-SHORTEST = 1e-12
-"""[m] Distances are not divided by less."""
+"""For every unit, the unit in which figures are shown, and the conversion factor."""
+MIN_LENGTH = 1e-12
+"""[m] Lower bound of lengths in quotients."""
 
 Unknowns = Mapping[str, Float64[Tensor, "columns owners"]]
-"""By group, what sensors have to find out about themselves; points are as seen from the anchor of their base."""
+"""Unknowns of sensors by group; points are in the frame of the anchor of their base."""
 
 Poses = Float64[Tensor, "rows 4 4"]
 """Tool poses, each in the frame of its row."""
 Values = Float[Tensor, "components poses"]
-"""What a sensor measures, or by how much it misses what is predicted [m or rad]."""
+"""Measured values of a sensor, or their residuals [m or rad]."""
 Derivative = Float[Tensor, "parameters components poses"]
 """Derivative of predicted values by parameters that move the tool [m/m, m/rad, rad/m or rad/rad]."""
 
 
 @dataclass(frozen=True)
 class UnknownGroup:
-    """What one kind of sensor has to find out about itself, once for each of its owners.
+    """Unknowns of one kind of sensor, which each of its owners has.
 
     Attributes:
-        name: such as "anchor".
-        columns: names of one owner's unknowns. Where they begin with x, y, z, these are a point in the owner's frame
+        name: name of the group, such as "anchor".
+        columns: names of one owner's unknowns. If the first ones are x, y, z, they are a point in the owner's frame
             [m]; all others are the same in every frame.
-        owners: names of those that have such unknowns, such as the anchors.
-        frames: per owner, the frame that it stands in.
+        owners: names of the owners of such unknowns, such as the anchors.
+        frames: per owner, the frame in which it is.
         angles: the columns that are angles [rad]; the others are lengths [m].
-        units: by column, the unit of those that are neither: "px", or "1" of plain numbers.
+        units: units of columns that are neither, "px" or "1" (dimensionless).
     """
 
     name: str
@@ -72,11 +72,11 @@ class UnknownGroup:
 
 @dataclass(frozen=True, eq=False)
 class InitialUnknowns:
-    """Where the unknowns of a group start.
+    """Initial values of the unknowns of a group.
 
     Attributes:
-        values: of every owner, in its frame [m or rad].
-        free: which of them are to be identified; the others stay.
+        values: values of every owner, in its frame [m or rad].
+        free: which of them are estimated; the others are fixed.
     """
 
     values: Float64[Tensor, "owners columns"]
@@ -85,12 +85,12 @@ class InitialUnknowns:
 
 @dataclass(frozen=True, eq=False)
 class SensorRows:
-    """Rows of measurements as sensors are built from them.
+    """Rows of measurements from which sensors are built.
 
     Attributes:
-        measurements: the rows; those of pairs come first, side by side.
-        bases: per row the anchor of its base, `T_frame_tool = anchor · T_anchor_tool`.
-        tools: per row the anchor of its tool's rotation, `R_anchor_tool = R_predicted · anchor`.
+        measurements: the rows; pairs come first, with their rows next to each other.
+        bases: per row, the anchor of its base, `T_frame_tool = anchor · T_anchor_tool`.
+        tools: per row, the anchor of its tool's rotation, `R_anchor_tool = R_predicted · anchor`.
     """
 
     measurements: Measurements
@@ -100,7 +100,7 @@ class SensorRows:
     def sigma(
         self, present: Bool[Tensor, " rows"], unit: Literal["m", "rad"] = "m"
     ) -> Float64[Tensor, " rows"] | None:
-        """Return the standard deviations that a sensor's rows state [m or rad]; None where none does.
+        """Return the standard deviations that a sensor's rows state [m or rad]; None if no row does.
 
         Raises:
             IdentificationError: some of the sensor's rows state one and some do not.
@@ -113,23 +113,24 @@ class SensorRows:
         if bool(lacking.any()):
             row = int(lacking.nonzero()[0, 0])
             raise IdentificationError(
-                f"{data.source}: {'sigma_mm' if unit == 'm' else 'sigma_deg'} is stated in some rows but not in "
-                f"{data.place(row)}; state it in every row or in none, then it is estimated."
+                "the standard deviation is given in some rows, but not in this one",
+                at=data.at(row, "sigma_mm" if unit == "m" else "sigma_deg"),
+                remedy="give it in every row, or in none to have it estimated",
             )
         return sigma
 
     @property
     def by_corners(self) -> Bool[Tensor, " rows"]:
-        """Which rows hold a pose that the corners of a board in an image give, whole and with its covariance."""
+        """Which rows contain a complete pose from the corners of a board in an image, with its covariance."""
         return self.measurements.measured("corner") & self.measurements.measured("pose")
 
     def readings(self, name: str) -> Float64[Tensor, " rows"]:
-        """Return the numbers in a column of a registered sensor [SI], NaN where a row has none."""
+        """Return a numeric column of a registered sensor [SI]; NaN in rows without a value."""
         values = self.measurements.readings.get(name)
         return values if isinstance(values, Tensor) else torch.full_like(self.measurements.q[:, 0], torch.nan)
 
     def numbers(self, names: tuple[str, ...] | None, order: tuple[str, ...]) -> Int64[Tensor, " rows"]:
-        """Return where every row's name stands in an order, -1 where it is in none."""
+        """Return the index of every row's name in `order`, -1 if it is not in it."""
         return numbers_of(names, order, self.measurements.rows).to(self.measurements.q.device)
 
 
@@ -138,9 +139,9 @@ class UnknownDerivative:
     """Derivative of a sensor's values by the unknowns of a group.
 
     Attributes:
-        group: its name.
-        owner: per row, the index of the owner whose unknowns the value depends on.
-        derivative: of the predicted value by each of that owner's unknowns.
+        group: name of the group.
+        owner: per row, the index of the owner on whose unknowns the value depends.
+        derivative: derivative of the predicted value by each of that owner's unknowns.
     """
 
     group: str
@@ -149,25 +150,25 @@ class UnknownDerivative:
 
 
 class AbstractSensor(ABC):
-    """One kind of measurement: how rows become values, and how values follow from the tool's motion.
+    """One kind of measurement: its values, their predictions from the tool's motion, and derivatives.
 
     A subclass is a frozen dataclass whose tensors have the row index last; rows are those of the calibration
-    problem. It is registered with `pisigma.measurement.sensors.register_sensor`. Values are predicted as seen from the
-    base's anchor (see `SensorRows`), so that no angle of a base comes near its singularity.
+    problem. It is registered with `pisigma.measurement.sensors.register_sensor`. Values are predicted in the frame of
+    the base's anchor (see `SensorRows`), so that no angle of a base is near its singularity.
 
     Attributes:
-        name: such as "position"; one noise figure is estimated per name.
-        unit: of its values.
-        components: values a row.
+        name: name of the sensor, such as "position"; one noise level is estimated per name.
+        unit: unit of its values.
+        components: number of values per row.
         turning: whether it needs the tool's rotation.
-        certain: whether its values are stated rather than measured: their standard deviation stands, and none of them
-            counts as wrong.
-        paired: whether a value belongs to a row and the next one together.
-        holds_frame: whether its values determine where the frame is that it measures in.
+        certain: whether its values are given rather than measured: their standard deviation is not estimated, and none
+            of them is an outlier.
+        paired: whether a value belongs to a row together with the next one.
+        holds_frame: whether its values determine the position of the frame in which it measures.
         readings: the columns that it adds to measurement files; None for a sensor whose values are fields of
             `Measurements`.
-        present: whether a row has a value.
-        sigma: standard deviation of a value where the rows state it, else None: it is estimated.
+        present: which rows have a value.
+        sigma: standard deviation of the values if the rows state it; None if it is estimated.
     """
 
     name: ClassVar[str]
@@ -184,22 +185,22 @@ class AbstractSensor(ABC):
     @classmethod
     @abstractmethod
     def build(cls, rows: SensorRows) -> "AbstractSensor | None":
-        """Gather the values of this kind; None where no row has one.
+        """Gather the values of this kind; None if no row has one.
 
         Raises:
-            IdentificationError: the rows cannot be of one data set.
+            IdentificationError: the rows contradict each other.
         """
 
     @abstractmethod
     def residual(self, motion: ToolMotion, unknowns: Unknowns, rows: slice) -> Values:
-        """Return measured minus predicted values; rows without a value may hold anything."""
+        """Return measured minus predicted values; rows without a value may contain anything."""
 
     @abstractmethod
     def derivative(self, motion: ToolMotion, unknowns: Unknowns, rows: slice) -> Derivative:
         """Return the derivative of the predicted values by every parameter that moves the tool."""
 
     def partner_derivative(self, motion: ToolMotion) -> Derivative:
-        """Return what of the derivative comes from the next row's tool, where values are paired; else 0."""
+        """Return the derivative by the next row's tool for paired values; else 0."""
         return motion.derivative.new_zeros(1, self.components, 1).expand(
             motion.derivative.shape[0], -1, motion.derivative.shape[2]
         )
@@ -207,25 +208,25 @@ class AbstractSensor(ABC):
     def unknown_derivatives(
         self, motion: ToolMotion, unknowns: Unknowns, rows: slice
     ) -> tuple[UnknownDerivative, ...]:
-        """Return the derivatives of the predicted values by the sensor's unknowns; none where it has none."""
+        """Return the derivatives of the predicted values by the sensor's unknowns, if it has any."""
         return ()
 
     @classmethod
     def unknowns(cls, measurements: Measurements) -> UnknownGroup | None:
-        """Name the unknowns of this sensor in some rows; None where it has none."""
+        """Return the unknowns of this sensor in some rows; None if it has none."""
         return None
 
     @classmethod
     def initial_guess(cls, measurements: Measurements, T: Poses, reach: float) -> InitialUnknowns | None:
-        """Guess the unknowns from the robot as drawn, and refuse values that no robot near it can have measured.
+        """Guess the unknowns by the nominal robot, and refuse values that are impossible for a robot near it.
 
         Args:
-            measurements: the rows; those of pairs come first, side by side.
-            T: where the robot as drawn has the tool that suits the rows best, in the frame of every row.
-            reach: of the robot [m].
+            measurements: the rows; pairs come first, with their rows next to each other.
+            T: poses of the best fitting tool of the nominal robot, in the frame of every row.
+            reach: reach of the robot [m].
 
         Raises:
-            IdentificationError: a value cannot be, or there are too few of them.
+            IdentificationError: a value is impossible, or there are too few of them.
         """
         return None
 
@@ -233,12 +234,12 @@ class AbstractSensor(ABC):
     def uncalibrated(
         cls, measurements: Measurements, owner: str, T: Poses, calibrated: Collection[str]
     ) -> Float64[Tensor, " columns"]:
-        """Return the unknowns of an owner that was not calibrated, for judging its rows.
+        """Return the unknowns of an owner that was not calibrated, for the validation of its rows.
 
         Args:
-            measurements: rows that were not calibrated with.
-            owner: such as the name of an anchor.
-            T: where a model has the tool, in the frame of every row.
+            measurements: rows that were not used for the calibration.
+            owner: name of the owner, such as an anchor.
+            T: poses of the tool by a model, in the frame of every row.
             calibrated: the owners that were calibrated.
 
         Raises:
@@ -246,12 +247,14 @@ class AbstractSensor(ABC):
         """
         row = next(row for row in range(measurements.rows) if owner in _names_in(measurements, row))
         raise IdentificationError(
-            f"{measurements.place(row)}: '{owner}' of the sensor '{cls.name}' was not calibrated; "
-            f"{nearest_choice(owner, calibrated)}"
+            f"'{owner}' of the sensor '{cls.name}' was not calibrated",
+            at=measurements.at(row),
+            value=owner,
+            remedy=nearest_choice(owner, calibrated),
         )
 
     def select(self, rows: Int64[Tensor, " chosen"]) -> "AbstractSensor":
-        """Return the same sensor with some of the rows."""
+        """Return the sensor with the rows of an index."""
         tensors = {item.name: getattr(self, item.name) for item in fields(self)}  # type: ignore[arg-type]
         chosen: dict[str, Any] = {
             name: value[..., rows] for name, value in tensors.items() if isinstance(value, Tensor)
@@ -264,7 +267,7 @@ def _names_in(measurements: Measurements, row: int) -> set[str]:
 
 
 def numbers_of(names: tuple[str, ...] | None, order: Sequence[str], rows: int) -> Int64[Tensor, " rows"]:
-    """Return where every row's name stands in an order, -1 where it is in none."""
+    """Return the index of every row's name in `order`, -1 if it is not in it."""
     numbers = {name: number for number, name in enumerate(order)}
     different = set(names or ("",))
     if len(different) == 1:
@@ -273,14 +276,14 @@ def numbers_of(names: tuple[str, ...] | None, order: Sequence[str], rows: int) -
 
 
 def names_of(names: tuple[str, ...] | None) -> tuple[str, ...]:
-    """Return the different names, in the order in which they come; "" is none."""
+    """Return the different names except "", in the order of their first row."""
     return tuple(name for name in dict.fromkeys(names or ()) if name)
 
 
 def owners_of(
     measurements: Measurements, names: tuple[str, ...] | None
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return the different names and, for each of them, the frame of its first row."""
+    """Return the different names and the frame of the first row of each."""
     owners = names_of(names)
     return owners, tuple(measurements.frame[(names or ()).index(owner)] for owner in owners)
 
@@ -288,7 +291,7 @@ def owners_of(
 def along(
     axis: Float[Tensor, "3 poses"], derivative: Float[Tensor, "parameters six poses"]
 ) -> Float[Tensor, "parameters 1 poses"]:
-    """Return the part of every parameter's shift of the tool that is along an axis."""
+    """Return the component along an axis of the shift of the tool by every parameter."""
     total = derivative[:, 0] * axis[0]
     for k in (1, 2):
         total = torch.addcmul(total, derivative[:, k], axis[k])
@@ -296,6 +299,6 @@ def along(
 
 
 def unit_vectors(vectors: Float[Tensor, "3 poses"]) -> Float[Tensor, "3 poses"]:
-    """Return the directions of vectors [m]; of a vector of no length none."""
-    directions: Tensor = vectors / vectors.norm(dim=0).clamp(min=SHORTEST)
+    """Return the unit vectors of vectors [m]; 0 for zero vectors."""
+    directions: Tensor = vectors / vectors.norm(dim=0).clamp(min=MIN_LENGTH)
     return directions

@@ -1,4 +1,4 @@
-"""Sockets: fixed points that the ball at the tool sits in, and stated distances between them."""
+"""Sockets: fixed points in which the ball at the tool sits, and given distances between them."""
 
 import re
 from collections.abc import Collection, Iterable, Mapping
@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Bool, Float64, Int64
 from torch import Tensor
 
-from pisigma.files.errors import IdentificationError, nearest_choice
+from pisigma.files.errors import IdentificationError, Place, nearest_choice
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.sensors.sensor import (
     AbstractSensor,
@@ -30,11 +30,12 @@ from pisigma.robot.kinematics.parameter_jacobian import ToolMotion
 PairOfSockets = tuple[str, str]
 SOCKET_COLUMNS = ("x", "y", "z")
 
-LARGEST_SCATTER = 0.05
-"""[reach] By the robot as drawn, rows of one socket are not farther apart than this."""
+MAX_SCATTER = 0.05
+"""[reach] Largest plausible scatter of the rows of one socket by the nominal robot."""
 
-GROSS = 4.0
-"""Rows that put a ball farther than so many times the median from its median are wrong: 6 standard deviations."""
+OUTLIER_FACTOR = 4.0
+"""Distance of a row from the median position, relative to the median distance, above which it is an outlier: about 6
+standard deviations."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,8 +43,8 @@ class SocketSensor(AbstractSensor):
     """A ball that sits in a socket: `p_tool - p_socket = 0`, where the socket is unknown.
 
     Attributes:
-        socket: index of every row's socket, -1 where there is none.
-        present: whether a row has one.
+        socket: index of every row's socket, -1 in rows without one.
+        present: which rows have a socket.
         sigma: standard deviation of a coordinate [m] of every row, or None.
     """
 
@@ -69,29 +70,29 @@ class SocketSensor(AbstractSensor):
         return unknowns["socket"][:, self.socket[rows]] - motion.position
 
     def derivative(self, motion: ToolMotion, unknowns: Unknowns, rows: slice) -> Derivative:
-        """Return the tool's shift."""
+        """Return the shift of the tool."""
         return motion.derivative[:, :3]
 
     def unknown_derivatives(
         self, motion: ToolMotion, unknowns: Unknowns, rows: slice
     ) -> tuple[UnknownDerivative, ...]:
-        """Return minus the socket's shift."""
+        """Return the negative identity for the socket's position."""
         socket = self.socket[rows]
         eye = torch.eye(3).to(motion.position)
         return (UnknownDerivative("socket", socket, -eye[..., None].expand(3, 3, len(socket))),)
 
     @classmethod
     def unknowns(cls, measurements: Measurements) -> UnknownGroup | None:
-        """Name the sockets; each has a position."""
+        """Return the sockets, each with a position."""
         owners, frames = owners_of(measurements, measurements.socket)
         return UnknownGroup("socket", SOCKET_COLUMNS, owners, frames) if owners else None
 
     @classmethod
     def initial_guess(cls, measurements: Measurements, T: Poses, reach: float) -> InitialUnknowns | None:
-        """Guess every socket at the mean of its rows.
+        """Guess the position of every socket as the mean of its rows.
 
         Raises:
-            IdentificationError: by the robot as drawn, the rows of one socket are far from each other.
+            IdentificationError: by the nominal robot, the rows of one socket are far from each other.
         """
         names = names_of(measurements.socket)
         if not names:
@@ -100,11 +101,12 @@ class SocketSensor(AbstractSensor):
         points, socket = T[socket >= 0, :3, 3], socket[socket >= 0]
         middle = means(points, socket, len(names))
         usual = float((points - middle[socket]).norm(dim=-1).median())
-        if usual > LARGEST_SCATTER * reach:
+        if usual > MAX_SCATTER * reach:
             raise IdentificationError(
-                f"{measurements.source}: by the robot as drawn the rows of one socket are about {usual * 1e3:.3g} mm "
-                "away from each other; check the directions and zeros of the joints, the tool, and the names of the "
-                "sockets."
+                expected="rows of one socket at one position by the nominal robot",
+                value=f"a median distance of {usual * 1e3:.3g} mm from their mean",
+                at=Place(measurements.source),
+                remedy="check the directions and zeros of the joints, the tool, and the names of the sockets",
             )
         return InitialUnknowns(middle, torch.ones_like(middle, dtype=torch.bool))
 
@@ -112,23 +114,23 @@ class SocketSensor(AbstractSensor):
     def uncalibrated(
         cls, measurements: Measurements, owner: str, T: Poses, calibrated: Collection[str]
     ) -> Float64[Tensor, " columns"]:
-        """Return where the rows of a socket meet on average, but for gross errors."""
+        """Return the mean position of the rows of a socket, without outliers."""
         rows = numbers_of(measurements.socket, (owner,), measurements.rows).to(T.device) == 0
         points = T[rows, :3, 3]
         off = (points - points.quantile(0.5, dim=0)).norm(dim=-1)
-        middle: Tensor = points[off <= GROSS * off.quantile(0.5)].mean(0)
+        middle: Tensor = points[off <= OUTLIER_FACTOR * off.quantile(0.5)].mean(0)
         return middle
 
 
 @dataclass(frozen=True, eq=False)
 class SocketDistanceSensor(AbstractSensor):
-    """Stated distances between two sockets, each attached to a row of one of them.
+    """Given distances between two sockets, each assigned to a row of one of them.
 
     Attributes:
-        first: index of one socket, -1 where a row has no such distance.
-        second: index of the other.
+        first: index of one socket, -1 in rows without a distance.
+        second: index of the other socket.
         measured: the distance [m].
-        present: whether a row has one.
+        present: which rows have a distance.
         sigma: its standard deviation [m].
     """
 
@@ -145,22 +147,22 @@ class SocketDistanceSensor(AbstractSensor):
 
     @classmethod
     def build(cls, rows: SensorRows) -> "SocketDistanceSensor | None":
-        """Find none: the distances come from the user, see `between`."""
+        """Return None: the distances are given by the user, see `between`."""
         return None
 
     @classmethod
     def between(
         cls, measurements: Measurements, distances: Mapping[PairOfSockets, float], sigma: float
     ) -> "SocketDistanceSensor | None":
-        """Attach distances to rows of their sockets, each to another row; None where there is no distance.
+        """Assign distances to different rows of their sockets; None if there is no distance.
 
         Args:
             measurements: rows with sockets.
-            distances: between two sockets [m].
+            distances: distances between two sockets [m].
             sigma: standard deviation of the distances [m].
 
         Raises:
-            IdentificationError: a distance is none, or names a socket that no row has, or twice the same.
+            IdentificationError: a distance is not positive, or its sockets are equal or have no rows.
         """
         if not distances:
             return None
@@ -177,8 +179,11 @@ class SocketDistanceSensor(AbstractSensor):
             rows_left = free[one] or free[other]
             if not rows_left:
                 raise IdentificationError(
-                    f"{measurements.source}: more distances of the sockets '{one}' and '{other}' are stated than they "
-                    "have rows; give fewer distances."
+                    f"the sockets '{one}' and '{other}' have more distances than rows",
+                    option="socket_distances",
+                    value=f"{one} and {other}",
+                    at=Place(measurements.source),
+                    remedy="give fewer distances",
                 )
             row = rows_left.pop(0)
             first[row], second[row], measured[row] = order.index(one), order.index(other), distance
@@ -186,18 +191,18 @@ class SocketDistanceSensor(AbstractSensor):
         return cls(*(tensor.to(device) for tensor in tensors))
 
     def residual(self, motion: ToolMotion, unknowns: Unknowns, rows: slice) -> Values:
-        """Return stated minus present distances [m]."""
+        """Return given minus predicted distances [m]."""
         residual: Tensor = self.measured[rows] - self._apart(unknowns, rows).norm(dim=0)
         return residual[None]
 
     def derivative(self, motion: ToolMotion, unknowns: Unknowns, rows: slice) -> Derivative:
-        """Return 0: the tool has no part in it."""
+        """Return 0, as the distances do not depend on the tool."""
         return torch.zeros_like(motion.derivative[:, :1])
 
     def unknown_derivatives(
         self, motion: ToolMotion, unknowns: Unknowns, rows: slice
     ) -> tuple[UnknownDerivative, ...]:
-        """Return the direction from the second socket to the first, and back."""
+        """Return the unit vector from the second socket to the first, and its negative."""
         direction = unit_vectors(self._apart(unknowns, rows))[:, None]
         return (
             UnknownDerivative("socket", self.first[rows], direction),
@@ -214,13 +219,18 @@ def _check_distance(one: str, other: str, distance: float, order: tuple[str, ...
     for name in (one, other):
         if name not in order:
             raise IdentificationError(
-                f"{source}: socket_distances names the socket '{name}', but no row has it; "
-                f"{nearest_choice(name, order)}"
+                f"no row has the socket '{name}'",
+                option="socket_distances",
+                value=name,
+                at=Place(source),
+                remedy=nearest_choice(name, order),
             )
     if one == other or not distance > 0:
         raise IdentificationError(
-            f"{source}: socket_distances states {distance * 1e3:.6g} mm between '{one}' and '{other}'; a positive "
-            "distance between two different sockets was wanted."
+            option="socket_distances",
+            expected="a distance > 0 between two different sockets",
+            value=f"{distance * 1e3:.6g} mm between '{one}' and '{other}'",
+            at=Place(source),
         )
 
 
@@ -233,7 +243,7 @@ def means(values: Float64[Tensor, "rows size"], number: Int64[Tensor, " rows"], 
 def matching_sockets(
     distances: Mapping[tuple[str, str], float], sockets: Iterable[str]
 ) -> dict[tuple[str, str], float]:
-    """Distances by names of sockets in the data; see `CalibrationSettings`."""
+    """Return distances by names of sockets in the data, expanding "*"; see `CalibrationSettings`."""
     names = dict.fromkeys(name for name in sockets if name)
     matching: dict[tuple[str, str], float] = {}
     for (first, second), distance in distances.items():
@@ -246,15 +256,17 @@ def matching_sockets(
                 pairs.append((name, other))
         if not pairs:
             raise IdentificationError(
-                f"no two sockets of the data are called '{first}' and '{second}'; there are "
-                f"{', '.join(names) or 'none'}."
+                option="socket_distances",
+                expected=f"names of two sockets of the data ({', '.join(names) or 'none'})",
+                value=f"{first} and {second}",
             )
         for pair in pairs:
             known = matching.get(pair, matching.get((pair[1], pair[0]), distance))
             if known != distance:
                 raise IdentificationError(
-                    f"expected one distance of the sockets '{pair[0]}' and '{pair[1]}', got {known * 1e3:g} and "
-                    f"{distance * 1e3:g} mm; state one."
+                    option="socket_distances",
+                    expected=f"one distance of the sockets '{pair[0]}' and '{pair[1]}'",
+                    value=f"{known * 1e3:g} and {distance * 1e3:g} mm",
                 )
             matching[pair] = distance
     return matching

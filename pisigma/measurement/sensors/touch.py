@@ -1,4 +1,4 @@
-"""Touches: one coordinate of the tip in its frame."""
+"""Touches: one coordinate of the tip in the frame of the jig."""
 
 from dataclasses import dataclass
 
@@ -15,9 +15,9 @@ class TouchSensor(AbstractSensor):
     """A tip that touches a face: `axis · p_tool = coordinate` (Lim et al., eqs 35 to 37).
 
     Attributes:
-        axis: unit vector of the touched coordinate, as seen from the base's anchor.
+        axis: unit vector of the touched coordinate, in the frame of the base's anchor.
         measured: the coordinate along it [m].
-        present: whether a row has one.
+        present: which rows have a touch.
         sigma: standard deviation of every row [m], or None.
     """
 
@@ -46,5 +46,5 @@ class TouchSensor(AbstractSensor):
         return (self.measured[rows] - (self.axis[:, rows] * motion.position).sum(0))[None]
 
     def derivative(self, motion: ToolMotion, unknowns: Unknowns, rows: slice) -> Derivative:
-        """Return the tool's shift along the axis."""
+        """Return the shift of the tool along the axis."""
         return along(self.axis[:, rows], motion.derivative)

@@ -10,7 +10,8 @@ from pisigma.measurement.camera.camera_files import CameraFiles
 from pisigma.measurement.camera.corner_file import corners_of
 from pisigma.measurement.csv.table import Table
 from pisigma.measurement.dataset import Measurements, join
-from pisigma.measurement.fields import Fault, LeftOut, MeasuredFields
+from pisigma.measurement.faults import Fault
+from pisigma.measurement.fields import LeftOut, MeasuredFields
 from pisigma.measurement.growing_file import GrowingFile
 from pisigma.planning.plan_settings import PlanSettings
 from pisigma.robot.description import Robot

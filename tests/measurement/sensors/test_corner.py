@@ -7,6 +7,7 @@ import pytest
 import torch
 from testing.camera_cell import BOARD, CAMERA, camera_cell
 from testing.closeness import assert_close
+from testing.refusals import refused
 from torch import Tensor
 
 from pisigma.calibration.geometric.calibrator import GeometricCalibrator
@@ -70,23 +71,23 @@ def test_positions_of_images_without_their_rotations_are_plain_positions() -> No
 
 
 @pytest.mark.parametrize(
-    ("cells", "message"),
+    ("cells", "column", "value"),
     [
-        ("0.1,1 2 3", "a noise and 21 weights with blanks between were wanted, got '1 2 3'"),
-        (f",{' '.join(['1'] * 21)}", "a noise and 21 weights with blanks between were wanted"),
-        (f"-0.1,{' '.join(['1'] * 21)}", r"a positive noise was wanted, got -0\.1 mm"),
+        ("0.1,1 2 3", "corner_weight", "1 2 3"),
+        (f",{' '.join(['1'] * 21)}", "corner_weight", " ".join(["1"] * 21)),
+        (f"-0.1,{' '.join(['1'] * 21)}", "corner_noise_mm", -0.1),
     ],
 )
-def test_faulty_weights_are_named(tmp_path: Path, cells: str, message: str) -> None:
+def test_faulty_weights_are_refused(tmp_path: Path, cells: str, column: str, value: object) -> None:
     path = tmp_path / "rows.csv"
     path.write_text(
         "q1_deg,x_mm,y_mm,z_mm,qx,qy,qz,qw,corner_noise_mm,corner_weight\n" + f"1,1,2,3,0,0,0,1,{cells}\n"
     )
-    with pytest.raises(MeasurementError, match=message):
+    with refused(MeasurementError, line=2, column=column, value=value):
         Measurements.read_csv(path)
 
 
-def test_what_a_model_has_counted_is_not_counted_again() -> None:
+def test_priors_that_a_model_includes_are_not_counted_again() -> None:
     images = image_measurements(camera_cell(8).images, CAMERA, BOARD, False, Repeatability())
     plain = Measurements(q=images.q, position=images.position)
     assert without_stated(plain, {"camera": ["wrist"]}) is plain

@@ -13,7 +13,9 @@ from pisigma.calibration.geometric.problem.parameters import ParameterSpace
 from pisigma.files.errors import ImplausibleError, Place
 from pisigma.measurement.csv.columns import MISNAMED_UNITS
 from pisigma.measurement.dataset import Measurements
-from pisigma.measurement.sensors.anchor import FEWEST, LARGEST_MISS, anchor_from_distances, stated_position
+from pisigma.measurement.sensors.anchor import MAX_NOMINAL_ERROR as LARGEST_MISS
+from pisigma.measurement.sensors.anchor import MIN_DISTANCES as FEWEST
+from pisigma.measurement.sensors.anchor import anchor_from_distances, stated_position
 from pisigma.measurement.sensors.sensor import names_of, numbers_of
 from pisigma.robot.description import Robot
 from pisigma.robot.se3 import rotation_from_rpy, rpy_from_rotation
