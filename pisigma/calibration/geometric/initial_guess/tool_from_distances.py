@@ -13,9 +13,12 @@ from pisigma.calibration.geometric.problem.parameters import ParameterSpace
 from pisigma.files.errors import ImplausibleError, Place
 from pisigma.measurement.csv.columns import MISNAMED_UNITS
 from pisigma.measurement.dataset import Measurements
-from pisigma.measurement.sensors.anchor import MAX_NOMINAL_ERROR as LARGEST_MISS
-from pisigma.measurement.sensors.anchor import MIN_DISTANCES as FEWEST
-from pisigma.measurement.sensors.anchor import anchor_from_distances, stated_position
+from pisigma.measurement.sensors.anchor import (
+    MAX_NOMINAL_ERROR,
+    MIN_DISTANCES,
+    anchor_from_distances,
+    stated_position,
+)
 from pisigma.measurement.sensors.sensor import names_of, numbers_of
 from pisigma.robot.description import Robot
 from pisigma.robot.se3 import rotation_from_rpy, rpy_from_rotation
@@ -41,7 +44,7 @@ DOUBTFUL = 0.01
 COLLAPSED = 0.25
 """Share of the errors that may remain in another unit."""
 MAX_WRONG_SHARE = 0.25
-"""Share of the distances that may be off by more than `LARGEST_MISS`."""
+"""Share of the distances that may be off by more than `MAX_NOMINAL_ERROR`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,17 +159,17 @@ def tools_from_distances(
     tools, drawn, reach = dict(tools), space.robot.tool, space.robot.reach
     for name in space.targets:
         distances = _distances_of(measurements, T_flange, name)
-        if len(distances.measured) < FEWEST:
+        if len(distances.measured) < MIN_DISTANCES:
             continue
         held = name in tools or not free_tool
         position = torch.from_numpy(tools.get(name, drawn)[:3].copy())
         tool, residual = distances.fitted(position, held, reach)
         _refuse_other_units(space.robot, distances, (tool, residual), (position, held), measurements.source)
-        off = int((residual.abs() > LARGEST_MISS * reach).sum())
+        off = int((residual.abs() > MAX_NOMINAL_ERROR * reach).sum())
         if off > MAX_WRONG_SHARE * len(residual):
             raise ImplausibleError(
                 f"expected distances of robot '{space.robot.name}' at these joint values, got {off} of {len(residual)} "
-                f"that are off by more than {LARGEST_MISS * reach * 1e3:.3g} mm for any tool",
+                f"that are off by more than {MAX_NOMINAL_ERROR * reach * 1e3:.3g} mm for any tool",
                 expected="distances of this robot",
                 value=off,
                 at=Place(measurements.source),
@@ -202,7 +205,7 @@ def base_from_anchors(
             if anchor == name and measurements.frame[row] == frame
         ]
         place = stated_position(measurements, rows[0]) if rows else None
-        if place is not None and len(rows) >= FEWEST and measurements.distance is not None:
+        if place is not None and len(rows) >= MIN_DISTANCES and measurements.distance is not None:
             seen.append(anchor_from_distances(tip[rows], measurements.distance.cpu()[rows])[:3])
             stated.append(place.cpu())
     if not seen:
@@ -240,7 +243,7 @@ def _refuse_other_units(
     miss, (factor, are, named) = min(
         zip(misses, MISNAMED_UNITS, strict=True), key=lambda one: one[0] / one[1][0]
     )
-    if miss < LARGEST_MISS * robot.reach and miss / factor < COLLAPSED * typical:
+    if miss < MAX_NOMINAL_ERROR * robot.reach and miss / factor < COLLAPSED * typical:
         raise ImplausibleError(
             f"expected distances of robot '{robot.name}' at these joint values, got {are} that are named {named}: the "
             f"median error is {typical * 1e3:.3g} mm, and {miss * 1e3:.3g} mm for distances multiplied by {factor:.4g}",
@@ -260,7 +263,7 @@ def _distances_of(measurements: Measurements, T: Tensor, target: str) -> _Distan
     own = torch.tensor([name == target for name in measurements.target]) & torch.isfinite(distance)
     number = numbers_of(measurements.anchor, names_of(measurements.anchor), measurements.rows)
     known, counts = torch.unique(number[own & (number >= 0)], return_counts=True)
-    wires = own & torch.isin(number, known[counts >= FEWEST])
+    wires = own & torch.isin(number, known[counts >= MIN_DISTANCES])
     anchor = torch.unique(number[wires], return_inverse=True)[1]
     first = torch.arange(0, 2 * len(names_of(measurements.pair)), 2)
     first = first[own[first] & own[first + 1]]
