@@ -1,4 +1,4 @@
-"""A board as a page to print at its true size."""
+"""Calibration boards as pages to print at true size."""
 
 import io
 
@@ -21,20 +21,20 @@ PAPERS = {
 }
 """Width and height of paper [mm]."""
 MARGIN = 8.0
-"""[mm] What printers leave white along the edges of a sheet."""
+"""[mm] Margin that printers leave blank along the edges of a sheet."""
 FOOT = 22.0
-"""[mm] Below the board, for its text and the ruler."""
+"""[mm] Space below the board for its text and the ruler."""
 RULER = 100.0
-"""[mm] Length of the line by which the scale of a printer is checked."""
+"""[mm] Length of the line by which the scale of the print is checked."""
 MM = 1 / 25.4
-"""Inches."""
+"""One millimetre [inch]."""
 
 
 def board_pdf(board: Board) -> tuple[str, bytes]:
     """Draw a board as a PDF; see `draw_board_sheet`.
 
     Returns:
-        The paper that it is for, such as "A4" or "A3 landscape"; and the PDF.
+        The paper size, such as "A4" or "A3 landscape", and the PDF.
     """
     paper, figure = draw_board_sheet(board)
     stream = io.BytesIO()
@@ -44,11 +44,11 @@ def board_pdf(board: Board) -> tuple[str, bytes]:
 
 
 def draw_board_sheet(board: Board) -> tuple[str, Figure]:
-    """Draw a board in its true size, with what it is and a ruler below, on the smallest paper that it fits on.
+    """Draw a board at true size, with its description and a ruler below, on the smallest paper that it fits on.
 
     Raises:
-        OutputError: it fits on no paper.
-        MeasurementError: there are not so many markers in its dictionary.
+        OutputError: it does not fit on any paper.
+        MeasurementError: its dictionary has too few markers.
         ImportError: the markers need OpenCV, which is not installed.
     """
     pattern = board_pattern(board)
@@ -65,8 +65,8 @@ def draw_board_sheet(board: Board) -> tuple[str, Figure]:
         [begin, begin, begin, end, end, end], [top, top + 4, top + 2, top + 2, top, top + 4], "k", lw=0.5
     )
     texts = (
-        f"This line is {RULER:g} mm long; if not, print again at 100 %, or state the lengths that are measured.",
-        f"{board.name}: {_description(board)}. Paper: {paper}. x leads right, y down; corner 0 is upper left.",
+        f"This line is {RULER:g} mm long; if not, print again at 100 %, or state the measured lengths of the board.",
+        f"{board.name}: {_description(board)}. Paper: {paper}. x points right, y down; corner 0 is at the upper left.",
     )
     for number, text in enumerate(texts):
         axes.text(width / 2, top + 8 + 4 * number, text, ha="center", va="center", fontsize=6.5)
@@ -74,20 +74,21 @@ def draw_board_sheet(board: Board) -> tuple[str, Figure]:
 
 
 def _paper(board: Board, across: float, down: float) -> tuple[str, tuple[float, float]]:
-    """Give the smallest paper for a board of some width and height [mm], upright where both ways fit."""
+    """Return the smallest paper for a board of given width and height [mm], portrait where both fit."""
     needs = max(across, RULER) + 2 * MARGIN, down + FOOT + 2 * MARGIN
     for name, (width, height) in PAPERS.items():
         for title, size in ((name, (width, height)), (f"{name} landscape", (height, width))):
             if needs[0] <= size[0] and needs[1] <= size[1]:
                 return title, size
     raise OutputError(
-        f"board '{board.name}': needs a sheet of {needs[0]:.0f} x {needs[1]:.0f} mm, more than A0 has; take fewer or "
-        "smaller squares."
+        f"board '{board.name}' needs a sheet of {needs[0]:.0f} x {needs[1]:.0f} mm, larger than A0",
+        value=board.name,
+        remedy="use fewer or smaller squares",
     )
 
 
 def _outline(pattern: Pattern, corner: np.ndarray) -> Outline:
-    """All black rectangles as one outline [mm], so that no light shines through where two of them meet."""
+    """Join all black rectangles to one outline [mm], so that there are no gaps between them."""
     left, top, right, bottom = (1e3 * pattern.black + np.tile(corner, 2)).T
     ends = np.stack([[left, top], [right, top], [right, bottom], [left, bottom], [left, top]]).transpose(
         2, 0, 1

@@ -1,4 +1,4 @@
-"""Figures of a calibration: residuals, held-out errors, correlations, and what was learned beyond the geometry."""
+"""Figures of a calibration: residuals, held-out errors, correlations, and the learned joint correction."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -22,17 +22,19 @@ from pisigma.validation.report.corrections import JOINT_UNITS
 
 _UNITS = {"position": ("mm", 1e3), "rotation": ("deg", float(np.rad2deg(1.0)))}
 _REDUNDANT = 1 - 1e-6
+"""Absolute correlation above which two parameters are marked as redundant."""
 _LETTER = 0.07
-"""[inch] Width of a letter of the names along tables."""
+"""[inch] Width of a character of the names along tables."""
 STYLES = {"nominal": (":", "s"), "geometric": ("--", "o"), "hybrid": ("-", "^")}
-"""Line and mark of every model, so that they differ without colour too."""
+"""Line and marker of every model, so that they differ without colour."""
 POINTS = 1_000
-"""Points of a curve: 9 to a period of the 110th harmonic, two a pixel."""
-MOST_DOTS = 2_000
-FAR_APART = 5.0
-"""Axes of deviations are logarithmic where the largest is more than so many times the smallest."""
+"""Points of a curve: 9 per period of the 110th harmonic, 2 per pixel."""
+MAX_DOTS = 2_000
+"""Dots of a panel; of more rows an even selection is drawn."""
+LOG_RATIO = 5.0
+"""Ratio of the largest to the smallest standard deviation above which axes are logarithmic."""
 BINS = 8
-"""Parts of equally many values in which predicted and actual spread are compared."""
+"""Bins with equal numbers of values in which predicted and actual spread are compared."""
 
 
 def draw_residuals(
@@ -41,10 +43,10 @@ def draw_residuals(
     """Draw the residuals per coordinate over the rows.
 
     Args:
-        residuals: by sensor, measured minus predicted of the calibration rows [m or rad], NaN where nothing
-            was measured.
-        path: the PNG to write.
-        under: which calibration the residuals are of, for the title.
+        residuals: measured minus predicted values of the calibration rows by sensor [m or rad]; NaN where nothing was
+            measured.
+        path: PNG file to write.
+        under: calibration that the residuals belong to, for the title.
     """
     shown = [name for name in _UNITS if name in residuals]
     count = max(len(shown), 1)
@@ -70,11 +72,11 @@ def _draw_over_rows(axes: Axes, name: str, residuals: np.ndarray, under: str) ->
 
 
 def draw_held_out(held_out: Mapping[str, Float64[np.ndarray, " held"]], path: Path) -> None:
-    """Draw how the errors of rows that the calibration did not see are spread, one line for every model.
+    """Draw the cumulative distribution of held-out errors, one line per model.
 
     Args:
-        held_out: by model, lengths of the position errors [m].
-        path: the PNG to write.
+        held_out: lengths of the position errors of held-out rows by model [m].
+        path: PNG file to write.
     """
     figure = Figure(figsize=(7.6, 3.8))
     axes = figure.subplots()
@@ -83,10 +85,15 @@ def draw_held_out(held_out: Mapping[str, Float64[np.ndarray, " held"]], path: Pa
         share = np.arange(1, len(errors) + 1) / len(errors) * 100
         rms, largest = np.sqrt((errors**2).mean()), errors.max(initial=0.0)
         axes.plot(errors, share, style, label=f"{name}: RMS {rms:.3g} mm, largest {largest:.3g} mm")
-    axes.set(xlabel="position error [mm]", ylabel="share of rows below [%]", xscale="log", ylim=(0, 100))
-    axes.set_title("rows that the calibration did not see", loc="left", fontsize=10)
+    axes.set(
+        xlabel="position error [mm]",
+        ylabel="share of rows with a smaller error [%]",
+        xscale="log",
+        ylim=(0, 100),
+    )
+    axes.set_title("held-out rows", loc="left", fontsize=10)
     low, high = axes.get_xlim()
-    if low > 0 and high < 1e4 * low:  # narrow enough for plain numbers at 1, 2 and 5
+    if low > 0 and high < 1e4 * low:  # few decades: plain numbers at 1, 2 and 5
         axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
         axes.xaxis.set_major_formatter("{x:g}")
         axes.xaxis.set_minor_formatter(NullFormatter())
@@ -97,13 +104,13 @@ def draw_held_out(held_out: Mapping[str, Float64[np.ndarray, " held"]], path: Pa
 
 
 def draw_correlations(tables: Sequence[CorrelationTable], path: Path) -> None:
-    """Draw the correlation tables of length and angle parameters.
+    """Draw the correlation matrices of length and angle parameters.
 
-    +1 and -1 beside the diagonal mean redundant and bear a sign; parameters without effect are grey.
+    Redundant pairs (+1 and -1 off the diagonal) are marked with a sign; parameters without effect are grey.
 
     Args:
-        tables: of lengths and of angles.
-        path: the PNG to write.
+        tables: correlations of lengths and of angles.
+        path: PNG file to write.
     """
     largest = max(len(table.names) for table in tables)
     side = float(np.clip(0.27 * largest + 1.2, 4.0, 12.0))
@@ -130,7 +137,7 @@ def draw_correlations(tables: Sequence[CorrelationTable], path: Path) -> None:
 def show_correlations(
     axes: Axes, names: Sequence[str], values: Float64[np.ndarray, "_names _names"]
 ) -> AxesImage:
-    """Show a table of correlations as colours with the names along both axes; undefined ones are grey."""
+    """Show a correlation matrix as colours with the names along both axes; undefined values are grey."""
     axes.set_facecolor("0.85")
     axes.set_xticks(range(len(names)), names, rotation=90, fontsize=8)
     axes.set_yticks(range(len(names)), names, fontsize=8)
@@ -138,15 +145,15 @@ def show_correlations(
 
 
 def draw_corrections(correction: JointCorrection, measurements: Measurements, path: Path) -> None:
-    """Draw what every joint is corrected by over its own value, and over the measured rows.
+    """Draw the correction of every joint over its own value, and at the measured rows.
 
-    The line is with all other joints at the middle (median) of their measured values, the dots at the measured
-    joint values; where the dots leave the line, the correction depends on other joints too.
+    The line has all other joints at their medians, the dots are at the measured joint values; where the dots leave the
+    line, the correction depends on other joints too.
 
     Args:
-        correction: Δ.
-        measurements: the measured rows.
-        path: the PNG to write.
+        correction: joint correction Δ.
+        measurements: measured rows.
+        path: PNG file to write.
     """
     joints, q = correction.robot.joints, measurements.q
     rows = (len(joints) + 1) // 2
@@ -158,7 +165,7 @@ def draw_corrections(correction: JointCorrection, measurements: Measurements, pa
     for j, (axes, joint) in enumerate(zip(panels, joints, strict=False)):
         unit, factor, small, scale = JOINT_UNITS[joint.type]
         values, line = _over_own_value(correction, q, j)
-        step = max(len(q) // MOST_DOTS, 1)
+        step = max(len(q) // MAX_DOTS, 1)
         axes.plot(
             q[::step, j].numpy() * factor, corrections[::step, j] * scale, ".", color="0.55", markersize=2.5
         )
@@ -171,16 +178,14 @@ def draw_corrections(correction: JointCorrection, measurements: Measurements, pa
         axes.grid(alpha=0.3)
     for axes in panels[len(joints) :]:
         axes.set_visible(False)
-    figure.supxlabel(
-        "line: the other joints at the middle of the measured rows;  dots: the measured rows", fontsize=9
-    )
+    figure.supxlabel("line: other joints at their medians;  dots: measured rows", fontsize=9)
     save_figure(figure, path)
 
 
 def _over_own_value(
     correction: JointCorrection, q: Float64[Tensor, "rows dof"], joint: int
 ) -> tuple[Float64[np.ndarray, " points"], Float64[np.ndarray, " points"]]:
-    """Values of one joint over its measured range, the others at their medians, and its corrections there."""
+    """Return values of one joint over its measured range and its corrections, with the others at their medians."""
     values = torch.linspace(float(q[:, joint].min()), float(q[:, joint].max()), POINTS, dtype=torch.float64)
     at = q.median(0).values.repeat(POINTS, 1)
     at[:, joint] = values
@@ -192,8 +197,8 @@ def draw_learning_curve(points: Sequence[LearningPoint], path: Path) -> None:
     """Draw the error on held-out rows over the number of training rows, both logarithmic.
 
     Args:
-        points: by number of training rows, the fewest first.
-        path: the PNG to write.
+        points: errors by number of training rows, in ascending order.
+        path: PNG file to write.
     """
     rows = [point.rows for point in points]
     names = [name for name in points[0].models if name != "nominal"]
@@ -208,9 +213,7 @@ def draw_learning_curve(points: Sequence[LearningPoint], path: Path) -> None:
             axes.annotate(
                 f"{error:.3f}", (count, error), (0, 6), textcoords="offset points", ha="center", fontsize=8
             )
-    axes.set(
-        xscale="log", yscale="log", xlabel="rows to calibrate with", ylabel="RMS error of held-out rows [mm]"
-    )
+    axes.set(xscale="log", yscale="log", xlabel="calibration rows", ylabel="RMS error of held-out rows [mm]")
     axes.set_xticks(rows, [str(count) for count in rows])
     axes.xaxis.set_minor_formatter(NullFormatter())
     axes.margins(0.06, 0.12)
@@ -221,13 +224,13 @@ def draw_learning_curve(points: Sequence[LearningPoint], path: Path) -> None:
 
 
 def draw_spread(spread: PredictedSpread, path: Path) -> None:
-    """Draw errors of held-out coordinates over the standard deviation that was predicted of them.
+    """Draw errors of held-out coordinates over their predicted standard deviations.
 
-    The steps are the root mean square errors of parts with equally many values; they should lie on the line.
+    The diamonds are the RMS errors of bins with equal numbers of values; they should be on the line.
 
     Args:
-        spread: with at least one judged value.
-        path: the PNG to write.
+        spread: errors and predicted standard deviations, with at least one known value.
+        path: PNG file to write.
     """
     judged = torch.isfinite(spread.error) & torch.isfinite(spread.sigma)
     sigma, error = spread.sigma[judged].numpy() * 1e3, np.abs(spread.error[judged].numpy()) * 1e3
@@ -236,31 +239,33 @@ def draw_spread(spread: PredictedSpread, path: Path) -> None:
     figure = Figure(figsize=(6.8, 5.2))
     axes = figure.add_subplot()
     set_margins(figure, left=0.75, right=0.15, bottom=0.55, top=0.35)
-    step = max(len(sigma) // (3 * MOST_DOTS), 1)
-    axes.plot(sigma[::step], error[::step], ".", color="0.6", markersize=2, label="a coordinate of a row")
+    step = max(len(sigma) // (3 * MAX_DOTS), 1)
+    axes.plot(sigma[::step], error[::step], ".", color="0.6", markersize=2, label="coordinate of a row")
     ends = np.array([sigma[0], sigma[-1]])
     axes.plot(ends, ends, "-", color="black", linewidth=1.0, label="as predicted")
-    axes.plot(ends, WITHIN * ends, "--", color="black", linewidth=1.0, label="95 % should lie below")
+    axes.plot(ends, WITHIN * ends, "--", color="black", linewidth=1.0, label="95 % should be below")
     parts = [part for part in np.array_split(np.arange(len(sigma)), BINS) if len(part)]
     middle = [np.sqrt((sigma[part] ** 2).mean()) for part in parts]
     axes.plot(
         middle, [np.sqrt((error[part] ** 2).mean()) for part in parts], "D", color="tab:red",
-        markeredgecolor="black", label="RMS error of an eighth of them",
+        markeredgecolor="black", label="RMS error of a bin",
     )  # fmt: skip
     axes.set(xlabel="predicted standard deviation [mm]", ylabel="|error| [mm]")
-    far = bool(ends[1] > FAR_APART * ends[0])
+    far = bool(ends[1] > LOG_RATIO * ends[0])
     if far:
         axes.set(xscale="log", yscale="log", ylim=(float(np.quantile(error, 0.02)), None))
     else:
         axes.set_ylim(bottom=0.0)
-    axes.set_title(f"{spread.coverage * 100:.1f} % within 1.96 predicted deviations", loc="left", fontsize=10)
+    axes.set_title(
+        f"{spread.coverage * 100:.1f} % within 1.96 predicted standard deviations", loc="left", fontsize=10
+    )
     axes.grid(alpha=0.3)
     axes.legend(fontsize=9, loc="upper left" if far else "upper right", framealpha=1.0)
     save_figure(figure, path)
 
 
 def _plain_numbers(axes: Axes) -> None:
-    """Numbers such as 0.02 instead of powers of ten up the axis, where it is short enough for them."""
+    """Label a logarithmic axis with plain numbers such as 0.02, where it spans few decades."""
     low, high = axes.get_ylim()
     if low > 0 and high < 1e3 * low:
         axes.yaxis.set_major_locator(LogLocator(subs=(1, 1.5, 2, 3, 5, 7) if high < 30 * low else (1, 2, 5)))

@@ -30,7 +30,7 @@ _say = functools.partial(sentences, "calibration.txt.j2")
 
 
 def parameter_table(parameters: Sequence[ParameterFigures]) -> Table:
-    """One row per parameter: its figures, and the remark in a few words."""
+    """Make a table of parameters: figures, and the remark in a few words."""
     rows = []
     for parameter in parameters:
         figures = (parameter.nominal, parameter.estimated, parameter.change, parameter.standard_error)
@@ -40,50 +40,49 @@ def parameter_table(parameters: Sequence[ParameterFigures]) -> Table:
 
 
 def undetermined_lines(summary: CalibrationSummary) -> list[str]:
-    """What the data cannot determine, a sentence each."""
+    """Return sentences on what the data cannot determine."""
     redundancy = summary.redundancy
     lines = list(redundancy.dependencies)
     if redundancy.no_effect:
-        lines.append(f"{', '.join(redundancy.no_effect)} change no measured value")
+        lines.append(f"{', '.join(redundancy.no_effect)} have no effect on the measured values")
     lines += summary.weak_directions
-    lines = lines or ["Nothing: every parameter is identified."]
+    lines = lines or ["Every parameter is identifiable."]
     if summary.scale is not None:
         lines.append(_scale(summary.scale))
     return [_sentence(line) for line in lines]
 
 
 def _scale(scale: ScaleFigures) -> str:
-    """Say what a wrong scale of the sensor would explain, and how wrong positions would then be."""
+    """Say what a wrong scale of the sensor would explain, and the resulting error of positions."""
     return (
         f"whether links are {scale.factor:.5f} times as long as drawn (standard deviation {scale.sigma:.2g}) or the "
-        "scale of the sensor is off by that factor: both give the same errors of left-out rows. The scale is "
-        f"{scale.odds:.2g} times as likely as links that err each by "
-        f"itself; if it is the scale, true positions are off by {scale.rms_mm:.2g} mm RMS beside all errors shown"
+        "scale of the sensor is wrong by that factor: both give the same errors of held-out rows. The scale is "
+        f"{scale.odds:.2g} times as probable as independent errors of the links; if it is the scale, true positions "
+        f"deviate by {scale.rms_mm:.2g} mm RMS in addition to all errors shown"
     )
 
 
 def predicted_line(rms_mm: float) -> str:
-    """Say what a calibration that no row judged predicts of its own errors, and what to do."""
+    """Say which errors a calibration without held-out rows predicts, and what to do."""
     return (
-        f"Predicted error at other poses: {rms_mm:.3g} mm RMS, by the calibration's own uncertainty. No row was left "
-        "out, so nothing judged it, and errors of the rows that were calibrated with are smaller than those at other "
-        "poses; measure more poses, or begin with what robots of this kind have in common (--prior, of "
-        "`pisigma fleet prior`)."
+        f"Predicted position error at other poses: {rms_mm:.3g} mm RMS, by the posterior of the calibration. "
+        "No row was held out to test it, and residuals of the calibration rows are smaller than errors at other poses; measure "
+        "more poses, or use a fleet prior of this robot type (--prior, made by `pisigma fleet prior`)."
     )
 
 
 def warning_lines(summary: CalibrationSummary) -> list[str]:
-    """What to check or to measure next, a sentence each."""
+    """Return sentences on what to check or to measure next."""
     return [_sentence(line) for line in summary.warnings]
 
 
 def implausible_lines(summary: CalibrationSummary) -> list[str]:
-    """Why the calibration must not be trusted, a sentence each."""
+    """Return sentences on why the calibration is implausible."""
     return [one.sentence for one in summary.diagnostics if one.severity == "implausible"]
 
 
 def trial_table(hybrid: HybridFigures) -> Table:
-    """One row per joint correction that was tried, in order."""
+    """Make a table of the joint corrections that were tried, in order."""
     rows = [
         (
             trial.name,
@@ -99,17 +98,17 @@ def trial_table(hybrid: HybridFigures) -> Table:
 
 
 def learned_lines(hybrid: HybridFigures) -> list[str]:
-    """What was learned beyond the geometry, in sentences."""
+    """Return sentences on the learned joint correction."""
     return list(_say("learned", hybrid))
 
 
 def coverage_line(figures: AbstractValidationFigures) -> str:
-    """How often held-out coordinates are within the predicted intervals, in a sentence; "" where none are predicted."""
+    """Say how often held-out coordinates are within the predicted intervals; "" where none are predicted."""
     return "".join(_say("coverage", figures))
 
 
 def curve_table(points: Sequence[LearningPoint]) -> Table:
-    """RMS position errors of held-out rows [mm] per calibration, one row per number of training rows."""
+    """Make a table of RMS position errors of held-out rows [mm] over the number of training rows."""
     models = list(points[0].models)
     head = ["training rows", *(f"{name}, RMS [mm]" for name in models)]
     has_coverage = all(point.coverage is not None for point in points)
@@ -123,27 +122,27 @@ def curve_table(points: Sequence[LearningPoint]) -> Table:
 
 
 def folds_text(figures: ValidationFigures) -> str:
-    """How the rows of a validation were held out, such as "6 folds, 8 repeats"."""
+    """Say how rows were held out, such as "6 folds, 8 repeats"."""
     return _say("folds", figures)[0]
 
 
 def cross_validation_text(figures: ValidationFigures) -> str:
-    """The same as a sentence without its end: "6-fold cross-validation, 8 repeats: each of 720 rows is ..."."""
+    """Say the same as a clause: "6-fold cross-validation, 8 repeats: each of 720 rows was ..."."""
     return _say("cross_validation", figures)[0]
 
 
 def simulations_text(figures: ValidationFigures) -> str:
-    """Which simulated rows were held out, in a sentence."""
+    """Say which simulated rows were held out."""
     return _say("simulations", figures)[0]
 
 
 def held_out_lines(figures: ValidationFigures) -> list[str]:
-    """What else is to be said of a validation: of its repeats, of sockets and frames that were held out whole."""
+    """Return sentences on repeats of a validation, and on sockets and frames that were held out."""
     return list(_say("held_out", figures))
 
 
 def noise_text(noise: NoiseFigures) -> str:
-    """How much a sensor scatters, in a sentence."""
+    """Say how much a sensor scatters."""
     return _say("noise", noise)[0]
 
 
@@ -152,11 +151,11 @@ def _sentence(line: str) -> str:
 
 
 def write_parameters(parameters: Sequence[ParameterFigures], path: Path) -> None:
-    """Write the parameter table in full digits; a cell is empty where there is no figure.
+    """Write the parameter table with all digits; a cell is empty where there is no figure.
 
     Args:
-        parameters: in mm and deg.
-        path: the CSV to write.
+        parameters: parameters in mm and deg.
+        path: CSV file to write.
     """
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")
@@ -168,11 +167,11 @@ def write_parameters(parameters: Sequence[ParameterFigures], path: Path) -> None
 
 
 def write_correlations(tables: Sequence[CorrelationTable], path: Path) -> None:
-    """Write the tables of lengths and of angles, a cell a line; an undefined correlation is an empty cell.
+    """Write the correlations of lengths and of angles, one pair per line; undefined ones are empty.
 
     Args:
-        tables: of lengths and of angles.
-        path: the CSV to write.
+        tables: correlations of lengths and of angles.
+        path: CSV file to write.
     """
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")

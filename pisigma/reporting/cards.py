@@ -1,4 +1,4 @@
-"""The cards of calibrations and of trained networks, with their figures: what they are, how good, and how made."""
+"""Cards of calibrations and of trained networks, with their figures."""
 
 import math
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ from pisigma.validation.held_out.training_summary import TrainingRun, TrainingSu
 
 @dataclass(frozen=True)
 class CardTexts:
-    """What a card says in words of its own: what the model is, and what nobody checked."""
+    """Texts of a card: what the model is, and what was not validated."""
 
     description: str
     not_validated: str
@@ -37,14 +37,14 @@ def write_calibration_card(
     """Write the card, its CSV files and its figures into a model folder.
 
     Args:
-        model: the model of the folder.
-        result: the calibration.
-        rows: the rows it was calibrated with.
+        model: model of the folder.
+        result: calibration.
+        rows: rows of the calibration.
         validation: errors of held-out rows for the figures, or None.
         summary: all figures of the calibration.
         texts: description, and what was not validated.
-        folder: where to write.
-        pictures: whether figures are drawn.
+        folder: model folder.
+        pictures: whether to draw figures.
     """
     tables.write_parameters(summary.parameters, folder / model_files.PARAMETERS_CSV)
     geometric = geometric_result(result)
@@ -95,11 +95,11 @@ def write_training_card(
     """Write the card and its figures into a model folder.
 
     Args:
-        name: of the model.
+        name: name of the model.
         texts: description, and what was not validated.
-        run: what came out.
+        run: result of the training.
         summary: all figures.
-        folder: where to write.
+        folder: model folder.
     """
     from pisigma.reporting import figures as training_figures
 

@@ -1,4 +1,4 @@
-"""A comparison of models as tables for people."""
+"""Comparisons of models as tables."""
 
 from collections.abc import Mapping, Sequence
 
@@ -10,30 +10,30 @@ _NONE = "-"
 
 
 _Lines = list[tuple[str, Sequence[str]]]
-"""Per line of a table what it is, and a cell per model."""
+"""Label of each line of a table, and one cell per model."""
 
 
 def comparison_tables(comparison: ModelComparison, data: str, width: int) -> list[tuple[str, Table]]:
     """Make titled tables of the errors of every model, and of their differences to the first.
 
-    They have one column per model. Where the models do not fit the width side by side, there are several tables.
+    They have one column per model. Models that do not fit the width are divided among several tables.
 
     Args:
-        comparison: of one model or more.
+        comparison: comparison of one model or more.
         data: name of the rows.
-        width: of the screen, in characters.
+        width: width of the screen [characters].
     """
     names = [model.name for model in comparison.models]
     rows = f"{comparison.rows} rows ({comparison.configurations} configurations) of {data}"
     tables = [(f"Errors of {rows}", names, _error_lines(comparison))]
     if len(names) > 1:
-        title = f"Differences to {names[0]} on the same rows, below 0 is better"
+        title = f"Differences to {names[0]} on the same rows (negative is better)"
         tables.append((title, names[1:], _difference_lines(comparison)))
     return [(title, table) for title, heads, lines in tables for table in _fitting(heads, lines, width)]
 
 
 def _fitting(heads: Sequence[str], lines: _Lines, width: int) -> list[Table]:
-    """Divide the models among tables that fit the width, a single model at least."""
+    """Divide the models among tables that fit the width, at least one model each."""
     label = max(len(line) for line, _ in lines)
     widths = [max(len(head), *(len(cells[k]) for _, cells in lines)) for k, head in enumerate(heads)]
     blocks: list[list[int]] = [[]]
@@ -51,7 +51,7 @@ def _fitting(heads: Sequence[str], lines: _Lines, width: int) -> list[Table]:
 
 
 def _error_lines(comparison: ModelComparison) -> _Lines:
-    """Write errors with confidence intervals, along the axes, and inside and outside of the domain."""
+    """Return errors with confidence intervals, per axis, and inside and outside the domain."""
     models = comparison.models
     lines: _Lines = []
     for quantity, first in models[0].quantities.items():
@@ -78,7 +78,7 @@ def _statistic_lines(
     shown: Mapping[str, str],
     errors: Sequence[QuantityErrors | Difference],
 ) -> _Lines:
-    """Write statistics of every model, each followed by its confidence intervals where there are some."""
+    """Return statistics of every model, each followed by its confidence intervals where there are any."""
     lines: _Lines = []
     for key, statistic in shown.items():
         lines.append((label.format(statistic), [figure_text(one.statistics[key]) for one in errors]))
@@ -89,7 +89,7 @@ def _statistic_lines(
 
 
 def _difference_lines(comparison: ModelComparison) -> _Lines:
-    """Write the differences of every later model to the first, with intervals and Wilcoxon's p."""
+    """Return the differences of the other models to the first, with intervals and Wilcoxon's p."""
     first, *others = comparison.models
     lines: _Lines = []
     for quantity, errors in first.quantities.items():

@@ -8,11 +8,11 @@ NO_VALUE = "-"
 
 
 def difference_table(differences: ParameterDifferences, names: tuple[str, str]) -> Table:
-    """One row per parameter of the arm that is not the same in both models: values, shift with 95 %, and p.
+    """Make a table of the DH parameters that differ between two models: values, shift with 95 % interval, and p.
 
     Args:
-        differences: of two models.
-        names: of the models.
+        differences: differences of the models.
+        names: names of the models.
     """
     columns = ("parameter", "unit", *names, "shift alone", "± 95 %", "p")
     shown = [one for one in differences.parameters if one.difference or any(one.deviations)]
@@ -20,7 +20,7 @@ def difference_table(differences: ParameterDifferences, names: tuple[str, str]) 
 
 
 def _row(one: ParameterDifference) -> tuple[str, ...]:
-    """A parameter; what has no test has no shift."""
+    """Return the row of a parameter; without a test it has no shift."""
     values = (f"{value:.4f}" for value in (one.first, one.second))
     if one.shift is None or one.deviation is None or one.p is None:
         return (one.name, one.unit, *values, NO_VALUE, NO_VALUE, NO_VALUE)

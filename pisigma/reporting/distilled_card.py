@@ -1,4 +1,4 @@
-"""The card of a distilled model, and its tables on card and screen."""
+"""Card of a distilled model, and its tables."""
 
 from pathlib import Path
 
@@ -15,9 +15,9 @@ def write_distilled_card(model: CalibratedModel, summary: DistillationSummary, f
     """Write the card into a model folder.
 
     Args:
-        model: the distilled model.
-        summary: its figures.
-        folder: where to write.
+        model: distilled model.
+        summary: figures of the model.
+        folder: model folder.
     """
     tables = {
         "sizes": size_table(summary),
@@ -28,7 +28,7 @@ def write_distilled_card(model: CalibratedModel, summary: DistillationSummary, f
 
 
 def size_table(summary: DistillationSummary) -> Table:
-    """One row per size that was tried."""
+    """Make a table of the network sizes that were tried."""
     rows = (
         (
             ", ".join(map(str, size.orders)),
@@ -43,7 +43,7 @@ def size_table(summary: DistillationSummary) -> Table:
 
 
 def correction_table(summary: DistillationSummary) -> Table:
-    """One row per joint: what is added to its values, and how far the network is from that."""
+    """Make a table of the joints: corrections, and errors of the network."""
     head = [f"{what}: {label}" for what in ("correction", "error") for _, label in _STATISTICS]
     rows = []
     for joint in summary.joints:
@@ -53,7 +53,7 @@ def correction_table(summary: DistillationSummary) -> Table:
 
 
 def _range_table(summary: DistillationSummary) -> Table:
-    """One row per joint: its smallest and largest nominal value among the poses."""
+    """Make a table of the joints: smallest and largest nominal value among the poses."""
     joints = summary.region.joints
     rows = ((joint.name, joint.unit, figure_text(joint.lower), figure_text(joint.upper)) for joint in joints)
     return Table(("joint", "unit", "lowest", "highest"), tuple(rows))

@@ -1,4 +1,4 @@
-"""Figures of a training: energy curves, and joint errors over the workspace before and after."""
+"""Figures of a training: energy curves, and joint errors over the workspace before and after correction."""
 
 import csv
 from collections.abc import Sequence
@@ -11,8 +11,8 @@ from matplotlib.figure import Figure
 from PIL import Image
 from torch import Tensor
 
-_LEAST_ENERGY = 1e-32
-"""What 0 is drawn as on a logarithmic axis."""
+_MIN_ENERGY = 1e-32
+"""Value that 0 is drawn as on a logarithmic axis."""
 
 
 def write_energy_csv(joints: Sequence[str], energies: Float64[Tensor, "epochs joints"], path: Path) -> None:
@@ -24,13 +24,13 @@ def write_energy_csv(joints: Sequence[str], energies: Float64[Tensor, "epochs jo
 
 
 def draw_energy(joints: Sequence[str], energies: Float64[Tensor, "epochs joints"], path: Path) -> None:
-    """Draw the energy curves on logarithmic axes; every joint has a line style of its own."""
+    """Draw the energy curves on logarithmic axes, with different line styles."""
     figure = Figure(figsize=(6.4, 4.2), layout="constrained")
     axes = figure.add_subplot()
     epochs = np.arange(1, len(energies) + 1)
     styles = ("-", "--", "-.", ":")
     for index, (joint, curve) in enumerate(zip(joints, energies.t().tolist(), strict=True)):
-        drawn = np.maximum(curve, _LEAST_ENERGY)
+        drawn = np.maximum(curve, _MIN_ENERGY)
         axes.plot(epochs, drawn, styles[index % 4], label=joint, linewidth=1.6)
     axes.set(xlabel="epoch", ylabel="energy E (scaled, no unit)", xscale="log", yscale="log")
     axes.set_title("training energy of every joint", fontsize=10)
@@ -47,15 +47,15 @@ def draw_errors_over_workspace(
     after: Float64[Tensor, "rows joints"],
     path: Path,
 ) -> None:
-    """Draw the absolute joint error at every pose, seen from above, before and after (paper's Fig. 6).
+    """Draw the absolute joint error at every pose from above, before and after correction (paper's Fig. 6).
 
     Args:
         joints: names of the corrected joints.
-        units: unit of every joint's errors, "deg" or "mm".
+        units: unit of each joint's errors, "deg" or "mm".
         position: tool positions [m].
-        before: joint errors without correction, in those units.
-        after: the same with correction.
-        path: the PNG to write.
+        before: joint errors without correction, in these units.
+        after: joint errors with correction, in these units.
+        path: PNG file to write.
     """
     x, y = (position[:, axis].numpy() * 1e3 for axis in (0, 1))
     figure = Figure(figsize=(8.6, _row_height(x, y) * len(joints) + 0.6), layout="compressed")
@@ -81,13 +81,13 @@ def draw_errors_over_workspace(
 
 
 def _row_height(x: Float64[np.ndarray, " rows"], y: Float64[np.ndarray, " rows"]) -> float:
-    """Height [inch] of a row of axes 3.1 inch wide, so that millimetres are as long up as across."""
+    """Return the height [inch] of axes of 3.1 inch width with equal scales."""
     width, height = max(float(np.ptp(x)), 1.0), max(float(np.ptp(y)), 1.0)
     return float(np.clip(3.1 * height / width, 1.2, 5.0)) + 0.4
 
 
 def save_figure(figure: Figure, path: Path) -> None:
-    """Write a PNG of 256 colours, a third of the size, without touching matplotlib's global state."""
+    """Write a PNG of 256 colours, a third of the size, without changing matplotlib's global state."""
     canvas = FigureCanvasAgg(figure)
     figure.set_dpi(120)
     canvas.draw()  # type: ignore[no-untyped-call]
@@ -99,16 +99,16 @@ def save_figure(figure: Figure, path: Path) -> None:
 def set_margins(
     figure: Figure, left: float, right: float, bottom: float, top: float, across: float = 0.0, up: float = 0.0
 ) -> None:
-    """Leave room [inch] around and between the axes, for texts of known size: to measure all texts takes as long again.
+    """Set margins around and between axes [inch]; measuring all texts instead would double the drawing time.
 
     Args:
-        figure: to lay out.
-        left: of the first column.
-        right: of the last one.
-        bottom: of the last row.
-        top: of the first one.
-        across: between two columns.
-        up: between two rows.
+        figure: figure of subplots.
+        left: margin left of the first column.
+        right: margin right of the last column.
+        bottom: margin below the last row.
+        top: margin above the first row.
+        across: space between two columns.
+        up: space between two rows.
     """
     width, height = figure.get_size_inches()
     grid = figure.axes[0].get_gridspec()

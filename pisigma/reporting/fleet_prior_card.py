@@ -1,4 +1,4 @@
-"""The card of a fleet prior."""
+"""Card of a fleet prior."""
 
 from pathlib import Path
 
@@ -8,8 +8,8 @@ from pisigma.reporting.rendering import write_card
 from pisigma.reporting.tables import Table
 
 UNDETERMINED = (
-    "A parameter that the rows do not determine, such as where the first axis stands in the base, has mean 0 and the "
-    "usual deviation of the robot's class."
+    "A parameter that the rows do not determine, such as the position of the first axis in the base, has mean 0 and "
+    "the usual standard deviation of the robot's class."
 )
 
 
@@ -17,9 +17,9 @@ def write_fleet_prior_card(model: CalibratedModel, summary: FleetPriorSummary, f
     """Write the card into a model folder.
 
     Args:
-        model: the mean robot.
-        summary: its figures.
-        folder: where to write.
+        model: mean robot.
+        summary: figures of the prior.
+        folder: model folder.
     """
     write_card(
         folder,
@@ -33,13 +33,13 @@ def write_fleet_prior_card(model: CalibratedModel, summary: FleetPriorSummary, f
 
 
 def common_table(summary: FleetPriorSummary) -> Table:
-    """Mean and standard deviation between robots of every geometric parameter."""
+    """Make a table of the mean and the standard deviation between robots of every geometric parameter."""
     rows = ((one.name, one.unit, f"{one.mean:z.4f}", f"{one.deviation:.4f}") for one in summary.parameters)
     return Table(("parameter", "unit", "mean", "between robots"), tuple(rows))
 
 
 def spectrum_table(summary: FleetPriorSummary) -> Table:
-    """Standard deviation between robots of the weights of the joint correction, by group."""
+    """Make a table of the standard deviation between robots of the joint correction's weights, by group."""
     return Table(
         ("weights", "between robots [deg]"), tuple((one.group, f"{one.deg:.5f}") for one in summary.spectrum)
     )

@@ -1,4 +1,4 @@
-"""The robots of a fleet as tables."""
+"""Tables of the robots of a fleet."""
 
 from collections.abc import Sequence
 
@@ -6,19 +6,19 @@ from pisigma.lifetime.fleet.status import FleetStatus, RobotStatus
 from pisigma.reporting.tables import Table
 
 STATES = ("refused", "missing", "drifting", "overdue", "fine")
-WHOSE_ERRORS = (
-    "RMS is that of the position: of rows left out by a cross-validation or a recalibration, otherwise of the rows "
-    "that were calibrated with, or of a monitored session under its model."
+ERRORS_NOTE = (
+    "RMS is the position error: of rows held out by a cross-validation or a recalibration; otherwise of the "
+    "calibration rows, or of a monitored session under its model."
 )
 
 
 def state_table(status: FleetStatus) -> Table:
-    """How many robots are in each state."""
+    """Make a table of the number of robots in each state."""
     return Table(("state", "robots"), tuple((state, str(len(status.in_state(state)))) for state in STATES))
 
 
 def robot_table(robots: Sequence[RobotStatus]) -> Table:
-    """One row per robot: its last session and its state."""
+    """Make a table of the robots: last session and state."""
     return Table(
         ("robot", "session", "rows", "verdict", "RMS [mm]", "days", "state"),
         tuple(_row(one) for one in robots),
@@ -26,14 +26,14 @@ def robot_table(robots: Sequence[RobotStatus]) -> Table:
 
 
 def not_compared(status: FleetStatus) -> str:
-    """Say of how many robots nothing is known of drift; "" where that is of none."""
+    """Say for how many robots drift is unknown; "" where there are none."""
     count = sum(not one.compared for one in status.robots)
     if not count:
         return ""
     robots = "1 robot has" if count == 1 else f"{count} robots have"
     return (
-        f"{robots} several sessions of which each was calibrated by itself, so that nothing is known of drift; "
-        "`pisigma fleet run --task monitor` or `--task recalibrate` compares them."
+        f"{robots} several sessions that were calibrated separately, so that drift is unknown; `pisigma fleet run "
+        "--task monitor` or `--task recalibrate` compares them."
     )
 
 

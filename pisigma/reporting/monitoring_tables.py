@@ -1,4 +1,4 @@
-"""Sessions and control charts as tables."""
+"""Tables of sessions and control charts."""
 
 from collections.abc import Sequence
 
@@ -8,7 +8,7 @@ from pisigma.reporting.tables import Table
 
 
 def session_table(records: Sequence[Record]) -> Table:
-    """One row per session: its verdict, and whether recalibrating pays."""
+    """Make a table of the sessions: verdict, error, and whether to recalibrate."""
     rows = tuple(
         (
             *(one.date, one.file, str(one.session.rows), one.session.verdict, f"{one.session.rms * 1e3:.3f}"),
@@ -20,7 +20,7 @@ def session_table(records: Sequence[Record]) -> Table:
 
 
 def chart_table(charts: Sequence[Chart]) -> Table:
-    """One row per chart: the last value, and both statistics as shares of their limits."""
+    """Make a table of the charts: last value, and both statistics as shares of their limits."""
     columns = ("chart", "last", "unit", "EWMA / limit", "CUSUM / limit", "alarm")
     return Table(columns, tuple(_chart_row(one) for one in charts))
 

@@ -1,4 +1,4 @@
-"""The card of a recalibrated model, and its table on card and screen."""
+"""Card of a recalibrated model, and its table."""
 
 from pathlib import Path
 
@@ -10,7 +10,7 @@ from pisigma.reporting.tables import Table, figure_text
 
 CANDIDATES = {
     "recalibrated": "recalibrated",
-    "old": "old, frames of these rows",
+    "old": "old, with base and tool of these rows",
     "scratch": "from scratch",
 }
 OF_FLEET = CANDIDATES | {"recalibrated": "fleet and these rows", "old": "mean robot of the fleet"}
@@ -20,9 +20,9 @@ def write_recalibration_card(model: CalibratedModel, summary: RecalibrationSumma
     """Write the card into a model folder.
 
     Args:
-        model: the model of the folder.
-        summary: its figures.
-        folder: where to write.
+        model: model of the folder.
+        summary: figures of the recalibration.
+        folder: model folder.
     """
     write_card(
         folder, "recalibration_card.md.j2", model=model, summary=summary, candidates=candidate_table(summary)
@@ -30,7 +30,7 @@ def write_recalibration_card(model: CalibratedModel, summary: RecalibrationSumma
 
 
 def candidate_table(summary: RecalibrationSummary) -> Table:
-    """One row per candidate: the RMS error of left-out rows, and whether it was kept."""
+    """Make a table of the candidates: RMS error of held-out rows, and which was kept."""
     names = OF_FLEET if summary.parent.kind == FLEET_PRIOR else CANDIDATES
     rows = (
         (
@@ -40,4 +40,4 @@ def candidate_table(summary: RecalibrationSummary) -> Table:
         )
         for name, errors in summary.cross_validation.items()
     )
-    return Table(("model", "left-out rows, RMS [mm]", "kept"), tuple(rows))
+    return Table(("model", "held-out rows, RMS [mm]", "kept"), tuple(rows))

@@ -1,4 +1,4 @@
-"""Cards and pages from templates: Python computes, a template of the folder `templates` holds layout and wording."""
+"""Cards and pages from templates: layout and wording are in the folder `templates`."""
 
 import functools
 from pathlib import Path
@@ -22,14 +22,14 @@ def render(template: str, **content: object) -> str:
     """Fill in a template.
 
     Args:
-        template: a file of the folder `templates`; what is filled into one of HTML shows as text, whatever it holds.
-        content: what the template names.
+        template: file of the folder `templates`; values are escaped in HTML templates.
+        content: values by the names in the template.
     """
     return _environment().get_template(template).render(content)
 
 
 def sentences(template: str, macro: str, *values: object) -> tuple[str, ...]:
-    """Fill in a macro of a template: its paragraphs, which stand between empty lines; none where it says nothing."""
+    """Fill in a macro of a template and return its paragraphs, which are separated by empty lines."""
     text = getattr(_environment().get_template(template).module, macro)(*values)
     return tuple(paragraph.strip() for paragraph in text.split("\n\n") if paragraph.strip())
 

@@ -1,4 +1,4 @@
-"""Figures as text: numbers, tables, and what the cards of all models have in common."""
+"""Numbers and tables as text."""
 
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
@@ -11,25 +11,30 @@ _SHOWN = {"rms": "RMS", "p95": "95 %", "max": "maximum"}
 
 
 class Table(NamedTuple):
-    """Names of the columns, and rows of text."""
+    """A table of text.
+
+    Attributes:
+        columns: names of the columns.
+        rows: cells of each row.
+    """
 
     columns: tuple[str, ...]
     rows: tuple[tuple[str, ...], ...]
 
 
 def markdown_table(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A Markdown table."""
+    """Write a Markdown table."""
     lines = [columns, ["---"] * len(columns), *rows]
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
 def figure_text(value: float) -> str:
-    """A figure with four decimals, or two digits and an exponent where these would say little."""
+    """Write a figure with four decimals; with two digits and an exponent where it is below 0.001."""
     return f"{value:.4f}" if value == 0 or abs(value) >= 1e-3 else f"{value:.1e}"
 
 
 def percent_text(share: float) -> str:
-    """Write a share as a percentage; "less than 1 %" where rounding would make it none or all."""
+    """Write a share as a percentage, such as "less than 1 %" instead of "0 %"."""
     if share < 0.005:
         return "less than 1 %"
     return "more than 99 %" if share > 0.995 else f"{100 * share:.0f} %"
@@ -41,7 +46,7 @@ def p_text(probability: float) -> str:
 
 
 def joint_rows(joints: Sequence[JointFigures]) -> list[tuple[str, ...]]:
-    """Per joint and rows: joint, unit, rows, then average, deviation, maximum before and after."""
+    """Return a line per joint and set of rows: joint, unit, rows, then mean, deviation, maximum before and after."""
     lines = []
     for joint in joints:
         for label, errors in (
@@ -56,16 +61,16 @@ def joint_rows(joints: Sequence[JointFigures]) -> list[tuple[str, ...]]:
 
 
 def joint_table(joints: Sequence[JointFigures]) -> str:
-    """A Markdown table of the joint errors; one line per joint and rows, before and after side by side."""
+    """Write a Markdown table of joint errors, before and after side by side."""
     figures = (f"{when}: {name}" for when in ("before", "after") for name in _STATISTICS)
     return markdown_table(("joint", "unit", "rows", *figures), joint_rows(joints))
 
 
 def pose_rows(models: Mapping[str, ErrorFigures]) -> Table:
-    """Pose errors: one column per model, one row per figure.
+    """Make a table of pose errors: one column per model, one row per figure.
 
     Args:
-        models: by name, their errors.
+        models: errors by the name of the model.
     """
     figures = [errors.by_name for errors in models.values()]
     rows = [(*_with_unit(name), *(figure_text(errors[name]) for errors in figures)) for name in figures[0]]
@@ -73,12 +78,12 @@ def pose_rows(models: Mapping[str, ErrorFigures]) -> Table:
 
 
 def pose_table(models: Mapping[str, ErrorFigures]) -> str:
-    """A Markdown table of pose errors, one column per model. See `pose_rows`."""
+    """Write a Markdown table of pose errors; see `pose_rows`."""
     return markdown_table(*pose_rows(models))
 
 
 def distance_table(distances: SocketDistances) -> Table:
-    """One row per stated distance of two sockets, and how far every model misses it [mm]."""
+    """Make a table of stated distances of sockets, and the errors of every model [mm]."""
     models = list(distances.each[0].errors_mm)
     rows = [
         (

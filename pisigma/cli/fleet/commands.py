@@ -169,13 +169,13 @@ def _print_run(result: "FleetRun") -> None:
 
 def _print_status(seen: "FleetStatus", page: Path | None) -> None:
     """Print how many robots are in each state, the worst, and what is to be done."""
-    from pisigma.reporting.fleet_tables import WHOSE_ERRORS, not_compared, robot_table, state_table
+    from pisigma.reporting.fleet_tables import ERRORS_NOTE, not_compared, robot_table, state_table
 
     count = len(seen.robots)
     print_table(f"{count} robot{'' if count == 1 else 's'}, seen on {seen.today}", *state_table(seen))
     if worst := seen.worst_first[:SHOWN]:
         print_table("largest errors", *robot_table(worst))
-        print_lines([WHOSE_ERRORS])
+        print_lines([ERRORS_NOTE])
     for state, title in (("drifting", "Drifting"), ("refused", "Refused")):
         for one in seen.in_state(state):
             said = one.refused or one.last

@@ -1,1 +1,1 @@
-"""One page by which an engineer accepts a calibration."""
+"""Calibration reports and other pages as single HTML files."""

@@ -1,4 +1,4 @@
-"""Figures of a report, drawn and as SVG and PNG: many dots as pixels, no dates inside, names shown as they are."""
+"""Figures of a report as SVG and PNG: many dots are rasterised, files contain no dates, names are shown verbatim."""
 
 import io
 import os
@@ -31,13 +31,13 @@ from pisigma.validation.report.dependence import Dependence, binned
 from pisigma.validation.report.error_map import Layer
 
 SIZE = (5.2, 3.1)
-"""Of a panel [inch]."""
+"""Width and height of a panel [inch]."""
 MANY_DOTS = 200
-"""From so many on, dots are drawn as pixels."""
+"""Number of dots above which they are rasterised."""
 PIXELS = 130
-"""Of dots, per inch."""
+"""Resolution of rasterised dots [pixels per inch]."""
 BEFORE, AFTER, OTHER = "#b35806", "#1f5fa8", "#4d4d4d"
-"""Colours that people who see no red or no green can distinguish, too."""
+"""Colours that can be distinguished with colour blindness."""
 _STYLE: dict[Any, Any] = {
     "text.parse_math": False,
     "svg.hashsalt": "pisigma",
@@ -52,8 +52,8 @@ _STYLE: dict[Any, Any] = {
     "legend.frameon": False,
     "legend.fontsize": 9.0,
 }
-MOST_MAP_DOTS = 1_500
-"""Of the flat map: the largest errors all, of the others every fourth and as many at most."""
+MAX_MAP_DOTS = 1_500
+"""Dots of the flat map with the largest errors; of the others every fourth is drawn, at most as many."""
 _COLORS = {"nominal": BEFORE, "geometric": OTHER, "hybrid": AFTER}
 
 
@@ -62,9 +62,9 @@ class Drawing:
     """A figure of the report.
 
     Attributes:
-        key: its file name without ending.
-        title: for the page.
-        alt: what is to be seen, for people who do not see it.
+        key: file name without suffix.
+        title: title on the page.
+        alt: text alternative of the image.
         figure: the figure.
     """
 
@@ -74,7 +74,7 @@ class Drawing:
     figure: Figure
 
     def svg(self) -> str:
-        """The figure as SVG, the same text for the same figure."""
+        """Write the figure as SVG, reproducibly."""
         stream = io.BytesIO()
         with drawing_style():
             FigureCanvasSVG(self.figure)
@@ -82,7 +82,7 @@ class Drawing:
         return stream.getvalue().decode()
 
     def png(self) -> bytes:
-        """The figure as PNG."""
+        """Write the figure as PNG."""
         stream = io.BytesIO()
         with drawing_style():
             FigureCanvasAgg(self.figure)
@@ -95,11 +95,11 @@ class ReportFigures:
     """Drawings of a report.
 
     Attributes:
-        map: from above and from the side.
-        dependences: over joint values, order, payload and temperature.
-        correlations: of lengths and of angles.
-        corrections: of every joint.
-        learning_curve: none or one.
+        map: error map from above and from the side.
+        dependences: errors over joint values, order, payload and temperature.
+        correlations: correlations of lengths and of angles.
+        corrections: corrections of the joints.
+        learning_curve: learning curve; empty where there is none.
     """
 
     map: Drawing
@@ -110,23 +110,23 @@ class ReportFigures:
 
     @property
     def all(self) -> tuple[Drawing, ...]:
-        """Every one of them."""
+        """All drawings."""
         return (self.map, *self.dependences, *self.correlations, *self.corrections, *self.learning_curve)
 
 
 @contextmanager
 def drawing_style() -> Iterator[None]:
-    """The style of all figures; characters that no font has are no reason to complain."""
+    """Apply the style of all figures, without warnings about characters that no font has."""
     with mpl.rc_context(_STYLE), warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="Glyph .* missing from")
         yield
 
 
 def check_figures(folder: Path, inputs: Iterable[Input] = ()) -> None:
-    """Make sure that figures may be written into a folder: before the work, not after it.
+    """Check in advance that figures can be written into a folder.
 
     Raises:
-        OutputError: it is a file, lies in a model folder or an input, or it cannot be made or written to.
+        OutputError: it is a file, is inside a model folder or an input, or cannot be made or written to.
     """
     check_conflicts(folder / "figure.png", inputs, "--figures")
     if folder.exists() and not folder.is_dir():
@@ -148,8 +148,8 @@ def write_figures(drawings: Sequence[Drawing], folder: Path) -> list[Path]:
     """Write every figure as PNG and SVG.
 
     Args:
-        drawings: to write; names that no file can have are changed.
-        folder: made where missing.
+        drawings: drawings to write; characters that file names cannot have are replaced.
+        folder: folder, created where missing.
 
     Raises:
         OutputError: a file cannot be written.
@@ -174,7 +174,7 @@ def write_figures(drawings: Sequence[Drawing], folder: Path) -> list[Path]:
 
 
 def draw_figures(content: ReportContent) -> ReportFigures:
-    """Draw what a report shows."""
+    """Draw the figures of a report."""
     points = (content.summary.learning_curve if content.summary else None) or ()
     return ReportFigures(
         map=draw_map(
@@ -188,7 +188,7 @@ def draw_figures(content: ReportContent) -> ReportFigures:
 
 
 def draw_dependence(dependence: Dependence) -> Drawing:
-    """Draw errors over one quantity: every row a dot, and the RMS errors of its bins."""
+    """Draw errors over one quantity: a dot per row, and RMS errors of bins."""
     with drawing_style():
         figure, axes = panel()
         if "before" in dependence.errors:
@@ -201,7 +201,7 @@ def draw_dependence(dependence: Dependence) -> Drawing:
 
 
 def draw_correction(curve: CorrectionCurve) -> Drawing:
-    """Draw what a joint is corrected by over its own value, measured values shaded."""
+    """Draw the correction of a joint over its own value, with measured values shaded."""
     with drawing_style():
         figure, axes = panel()
         for low, high in _stretches(curve.values, curve.measured):
@@ -217,7 +217,7 @@ def draw_correction(curve: CorrectionCurve) -> Drawing:
 
 
 def draw_correlations(tables: Sequence[Correlations]) -> tuple[Drawing, ...]:
-    """Draw correlations of lengths and of angles; pairs that act alike bear their sign."""
+    """Draw correlations of lengths and of angles; redundant pairs are marked with a sign."""
     named = zip(("lengths", "angles"), tables, strict=False)
     return tuple(_correlations(title, table) for title, table in named if table[0])
 
@@ -237,12 +237,12 @@ def _correlations(title: str, table: Correlations) -> Drawing:
                 color = "white" if abs(value) > 0.7 else "black"
                 axes.text(k, i, text, ha="center", va="center", fontsize=6.5, color=color)
         figure.colorbar(shown, ax=axes, shrink=0.8).set_label("Pearson correlation")
-    alt = f"Correlations of the columns of {len(names)} {title}; the strongest pairs stand in the text."
+    alt = f"Correlations of {len(names)} {title}; the strongest pairs are listed in the text."
     return Drawing(f"correlation_{title}", title, alt, figure)
 
 
 def draw_learning_curve(points: Sequence[LearningPoint]) -> Drawing:
-    """Draw errors of held-out rows over the number of rows to calibrate with, both logarithmic."""
+    """Draw errors of held-out rows over the number of calibration rows, both logarithmic."""
     with drawing_style():
         figure, axes = panel()
         rows = [point.rows for point in points]
@@ -250,26 +250,28 @@ def draw_learning_curve(points: Sequence[LearningPoint]) -> Drawing:
             line, mark = STYLES[name]
             errors = [point.models[name].rms_mm for point in points]
             axes.plot(rows, errors, line, marker=mark, label=name, color=_COLORS[name])  # type: ignore[arg-type]
-        axes.set(xscale="log", yscale="log", xlabel="rows to calibrate with", ylabel="RMS error [mm]")
+        axes.set(
+            xscale="log", yscale="log", xlabel="calibration rows", ylabel="RMS error of held-out rows [mm]"
+        )
         axes.set_xticks(rows, [str(count) for count in rows])
         axes.xaxis.set_minor_formatter(NullFormatter())
         _plain_log(axes)
         axes.legend()
-    alt = "RMS error of held-out rows over the number of rows."
+    alt = "RMS error of held-out rows over the number of calibration rows."
     return Drawing("learning_curve", "learning curve", alt, figure)
 
 
 def draw_map(
     key: str, title: str, what: str, place: Float64[np.ndarray, "points 3"], layers: Sequence[Layer]
 ) -> Drawing:
-    """Draw quantities at points of space from above and from the side, for paper and for pages without scripts.
+    """Draw quantities at points in space from above and from the side, for printing and without JavaScript.
 
     Args:
-        key: of the drawing.
-        title: of the drawing.
-        what: is to be seen.
-        place: of every point [mm].
-        layers: the quantities, side by side.
+        key: key of the drawing.
+        title: title of the drawing.
+        what: subject of the drawing, at the start of its text alternative.
+        place: position of every point [mm].
+        layers: quantities, drawn side by side.
     """
     with drawing_style():
         figure = Figure(figsize=(3.9 * len(layers), 5.8), layout="constrained")
@@ -277,7 +279,7 @@ def draw_map(
         for column, layer in enumerate(layers):
             finite = np.isfinite(layer.values)
             order = np.argsort(layer.values[finite], kind="stable")
-            order = np.concatenate([order[:-MOST_MAP_DOTS:4], order[-MOST_MAP_DOTS:]])[-2 * MOST_MAP_DOTS :]
+            order = np.concatenate([order[:-MAX_MAP_DOTS:4], order[-MAX_MAP_DOTS:]])[-2 * MAX_MAP_DOTS :]
             values, at = layer.values[finite][order], place[finite][order]
             top = max(float(values.max(initial=0.0)), 1e-12)
             for axes, (a, b) in zip(grid[:, column], ((0, 1), (0, 2)), strict=True):
@@ -294,7 +296,7 @@ def draw_map(
 
 
 def panel() -> tuple[Figure, Axes]:
-    """A panel with fixed margins: working them out would take as long as drawing it."""
+    """Make a panel with fixed margins; computing them would take as long as drawing."""
     figure = Figure(figsize=SIZE)
     figure.subplots_adjust(left=0.155, right=0.985, bottom=0.165, top=0.9)
     axes = figure.add_subplot()
@@ -303,7 +305,7 @@ def panel() -> tuple[Figure, Axes]:
 
 
 def _lengths(axes: Axes, dependence: Dependence) -> None:
-    """Draw lengths on a logarithmic axis: dots after, and root mean squares before and after."""
+    """Draw lengths on a logarithmic axis: dots after, and RMS before and after."""
     after = dependence.errors["after"]
     floor = max(float(np.quantile(after, 0.01)) / 2, 1e-9) if len(after) else 1e-9
     _dots(axes, dependence.values, np.maximum(after, floor), AFTER)
@@ -317,12 +319,12 @@ def _lengths(axes: Axes, dependence: Dependence) -> None:
         axes.stairs(bins.rms, bins.edges, baseline=None, **style)  # type: ignore[arg-type]
     axes.set(yscale="log", ylabel=f"error [{dependence.error_unit}]")
     _plain_log(axes)
-    if axes.get_legend_handles_labels()[0]:  # too few rows for bins have no lines
+    if axes.get_legend_handles_labels()[0]:  # without bins there are no lines
         axes.legend(ncols=2, loc="lower left", bbox_to_anchor=(0, 1), borderaxespad=0.1)
 
 
 def _signed(axes: Axes, dependence: Dependence) -> None:
-    """Draw signed errors, with the mean of stretches of the rows."""
+    """Draw signed errors, with means of consecutive rows."""
     styles = {"x": (AFTER, "-", "o"), "y": (BEFORE, "--", "s"), "z": (OTHER, ":", "^")}
     number = dependence.values
     for name, (color, line, mark) in styles.items():
@@ -347,7 +349,7 @@ def _dots(axes: Axes, x: np.ndarray, y: np.ndarray, color: str) -> None:
 
 
 def _plain_log(axes: Axes) -> None:
-    """Numbers such as 0.02 up a logarithmic axis; every tick costs a millisecond, so there are few."""
+    """Label a logarithmic axis with plain numbers such as 0.02; few ticks, as each takes a millisecond."""
     low, high = axes.get_ylim()
     axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5) if low > 0 and high < 300 * low else (1,)))
     axes.yaxis.set_major_formatter("{x:g}")

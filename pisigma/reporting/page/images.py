@@ -1,4 +1,4 @@
-"""Images of boards with the corners that were detected, as one page that loads nothing from elsewhere."""
+"""Page of board images with detected corners, self-contained."""
 
 from collections.abc import Sequence
 
@@ -15,13 +15,13 @@ from pisigma.reporting.rendering import render
 from pisigma.reporting.tables import Table
 
 WIDTH = 4.8
-"""Of a picture [inch]."""
-MOST_PIXELS = 480
-"""Of a picture along u; finer images are averaged."""
+"""Width of a picture [inch]."""
+MAX_PIXELS = 480
+"""Pixels of a picture along u; larger images are averaged."""
 GRAY_STEP = 16
-"""Noise below is not shown, as it would make the page ten times as large."""
+"""Step of the gray values; finer noise would make the page ten times as large."""
 ARROW = 0.05
-"""Length of an arrow that 5 % of the residuals exceed, as share of the width of an image."""
+"""Length of the arrow of the 95 % quantile of the residuals, as a share of the image width."""
 
 
 def images_page(
@@ -30,13 +30,13 @@ def images_page(
     tables: Sequence[tuple[str, Table]],
     says: tuple[Sequence[str], Sequence[str]],
 ) -> str:
-    """Lay images out as HTML; every text is shown as it is, whatever it holds.
+    """Render the page of images as HTML; texts are escaped.
 
     Args:
-        title: of the page.
-        detection: the boards in the images.
-        tables: with their titles.
-        says: sentences, and what to heed.
+        title: title of the page.
+        detection: boards in the images.
+        tables: tables with their titles.
+        says: sentences, and warnings.
     """
     sentences, warnings = says
     scale = arrow_scale(detection)
@@ -54,7 +54,7 @@ def images_page(
 
 
 def arrow_scale(detection: DetectedBoards) -> float:
-    """By how much residuals are enlarged in all pictures: 1, 2 or 5 times a power of ten."""
+    """Compute the magnification of residuals in all pictures: 1, 2 or 5 times a power of ten."""
     lengths = np.linalg.norm(np.concatenate(list(detection.residuals.values())), axis=1)
     width = next(one.size[0] for one in detection.images if one.is_read)
     wanted = ARROW * width / max(float(np.quantile(lengths, 0.95)), 1e-6)
@@ -63,12 +63,12 @@ def arrow_scale(detection: DetectedBoards) -> float:
 
 
 def draw_image(one: BoardImage, detection: DetectedBoards, scale: float) -> Drawing:
-    """Draw an image with its corners and arrows from where they are predicted to where they are, enlarged.
+    """Draw an image with magnified arrows from predicted to detected corners.
 
     Args:
-        one: the image.
-        detection: with the residuals of its corners, if it has some.
-        scale: of the arrows.
+        one: image.
+        detection: detected boards, with the residuals of corners where the image was used.
+        scale: magnification of the arrows.
     """
     width, height = one.size
     with drawing_style():
@@ -90,13 +90,13 @@ def draw_image(one: BoardImage, detection: DetectedBoards, scale: float) -> Draw
     largest = float(np.linalg.norm(residual, axis=1).max())
     alt = (
         f"{len(residual)} corners, RMS {rms_of(residual):.3f} px, largest residual {largest:.3f} px, blur "
-        f"{one.blur:.2f} px; arrows are enlarged {scale:g} times."
+        f"{one.blur:.2f} px; arrows are magnified {scale:g} times."
     )
     return Drawing(one.name, one.name, alt, figure)
 
 
 def _thumbnail(one: BoardImage) -> np.ndarray:
-    """Gray values of an image in a few pixels and levels."""
+    """Reduce an image to few pixels and gray levels."""
     full = Image.fromarray(read_image(one.file))
-    full.thumbnail((MOST_PIXELS, MOST_PIXELS), Image.Resampling.BOX)
+    full.thumbnail((MAX_PIXELS, MAX_PIXELS), Image.Resampling.BOX)
     return np.asarray(full) // GRAY_STEP * GRAY_STEP + GRAY_STEP // 2

@@ -1,4 +1,4 @@
-"""Pages on the life of robots: control charts of sessions, two models beside each other, fleets; one file each."""
+"""Pages of control charts, comparisons of two models, and fleets; one file each."""
 
 import datetime
 from collections.abc import Mapping, Sequence
@@ -17,7 +17,7 @@ from pisigma.lifetime.recalibration.movement import NORMAL_95
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.reporting.comparison_tables import comparison_tables
 from pisigma.reporting.difference_tables import difference_table
-from pisigma.reporting.fleet_tables import STATES, WHOSE_ERRORS, not_compared, robot_table, state_table
+from pisigma.reporting.fleet_tables import STATES, ERRORS_NOTE, not_compared, robot_table, state_table
 from pisigma.reporting.monitoring_tables import chart_table, session_table
 from pisigma.reporting.page.figures import AFTER, BEFORE, OTHER, Drawing, draw_map, drawing_style, panel
 from pisigma.reporting.page.page import image, resource
@@ -26,8 +26,8 @@ from pisigma.reporting.tables import pose_rows
 from pisigma.validation.held_out.model_comparison import ModelComparison
 from pisigma.validation.report.error_map import Layer
 
-WIDE = 10_000
-"""Characters: tables of a page scroll."""
+PAGE_WIDTH = 10_000
+"""[characters] Width of tables on a page, which scroll."""
 
 
 def monitoring_page(
@@ -37,14 +37,14 @@ def monitoring_page(
     sentences: Sequence[str],
     warnings: Sequence[str],
 ) -> str:
-    """Lay sessions and charts out as HTML; every text is shown as it is, whatever it holds.
+    """Render sessions and charts as HTML; texts are escaped.
 
     Args:
-        model: that the sessions were compared with.
-        records: all sessions, by their dates.
-        charts: over them.
-        sentences: what they say together.
-        warnings: what to heed.
+        model: model that the sessions were compared with.
+        records: all sessions sorted by date.
+        charts: control charts of the sessions.
+        sentences: sentences on all sessions together.
+        warnings: warnings, one sentence each.
     """
     days = [datetime.date.fromisoformat(one.date) for one in records]
     return render(
@@ -66,7 +66,7 @@ def monitoring_page(
 
 
 def draw_values(chart: Chart, days: Sequence[datetime.date]) -> Drawing:
-    """Draw a quantity over the sessions with its 95 % intervals."""
+    """Draw a quantity over the sessions with 95 % intervals."""
     with drawing_style():
         figure, axes = panel()
         values, half = chart.values.numpy(), NORMAL_95 * chart.deviations.numpy()
@@ -116,11 +116,11 @@ def _dates(axes: Axes) -> None:
 
 
 def fleet_page(status: FleetStatus, name: str) -> str:
-    """Lay the robots of a fleet out as HTML; every text is shown as it is, whatever it holds.
+    """Render the robots of a fleet as HTML; texts are escaped.
 
     Args:
-        status: of the fleet.
-        name: of the fleet.
+        status: status of the fleet.
+        name: name of the fleet.
     """
     order = {one.robot: place for place, one in enumerate(status.worst_first)}
     robots = sorted(
@@ -133,7 +133,7 @@ def fleet_page(status: FleetStatus, name: str) -> str:
         states=state_table(status),
         robots=robots,
         table=robot_table(robots),
-        notes=(WHOSE_ERRORS, *filter(None, [not_compared(status)]), *status.warnings),
+        notes=(ERRORS_NOTE, *filter(None, [not_compared(status)]), *status.warnings),
         style=Markup(resource("style.css")),  # ours
     )
 
@@ -145,14 +145,14 @@ def comparison_page(
     rows: ModelComparison | None,
     says: tuple[Sequence[str], Sequence[str]],
 ) -> str:
-    """Lay a comparison out as HTML; every text is shown as it is, whatever it holds.
+    """Render a comparison of two models as HTML; texts are escaped.
 
     Args:
-        models: the two, by name.
-        parameters: side by side.
-        displacements: distances between both models' poses, by what the poses are.
-        rows: errors of both models; None where none were given.
-        says: sentences, and what to heed.
+        models: two models by name.
+        parameters: differences of the parameters.
+        displacements: displacements of the tool, by description of the poses.
+        rows: errors of both models on rows; None where none were given.
+        says: sentences, and warnings.
     """
     first, second = models
     sentences, warnings = says
@@ -166,7 +166,7 @@ def comparison_page(
         level=f"{parameters.level:.2g}",
         maps=[draw_displacement(what, one) for what, one in displacements.items()],
         displacements=pose_rows({what: one.errors.figures for what, one in displacements.items()}),
-        rows=() if rows is None else comparison_tables(rows, "the rows", WIDE),
+        rows=() if rows is None else comparison_tables(rows, "the rows", PAGE_WIDTH),
         sentences=sentences,
         warnings=warnings,
         image=image,
@@ -175,16 +175,16 @@ def comparison_page(
 
 
 def draw_displacement(what: str, displacement: Displacement) -> Drawing:
-    """Draw distances between both models' poses from above and from the side.
+    """Draw distances between the poses of two models from above and from the side.
 
     Args:
-        what: the poses are.
-        displacement: at the poses.
+        what: description of the poses.
+        displacement: displacement of the tool at the poses.
     """
     errors = displacement.errors
     layers = [Layer("distance", "mm", errors.position.numpy() * 1e3)]
     if errors.rotation is not None:
         layers.append(Layer("turn", "deg", np.rad2deg(errors.rotation.numpy())))
-    seen = f"Distance and turn between the poses of both models, {what},"
+    seen = f"Distance and rotation between the poses of both models, {what},"
     title = f"{what[:1].upper()}{what[1:]}"
     return draw_map(f"displacement_{what}", title, seen, displacement.place.numpy() * 1e3, layers)

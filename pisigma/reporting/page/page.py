@@ -1,4 +1,4 @@
-"""The report as one page that loads nothing from elsewhere."""
+"""The report as one self-contained HTML page."""
 
 import base64
 import json
@@ -30,10 +30,7 @@ _PACKAGE = "pisigma.reporting.page"
 
 
 def render_page(content: ReportContent, figures: ReportFigures) -> str:
-    """Lay the report out as HTML.
-
-    Every text of the content is shown as it is, whatever it holds.
-    """
+    """Render the report as HTML; texts are escaped."""
     return render(
         "page.html.j2",
         c=content,
@@ -53,12 +50,12 @@ def render_page(content: ReportContent, figures: ReportFigures) -> str:
 
 
 def script_json(value: Any) -> Markup:
-    """Write JSON that can stand inside a script element: nothing in it ends the element or a line."""
+    """Write JSON for a script element, escaped so that it cannot end the element or a line."""
     return Markup(json.dumps(value, allow_nan=False, ensure_ascii=True).translate(_ESCAPED))
 
 
 def map_data(error_map: ErrorMap, robot: Robot) -> dict[str, Any]:
-    """Pack what the viewer reads; arrays as base64 of little-endian float32."""
+    """Pack the data of the viewer; arrays as base64 of little-endian float32."""
     return {
         "place": _packed(error_map.place),
         "layers": [
@@ -95,7 +92,7 @@ def _packed(values: Any) -> str:
 
 
 def image(drawing: Drawing) -> str:
-    """Give the address of an image that holds a figure."""
+    """Return the data URL of a figure."""
     return _address("svg+xml", drawing.svg().encode())
 
 

@@ -1,4 +1,4 @@
-"""A page in the browser that shows a measuring session while it goes on."""
+"""Live page of a measuring session in the browser."""
 
 import contextlib
 import io
@@ -25,13 +25,13 @@ if TYPE_CHECKING:  # names in full, which type checkers at run time find without
     import viser
     import viser.uplot
 
-DRAWN = 0.15
-"""Share of the robot's reach that an error at the end of the scale of colours is drawn with."""
+ERROR_SHARE = 0.15
+"""Drawn length of an error at the end of the colour scale, as a share of the robot's reach."""
 FIELD, RISE, AROUND_ROBOT, CLOSER = 0.8, 0.5, 0.7, 0.92
-"""Of the first view: its angle [rad], how steeply it looks down, the share of the reach that it shows around, and how
-much nearer than for all of that ball it is."""
-MOST_ALARMS = 8
-"""The latest are shown."""
+"""First view: field of view [rad], downward slope, radius around the robot as a share of the reach, and distance of the
+camera as a share of that at which this radius is visible."""
+MAX_ALARMS = 8
+"""Latest alarms that are shown."""
 
 CURVES: tuple["viser.uplot.Series", ...] = (
     {"label": "poses"},
@@ -44,9 +44,9 @@ CURVES: tuple["viser.uplot.Series", ...] = (
 
 
 class SessionView:
-    """Serves the page until it is closed: `with SessionView(arm) as view: view.show(state)`.
+    """Server of the page until it is closed: `with SessionView(arm) as view: view.show(state)`.
 
-    The page fetches nothing from other machines.
+    The page is self-contained.
 
     Attributes:
         url: address of the page.
@@ -65,15 +65,15 @@ class SessionView:
 
         Args:
             arm: the robot in its cell.
-            body: what the robot looks like; None for capsules.
-            limit: what 95 % of the errors are to stay below [m]; None for no limit.
-            host: address to listen at; at 127.0.0.1 only this machine can open the page.
-            port: to listen at; where it is taken, the next one that is free.
+            body: appearance of the robot; None for capsules.
+            limit: limit of the 95 % quantile of the errors [m]; None for no limit.
+            host: address to listen on; at 127.0.0.1 only this machine can open the page.
+            port: port to listen on; if it is taken, the next free one.
             sight: camera and board; None without a camera.
 
         Raises:
             ImportError: viser is not installed.
-            OutputError: the host is no address of this machine.
+            OutputError: the host is not an address of this machine.
         """
         import viser
 
@@ -81,7 +81,7 @@ class SessionView:
         self._reach, self._lock = arm.robot.reach, threading.Lock()
         self._state: SessionState | None = None
         self._magnified_by_hand = False
-        with contextlib.redirect_stdout(io.StringIO()):  # it greets where results are printed
+        with contextlib.redirect_stdout(io.StringIO()):  # viser prints a greeting to stdout
             self._server = viser.ViserServer(host, port, label="pisigma measure", verbose=False)
         self.url = f"http://{host}:{self._server.get_port()}"
         self._server.gui.configure_theme(show_logo=False, show_share_button=False, control_width="large")
@@ -95,7 +95,7 @@ class SessionView:
         self._panel.magnification.on_update(self._magnify)
 
     def __enter__(self) -> "SessionView":
-        """The view itself."""
+        """Return the view."""
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -104,12 +104,12 @@ class SessionView:
             self._server.stop()
 
     def show(self, state: SessionState) -> None:
-        """Show a state of the session on every page that is open."""
+        """Show a state of the session on all open pages."""
         top = top_of_scale(state.rows)
         with self._lock, self._server.atomic():
             self._state = state
             if not self._magnified_by_hand:
-                times = 10 * round(float(np.clip(DRAWN * self._reach / top, 10, 2000)) / 10)
+                times = 10 * round(float(np.clip(ERROR_SHARE * self._reach / top, 10, 2000)) / 10)
                 self._panel.magnification.value = times  # type: ignore[misc]  # mypy misses its decorated setter
             self._scene.show_robot(state)
             if state.base is not None:
@@ -119,7 +119,7 @@ class SessionView:
         self._server.flush()
 
     def _magnify(self, event: "viser.GuiEvent[Any]") -> None:
-        """Draw the errors as long as the slider says, from when a person moves it."""
+        """Draw the errors with the magnification of the slider, once a person has moved it."""
         if event.client is None:
             return
         with self._lock, self._server.atomic():
@@ -130,20 +130,22 @@ class SessionView:
 
 
 def _check_host(host: str) -> None:
-    """Refuse an address that this machine has not; viser would look for a free port there for ever."""
+    """Refuse an address that is not one of this machine; viser would look for a free port there forever."""
     try:
         family, kind, _, _, address = socket.getaddrinfo(host, 0, type=socket.SOCK_STREAM)[0]
         with socket.socket(family, kind) as trial:
             trial.bind(address)
     except OSError as problem:
         raise OutputError(
-            f"the page cannot be served at '{host}' ({problem.strerror}); give an address of this machine, such as "
-            "127.0.0.1, or 0.0.0.0 for all of them."
+            f"the page cannot be served at '{host}': {problem.strerror}",
+            value=host,
+            option="--host",
+            remedy="give an address of this machine, such as 127.0.0.1, or 0.0.0.0 for all of them",
         ) from None
 
 
 def first_view(arm: ArmInCell) -> tuple[Float64[np.ndarray, " 3"], Float64[np.ndarray, " 3"]]:
-    """From where to look at the robot and its tracker, which then stand side by side, and where to [m]."""
+    """Return camera position and target of a view with robot and tracker side by side [m]."""
     tracker = np.zeros(3) if arm.cell.tracker is None else arm.cell.tracker.position.numpy()
     around = AROUND_ROBOT * arm.robot.reach
     low, high = np.minimum(tracker, (-around, -around, 0.0)), np.maximum(tracker, around)
@@ -154,26 +156,26 @@ def first_view(arm: ArmInCell) -> tuple[Float64[np.ndarray, " 3"], Float64[np.nd
 
 
 def top_of_scale(rows: RowsSoFar) -> float:
-    """Error [m] at which the scale of colours ends: a round one that 95 % of the rows that count stay below."""
+    """Return the error at the end of the colour scale: the 95 % quantile of the rows that count, rounded up [m]."""
     errors = np.linalg.norm(rows.error, axis=1)[~rows.alarmed]
     errors = errors[np.isfinite(errors)]
     return round_up(float(np.quantile(errors, 0.95))) if errors.size else 1e-3
 
 
 class SessionPanel:
-    """Fills the panel beside the scene; every call replaces what the call before has written.
+    """Panel next to the scene; every call replaces the previous content.
 
     Attributes:
-        magnification: slider: how many times longer than they are errors are drawn.
+        magnification: slider of the magnification of errors.
     """
 
     def __init__(self, gui: "viser.GuiApi", robot: Robot, limit: float | None) -> None:
-        """Lay the panel out.
+        """Set up the panel.
 
         Args:
-            gui: where to.
-            robot: gives the joints their names and units.
-            limit: what 95 % of the errors are to stay below [m]; None for no limit.
+            gui: GUI of the server.
+            robot: robot with the names and units of the joints.
+            limit: limit of the 95 % quantile of the errors [m]; None for no limit.
         """
         self._robot, self._limit = robot, limit
         environment = template_environment(
@@ -194,15 +196,15 @@ class SessionPanel:
         self._rows = gui.add_html("")
 
     def show(self, state: SessionState, top: float) -> None:
-        """Write a state of the session.
+        """Show a state of the session.
 
         Args:
             state: the state.
-            top: error [m] at which the scale of colours ends.
+            top: error at the end of the colour scale [m].
         """
         self._advice.content = str(self._text.advice(state, self._robot.axes, self._limit))
         self._rows.content = str(
-            self._text.rows(state, self._robot.axes, state.alarms[: -MOST_ALARMS - 1 : -1], top, RAMP)
+            self._text.rows(state, self._robot.axes, state.alarms[: -MAX_ALARMS - 1 : -1], top, RAMP)
         )
         points = (*state.expected, *state.reached)
         curves = _curves(points, self._limit)
@@ -213,7 +215,7 @@ class SessionPanel:
 def _curves(
     points: Sequence[AccuracyPoint], limit: float | None
 ) -> tuple[Float64[np.ndarray, " points"], ...]:
-    """Columns of the curve [mm] by the number of poses; of several points for one number the last counts."""
+    """Return the columns of the curve [mm] over the number of poses; of several points for one number, the last."""
     by_poses = {point.poses: point for point in points}
     line = math.nan if limit is None else limit
     rows = [
@@ -225,6 +227,6 @@ def _curves(
 
 
 def _scales(curves: Sequence[Float64[np.ndarray, " points"]]) -> dict[str, "viser.uplot.Scale"]:
-    """Axes of the curve: errors from 0 to the largest, which uPlot does not work out where one is missing."""
+    """Return the axes of the curve: errors from 0 to the largest, which uPlot cannot compute with missing values."""
     finite = [column[np.isfinite(column)].max(initial=0.0) for column in curves[1:]]
     return {"x": {"time": False}, "y": {"auto": False, "range": (0.0, 1.05 * max((1e-3, *finite)))}}

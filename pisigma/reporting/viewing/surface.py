@@ -6,39 +6,39 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 AROUND = 24
-"""Points around the axis."""
+"""Points around the axis of revolution."""
 
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """Triangles.
+    """A triangle mesh.
 
     Attributes:
-        points: corners of triangles [m].
-        faces: indices of the corners of every triangle, anticlockwise from outside.
+        points: vertices [m].
+        faces: indices of the vertices of every triangle, counterclockwise seen from outside.
     """
 
     points: Float64[np.ndarray, "points 3"]
     faces: Int64[np.ndarray, "faces 3"]
 
     def moved(self, R: Float64[np.ndarray, "3 3"], t: Float64[np.ndarray, " 3"]) -> "Surface":
-        """The surface after a rotation and a translation [m]."""
+        """Return the surface after a rotation and a translation [m]."""
         return Surface(self.points @ R.T + t, self.faces)
 
 
 def joined(surfaces: list[Surface]) -> Surface:
-    """Several surfaces as one."""
+    """Join several surfaces to one."""
     starts = np.cumsum([0, *(len(surface.points) for surface in surfaces)])
     faces = [surface.faces + start for surface, start in zip(surfaces, starts, strict=False)]
     return Surface(np.concatenate([surface.points for surface in surfaces]), np.concatenate(faces))
 
 
 def revolve(radii: Float64[np.ndarray, " rings"], heights: Float64[np.ndarray, " rings"]) -> Surface:
-    """Turn a line about the z axis.
+    """Make a surface of revolution about the z axis.
 
     Args:
-        radii: distances of its points from the axis [m]; the surface is closed at 0.
-        heights: their places along the axis [m], rising.
+        radii: radii of the rings [m]; the surface is closed at radius 0.
+        heights: heights of the rings along the axis, ascending [m].
     """
     angles = np.linspace(0.0, 2 * np.pi, AROUND, endpoint=False)
     circle = np.stack([np.cos(angles), np.sin(angles), np.zeros(AROUND)], axis=1)
@@ -51,7 +51,7 @@ def revolve(radii: Float64[np.ndarray, " rings"], heights: Float64[np.ndarray, "
 
 
 def capsule(start: Float64[np.ndarray, " 3"], end: Float64[np.ndarray, " 3"], radius: float) -> Surface:
-    """A cylinder between two points [m] with half a ball at either end."""
+    """Make a cylinder between two points with a hemisphere at either end [m]."""
     length = float(np.linalg.norm(end - start))
     angles = np.linspace(-np.pi / 2, np.pi / 2, 16)
     heights = radius * np.sin(angles) + np.where(angles > 0, length, 0.0)
@@ -59,7 +59,7 @@ def capsule(start: Float64[np.ndarray, " 3"], end: Float64[np.ndarray, " 3"], ra
 
 
 def rotation_to(direction: Float64[np.ndarray, " 3"]) -> Float64[np.ndarray, "3 3"]:
-    """A rotation that takes the z axis to a direction; the identity where that is 0."""
+    """Return a rotation that maps the z axis to a direction; the identity where the direction is 0."""
     length = float(np.linalg.norm(direction))
     if length == 0:
         return np.eye(3)
