@@ -65,9 +65,9 @@ def _scale(scale: ScaleFigures) -> str:
 def predicted_line(rms_mm: float) -> str:
     """Say which errors a calibration without held-out rows predicts, and what to do."""
     return (
-        f"Predicted position error at other poses: {rms_mm:.3g} mm RMS, by the posterior of the calibration. "
-        "No row was held out to test it, and residuals of the calibration rows are smaller than errors at other poses; measure "
-        "more poses, or use a fleet prior of this robot type (--prior, made by `pisigma fleet prior`)."
+        f"Predicted position error at other poses: {rms_mm:.3g} mm RMS, by the posterior of the calibration. No row "
+        "was held out to test it, and residuals of the calibration rows are smaller than errors at other poses; "
+        "measure more poses, or use a fleet prior of this robot type (--prior, made by `pisigma fleet prior`)."
     )
 
 

@@ -380,7 +380,7 @@ def test_an_implausible_calibration_is_written_on_demand_only(run, tmp_path):
     accepted = run(*command, "--accept-implausible")
     assert accepted.exit_code == 0, accepted.output
     card = (tmp_path / "arm" / "README.md").read_text()
-    assert "## Not to be trusted" in card
+    assert "## Implausible" in card
     assert worst["sentence"] in card
     assert load_model(tmp_path / "arm").metrics["diagnostics"] == printed["diagnostics"]
 

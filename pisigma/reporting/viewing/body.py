@@ -1,4 +1,4 @@
-"""What a robot looks like: capsules along its links, or the meshes of the URDF file that it was loaded from."""
+"""Appearance of a robot: capsules along its links, or the meshes of its URDF file."""
 
 import io
 import os
@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float64
 from scipy.spatial.transform import Rotation
 
-from pisigma.files.errors import RobotError
+from pisigma.files.errors import Place, RobotError
 from pisigma.files.input_file import read_input
 from pisigma.planning.surroundings.capsules import Capsules
 from pisigma.reporting.viewing.colors import Color
@@ -28,7 +28,7 @@ if TYPE_CHECKING:  # names in full, which type checkers at run time find without
 
 
 class AbstractBody(ABC):
-    """Something that draws a robot at joint values, in the frame that poses are given in."""
+    """Interface of the appearance of a robot, drawn at joint values in the base frame of poses."""
 
     @abstractmethod
     def draw(
@@ -39,19 +39,19 @@ class AbstractBody(ABC):
         color: Color,
         opacity: float | None,
     ) -> None:
-        """Draw the robot in place of what was drawn under the name before.
+        """Draw the robot, replacing what was drawn under the name before.
 
         Args:
-            scene: where to.
-            name: of the node that holds the robot, such as "/robot".
+            scene: scene to draw in.
+            name: name of the robot's node, such as "/robot".
             q: joint values [rad or m].
-            color: of the links.
-            opacity: 0 to 1; None for what nothing shines through.
+            color: colour of the links.
+            opacity: opacity from 0 to 1; None for opaque.
         """
 
 
 class CapsuleBody(AbstractBody):
-    """The robot as the capsules that plans are checked with."""
+    """The robot as the capsules by which plans are checked for collision."""
 
     def __init__(self, capsules: Capsules) -> None:
         self._capsules = capsules
@@ -73,7 +73,7 @@ class CapsuleBody(AbstractBody):
 
 
 class MeshBody(AbstractBody):
-    """Links as the file shows them, each moved with its joint."""
+    """Meshes of the links of a URDF file, each moved with its joint."""
 
     def __init__(
         self, robot: Robot, path: str | os.PathLike[str], base: str | None = None, tip: str | None = None
@@ -81,21 +81,23 @@ class MeshBody(AbstractBody):
         """Read the meshes.
 
         Args:
-            robot: as loaded from the file.
-            path: the URDF file.
-            base: the link that poses are given in, as in `Robot.load`.
-            tip: the link that is the tool, as in `Robot.load`.
+            robot: robot as loaded from the file.
+            path: URDF file.
+            base: link that poses are given in, as in `Robot.load`.
+            tip: link that is the tool, as in `Robot.load`.
 
         Raises:
-            RobotError: the file cannot be used, it is of another robot or shows no link, or a mesh is not at hand or of
-                no usable format.
+            RobotError: the file cannot be used, belongs to another robot or has no visual, or a mesh is missing or has
+                an unsupported format.
         """
         chain = read_chain(path, base, tip)
         self._base, self._joints = chain.base, [joint.name for joint in robot.joints]
         if [joint.name for joint in chain.joints] != self._joints:
             raise RobotError(
-                f"{path}: its joints are {', '.join(joint.name for joint in chain.joints)}, but those of robot "
-                f"'{robot.name}' are {', '.join(self._joints)}; give the file that the robot was loaded from."
+                expected=f"the joints of robot '{robot.name}': {', '.join(self._joints)}",
+                value=", ".join(joint.name for joint in chain.joints),
+                at=Place(path),
+                remedy="give the file that the robot was loaded from",
             )
         self._urdf, _ = read_urdf(path)
         self.links: dict[str, Surface] = {}
@@ -103,7 +105,7 @@ class MeshBody(AbstractBody):
             if visuals := [_surface(visual, Path(path)) for visual in element.iterchildren("{*}visual")]:
                 self.links[element.get("name")] = joined(visuals)
         if not self.links:
-            raise RobotError(f"{path}: no link has a <visual>.")
+            raise RobotError("no link has a <visual>", at=Place(path))
         self._drawn: dict[str, viser.MeshHandle] = {}
 
     def draw(
@@ -114,7 +116,7 @@ class MeshBody(AbstractBody):
         color: Color,
         opacity: float | None,
     ) -> None:
-        """Draw a mesh a link at first and move it afterwards; see `AbstractBody.draw`."""
+        """Draw one mesh per link on the first call, and move the meshes afterwards; see `AbstractBody.draw`."""
         values = dict(zip(self._joints, q.tolist(), strict=True))
         for link, T in self.frames(values).items():
             if link not in self.links:
@@ -135,10 +137,10 @@ class MeshBody(AbstractBody):
             self._drawn[node].wxyz = Rotation.from_matrix(T[:3, :3]).as_quat(scalar_first=True)
 
     def frames(self, values: Mapping[str, float]) -> dict[str, Frame]:
-        """Frames of the links below the base link in it [m], by name.
+        """Compute the frames of all links after the base link, in the frame of that link [m].
 
         Args:
-            values: joint values [rad or m] by the names of the joints; others are 0.
+            values: joint values by the names of the joints [rad or m]; others are 0.
         """
         frames, parents = {self._base: np.eye(4)}, [self._base]
         while parents:
@@ -160,10 +162,10 @@ def _motion(joint: Any, value: float) -> Frame:
 
 
 def _surface(visual: Any, path: Path) -> Surface:
-    """What a <visual> shows, in the frame of its link.
+    """Return the surface of a <visual> in the frame of its link.
 
     Raises:
-        RobotError: it cannot be drawn; the message names file and line.
+        RobotError: the visual cannot be drawn.
     """
     origin = next(visual.iterchildren("{*}origin"), None)
     try:
@@ -177,9 +179,10 @@ def _surface(visual: Any, path: Path) -> Surface:
         T = frame_of([*xyz, *rpy[::-1]])
     except RobotError:
         raise
-    except Exception as problem:  # what trimesh raises depends on the bytes
+    except Exception as problem:  # trimesh raises various exceptions on malformed files
         raise RobotError(
-            f"{path}, line {visual.sourceline}: this <visual> cannot be drawn ({type(problem).__name__}: {problem})."
+            f"the <visual> cannot be drawn: {type(problem).__name__}: {problem}",
+            at=Place(path, visual.sourceline),
         ) from None
     return Surface(mesh.vertices, mesh.faces).moved(T[:3, :3], T[:3, 3])
 
@@ -209,7 +212,7 @@ def _numbers(element: Any, key: str, default: str = "") -> list[float]:
 
 
 def _mesh_file(name: str, path: Path) -> Path:
-    """The file of a mesh: `package://name/...` is looked for beside the folders that the URDF file lies in.
+    """Find the file of a mesh; `package://name/...` is searched for in the parent folders of the URDF file.
 
     Raises:
         RobotError: there is no such file.
@@ -225,4 +228,4 @@ def _mesh_file(name: str, path: Path) -> Path:
     for choice in choices:
         if choice.is_file():
             return choice
-    raise RobotError(f"{path}: the mesh '{name}' is not at hand.")
+    raise RobotError(f"there is no mesh file '{name}'", value=name, at=Place(path))

@@ -1,4 +1,4 @@
-"""Colours of errors and of what stands for what."""
+"""Colours of errors and of objects in the scene."""
 
 import math
 
@@ -29,15 +29,15 @@ RAMP = (
     "#b5de2b",
     "#fde725",
 )
-"""Dark to light in even steps of lightness ("viridis"), so that it holds in grey and for the colour blind."""
+"""Colour ramp "viridis" with even steps of lightness, readable in grey and with colour blindness."""
 
 
 def shades(errors: Float64[np.ndarray, " rows"], top: float) -> UInt8[np.ndarray, "rows 3"]:
-    """Give every row the colour of its error.
+    """Return the colour of every row's error.
 
     Args:
-        errors: errors [m]; NaN where there is none, which shows in grey.
-        top: error [m] of the last colour.
+        errors: errors [m]; NaN is shown in grey.
+        top: error of the last colour [m].
     """
     ramp = np.array([[int(color[k : k + 2], 16) for k in (1, 3, 5)] for color in RAMP], dtype=np.float64)
     at = np.nan_to_num(errors / top).clip(0.0, 1.0) * (len(RAMP) - 1)
@@ -47,7 +47,7 @@ def shades(errors: Float64[np.ndarray, " rows"], top: float) -> UInt8[np.ndarray
 
 
 def round_up(value: float) -> float:
-    """The next of 1, 2 and 5 times a power of ten that is not smaller; 1 where the value is not positive."""
+    """Round up to 1, 2 or 5 times a power of ten; 1 where the value is not positive."""
     if not value > 0:
         return 1.0
     power = 10.0 ** math.floor(math.log10(value))

@@ -1,4 +1,4 @@
-"""The robot, its cell and the rows so far in three dimensions, in the robot's base frame [m]."""
+"""Three-dimensional scene of the robot, its cell and the rows so far, in the robot's base frame [m]."""
 
 from typing import TYPE_CHECKING, Literal
 
@@ -35,18 +35,19 @@ if TYPE_CHECKING:  # names in full, which type checkers at run time find without
 GHOST = 0.35
 """Opacity of the robot at the next pose."""
 
-DOT, SHAFT, HEAD, LONGEST, AXES = 0.02, 0.003, 0.008, 0.3, 0.2
-"""Shares of the robot's reach: diameter of a point, radii of shaft and head of an arrow, its largest length,
-and the axes of the base."""
+DOT, SHAFT, HEAD, MAX_ARROW, AXES = 0.02, 0.003, 0.008, 0.3, 0.2
+"""Shares of the robot's reach: diameter of a point, radii of shaft and head of an arrow, its largest length, and length
+of the base axes."""
 SHEET, PRINT = (245, 245, 245), (20, 20, 20)
+"""Colours of a board's sheet and corners."""
 CORNER_DOT = 0.25
-"""Diameter of a dot as share of the distance of two corners."""
+"""Diameter of a corner's dot, as a share of the distance of two corners."""
 FLOOR, TRACKER_HEAD, CONE, BEAM = 5.0, 0.05, 0.2, 0.003
 """Shares of the robot's reach: edge of the floor, radius of the tracker, length of the cone, width of the beam."""
 
 
 class SessionScene:
-    """Draws the robot and the rows; every call replaces what the call before has drawn."""
+    """Scene of the robot and the rows; every call replaces what was drawn before."""
 
     def __init__(
         self, scene: "viser.SceneApi", arm: ArmInCell, body: AbstractBody, sight: BoardSight | None = None
@@ -54,9 +55,9 @@ class SessionScene:
         """Draw the cell.
 
         Args:
-            scene: where to.
+            scene: scene to draw in.
             arm: the robot in its cell.
-            body: what the robot looks like.
+            body: appearance of the robot.
             sight: camera and board; None without a camera.
         """
         self._sight = sight
@@ -86,7 +87,7 @@ class SessionScene:
             self._dots("/next/remaining", self._poses(state.remaining)[:, :3, 3], PLANNED, 0.5)
 
     def show_sensor(self, T_sensor_base: Float64[np.ndarray, "4 4"]) -> None:
-        """Draw the axes of the frame that was measured in, as the rows determine it."""
+        """Draw the axes of the measuring frame, as determined by the rows."""
         T = invert(torch.from_numpy(T_sensor_base)).numpy()
         axes = AXES * self._robot.reach
         self._scene.add_frame(
@@ -100,12 +101,12 @@ class SessionScene:
             self._label("/sensor/label", "frame of the sensor", np.zeros(3))
 
     def show_rows(self, rows: RowsSoFar, top: float, magnification: float) -> None:
-        """Draw a point for every row, in the colour of its error, and the error as an arrow.
+        """Draw every row as a point in the colour of its error, with the error as an arrow.
 
         Args:
-            rows: the rows; such as cannot be judged yet stand where the robot as drawn has its tool.
-            top: error [m] at which the scale of colours ends.
-            magnification: by how much arrows are longer than the errors.
+            rows: rows; those that cannot be judged yet are drawn at the tool of the nominal robot.
+            top: error at the end of the colour scale [m].
+            magnification: length of the arrows over that of the errors.
         """
         self._begin("/rows")
         if not rows.line:
@@ -133,7 +134,7 @@ class SessionScene:
         if not judged.any() or magnification == 0:
             return
         lengths = magnification * np.linalg.norm(rows.error, axis=1, keepdims=True)
-        drawn = magnification * rows.error * np.minimum(1.0, LONGEST * reach / np.maximum(lengths, 1e-12))
+        drawn = magnification * rows.error * np.minimum(1.0, MAX_ARROW * reach / np.maximum(lengths, 1e-12))
         ends = np.stack([position, position + drawn], axis=1)
         self._scene.add_arrows(
             "/rows/errors",
@@ -145,12 +146,12 @@ class SessionScene:
         )
 
     def _poses(self, q: Float64[np.ndarray, "*batch dof"]) -> Float64[np.ndarray, "*batch 4 4"]:
-        """T_base_tool [m] of the robot as drawn."""
+        """Compute T_base_tool of the nominal robot [m]."""
         T: Float64[np.ndarray, "*batch 4 4"] = forward_kinematics(self._robot, torch.from_numpy(q)).numpy()
         return T
 
     def _begin(self, name: str) -> None:
-        """Start a group of nodes anew."""
+        """Clear a group of nodes."""
         if name in self._groups:
             self._groups[name].remove()
         self._groups[name] = self._scene.add_frame(name, show_axes=False)
@@ -173,18 +174,18 @@ class SessionScene:
 
 
 def _quaternion(T: Float64[np.ndarray, "4 4"]) -> Float64[np.ndarray, " 4"]:
-    """The rotation of a pose as viser wants it, w first."""
+    """Return the rotation of a pose as a quaternion, w first."""
     wxyz: Float64[np.ndarray, " 4"] = Rotation.from_matrix(T[:3, :3]).as_quat(scalar_first=True)
     return wxyz
 
 
 def draw_board(scene: "viser.SceneApi", name: str, board: Board) -> None:
-    """Draw a board under a node that is its frame.
+    """Draw a board in the frame of a node.
 
     Args:
-        scene: where to.
-        name: of the node.
-        board: what is drawn.
+        scene: scene to draw in.
+        name: name of the node.
+        board: board to draw.
     """
     left, top, right, bottom = board_sheet(board)
     ends = np.array([[left, top, 0.0], [right, top, 0.0], [right, bottom, 0.0], [left, bottom, 0.0]])
@@ -198,9 +199,9 @@ def draw_cell(scene: "viser.SceneApi", cell: Cell, reach: float) -> None:
     """Draw floor, boxes and tracker.
 
     Args:
-        scene: where to, in the robot's base frame.
-        cell: the cell; without a floor the grid stands at the height of the robot's base.
-        reach: of the robot [m].
+        scene: scene to draw in, in the robot's base frame.
+        cell: cell to draw; without a floor the grid is at the height of the robot's base.
+        reach: reach of the robot [m].
     """
     edge = FLOOR * reach
     height = 0.0 if cell.floor_mm is None else cell.floor_mm / 1e3
@@ -223,14 +224,14 @@ def draw_cell(scene: "viser.SceneApi", cell: Cell, reach: float) -> None:
 def draw_sight(
     scene: "viser.SceneApi", name: str, cell: Cell, T_base_tool: Float64[np.ndarray, "4 4"], reach: float
 ) -> None:
-    """Draw the beam from the tracker to the reflector, and the cone from within which the reflector can be seen.
+    """Draw the beam from the tracker to the reflector, and the acceptance cone of the reflector.
 
     Args:
-        scene: where to.
-        name: of the node that holds both.
-        cell: says where the tracker is, and where the reflector looks; nothing is drawn without a tracker.
+        scene: scene to draw in.
+        name: name of the parent node.
+        cell: cell with tracker and reflector; nothing is drawn without a tracker.
         T_base_tool: pose of the reflector [m].
-        reach: of the robot [m].
+        reach: reach of the robot [m].
     """
     if cell.tracker is None:
         return
@@ -250,11 +251,11 @@ def draw_sight(
 
 
 def acceptance_cone(reflector: ReflectorSection, length: float) -> Surface:
-    """The cone from within which a reflector can be seen, in the frame of the tool.
+    """Make the acceptance cone of a reflector in the frame of the tool.
 
     Args:
-        reflector: gives its axis and half its angle.
-        length: from its tip to its rim [m].
+        reflector: reflector with axis and acceptance angle.
+        length: distance from the tip of the cone to its rim [m].
     """
     half = np.deg2rad(reflector.acceptance_deg)
     cone = revolve(np.array([0.0, length * np.sin(half)]), np.array([0.0, length * np.cos(half)]))
