@@ -27,7 +27,7 @@ AMBIGUOUS_ROWS = 6
 
 def unreadable(row: LeftOut) -> Alarm:
     """Return the alarm on a row that cannot be read."""
-    return Alarm(row.line, "unreadable", f"line {row.line}, {row.reason}.", repeat=True)
+    return Alarm(row.line, "unreadable", f"line {row.line}: {row.reason}.", repeat=True)
 
 
 def of_all_rows(sentence: str) -> Alarm:

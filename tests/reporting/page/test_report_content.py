@@ -18,7 +18,7 @@ from pisigma.model.calibrated_model import poses_of_rows
 from pisigma.reporting.page.content import causes_of, report_content
 from pisigma.validation.held_out.calibration_summary import CalibrationSummary
 from pisigma.validation.held_out.diagnostic import Diagnostic
-from pisigma.validation.held_out.judged_rows import MOST_PREDICTED, predicted_at
+from pisigma.validation.held_out.judged_rows import MAX_PREDICTED, predicted_at
 from pisigma.validation.held_out.validation_figures import ErrorFigures
 from pisigma.validation.report.accuracy import limit_of
 from pisigma.validation.report.corrections import correction_curves
@@ -231,10 +231,10 @@ def test_scatter_above_the_error_has_no_share(hybrid, tmp_path):
 
 def test_accuracy_is_predicted_at_many_rows_at_most(hybrid, monkeypatch):
     arm, model = hybrid
-    monkeypatch.setattr("pisigma.validation.held_out.judged_rows.MOST_PREDICTED", 20)
+    monkeypatch.setattr("pisigma.validation.held_out.judged_rows.MAX_PREDICTED", 20)
     found = predicted_at(model, arm.measurements)
     assert int(torch.isfinite(found).sum()) == 20
-    assert MOST_PREDICTED > 20
+    assert MAX_PREDICTED > 20
     assert bool(torch.isfinite(found[[0, -1]]).all())
 
 
