@@ -47,8 +47,8 @@ def test_status_prints_and_writes_a_page(plant, run):
 
 def test_what_is_no_fleet_is_refused(run, tmp_path):
     for arguments, complaint in (
-        (("status", tmp_path), "is not the folder of a fleet"),
-        (("run", tmp_path, "--out", tmp_path / "out"), "holds no robot"),
+        (("status", tmp_path), "not the folder of a fleet"),
+        (("run", tmp_path, "--out", tmp_path / "out"), "got 'no robot'"),
         (("run", tmp_path, "--out", tmp_path / "out", "--task", "calibrat"), "did you mean 'calibrate'"),
         (("run", tmp_path, "--out", tmp_path / "out", "--jobs", "0"), "jobs: 1 or more were wanted"),
     ):

@@ -35,7 +35,7 @@ def test_what_the_robots_have_in_common_is_printed_and_kept(prior):
     assert "what 5 robots have in common" in made.stdout
     assert all(len(line) <= 80 for line in made.stdout.splitlines())
     card = (folder / "prior" / "README.md").read_text(encoding="utf-8")
-    assert "What 5 robots of the type rb5" in card
+    assert "5 robots of the type rb5" in card
     assert "| a_2 | mm |" in card
     for name in ("bad", "undrawn", "metres"):
         assert f"Robot '{name}' did not count: " in card
