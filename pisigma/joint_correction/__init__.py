@@ -1,1 +1,1 @@
-"""Features and weights of the joint correction that is fitted through the kinematics."""
+"""Features and weights of the joint correction, which is fitted through the kinematics."""

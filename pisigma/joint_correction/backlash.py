@@ -1,4 +1,4 @@
-"""Backlash: a joint stops short on the side that it came from."""
+"""Backlash of joints, which depends on the direction of approach."""
 
 from typing import Any, no_type_check
 
@@ -16,19 +16,19 @@ from pisigma.robot.kernels.forms import CompiledForm
 
 @no_type_check
 def add_backlash(arms: Any, correction: Any, first: int, memory: Any, q: Any) -> None:
-    """Add a weight times the side that the joint comes from."""
+    """Add a weight times the approach direction of the joint."""
     for j in range(arms.dof):
         memory.delta[j] += correction.values[first + j] * memory.approach[j]
 
 
 class Backlash(AbstractFeature):
-    """`Δ_j = b_j · approach_j`: half the play of a gear, on the side that the joint came from.
+    """`Δ_j = b_j · approach_j`: half the backlash of a joint in its direction of approach.
 
-    The approach is +1 where the joint's value grew before it stopped and -1 where it fell; where that is not stated
-    it is 0, the middle of the play. A joint has the weight b_j, half its backlash, and all joints share a prior size.
+    The approach is +1 if the joint value increased before it stopped and -1 if it decreased; if it is not stated it is
+    0, the middle of the backlash. The weight b_j of a joint is half its backlash; all joints share a prior size.
 
     Source: Whitney, Lozinski and Rourke, ASME Journal of Dynamic Systems, Measurement, and Control 108(1), 1986, 1-8,
-    who name backlash among the errors of the joints. What it adds to the pose is the multi-directional pose accuracy
+    who list backlash among the errors of joints. Its effect on the pose is the multi-directional pose accuracy
     variation of ISO 9283:1998, 7.2.3.
     """
 
@@ -38,29 +38,29 @@ class Backlash(AbstractFeature):
     group_names = ("backlash",)
 
     def __init__(self, robot: Robot) -> None:
-        """Take a weight for every joint."""
+        """Make a feature with one weight per joint."""
         super().__init__(robot)
         self.used = torch.ones(robot.dof, 1, dtype=torch.bool)
         self.group = torch.zeros(robot.dof, 1, dtype=torch.int64)
 
     @classmethod
     def candidates(cls, robot: Robot, options: FeatureOptions, state: JointState) -> tuple["Backlash", ...]:
-        """None where no joint was approached from both sides."""
+        """Return the feature if a joint was approached from both sides, else nothing."""
         approach = state.stated.get(APPROACH)
         if approach is None or not bool(((approach > 0).any(0) & (approach < 0).any(0)).any()):
             return ()
         return (Backlash(robot),)
 
     def columns(self, state: JointState) -> Float[Tensor, "*batch dof columns"]:
-        """The side that every joint came from."""
+        """Return the approach direction of every joint."""
         approach = state.stated.get(APPROACH)
         if approach is None:
             return torch.zeros_like(state.q)[..., None]
         return approach.to(state.q).nan_to_num(0.0).expand(state.q.shape)[..., None]
 
     def add_onnx(self, graph: OnnxGraph, weight: Float64[np.ndarray, "dof columns"], q: str) -> str:
-        """The graph gets the input `approach`; see `AbstractFeature.add_onnx`."""
+        """Add the graph input `approach` and the correction; see `AbstractFeature.add_onnx`."""
         doc = (
-            "side that every joint came from: 1 as its value grew, -1 as it fell, 0 where that is not stated"
+            "approach direction of every joint: 1 if its value increased, -1 if it decreased, 0 if not stated"
         )
         return graph.node("Mul", graph.add_input(APPROACH, [len(weight)], doc), weight[:, 0])

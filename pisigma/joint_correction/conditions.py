@@ -1,4 +1,4 @@
-"""Payload and temperature: what they do to the joints, and a correction under fixed ones."""
+"""Effects of payload and temperature on the joints, and corrections under fixed conditions."""
 
 from collections.abc import Callable, Sequence
 from typing import Annotated, Literal
@@ -18,7 +18,7 @@ from pisigma.robot.description import Robot
 
 
 class ConditionSection(FeatureSection):
-    """Conditions in the description of a model."""
+    """Section of conditions in the description of a model."""
 
     name: Literal["conditions"]
     names: Annotated[tuple[Literal["payload_kg", "temperature_c"], ...], Field(min_length=1)]
@@ -29,18 +29,18 @@ class ConditionSection(FeatureSection):
 
 
 class ConditionFeatures(AbstractFeature):
-    """Payload and temperature: each times 1, sine and cosine of the joint's own value (prismatic: scaled value).
+    """Payload and temperature, each times 1, sine and cosine of the joint's own value (prismatic: scaled value).
 
-    A condition counts in standard deviations from its mean over the measured rows, so that joint values alone stand
-    for the usual conditions. The payload also goes with the gravity torques of a mass at the last row's frame; what it
-    does grows in proportion, beyond the measured values too. Beyond the lowest and the highest measured temperature the
-    correction stays as it is there: how an arm expands is no straight line, and one that is continued soon does harm.
+    A condition is expressed in standard deviations from its mean over the measured rows, so that joint values alone
+    mean the usual conditions. The payload also multiplies the gravity torques of a mass in the frame of the last row;
+    its effect is proportional, beyond the measured values too. Beyond the lowest and highest measured temperature the
+    correction is constant, because thermal expansion of an arm is not linear and extrapolation soon does harm.
 
     Attributes:
-        names: of the conditions.
-        mean: over the measured rows [kg, deg C].
-        spread: standard deviation over them.
-        measured: lowest and highest value of every condition in them.
+        names: names of the conditions.
+        mean: means over the measured rows [kg, deg C].
+        spread: standard deviations over the measured rows.
+        measured: lowest and highest measured value of every condition.
     """
 
     name = "conditions"
@@ -57,15 +57,15 @@ class ConditionFeatures(AbstractFeature):
         measured: Sequence[tuple[float, float]],
         gravity: Direction = (0.0, 0.0, -1.0),
     ) -> None:
-        """Take some conditions.
+        """Make a feature of conditions.
 
         Raises:
-            ValueError: there is none, one does not vary, or its mean does not lie within its measured values.
+            ValueError: there is no condition, one does not vary, or its mean is outside its measured values.
         """
         super().__init__(robot)
         if not names or not len(names) == len(mean) == len(spread) or min(spread) <= 0:
             raise ValueError(
-                f"conditions need names, means and positive spreads, got {tuple(names)}, {tuple(mean)}, "
+                f"expected names, means and positive spreads of conditions, got {tuple(names)}, {tuple(mean)}, "
                 f"{tuple(spread)}."
             )
         measured = tuple((low, high) for low, high in measured)
@@ -73,7 +73,7 @@ class ConditionFeatures(AbstractFeature):
             not low <= middle <= high for middle, (low, high) in zip(mean, measured, strict=False)
         ):
             raise ValueError(
-                f"conditions need a lowest and a highest measured value about every mean, got {measured} about "
+                f"expected a lowest and a highest measured value around every mean, got {measured} around "
                 f"{tuple(mean)}."
             )
         self.names, self.mean, self.spread, self.measured = tuple(names), tuple(mean), tuple(spread), measured
@@ -90,7 +90,7 @@ class ConditionFeatures(AbstractFeature):
     def candidates(
         cls, robot: Robot, options: FeatureOptions, state: JointState
     ) -> tuple["ConditionFeatures", ...]:
-        """None where no condition varies."""
+        """Return the feature if a condition varies, else nothing."""
         if not options.varying:
             return ()
         values = torch.stack([state.stated[name] for name in options.varying], 1)
@@ -99,7 +99,7 @@ class ConditionFeatures(AbstractFeature):
         return (ConditionFeatures(robot, options.varying, mean, spread, measured, options.gravity),)
 
     def columns(self, state: JointState) -> Float[Tensor, "*batch dof columns"]:
-        """The products; 0 under the usual conditions, and for conditions that are NaN or missing."""
+        """Return the products; 0 under the usual conditions, and for conditions that are NaN or missing."""
         q = state.q
         if not any(name in state.stated for name in self.names):
             return q.new_zeros((*q.shape, self.count))
@@ -128,24 +128,24 @@ class ConditionFeatures(AbstractFeature):
 
 
 def learned_conditions(correction: JointCorrection) -> ConditionFeatures | None:
-    """What a correction has learned of payload and temperature; None where it has learned nothing."""
+    """Return the `ConditionFeatures` of a correction; None if it has none."""
     return next((own for own in correction.features if isinstance(own, ConditionFeatures)), None)
 
 
 def at_conditions(
     correction: JointCorrection, scaled: Float64[Tensor, " conditions"]
 ) -> tuple[JointCorrection, Float64[Tensor, " dof"]]:
-    """A correction under fixed conditions, as a function of the joint values alone.
+    """Reduce a correction at fixed conditions to a function of the joint values.
 
-    With `ConditionFeatures` weights at fixed conditions are shifts of the joints, first harmonics, and gravity
-    torques of the last row; these are added to the weights of the other features.
+    At fixed conditions `ConditionFeatures` are offsets of the joints, first harmonics, and gravity torques of the last
+    row; these are added to the weights of the other features.
 
     Args:
-        correction: one that has learned what conditions do.
-        scaled: the conditions, in standard deviations from their mean.
+        correction: correction with `ConditionFeatures`.
+        scaled: the conditions, in standard deviations from their means.
 
     Returns:
-        The correction without `ConditionFeatures`, and the shift of every joint [rad or m] that belongs to it.
+        The correction without `ConditionFeatures`, and the remaining offset of every joint [rad or m].
     """
     robot = correction.robot
     kept: list[tuple[AbstractFeature, Tensor]] = []
@@ -184,7 +184,7 @@ def _weights_of(
     wanted: AbstractFeature,
     fits: Callable[[AbstractFeature], bool],
 ) -> Float64[Tensor, "dof columns"]:
-    """Weights of the feature that fits, to be changed in place; of the wanted one, all 0, where none does."""
+    """Return the weights of the first feature that fits, to be changed in place; if none fits, add `wanted`."""
     for feature, weights in kept:
         if fits(feature):
             return weights

@@ -1,4 +1,4 @@
-"""Errors that come from what drives a coupled joint: its factors, gears before the coupling, guides out of true."""
+"""Errors of the drives of coupled joints: factors, gears before the coupling, and guides that are not straight."""
 
 from typing import Any
 
@@ -12,20 +12,21 @@ from pisigma.measurement.conditions import JointState
 from pisigma.robot.description import Robot
 
 HARMONICS, LOW = 8, 3
-"""Of every axis, and how many of them share a prior size: guides bend in the low ones, gears err in others too."""
+"""Number of harmonics of every axis, and number of low ones with their own prior size: guides have errors in low
+harmonics, gears in others too."""
 
 
 class CoupledSeries(AbstractFeature):
-    """The value of every axis that drives a coupled joint, scaled, and its first sines and cosines.
+    """Scaled value, and first sines and cosines, of every axis that drives a coupled joint.
 
     For joint i and an axis j that its coupling names, with q_j the controller's value::
 
         Δ_i = δC_ij · q_j + Σ_k (a_k sin k φ_j + b_k cos k φ_j) + Σ_l (∂f_i/∂ln l) δl/l
 
-    δC_ij is the error of the factor. φ_j is the axis' angle; for an axis that slides, an angle that repeats after twice
+    δC_ij is the error of the factor. φ_j is the angle of the axis; for a prismatic axis an angle with a period of twice
     its travel, so that low harmonics describe the straightness and yaw of a rail (a joint that follows it with the
-    factor 0). The last sum is over the lengths l of the bars of a four-bar linkage. Gears before the coupling err with
-    φ_j (Judd and Knasinski 1990, IEEE Transactions on Robotics and Automation 6(1), 20-30).
+    factor 0). The last sum is over the lengths l of the bars of a four-bar linkage. Errors of gears before the coupling
+    depend on φ_j (Judd and Knasinski 1990, IEEE Transactions on Robotics and Automation 6(1), 20-30).
     """
 
     name = "coupling"
@@ -40,7 +41,7 @@ class CoupledSeries(AbstractFeature):
     )
 
     def __init__(self, robot: Robot) -> None:
-        """Take the axes that drive every coupled joint; joints that are not coupled get no column."""
+        """Make columns for the axes that drive every coupled joint; joints that are not coupled have none."""
         super().__init__(robot)
         coupling = robot.coupling
         axes = len(robot.axes)
@@ -76,11 +77,11 @@ class CoupledSeries(AbstractFeature):
     def candidates(
         cls, robot: Robot, options: FeatureOptions, state: JointState
     ) -> tuple["CoupledSeries", ...]:
-        """None of a robot without coupled joints."""
+        """Return the feature for a robot with coupled joints, else nothing."""
         return () if robot.coupling is None else (CoupledSeries(robot),)
 
     def columns(self, state: JointState) -> Float[Tensor, "*batch dof columns"]:
-        """The scaled values, then sines and cosines of the harmonics, of all axes; then slopes by lengths of bars."""
+        """Return scaled values, sines and cosines of the harmonics of all axes, then derivatives by bar lengths."""
         q = self.robot.to_controller(state.q)
         scaled = (q - self._middle.to(q)) / self._half.to(q)
         angles = [k * self._rate.to(q) * q for k in range(1, HARMONICS + 1)]
@@ -95,10 +96,10 @@ class CoupledSeries(AbstractFeature):
         return torch.cat([columns, lengths], -1)
 
     def is_periodic(self, weight: Float64[np.ndarray, "dof columns"]) -> bool:
-        """Not where a factor is off: a full turn of an axis then moves a joint by a little more or less."""
+        """Return False if a factor has an error, because a full turn of an axis then moves the joint differently."""
         return not weight[:, : len(self.robot.axes)].any()
 
     def factor_errors(self, weight: Float64[np.ndarray, "dof columns"]) -> Float64[np.ndarray, "dof axes"]:
-        """Errors δC of the factors, [rad or m] of a joint per [rad or m] of an axis."""
+        """Return the errors δC of the factors, [rad or m] of a joint per [rad or m] of an axis."""
         errors: Any = weight[:, : len(self.robot.axes)] / self._half.numpy()
         return np.asarray(errors)

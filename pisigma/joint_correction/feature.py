@@ -1,4 +1,4 @@
-"""What a feature is: functions of the joint values that a joint's correction is a weighted sum of."""
+"""Interface of features: functions of the joint values whose weighted sum is a joint's correction."""
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
@@ -16,23 +16,23 @@ from pisigma.robot.description import Robot
 from pisigma.robot.kernels.forms import CompiledForm
 
 USUAL_SIZE = 2e-5
-"""Prior size [rad] of weights of which nothing else is known."""
+"""Default prior size of weights [rad]."""
 Feature = TypeVar("Feature", bound="AbstractFeature")
 
 
 class FeatureSection(Section):
-    """A feature in the description of a model: its name, and in subclasses what else it is made from."""
+    """Section of a feature in the description of a model: its name, and in subclasses further values."""
 
     name: str
 
 
 @dataclass(frozen=True)
 class FeatureOptions:
-    """What a calibrator says to the features that it tries.
+    """Options of a calibrator for the features that it tries.
 
     Attributes:
-        harmonics: of Fourier series, in the order in which they are tried.
-        gravity: direction in which things fall, in the frame of the robot's first row.
+        harmonics: numbers of harmonics of Fourier series, in the order in which they are tried.
+        gravity: direction of gravity in the frame of the robot's first row.
         configurations: number of different joint values that were measured.
         varying: names of the conditions that all rows state and that vary.
     """
@@ -46,24 +46,23 @@ class FeatureOptions:
 class AbstractFeature(ABC):
     """Columns for every joint: the correction of joint j is `Σ_m weight[j, m] · columns(state)[..., j, m]`.
 
-    A new feature is a subclass in a file of its own and a line in `registry.py`; `register_feature` takes one from
-    anywhere. Without `compiled` the models that use it are solved in torch, without `add_onnx` they are not
+    A new feature is a subclass in its own file and a line in `registry.py`; `register_feature` adds features of
+    plug-ins. Models with a feature without `compiled` are solved in torch; those with one without `add_onnx` cannot be
     exported as ONNX.
 
     Attributes:
         robot: the nominal robot.
-        name: of the feature, as recipes and models write it.
-        section: how it stands in the description of a model.
-        reads: what it needs of the rows beside the joint values, by the names of `JointState.stated`.
-        compiled: its form in the kernels, which gets the numbers of `pack`; None where it has none.
-        usually_zero: whether it is 0 where nothing is stated beside the joint values, so that kernels and graphs may
-            leave it out.
-        used: `(dof, m)`: which columns a joint has; the others are not to be given weights.
-        group: `(dof, m)`: number of the prior size that a column's weight has, from 0 on.
-        group_names: of the prior sizes.
-        size: how large it is among those of its name that are tried in turn, such as its number of harmonics; 0
-            where there is only one.
-        fastest: its highest harmonic of a joint's value.
+        name: name of the feature in recipes and models.
+        section: class of its section in the description of a model.
+        reads: row data that it needs in addition to the joint values, by the names of `JointState.stated`.
+        compiled: its form in the kernels, which gets the numbers of `pack`; None if it has none.
+        usually_zero: whether it is 0 if only joint values are stated, so that kernels and graphs may omit it.
+        used: `(dof, m)`: which columns a joint uses; the others must not have weights.
+        group: `(dof, m)`: index of the prior size of a column's weight, from 0.
+        group_names: names of the prior sizes.
+        size: size among features of the same name that are tried one after the other, such as the number of harmonics;
+            0 if there is only one.
+        fastest: its highest harmonic of a joint value.
     """
 
     name: ClassVar[str]
@@ -79,95 +78,95 @@ class AbstractFeature(ABC):
 
     @property
     def usual_sizes(self) -> tuple[float, ...]:
-        """Standard deviations of the weights of every group [rad] with which fits of few rows start.
+        """Initial standard deviations of the weights of every group [rad] for fits of few rows.
 
-        They are rather too large than too small, as the evidence takes back quickly what is not needed.
+        They are larger rather than smaller than usual, because the evidence quickly reduces sizes that are too large.
         """
         return (USUAL_SIZE,) * len(self.group_names)
 
     def __init__(self, robot: Robot) -> None:
-        """Prepare for the nominal robot."""
+        """Make a feature for the nominal robot."""
         self.robot = robot
 
     @abstractmethod
     def columns(self, state: JointState) -> Float[Tensor, "*batch dof columns"]:
-        """Values of the columns, of the order of 1.
+        """Compute the columns, of the order of 1.
 
         Args:
-            state: joint values [rad or m], and what is stated beside them.
+            state: joint values [rad or m], and further data of the rows.
         """
 
     @classmethod
     def candidates(
         cls: type[Feature], robot: Robot, options: FeatureOptions, state: JointState
     ) -> tuple[Feature, ...]:
-        """What a calibrator tries: one feature, ever larger ones, or none where the rows lack what it needs.
+        """Return the features that a calibrator tries: one, several of increasing size, or none if data are missing.
 
         Args:
             robot: the nominal robot.
-            options: of the calibrator.
-            state: of the rows on which features are chosen.
+            options: options of the calibrator.
+            state: joint states of the rows on which features are selected.
         """
         return (cls.from_section(robot, cls.section(name=cls.name)),)
 
     @classmethod
     def from_section(cls: type[Feature], robot: Robot, section: Any) -> Feature:
-        """The feature that a section describes, as `describe` gives it.
+        """Make the feature that a section describes; the inverse of `describe`.
 
         Args:
             robot: the nominal robot.
-            section: of the type `cls.section`.
+            section: section of the class `cls.section`.
 
         Raises:
-            ValueError: the values make no feature.
+            ValueError: the values are not valid for the feature.
         """
         return cls(robot, **section.model_dump(exclude={"name"}))
 
     def describe(self) -> FeatureSection:
-        """What `from_section` makes the same feature again from: the attributes that the section names."""
+        """Return the section from which `from_section` restores the feature."""
         stated = self.section.model_fields.keys() - {"name"}
         return self.section(name=self.name, **{key: getattr(self, key) for key in stated})
 
     def pack(self, weight: Float64[np.ndarray, "dof columns"]) -> Float64[np.ndarray, " values"]:
-        """The numbers that the compiled form reads, in its own order."""
+        """Return the numbers that the compiled form reads."""
         return weight.ravel()
 
     def add_onnx(self, graph: OnnxGraph, weight: Float64[np.ndarray, "dof columns"], q: str) -> str | None:
         """Add the weighted sum of the columns to an ONNX graph.
 
         Args:
-            graph: to add to.
-            weight: of the columns.
-            q: joint values `(batch, dof)` in the graph.
+            graph: graph to extend.
+            weight: weights of the columns.
+            q: name of the joint values `(batch, dof)` in the graph.
 
         Returns:
-            Corrections `(batch, dof)` in the graph; None where the feature has no ONNX form.
+            Name of the corrections `(batch, dof)` in the graph; None if the feature has no ONNX form.
         """
         return None
 
     def is_periodic(self, weight: Float64[np.ndarray, "dof columns"]) -> bool:
-        """Whether a full turn of a revolute joint changes nothing, with these weights."""
+        """Return whether the correction with these weights is the same after a full turn of a revolute joint."""
         return True
 
     def columns_in(self, larger: "AbstractFeature") -> Int64[Tensor, "dof columns"]:
-        """Which columns of a feature of the same name and at least this size are the columns of this one."""
+        """Return the indices of this feature's columns in one of the same name and at least this size."""
         return torch.arange(self.count).expand(self.used.shape)
 
     @property
     def count(self) -> int:
-        """Number of columns of a joint."""
+        """Number of columns per joint."""
         return self.used.shape[1]
 
     @property
     def label(self) -> str:
-        """What it is called in a table of what was tried."""
+        """Name of the feature in tables."""
         return f"{self.name} {self.size}" if self.size else self.name
 
 
 def turning_rate(robot: Robot) -> Float[np.ndarray, " dof"]:
-    """Angle of a joint's periodic functions per joint value: 1 for a revolute joint [rad/rad].
+    """Return the angle of a joint's periodic functions per joint value: 1 for a revolute joint [rad/rad].
 
-    A prismatic joint repeats after twice its travel, [rad/m]; without limits its unit of travel is the reach.
+    The period of a prismatic joint is twice its travel [rad/m], or twice the reach if it has no limits.
     """
     travel = np.diff(robot.limits)[:, 0]
     travel = np.where(np.isfinite(travel) & (travel > 0), travel, max(robot.reach, 1e-3))
@@ -175,7 +174,7 @@ def turning_rate(robot: Robot) -> Float[np.ndarray, " dof"]:
 
 
 def scaled_joints(robot: Robot, q: Float[Tensor, "*batch dof"]) -> Float[Tensor, "*batch dof"]:
-    """Joint values, 0 in the middle of the limits and ±1 at them; without limits over pi or the reach."""
+    """Scale joint values to 0 in the middle of the limits and ±1 at them; without limits divide by pi or the reach."""
     limited = np.isfinite(robot.limits).all(1)
     bounds = np.where(limited[:, None], robot.limits, 0.0)
     middle, half = bounds.mean(1), (bounds[:, 1] - bounds[:, 0]) / 2
@@ -184,7 +183,7 @@ def scaled_joints(robot: Robot, q: Float[Tensor, "*batch dof"]) -> Float[Tensor,
 
 
 def unit_inputs(robot: Robot, q: Float[Tensor, "*batch dof"]) -> Float[Tensor, "*batch inputs"]:
-    """Inputs of the product units: sines, then cosines of the revolute joints, then scaled prismatic joints."""
+    """Compute the inputs of the product units: sines, then cosines of revolute joints, then scaled prismatic joints."""
     turning = torch.from_numpy(np.flatnonzero(robot.revolute)).to(q.device)
     sliding = torch.from_numpy(np.flatnonzero(~np.asarray(robot.revolute))).to(q.device)
     angle = q.index_select(-1, turning)

@@ -1,4 +1,4 @@
-"""Sines and cosines of multiples of a joint's own value: gears and encoders that run out of true."""
+"""Sines and cosines of multiples of a joint's own value: errors of gears and encoders."""
 
 from typing import Annotated, Any, Literal, no_type_check
 
@@ -15,15 +15,15 @@ from pisigma.robot.description import Robot
 from pisigma.robot.kernels.forms import MAX_JOINTS, CompiledForm
 
 BAND_STARTS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128, 192, 256)
-"""First harmonic of every band of few configurations: about two bands an octave."""
+"""First harmonic of every band for few configurations: about two bands per octave."""
 FINE_BAND_STARTS = (*range(1, 10), 11, 13, 15, 18, 21, 25, 30, 35, 41, 49, 58, 69, 82, 97, 115, 137, 163)
-"""The same of many: one harmonic each up to 8, then about four bands an octave.
+"""The same for many configurations: one harmonic each up to 8, then about four bands per octave.
 
-The log evidence of all 29 subsets of the measured UR5 and UR10 that were looked at (random folds, boxes and halves)
-is higher than with `BAND_STARTS`, by 12 in the mean for 11 prior sizes more. Eight bands an octave raise it by another
-17 for 18 sizes, which is less than their number (Akaike 1974, IEEE Transactions on Automatic Control 19(6))."""
+The log evidence of all 29 subsets of the measured UR5 and UR10 that were tested (random folds, boxes and halves) is
+higher than with `BAND_STARTS`, by 12 on average for 11 additional prior sizes. Eight bands per octave raise it by
+another 17 for 18 sizes, which is less than their number (Akaike 1974, IEEE Transactions on Automatic Control 19(6))."""
 MANY_CONFIGURATIONS = 200
-"""Bands are fine from so many on; fewer say too little of the size of every band."""
+"""Number of configurations from which fine bands are used; fewer do not determine the size of every band."""
 BAND_SIZES = (
     2e-4,
     1.6e-4,
@@ -42,16 +42,16 @@ BAND_SIZES = (
     3e-6,
     3e-6,
 )
-"""[rad] Standard deviation of the weights of every band of `BAND_STARTS` with which fits of few rows start.
+"""Initial standard deviations of the weights of every band of `BAND_STARTS` [rad] for fits of few rows.
 
-Between the sizes that maximise the evidence of hybrid calibrations of the measured UR5, UR10 and FANUC R-2000iC and of
-simulated arms whose gears err by 0.26 mrad with harmonics 1, 2 and 7."""
+They are between those that maximise the evidence of hybrid calibrations of the measured UR5, UR10 and FANUC R-2000iC
+and of simulated arms with gear errors of 0.26 mrad at harmonics 1, 2 and 7."""
 USUAL_HARMONICS = 56
-"""Series of so many are tried with any number of rows, as few rows are fitted with `BAND_SIZES`."""
+"""Number of harmonics up to which series are tried for any number of rows, because few rows start with `BAND_SIZES`."""
 
 
 class SeriesSection(FeatureSection):
-    """A Fourier series in the description of a model."""
+    """Section of a Fourier series in the description of a model."""
 
     name: Literal["series"]
     harmonics: Annotated[int, Field(ge=1, le=100_000)]
@@ -60,9 +60,9 @@ class SeriesSection(FeatureSection):
 
 @no_type_check
 def add_series(arms: Any, correction: Any, first: int, memory: Any, q: Any) -> None:
-    """Add sums of sines and cosines of multiples of every joint's angle, four joints abreast.
+    """Add sums of sines and cosines of multiples of every joint's angle, four joints at a time.
 
-    `correction.values` holds the number of harmonics, and for each the weights of the sines and of the cosines of
+    `correction.values` contains the number of harmonics, and for each the weights of the sines and of the cosines of
     `MAX_JOINTS` joints.
 
     Source: C. W. Clenshaw, A note on the summation of Chebyshev series, 1955: from the last multiple to the first,
@@ -95,7 +95,7 @@ def add_series(arms: Any, correction: Any, first: int, memory: Any, q: Any) -> N
 
 @no_type_check
 def add_series_slope(arms: Any, correction: Any, first: int, memory: Any, q: Any) -> None:
-    """Add the slope of every joint's series by the joint's own value, with the same recurrence."""
+    """Add the derivative of every joint's series with respect to its own value, with the same recurrence."""
     values = correction.values
     harmonics = int(values[first])
     for j in range(0, arms.dof, 4):
@@ -124,9 +124,9 @@ def add_series_slope(arms: Any, correction: Any, first: int, memory: Any, q: Any
 class FourierSeries(AbstractFeature):
     """sin(k q_j) and cos(k q_j) of the joint's own value, k = 1 … K.
 
-    Weights of neighbouring harmonics share a prior size (see `BAND_STARTS`), so that the data say how the
-    error's spectrum falls with k; in fine bands (see `FINE_BAND_STARTS`) fewer of them do. Source of the model: Judd
-    and Knasinski, IEEE Transactions on Robotics and Automation 6(1), 1990, 20-30.
+    Weights of neighbouring harmonics share a prior size (see `BAND_STARTS`), so that the data determine how the
+    spectrum of the error decreases with k; fine bands (see `FINE_BAND_STARTS`) contain fewer harmonics. Source of the
+    model: Judd and Knasinski, IEEE Transactions on Robotics and Automation 6(1), 1990, 20-30.
     """
 
     name = "series"
@@ -134,10 +134,10 @@ class FourierSeries(AbstractFeature):
     compiled = CompiledForm(add_series, add_series_slope)
 
     def __init__(self, robot: Robot, harmonics: int, fine: bool = False) -> None:
-        """Take the first `harmonics` harmonics, at least one, in bands or in fine bands."""
+        """Make a feature of the first `harmonics` harmonics, at least one, in coarse or fine bands."""
         super().__init__(robot)
         if harmonics < 1:
-            raise ValueError(f"a Fourier series needs at least one harmonic, got {harmonics}.")
+            raise ValueError(f"expected at least one harmonic of a Fourier series, got {harmonics}.")
         self.harmonics = self.size = self.fastest = harmonics
         self.fine = fine
         self._rate = torch.from_numpy(turning_rate(robot))
@@ -162,22 +162,22 @@ class FourierSeries(AbstractFeature):
     def candidates(
         cls, robot: Robot, options: FeatureOptions, state: JointState
     ) -> tuple["FourierSeries", ...]:
-        """Series of ever more harmonics, from `USUAL_HARMONICS` on not many more than there are joint values."""
+        """Return series of increasing size; above `USUAL_HARMONICS` up to twice the number of configurations."""
         most = max(2 * options.configurations, min(options.harmonics), USUAL_HARMONICS)
         fine = options.configurations >= MANY_CONFIGURATIONS
         return tuple(FourierSeries(robot, k, fine) for k in options.harmonics if k <= most)
 
     def columns(self, state: JointState) -> Float[Tensor, "*batch dof columns"]:
-        """All sines, sin(q) first, and then all cosines."""
+        """Return all sines, sin(q) first, then all cosines."""
         return sines_cosines(state.q * self._rate.to(state.q), torch.arange(1, self.harmonics + 1))
 
     def columns_in(self, larger: AbstractFeature) -> Int64[Tensor, "dof columns"]:
-        """The first sines and the first cosines."""
+        """Return the indices of the first sines and the first cosines."""
         k = torch.arange(self.harmonics)
         return torch.cat([k, larger.size + k]).expand(self.used.shape)
 
     def pack(self, weight: Float64[np.ndarray, "dof columns"]) -> Float64[np.ndarray, " values"]:
-        """The number of harmonics, and for each the weights of the sines and of the cosines of all joints."""
+        """Return the number of harmonics, and for each the weights of the sines and of the cosines of all joints."""
         lanes = np.zeros((self.harmonics, 2, MAX_JOINTS))
         lanes[..., : len(weight)] = weight.reshape(-1, 2, self.harmonics).transpose(2, 1, 0)
         return np.concatenate([[self.harmonics], lanes.ravel()])
@@ -191,11 +191,11 @@ class FourierSeries(AbstractFeature):
 def sines_cosines(
     angle: Float[Tensor, "*batch dof"], orders: Shaped[Tensor, "*dof harmonics"]
 ) -> Float[Tensor, "*batch dof columns"]:
-    """Sines of multiples of every joint's angle, and then the cosines.
+    """Compute sines of multiples of every joint's angle, then cosines.
 
     Args:
-        angle: of the joints [rad].
-        orders: the multiples, of every joint or the same for all.
+        angle: angles of the joints [rad].
+        orders: multiples, for every joint or the same for all.
     """
     multiple = angle[..., None] * orders.to(angle)
     return torch.cat([multiple.sin(), multiple.cos()], -1)
@@ -210,13 +210,13 @@ def add_harmonics(
     """Add the weighted sum of `sines_cosines` to an ONNX graph.
 
     Args:
-        graph: to add to.
-        angle: `(batch, dof)` in the graph.
+        graph: graph to extend.
+        angle: name of the angles `(batch, dof)` in the graph.
         orders: see `sines_cosines`.
-        weight: of the columns.
+        weight: weights of the columns.
 
     Returns:
-        The sums `(batch, dof)` in the graph.
+        Name of the sums `(batch, dof)` in the graph.
     """
     multiple = graph.node("Mul", graph.reshape(angle, [len(weight), 1]), orders)
     sines, cosines = np.split(weight, 2, axis=1)

@@ -1,4 +1,4 @@
-"""Single fast harmonics of a joint's own value: teeth of gears, poles of motors, lines of encoders."""
+"""Lines of high order in the error spectrum of gears and motors."""
 
 import math
 from collections.abc import Sequence
@@ -19,7 +19,7 @@ from pisigma.robot.kernels.forms import CompiledForm
 
 
 class LinesSection(FeatureSection):
-    """Lines of every joint in the description of a model."""
+    """Section of the lines of every joint in the description of a model."""
 
     name: Literal["lines"]
     orders: tuple[tuple[Annotated[int, Field(ge=1, le=100_000)], ...], ...]
@@ -27,7 +27,7 @@ class LinesSection(FeatureSection):
 
 @no_type_check
 def add_lines(arms: Any, correction: Any, first: int, memory: Any, q: Any) -> None:
-    """Add the lines: `correction.values` holds how many there are, and of each joint, order, and weights."""
+    """Add the lines; `correction.values` contains their number, and joint, order and weights of each."""
     for line in range(int(correction.values[first])):
         start = first + 1 + 4 * line
         j, order = int(correction.values[start]), correction.values[start + 1]
@@ -38,7 +38,7 @@ def add_lines(arms: Any, correction: Any, first: int, memory: Any, q: Any) -> No
 
 @no_type_check
 def add_lines_slope(arms: Any, correction: Any, first: int, memory: Any, q: Any) -> None:
-    """Add the slope of the lines by every joint's own value."""
+    """Add the derivative of the lines with respect to every joint's own value."""
     for line in range(int(correction.values[first])):
         start = first + 1 + 4 * line
         j = int(correction.values[start])
@@ -50,15 +50,15 @@ def add_lines_slope(arms: Any, correction: Any, first: int, memory: Any, q: Any)
 class GearLines(AbstractFeature):
     """sin(k q_j) and cos(k q_j) of the joint's own value for a few orders k, which may be in the thousands.
 
-    A strain wave gear of ratio N errs with 2N and 4N cycles a turn, the cogging of a motor of p pairs of poles behind
-    it with multiples of pN. Between these lines the spectrum is empty, and a series up to them would have to determine
-    thousands of weights. `hybrid.spectrum` says which orders stand out. All lines of a joint share a prior size.
+    The error of a strain wave gear of ratio N has 2N and 4N cycles per turn, the cogging of a motor with p pole pairs
+    multiples of pN. Between these lines the spectrum is empty, and a series up to them would have thousands of weights.
+    `hybrid.spectrum` finds the significant orders. All lines of a joint share a prior size.
 
     Source: Tuttle and Seering, IEEE Transactions on Robotics and Automation 12(3), 1996, 368-374, of the transmission
     errors of strain wave gears.
 
     Attributes:
-        orders: of the lines of every joint [cycles a turn; of a prismatic joint in twice its travel].
+        orders: orders of the lines of every joint [cycles per turn; for a prismatic joint per twice its travel].
     """
 
     name = "lines"
@@ -66,16 +66,16 @@ class GearLines(AbstractFeature):
     compiled = CompiledForm(add_lines, add_lines_slope)
 
     def __init__(self, robot: Robot, orders: Sequence[Sequence[int]]) -> None:
-        """Take the lines of every joint.
+        """Make a feature of the lines of every joint.
 
         Raises:
-            ValueError: there is none, or the number of joints is another one.
+            ValueError: there are no lines, or the number of joints is wrong.
         """
         super().__init__(robot)
         self.orders = tuple(tuple(of_joint) for of_joint in orders)
         most = max((len(of_joint) for of_joint in self.orders), default=0)
         if len(self.orders) != robot.dof or not most:
-            raise ValueError(f"lines need orders for each of {robot.dof} joints, got {self.orders}.")
+            raise ValueError(f"expected orders for each of {robot.dof} joints, got {self.orders}.")
         self.fastest = max(map(max, filter(None, self.orders)))
         self._rate = torch.from_numpy(turning_rate(robot))
         padded = [[*of_joint, *[0] * (most - len(of_joint))] for of_joint in self.orders]
@@ -86,15 +86,15 @@ class GearLines(AbstractFeature):
 
     @classmethod
     def candidates(cls, robot: Robot, options: FeatureOptions, state: JointState) -> tuple["GearLines", ...]:
-        """None: which orders stand out is seen in what a first model leaves (see `hybrid.spectrum`)."""
+        """Return nothing: orders are found in the residuals of a first model (see `hybrid.spectrum`)."""
         return ()
 
     def columns(self, state: JointState) -> Float[Tensor, "*batch dof columns"]:
-        """The sines of all lines of a joint, and then the cosines."""
+        """Return the sines of all lines of a joint, then the cosines."""
         return sines_cosines(state.q * self._rate.to(state.q), self._orders)
 
     def pack(self, weight: Float64[np.ndarray, "dof columns"]) -> Float64[np.ndarray, " values"]:
-        """How many lines there are, and of each its joint, its order, and the weights of sine and cosine."""
+        """Return the number of lines, and joint, order and weights of sine and cosine of each."""
         sines, cosines = np.split(weight, 2, axis=1)
         lines = [
             (j, order, sines[j, k], cosines[j, k])

@@ -1,4 +1,4 @@
-"""Torques of gravity on the joints, for masses that are not known: joints and gears give way to them."""
+"""Gravity torques of unknown masses, which deflect compliant joints and gears."""
 
 from typing import Any, Literal, no_type_check
 
@@ -19,7 +19,7 @@ Direction = tuple[float, float, float]
 
 
 class GravitySection(FeatureSection):
-    """Torques of gravity in the description of a model."""
+    """Section of gravity torques in the description of a model."""
 
     name: Literal["gravity"]
     gravity: Direction
@@ -27,11 +27,11 @@ class GravitySection(FeatureSection):
 
 @no_type_check
 def add_gravity(arms: Any, correction: Any, first: int, memory: Any, q: Any) -> None:
-    """Add what unknown masses turn the joints.
+    """Add the deflections of the joints by the gravity torques of unknown masses.
 
     Torque j is `Σ_k z_j · (arm_jk × g)`, with the weights of row k in `arm_jk`, and `z · (a × g) = a · (g × z)`.
-    `correction.values` holds g, and for joint j and moved row k four weights: over the reach (mass), and times the
-    arm (first moments). `memory.frames` holds of every joint its axis and origin, and axes and origin of its row.
+    `correction.values` contains g, and four weights for joint j and moved row k: divided by the reach (mass), and times
+    the arm (first moments). `memory.frames` contains axis and origin of every joint, and axes and origin of its row.
     """
     gx, gy, gz = correction.values[first], correction.values[first + 1], correction.values[first + 2]
     dof = arms.dof
@@ -57,16 +57,16 @@ def add_gravity(arms: Any, correction: Any, first: int, memory: Any, q: Any) -> 
 
 
 class GravityTorques(AbstractFeature):
-    """What gravity turns a joint with.
+    """Deflection of joints by gravity torques.
 
-    The torque on joint j is linear in the masses beyond it. For every moved row k from joint j on it has four
-    columns, a mass in the origin p_k of the row's frame and first moments along its axes u [1/m, scaled by
-    `ARM` as a usual distance]::
+    The torque on joint j is linear in the masses that it carries. For every moved row k from joint j to the tool there
+    are four columns, a mass at the origin p_k of the row's frame and first moments along its axes u [1/m, scaled by
+    `ARM` as a typical distance]::
 
         z_j · ((p_k - p_j) × g) / reach        z_j · (u_k × g) · ARM
 
-    with g the direction of gravity; a weight is then compliance times mass. On a prismatic joint, the force
-    `z_j · g`. Taken on the nominal geometry.
+    with g the direction of gravity; a weight is then compliance times mass. For a prismatic joint it is the force
+    `z_j · g`. The nominal geometry is used.
 
     Source: Whitney, Lozinski and Rourke, ASME Journal of Dynamic Systems, Measurement, and Control 108(1),
     1986, 1-8; regressors linear in the masses as in Khalil and Dombre, "Modeling, Identification and Control
@@ -77,23 +77,24 @@ class GravityTorques(AbstractFeature):
     section = GravitySection
     compiled = CompiledForm(add_gravity, frames=True)
     ARM = 0.2
-    """Centres of mass lie about this share of the reach from the frames' origins."""
+    """Typical distance of centres of mass from the origins of the frames, as a share of the reach."""
     group_names = ("gravity",)
     usual_sizes = (3e-4,)
-    """[rad] Simulated arms with a payload have 1.8e-4, the measured UR10 8.6e-4 and the UR5 1.7e-4."""
+    """Prior size of the weights [rad]: 1.8e-4 for simulated arms with a payload, 8.6e-4 for the measured UR10 and
+    1.7e-4 for the UR5."""
 
     def __init__(self, robot: Robot, gravity: Direction = (0.0, 0.0, -1.0)) -> None:
-        """Prepare for a robot.
+        """Make a feature for a robot.
 
         Args:
             robot: the nominal robot; its base and tool do not matter.
-            gravity: direction in which things fall, in the frame of the robot's first row.
+            gravity: direction of gravity in the frame of the robot's first row.
         """
         super().__init__(robot)
         norm = float(np.linalg.norm(gravity))
         if not norm > 0 or not np.isfinite(norm):
-            raise ValueError(f"gravity needs a direction, got {gravity}.")
-        # A unit vector is kept as it is, so that features made again are the same to the last bit.
+            raise ValueError(f"expected a direction of gravity, got {gravity}.")
+        # A unit vector is not normalised again, so that restored features are identical to the last bit.
         scale = 1.0 if abs(norm - 1) < 1e-12 else norm
         x, y, z = (float(value / scale) for value in gravity)
         self.gravity: Direction = (x, y, z)
@@ -108,7 +109,7 @@ class GravityTorques(AbstractFeature):
         return (GravityTorques(robot, options.gravity),)
 
     def columns(self, state: JointState) -> Float[Tensor, "*batch dof columns"]:
-        """Torques of unit masses and moments over the reach; 0 for masses before the joint."""
+        """Return torques of unit masses and moments over the reach; 0 for masses that the joint does not carry."""
         q = state.q
         z, p, carried = self._frames(q.reshape(-1, self.robot.dof))
         g, z = q.new_tensor(self.gravity), z * q.new_tensor(self.robot.directions)[:, None, None]
@@ -122,7 +123,7 @@ class GravityTorques(AbstractFeature):
         return cells.flatten(1, 2).movedim(-1, 0).reshape(*q.shape, 4 * self.robot.dof)
 
     def _frames(self, q: Float[Tensor, "poses dof"]) -> tuple[Tensor, Tensor, Tensor]:
-        """Per joint its axis and origin, and the origin and the axes of its row's frame; the pose index is last."""
+        """Return axis and origin of every joint, and origin and axes of its row's frame; the pose index is last."""
         geometry = Geometry(self.robot.dh.tolist(), [0.0] * 6, [0.0] * 6)
 
         def vector(values: tuple[float | Tensor, ...]) -> Tensor:
@@ -138,7 +139,7 @@ class GravityTorques(AbstractFeature):
         return z, p, carried
 
     def pack(self, weight: Float64[np.ndarray, "dof columns"]) -> Float64[np.ndarray, " values"]:
-        """Direction of gravity, and the scaled weights of every joint and moved row."""
+        """Return the direction of gravity, and the scaled weights of every joint and moved row."""
         dof, slides = self.robot.dof, ~np.array(self.robot.revolute)
         masses = (weight * self.used.numpy()).reshape(dof, dof, 4)
         scale = np.where(slides[:, None], [1.0, 0.0, 0.0, 0.0], [1 / self.robot.reach, *[self.ARM] * 3])

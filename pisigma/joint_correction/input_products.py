@@ -1,4 +1,4 @@
-"""Products of the inputs of different joints, and the product units of a Pi-Sigma network that they make up."""
+"""Products of the inputs of different joints, and their conversion to product units of a Pi-Sigma network."""
 
 from itertools import combinations
 
@@ -12,16 +12,16 @@ from pisigma.robot.description import Robot
 
 
 class InputProducts(AbstractFeature):
-    """Products φ_a φ_b of two inputs of different joints, to which a weight each is fitted.
+    """Products φ_a φ_b of two inputs of different joints, with one weight each.
 
-    With φ = `unit_inputs`, `Σ_ab w_ab φ_a φ_b` is what product units of order 2 express; with its weights fitted, the
-    sum is written as such units (see `factors`), which is how a model holds it.
+    With φ = `unit_inputs`, product units of order 2 express the sum `Σ_ab w_ab φ_a φ_b`. After the weights are fitted,
+    the sum is converted to such units (see `factors`), which models contain.
     """
 
     name = "products"
 
     def __init__(self, robot: Robot) -> None:
-        """Take all pairs of inputs that do not belong to the same joint."""
+        """Make a feature of all pairs of inputs of different joints."""
         super().__init__(robot)
         turning = [j for j, turns in enumerate(robot.revolute) if turns]
         sliding = [j for j, turns in enumerate(robot.revolute) if not turns]
@@ -34,18 +34,18 @@ class InputProducts(AbstractFeature):
         self.group_names = tuple(f"products, {row.name}" for row in robot.joints)
 
     def columns(self, state: JointState) -> Float[Tensor, "*batch dof columns"]:
-        """The products."""
+        """Return the products."""
         phi = unit_inputs(self.robot, state.q)
         first, second = self.pairs.to(phi.device)
         values = phi.index_select(-1, first) * phi.index_select(-1, second)
         return values.unsqueeze(-2).expand(*values.shape[:-1], len(self.used), values.shape[-1])
 
     def factors(self, weights: Float64[Tensor, " weights"]) -> Float64[Tensor, "dof factors inputs"]:
-        """Weights of the factors of product units of order 2 whose sum is the same, two factors a unit.
+        """Convert the weights to factors of product units of order 2 with the same sum, two factors per unit.
 
         `Σ_ab w_ab φ_a φ_b = φ^T M φ` with a symmetric M. With its positive and negative eigenvalues λ and μ and their
         eigenvectors e and f, it is the sum over units of `λ (e·φ)² - |μ| (f·φ)² = (r·φ) (s·φ)` with
-        r, s = √λ e ± √|μ| f. There are as many units as there are eigenvalues of one sign at most.
+        r, s = √λ e ± √|μ| f. The number of units is that of the eigenvalues of the more frequent sign.
         """
         first, second = self.pairs
         M = weights.new_zeros((len(self.used), self.inputs, self.inputs))
@@ -58,7 +58,7 @@ class InputProducts(AbstractFeature):
         return sides.flatten(2).mT
 
     def weights(self, factors: Float64[Tensor, "dof factors inputs"]) -> Float64[Tensor, " weights"]:
-        """Weights of the products that product units of order 2 add up to: the inverse of `factors`."""
+        """Convert factors of product units of order 2 to weights of products; the inverse of `factors`."""
         first, second = self.pairs
         M = factors[:, 0::2].mT @ factors[:, 1::2]
         return (M + M.mT)[:, first, second].flatten()

@@ -1,4 +1,4 @@
-"""The Pi-Sigma network that is fitted through the kinematics: corrections of all joints by joint values."""
+"""The Pi-Sigma network of joint corrections as functions of the joint values, fitted through the kinematics."""
 
 from collections.abc import Sequence
 
@@ -20,14 +20,14 @@ class JointCorrection(nn.Module):
 
         Δ_j(q) = Σ_f Σ_m w_jm f_jm(q) + Σ_u Π_{s in unit u} (b_js + Σ_i v_jsi φ_i(q))
 
-    A ridge polynomial network (Shin and Ghosh 1995, IEEE Transactions on Neural Networks 6(3), 610-622) of
-    Pi-Sigma units, the weights behind the products fixed to 1.
+    This is a ridge polynomial network (Shin and Ghosh 1995, IEEE Transactions on Neural Networks 6(3), 610-622) of
+    Pi-Sigma units, with the weights of the products fixed to 1.
 
     Attributes:
         robot: the nominal robot.
-        features: of the unit of order 1.
-        orders: number of factors of every product unit; none for an additive correction.
-        linear: per feature `(dof, columns)` weights.
+        features: features of the unit of order 1.
+        orders: number of factors of every product unit; empty for an additive correction.
+        linear: weights `(dof, columns)` of every feature.
         weight: `(dof, factors, inputs)`: v.
         bias: `(dof, factors)`: b.
         fixed: `(dof, factors)`: ones.
@@ -45,7 +45,7 @@ class JointCorrection(nn.Module):
         """
         super().__init__()
         if any(order < 2 for order in orders):
-            raise ValueError(f"product units have two factors or more, got orders {tuple(orders)}.")
+            raise ValueError(f"expected product units with at least two factors, got orders {tuple(orders)}.")
         self.robot = robot
         self.features = tuple(features)
         self.orders = tuple(orders)
@@ -59,17 +59,17 @@ class JointCorrection(nn.Module):
 
     @property
     def reads(self) -> tuple[str, ...]:
-        """What it depends on beside the joint values, by the names of `JointState.stated`."""
+        """Row data that it needs in addition to the joint values, by the names of `JointState.stated`."""
         return tuple(dict.fromkeys(name for feature in self.features for name in feature.reads))
 
     @property
     def is_periodic(self) -> bool:
-        """Whether it is the same on all turns of revolute joints."""
+        """Whether it is the same after full turns of revolute joints."""
         pairs = zip(self.features, self.linear, strict=True)
         return all(feature.is_periodic(weight.detach().cpu().numpy()) for feature, weight in pairs)
 
     def of_rows(self, measurements: Measurements) -> Float[Tensor, "rows dof"]:
-        """Corrections with what measured rows state; where a row does not state it, under the usual conditions."""
+        """Compute the corrections of measured rows; data that a row does not state have their usual values."""
         delta: Tensor = self(JointState.of(measurements))
         return delta
 
@@ -78,13 +78,13 @@ class JointCorrection(nn.Module):
         q: Float[Tensor, "*batch dof"] | JointState,
         approach: Float[Tensor, "*batch dof"] | None = None,
     ) -> Float[Tensor, "*batch dof"]:
-        """Corrections to add to joint values [rad or m].
+        """Compute the corrections to add to joint values [rad or m].
 
         Args:
-            q: joint values [rad or m], under the usual conditions and in the middle of all play; or with what is
-                stated beside them.
-            approach: of plain joint values, from which side every joint comes: +1 as its value grows, -1 as it
-                falls, 0 where that is not stated.
+            q: joint values [rad or m], under the usual conditions and in the middle of all backlash; or joint states
+                with further data.
+            approach: approach direction of every joint for plain joint values: +1 if its value increases, -1 if it
+                decreases, 0 if not stated.
         """
         stated = {} if approach is None else {APPROACH: approach}
         state = q if isinstance(q, JointState) else JointState(q, stated)
@@ -96,6 +96,6 @@ class JointCorrection(nn.Module):
         return total + sum_of_products(self.factors(state.q), self.orders)
 
     def factors(self, q: Float[Tensor, "*batch dof"]) -> Float[Tensor, "*batch dof factors"]:
-        """Values of all factors of the product units of all joints."""
+        """Compute the factors of the product units of all joints."""
         phi = unit_inputs(self.robot, q)
         return weigh_sums(phi, self.weight.to(q), self.bias.to(q), self.fixed.to(q))

@@ -14,7 +14,7 @@ from pisigma.robot.se3 import transform_from_xyzrpy
 
 
 class _Step(NamedTuple):
-    """A row of the chain: what it is, and the frames `(batch, 4, 4)` before and after it."""
+    """A row of the chain, with the frames `(batch, 4, 4)` before and after it."""
 
     row: Row
     before: str
@@ -22,17 +22,17 @@ class _Step(NamedTuple):
 
 
 def add_pose(graph: OnnxGraph, robot: Robot, q: str) -> tuple[str, str]:
-    """Position `(batch, 3)` of T_base_tool and the cells of its rotation `(batch, 9)`, row by row."""
+    """Add the position `(batch, 3)` of T_base_tool and the entries of its rotation `(batch, 9)`, row-major."""
     (*_, last) = _add_chain(graph, robot, q, _matrix(robot.base))
     cells = graph.reshape(graph.node("MatMul", last.after, _matrix(robot.tool)), [16])
     return graph.columns(cells, [3, 7, 11]), graph.columns(cells, [0, 1, 2, 4, 5, 6, 8, 9, 10])
 
 
 def add_joint_frames(graph: OnnxGraph, robot: Robot, q: str) -> tuple[str, str, str]:
-    """Axes `(batch, dof, 3)` and origins `(batch, dof, 3)` of the joints, and what is carried `(batch, 4 dof, 3)`.
+    """Add axes `(batch, dof, 3)` and origins `(batch, dof, 3)` of the joints, and frames of their rows.
 
-    All are in the frame of the first row, so without base and tool. Carried are, per joint, the origin and the three
-    axes of its row's frame.
+    All are in the frame of the first row, without base and tool. The frames `(batch, 4 dof, 3)` are the origin and the
+    three axes of every joint's row.
     """
     node, dof = graph.node, robot.dof
     steps = [step for step in _add_chain(graph, robot, q, np.eye(4)) if step.row.type != "fixed"]
@@ -50,7 +50,7 @@ def add_joint_frames(graph: OnnxGraph, robot: Robot, q: str) -> tuple[str, str, 
 
 
 def add_roll_pitch_yaw(graph: OnnxGraph, cells: str) -> list[str]:
-    """Roll, pitch, yaw of rotations `(batch, 9)`, each `(batch, 1)`; see `pisigma.robot.se3.rpy_from_rotation`."""
+    """Add roll, pitch, yaw of rotations `(batch, 9)`, each `(batch, 1)`; see `pisigma.robot.se3.rpy_from_rotation`."""
     node = graph.node
     entry = {(i, j): graph.column(cells, 3 * i + j) for i in range(3) for j in range(3)}
     square = node("Add", *(node("Mul", entry[i, 0], entry[i, 0]) for i in range(2)))
@@ -64,8 +64,8 @@ def add_roll_pitch_yaw(graph: OnnxGraph, cells: str) -> list[str]:
 
 
 def _add_chain(graph: OnnxGraph, robot: Robot, q: str, base: np.ndarray) -> Iterator[_Step]:
-    """Walk along the rows: `RotZ(q)` or `Trans(0, 0, q)` comes first, and what does not move behind it."""
-    ones = graph.node("Add", graph.node("Mul", graph.column(q, 0), 0.0), 1.0)  # one a row of q
+    """Yield the rows: `RotZ(q)` or `Trans(0, 0, q)` is followed by the constant transform of the row."""
+    ones = graph.node("Add", graph.node("Mul", graph.column(q, 0), 0.0), 1.0)  # of the batch size of q
     frame, joint = graph.node("Mul", graph.reshape(ones, [1, 1]), base), 0
     for row, still in zip(robot.rows, _still(robot), strict=True):
         before = frame
@@ -78,7 +78,7 @@ def _add_chain(graph: OnnxGraph, robot: Robot, q: str, base: np.ndarray) -> Iter
 
 
 def _moving(row: Row) -> list[np.ndarray]:
-    """Matrices that `RotZ(q)` is the sum of, times 1, cos q and sin q, or `Trans(0, 0, q)`, times 1 and q."""
+    """Return the matrices whose sum times 1, cos q, sin q is `RotZ(q)`, or times 1, q is `Trans(0, 0, q)`."""
     if row.type == "prismatic":
         along = np.zeros((4, 4))
         along[2, 3] = 1.0
@@ -89,7 +89,7 @@ def _moving(row: Row) -> list[np.ndarray]:
 
 
 def _combined(graph: OnnxGraph, value: str, parts: Sequence[np.ndarray]) -> str:
-    """The sum of `_moving` at joint values `(batch, 1, 1)`, as `(batch, 4, 4)`."""
+    """Add the sum of `_moving` at joint values `(batch, 1, 1)`, as `(batch, 4, 4)`."""
     constant, *others = parts
     factors = [value] if len(others) == 1 else [graph.node("Cos", value), graph.node("Sin", value)]
     total = ""
@@ -100,7 +100,7 @@ def _combined(graph: OnnxGraph, value: str, parts: Sequence[np.ndarray]) -> str:
 
 
 def _still(robot: Robot) -> list[np.ndarray]:
-    """What every row does at joint value 0."""
+    """Return the transform of every row at joint value 0."""
     like = torch.zeros((), dtype=torch.float64)
     return [as_transform(follow_row(IDENTITY, row), like).numpy() for row in robot.dh.tolist()]
 

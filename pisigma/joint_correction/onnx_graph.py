@@ -1,4 +1,4 @@
-"""Writing an ONNX graph node by node, in double precision."""
+"""Build an ONNX graph node by node, in double precision."""
 
 import math
 from collections.abc import Sequence
@@ -9,19 +9,19 @@ import numpy as np
 from pisigma.files.errors import missing_extra
 
 OPSET, IR_VERSION = 17, 8
-"""Old enough for runtimes of 2022."""
+"""Versions that runtimes of 2022 support."""
 
 BATCH = "batch"
-"""Name of the first axis of every input and output."""
+"""Name of the first dimension of every input and output."""
 
 _TINY = 1e-300
 
 
 def import_onnx() -> Any:
-    """The package onnx, which is not among the requirements.
+    """Import the optional package onnx.
 
     Raises:
-        MissingExtraError: it is not installed.
+        MissingExtraError: onnx is not installed.
     """
     try:
         import onnx
@@ -31,16 +31,16 @@ def import_onnx() -> Any:
 
 
 class OnnxGraph:
-    """Nodes, constants, inputs and outputs; values are called by their names.
+    """Nodes, constants, inputs and outputs of a graph; values are identified by name.
 
     Attributes:
-        nodes: so far.
+        nodes: nodes added so far.
         inputs: descriptions of inputs.
         outputs: descriptions of outputs.
     """
 
     def __init__(self) -> None:
-        """Begin an empty graph.
+        """Make an empty graph.
 
         Raises:
             MissingExtraError: onnx is not installed.
@@ -52,18 +52,18 @@ class OnnxGraph:
         self._constants: list[Any] = []
 
     def add_input(self, name: str, shape: Sequence[int], doc: str) -> str:
-        """Declare an input `(batch, *shape)`, once; gives its name."""
+        """Declare an input `(batch, *shape)` unless it exists, and return its name."""
         if name not in {known.name for known in self.inputs}:
             self.inputs.append(self._described(name, shape, doc))
         return name
 
     def add_output(self, value: str, name: str, shape: Sequence[int], doc: str) -> None:
-        """Give a value out as `(batch, *shape)` under a name."""
+        """Declare a value as an output `(batch, *shape)` with a name."""
         self.nodes.append(self._onnx.helper.make_node("Identity", [value], [name]))
         self.outputs.append(self._described(name, shape, doc))
 
     def constant(self, values: Any) -> str:
-        """A constant of floats (as double) or integers; gives its name."""
+        """Add a constant of floats (as double) or integers, and return its name."""
         array = np.asarray(values)
         array = array.astype(np.int64 if array.dtype.kind in "iu" else np.float64)
         name = f"constant_{len(self._constants)}"
@@ -71,26 +71,26 @@ class OnnxGraph:
         return name
 
     def node(self, operator: str, *operands: Any, **attributes: Any) -> str:
-        """Apply an operator to values (by name) and constants (numbers or arrays); gives the name of its result."""
+        """Apply an operator to values (by name) and constants (numbers or arrays), and return the result's name."""
         names = [value if isinstance(value, str) else self.constant(value) for value in operands]
         result = f"{operator.lower()}_{len(self.nodes)}"
         self.nodes.append(self._onnx.helper.make_node(operator, names, [result], **attributes))
         return result
 
     def columns(self, value: str, indices: Sequence[int]) -> str:
-        """Some columns of `(batch, n)`, or slices of the second axis."""
+        """Select columns of `(batch, n)`, or slices of the second dimension."""
         return self.node("Gather", value, np.array(indices, dtype=np.int64), axis=1)
 
     def column(self, value: str, index: int) -> str:
-        """One column of `(batch, n)` as `(batch, 1)`."""
+        """Select one column of `(batch, n)` as `(batch, 1)`."""
         return self.columns(value, [index])
 
     def reshape(self, value: str, shape: Sequence[int]) -> str:
-        """A value as `(batch, *shape)`; one of them may be -1 if the batch is not to be guessed."""
+        """Reshape a value to `(batch, *shape)`; one dimension may be -1."""
         return self.node("Reshape", value, np.array([0, *shape], dtype=np.int64))
 
     def total(self, value: str, axis: int) -> str:
-        """Sum over an axis, which goes away."""
+        """Sum over a dimension, which is removed."""
         return self.node("ReduceSum", value, np.array([axis], dtype=np.int64), keepdims=0)
 
     def sum_of_products(self, factors: str, orders: Sequence[int]) -> str:
@@ -104,10 +104,10 @@ class OnnxGraph:
         return total
 
     def angle(self, sine: str, cosine: str) -> str:
-        """`atan2(sine, cosine)` to the last digits, of values of any length.
+        """Add `atan2(sine, cosine)` in full double precision, for values of any length.
 
-        Runtimes have no arc functions in double. That in float gives an angle a; from there the angle is
-        `a + asin(u)` with `u = (sine cos a - cosine sin a) / length`, some 1e-7, so that two terms of asin do.
+        Runtimes have no inverse trigonometric functions in double. The one in float returns an angle a; the exact angle
+        is `a + asin(u)` with `u = (sine cos a - cosine sin a) / length`, about 1e-7, so that two terms of asin suffice.
         """
         node, doubles, floats = self.node, self._onnx.TensorProto.DOUBLE, self._onnx.TensorProto.FLOAT
         high, wide = node("Abs", sine), node("Abs", cosine)
@@ -115,7 +115,7 @@ class OnnxGraph:
         a = node("Cast", node("Atan", node("Cast", ratio, to=floats)), to=doubles)
         a = node("Where", node("Greater", high, wide), node("Sub", math.pi / 2, a), a)
         a = node("Where", node("Less", cosine, 0.0), node("Sub", math.pi, a), a)
-        below = node("Less", node("Reciprocal", sine), 0.0)  # -0 lies below, as for atan2
+        below = node("Less", node("Reciprocal", sine), 0.0)  # -0 counts as negative, as for atan2
         a = node("Where", below, node("Neg", a), a)
         square = node("Add", node("Mul", sine, sine), node("Mul", cosine, cosine))
         length = node("Max", node("Sqrt", square), _TINY)
@@ -125,7 +125,7 @@ class OnnxGraph:
         return node("Add", a, node("Add", u, third))
 
     def finish(self, name: str, doc: str, metadata: dict[str, str]) -> bytes:
-        """The model as the content of a file, checked."""
+        """Check the model, and return it as the content of a file."""
         from pisigma import __version__
 
         helper = self._onnx.helper

@@ -1,8 +1,8 @@
-"""The features of joint corrections by name: a line each, and `register_feature` for those from outside."""
+"""Registry of the features of joint corrections by name; `register_feature` adds features of plug-ins."""
 
 from typing import Any
 
-from pisigma.files.errors import nearest_choice
+from pisigma.files.errors import ModelError, nearest_choice
 from pisigma.joint_correction.backlash import Backlash
 from pisigma.joint_correction.conditions import ConditionFeatures
 from pisigma.joint_correction.coupled_series import CoupledSeries
@@ -15,52 +15,50 @@ from pisigma.robot.description import Robot
 from pisigma.robot.kernels.forms import register_compiled
 
 FEATURES: dict[str, type[AbstractFeature]] = {}
-"""All features by name, in the order in which they were registered."""
+"""All features by name, in the order of registration."""
 
 
 def register_feature(feature: type[AbstractFeature]) -> type[AbstractFeature]:
-    """Make a feature known: calibrators and recipes may choose it, and models with it are read.
+    """Register a feature, so that calibrators and recipes can use it and models with it can be loaded.
 
-    It may decorate the class. A feature with a compiled form has the kernels made again where it is first used, which
-    needs numba (`pip install 'pisigma[compile]'`).
+    May be used as a class decorator. A feature with a compiled form makes the kernels recompile at its first use, which
+    requires numba (`pip install 'pisigma[compile]'`).
 
     Raises:
         ValueError: another feature has the name.
     """
     if FEATURES.setdefault(feature.name, feature) is not feature:
-        raise ValueError(f"there is a feature '{feature.name}' already; give yours another name.")
+        raise ValueError(f"a feature '{feature.name}' is already registered; choose another name.")
     if feature.compiled is not None:
         register_compiled(feature.name, feature.compiled)
     return feature
 
 
 def feature_named(name: str) -> type[AbstractFeature]:
-    """The feature of a name.
+    """Return the feature with a name.
 
     Raises:
-        ValueError: there is none.
+        ModelError: there is no such feature.
     """
     if name not in FEATURES:
-        raise ValueError(
-            f"there are no features '{name}'; {nearest_choice(name, FEATURES)} One from outside the package needs its "
-            "plug-in (--plugin FILE)."
-        )
+        hint = f"{nearest_choice(name, FEATURES)} Features of plug-ins need their plug-in (--plugin FILE)."
+        raise ModelError(f"there is no feature '{name}'", value=name, remedy=hint)
     return FEATURES[name]
 
 
 def features_from_outside() -> tuple[str, ...]:
-    """Names of the features that do not come with pisigma."""
+    """Return the names of the features that are not part of pisigma."""
     return tuple(name for name, feature in FEATURES.items() if feature.__module__.split(".")[0] != "pisigma")
 
 
 def feature_section(value: Any) -> FeatureSection:
-    """How a feature stands in the description of a model, from plain data.
+    """Validate the section of a feature in the description of a model.
 
     Args:
-        value: a mapping with the key "name", and what else the section of the feature of that name has.
+        value: mapping with the key "name" and the other keys of that feature's section.
 
     Raises:
-        ValueError: there is no such feature, or what it needs is missing, too much or wrong.
+        ValueError: there is no such feature, or its keys are missing, unknown or invalid.
     """
     if isinstance(value, FeatureSection):
         return value
@@ -69,14 +67,14 @@ def feature_section(value: Any) -> FeatureSection:
 
 
 def feature_from(robot: Robot, section: FeatureSection) -> AbstractFeature:
-    """The feature that a section describes.
+    """Make the feature that a section describes.
 
     Args:
         robot: the nominal robot.
-        section: as `AbstractFeature.describe` gives it.
+        section: section as returned by `AbstractFeature.describe`.
 
     Raises:
-        ValueError: the values make no feature.
+        ValueError: the values are not valid for the feature.
     """
     return feature_named(section.name).from_section(robot, section)
 

@@ -19,10 +19,10 @@ from pisigma.robot.kinematics.forward import forward_kinematics
 
 
 class AbstractSharedFeature(AbstractFeature):
-    """What features share whose columns do not depend on the joint that they correct."""
+    """Base class of features whose columns do not depend on the joint that they correct."""
 
     def __init__(self, robot: Robot) -> None:
-        """Prepare for a robot."""
+        """Make a feature for a robot."""
         super().__init__(robot)
         count = self.values(torch.zeros(robot.dof, dtype=torch.float64)).shape[-1]
         self.used = torch.ones(robot.dof, count, dtype=torch.bool)
@@ -30,13 +30,13 @@ class AbstractSharedFeature(AbstractFeature):
         self.group_names = (self.name,)
 
     def columns(self, state: JointState) -> Float[Tensor, "*batch dof columns"]:
-        """The values, once for every joint."""
+        """Return the same values for every joint."""
         values = self.values(state.q)
         return values.unsqueeze(-2).expand(*state.q.shape, values.shape[-1])
 
     @abstractmethod
     def values(self, q: Float[Tensor, "*batch dof"]) -> Float[Tensor, "*batch columns"]:
-        """The columns."""
+        """Compute the columns."""
 
     def add_onnx(self, graph: OnnxGraph, weight: Float64[np.ndarray, "dof columns"], q: str) -> str:
         """See `AbstractFeature.add_onnx`."""
@@ -44,7 +44,7 @@ class AbstractSharedFeature(AbstractFeature):
 
     @abstractmethod
     def add_values(self, graph: OnnxGraph, q: str) -> str:
-        """The columns in an ONNX graph, `(batch, columns)`."""
+        """Add the columns `(batch, columns)` to an ONNX graph."""
 
 
 @no_type_check
@@ -71,7 +71,7 @@ class ScaledJoints(AbstractSharedFeature):
         return add_scaled_joints(graph, self.robot, q)
 
     def is_periodic(self, weight: Float64[np.ndarray, "dof columns"]) -> bool:
-        """Not where a revolute joint has weights."""
+        """Return False if a revolute joint has weights."""
         return not weight[:, np.array(self.robot.revolute)].any()
 
 
@@ -99,17 +99,17 @@ class SinesCosines(AbstractSharedFeature):
 
 
 class NominalPose(AbstractSharedFeature):
-    """The nominal pose's x, y, z over the reach, and roll, pitch, yaw [rad] (Jeong et al. 1998, section 3.2)."""
+    """x, y, z of the nominal pose divided by the reach, and roll, pitch, yaw [rad] (Jeong et al. 1998, section 3.2)."""
 
     name = "pose"
 
     def __init__(self, robot: Robot) -> None:
-        """Prepare for a robot."""
+        """Make a feature for a robot."""
         self._inputs = Inputs.of(robot, ("x", "y", "z", "roll", "pitch", "yaw"))
         super().__init__(robot)
 
     def values(self, q: Float[Tensor, "*batch dof"]) -> Float[Tensor, "*batch columns"]:
-        """The coordinates of the pose."""
+        """Compute the coordinates of the pose."""
         values = self._inputs(forward_kinematics(self.robot, q), q)
         return values / values.new_tensor([self.robot.reach] * 3 + [1.0] * 3)
 
@@ -121,14 +121,14 @@ class NominalPose(AbstractSharedFeature):
 
 
 def add_scaled_joints(graph: OnnxGraph, robot: Robot, q: str) -> str:
-    """See `scaled_joints`; `(batch, dof)`."""
+    """Add `scaled_joints` `(batch, dof)` to an ONNX graph."""
     zero = scaled_joints(robot, torch.zeros(robot.dof, dtype=torch.float64)).numpy()
     one = scaled_joints(robot, torch.ones(robot.dof, dtype=torch.float64)).numpy()
     return graph.node("Add", graph.node("Mul", q, one - zero), zero)
 
 
 def add_unit_inputs(graph: OnnxGraph, robot: Robot, q: str) -> str:
-    """See `unit_inputs`; `(batch, inputs)`."""
+    """Add `unit_inputs` `(batch, inputs)` to an ONNX graph."""
     turning = np.flatnonzero(robot.revolute).tolist()
     sliding = np.flatnonzero(~np.array(robot.revolute)).tolist()
     angle = graph.columns(q, turning)

@@ -1,1 +1,1 @@
-"""The Pi-Sigma network and what it sees."""
+"""The Pi-Sigma network, its inputs and its training."""

@@ -1,4 +1,4 @@
-"""Joint corrections of a pose: one Pi-Sigma network for every group of joints that sees the same inputs."""
+"""Joint corrections of a pose by one Pi-Sigma network per group of joints with the same inputs."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,11 +13,11 @@ from pisigma.network.pi_sigma import PiSigma
 
 @dataclass(frozen=True, eq=False)
 class JointGroup:
-    """Joints whose corrections are outputs of one network.
+    """Joints whose corrections are the outputs of one network.
 
     Attributes:
-        joints: index of every joint, in the order of the network's outputs.
-        inputs: what the network sees.
+        joints: indices of the joints in the order of the network's outputs.
+        inputs: inputs of the network.
     """
 
     joints: tuple[int, ...]
@@ -25,12 +25,12 @@ class JointGroup:
 
 
 class CorrectionNetwork(nn.Module):
-    """Corrections of all joints [rad or m]; joints in no group are not corrected."""
+    """Networks for the corrections of all joints [rad or m]; joints in no group are not corrected."""
 
     networks: nn.ModuleList
 
     def __init__(self, dof: int, groups: Sequence[JointGroup], networks: Sequence[PiSigma]) -> None:
-        """Put groups and their networks together.
+        """Combine groups and their networks.
 
         Raises:
             ValueError: a joint is in two groups, or a network does not fit its group.
@@ -38,31 +38,31 @@ class CorrectionNetwork(nn.Module):
         super().__init__()
         joints = [joint for group in groups for joint in group.joints]
         if len(set(joints)) != len(joints):
-            raise ValueError(f"a joint stands in two groups of the network: {joints}.")
+            raise ValueError(f"a joint appears in two groups of the network: {joints}.")
         for group, network in zip(groups, networks, strict=True):
             if (network.inputs, network.outputs) != (len(group.inputs.names), len(group.joints)):
                 raise ValueError(
-                    f"a group of {len(group.joints)} joints and {len(group.inputs.names)} inputs was given a "
-                    f"network of {network.outputs} outputs and {network.inputs} inputs."
+                    f"expected a network with {len(group.joints)} outputs and {len(group.inputs.names)} inputs for its "
+                    f"group, got {network.outputs} outputs and {network.inputs} inputs."
                 )
         self.dof = dof
         self.groups = tuple(groups)
         self.networks = nn.ModuleList(networks)
 
     def members(self) -> list[tuple[JointGroup, PiSigma]]:
-        """Every group with its network."""
+        """Return every group with its network."""
         return [(group, network) for group, network in zip(self.groups, self.networks, strict=True)]  # type: ignore[misc]
 
     def scaled_inputs(
         self, T: Float[Tensor, "*batch 4 4"], q: Float[Tensor, "*batch dof"]
     ) -> Float[Tensor, "*batch all_inputs"]:
-        """Scaled inputs of all groups side by side: the space in which the domain is measured."""
+        """Compute the concatenated scaled inputs of all groups, the space of the domain."""
         return torch.cat([net.scale_inputs(group.inputs(T, q)) for group, net in self.members()], -1)
 
     def forward(
         self, T: Float[Tensor, "*batch 4 4"], q: Float[Tensor, "*batch dof"]
     ) -> Float[Tensor, "*batch dof"]:
-        """Correction to add to the nominal joint values `q` of the poses `T`."""
+        """Compute the correction of the nominal joint values `q` of the poses `T`."""
         columns: list[Tensor] = [torch.zeros_like(q[..., 0])] * self.dof
         for group, network in self.members():
             for joint, value in zip(group.joints, network(group.inputs(T, q)).unbind(-1), strict=True):

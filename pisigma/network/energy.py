@@ -1,4 +1,4 @@
-"""The energy of a Pi-Sigma network and its derivatives in closed form."""
+"""Energy of a Pi-Sigma network and its derivatives in closed form."""
 
 from collections.abc import Sequence
 
@@ -12,14 +12,14 @@ from pisigma.network.pi_sigma import PiSigma, products_of_others, sum_of_product
 def energy(
     outputs: Float[Tensor, "patterns *models"], targets: Float[Tensor, "patterns *models"]
 ) -> Float[Tensor, "*models"]:
-    """Energy `E = 1/2 Σ_μ (d - y)²` over the patterns, for every output (Jeong et al. 1998, eq. 3)."""
+    """Return the energy `E = 1/2 Σ_μ (d - y)²` over the patterns for every output (Jeong et al. 1998, eq. 3)."""
     return (targets - outputs).square().sum(0) / 2
 
 
 def energy_gradient(
     network: PiSigma, x: Float[Tensor, "patterns inputs"], d: Float[Tensor, "patterns outputs"]
 ) -> tuple[Float[Tensor, " outputs"], Float[Tensor, "outputs units inputs"], Float[Tensor, "outputs units"]]:
-    """Energy of every output and its gradient (Jeong et al. 1998, eq. 4).
+    """Compute the energy of every output and its gradient (Jeong et al. 1998, eq. 4).
 
     `∂E/∂h_j = -Σ_μ (d - y) · Π_{i≠j} W_i h_i · W_j`, times `∂h_j/∂w_ji = x_i`, or times 1 for the bias.
 
@@ -29,7 +29,7 @@ def energy_gradient(
         d: scaled targets.
 
     Returns:
-        Energy, its gradient by `network.weight` and by `network.bias`.
+        Energy, and its gradients with respect to `network.weight` and `network.bias`.
     """
     weighted = weigh_sums(x, network.weight.detach(), network.bias.detach(), network.fixed)
     difference = d - sum_of_products(weighted, network.orders)
@@ -44,17 +44,17 @@ def pull_back(
     fixed: Float[Tensor, "*models units"],
     orders: Sequence[int],
 ) -> tuple[Float[Tensor, "*models units inputs"], Float[Tensor, "*models units"]]:
-    """Carry derivatives by the outputs back to the weights and biases, summed over the patterns.
+    """Backpropagate derivatives with respect to the outputs to weights and biases, summed over the patterns.
 
     Args:
-        by_output: derivative of anything by every output of every pattern.
+        by_output: derivative of any quantity with respect to every output of every pattern.
         x: scaled inputs.
-        weighted: `W_j h_j` of the summing units, as `weigh_sums` gives them.
-        fixed: the fixed weights W.
+        weighted: `W_j h_j` of the summing units, see `weigh_sums`.
+        fixed: fixed weights W.
         orders: number of summing units of every product unit.
 
     Returns:
-        The derivative by the weights, and by the biases: `J^T by_output` without forming J.
+        The derivatives with respect to weights and biases: `J^T by_output` without forming J.
     """
     by_sum = by_output[..., None] * products_of_others(weighted, orders) * fixed
     by_weight = by_sum.reshape(x.shape[0], -1).mT @ x
@@ -67,16 +67,16 @@ def output_jacobian(
     fixed: Float[Tensor, "*models units"],
     orders: Sequence[int],
 ) -> Float[Tensor, "*models patterns parameters"]:
-    """Derivative of the outputs by all weights and biases.
+    """Compute the derivatives of the outputs with respect to all weights and biases.
 
     Args:
         x: scaled inputs.
-        weighted: `W_j h_j` of the summing units, as `weigh_sums` gives them.
-        fixed: the fixed weights W.
+        weighted: `W_j h_j` of the summing units, see `weigh_sums`.
+        fixed: fixed weights W.
         orders: number of summing units of every product unit.
 
     Returns:
-        For every summing unit in turn the derivative by its weights, then by its bias.
+        For each summing unit the derivatives with respect to its weights, then to its bias.
     """
     by_sum = (products_of_others(weighted, orders) * fixed).movedim(0, -2)
     with_bias = torch.cat([x, x.new_ones((x.shape[0], 1))], -1)

@@ -1,4 +1,4 @@
-"""What a network sees of a pose: named inputs, computed from the pose and its nominal joint values."""
+"""Named network inputs, computed from a pose and its nominal joint values."""
 
 import re
 from collections.abc import Sequence
@@ -14,24 +14,23 @@ from pisigma.robot.description import Robot
 from pisigma.robot.se3 import rpy_from_rotation
 
 POSE_INPUTS = ("x", "y", "z", "roll", "pitch", "yaw")
-"""Coordinates of the pose: x, y, z [m] and angles [rad] of the rotation seen from the reference."""
+"""Coordinates of the pose: x, y, z [m] and angles [rad] of the rotation relative to the reference."""
 
 _FUNCTION = re.compile(r"^(sin|cos)\((.+)\)$")
 
 
 @dataclass(frozen=True, eq=False)
 class Inputs:
-    """A named choice of inputs for one robot.
+    """Named inputs for one robot.
 
     A name is a coordinate of the pose (`x`, `y`, `z`, `roll`, `pitch`, `yaw`), a joint (`theta_1`: its
-    nominal value [rad or m]), or `sin(...)` and `cos(...)` of a sum of revolute joints, each of which may have a
-    whole number before it (`sin(theta_1)`, `cos(theta_2 + theta_3)`, `sin(theta_5 - theta_4)`,
-    `cos(8*theta_1)`).
+    nominal value [rad or m]), or `sin(...)` or `cos(...)` of a sum of revolute joints with optional integer factors
+    (`sin(theta_1)`, `cos(theta_2 + theta_3)`, `sin(theta_5 - theta_4)`, `cos(8*theta_1)`).
 
     Attributes:
-        names: the inputs in order.
-        joint_names: the robot's joints.
-        reference: rotation from which roll, pitch and yaw are counted: `R = reference · RotZ · RotY · RotX`.
+        names: names of the inputs in order.
+        joint_names: names of the robot's joints.
+        reference: rotation to which roll, pitch and yaw are relative: `R = reference · RotZ · RotY · RotX`.
     """
 
     names: tuple[str, ...]
@@ -42,11 +41,11 @@ class Inputs:
     def of(
         robot: Robot, names: Sequence[str], reference: Float64[np.ndarray, "3 3"] | None = None
     ) -> "Inputs":
-        """Choose inputs for a robot.
+        """Make the inputs for a robot.
 
         Raises:
-            RecipeError: a name is none of those above (the message lists the valid ones), two mean the same,
-                or one is a sine or cosine of a length.
+            RecipeError: a name is not valid (the message lists the valid ones), two inputs are the same, or one is a
+                sine or cosine of a length.
         """
         joints = tuple(joint.name for joint in robot.joints)
         chosen = Inputs(tuple(names), joints, np.eye(3) if reference is None else reference)
@@ -54,15 +53,15 @@ class Inputs:
         for name in names:
             if name in POSE_INPUTS and name in joints:
                 raise RecipeError(
-                    f"the network input '{name}' is a coordinate of the pose and a joint of robot "
-                    f"'{robot.name}'; rename the joint."
+                    f"the network input '{name}' is both a coordinate of the pose and a joint of robot '{robot.name}'",
+                    value=name,
+                    remedy="rename the joint",
                 )
             function, factors = chosen.combination(name)
             meaning = (function if factors else name, tuple(factors))
             if meaning in meanings:
-                raise RecipeError(
-                    f"the network inputs '{meanings[meaning]}' and '{name}' are the same; leave one out."
-                )
+                problem = f"the network inputs '{meanings[meaning]}' and '{name}' are the same"
+                raise RecipeError(problem, value=name, remedy="leave one out")
             meanings[meaning] = name
             if function:
                 _check_angle(robot, name, factors)
@@ -71,7 +70,7 @@ class Inputs:
     def __call__(
         self, T: Float[Tensor, "*batch 4 4"], q: Float[Tensor, "*batch dof"]
     ) -> Float[Tensor, "*batch inputs"]:
-        """Values of the inputs.
+        """Compute the inputs.
 
         Args:
             T: poses T_base_tool.
@@ -93,7 +92,11 @@ class Inputs:
         return torch.stack(columns, -1)
 
     def combination(self, name: str) -> tuple[str, list[float]]:
-        """What a name means: function ("" for none) and every joint's factor in its argument; none for a coordinate."""
+        """Return function ("" for none) and joint factors of an input; the factors are empty for a coordinate.
+
+        Raises:
+            RecipeError: the name is not valid.
+        """
         if name in POSE_INPUTS:
             return "", []
         factors = [0.0] * len(self.joint_names)
@@ -102,14 +105,14 @@ class Inputs:
             return "", factors
         match = _FUNCTION.match(name)
         if not match:
-            raise RecipeError(self._unknown(name))
+            raise self._unknown(name)
         function, argument = match.groups()
         for factor, term in self._terms(argument, name):
             factors[self.joint_names.index(term)] += factor
         return function, factors
 
     def _terms(self, argument: str, name: str) -> list[tuple[float, str]]:
-        """Factor and joint of every term of a sum; nothing may be left over between them."""
+        """Return factor and joint of every term of a sum, which has to be parsed completely."""
         joints = "|".join(re.escape(joint) for joint in sorted(self.joint_names, key=len, reverse=True))
         rest = argument
         terms: list[tuple[float, str]] = []
@@ -119,22 +122,26 @@ class Inputs:
             terms.append((float(match[1] + (match[2] or "1")), match[3]))
             rest = rest[match.end() :]
         if rest or not terms:
-            raise RecipeError(self._unknown(name))
+            raise self._unknown(name)
         return terms
 
-    def _unknown(self, name: str) -> str:
+    def _unknown(self, name: str) -> RecipeError:
         functions = [f"{f}({joint})" for f in ("sin", "cos") for joint in self.joint_names]
         choices = [*POSE_INPUTS, *self.joint_names, *functions]
-        return f"unknown network input '{name}'; {nearest_choice(name, choices)}"
+        hint = nearest_choice(name, choices)
+        return RecipeError(f"unknown network input '{name}'", value=name, remedy=hint)
 
 
 def _check_angle(robot: Robot, name: str, factors: Sequence[float]) -> None:
-    """Refuse a sine or cosine of a length, or of nothing."""
+    """Check that the argument of a sine or cosine is a variable angle."""
     for joint, factor in zip(robot.joints, factors, strict=True):
         if factor and joint.type == "prismatic":
             raise RecipeError(
-                f"the network input '{name}' takes a function of prismatic joint '{joint.name}', which is "
-                f"a length; use '{joint.name}' itself."
+                f"the network input '{name}' is a function of an angle, but joint '{joint.name}' is prismatic",
+                expected="a revolute joint",
+                value=name,
+                remedy=f"use '{joint.name}' itself",
             )
     if not any(factors):
-        raise RecipeError(f"the network input '{name}' is the same for all joint values; leave it out.")
+        problem = f"the network input '{name}' is the same for all joint values"
+        raise RecipeError(problem, expected="a variable angle", value=name, remedy="leave it out")

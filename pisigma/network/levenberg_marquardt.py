@@ -1,4 +1,4 @@
-"""Levenberg-Marquardt training of Pi-Sigma networks: every output a small problem, many at once."""
+"""Levenberg-Marquardt training of Pi-Sigma networks: many small problems, one per output and start, in parallel."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,16 +15,16 @@ DAMPING_RANGE = (1e-14, 1e10)
 DAMPING_FALL, DAMPING_RISE = 0.2, 3.0
 
 WINDOW = 5
-"""Iterations after which progress is judged."""
+"""Number of iterations between checks of convergence."""
 CONVERGED_SHARE = 0.02
-"""A problem has converged when a window lowers its cost by less than this share, ..."""
+"""A problem has converged if its cost decreased by less than this share within a window, ..."""
 CONVERGED_COST = 1e-11
-"""... or by less than this: an RMS of 4e-6 of the width of the targets, in the scaling of `build_network`."""
+"""... or by less than this: an RMS of 4e-6 of the range of the targets, in the scaling of `build_network`."""
 
 _PROBE = 0.1
-"""Share of a step at which the curvature along it is probed."""
+"""Share of a step for the finite difference of the curvature along it."""
 _BEND = 0.75
-"""Largest ratio of twice the bend of a step to the step."""
+"""Largest ratio of twice the second-order correction to the step (Transtrum and Sethna 2012)."""
 _CHUNK = 8_000_000
 """Largest number of Jacobian entries that are in memory at once."""
 
@@ -36,7 +36,7 @@ class Patterns:
     Attributes:
         x: scaled inputs.
         d: scaled targets.
-        validation: patterns that choose between starts and are not fitted.
+        validation: held-out patterns, which select among starts.
     """
 
     x: Float[Tensor, "patterns inputs"]
@@ -47,21 +47,20 @@ class Patterns:
 class LevenbergMarquardt(nn.Module):
     """Damped Gauss-Newton on `1/2 Σ_μ (d - y)² + 1/2 ridge Σ w²`, for several starts and all outputs.
 
-    Steps solve `(J^T J + λ diag(J^T J)) δ = J^T r` with the Jacobian in closed form (Marquardt 1963) and
-    follow the curve of the outputs to second order: `δ - 1/2 (J^T J + λ diag(J^T J))⁻¹ J^T y''`, y'' being
-    the second derivative along δ (geodesic acceleration, Transtrum and Sethna 2012). The weights of a
-    product trade scale with each other, and plain steps creep along such valleys. λ falls after a step that
-    lowers the cost and rises after one that does not, which is then taken back. Everything is a buffer, so
-    that an interrupted training resumes exactly.
+    Steps solve `(J^T J + λ diag(J^T J)) δ = J^T r` with the Jacobian in closed form (Marquardt 1963), with a
+    second-order correction: `δ - 1/2 (J^T J + λ diag(J^T J))⁻¹ J^T y''`, where y'' is the second derivative along δ
+    (geodesic acceleration, Transtrum and Sethna 2012). Factors of a product can be scaled against each other, and
+    first-order steps are very short along such valleys. λ decreases after a step that lowers the cost and increases
+    after one that does not, which is rejected. All state is in buffers, so that a training resumes exactly.
 
     Attributes:
         parameters_now: `(starts, outputs, units, inputs + 1)`: weights and, last, the bias.
         damping: `(starts, outputs)`: λ.
-        cost: `(starts, outputs)`: of the fitted patterns, with the ridge.
-        window_cost: `(starts, outputs)`: cost when progress was last judged.
+        cost: `(starts, outputs)`: cost of the fitted patterns, including the ridge.
+        window_cost: `(starts, outputs)`: cost at the last check of convergence.
         moving: `(starts, outputs)`: problems that have not converged.
-        iterations: steps taken.
-        best: the parameters of every start with the lowest validation error so far.
+        iterations: number of steps.
+        best: parameters of every start with the lowest validation error so far.
         best_error: `(starts, outputs)`: that error, the sum of squares over the validation patterns.
     """
 
@@ -78,14 +77,14 @@ class LevenbergMarquardt(nn.Module):
     def __init__(
         self, network: PiSigma, starts: int, spread: float, ridge: float, generator: torch.Generator
     ) -> None:
-        """Draw the starts as `PiSigma.initialise` does.
+        """Draw the starts like `PiSigma.initialise`.
 
         Args:
-            network: gives the structure and the fixed weights; it is not changed before `write_best`.
+            network: network with the structure and the fixed weights; it is not changed until `write_best`.
             starts: number of starts.
-            spread: half width of the uniform start of weights and biases.
-            ridge: strength of the pull of the weights (not the biases) towards 0, in scaled units.
-            generator: source of the starts.
+            spread: half width of the uniform distribution of initial weights and biases.
+            ridge: ridge penalty of the weights (not the biases), in scaled units.
+            generator: generator of the starts.
         """
         super().__init__()
         self.orders: Sequence[int] = network.orders
@@ -106,7 +105,7 @@ class LevenbergMarquardt(nn.Module):
 
     @torch.no_grad()
     def iterate(self, patterns: Patterns) -> Float[Tensor, " outputs"]:
-        """Take one step with every start and output.
+        """Perform one step for every start and output.
 
         Returns:
             Energy (eq. 3, all patterns) of the best start of every output.
@@ -132,25 +131,25 @@ class LevenbergMarquardt(nn.Module):
 
     @property
     def converged(self) -> bool:
-        """Whether no problem moves any more."""
+        """Whether all problems have converged."""
         return not bool(self.moving.any())
 
     @torch.no_grad()
     def write_best(self, network: PiSigma) -> None:
-        """Give the network, for every output, the parameters with the lowest validation error."""
+        """Write the parameters with the lowest validation error of every output into the network."""
         chosen = self._winner()
         network.weight.copy_(chosen[..., :-1])
         network.bias.copy_(chosen[..., -1])
 
     def _winner(self) -> Tensor:
-        """For every output the best parameters of its best start."""
+        """Return the best parameters of the best start for every output."""
         return self.best[self.best_error.argmin(0), torch.arange(self.best.shape[1], device=self.best.device)]
 
     def _weigh(self, x: Tensor, parameters: Tensor) -> Tensor:
         return weigh_sums(x, parameters[..., :-1], parameters[..., -1], self.fixed)
 
     def _residual(self, patterns: Patterns, parameters: Tensor) -> Tensor:
-        """`d - y` as `(patterns, starts, outputs)`."""
+        """Return `d - y` as `(patterns, starts, outputs)`."""
         return patterns.d[:, None, :] - sum_of_products(self._weigh(patterns.x, parameters), self.orders)
 
     def _cost(self, residual: Tensor, parameters: Tensor, fitted: Tensor) -> Tensor:
@@ -158,7 +157,7 @@ class LevenbergMarquardt(nn.Module):
         return ((residual.square() * fitted[:, None, None]).sum(0) + pull) / 2
 
     def _step(self, patterns: Patterns, fitted: Tensor) -> Tensor:
-        """The step of every problem, bent along the curve of its outputs where that is a small correction."""
+        """Return the step of every problem, with the second-order correction if that is small."""
         weighted = self._weigh(patterns.x, self.parameters_now)
         pull = torch.full_like(self.parameters_now, self.ridge)
         pull[..., -1] = 0.0
@@ -180,7 +179,7 @@ class LevenbergMarquardt(nn.Module):
         return torch.cat([by_weight, by_bias[..., None]], -1)
 
     def _normal_matrix(self, x: Tensor, weighted: Tensor, fitted: Tensor) -> Tensor:
-        """`J^T J` over the fitted patterns, in chunks of patterns that fit into memory."""
+        """Return `J^T J` over the fitted patterns, computed in chunks of patterns that fit into memory."""
         size = self.parameters_now.shape[-2] * self.parameters_now.shape[-1]
         rows = max(1, _CHUNK // (self.cost.numel() * size))
         total = x.new_zeros(*self.cost.shape, size, size)
@@ -191,13 +190,13 @@ class LevenbergMarquardt(nn.Module):
         return total
 
     def _factorise(self, A: Tensor, pull: Tensor) -> Tensor:
-        """Cholesky factor of the damped normal matrix."""
+        """Return the Cholesky factor of the damped normal matrix."""
         A = A + torch.diag_embed(pull.flatten(-2))
         diagonal = A.diagonal(dim1=-2, dim2=-1)
         floor = diagonal.amax(-1, keepdim=True) * 1e-12 + torch.finfo(A.dtype).tiny
         damping = self.damping[..., None] * diagonal.clamp_min(floor) + floor * 1e-3
         factor, info = torch.linalg.cholesky_ex(A + torch.diag_embed(damping))
-        # A matrix that rounding made indefinite gives no step: its candidate is no better, and λ rises.
+        # A matrix that is indefinite by rounding results in no step: the candidate is not better, so λ increases.
         return torch.where((info == 0)[..., None, None], factor, torch.inf)
 
     def _solve(self, factor: Tensor, right: Tensor) -> Tensor:
@@ -212,7 +211,7 @@ class LevenbergMarquardt(nn.Module):
             self.window_cost = self.cost.clone()
 
     def _remember(self, patterns: Patterns, residual: Tensor, changed: Tensor) -> None:
-        """Keep what does best on the validation patterns, or on all where none validates."""
+        """Keep the parameters that are best on the validation patterns, or on all if there are none."""
         chosen = patterns.validation if patterns.validation.any() else torch.ones_like(patterns.validation)
         error = (residual.square() * chosen[:, None, None]).sum(0)
         better = changed & (error < self.best_error)

@@ -1,4 +1,4 @@
-"""Fitting Pi-Sigma networks with Lightning: the paper's gradient descent, Levenberg-Marquardt, or mini-batches."""
+"""Train Pi-Sigma networks with Lightning: the paper's gradient descent, Levenberg-Marquardt, or mini-batches."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -33,16 +33,16 @@ def fit_networks(
     """Train networks in place.
 
     Args:
-        networks: one per joint group.
+        networks: one network per joint group.
         patterns: their scaled patterns.
         labels: names of the joints of every group.
         fit: method and settings.
-        checkpoints: where they are kept; None keeps none.
-        show_progress: draw a bar on stderr, if that is a terminal.
+        checkpoints: folder and settings of checkpoints; None writes none.
+        show_progress: whether to draw a progress bar on stderr if it is a terminal.
         logs: folder for the energies of every epoch as `metrics.csv`; None writes none.
 
     Raises:
-        TrainingError: a pattern is not finite, the training diverged, or there is no checkpoint of these settings
+        TrainingError: a pattern is not finite, the training diverged, or there is no checkpoint with these settings
             and data to resume from.
         OutputError: checkpoints cannot be written.
     """
@@ -59,16 +59,16 @@ def _check_finite(patterns: Sequence[Patterns], labels: Sequence[Sequence[str]])
         for values in (group.x, group.d):
             if not torch.isfinite(values).all():
                 row = int((~torch.isfinite(values)).nonzero()[0, 0])
-                raise TrainingError(
-                    f"pattern {row} (counted from 0) of {', '.join(names)} is not finite; leave that row out."
-                )
+                problem = f"pattern {row} (counted from 0) of {', '.join(names)} is not finite"
+                remedy = "leave that row out"
+                raise TrainingError(problem, expected="finite patterns", value=row, remedy=remedy)
 
 
 def _batches(patterns: Sequence[Patterns], fit: FitSection) -> tuple[Any, int]:
-    """What gives Lightning its batches, and the number of its epochs.
+    """Return the data loader for Lightning and the number of its epochs.
 
-    Where every step takes all patterns, an epoch of Lightning's is a twentieth of the training: its hooks cost more
-    than a step. The module ends the last one early where the number of steps is no multiple of twenty.
+    If every step uses all patterns, an epoch of Lightning is a twentieth of the training, because its hooks cost more
+    than a step. The module ends the last epoch early if the number of steps is not a multiple of twenty.
     """
     tensors = [values for group in patterns for values in (group.x, group.d, group.validation)]
     if not isinstance(fit, MiniBatchSection):
@@ -79,50 +79,50 @@ def _batches(patterns: Sequence[Patterns], fit: FitSection) -> tuple[Any, int]:
 
 
 class WholeBatches:
-    """A loader that gives all patterns again and again: a DataLoader would double the time of a step."""
+    """A loader that repeats the batch of all patterns; a DataLoader would double the time of a step."""
 
     def __init__(self, batch: list[Tensor], count: int) -> None:
-        """Keep the batch of all patterns; an epoch has `count` of it."""
+        """Store the batch of all patterns, and how often an epoch repeats it."""
         self._batch, self._count = batch, count
 
     def __iter__(self) -> Iterator[list[Tensor]]:
-        """Give the batch as often as an epoch wants it."""
+        """Yield the batches of an epoch."""
         for _ in range(self._count):
             yield self._batch
 
     def __len__(self) -> int:
-        """Batches of an epoch."""
+        """Number of batches of an epoch."""
         return self._count
 
 
 class ShuffledBatches(Sampler[Tensor]):
-    """Rows of the batches, in an order that only seed and epoch decide, so that a training resumes exactly."""
+    """Rows of mini-batches in an order that depends on seed and epoch only, so that a training resumes exactly."""
 
     def __init__(self, rows: int, batch_rows: int, seed: int) -> None:
-        """Number of rows in all and of a batch, and the seed of their order."""
+        """Store the total number of rows, the rows per batch, and the seed of their order."""
         self._rows, self._batch_rows, self._seed, self._epoch = rows, batch_rows, seed, 0
 
     def set_epoch(self, epoch: int) -> None:
-        """Lightning calls this before every epoch."""
+        """Set the epoch; Lightning calls this before every epoch."""
         self._epoch = epoch
 
     def __iter__(self) -> Iterator[Tensor]:
-        """Give the rows of every batch."""
+        """Yield the rows of every batch."""
         generator = torch.Generator().manual_seed(self._seed + self._epoch)
         yield from torch.split(torch.randperm(self._rows, generator=generator), self._batch_rows)
 
     def __len__(self) -> int:
-        """Batches of an epoch."""
+        """Number of batches of an epoch."""
         return math.ceil(self._rows / self._batch_rows)
 
 
 class NetworkTraining(lightning.LightningModule):
-    """Trains the networks of all joint groups side by side, each output for itself.
+    """Trains the networks of all joint groups in parallel, each output independently.
 
     Attributes:
-        energies: `(epochs, joints)`: see `TrainingHistory`; NaN for epochs that have not been.
-        epochs_done: epochs that have been.
-        resumed_from: epochs that were done in the checkpoint with which the training went on.
+        energies: `(epochs, joints)`: see `TrainingHistory`; NaN for epochs that are not completed.
+        epochs_done: number of completed epochs.
+        resumed_from: number of completed epochs in the checkpoint from which the training was resumed.
     """
 
     energies: Tensor
@@ -132,7 +132,7 @@ class NetworkTraining(lightning.LightningModule):
         """Prepare the training.
 
         Args:
-            networks: one per joint group; they are trained in place.
+            networks: one network per joint group; they are trained in place.
             fit: method and settings.
             labels: names of the joints of every group.
         """
@@ -156,17 +156,17 @@ class NetworkTraining(lightning.LightningModule):
         self.register_buffer("epochs_done", torch.zeros((), dtype=torch.int64))
 
     def configure_optimizers(self) -> Any:
-        """The optimiser of the method."""
+        """Make the optimiser of the method."""
         if not isinstance(self.fit, MiniBatchSection):
-            # `_descend` writes gradients times rates. Solvers write none: they keep the state, but Lightning counts
-            # steps, and saves, by an optimiser.
+            # `_descend` writes gradients times rates. Solvers write none, but Lightning needs an optimiser to count
+            # steps and save checkpoints.
             return torch.optim.SGD(self.networks.parameters(), lr=1.0)
         optimiser, steps = self.fit.build(self.networks.parameters()), self.trainer.estimated_stepping_batches
         falling = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, int(steps))
         return {"optimizer": optimiser, "lr_scheduler": {"scheduler": falling, "interval": "step"}}
 
     def training_step(self, batch: list[Tensor], batch_idx: int) -> Tensor | None:
-        """Do one step.
+        """Perform one step.
 
         Raises:
             TrainingError: the training diverged.
@@ -185,17 +185,17 @@ class NetworkTraining(lightning.LightningModule):
             self._count(self.energies[int(self.epochs_done)].clone())
 
     def on_train_start(self) -> None:
-        """Do nothing more where a resumed training had ended already."""
+        """Stop at once if a resumed training had already ended."""
         self._stop_when_done()
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Read how many epochs were done in the checkpoint."""
+        """Read the number of completed epochs from a checkpoint."""
         self.resumed_from = int(checkpoint["state_dict"]["epochs_done"])
 
     def write_networks(self) -> None:
-        """Give every network its best start, once the training has ended.
+        """Write the parameters of the best start into every network after the training.
 
-        Not a hook: Lightning runs none when a training that had come to its end is resumed.
+        This is not a hook, because Lightning runs none when a completed training is resumed.
 
         Raises:
             TrainingError: a weight is not finite, because the last step diverged.
@@ -210,11 +210,11 @@ class NetworkTraining(lightning.LightningModule):
 
     @property
     def history(self) -> Float[Tensor, "epochs joints"]:
-        """The energies of the epochs that have been."""
+        """Energies of the completed epochs."""
         return self.energies[: int(self.epochs_done)].clone()
 
     def _descend(self, patterns: list[Patterns]) -> Tensor:
-        """Write `η ∂E/∂w` (Jeong et al. 1998, eq. 4) into the parameters' `grad`; give the energy of every output."""
+        """Write `η ∂E/∂w` (Jeong et al. 1998, eq. 4) into the parameters' `grad`; return the energy of every output."""
         energies = []
         for network, group, rates in zip(self.networks, patterns, self._rates, strict=True):
             value, by_weight, by_bias = energy_gradient(network, group.x, group.d)  # type: ignore[arg-type]
@@ -229,7 +229,7 @@ class NetworkTraining(lightning.LightningModule):
         return torch.cat([s.iterate(p) for s, p in zip(self.solvers, patterns, strict=True)])  # type: ignore[operator]
 
     def _descend_by_batch(self, patterns: list[Patterns], batch_idx: int) -> Tensor:
-        """Cost of a batch, with the weight of all rows; the epoch's energies are the mean over its batches."""
+        """Return the cost of a batch, scaled to all rows, and accumulate the energies of the epoch."""
         energies = torch.cat(
             [energy(net.products(p.x), p.d) for net, p in zip(self.networks, patterns, strict=True)]  # type: ignore[operator]
         )
@@ -238,7 +238,7 @@ class NetworkTraining(lightning.LightningModule):
         return energies.sum() * self.trainer.num_training_batches
 
     def _count(self, energies: Tensor) -> None:
-        """Keep the energies of an epoch that is done."""
+        """Record the energies of a completed epoch."""
         self._check(0, energies)
         self.energies[int(self.epochs_done)] = energies.to(self.energies)
         self.epochs_done += 1
@@ -253,12 +253,18 @@ class NetworkTraining(lightning.LightningModule):
             self.trainer.should_stop = True
 
     def _check(self, first: int, values: Tensor) -> None:
-        """Refuse values, one per joint from number `first` on, that are not finite."""
+        """Check that values, one per joint from index `first`, are finite.
+
+        Raises:
+            TrainingError: a value is not finite.
+        """
         bad = ~torch.isfinite(values)
         if bad.any():
             name = self.labels[first + int(bad.nonzero()[0])]
             rate = f".{name}" if isinstance(self.fit, GradientDescentSection) else ""
             raise TrainingError(
-                f"the training of {name} diverged in epoch {int(self.epochs_done) + 1} (its energy is no longer "
-                f"finite); lower 'fit.learning_rate{rate}' in the recipe or use method levenberg_marquardt."
+                f"the training of {name} diverged in epoch {int(self.epochs_done) + 1}: its energy is not finite",
+                value=name,
+                option=f"fit.learning_rate{rate}",
+                remedy=f"lower 'fit.learning_rate{rate}' in the recipe or use method levenberg_marquardt",
             )

@@ -1,4 +1,4 @@
-"""Training pairs of inverse calibration: a measured pose, and the joint difference that explains it."""
+"""Training pairs of inverse calibration: a measured pose and the joint correction that explains it."""
 
 from dataclasses import dataclass
 
@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Bool, Float64
 from torch import Tensor
 
-from pisigma.files.errors import IdentificationError
+from pisigma.files.errors import IdentificationError, Place
 from pisigma.measurement.dataset import Measurements
 from pisigma.robot.description import Robot
 from pisigma.robot.kinematics.closed_form import closed_form_solver
@@ -18,18 +18,16 @@ from pisigma.robot.kinematics.status import Status
 
 @dataclass(frozen=True, eq=False)
 class TrainingPairs:
-    """Poses with the corrections that a network shall learn.
+    """Poses with the joint corrections that a network has to learn.
 
     Attributes:
         T: measured poses T_base_tool.
-        q_nominal: nominal joint values of those poses, on the branch nearest to the commanded ones
-            [rad or m].
-        target: `Δ = q - q_nominal`, wrapped to (-pi, pi] where a joint turns.
-        used: rows that are fit for training.
+        q_nominal: nominal joint values of these poses on the branch nearest to the commanded values [rad or m].
+        target: `Δ = q - q_nominal`, wrapped to (-pi, pi] for revolute joints.
+        used: rows that are used for training.
         singular: rows left out because they are near a singularity.
-        unreachable: rows left out because the nominal robot cannot take the measured pose.
-        branches: the branches that the used rows lie on, most frequent first; empty without closed-form
-            inverse.
+        unreachable: rows left out because the nominal robot cannot reach the measured pose.
+        branches: branches of the used rows, the most frequent first; empty without a closed-form inverse.
     """
 
     T: Float64[Tensor, "rows 4 4"]
@@ -42,7 +40,7 @@ class TrainingPairs:
 
     @property
     def left_out(self) -> str:
-        """How many rows were left out and why, in words; "" where none was."""
+        """Number of left-out rows and the reason, in words; "" if none was left out."""
         counts = (
             (self.singular, "near a singularity"),
             (self.unreachable, "not reachable by the nominal robot"),
@@ -51,19 +49,19 @@ class TrainingPairs:
 
 
 def build_pairs(robot: Robot, measurements: Measurements, singular_below: float | None) -> TrainingPairs:
-    """Turn measured poses into pairs: `Δθ = θ_measured - θ_analytic` (Jeong et al. 1998, eq. 5).
+    """Convert measured poses to pairs: `Δθ = θ_measured - θ_analytic` (Jeong et al. 1998, eq. 5).
 
-    No truth is needed: the commanded joint values q stand for θ_measured, and the nominal inverse
-    kinematics of the measured pose gives θ_analytic, on the branch nearest to q.
+    The true joint values are not needed: θ_measured are the commanded joint values q, and θ_analytic is the nominal
+    inverse kinematics of the measured pose on the branch nearest to q.
 
     Args:
-        robot: with the base and tool that the poses are measured by.
+        robot: robot with the base and tool of the measured poses.
         measurements: rows with poses.
-        singular_below: rows whose `singularity_measure` is below this are not used; None uses all.
+        singular_below: `singularity_measure` below which a row is not used; None uses all rows.
 
     Raises:
         MeasurementError: no poses were measured.
-        IdentificationError: no row is left to train on.
+        IdentificationError: no row can be used for training.
     """
     T, q = measurements.T, measurements.q
     solver = closed_form_solver(robot)
@@ -83,8 +81,10 @@ def build_pairs(robot: Robot, measurements: Measurements, singular_below: float 
     used = ~singular & ~unreachable
     if not used.any():
         raise IdentificationError(
-            f"{measurements.source}: none of the {len(q)} rows can be used for training; check base, "
-            "tool and units, or measure away from singularities."
+            f"none of the {len(q)} rows can be used for training",
+            value=len(q),
+            at=Place(measurements.source),
+            remedy="check base, tool and units, or measure away from singularities",
         )
     branches = () if solver is None else solver.frequent(index[used])
     return TrainingPairs(T, q_nominal, target, used, singular, unreachable, branches)

@@ -1,4 +1,4 @@
-"""From training pairs to a scaled network and its patterns."""
+"""Build a scaled network and its patterns from training pairs."""
 
 from collections.abc import Sequence
 
@@ -17,14 +17,13 @@ from pisigma.network.sections import NetworkSection
 from pisigma.robot.description import Robot
 
 TARGET_RANGE = 1.25
-"""Products start near 1, so targets are scaled to [0, 1.25]: the start lies among them, and no product has to
-change its sign. With [-1, 1] some starts end in poor minima, with [0, 2] the paper's learning rates
-diverge."""
+"""Products start near 1, so targets are scaled to [0, 1.25]: the start is among them, and no product has to change its
+sign. With [-1, 1] some starts end in poor minima, with [0, 2] the paper's learning rates diverge."""
 
-_FLAT_INPUT = 1e-9
-"""[m, rad or 1] An input that varies less does not vary."""
-_FLAT_TARGET = 1e-12
-"""[rad or m] Smallest width that targets are scaled by."""
+_MIN_INPUT_RANGE = 1e-9
+"""Range of an input [m, rad or 1] below which it counts as constant."""
+_MIN_TARGET_RANGE = 1e-12
+"""Smallest range by which targets are scaled [rad or m]."""
 
 
 def build_network(
@@ -32,12 +31,11 @@ def build_network(
 ) -> CorrectionNetwork:
     """Build the network of a recipe, scaled by the rows that are used for training.
 
-    Inputs are scaled from their range in the data to [-1, 1] and targets to [0, 1.25] / sqrt(n), n being the
-    number of patterns; the fixed weights of a unit have the product 1 / sqrt(n) too. The energy of eq. (3) is
-    then half the mean square of the error in units of the scaled range, and a learning rate means the same
-    for 100 rows as for 1000.
+    Inputs are scaled from their range in the data to [-1, 1] and targets to [0, 1.25] / sqrt(n) for n patterns; the
+    product of the fixed weights of a unit is 1 / sqrt(n) too. The energy of eq. (3) is then half the mean square of the
+    error in units of the scaled range, so a learning rate has the same effect for 100 rows as for 1000.
 
-    A target that does not vary is scaled as one that varies by 1e-12: the correction is then that constant.
+    A constant target is scaled as if it varied by 1e-12: the correction is then that constant.
 
     Raises:
         RecipeError: an input is unknown; the message lists the valid ones.
@@ -57,7 +55,7 @@ def build_network(
         _check_varying(section.inputs, input_width, rows)
         network.input_offset, network.input_scale = (x.amax(0) + x.amin(0)) / 2, input_width / 2
         network.output_offset = d.amin(0)
-        network.output_scale = target_width.clamp_min(_FLAT_TARGET) / TARGET_RANGE * rows**0.5
+        network.output_scale = target_width.clamp_min(_MIN_TARGET_RANGE) / TARGET_RANGE * rows**0.5
         groups.append(group)
         networks.append(network)
     return CorrectionNetwork(robot.dof, groups, networks)
@@ -73,14 +71,14 @@ def build_patterns(
     """Scaled patterns of every joint group; the validation rows are drawn once for all.
 
     Args:
-        network: built by `build_network` from the same pairs.
-        pairs: the training pairs.
-        validation_share: share of the used rows that only validates.
-        groups_of_rows: rows of equal number stay on one side.
-        generator: draws the validation rows.
+        network: network built by `build_network` from the same pairs.
+        pairs: training pairs.
+        validation_share: share of the used rows that are held out for validation.
+        groups_of_rows: group index of every row; groups are not divided.
+        generator: generator for the choice of validation rows.
 
     Raises:
-        IdentificationError: fewer rows are left to fit than the network has free parameters per joint.
+        IdentificationError: there are fewer rows to fit than the network has free parameters per joint.
     """
     validation = _draw_validation(pairs.used, groups_of_rows, validation_share, generator)[pairs.used]
     patterns = []
@@ -93,28 +91,33 @@ def build_patterns(
 
 
 def _check_varying(names: Sequence[str], width: Float64[Tensor, " inputs"], rows: int) -> None:
-    if (width < _FLAT_INPUT).any():
-        name = names[int((width < _FLAT_INPUT).nonzero()[0])]
+    if (width < _MIN_INPUT_RANGE).any():
+        name = names[int((width < _MIN_INPUT_RANGE).nonzero()[0])]
         raise IdentificationError(
-            f"the network input '{name}' does not vary over the {rows} training rows, so no correction can "
-            "be learned from it; measure where it varies, or leave it out of the recipe."
+            f"the network input '{name}' does not vary over the {rows} training rows, so no correction can be learned "
+            "from it",
+            value=name,
+            remedy="measure where it varies, or leave it out of the recipe",
         )
 
 
 def _check_count(group: JointGroup, network: PiSigma, fitted: int) -> None:
-    """Refuse to fit more free parameters than rows; a product's factors trade scale, which frees none."""
+    """Check that there are as many rows as free parameters; scaling of factors against each other is not one."""
     free = sum(network.orders) * (network.inputs + 1) - sum(order - 1 for order in network.orders)
     if fitted < free:
         raise IdentificationError(
-            f"{fitted} rows are there to fit, but the network of inputs {', '.join(group.inputs.names)} has "
-            f"{free} free parameters per joint; measure more poses, or give it fewer inputs or lower orders."
+            f"there are {fitted} rows to fit, but the network of inputs {', '.join(group.inputs.names)} has {free} "
+            "free parameters per joint",
+            expected=f"at least {free} rows",
+            value=fitted,
+            remedy="measure more poses, or give it fewer inputs or lower orders",
         )
 
 
 def _draw_validation(
     used: Bool[Tensor, " rows"], groups: Int64[Tensor, " rows"], share: float, generator: torch.Generator
 ) -> Bool[Tensor, " rows"]:
-    """Whole groups of rows at random, until their share is reached; one group is always fitted."""
+    """Draw whole groups of rows at random until their share is reached; one group is always fitted."""
     present, counts = torch.unique(groups[used], return_counts=True)
     order = torch.randperm(len(present), generator=generator)
     before = counts[order].cumsum(0) - counts[order]

@@ -1,4 +1,4 @@
-"""The Pi-Sigma network: a hidden layer of linear sums, an output layer of products with fixed weights."""
+"""The Pi-Sigma network: a hidden layer of linear sums and an output layer of products with fixed weights."""
 
 from collections.abc import Sequence
 
@@ -8,18 +8,18 @@ from torch import Tensor, nn
 
 
 class PiSigma(nn.Module):
-    """Outputs that are sums of products of linear sums.
+    """Network whose outputs are sums of products of linear sums.
 
     For every output k and every unit u of order m_u, with inputs x and outputs y in scaled form::
 
         h_kj = b_kj + Σ_i w_kji x_i                                (Jeong et al. 1998, eq. 1, with a bias)
         y_k  = Σ_u Π_{j in unit u} W_kj h_kj                       (eq. 2; one unit in the paper)
 
-    One unit is a Pi-Sigma network; several units of rising order are a ridge polynomial network (Shin and
-    Ghosh 1995). The weights W between the summing units and the products are fixed: a buffer, never a
-    parameter. Nothing is shared between outputs, so every output can be trained on its own.
+    One unit is a Pi-Sigma network; several units of increasing order are a ridge polynomial network (Shin and
+    Ghosh 1995). The weights W between the summing units and the products are fixed: a buffer, not a parameter.
+    Outputs share no weights, so every output can be trained independently.
 
-    Scaling is part of the network: `forward` takes and gives plain values.
+    Scaling is part of the network: inputs and outputs of `forward` are in physical units.
 
     Attributes:
         weight: `(outputs, summing_units, inputs)`: w.
@@ -46,14 +46,14 @@ class PiSigma(nn.Module):
         fixed_product: float = 1.0,
         dtype: torch.dtype = torch.float64,
     ) -> None:
-        """Build a network whose products are all exactly `fixed_product` until it is initialised or trained.
+        """Build a network whose products are all equal to `fixed_product` until it is initialised or trained.
 
         Args:
             inputs: number of inputs.
             outputs: number of outputs.
             orders: number of summing units of every product unit, such as `(3,)` or `(1, 2, 3)`.
-            fixed_product: product of the fixed weights of a unit; each is the root of it.
-            dtype: of weights and buffers.
+            fixed_product: product of the fixed weights of a unit, which are all equal.
+            dtype: dtype of weights and buffers.
 
         Raises:
             ValueError: a count is below 1, or the fixed product is not positive.
@@ -61,11 +61,11 @@ class PiSigma(nn.Module):
         super().__init__()
         if inputs < 1 or outputs < 1 or not orders or min(orders) < 1:
             raise ValueError(
-                f"a Pi-Sigma network needs inputs, outputs and orders of at least 1, got {inputs} inputs, "
-                f"{outputs} outputs, orders {tuple(orders)}."
+                f"expected inputs, outputs and orders >= 1, got {inputs} inputs, {outputs} outputs and orders "
+                f"{tuple(orders)}."
             )
         if not fixed_product > 0:
-            raise ValueError(f"the product of the fixed weights must be above 0, got {fixed_product}.")
+            raise ValueError(f"expected a product of the fixed weights > 0, got {fixed_product}.")
         self.orders = tuple(orders)
         summing_units = sum(self.orders)
         self.weight = nn.Parameter(torch.zeros(outputs, summing_units, inputs, dtype=dtype))
@@ -89,33 +89,33 @@ class PiSigma(nn.Module):
 
     @torch.no_grad()
     def initialise(self, spread: float, generator: torch.Generator) -> None:
-        """Draw the weights from ±spread and the biases from 1 ± spread, both uniformly.
+        """Draw the weights uniformly from ±spread and the biases from 1 ± spread.
 
-        Every product then starts near the product of its fixed weights. Near 0 it would stall: the gradient
-        of a product by one factor is the product of the others.
+        Every product then starts near the product of its fixed weights. Near 0 training would stall, because the
+        gradient of a product with respect to one factor is the product of the others.
         """
         for parameter, centre in ((self.weight, 0.0), (self.bias, 1.0)):
             parameter.copy_(centre + draw_uniform(parameter, spread, generator))
 
     def scale_inputs(self, x: Float[Tensor, "*batch inputs"]) -> Float[Tensor, "*batch inputs"]:
-        """Inputs as the summing units see them."""
+        """Scale inputs for the summing units."""
         return (x - self.input_offset) / self.input_scale
 
     def scale_targets(self, y: Float[Tensor, "*batch outputs"]) -> Float[Tensor, "*batch outputs"]:
-        """Wanted outputs as the products are compared with."""
+        """Scale target outputs for comparison with the products."""
         return (y - self.output_offset) / self.output_scale
 
     def products(self, scaled: Float[Tensor, "*batch inputs"]) -> Float[Tensor, "*batch outputs"]:
-        """Scaled outputs of scaled inputs: eqs (1) and (2)."""
+        """Compute scaled outputs of scaled inputs: eqs (1) and (2)."""
         return sum_of_products(weigh_sums(scaled, self.weight, self.bias, self.fixed), self.orders)
 
     def forward(self, x: Float[Tensor, "*batch inputs"]) -> Float[Tensor, "*batch outputs"]:
-        """Outputs of inputs, both in plain units."""
+        """Compute outputs of inputs, both in physical units."""
         return self.output_offset + self.output_scale * self.products(self.scale_inputs(x))
 
 
 def draw_uniform(like: Tensor, spread: float, generator: torch.Generator) -> Tensor:
-    """Numbers uniform in ±spread, shaped as `like`, drawn in float64 so that every dtype starts alike."""
+    """Draw uniform numbers in ±spread of the shape of `like`, in float64 so that they are the same for every dtype."""
     drawn = torch.rand(like.shape, generator=generator, dtype=torch.float64, device=generator.device)
     return (spread * (2 * drawn - 1)).to(like)
 
@@ -126,7 +126,7 @@ def weigh_sums(
     bias: Float[Tensor, "*models units"],
     fixed: Float[Tensor, "*models units"],
 ) -> Float[Tensor, "... units"]:
-    """Weighted outputs `W_kj h_kj` of the summing units (eq. 1), for any leading axes of models."""
+    """Compute weighted outputs `W_kj h_kj` of the summing units (eq. 1), for any leading model dimensions."""
     flat = x @ weight.reshape(-1, weight.shape[-1]).mT
     sums = flat.reshape(*x.shape[:-1], *bias.shape) + bias
     return sums * fixed
@@ -135,7 +135,7 @@ def weigh_sums(
 def sum_of_products(
     weighted: Float[Tensor, "*batch units"], orders: Sequence[int]
 ) -> Float[Tensor, "*batch"]:
-    """Sum over the product units (eq. 2) of summing units that lie one unit after the other."""
+    """Sum the product units (eq. 2), whose summing units are consecutive."""
     total: Tensor | None = None
     for unit in torch.split(weighted, list(orders), dim=-1):
         factors = unit.unbind(-1)
@@ -150,7 +150,7 @@ def sum_of_products(
 def products_of_others(
     weighted: Float[Tensor, "*batch units"], orders: Sequence[int]
 ) -> Float[Tensor, "*batch units"]:
-    """For every summing unit the product of the others of its product unit, exact where factors are zero.
+    """Return for every summing unit the product of the others in its product unit, exact even if factors are zero.
 
     This is `Π_{i≠j} W_ki h_i` in the derivative of eq. (4).
     """

@@ -1,4 +1,4 @@
-"""Sections of recipes: a network, and how it is trained."""
+"""Recipe sections for networks and their training."""
 
 from collections.abc import Iterable, Sequence
 from typing import Annotated, Literal
@@ -20,7 +20,8 @@ _Row = tuple[float, float, float]
 def _check_rotation(rows: tuple[_Row, _Row, _Row]) -> tuple[_Row, _Row, _Row]:
     R = np.array(rows, dtype=np.float64)
     if np.abs(R @ R.T - np.eye(3)).max() > 1e-6 or np.linalg.det(R) < 0:
-        raise ValueError("the three rows are no rotation; give an orthonormal, right-handed matrix")
+        expected = "an orthonormal, right-handed matrix"
+        raise RecipeError(f"expected {expected}, got three rows that are not a rotation", expected=expected)
     return rows
 
 
@@ -61,16 +62,19 @@ class GradientDescentSection(Section):
     spread: PositiveFloat = 0.3
 
     def rates(self, joints: Sequence[str]) -> Float64[Tensor, " outputs"]:
-        """Learning rates in the order of the joints.
+        """Return the learning rates in the order of the joints.
 
         Raises:
-            RecipeError: a joint has none.
+            RecipeError: a joint has no rate.
         """
         for joint in joints:
             if joint not in self.learning_rate:
                 stated = ", ".join(sorted(self.learning_rate)) or "none"
                 raise RecipeError(
-                    f"'fit.learning_rate' has no rate for joint '{joint}'; add one to those stated ({stated})."
+                    f"there is no learning rate for joint '{joint}'",
+                    value=joint,
+                    option="fit.learning_rate",
+                    remedy=f"add one to those stated ({stated})",
                 )
         return torch.tensor([self.learning_rate[joint] for joint in joints], dtype=torch.float64)
 
@@ -119,7 +123,7 @@ class MiniBatchSection(Section):
     spread: PositiveFloat = 0.3
 
     def build(self, parameters: Iterable[nn.Parameter]) -> torch.optim.Optimizer:
-        """The optimiser of these parameters."""
+        """Make the optimiser for these parameters."""
         if self.optimiser == "sgd":
             return torch.optim.SGD(parameters, lr=self.learning_rate, momentum=0.9)
         kind = torch.optim.Adam if self.optimiser == "adam" else torch.optim.AdamW

@@ -1,4 +1,4 @@
-"""Lightning's trainer as pisigma uses it: on the CPU, on one thread, with checkpoints, and silent on stdout."""
+"""Run Lightning's trainer on one CPU thread, with checkpoints and without output on stdout."""
 
 import logging
 import os
@@ -19,10 +19,11 @@ import torch
 from lightning.pytorch.callbacks import ModelCheckpoint, RichProgressBar
 from lightning.pytorch.loggers import CSVLogger, Logger, TensorBoardLogger
 
-from pisigma.files.errors import OutputError, TrainingError
+from pisigma.files.errors import Place, TrainingError
+from pisigma.files.output_file import not_writable
 
 SAVED = 20
-"""How often a whole training is saved."""
+"""Number of checkpoints of a training."""
 
 _NAME = "last"
 _FINGERPRINT = "pisigma_fingerprint"
@@ -39,12 +40,12 @@ _HARMLESS = (
 
 @dataclass(frozen=True)
 class Checkpoints:
-    """Where the checkpoints of a training are kept.
+    """Checkpoints of a training.
 
     Attributes:
-        folder: for the checkpoints.
-        fingerprint: says what settings and data a checkpoint belongs to.
-        resume: go on from the checkpoint there, instead of from the start.
+        folder: folder of the checkpoints.
+        fingerprint: identifier of the settings and data of a checkpoint.
+        resume: whether to resume from the checkpoint in the folder.
     """
 
     folder: Path
@@ -53,14 +54,14 @@ class Checkpoints:
 
     @property
     def file(self) -> Path:
-        """The last checkpoint."""
+        """Path of the last checkpoint."""
         return self.folder / f"{_NAME}.ckpt"
 
     def prepare(self) -> None:
-        """Make the folder without an older checkpoint; or, to resume, check the checkpoint there.
+        """Create the folder and remove an older checkpoint, or check the checkpoint to resume from.
 
         Raises:
-            TrainingError: there is no checkpoint to resume, it is damaged, or it is of other settings or data.
+            TrainingError: there is no checkpoint to resume from, it is damaged, or it has other settings or data.
             OutputError: the folder cannot be written.
         """
         if self.resume:
@@ -70,30 +71,29 @@ class Checkpoints:
             self.folder.mkdir(parents=True, exist_ok=True)
             self.file.unlink(missing_ok=True)
         except OSError as problem:
-            raise OutputError(
-                f"{self.folder}: cannot be written ({problem.strerror}); choose another --out."
-            ) from None
+            raise not_writable(self.folder, problem) from None
 
     def _check(self) -> None:
+        expected, remedy = "an interrupted training", "run without --resume"
         if not self.file.is_file():
-            raise TrainingError(
-                f"{self.folder}: there is no interrupted training to resume; run without --resume."
-            )
+            problem = "there is no interrupted training to resume"
+            raise TrainingError(problem, expected=expected, at=Place(self.folder), remedy=remedy)
         try:
             fingerprint = torch.load(self.file, map_location="cpu", weights_only=True)[_FINGERPRINT]
         except (OSError, EOFError, RuntimeError, KeyError, TypeError, ValueError, pickle.UnpicklingError):
-            raise TrainingError(
-                f"{self.file}: is no whole checkpoint of pisigma; run without --resume."
-            ) from None
+            expected = "a complete checkpoint of pisigma"
+            raise TrainingError(expected=expected, at=Place(self.file), remedy=remedy) from None
         if fingerprint != self.fingerprint:
             raise TrainingError(
-                f"{self.folder}: the interrupted training there is of another recipe or other data; "
-                "run without --resume to start afresh, or choose another --out."
+                "the interrupted training has another recipe or other data",
+                expected="the same recipe and data",
+                at=Place(self.folder),
+                remedy="run without --resume to start from scratch, or choose another --out",
             )
 
 
 class _Fingerprint(lightning.Callback):
-    """Writes into every checkpoint what settings and data it belongs to."""
+    """Writes the fingerprint of settings and data into every checkpoint."""
 
     def __init__(self, fingerprint: str) -> None:
         self._fingerprint = fingerprint
@@ -116,15 +116,15 @@ def train(
     """Train a module in place.
 
     Args:
-        module: to train.
-        data: what gives the batches of an epoch.
-        epochs: to train at most; about `SAVED` times, and at the end, a checkpoint is written.
-        checkpoints: where they are kept; None keeps none.
-        show_progress: draw Lightning's bar on stderr, if that is a terminal.
-        logs: folder for Lightning's logs: `metrics.csv`, and TensorBoard's events where it is installed.
+        module: module to train.
+        data: loader of the batches of an epoch.
+        epochs: largest number of epochs; about `SAVED` checkpoints are written, and one at the end.
+        checkpoints: folder and settings of checkpoints; None writes none.
+        show_progress: whether to draw Lightning's progress bar on stderr if it is a terminal.
+        logs: folder for Lightning's logs: `metrics.csv`, and TensorBoard events if that is installed.
 
     Raises:
-        TrainingError: there is no checkpoint of these settings and data to resume.
+        TrainingError: there is no checkpoint with these settings and data to resume from.
         OutputError: the folder of the checkpoints cannot be written.
         KeyboardInterrupt: the user pressed Ctrl-C.
     """
@@ -155,7 +155,7 @@ def train(
 
 
 def _saving(folder: Path, epochs: int) -> ModelCheckpoint:
-    """Replaces the last checkpoint at even distances; Lightning renames a whole file into its place."""
+    """Return a callback that replaces the last checkpoint at regular intervals; Lightning replaces it atomically."""
     return ModelCheckpoint(
         dirpath=folder,
         filename=_NAME,
@@ -176,7 +176,7 @@ def _loggers(folder: Path | None) -> list[Logger]:
 
 @contextmanager
 def _one_thread() -> Iterator[None]:
-    """Compute on one thread: on a hundred patterns, a second one costs more than it does."""
+    """Compute on one thread: for a hundred patterns, a second thread costs more than it saves."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
@@ -187,7 +187,7 @@ def _one_thread() -> Iterator[None]:
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Keep Lightning's hints and warnings about what we do on purpose to ourselves."""
+    """Suppress Lightning's hints and warnings about choices that are made on purpose."""
     loggers = [logging.getLogger(name) for name in ("lightning.pytorch", "lightning.fabric")]
     levels = [logger.level for logger in loggers]
     for logger in loggers:
@@ -204,7 +204,7 @@ def _quiet() -> Iterator[None]:
 
 @contextmanager
 def _keyboard_interrupts() -> Iterator[None]:
-    """Let Ctrl-C arrive as `KeyboardInterrupt`: Lightning exits with status 1 and ignores all later ones."""
+    """Turn Ctrl-C into `KeyboardInterrupt`: Lightning would exit with status 1 and ignore all later interrupts."""
     handler = signal.getsignal(signal.SIGINT)
     try:
         yield

@@ -1,4 +1,4 @@
-"""A root of the covariance in factors says what the matrix says."""
+"""A covariance root in factors agrees with the matrix."""
 
 import torch
 from testing.closeness import assert_close
@@ -19,7 +19,7 @@ def factored() -> CovarianceRoot:
     return CovarianceRoot(normal(PARAMETERS + WEIGHTS, 4, seed=3), FewValues(size, Z, factor))
 
 
-def test_few_values_leave_the_inverse_of_what_they_and_the_prior_say() -> None:
+def test_the_covariance_after_few_values_is_the_inverse_of_the_information() -> None:
     few = factored().weights
     assert few is not None
     root = few.along(torch.eye(WEIGHTS, dtype=torch.float64))

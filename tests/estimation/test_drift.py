@@ -1,4 +1,4 @@
-"""Sizes of a drift by evidence, against the evidence and the least squares of dense matrices."""
+"""Drift sizes by evidence, compared with evidence and least squares of dense matrices."""
 
 import math
 
@@ -14,7 +14,7 @@ NOISE, MOVED = 1e-4, 4e-3
 
 
 def search(moved: float, seed: int = 0, stated: bool = False) -> DriftSearch:
-    """Fifty values of seven unknowns: three of a first group and one each of four others, of which one has moved."""
+    """Fifty values of seven unknowns: three of a first group and one each of four others, one of which has moved."""
     rng = np.random.default_rng(seed)
     X = torch.from_numpy(rng.normal(size=(50, 7)))
     root = 1e-4 * torch.eye(7).double()[:, :5]
@@ -53,7 +53,7 @@ def test_only_what_moved_has_a_size():
 
 
 @pytest.mark.parametrize("seed", range(8))
-def test_nothing_has_a_size_where_nothing_moved(seed):
+def test_nothing_has_a_size_if_nothing_moved(seed):
     assert not any(group.size for group in estimated(search(0.0, seed)).groups)
 
 
@@ -82,7 +82,7 @@ def test_a_shift_is_that_of_least_squares():
     assert float(narrower) < float(covariance)
 
 
-def test_more_noise_than_before_is_noticed():
+def test_larger_noise_is_detected():
     looked_at = search(0.0)
     looked_at.values.y.add_(3 * NOISE * torch.from_numpy(np.random.default_rng(5).normal(size=50)))
     assert float(estimated(looked_at).noise[0]) > 2 * NOISE

@@ -15,7 +15,7 @@ COMPONENTS = [1, 2, 3]
 
 
 def density(components: int) -> tuple[torch.Tensor, torch.Tensor]:
-    """Lengths of standard normal vectors and their probabilities, on a fine grid."""
+    """Return lengths of standard normal vectors and their probabilities on a fine grid."""
     d = torch.linspace(1e-6, 15.0, 300_001, dtype=torch.float64)
     weight = d ** (components - 1) * torch.exp(-d.square() / 2)
     return d, weight / weight.sum()
@@ -23,7 +23,9 @@ def density(components: int) -> tuple[torch.Tensor, torch.Tensor]:
 
 @pytest.mark.parametrize("loss", [SquaredLoss(), HampelLoss()])
 @pytest.mark.parametrize("components", COMPONENTS)
-def test_weight_is_half_the_slope_of_the_cost_over_the_distance(loss: AbstractLoss, components: int) -> None:
+def test_weight_is_half_the_derivative_of_the_cost_over_the_distance(
+    loss: AbstractLoss, components: int
+) -> None:
     d = torch.linspace(0.05, 20.0, 401, dtype=torch.float64)
     slope = (loss.cost(d + 1e-6, components) - loss.cost(d - 1e-6, components)) / 2e-6
     assert_close(slope / (2 * d), loss.weight(d, components), atol=1e-6)
@@ -51,7 +53,7 @@ def test_hampel_leaves_good_rows_and_drops_bad_ones() -> None:
 
 
 @pytest.mark.parametrize("components", COMPONENTS)
-def test_scale_stands_up_to_wrong_rows(components: int, generator: torch.Generator) -> None:
+def test_scale_is_robust_to_wrong_rows(components: int, generator: torch.Generator) -> None:
     r = 0.2 * torch.randn(20_000, components, generator=generator, dtype=torch.float64)
     r[:2000] *= 100
     loss = HampelLoss()
@@ -62,7 +64,7 @@ def test_scale_stands_up_to_wrong_rows(components: int, generator: torch.Generat
     assert SquaredLoss().scale(distance, components, 0.0) > 5
 
 
-def test_parameters_used_up_widen_the_scale() -> None:
+def test_estimated_parameters_increase_the_scale() -> None:
     d = torch.ones(10, dtype=torch.float64)
     assert_close(SquaredLoss().scale(d, 1, 5.0), 2**0.5, rtol=1e-12)
     assert_close(HampelLoss().scale(d, 1, 5.0) / HampelLoss().scale(d, 1, 0.0), 2**0.5, rtol=1e-12)

@@ -1,4 +1,4 @@
-"""The posterior after new values, against Kalman's formulas with dense matrices."""
+"""The posterior after new values, compared with Kalman's formulas with dense matrices."""
 
 import numpy as np
 import pytest

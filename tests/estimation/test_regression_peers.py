@@ -1,4 +1,4 @@
-"""Primal and dual regression against scikit-learn, and against exact formulas in 50 digits."""
+"""Primal and dual regression compared with scikit-learn and with exact formulas in 50 digits."""
 
 import math
 from dataclasses import replace
@@ -21,7 +21,7 @@ VALUES, WEIGHTS = 30, 6
 
 
 def random_case(values: int = VALUES, parameters: int = 0) -> tuple[Tensor, Tensor, GaussianPrior]:
-    """Columns, values and a prior: parameters without prior knowledge in front, and weights of one size."""
+    """Return columns, values and a prior: parameters without a prior, then weights of one size."""
     generator = torch.Generator().manual_seed(3)
     X = torch.randn(values, parameters + WEIGHTS, generator=generator, dtype=torch.float64)
     x = torch.randn(parameters + WEIGHTS, generator=generator, dtype=torch.float64)
@@ -76,7 +76,7 @@ def test_the_evidence_is_that_of_a_gaussian_process(form: str):
 @pytest.mark.parametrize("form", ["primal", "dual"])
 @pytest.mark.parametrize("scale", [1.0, 1e-6])
 def test_parameters_without_prior_are_exact_in_fifty_digits(form: str, scale: float):
-    """Weights of a millionth of the parameters' size, as gear errors are beside lengths."""
+    """Weights of a millionth of the parameters' size, like gear errors compared with lengths."""
     X, y, prior = random_case(values=14, parameters=3)
     X[:, 3:] *= scale
     prior = replace(prior, sizes=prior.sizes * torch.tensor([1.0, 1 / scale]).double())

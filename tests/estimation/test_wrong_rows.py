@@ -1,4 +1,4 @@
-"""Configurations that were measured wrongly, beside a joint that has moved and unknowns that could explain anything."""
+"""Configurations with wrong measurements, with a moved joint and many unknowns."""
 
 from dataclasses import replace
 
@@ -15,7 +15,7 @@ NOISE, MOVED, CONFIGURATIONS = 1e-4, 4e-3, 12
 
 
 def explained(off: float, seed: int = 0) -> Explained[DriftSearch]:
-    """Three values of every configuration, of which one is off; as many unknowns as values, and a joint that moved."""
+    """Three values per configuration, one of them wrong, with as many unknowns as values and a moved joint."""
     rng, count = np.random.default_rng(seed), 3 * CONFIGURATIONS
     X = torch.from_numpy(rng.normal(size=(count, count + 1)))
     y = MOVED * X[:, 0] + NOISE * torch.from_numpy(rng.normal(size=count))
@@ -38,7 +38,7 @@ def explained(off: float, seed: int = 0) -> Explained[DriftSearch]:
 
 
 @pytest.mark.parametrize("off", [0.005, 0.5])
-def test_a_wrong_configuration_beside_a_drift_is_found(off):
+def test_a_wrong_configuration_is_found_despite_a_drift(off):
     result = explained(off)
     assert list(result.values.wrong) == [5]
     assert [group.what for group in result.what.drift.groups if group.size] == ["joint 1"]
@@ -49,5 +49,5 @@ def test_a_wrong_configuration_beside_a_drift_is_found(off):
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_no_configuration_is_wrong_where_none_is(seed):
+def test_no_configuration_is_wrong_if_all_are_correct(seed):
     assert not explained(0.0, seed).values.wrong

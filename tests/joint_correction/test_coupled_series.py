@@ -1,4 +1,4 @@
-"""The feature of coupled joints: found where a coupling or a rail is off, left out where nothing is coupled."""
+"""The feature of coupled joints identifies errors of couplings and rails, and is omitted for other robots."""
 
 import pytest
 import torch
@@ -63,7 +63,7 @@ def test_columns_are_of_the_order_of_one_in_every_batch(text):
     )
 
 
-def test_lengths_of_bars_are_a_sum_of_its_columns():
+def test_bar_length_errors_are_a_sum_of_its_columns():
     robot = coupled_robot(PALLETISER)
     source = CouplingDeviation(
         kind="coupling",
@@ -110,7 +110,7 @@ def test_a_wrong_factor_is_identified_and_kept_in_the_folder(tmp_path):
     assert_close(ik(T, near=values).q, values, atol=1e-9)
 
 
-def test_a_rail_that_bends_is_identified():
+def test_a_curved_rail_is_identified():
     robot = coupled_robot(RAIL)
     waves = [
         {"joint": "side", "amplitude_mm": 0.4, "harmonic": 1, "phase_deg": 30},
@@ -128,10 +128,8 @@ def test_a_rail_that_bends_is_identified():
     assert float(bent.square().mean().sqrt()) > 0.3e-3
 
 
-@pytest.mark.parametrize(
-    ("along", "complaint"), [("rial", "did you mean 'rail'"), ("theta_1", "does not slide between limits")]
-)
-def test_a_guide_needs_an_axis_that_slides(along, complaint):
+@pytest.mark.parametrize(("along", "complaint"), [("rial", "'rail'"), ("theta_1", "'theta_1'")])
+def test_a_guide_needs_a_limited_prismatic_axis(along, complaint):
     source = Guide(kind="guide", along=along, waves=[{"joint": "side", "amplitude_mm": 1, "harmonic": 1}])
     with pytest.raises(RecipeError, match=complaint):
         source.bind(coupled_robot(RAIL), "test")
@@ -139,9 +137,9 @@ def test_a_guide_needs_an_axis_that_slides(along, complaint):
 
 @pytest.mark.parametrize(
     ("robot", "complaint"),
-    [("ur5", "no coupled joints"), (None, "joint 'theta_2' of robot .* is not coupled")],
+    [("ur5", "'ur5'"), (None, "'theta_2'")],
 )
-def test_a_coupling_is_off_only_where_there_is_one(robot, complaint):
+def test_a_coupling_deviation_needs_a_coupled_joint(robot, complaint):
     source = CouplingDeviation(kind="coupling", coupling=[{"joint": "theta_2", "factors": {"theta_2": 1}}])
     with pytest.raises(RecipeError, match=complaint):
         source.bind(coupled_robot() if robot is None else Robot.load(robot), "test")

@@ -1,4 +1,4 @@
-"""Products of inputs of different joints, and the product units that they make up."""
+"""Products of inputs of different joints, and their conversion to product units."""
 
 import pytest
 import torch
@@ -18,7 +18,7 @@ def normal(*shape: int, seed: int = 0) -> Tensor:
 
 
 def network_of(products: InputProducts, weights: Tensor) -> JointCorrection:
-    """Of nothing but product units with these factors."""
+    """Make a correction of product units with the factors of these weights."""
     factors = products.factors(weights)
     made = JointCorrection(products.robot, (), (2,) * (factors.shape[1] // 2)).requires_grad_(False)
     made.weight.copy_(factors)
@@ -26,13 +26,13 @@ def network_of(products: InputProducts, weights: Tensor) -> JointCorrection:
 
 
 def weighted(products: InputProducts, weights: Tensor, q: Tensor) -> Tensor:
-    """Sum of the columns [rad or m]."""
+    """Return the weighted sum of the columns [rad or m]."""
     return (products.columns(JointState(q)) * weights.view(products.used.shape)).sum(-1)
 
 
 @pytest.mark.parametrize("name", ["ur5", "kiro3"])
 def test_columns_are_products_of_inputs_of_different_joints(name: str) -> None:
-    """Written out joint by joint; kiro3 has a sliding one, whose input is its scaled value."""
+    """Computed joint by joint; kiro3 has a prismatic joint, whose input is its scaled value."""
     robot = Robot.load(name)
     products, q = InputProducts(robot), drawn_joints(robot, 5, 0)
     turning = [j for j, turns in enumerate(robot.revolute) if turns]
@@ -46,7 +46,7 @@ def test_columns_are_products_of_inputs_of_different_joints(name: str) -> None:
         assert_close(products.columns(JointState(q))[:, joint], expected, atol=1e-15)
 
 
-def test_every_joint_has_a_prior_size_of_its_own() -> None:
+def test_every_joint_has_its_own_prior_size() -> None:
     products = InputProducts(Robot.load("kiro3"))
     assert bool(products.used.all())
     assert products.group.tolist() == [[joint] * products.count for joint in range(4)]
@@ -65,7 +65,7 @@ def test_batches_of_any_shape_have_columns() -> None:
 
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("name", ["ur5", "panda", "kiro3"])
-def test_product_units_come_to_the_weighted_sum_of_the_columns(name: str, seed: int) -> None:
+def test_product_units_are_equal_to_the_weighted_sum_of_the_columns(name: str, seed: int) -> None:
     robot = Robot.load(name)
     products, q = InputProducts(robot), drawn_joints(robot, 40, seed)
     weights = 1e-4 * normal(products.used.numel(), seed=seed)
@@ -101,7 +101,7 @@ def test_joints_may_have_different_weights_and_none() -> None:
     assert_close(found, weighted(products, weights, q), atol=1e-11)
 
 
-def test_no_weights_give_no_units() -> None:
+def test_zero_weights_result_in_no_units() -> None:
     products = InputProducts(Robot.load("ur5"))
     factors = products.factors(torch.zeros(products.used.numel(), dtype=torch.float64))
     assert factors.shape == (6, 0, 12)
@@ -109,7 +109,7 @@ def test_no_weights_give_no_units() -> None:
     assert_close(network_of(products, torch.zeros(products.used.numel()).double())(q), torch.zeros(4, 6))
 
 
-def test_weights_come_back_from_the_factors():
+def test_weights_are_restored_from_the_factors():
     products = InputProducts(Robot.load("ur5"))
     weights = normal(int(products.used.sum()), seed=3)
     assert_close(products.weights(products.factors(weights)), weights, atol=1e-12)

@@ -1,4 +1,4 @@
-"""The derivatives in closed form agree with autograd, with eq. (4) written out, and with torch.func."""
+"""The derivatives in closed form agree with autograd, eq. (4) and torch.func."""
 
 import pytest
 import torch
@@ -25,7 +25,7 @@ def test_energy_is_half_the_sum_of_squares():
     assert_close(energy(outputs, targets), torch.tensor([2.5, 8.0], dtype=torch.float64), atol=0)
 
 
-def test_the_gradient_is_autograds(problem):
+def test_the_gradient_agrees_with_autograd(problem):
     net, x, d = problem
     E, by_weight, by_bias = energy_gradient(net, x, d)
     expected = energy(net.products(x), d)
@@ -35,7 +35,7 @@ def test_the_gradient_is_autograds(problem):
     assert_close(by_bias, bias, rtol=1e-11, atol=1e-13)
 
 
-def test_the_gradient_is_equation_4_written_out(generator):
+def test_the_gradient_agrees_with_equation_4(generator):
     net = PiSigma(2, 1, (3,), fixed_product=0.5)
     net.initialise(0.4, generator)
     x = torch.randn(4, 2, generator=generator, dtype=torch.float64)
@@ -58,7 +58,7 @@ def test_the_gradient_is_equation_4_written_out(generator):
     assert_close(by_bias[0], torch.tensor(expected_b, dtype=torch.float64), rtol=1e-12)
 
 
-def test_the_output_jacobian_is_that_of_torch_func(problem):
+def test_the_output_jacobian_agrees_with_torch_func(problem):
     net, x, _ = problem
     fixed, orders = net.fixed, net.orders
     packed = torch.cat([net.weight, net.bias[..., None]], -1).detach()
@@ -75,7 +75,7 @@ def test_the_output_jacobian_is_that_of_torch_func(problem):
         assert_close(full[:, k, 1 - k], torch.zeros_like(full[:, k, 1 - k]), atol=0)
 
 
-def test_pulling_back_is_multiplying_by_the_transposed_jacobian(problem):
+def test_pull_back_multiplies_by_the_transposed_jacobian(problem):
     net, x, d = problem
     weighted = weigh_sums(x, net.weight, net.bias, net.fixed).detach()
     by_weight, by_bias = pull_back(d, x, weighted, net.fixed, net.orders)
@@ -84,7 +84,7 @@ def test_pulling_back_is_multiplying_by_the_transposed_jacobian(problem):
     assert_close(torch.cat([by_weight, by_bias[..., None]], -1), expected, rtol=1e-11, atol=1e-13)
 
 
-def test_the_gradient_is_finite_where_all_sums_are_zero():
+def test_the_gradient_is_finite_if_all_sums_are_zero():
     net = PiSigma(2, 1, (3,))
     with torch.no_grad():
         net.bias.zero_()

@@ -1,4 +1,4 @@
-"""Levenberg-Marquardt finds exact solutions, equals scipy, and keeps the best start by validation error."""
+"""Levenberg-Marquardt finds exact solutions, agrees with scipy, and keeps the best start by validation error."""
 
 import numpy as np
 import pytest
@@ -76,7 +76,7 @@ def solve_from(network: PiSigma, data: Patterns, start: torch.Tensor, ridge: flo
     return solver
 
 
-def test_validation_rows_are_not_fitted_and_choose_the_start(generator):
+def test_validation_rows_are_held_out_and_select_the_start(generator):
     network = truth((2,), generator)
     data = patterns(network, generator, noise=0.05)
     spoilt = Patterns(data.x, torch.where(data.validation[:, None], 9.0, data.d), data.validation)
@@ -96,7 +96,7 @@ def test_validation_rows_are_not_fitted_and_choose_the_start(generator):
         assert_close(found.weight[output], clean.best[start, output, :, :-1], atol=0)
 
 
-def test_without_validation_rows_the_fitted_ones_choose(generator):
+def test_without_validation_rows_the_fitted_rows_select_the_start(generator):
     network = truth((2,), generator)
     data = patterns(network, generator, noise=0.05)
     data = Patterns(data.x, data.d, torch.zeros_like(data.validation))
@@ -104,7 +104,7 @@ def test_without_validation_rows_the_fitted_ones_choose(generator):
     assert_close(solver.best_error / 2, solver.cost, rtol=1e-9)
 
 
-def test_every_problem_is_solved_on_its_own(generator):
+def test_problems_are_solved_independently(generator):
     network = truth((1, 2), generator)
     data = patterns(network, generator, noise=0.05)
     other = Patterns(data.x, torch.stack([data.d[:, 0], data.d[:, 1].flip(0)], 1), data.validation)
@@ -128,7 +128,7 @@ def test_the_normal_matrix_in_chunks_is_the_same(generator, monkeypatch):
     assert_close(solve_n(network, data).cost, whole.cost, rtol=1e-6)
 
 
-def test_a_target_at_a_constant_is_no_trouble(generator):
+def test_a_constant_target_is_fitted(generator):
     x = 2 * torch.rand(50, 3, generator=generator, dtype=torch.float64) - 1
     data = Patterns(x, torch.zeros(50, 2, dtype=torch.float64), torch.zeros(50, dtype=torch.bool))
     solver = solve(PiSigma(3, 2, (3,)), data)
@@ -136,7 +136,7 @@ def test_a_target_at_a_constant_is_no_trouble(generator):
     assert float(solver.cost.max()) < 1e-6
 
 
-def test_fixed_weights_stay(generator):
+def test_fixed_weights_are_unchanged(generator):
     network = PiSigma(3, 2, (1, 2), fixed_product=0.2)
     before = network.fixed.clone()
     solver = solve(network, patterns(truth((1, 2), generator), generator, noise=0.1))

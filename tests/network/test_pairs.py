@@ -1,4 +1,4 @@
-"""Training pairs: joint differences on the nearest branch, wrapped, with singular rows set aside."""
+"""Training pairs: joint differences on the nearest branch, wrapped, without singular rows."""
 
 import math
 
@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 from testing.closeness import assert_close
+from testing.refusals import refused
 
 from pisigma.calibration.geometric.initial_guess.base_and_tool import fit_base_and_tool
 from pisigma.files.errors import IdentificationError, MeasurementError
@@ -52,7 +53,7 @@ def test_targets_stay_small_across_a_full_turn(generator):
     assert_close(pairs.q_nominal, turned + error, atol=1e-10)
 
 
-def test_singular_rows_are_found_told_and_left_out(generator):
+def test_singular_rows_are_left_out_and_reported(generator):
     robot = Robot.load("kiro4")
     q = random_joints(generator, 60)
     q[:, 4] = torch.where(q[:, 4].abs() < 0.3, 0.3, q[:, 4])
@@ -65,11 +66,11 @@ def test_singular_rows_are_found_told_and_left_out(generator):
     assert torch.equal(pairs.used, ~expected)
     assert pairs.left_out == f"{int(expected.sum())} near a singularity"
     assert build_pairs(robot, measurements, None).used.all()
-    with pytest.raises(IdentificationError, match="made up: none of the 60 rows"):
+    with refused(IdentificationError, file="made up", value=60):
         build_pairs(robot, measurements, 10.0)
 
 
-def test_rows_that_the_nominal_robot_cannot_reach_are_left_out_and_told(generator):
+def test_unreachable_rows_are_left_out_and_reported(generator):
     robot = Robot.load("kiro4")
     q = random_joints(generator, 20)
     measurements = measure(robot, q, torch.zeros(6, dtype=torch.float64))
@@ -84,7 +85,7 @@ def test_rows_that_the_nominal_robot_cannot_reach_are_left_out_and_told(generato
     assert torch.isfinite(pairs.q_nominal).all()
 
 
-def test_branches_are_told_most_frequent_first():
+def test_branches_are_sorted_by_frequency():
     robot = Robot.load("kiro3")
     q = torch.tensor(
         [[0.1, 1.0, -0.1, 0.0], [0.2, -1.0, -0.1, 0.0], [0.3, -1.2, -0.2, 0.1]], dtype=torch.float64
@@ -96,10 +97,10 @@ def test_branches_are_told_most_frequent_first():
     assert only.branches == pairs.branches[:1]
 
 
-def test_poses_are_wanted(generator):
+def test_rows_without_orientation_are_rejected(generator):
     robot = Robot.load("ur10")
     measurements = simulate(TrueRobot(robot), random_joints(generator, 5), sensor="position")
-    with pytest.raises(MeasurementError, match="no orientation was measured"):
+    with pytest.raises(MeasurementError):
         build_pairs(robot, measurements, None)
 
 

@@ -1,4 +1,4 @@
-"""The Pi-Sigma network is a product of sums, with fixed weights that nothing trains."""
+"""The Pi-Sigma network is a product of sums with fixed weights that are not trained."""
 
 import copy
 
@@ -74,7 +74,7 @@ def test_batch_shapes_and_dtypes(batch, dtype, generator):
     assert_close(y, looped, rtol=1e-5 if dtype == torch.float32 else 1e-13)
 
 
-def test_both_dtypes_start_alike():
+def test_both_dtypes_have_the_same_start():
     nets = [PiSigma(3, 2, (2,), dtype=dtype) for dtype in (torch.float32, torch.float64)]
     for net in nets:
         net.initialise(0.3, torch.Generator().manual_seed(5))
@@ -90,7 +90,7 @@ def test_products_start_near_one(orders, generator):
     assert float(y.detach().std()) > 0
 
 
-def test_fixed_weights_are_a_buffer_and_no_parameter():
+def test_fixed_weights_are_a_buffer_and_not_a_parameter():
     net = PiSigma(2, 3, (1, 2), fixed_product=0.25)
     assert set(dict(net.named_parameters())) == {"weight", "bias"}
     assert "fixed" in dict(net.named_buffers())
@@ -113,7 +113,7 @@ def test_scaling_is_in_the_state(generator):
     [((0, 1, (1,)), {}), ((1, 0, (1,)), {}), ((1, 1, ()), {}), ((1, 1, (2, 0)), {}),
      ((1, 1, (1,)), {"fixed_product": 0.0}), ((1, 1, (1,)), {"fixed_product": float("nan")})],
 )  # fmt: skip
-def test_impossible_networks_are_refused(arguments, options):
+def test_impossible_networks_are_rejected(arguments, options):
     with pytest.raises(ValueError, match="got"):
         PiSigma(*arguments, **options)
 

@@ -1,22 +1,22 @@
-"""The checkpoints of a training: made, refused, removed."""
+"""Checkpoints of a training are created, checked and removed."""
 
-import pytest
+from testing.refusals import refused
 
 from pisigma.files.errors import OutputError, TrainingError
 from pisigma.network.trainer import Checkpoints
 
 
-def test_resuming_nothing_or_something_else_is_refused(tmp_path):
-    with pytest.raises(TrainingError, match="no interrupted training to resume; run without --resume"):
+def test_resuming_without_a_valid_checkpoint_is_rejected(tmp_path):
+    with refused(TrainingError, file=tmp_path, expected="an interrupted training"):
         Checkpoints(tmp_path, "a", resume=True).prepare()
     (tmp_path / "last.ckpt").write_bytes(b"no checkpoint")
-    with pytest.raises(TrainingError, match="no whole checkpoint"):
+    with refused(TrainingError, file="last.ckpt", expected="a complete checkpoint of pisigma"):
         Checkpoints(tmp_path, "a", resume=True).prepare()
 
 
-def test_a_folder_that_cannot_be_made_is_refused_and_old_checkpoints_go(tmp_path):
+def test_an_unwritable_folder_is_rejected_and_old_checkpoints_are_removed(tmp_path):
     (tmp_path / "file").write_text("")
-    with pytest.raises(OutputError, match="cannot be written"):
+    with refused(OutputError, file="checkpoints", value="Not a directory"):
         Checkpoints(tmp_path / "file" / "checkpoints", "a").prepare()
     (tmp_path / "last.ckpt").write_text("")
     (tmp_path / "mine.txt").write_text("")
