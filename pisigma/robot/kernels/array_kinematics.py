@@ -1,4 +1,4 @@
-"""Forward kinematics and joint Jacobians of arrays by compiled kernels, without torch; tensors go through torch."""
+"""Forward kinematics and joint Jacobians: compiled kernels for arrays, without torch, and torch for tensors."""
 
 import functools
 import math
@@ -16,27 +16,27 @@ from pisigma.files.errors import ModelError
 from pisigma.robot.kernels.arrays import FIXED, FORWARD, PRISMATIC, REVOLUTE
 from pisigma.robot.kernels.layout import DESCRIPTION, DOF, ROWS, make_memory
 
-if TYPE_CHECKING:  # names in full, which type checkers at run time find without these imports
+if TYPE_CHECKING:  # full names, which run-time type checkers find without these imports
     import pisigma.robot.description
 
 KINDS = {"fixed": FIXED, "revolute": REVOLUTE, "prismatic": PRISMATIC}
 
 
 def forward_kinematics(robot: "pisigma.robot.description.Robot", q: Any) -> Any:
-    """Tool pose of a robot: `base · Π RotZ(theta + q) Trans(a, 0, d) RotX(alpha) RotY(beta) · tool`.
+    """Compute the tool pose of a robot: `base · Π RotZ(theta + q) Trans(a, 0, d) RotX(alpha) RotY(beta) · tool`.
 
-    Arrays and nested lists go through compiled kernels on one thread: some microseconds for a pose, a tenth of one in a
-    batch. Tensors go through torch on their device, with gradients; see `kinematics.forward`.
+    Arrays and nested lists use compiled kernels on one thread: a few microseconds for a single pose, 0.1 microseconds
+    per pose of a batch. Tensors use torch on their device, with gradients; see `kinematics.forward`.
 
     Args:
         robot: the robot.
-        q: `(*batch, dof)` joint values [rad or m], as the controller counts.
+        q: the controller's values `(*batch, axes)` [rad or m]; the joint values if joints are not coupled.
 
     Returns:
         T_base_tool `(*batch, 4, 4)` [m]: a float64 array for an array, a tensor for a tensor.
 
     Raises:
-        PoseError: q has another number of columns than the robot has joints.
+        PoseError: the number of columns of q is not the number of joints.
     """
     if robot.coupling is not None:
         q = robot.to_dh(q if is_tensor(q) else np.asarray(q, dtype=np.float64))
@@ -49,20 +49,20 @@ def forward_kinematics(robot: "pisigma.robot.description.Robot", q: Any) -> Any:
 
 
 def joint_jacobian(robot: "pisigma.robot.description.Robot", q: Any) -> Any:
-    """Geometric Jacobian of a robot's tool pose, in the base frame and at the tool's origin.
+    """Compute the geometric Jacobian of a robot's tool pose, in the base frame and at the tool's origin.
 
     `J @ dq` is the translation [m] and the rotation vector [rad] of the tool (Siciliano et al. 2009, eq. 3.30). Arrays
-    and tensors go the ways of `forward_kinematics`.
+    and tensors are treated as in `forward_kinematics`.
 
     Args:
         robot: the robot.
-        q: `(*batch, dof)` joint values [rad or m], as the controller counts.
+        q: the controller's values `(*batch, axes)` [rad or m]; the joint values if joints are not coupled.
 
     Returns:
-        `(*batch, 6, dof)`: a float64 array for an array, a tensor for a tensor.
+        J `(*batch, 6, axes)`: a float64 array for an array, a tensor for a tensor.
 
     Raises:
-        PoseError: q has another number of columns than the robot has joints.
+        PoseError: the number of columns of q is not the number of joints.
     """
     if robot.coupling is not None:
         values = robot.to_dh(q) if is_tensor(q) else robot.to_dh(np.asarray(q, dtype=np.float64))
@@ -79,13 +79,13 @@ def joint_jacobian(robot: "pisigma.robot.description.Robot", q: Any) -> Any:
 
 
 def is_tensor(values: Any) -> bool:
-    """Whether values are a tensor; torch need not be imported to know."""
+    """Return whether values are a tensor, without importing torch."""
     torch = sys.modules.get("torch")
     return torch is not None and isinstance(values, torch.Tensor)
 
 
 def by_torch(function: Callable[[Any], Any], q: Any) -> Any:
-    """A function of tensors; of an array in float64, as an array."""
+    """Call a function of tensors; arrays are converted to float64 tensors and back."""
     import torch
 
     if is_tensor(q):
@@ -94,7 +94,7 @@ def by_torch(function: Callable[[Any], Any], q: Any) -> Any:
 
 
 class _Chain:
-    """A robot as the kernels take it, ready for calls from several threads."""
+    """A robot packed for the kernels, which several threads may use."""
 
     def __init__(self, robot: "pisigma.robot.description.Robot") -> None:
         """Pack a robot.
@@ -108,9 +108,9 @@ class _Chain:
         )
 
         if len(robot.rows) > ROWS or robot.dof > DOF:
-            raise ModelError(
-                f"robot '{robot.name}' is larger than the kernels allow ({DOF} joints, {ROWS} rows)."
-            )
+            expected = f"at most {DOF} joints and {ROWS} rows"
+            problem = f"robot '{robot.name}' is larger than the kernels allow ({DOF} joints, {ROWS} rows)"
+            raise ModelError(problem, expected=expected, value=(robot.dof, len(robot.rows)))
         self._packed = np.zeros(1, DESCRIPTION)
         arms, rows = self._packed["arms"], len(robot.rows)
         arms["dof"], arms["rows_used"] = robot.dof, rows
@@ -124,7 +124,7 @@ class _Chain:
         self._run = functools.partial(load_kernels(), IGNORED, IGNORED, self._address)
 
     def move(self, q: Any, with_jacobian: bool) -> tuple[Any, Any]:
-        """Poses `(*batch, 4, 4)` [m], and Jacobians `(*batch, 6, dof)` where these are wanted."""
+        """Compute poses `(*batch, 4, 4)` [m], and optionally Jacobians `(*batch, 6, dof)`."""
         values = np.ascontiguousarray(q, dtype=np.float64) if np.ndim(q) else np.zeros(0)
         batch, dof = values.shape[:-1], self._dof
         if values.shape[-1] != dof:
@@ -161,7 +161,7 @@ _chains: "WeakKeyDictionary[pisigma.robot.description.Robot, _Chain | None]" = W
 
 
 def _chain(robot: "pisigma.robot.description.Robot", q: Any) -> _Chain | None:
-    """The robot for kernels; None of tensors, and where there are no kernels."""
+    """Return the robot packed for the kernels; None for tensors, and if there are no kernels."""
     if is_tensor(q):
         return None
     try:
@@ -173,7 +173,7 @@ def _chain(robot: "pisigma.robot.description.Robot", q: Any) -> _Chain | None:
 
 
 def arm_rows(robot: "pisigma.robot.description.Robot") -> np.ndarray:
-    """The rows of an arm for kernels, `(rows, 9)`: theta [rad], d, a [m], cosine and sine of alpha, beta and theta."""
+    """Return the rows of an arm, `(rows, 9)`: theta [rad], d, a [m], cosine and sine of alpha, beta and theta."""
     return np.array(
         [
             (theta, d, a, *_cosine_sine(alpha), *_cosine_sine(beta), *_cosine_sine(theta))
@@ -183,19 +183,19 @@ def arm_rows(robot: "pisigma.robot.description.Robot") -> np.ndarray:
 
 
 def arm_ends(robot: "pisigma.robot.description.Robot") -> np.ndarray:
-    """Base and tool of an arm as transforms without their last rows, `(2, 3, 4)`."""
+    """Return base and tool of an arm as transforms without their last rows, `(2, 3, 4)`."""
     return np.stack([transform_of(end)[:3] for end in (robot.base.tolist(), robot.tool.tolist())])
 
 
 def transform_of(xyzrpy: Any) -> np.ndarray:
-    """The transform `Trans(x, y, z) · RotZ(roll) · RotY(pitch) · RotX(yaw)`, `(4, 4)`; lengths [m] and angles [rad]."""
+    """Return `Trans(x, y, z) · RotZ(roll) · RotY(pitch) · RotX(yaw)`, `(4, 4)`, of lengths [m] and angles [rad]."""
     return np.array(transform_entries(*xyzrpy)).reshape(4, 4)
 
 
 def transform_entries(
     x: float, y: float, z: float, roll: float, pitch: float, yaw: float
 ) -> tuple[float, ...]:
-    """The 16 entries of `transform_of`, row by row."""
+    """Return the 16 entries of `transform_of`, row-major."""
     (c, s), (c_p, s_p), (c_y, s_y) = _cosine_sine(roll), _cosine_sine(pitch), _cosine_sine(yaw)
     first = c * c_p, c * s_p * s_y - s * c_y, c * s_p * c_y + s * s_y, x
     second = s * c_p, s * s_p * s_y + c * c_y, s * s_p * c_y - c * s_y, y
@@ -203,9 +203,9 @@ def transform_entries(
 
 
 def xyzrpy_of(T: Any) -> tuple[float, ...]:
-    """x, y, z [m], roll, pitch and yaw [rad] of a transform `(4, 4)`: the inverse of `transform_of`.
+    """Return x, y, z [m], roll, pitch and yaw [rad] of a transform `(4, 4)`: the inverse of `transform_of`.
 
-    The pitch lies within ±90 deg; at ±90 deg yaw is taken as 0.
+    The pitch is within ±90 deg; at ±90 deg yaw is set to 0.
     """
     rows = np.asarray(T).tolist()
     (a, b, _, x), (c, d, _, y), (e, f, g, z), _ = rows
@@ -217,7 +217,7 @@ def xyzrpy_of(T: Any) -> tuple[float, ...]:
 
 
 def _cosine_sine(angle: float) -> tuple[float, float]:
-    """Cosine and sine; within 1e-15 rad of a multiple of 90 deg they are exactly 0 and ±1."""
+    """Return cosine and sine, exactly 0 and ±1 within 1e-15 rad of a multiple of 90 deg."""
     quarter = angle / (math.pi / 2)
     if abs(quarter - round(quarter)) < 1e-15 * max(1.0, abs(quarter)):
         return ((1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0))[round(quarter) % 4]
@@ -225,5 +225,5 @@ def _cosine_sine(angle: float) -> tuple[float, float]:
 
 
 def address_of(array: Any) -> int:
-    """Where the numbers of a contiguous array lie in memory."""
+    """Return the memory address of a contiguous array."""
     return array.__array_interface__["data"][0]

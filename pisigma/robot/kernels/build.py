@@ -1,4 +1,4 @@
-"""The kernels' intermediate code, which comes with the package: made by numba, and tied to the sources by a hash.
+"""The kernels' intermediate code in the package, compiled by numba and tied to the sources by a hash.
 
 `python -m pisigma.joint_correction.registry` makes it, with all features and closed forms. The code is that of no
 processor in particular, and without vectors: 64-bit machines lay out the kernels' structs alike, and the machine that
@@ -17,30 +17,30 @@ from typing import Any
 from pisigma.robot.kernels.forms import KernelForms
 
 FILE = Path(__file__).parent / "kernels.ll.zlib"
-"""A line of JSON and the code as compressed text; `python -m pisigma.joint_correction.registry` writes it."""
+"""One line of JSON and the compressed code; `python -m pisigma.joint_correction.registry` writes it."""
 
 _PYTHON = frozenset(
     ("__init__.py", "array_kinematics.py", "build.py", "description_file.py", "machine_code.py")
 )
-"""Files of this folder without kernels, and without anything that these know."""
+"""Files of this folder without kernels and without constants of kernels."""
 _SHARED = ("kinematics/status.py", "kinematics/tolerances.py")
-"""Files of other folders that kernels take constants from."""
+"""Files of other folders with constants of kernels."""
 _NO_CODE = re.compile(rb'"""[\s\S]*?"""|#[^\n]*|^[ \t]*\n', re.MULTILINE)
 
 
 _FORMS = re.compile(rb"^@no_type_check\ndef [\s\S]*?(?=^(?:@|class |def |[A-Z_a-z])|\Z)", re.MULTILINE)
-"""Compiled forms among the files of features and closed forms."""
+"""Compiled forms in the files of features and closed forms."""
 
 
 def source_files() -> list[Path]:
-    """The files that the kernels are made from, without those of features and closed forms."""
+    """Return the source files of the kernels, without those of features and closed forms."""
     robot = Path(__file__).parent.parent
     kernels = sorted(path for path in (robot / "kernels").glob("*.py") if path.name not in _PYTHON)
     return [*kernels, *(robot / name for name in _SHARED)]
 
 
 def source_hash() -> str:
-    """SHA-256 of the sources without docstrings, comments and empty lines; of features and closed forms these only."""
+    """Return the SHA-256 of kernels and compiled forms, without docstrings, comments and empty lines."""
     robot = Path(__file__).parent.parent
     features = (robot.parent / "joint_correction").glob("*.py")
     forms = sorted([*features, *robot.glob("kinematics/closed_form/*.py")])
@@ -57,9 +57,9 @@ def write_ready(code: str, forms: KernelForms, **made_with: str) -> None:
     """Write the intermediate code of the present sources.
 
     Args:
-        code: text of LLVM.
-        forms: what it evaluates.
-        made_with: versions of the compilers that made it.
+        code: LLVM text.
+        forms: features and closed forms that it evaluates.
+        made_with: versions of the compilers.
     """
     stated = {"sources": source_hash(), "forms": dataclasses.asdict(forms), **made_with}
     header = json.dumps(stated, sort_keys=True)
@@ -67,13 +67,13 @@ def write_ready(code: str, forms: KernelForms, **made_with: str) -> None:
 
 
 def ready_forms() -> KernelForms | None:
-    """What the code evaluates; None where `read_ready` gives None, but for damaged code."""
+    """Return the forms that the code evaluates; None if `read_ready` returns None, except for damaged code."""
     header, _ = _content()
     return None if header is None else KernelForms(**{kind: tuple(n) for kind, n in header["forms"].items()})
 
 
 def read_ready() -> str | None:
-    """The intermediate code; None where there is none, it is damaged, or the sources have changed since."""
+    """Return the intermediate code; None if it is missing or damaged, or the sources have changed."""
     header, code = _content()
     try:
         return None if header is None else zlib.decompress(code).decode()
@@ -82,7 +82,7 @@ def read_ready() -> str | None:
 
 
 def _content() -> tuple[dict[str, Any] | None, bytes]:
-    """The first line of the file, where it is of the present sources, and the compressed code."""
+    """Return the first line of the file if it belongs to the present sources, and the compressed code."""
     try:
         stated, _, code = FILE.read_bytes().partition(b"\n")
         header = json.loads(stated)
@@ -92,26 +92,26 @@ def _content() -> tuple[dict[str, Any] | None, bytes]:
 
 
 ENTRY = "pisigma_run"
-"""Name of the one function in the code that is called from outside."""
+"""Name of the only exported function of the code."""
 ARGUMENTS = "ppiippipipiiiipi"
-"""Of `kernels.run`: p for a pointer, i for a number."""
+"""Arguments of `kernels.run`: p for a pointer, i for an integer."""
 
 _MACHINE = re.compile(r"^target (?:triple|datalayout) = .*\n", re.MULTILINE)
 _NO_PROCESSOR = {"CPU_NAME": "generic", "CPU_FEATURES": "", "LOOP_VECTORIZE": 0, "SLP_VECTORIZE": 0}
 """Settings of numba."""
 _NEWER = re.compile(r" captures\([^)]*\)| nocreateundeforpoison| memory\([^)]*(?:errnomem|target_mem)[^)]*\)")
-"""Words that LLVM 20, the oldest that is to read the code, does not know; they only help to optimise."""
+"""Attributes that LLVM 20, the oldest supported version, does not know; they only help to optimise."""
 _LIFETIME = re.compile(r"^.*@llvm\.lifetime\..*\n", re.MULTILINE)
-"""Hints on how long memory on the stack is needed, which LLVM 20 and 22 write differently."""
+"""Lifetime hints of stack memory, which LLVM 20 and 22 write differently."""
 _MANGLED = re.compile(r"(?<=[@\"])_ZN[\w.$]+")
-"""Names of functions that numba makes up from the types of all arguments."""
+"""Function names that numba mangles with the types of all arguments."""
 
 
 def intermediate_code() -> str:
-    """What numba makes of the kernels with all registered features and closed forms.
+    """Compile the kernels with all registered features and closed forms by numba.
 
     Returns:
-        Text of LLVM with the entry `ENTRY`.
+        LLVM text with the entry `ENTRY`.
 
     Raises:
         ImportError: numba is not installed.
@@ -123,7 +123,7 @@ def intermediate_code() -> str:
 
     for name, module in list(sys.modules.items()):
         if name.startswith("pisigma.robot.kernels.") and hasattr(module, "kernel"):
-            del sys.modules[name]  # its kernels may have been made for other forms
+            del sys.modules[name]  # its kernels may have been compiled for other forms
     from pisigma.robot.kernels.kernels import run
     from pisigma.robot.kernels.layout import DESCRIPTION, MEMORY
 
@@ -143,7 +143,7 @@ def intermediate_code() -> str:
 
 
 def build() -> None:
-    """Write what comes with the package, and say how large it is."""
+    """Write the code of the package, and print its size."""
     from importlib.metadata import version
 
     code = intermediate_code()

@@ -1,4 +1,4 @@
-"""A calibrated arm as one file of plain arrays, which is read without torch."""
+"""Files of calibrated arms as plain arrays, read without torch."""
 
 import dataclasses
 import json
@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from pisigma.files.errors import ModelError
+from pisigma.files.errors import ModelError, Place
 from pisigma.robot.kernels.arrays import PARTS, Description
 from pisigma.robot.kernels.forms import KernelForms
 
@@ -58,32 +58,34 @@ def write_description(
 
 
 def read_description(file: str | os.PathLike[str]) -> tuple[Description, dict[str, Any]]:
-    """Read what `write_description` wrote: the description, and the names by what they are of.
+    """Read a file of `write_description`; return the description, and the names by kind.
 
     Raises:
-        ModelError: the file is missing, truncated, foreign, changed or of another format.
+        ModelError: the file is missing, truncated, foreign, changed or has another format.
     """
+    remedy = "export the model again"
     try:
         with open(file, "rb") as stream, np.load(stream, allow_pickle=False) as stored:
             values = {key: stored[key] for key in stored.files}
     except OSError as problem:
-        raise ModelError(
-            f"{file}: cannot be read ({problem.strerror or problem}); export the model again."
-        ) from None
+        reason = str(problem.strerror or problem)
+        what = f"the file cannot be read: {reason}"
+        raise ModelError(what, value=reason, at=Place(file), remedy=remedy) from None
     except (ValueError, EOFError, zipfile.BadZipFile, zlib.error, AttributeError, TypeError):
-        raise ModelError(
-            f"{file}: is truncated or no compiled model of pisigma; export the model again."
-        ) from None
+        expected = "a complete compiled model of pisigma"
+        raise ModelError(expected=expected, at=Place(file), remedy=remedy) from None
     stated = values.pop("format", None)
     if stated is None or stated.shape != () or int(stated) != FORMAT:
-        raise ModelError(f"{file}: is no compiled model of format {FORMAT}; export the model again.")
+        value = None if stated is None else str(stated)
+        raise ModelError(expected=f"format {FORMAT}", value=value, at=Place(file), remedy=remedy)
     checksum = values.pop("checksum", None)
     if (
         checksum is None
         or set(values) != {"header", "floats", "integers"}
         or int(checksum) != _checksum(values)
     ):
-        raise ModelError(f"{file}: was changed or is no whole compiled model; export the model again.")
+        what, expected = "the file was changed or is incomplete", "a matching checksum"
+        raise ModelError(what, expected=expected, at=Place(file), remedy=remedy)
     header = json.loads(str(values["header"]))
     description = _description(header["shapes"], values)
     forms = KernelForms(**{kind: tuple(names) for kind, names in header["forms"].items()})
@@ -91,7 +93,7 @@ def read_description(file: str | os.PathLike[str]) -> tuple[Description, dict[st
 
 
 def _description(shapes: dict[str, Any], values: dict[str, Any]) -> Description:
-    """Cut the two rows of numbers into fields; a single number becomes Python's."""
+    """Split the two arrays of numbers into fields; single numbers become Python numbers."""
     taken = {"floats": 0, "integers": 0}
     parts: dict[str, dict[str, Any]] = {part: {} for part in PARTS}
     for part, field in _FIELDS:

@@ -151,7 +151,7 @@ def _key(forms: KernelForms) -> str:
 
 
 def _intermediate_code(forms: KernelForms) -> str:
-    """What comes with the package, where it is of the present sources and forms; else what numba makes."""
+    """Return the code of the package if it has the present sources and forms, else compile it with numba."""
     ready = read_ready() if _ready_forms() == forms else None
     if ready is not None:
         return ready
@@ -159,8 +159,9 @@ def _intermediate_code(forms: KernelForms) -> str:
         return intermediate_code()
     except ImportError:
         raise ModelError(
-            "the package holds no compiled inverse kinematics of its present sources; install pisigma[compile], which "
-            "makes it, or go without, which is some thousand times slower."
+            "the package contains no compiled inverse kinematics of its present sources",
+            value="pisigma[compile]",
+            remedy="install pisigma[compile], which makes it, or do without it, which is about 1000 times slower",
         ) from None
 
 
