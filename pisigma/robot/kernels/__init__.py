@@ -1,1 +1,1 @@
-"""Corrected inverse kinematics compiled for one pose at a time and for batches on the CPU, without torch."""
+"""Compiled kernels of corrected inverse kinematics for single poses and batches on the CPU, without torch."""

@@ -1,4 +1,4 @@
-"""What the compiled kernels know of a calibrated arm, as plain arrays."""
+"""Description of a calibrated arm for the compiled kernels, as plain arrays."""
 
 from typing import Any, NamedTuple
 
@@ -6,16 +6,17 @@ from pisigma.robot.kernels.forms import KernelForms
 from pisigma.robot.kinematics.status import Status
 
 NOMINAL, IDENTIFIED, DRAWN = 0, 1, 2
-"""Which arm: as modelled, with the identified geometry (of a hybrid the one that goes with its correction), and as
-drawn without base, on which gravity acts."""
+"""Indices of the arms: nominal, with the identified geometry (of a hybrid the one that belongs to its correction), and
+the nominal one without base, for gravity torques."""
 CORRECTED = 3
 """The identified arm at `q + Δ(q)`."""
 
 FIXED, REVOLUTE, PRISMATIC = 0, 1, 2
-"""What moves in a row."""
+"""Types of rows."""
 
 NO_CLOSED_FORM = 0
-"""Of a nominal arm that has none; else the kind is 1 + the index of its name in `KernelForms.closed_forms`."""
+"""Kind of a nominal arm without a closed form; other kinds are 1 + the index of the name in
+`KernelForms.closed_forms`."""
 
 REACHED = int(Status.REACHED)
 SINGULAR = int(Status.SINGULAR)
@@ -25,32 +26,32 @@ UNREACHABLE = int(Status.UNREACHABLE)
 INVALID = int(Status.INVALID_POSE)
 
 FINE, NOT_FINITE, LAST_ROW, NOT_ORTHONORMAL, LEFT_HANDED, NEAR_NOT_FINITE = -1, 1, 2, 3, 4, 5
-"""What is wrong with a matrix that should be a pose, or with the joint values to be near to."""
+"""Faults of a pose matrix, or of the reference joint values."""
 
 ANY_BRANCH, EVERY_BRANCH = -1, -2
-"""Instead of the index of a branch."""
+"""Special values instead of the index of a branch."""
 NEAREST = -2
-"""The same for closed forms: all branches, as near to the pose as they come where they do not reach it."""
+"""The same for closed forms: all branches, with the nearest joint values of those that do not reach the pose."""
 
 SOLVE, EVALUATE, FORWARD = 0, 1, 2
-"""What the kernels are to do: solve poses, evaluate the corrected arm, or only where an arm stands and how it moves."""
+"""Tasks: solve poses, evaluate the corrected arm, or compute poses and Jacobians of an arm."""
 
 ANGLE, SINE, COSINE = 6, 7, 8
-"""What an input of a network is; 0 to 5 are coordinates of the pose, in the order of `network.inputs.POSE_INPUTS`."""
+"""Kinds of network inputs; 0 to 5 are coordinates of the pose, in the order of `network.inputs.POSE_INPUTS`."""
 
 
 class Arms(NamedTuple):
     """The rows of the three arms, which have the same joints.
 
     Attributes:
-        kind: per row FIXED, REVOLUTE or PRISMATIC.
+        kind: FIXED, REVOLUTE or PRISMATIC for every row.
         rows: `(3, rows, 9)`: theta [rad], d, a [m], cosine and sine of alpha, of beta and of theta.
         ends: `(3, 2, 3, 4)`: transforms of base and tool without their last rows.
-        reach: of every arm [m].
-        direction: per joint +1 or -1, how the controller counts.
-        revolute: per joint 1 where it turns, else 0.
-        limits: `(dof, 2)` [rad or m].
-        corrected: 1 where a correction goes with the identified arm, else 0.
+        reach: reach of every arm [m].
+        direction: +1 or -1 for every joint, the sign of the controller's values.
+        revolute: 1 for every revolute joint, else 0.
+        limits: `(dof, 2)`: joint limits [rad or m].
+        corrected: 1 if the identified arm has a correction, else 0.
     """
 
     kind: Any
@@ -67,16 +68,16 @@ class Correction(NamedTuple):
     """The joint correction Δ(q); see `pisigma.joint_correction.joint_correction.JointCorrection`.
 
     Attributes:
-        rate: per joint, angle per joint value.
-        middle: of every joint's values [rad or m].
-        half: of every joint's travel [rad or m].
-        values: the numbers of all features one after the other, as their `pack` gives them.
-        starts: where those of every feature begin, in the order of `Description.forms`.
-        weight: `(factors, inputs, dof)` of the product units.
-        bias: `(factors, dof)` of the product units.
+        rate: angle of periodic functions per joint value, for every joint.
+        middle: middle of every joint's travel [rad or m].
+        half: half of every joint's travel [rad or m].
+        values: concatenated numbers of all features, as returned by their `pack`.
+        starts: index of the first number of every feature, in the order of `Description.forms`.
+        weight: `(factors, inputs, dof)`: weights of the product units.
+        bias: `(factors, dof)`: biases of the product units.
         orders: number of factors of every product unit.
-        periodic: 1 where the correction is the same on all turns, else 0.
-        frames: 1 where a feature reads the frames of the joints, else 0.
+        periodic: 1 if the correction is the same on all turns, else 0.
+        frames: 1 if a feature reads the frames of the joints, else 0.
     """
 
     rate: Any
@@ -95,10 +96,10 @@ class Coverage(NamedTuple):
     """Measured joint values; see `pisigma.calibration.hybrid.arm.JointCoverage`.
 
     Attributes:
-        joint: of every stretch.
-        middle: of every stretch [rad].
-        half: half its length [rad].
-        rate: per joint, angle per joint value.
+        joint: joint of every measured interval.
+        middle: middle of every interval [rad].
+        half: half the length of every interval [rad].
+        rate: angle per joint value, for every joint.
     """
 
     joint: Any
@@ -108,29 +109,29 @@ class Coverage(NamedTuple):
 
 
 class Network(NamedTuple):
-    """What corrects nominal joint values; see `network.correction_network` and `correction.domain`.
+    """A network that corrects nominal joint values; see `network.correction_network` and `model.domain`.
 
     Attributes:
-        used: 1 where there is such a network, else 0.
-        source: per input its kind: a coordinate of the pose, ANGLE, SINE or COSINE. Those of a group lie together.
-        factors: `(inputs, dof)`: the angle of an input is their sum over the joint values.
-        offset: of every input.
-        scale: of every input.
-        reference: `(groups, 3, 3)`: rotation from which roll, pitch and yaw are counted.
+        used: 1 if there is such a network, else 0.
+        source: kind of every input: a coordinate of the pose, ANGLE, SINE or COSINE; inputs of a group are consecutive.
+        factors: `(inputs, dof)`: the angle of an input is the sum of the joint values times these.
+        offset: offset of every input.
+        scale: scale of every input.
+        reference: `(groups, 3, 3)`: rotation to which roll, pitch and yaw are relative.
         first: `(groups + 1,)`: index of a group's first input.
-        orders: `(groups, units)`: number of factors of every product unit, 0 where there is none.
-        group: per joint; -1 where the joint is not corrected.
-        weight: `(dof, factors, inputs)`.
-        bias: `(dof, factors)`.
-        output_offset: per joint [rad or m].
-        output_scale: per joint [rad or m].
-        centre: per joint the middle of training rows [rad or m], on whose turns the network knows joint values.
-        samples: number of training rows that make the domain; 0 where there is none.
-        column: index of the input that a coordinate of the domain is; inputs that are the same are one coordinate.
-        times: per coordinate the root of how often its input stands in the network.
-        coarse: how many coordinates, the first ones, tell nearly all of a distance.
-        rows: `(coordinates · samples,)`: scaled inputs of the training rows, one coordinate after the other.
-        radius: of the domain, in scaled inputs.
+        orders: `(groups, units)`: number of factors of every product unit, 0 if there is none.
+        group: group of every joint; -1 if it is not corrected.
+        weight: `(dof, factors, inputs)`: weights.
+        bias: `(dof, factors)`: biases.
+        output_offset: output offset of every joint [rad or m].
+        output_scale: output scale of every joint [rad or m].
+        centre: middle of the training rows for every joint [rad or m], which determines the turns of the training.
+        samples: number of training rows of the domain; 0 without a domain.
+        column: index of the input of every coordinate of the domain; identical inputs are one coordinate.
+        times: root of the number of occurrences of every coordinate's input in the network.
+        coarse: number of leading coordinates that determine most of a distance.
+        rows: `(coordinates · samples,)`: scaled inputs of the training rows, coordinate by coordinate.
+        radius: radius of the domain, in scaled inputs.
     """
 
     used: int
@@ -159,17 +160,17 @@ class ClosedForm(NamedTuple):
     """The nominal arm with canonical twists; see `pisigma.robot.kinematics.closed_form`.
 
     Attributes:
-        branches: how many it has; 1 without closed form.
-        order: indices of the branches in the order in which they are tried where none is asked for.
-        trained: how many of these, the first ones, training rows lie on.
-        first: `(3, 4)`: frame of poses in the frame before the first joint.
+        branches: number of branches; 1 without a closed form.
+        order: indices of the branches in the order in which they are tried if none is requested.
+        trained: number of leading branches in this order that have training rows.
+        first: `(3, 4)`: base frame in the frame before the first joint.
         last: `(3, 4)`: frame of the last joint in that of the tool.
-        sign: per joint, `variable = sign · (direction · q + offset)`.
-        direction: per joint.
-        offset: per joint.
-        theta: of every joint's row, with sign [rad].
-        d: of every joint's row, with sign [m].
-        a: of every joint's row [m].
+        sign: sign for every joint: `variable = sign · (direction · q + offset)`.
+        direction: direction of every joint.
+        offset: offset of every joint [rad or m].
+        theta: sign · theta of every joint's row [rad].
+        d: sign · d of every joint's row [m].
+        a: a of every joint's row [m].
     """
 
     branches: int
@@ -186,10 +187,10 @@ class ClosedForm(NamedTuple):
 
 
 class Starts(NamedTuple):
-    """Joint values to start from.
+    """Stored joint values as starts of the iteration.
 
     Attributes:
-        q: `(starts, dof)` [rad or m].
+        q: `(starts, dof)`: joint values [rad or m].
         points: `(starts, 12)`: positions [m], and rotations times half a reach over sqrt(2).
         lever: half a reach over sqrt(2) [m].
     """
@@ -200,10 +201,10 @@ class Starts(NamedTuple):
 
 
 class Description(NamedTuple):
-    """All of a calibrated arm.
+    """Complete description of a calibrated arm.
 
     Attributes:
-        forms: names of the features that its correction has, and of its closed form, if it has one.
+        forms: names of the features of its correction and of its closed form, if any.
     """
 
     arms: Arms

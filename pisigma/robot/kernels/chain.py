@@ -1,4 +1,4 @@
-"""Forward kinematics and joint Jacobian of one arm, at one place and at many, on plain numbers."""
+"""Forward kinematics and joint Jacobian of an arm for single and many joint values, on plain numbers."""
 
 import math
 
@@ -9,14 +9,14 @@ from pisigma.robot.kernels.rows import Array, Record, contracted_kernel
 
 @contracted_kernel
 def walk(arms: Record, arm: int, q: Array, axes: Array, T: Array) -> None:
-    """Tool pose, and axis and origin of every joint, in the base frame: see `kinematics.forward`.
+    """Compute tool pose, and axis and origin of every joint, in the base frame; see `kinematics.forward`.
 
     Args:
         arms: the arms.
-        arm: which of them.
+        arm: index of the arm.
         q: joint values [rad or m].
-        axes: `(dof, 6)`, written: axis and origin [m].
-        T: `(3, 4)`, written: T_base_tool without its last row.
+        axes: `(dof, 6)`, output: axis and origin [m].
+        T: `(3, 4)`, output: T_base_tool without its last row.
     """
     base, tool = arms.ends[arm, 0], arms.ends[arm, 1]
     ax, ay, az, ap = base[0, 0], base[0, 1], base[0, 2], base[0, 3]
@@ -62,13 +62,13 @@ def walk(arms: Record, arm: int, q: Array, axes: Array, T: Array) -> None:
 
 @contracted_kernel
 def jacobian(arms: Record, axes: Array, T: Array, J: Array) -> None:
-    """Geometric Jacobian in the base frame at the tool's origin: see `kinematics.jacobian`.
+    """Compute the geometric Jacobian in the base frame at the tool's origin; see `kinematics.jacobian`.
 
     Args:
         arms: the arms.
-        axes: what `walk` wrote.
-        T: what `walk` wrote.
-        J: `(6, dof)`, written.
+        axes: output of `walk`.
+        T: output of `walk`.
+        J: `(6, dof)`, output.
     """
     for j in range(arms.dof):
         sign, axis = arms.direction[j], axes[j]
@@ -84,15 +84,15 @@ def jacobian(arms: Record, axes: Array, T: Array, J: Array) -> None:
 
 @contracted_kernel
 def walk_many(arms: Record, arm: int, memory: Record, q: Array, T: Array, J: Array) -> None:
-    """Tool poses and Jacobians at many joint values, `LANES` of them abreast, as `walk` and `jacobian` give them.
+    """Compute tool poses and Jacobians at many joint values, vectorised by `LANES`; see `walk` and `jacobian`.
 
     Args:
         arms: the arms.
-        arm: which of them.
-        memory: to work in.
+        arm: index of the arm.
+        memory: working memory.
         q: `(poses, dof)`: joint values [rad or m].
-        T: `(poses, 4, 4)`, written: T_base_tool.
-        J: `(poses, 6, dof)`, written; where it has no rows no Jacobian is computed.
+        T: `(poses, 4, 4)`, output: T_base_tool.
+        J: `(poses, 6, dof)`, output; without rows no Jacobian is computed.
     """
     frame, axes = memory.lanes, memory.lane_axes
     for first in range(0, q.shape[0], LANES):
@@ -130,7 +130,7 @@ def walk_many(arms: Record, arm: int, memory: Record, q: Array, T: Array, J: Arr
 def _turn_by_joint(
     arms: Record, row: Array, kind: int, joint: int, q: Array, first: int, count: int, memory: Record
 ) -> None:
-    """Turn frames about their z axes by theta and move them along these by d, one of them with the joint's value."""
+    """Rotate frames about their z axes by theta and translate them along z by d, one of these plus the joint value."""
     frame, turns = memory.lanes, memory.lane_turns
     for b in range(LANES):
         turns[0, b] = arms.direction[joint] * q[first + min(b, count - 1), joint]
@@ -154,7 +154,7 @@ def cosines_sines(turns: Array, offset: float) -> None:
     """Replace angles `turns[0]` [rad] by the cosines of angle and offset, and write the sines into `turns[1]`.
 
     Reduction to [-pi/4, pi/4] in three parts (Cody and Waite 1980) and the polynomials of fdlibm (Sun 1993): errors
-    below 1e-15, for any number of angles abreast. Angles that are too large for that go to the C library.
+    below 1e-15, vectorised over angles. Larger angles use the C library.
     """
     largest = 0.0
     for b in range(LANES):
@@ -188,7 +188,7 @@ def cosines_sines(turns: Array, offset: float) -> None:
 
 @contracted_kernel
 def _turn(frame: Array, u: int, v: int, cos: float, sin: float) -> None:
-    """Turn frames by one angle, from their axis u towards their axis v."""
+    """Rotate frames by one angle, from their axis u towards their axis v."""
     if sin == 0.0 and cos == 1.0:
         return
     for i in range(0, 12, 4):
@@ -199,7 +199,7 @@ def _turn(frame: Array, u: int, v: int, cos: float, sin: float) -> None:
 
 @contracted_kernel
 def _shift(frame: Array, axis: int, distance: float) -> None:
-    """Move the origins of frames along one of their axes [m]."""
+    """Translate frames along one of their axes [m]."""
     for i in range(0, 12, 4):
         for b in range(LANES):
             frame[i + 3, b] += distance * frame[i + axis, b]
@@ -207,7 +207,7 @@ def _shift(frame: Array, axis: int, distance: float) -> None:
 
 @contracted_kernel
 def _write_poses(tool: Array, frame: Array, first: int, count: int, T: Array) -> None:
-    """Write the frames with the tool behind them."""
+    """Write the frames followed by the tool."""
     for b in range(count):
         pose = T[first + b]
         for i in range(3):

@@ -1,6 +1,6 @@
 """Closed-form inverses of the nominal arm, branch by branch, on plain numbers.
 
-The formulas stand in the files of `pisigma.robot.kinematics.closed_form`, which hand in plain functions.
+The formulas are plain functions in the files of `pisigma.robot.kinematics.closed_form`.
 """
 
 import math
@@ -13,7 +13,7 @@ from pisigma.robot.kinematics.tolerances import LIMIT_TOLERANCE
 
 
 def _chained() -> Any:
-    """One function that calls the closed form that an arm has."""
+    """Return one function that calls the closed form of an arm."""
 
     @kernel
     def chain(form: Record, P: Array, only: int, rounding: float, q: Array) -> None:
@@ -42,17 +42,17 @@ _solve = _chained()
 def all_branches(
     arms: Record, form: Record, T: Array, only: int, rounding: float, P: Array, q: Array
 ) -> None:
-    """Write joint values of every branch, the first of them NaN where it does not reach the pose.
+    """Write joint values of every branch, the first one NaN if the branch does not reach the pose.
 
     Args:
         arms: the arms, for limits.
         form: the nominal arm with canonical twists.
         T: wanted T_base_tool.
-        only: the only branch that is wanted, -1 for all, NEAREST for all with the nearest joint values of those that do
-            not reach the pose. Of others the first joint value is NaN.
-        rounding: relative size below which a cosine beyond 1 or a length counts as rounding of T.
+        only: the only requested branch, -1 for all, NEAREST for all with the nearest joint values of those that do
+            not reach the pose. The first joint value of other branches is NaN.
+        rounding: relative size below which a cosine beyond 1 or a length is a rounding error of T.
         P: `(4, 4)`, overwritten.
-        q: `(8, dof)`, written [rad or m]: in (-pi, pi], or a full turn from there within the limits.
+        q: `(8, dof)`, output [rad or m]: in (-pi, pi], or shifted by a full turn into the limits.
     """
     for branch in range(form.branches):
         q[branch, 0] = math.nan
@@ -69,7 +69,7 @@ def all_branches(
 
 @kernel
 def wrap_into_limits(arms: Record, q: Array) -> bool:
-    """Move joints by full turns into their limits where that is possible; whether all are inside."""
+    """Shift joints by full turns into their limits if possible; return whether all are inside."""
     all_inside = True
     for j in range(arms.dof):
         lower, upper = arms.limits[j, 0] - LIMIT_TOLERANCE, arms.limits[j, 1] + LIMIT_TOLERANCE
@@ -89,7 +89,7 @@ def wrap_into_limits(arms: Record, q: Array) -> bool:
 
 @kernel
 def nearest_turn(arms: Record, q: Array, near: Array, within_limits: bool) -> None:
-    """Move revolute joints by full turns as near to given values as they can come."""
+    """Shift revolute joints by full turns to the values nearest to a reference."""
     for j in range(arms.dof):
         if not arms.revolute[j]:
             continue
@@ -104,7 +104,7 @@ def nearest_turn(arms: Record, q: Array, near: Array, within_limits: bool) -> No
 
 @kernel
 def _canonical_pose(form: Record, T: Array, P: Array) -> None:
-    """Pose of the last joint's frame, turned, in the frame before the first joint: `first · T · last`."""
+    """Write the pose of the last joint's rotated frame in the frame before the first joint: `first · T · last`."""
     for i in range(3):
         for k in range(4):
             P[3, k] = form.first[i, 0] * T[0, k] + form.first[i, 1] * T[1, k] + form.first[i, 2] * T[2, k]

@@ -10,7 +10,7 @@ _SWEEPS = 30
 
 @contracted_kernel
 def scaled_square(reach: float, error: Array) -> float:
-    """Squared pose error with translation in characteristic lengths."""
+    """Return the squared pose error with translation in characteristic lengths."""
     scale = 1 / (reach * reach)
     position = error[0] * error[0] + error[1] * error[1] + error[2] * error[2]
     rotation = error[3] * error[3] + error[4] * error[4] + error[5] * error[5]
@@ -32,7 +32,7 @@ def _scale(arms: Record, reach: float, J: Array, memory: Record) -> None:
 
 @contracted_kernel
 def _normal(memory: Record, dof: int, by_row: bool, rows: int) -> tuple[int, float]:
-    """Write `A A^T` or `A^T A` of the first rows of A; give its size and trace."""
+    """Write `A A^T` or `A^T A` of the first rows of A; return its size and trace."""
     A, S = memory.scaled, memory.square
     size, trace = rows if by_row else dof, 0.0
     for i in range(size):
@@ -51,7 +51,7 @@ def _normal(memory: Record, dof: int, by_row: bool, rows: int) -> tuple[int, flo
 
 @contracted_kernel
 def _factor(S: Array, size: int) -> float:
-    """Cholesky factor in place, the inverse of the diagonal on it; the determinant, 0 where it breaks down."""
+    """Compute the Cholesky factor in place, with its inverse diagonal; return the determinant, 0 if it fails."""
     determinant = 1.0
     for j in range(size):
         pivot = S[j, j]
@@ -72,18 +72,18 @@ def _factor(S: Array, size: int) -> float:
 
 @contracted_kernel
 def damped_step(arms: Record, reach: float, J: Array, error: Array, damping: float, memory: Record) -> bool:
-    """Write the step [rad or m] of `(J^T J + λ) dq = J^T e` into `memory.step`: see `kinematics.numeric`.
+    """Write the step [rad or m] of `(J^T J + λ) dq = J^T e` into `memory.step`; see `kinematics.numeric`.
 
     Args:
         arms: the arms.
         reach: characteristic length [m].
         J: Jacobian.
         error: pose error.
-        damping: factor of the squared error in λ; rounding sets a floor under it.
-        memory: to work in.
+        damping: factor of the squared error in λ; λ is kept above the rounding level.
+        memory: working memory.
 
     Returns:
-        Whether there is such a step.
+        Whether the step exists.
     """
     A, S, x, dof = memory.scaled, memory.square, memory.right, arms.dof
     by_row = memory.rows <= dof
@@ -121,10 +121,10 @@ def damped_step(arms: Record, reach: float, J: Array, error: Array, damping: flo
 
 @contracted_kernel
 def is_singular(arms: Record, reach: float, J: Array, tolerance: float, memory: Record) -> bool:
-    """Whether the smallest singular value of the dimensionless Jacobian is below a tolerance.
+    """Return whether the smallest singular value of the dimensionless Jacobian is below a tolerance.
 
-    Only the axes count that the task asks for. The determinant of the normal equations over the largest that the other
-    values can have is a lower bound, which settles it but near singularities.
+    Only the axes of the task are used. The determinant of the normal equations divided by the largest possible product
+    of the other values is a lower bound, which is sufficient except near singularities.
     """
     rows = _compact(arms, reach, J, memory)
     size, trace = _normal(memory, arms.dof, rows <= arms.dof, rows)
@@ -137,13 +137,13 @@ def is_singular(arms: Record, reach: float, J: Array, tolerance: float, memory: 
 
 @contracted_kernel
 def singularity_measure(arms: Record, reach: float, J: Array, memory: Record) -> float:
-    """Smallest singular value of the dimensionless Jacobian in the axes that the task asks for."""
+    """Return the smallest singular value of the dimensionless Jacobian in the axes of the task."""
     return _smallest_singular_value(memory.scaled, _compact(arms, reach, J, memory), arms.dof)
 
 
 @contracted_kernel
 def _compact(arms: Record, reach: float, J: Array, memory: Record) -> int:
-    """Write the rows of the dimensionless Jacobian that count, without that of the elbow; how many they are."""
+    """Write the rows of the dimensionless Jacobian in use, without that of the elbow; return their number."""
     _scale(arms, reach, J, memory)
     if memory.whole:
         return 6
@@ -158,7 +158,7 @@ def _compact(arms: Record, reach: float, J: Array, memory: Record) -> int:
 
 @contracted_kernel
 def _smallest_singular_value(A: Array, rows: int, dof: int) -> float:
-    """One-sided Jacobi rotations of A's columns, or of its rows where they are fewer; A is overwritten."""
+    """Apply one-sided Jacobi rotations to the columns of A, or to its rows if they are fewer; A is overwritten."""
     size, by_column = min(rows, dof), dof <= rows
     length = rows if by_column else dof
     for _ in range(_SWEEPS):

@@ -1,4 +1,4 @@
-"""Corrected inverse kinematics of one pose, on plain numbers: what `correction.corrected_ik` does for batches."""
+"""Corrected inverse kinematics of one pose, on plain numbers; see `model.inverse`."""
 
 import math
 
@@ -26,7 +26,7 @@ from pisigma.robot.kernels.task_axes import level_pose, write_residuals
 from pisigma.robot.kinematics import tolerances
 
 _DISTINCT, _FAR = 0.05, 0.5
-"""[rad or m] Solutions are different where a joint differs by more, with joints to spare by far more."""
+"""Difference of a joint [rad or m] above which solutions are different; much larger for redundant arms."""
 
 
 @kernel
@@ -35,10 +35,10 @@ def solve_pose(description: Record, memory: Record, has_near: bool, branch: int,
 
     Args:
         description: the calibrated arm.
-        memory: to work in, with the wanted T_base_tool, checked, and the joint values to stay near to.
-        has_near: whether these count.
-        branch: index of the branch wanted, or -1.
-        out: `(2 · dof + 5,)`, written: commanded and nominal joint values [rad or m], distance [m] and angle [rad]
+        memory: working memory, with the checked wanted T_base_tool and the reference joint values.
+        has_near: whether there are reference joint values.
+        branch: index of the requested branch, or -1.
+        out: `(2 · dof + 5,)`, output: commanded and nominal joint values [rad or m], distance [m] and angle [rad]
             from the pose, measure of the domain, status and branch.
     """
     form, chosen = description.closed_form, -1
@@ -69,7 +69,7 @@ def solve_pose(description: Record, memory: Record, has_near: bool, branch: int,
 
 @kernel
 def solve_every(description: Record, memory: Record, out: Array) -> None:
-    """Write different solutions of the pose in `memory.pose` of an arm without closed form, as `solve_pose` does."""
+    """Write different solutions of the pose in `memory.pose` for an arm without a closed form; see `solve_pose`."""
     reachable = level_pose(description, memory) and within_reach(description, memory, memory.pose)
     count = _distinct_solutions(description, memory, out.shape[0]) if reachable else 0
     for row in range(out.shape[0]):
@@ -85,7 +85,7 @@ def solve_every(description: Record, memory: Record, out: Array) -> None:
 
 @kernel
 def _distinct_solutions(description: Record, memory: Record, most: int) -> int:
-    """Keep different joint values that reach the pose in `memory.candidates`, up to so many; their number."""
+    """Store different joint values that reach the pose in `memory.candidates`; return their number."""
     arms, count = description.arms, 0
     least = _FAR if is_redundant(description, memory) else _DISTINCT
     starts = nearest_starts(description, memory, memory.pose, tolerances.MORE_ATTEMPTS)
@@ -109,7 +109,7 @@ def _distinct_solutions(description: Record, memory: Record, most: int) -> int:
 def _solve_by_network(
     description: Record, memory: Record, has_near: bool, branch: int, wanted: int, out: Array
 ) -> None:
-    """The same where a network corrects the nominal joint values."""
+    """Do the same for a network that corrects the nominal joint values."""
     chosen, inside = choose_corrected(description, memory, has_near, branch, wanted)
     numeric = description.closed_form.kind == arrays.NO_CLOSED_FORM and within_reach(
         description, memory, memory.pose
@@ -126,7 +126,7 @@ def _solve_by_network(
 
 @kernel
 def _write(description: Record, memory: Record, reached: bool, status: int, branch: int, out: Array) -> None:
-    """Write the joint values in memory, NaN where they do not reach the pose, the status and the branch."""
+    """Write joint values, NaN if they do not reach the pose, status and branch."""
     dof = description.arms.dof
     for j in range(dof):
         out[j] = memory.solution[j] if reached else math.nan
@@ -136,9 +136,9 @@ def _write(description: Record, memory: Record, reached: bool, status: int, bran
 
 @kernel
 def _solve_in_order(description: Record, memory: Record, wanted: int) -> int:
-    """Solve on the wanted branch, or on the first that reaches the pose inside the limits; -1 if none reaches it.
+    """Solve on the requested branch, or the first that reaches the pose inside the limits; return it, or -1.
 
-    Where one does that only outside its limits, it is the first of these. Joint values go to `memory.solution`.
+    If all reach it outside the limits only, the first of these is returned. Joint values are in `memory.solution`.
     """
     arms, form, outside = description.arms, description.closed_form, -1
     first = form.order[0] if wanted < 0 else wanted
@@ -163,7 +163,7 @@ def _solve_in_order(description: Record, memory: Record, wanted: int) -> int:
 
 @kernel
 def _follow(description: Record, memory: Record, branch: int) -> bool:
-    """Solve from the nominal joint values of a branch on, for joint values `memory.q` on their turns."""
+    """Solve from the nominal joint values of a branch on, shifted to the turns of `memory.q`."""
     arms = description.arms
     copy(memory.branches[branch], memory.q)
     if not search(description, memory, memory.pose, memory.q):
@@ -176,9 +176,9 @@ def _follow(description: Record, memory: Record, branch: int) -> bool:
 
 @kernel
 def _solve_nearest(description: Record, memory: Record) -> int:
-    """Solve for joint values `memory.solution` near to `memory.near`; give their branch, or -1.
+    """Solve for joint values `memory.solution` near `memory.near`; return their branch, or -1.
 
-    The nearest of the branches that reach the pose inside the limits is best, else of the others.
+    The nearest branch that reaches the pose inside the limits is preferred, else the nearest of the others.
     """
     arms, form, others = description.arms, description.closed_form, memory.others
     all_branches(arms, form, memory.level, -1, memory.rounding, memory.wanted, memory.branches)
@@ -206,7 +206,7 @@ def _solve_nearest(description: Record, memory: Record) -> int:
 
 @kernel
 def _continue(description: Record, memory: Record, chosen: int) -> int:
-    """Look from `memory.near` itself where nothing was found close to it; the branch, -1 where still nothing was."""
+    """Iterate from `memory.near` itself if nothing was found close to it; return the branch, or -1."""
     arms, off = description.arms, math.inf
     if chosen >= 0:
         copy(memory.solution, memory.trial)
@@ -232,7 +232,7 @@ def _continue(description: Record, memory: Record, chosen: int) -> int:
 
 @kernel
 def _nearest(description: Record, memory: Record) -> tuple[int, float]:
-    """Of the branches that are left the nearest one and its squared distance; -1 where none is left."""
+    """Return the nearest of the remaining branches and its squared distance; -1 if there is none."""
     arms, nearest, least = description.arms, -1, math.inf
     for branch in range(description.closed_form.branches):
         if math.isnan(memory.others[branch, 0]):
@@ -247,9 +247,9 @@ def _nearest(description: Record, memory: Record) -> tuple[int, float]:
 
 @kernel
 def _solve_without_branches(description: Record, memory: Record, has_near: bool) -> bool:
-    """Numeric inverse from `near`, then from the starts whose poses are nearest; whether one leads there.
+    """Iterate from `near`, then from the starts with the nearest poses; return whether the pose is reached.
 
-    The first that leads there inside the joint limits is taken, else the first that leads there.
+    The first solution inside the joint limits is used, else the first solution.
     """
     count, reached = nearest_starts(description, memory, memory.pose, tolerances.MORE_ATTEMPTS), False
     for attempt in range(-1 if has_near else 0, count):
@@ -277,7 +277,7 @@ def _solve_without_branches(description: Record, memory: Record, has_near: bool)
 def finish(
     description: Record, memory: Record, has_near: bool, reached: bool, out: Array
 ) -> tuple[bool, int]:
-    """Choose the turns, write the error left and how far that was measured; whether it is reached, and the status."""
+    """Select the turns, write residuals and domain measure; return whether the pose is reached, and the status."""
     arms, q, place = description.arms, memory.solution, 2 * description.arms.dof
     inside = False
     if reached:
@@ -304,7 +304,7 @@ def finish(
 
 @kernel
 def _choose_turns(description: Record, memory: Record, has_near: bool) -> tuple[bool, bool]:
-    """Bring joints into their limits and near to given values; whether they are inside, and still reach the pose."""
+    """Shift joints into their limits and near the reference; return whether inside, and whether the pose is reached."""
     arms, q = description.arms, memory.solution
     copy(q, memory.q)
     inside = wrap_into_limits(arms, q)

@@ -1,4 +1,4 @@
-"""The joint correction Δ(q), and where the tool of an arm with it is and how it moves, on plain numbers."""
+"""The joint correction Δ(q), and pose and Jacobian of an arm with it, on plain numbers."""
 
 import math
 from collections.abc import Callable, Iterable
@@ -11,7 +11,7 @@ from pisigma.robot.kernels.rows import Array, Record, contracted_kernel, kernel
 
 
 def _chained(functions: Iterable[Callable[..., None] | None]) -> Any:
-    """One function that calls those of the features that a correction has; see `CompiledForm`."""
+    """Return one function that calls those of the features of a correction; see `CompiledForm`."""
 
     @kernel
     def chain(arms: Record, correction: Record, memory: Record, q: Array) -> None:
@@ -46,7 +46,7 @@ def joint_correction(arms: Record, correction: Record, memory: Record, q: Array)
     Args:
         arms: the arms.
         correction: the weights.
-        memory: whose `approach` is read; `turning`, `phi` and `frames` are written.
+        memory: working memory; `approach` is read, `turning`, `phi` and `frames` are written.
         q: joint values [rad or m].
     """
     dof, revolute, turning, phi = arms.dof, 0, memory.turning, memory.phi
@@ -71,12 +71,12 @@ def joint_correction(arms: Record, correction: Record, memory: Record, q: Array)
 
 @kernel
 def correction_slope(arms: Record, correction: Record, memory: Record, q: Array) -> None:
-    """Write the slopes of every joint's correction by its own value into `memory.slope`, as far as they are steep.
+    """Write large derivatives of every joint's correction by its own value into `memory.slope`.
 
     Args:
         arms: the arms.
         correction: the weights.
-        memory: with sines and cosines as `joint_correction` leaves them.
+        memory: working memory with sines and cosines written by `joint_correction`.
         q: joint values [rad or m].
     """
     for j in range(arms.dof):
@@ -86,7 +86,7 @@ def correction_slope(arms: Record, correction: Record, memory: Record, q: Array)
 
 @contracted_kernel
 def _add_products(correction: Record, dof: int, phi: Array, delta: Array) -> None:
-    """Products of sums of the inputs, four joints abreast."""
+    """Add products of sums of the inputs, four joints at a time."""
     for j in range(0, dof, 4):
         total, factor = delta[j : j + 4], 0
         weights, biases = correction.weight[:, :, j : j + 4], correction.bias[:, j : j + 4]
@@ -111,7 +111,7 @@ def _add_products(correction: Record, dof: int, phi: Array, delta: Array) -> Non
 
 @contracted_kernel
 def _walk_drawn(arms: Record, q: Array, turning: Array, frames: Array) -> None:
-    """Write axis and origin of every joint, and axes and origin of its row's frame, of the arm as drawn.
+    """Write axis and origin of every joint, and axes and origin of its row's frame, of the nominal arm.
 
     All are in the frame of the arm's first row. `frames` is `(dof, 18)`.
     """
@@ -166,7 +166,7 @@ def correct(description: Record, memory: Record, q: Array) -> None:
 
 @kernel
 def beyond_measured(description: Record, q: Array) -> float:
-    """Angle [rad] by which the joint that is farthest out lies beyond its measured values; see `JointCoverage`."""
+    """Return the largest excess of a joint over its measured values [rad]; see `JointCoverage`."""
     coverage, arms, worst = description.coverage, description.arms, 0.0
     for j in range(arms.dof):
         angle, least = q[j] * coverage.rate[j], math.inf
@@ -184,11 +184,11 @@ def beyond_measured(description: Record, q: Array) -> float:
 def move(description: Record, memory: Record, arm: int, q: Array) -> None:
     """Write pose and Jacobian of an arm into `memory.T` and `memory.J`.
 
-    See `model.hybrid_motion`: the slope of the correction is left out of the Jacobian.
+    The derivative of the correction is omitted from the Jacobian, see `model.hybrid_motion`.
 
     Args:
         description: the calibrated arm.
-        memory: to work in.
+        memory: working memory.
         arm: NOMINAL, IDENTIFIED, or CORRECTED, which adds the correction to the joint values.
         q: joint values [rad or m].
     """

@@ -1,4 +1,4 @@
-"""The one function that is compiled for calls from Python; everything else is compiled into it."""
+"""The only exported function of the kernels, into which all others are compiled."""
 
 import math
 from typing import Any, no_type_check
@@ -38,28 +38,28 @@ def run(
     out: Pointer,
     count: int,
 ) -> int:
-    """Solve poses, evaluate the arm at joint values, or only say where it stands and how it moves.
+    """Solve poses, evaluate the corrected arm, or compute poses and Jacobians of an arm.
 
     See `solve_poses`, `evaluate` and `chain.walk_many`.
 
     Args:
-        description: one struct, see `kernels.layout`.
-        memory: one struct to work in.
+        description: struct of the arm, see `kernels.layout`.
+        memory: struct of working memory.
         task: SOLVE, EVALUATE or FORWARD.
-        rows: how many poses.
-        T: `(rows, 4, 4)`: wanted poses to read, or poses to write.
-        near: `(near_rows, dof)`: joint values [rad or m].
-        near_rows: 0, 1 or as many as poses.
-        approach: `(approach_rows, dof)`: +1 or -1 for the side from which a joint comes, 0 where that is not stated.
-        approach_rows: 0, 1 or as many as poses.
-        axes: `(axes_rows, 8)`: which axes of the tool count, see `kinematics.task_axes.TaskAxes.row`.
-        axes_rows: 0 where all six count, else 1.
-        branch: which branch, or which arm to evaluate.
-        mark: 1 to mark what is no pose, 0 to stop there.
-        single: 1 where the poses were rounded to float32, else 0.
-        out: written: `(rows, count, 2 · dof + 5)` to SOLVE, `(rows, 7 · dof + 1)` to EVALUATE, `(rows · count, 6, dof)`
-            FORWARD.
-        count: how many solutions a pose gets; for FORWARD 1 where Jacobians are wanted, else 0.
+        rows: number of poses.
+        T: `(rows, 4, 4)`: wanted poses (input) or poses (output).
+        near: `(near_rows, dof)`: reference joint values [rad or m].
+        near_rows: 0, 1 or the number of poses.
+        approach: `(approach_rows, dof)`: approach directions of the joints, +1 or -1, 0 if not stated.
+        approach_rows: 0, 1 or the number of poses.
+        axes: `(axes_rows, 8)`: tool axes of the task, see `kinematics.task_axes.TaskAxes.row`.
+        axes_rows: 0 if all six are exact, else 1.
+        branch: index of the branch, or of the arm to evaluate.
+        mark: 1 to mark invalid poses, 0 to stop at the first.
+        single: 1 if the poses were rounded to float32, else 0.
+        out: output: `(rows, count, 2 · dof + 5)` for SOLVE, `(rows, 7 · dof + 1)` for EVALUATE,
+            `(rows · count, 6, dof)` for FORWARD.
+        count: number of solutions per pose; for FORWARD 1 to compute Jacobians, else 0.
     """
     arm, work = carray(description, 1)[0], carray(memory, 1)[0]
     dof = arm.arms.dof
@@ -89,9 +89,9 @@ def solve_poses(
     single: bool,
     out: Array,
 ) -> int:
-    """Solve poses, every one on as many branches as `out` has.
+    """Solve every pose on as many branches as `out` has.
 
-    Gives -1, or `8 · row + what is wrong` with the first bad pose, if these are not to be marked.
+    Return -1, or `8 · row + fault` of the first invalid pose if these are not marked.
     """
     dof, has_near = description.arms.dof, near.shape[0] > 0
     tolerance = POSE_TOLERANCE_SINGLE if single else POSE_TOLERANCE
@@ -124,14 +124,14 @@ def solve_poses(
 
 @kernel
 def _take_row(values: Array, row: int, target: Array, dof: int) -> None:
-    """Copy the row of a pose, or the only one."""
+    """Copy the row of a pose, or the only row."""
     for j in range(dof):
         target[j] = values[row if values.shape[0] > 1 else 0, j]
 
 
 @kernel
 def _take_approach(approach: Array, row: int, target: Array, dof: int) -> None:
-    """The same for approaches, which are all 0 where none is stated."""
+    """Do the same for approach directions, which are 0 if not stated."""
     if approach.shape[0] > 0:
         _take_row(approach, row, target, dof)
     else:
@@ -140,7 +140,7 @@ def _take_approach(approach: Array, row: int, target: Array, dof: int) -> None:
 
 @kernel
 def _check_pose(T: Array, tolerance: float) -> int:
-    """What is wrong with a matrix, in the order in which `se3.check_transforms` looks."""
+    """Return the fault of a matrix, in the order of `se3.check_transforms`."""
     total = 0.0
     for i in range(4):
         for k in range(4):
@@ -171,7 +171,7 @@ def _check_near(near: Array, dof: int) -> int:
 
 @kernel
 def _mark(description: Record, branch: int, out: Array) -> None:
-    """Say that there is no pose to solve for."""
+    """Write the status of an invalid pose."""
     fill(out, math.nan)
     out[out.shape[0] - 2] = arrays.INVALID
     out[out.shape[0] - 1] = description.closed_form.order[0] if branch < 0 else branch
@@ -181,7 +181,7 @@ def _mark(description: Record, branch: int, out: Array) -> None:
 def evaluate(
     description: Record, memory: Record, arm: int, q: Array, approach: Array, T: Array, out: Array
 ) -> int:
-    """Write poses at joint values, and in a row Jacobian, correction, and angle beyond measured values; gives -1."""
+    """Write poses at joint values, and rows of Jacobian, correction and excess over measured values; return -1."""
     dof = description.arms.dof
     for row in range(q.shape[0]):
         for j in range(dof):

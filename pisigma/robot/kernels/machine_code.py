@@ -1,4 +1,4 @@
-"""The kernels as machine code of this processor, made by llvmlite from their intermediate code and kept in a file.
+"""Kernels as machine code for this processor, compiled by llvmlite from intermediate code and cached in a file.
 
 numba is not needed where the intermediate code comes with the package. The kernels call nothing but the mathematical
 functions of the C library, so their object code can be loaded by llvmlite alone.
@@ -32,16 +32,16 @@ from pisigma.robot.kernels.forms import KernelForms
 
 _ALLOWED = {"acos", "atan2", "ceil", "cos", "fabs", "floor", "hypot", "log", "pow", "sin", "sqrt"}
 _ALLOWED |= {"memcpy", "memset"}
-"""Functions of the C library that every process has."""
+"""Functions of the C library that are available in every process."""
 _OPTIONS = "speed 3, vectors up to 256 bits, internal linkage"
-"""What `optimised_object` does, as far as the code depends on it; part of the key of kept code."""
+"""Options of `optimised_object` that affect the code; part of the cache key."""
 _PATIENCE = 2.0
-"""[s] Kernels that are on disk are loaded in far less."""
+"""Delay of the notice on compilation [s]; cached kernels load much faster."""
 _COMPILING = "pisigma: preparing the inverse kinematics for this processor, once, in some seconds ...\n"
 Said = ctypes.c_int64 * 1
-"""What a call of the kernels says."""
+"""Status that a call of the kernels writes."""
 IGNORED = Said()
-"""Where nobody asks for that."""
+"""Status of calls whose status is ignored."""
 _lock = threading.Lock()
 _kept: list[Any] = []
 
@@ -55,29 +55,28 @@ _NOTHING = KernelForms()
 
 
 def kernel_forms(wanted: KernelForms = _NOTHING) -> KernelForms:
-    """What the kernels evaluate that `load_kernels` gives.
+    """Return the forms that the kernels of `load_kernels` evaluate.
 
-    That is what the code that comes with the package evaluates where this is all that is wanted; else what is
-    registered.
+    These are the forms of the code in the package if they include the wanted ones, else all registered forms.
     """
     ready = _ready_forms()
     return ready if ready is not None and ready.cover(wanted) else KernelForms.registered()
 
 
 def load_kernels(wanted: KernelForms = _NOTHING) -> Callable[..., int]:
-    """The function `kernels.run`, on addresses and numbers; bytes and ctypes arrays count as their addresses.
+    """Return the function `kernels.run` on addresses and numbers; bytes and ctypes arrays are passed by address.
 
-    Two arguments come before those of `run`: a `Said`, into which -1 is written, or what `kernels.solve_poses` says;
-    and `IGNORED`, for what was raised: nothing ever is.
+    It has two more arguments before those of `run`: a `Said`, into which -1 or the result of `kernels.solve_poses` is
+    written, and `IGNORED` for exceptions, which are never raised.
 
-    Machine code is made when it is first wanted on a machine, in some seconds, and read from a file afterwards.
-    Somebody at a terminal reads why that takes so long.
+    Machine code is compiled in some seconds at the first use on a machine, and read from a file afterwards. On a
+    terminal a notice explains the delay.
 
     Args:
-        wanted: what they have to evaluate.
+        wanted: forms that the kernels have to evaluate.
 
     Raises:
-        ModelError: there is no intermediate code of the present sources, and numba, which makes it, is not installed.
+        ModelError: there is no intermediate code of the present sources, and numba is not installed.
     """
     notice = threading.Timer(_PATIENCE, sys.stderr.write, (_COMPILING,))
     notice.daemon = True
@@ -105,7 +104,7 @@ def _load(forms: KernelForms) -> Callable[..., int]:
 
 
 def _code(forms: KernelForms, machine: Any, use: str) -> bytes:
-    """Object code, from a file or made now."""
+    """Return object code from the cache, or compile it."""
     name = f"{use}-{_key(forms)}.o"
     code = next((kept for folder in cache_folders() if (kept := read_code(folder / name)) is not None), None)
     if code is None:
@@ -115,10 +114,10 @@ def _code(forms: KernelForms, machine: Any, use: str) -> bytes:
 
 
 def library_object(wanted: KernelForms) -> bytes:
-    """Object code of the kernels for a shared library, on any processor of the kind of this one.
+    """Return object code of the kernels for a shared library, for any processor of the same architecture.
 
     Args:
-        wanted: what they have to evaluate.
+        wanted: forms that the kernels have to evaluate.
 
     Raises:
         ModelError: see `load_kernels`.

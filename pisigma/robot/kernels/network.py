@@ -1,6 +1,6 @@
-"""What a network adds to the nominal joint values of a pose, and how far the pose is from training rows.
+"""Network correction of the nominal joint values of a pose, and distance of the pose from training rows.
 
-The formulas are those of `network.correction_network` and `correction.domain`, on plain numbers.
+The formulas are those of `network.correction_network` and `model.domain`, on plain numbers.
 """
 
 import math
@@ -22,7 +22,7 @@ def network_correction(description: Record, memory: Record, T: Array, q: Array) 
 
     Args:
         description: the arm and its network.
-        memory: to work in.
+        memory: working memory.
         T: `(3 or 4, 4)`: T_base_tool.
         q: nominal joint values [rad or m].
     """
@@ -49,7 +49,7 @@ def network_correction(description: Record, memory: Record, T: Array, q: Array) 
 
 @kernel
 def _input(description: Record, memory: Record, T: Array, q: Array, index: int) -> float:
-    """One input, not scaled; see `network.inputs.Inputs`."""
+    """Return one unscaled input; see `network.inputs.Inputs`."""
     net = description.network
     source = net.source[index]
     if source < 3:
@@ -70,7 +70,7 @@ def _input(description: Record, memory: Record, T: Array, q: Array, index: int) 
 
 @kernel
 def _roll_pitch_yaw(reference: Array, T: Array, R: Array, angles: Array) -> None:
-    """Angles of a rotation seen from a reference, as `se3.rpy_from_rotation` gives them."""
+    """Write the angles of a rotation relative to a reference; see `se3.rpy_from_rotation`."""
     for i in range(3):
         for k in range(3):
             R[i, k] = reference[0, i] * T[0, k] + reference[1, i] * T[1, k] + reference[2, i] * T[2, k]
@@ -87,9 +87,9 @@ def _roll_pitch_yaw(reference: Array, T: Array, R: Array, angles: Array) -> None
 
 @kernel
 def domain_measure(description: Record, memory: Record) -> float:
-    """Distance of the inputs in `memory.seen` to the nearest training row over the radius; NaN without a domain.
+    """Return the distance of `memory.seen` from the nearest training row over the radius; NaN without a domain.
 
-    Most rows are farther by the coarse coordinates alone than the nearest by all of them.
+    The coarse coordinates alone exclude most rows.
     """
     net, distance, n = description.network, memory.distance, description.network.samples
     if n == 0:
@@ -116,17 +116,17 @@ def domain_measure(description: Record, memory: Record) -> float:
 def choose_corrected(
     description: Record, memory: Record, has_near: bool, branch: int, wanted: int
 ) -> tuple[int, bool]:
-    """Put the solution of the branch to take into memory, by the rules of `solve_pose`.
+    """Write the solution of the selected branch into memory, by the rules of `solve_pose`.
 
     Args:
         description: the arm and its network.
-        memory: to work in.
-        has_near: whether there are joint values to be near to.
-        branch: index of the branch wanted, or -1.
+        memory: working memory.
+        has_near: whether there are reference joint values.
+        branch: index of the requested branch, or -1.
         wanted: index of the first branch to try.
 
     Returns:
-        Index of the branch, -1 where none reaches the pose, and whether it does so inside the limits.
+        Index of the branch, -1 if none reaches the pose, and whether it is inside the limits.
     """
     arms, form = description.arms, description.closed_form
     if form.kind == arrays.NO_CLOSED_FORM:
@@ -157,7 +157,7 @@ def choose_corrected(
 
 @kernel
 def add_correction(description: Record, memory: Record, has_near: bool) -> bool:
-    """Correct `memory.nominal` to `memory.solution`, both on the turns to command; whether inside the limits."""
+    """Correct `memory.nominal` to `memory.solution`, both on the turns to command; return whether inside the limits."""
     arms, q = description.arms, memory.q
     copy(memory.nominal, q)
     nearest_turn(arms, q, description.network.centre, False)  # as the training rows were turned
@@ -175,7 +175,7 @@ def add_correction(description: Record, memory: Record, has_near: bool) -> bool:
 
 @kernel
 def finish_corrected(description: Record, memory: Record, branch: int, inside: bool, out: Array) -> int:
-    """Write what is left of the error and the measure of the domain; give the status."""
+    """Write residuals and domain measure; return the status."""
     arms, form, place = description.arms, description.closed_form, 2 * description.arms.dof
     measure = domain_measure(description, memory)
     out[place + 2] = measure
@@ -195,9 +195,9 @@ def finish_corrected(description: Record, memory: Record, branch: int, inside: b
 
 @kernel
 def _settle(description: Record, memory: Record, out: Array) -> None:
-    """Write how far the pose is missed whose corrected joint values are the solution; NaN where there is none.
+    """Write the residuals of the pose whose corrected joint values are the solution; NaN if there is none.
 
-    See `correction.calibrated_model.CalibratedModel.forward`; iteration begins at the nominal joint values out.
+    See `model.calibrated_model.CalibratedModel.forward`; the iteration starts at the nominal joint values.
     """
     arms, q, place, moved = description.arms, memory.trial, 2 * description.arms.dof, 0.0
     copy(memory.nominal, q)

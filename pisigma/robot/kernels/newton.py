@@ -1,4 +1,4 @@
-"""Damped Newton from a start to a pose, on plain numbers."""
+"""Damped Gauss-Newton iteration from a start to a pose, on plain numbers."""
 
 import math
 
@@ -17,7 +17,7 @@ _SETTLED: joint values [rad or m] move less after a step that is the last one.""
 
 @kernel
 def within(error: Array, position: float, rotation: float) -> bool:
-    """Whether an error is below a distance [m] and an angle [rad], that of the elbow with the others."""
+    """Return whether an error is below a distance [m] and an angle [rad], including the elbow angle."""
     linear = error[0] * error[0] + error[1] * error[1] + error[2] * error[2]
     angular = error[3] * error[3] + error[4] * error[4] + error[5] * error[5] + error[6] * error[6]
     return linear < position * position and angular < rotation * rotation
@@ -25,15 +25,15 @@ def within(error: Array, position: float, rotation: float) -> bool:
 
 @kernel
 def newton(description: Record, memory: Record, arm: int, T: Array, q: Array, tolerance: float) -> None:
-    """Bring q to a pose, as `kinematics.numeric.solve_numeric` does; the error left stands in `memory.best`.
+    """Move q to a pose like `kinematics.numeric.solve_numeric`; the residual error is in `memory.best`.
 
     Args:
         description: the calibrated arm.
-        memory: to work in.
-        arm: which arm.
+        memory: working memory.
+        arm: index of the arm.
         T: wanted T_base_tool.
-        q: joint values to begin with [rad or m]; the best found are written there.
-        tolerance: residuals to come below [m and rad].
+        q: initial joint values [rad or m], overwritten by the best found.
+        tolerance: residuals at convergence [m and rad].
     """
     arms, dof = description.arms, description.arms.dof
     reach = arms.reach[IDENTIFIED if arm == CORRECTED else arm]
@@ -67,7 +67,7 @@ def newton(description: Record, memory: Record, arm: int, T: Array, q: Array, to
 
 @kernel
 def _move_steeply(description: Record, memory: Record, arm: int, q: Array) -> None:
-    """Do as `move`, and take the slope of the correction into the Jacobian of a corrected arm."""
+    """Call `move`, and include the derivative of the correction in the Jacobian of a corrected arm."""
     move(description, memory, arm, q)
     dof = description.arms.dof
     if arm != CORRECTED or dof > 6:
@@ -80,10 +80,10 @@ def _move_steeply(description: Record, memory: Record, arm: int, q: Array) -> No
 
 @kernel
 def search(description: Record, memory: Record, T: Array, q: Array) -> bool:
-    """Bring q to a pose of the calibrated arm in the axes that count, and say whether that succeeded.
+    """Move q to a pose of the calibrated arm in the axes of the task; return whether that succeeded.
 
-    Axes with tolerances are first to be met like the exact ones, if the arm has joints enough for that; then by least
-    squares, each weighed by its tolerance.
+    Axes with tolerances are first met exactly if the arm has enough joints, then by least squares weighted by their
+    tolerances.
     """
     if memory.whole:
         return _search_exactly(description, memory, T, q)
@@ -99,7 +99,7 @@ def search(description: Record, memory: Record, T: Array, q: Array) -> bool:
 
 @kernel
 def _is_tolerable(description: Record, memory: Record, T: Array, q: Array) -> bool:
-    """Whether joint values keep within the tolerances of all axes."""
+    """Return whether joint values are within the tolerances of all axes."""
     move(description, memory, CORRECTED if description.arms.corrected else IDENTIFIED, q)
     pose_error(T, memory.T, memory.R, memory.error)
     in_task_axes(description.arms, memory, T, memory.error, True)
@@ -109,7 +109,7 @@ def _is_tolerable(description: Record, memory: Record, T: Array, q: Array) -> bo
 
 @kernel
 def _search_loosely(description: Record, memory: Record, T: Array, q: Array) -> bool:
-    """Bring q to the least weighted deviations, then without any to the axes that count exactly."""
+    """Minimise weighted deviations, then meet the exact axes without deviation."""
     arm = CORRECTED if description.arms.corrected else IDENTIFIED
     fill(memory.checked, math.nan)
     use_axes(memory, True, True)
@@ -123,10 +123,10 @@ def _search_loosely(description: Record, memory: Record, T: Array, q: Array) -> 
 
 @kernel
 def _search_exactly(description: Record, memory: Record, T: Array, q: Array) -> bool:
-    """The same for the axes that count now, none of which may deviate.
+    """Move q to a pose in the axes in use without deviation.
 
-    First the arm without its correction, then from there with it, which may reach a little farther; where the start
-    is near already, a shorter way to the same joint values.
+    The arm is solved first without, then with its correction, which may reach slightly farther; if the start is near, a
+    shorter iteration leads to the same joint values.
     """
     arms = description.arms
     fill(memory.checked, math.nan)
@@ -148,8 +148,7 @@ def _search_exactly(description: Record, memory: Record, T: Array, q: Array) -> 
 def _quick(description: Record, memory: Record, T: Array, q: Array) -> bool:
     """Solve for `q + Δ(q)` by Newton steps, then for q by fixed-point steps; checked on the arm itself.
 
-    Only where joint values near the start lead to the pose: there the correction need not be in the Newton steps at
-    all.
+    This is used only if the solution is near the start, because the correction is then not needed in Newton steps.
     """
     arms, dof = description.arms, description.arms.dof
     if not _converge(description, memory, T, q):
@@ -180,7 +179,7 @@ def _quick(description: Record, memory: Record, T: Array, q: Array) -> bool:
 
 @kernel
 def _checked(memory: Record, q: Array, tolerance: float) -> bool:
-    """Whether the pose is reached; if so, keep that the pose, Jacobian and error in memory are those of q."""
+    """Return whether the pose is reached; if so, mark pose, Jacobian and error in memory as those of q."""
     if not within(memory.error, tolerance, tolerance):
         return False
     copy(q, memory.checked)
@@ -189,7 +188,7 @@ def _checked(memory: Record, q: Array, tolerance: float) -> bool:
 
 @kernel
 def _converge(description: Record, memory: Record, T: Array, q: Array) -> bool:
-    """Newton steps of the identified arm as long as each is far better than the one before."""
+    """Perform Newton steps of the identified arm while each is much better than the one before."""
     arms, dof = description.arms, description.arms.dof
     reach, before = arms.reach[IDENTIFIED], _CLOSE * _CLOSE
     for _ in range(8):

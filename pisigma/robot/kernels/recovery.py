@@ -1,4 +1,4 @@
-"""Poses that take a search from several starts: beyond the nominal arm, or with joints to spare; on plain numbers."""
+"""Search from several starts, for poses beyond the nominal arm's reach and for redundant arms; on plain numbers."""
 
 import math
 
@@ -15,18 +15,18 @@ from pisigma.robot.kinematics import tolerances
 from pisigma.robot.kinematics.tolerances import ATTEMPTS, BRANCH_MISS, REACH_ROUNDING
 
 _TURN = 0.2
-"""[rad] By so much the elbow is turned at a time."""
+"""Largest step of the elbow angle [rad]."""
 _AROUND, _ASIDE = 8, 0.2
-"""How many starts are tried for one branch, and how far the joints of all but the first are off [rad]."""
+"""Number of starts that are tried for one branch, and offset of the joints of all but the first [rad]."""
 _APART = 1e-4
-"""[rad or m] Two solutions near a singular pose are different where a joint differs by more."""
+"""Difference of a joint [rad or m] above which two solutions near a singular pose are different."""
 _OUTSIDE = 1e6
-"""What is taken from the worth of joint values outside their limits."""
+"""Penalty of joint values outside their limits."""
 
 
 @kernel
 def within_reach(description: Record, memory: Record, T: Array) -> bool:
-    """Whether a pose is not farther away than the robot is long, whatever its joints do, where its position counts."""
+    """Return whether a pose is within the reach of the robot, if its position is part of the task."""
     if is_free(memory.tolerance[0]) or is_free(memory.tolerance[1]) or is_free(memory.tolerance[2]):
         return True
     base, reach = description.arms.ends[IDENTIFIED, 0], description.arms.reach[IDENTIFIED]
@@ -36,9 +36,9 @@ def within_reach(description: Record, memory: Record, T: Array) -> bool:
 
 @kernel
 def nearest_starts(description: Record, memory: Record, T: Array, most: int) -> int:
-    """Write the indices of the starts whose poses are nearest into `memory.nearest`, nearest first; their number.
+    """Write the indices of the starts with the nearest poses into `memory.nearest`; return their number.
 
-    Of orientations that do not count as a whole, the direction of the axis counts that the tool may turn about.
+    If the orientation is partly free, the direction of the tool's rotation axis is compared.
     """
     starts, near = description.starts, memory.nearest
     pivot, turned = memory.pivot if memory.rows > 3 else -1, memory.whole == 1
@@ -64,16 +64,16 @@ def nearest_starts(description: Record, memory: Record, T: Array, most: int) -> 
 
 @kernel
 def recover(description: Record, memory: Record, branch: int, any_branch: bool) -> int:
-    """Look for joint values from other starts, as `model.inverse.numeric_ik` does: branches as near as they come.
+    """Search joint values from other starts like `model.inverse.numeric_ik`: from the nearest values of branches.
 
     Args:
         description: the calibrated arm.
-        memory: to work in, with the pose; the joint values found are written into `memory.solution`.
-        branch: index of the branch wanted.
-        any_branch: whether another will do.
+        memory: working memory with the pose; joint values are written into `memory.solution`.
+        branch: index of the requested branch.
+        any_branch: whether another branch is accepted.
 
     Returns:
-        Index of the branch on which they lie, -1 where nothing was out.
+        Index of their branch, -1 if nothing was found.
     """
     form, starts, beside, plausible = description.closed_form, description.starts, memory.others, False
     all_branches(description.arms, form, memory.level, NEAREST, memory.rounding, memory.wanted, beside)
@@ -105,10 +105,10 @@ def recover(description: Record, memory: Record, branch: int, any_branch: bool) 
 
 @kernel
 def _recover_branch(description: Record, memory: Record, branch: int) -> bool:
-    """Look for joint values on one branch, from the nearest of the nominal arm in `memory.others`.
+    """Search joint values on one branch from the nearest values of the nominal arm in `memory.others`.
 
-    Near singular poses two branches may lead to one solution, beside which the other lies, or two solutions may be
-    nearest to one nominal branch; the one that this does not lead to is the other's.
+    Near singular poses two branches may lead to the same solution with the other one close to it, or two solutions
+    may be nearest to one nominal branch; the solution that this branch does not lead to belongs to the other.
     """
     if math.isnan(memory.others[branch, 0]):
         return False
@@ -130,7 +130,7 @@ def _recover_branch(description: Record, memory: Record, branch: int) -> bool:
 
 @kernel
 def _is_another(description: Record, memory: Record, lies: int) -> bool:
-    """Whether `memory.solution` is another one than that to which a nominal branch leads."""
+    """Return whether `memory.solution` differs from the solution to which a nominal branch leads."""
     arms, form = description.arms, description.closed_form
     all_branches(arms, form, memory.level, NEAREST, memory.rounding, memory.wanted, memory.others)
     copy(memory.others[lies], memory.q)
@@ -141,7 +141,7 @@ def _is_another(description: Record, memory: Record, lies: int) -> bool:
 
 @kernel
 def differ(arms: Record, q: Array, other: Array) -> float:
-    """Largest difference of a joint [rad or m], the short way round."""
+    """Return the largest wrapped difference of a joint [rad or m]."""
     far = 0.0
     for j in range(arms.dof):
         off = q[j] - other[j]
@@ -151,7 +151,7 @@ def differ(arms: Record, q: Array, other: Array) -> float:
 
 @kernel
 def _is_near(description: Record, memory: Record, q: Array) -> bool:
-    """Whether joint values of a nominal branch bring the identified arm near the pose; NaN do not."""
+    """Return whether joint values of a nominal branch move the identified arm near the pose; False for NaN."""
     move(description, memory, IDENTIFIED, q)
     miss(description.arms, memory, memory.pose, memory.error)
     return scaled_square(description.arms.reach[IDENTIFIED], memory.error) <= BRANCH_MISS * BRANCH_MISS
@@ -159,7 +159,7 @@ def _is_near(description: Record, memory: Record, q: Array) -> bool:
 
 @kernel
 def branch_of(description: Record, memory: Record, q: Array) -> int:
-    """Index of the nominal arm's branch that is nearest to joint values."""
+    """Return the index of the nominal arm's branch nearest to joint values."""
     walk(description.arms, NOMINAL, q, memory.axes, memory.T)
     every = memory.others
     all_branches(
@@ -178,7 +178,7 @@ def branch_of(description: Record, memory: Record, q: Array) -> int:
 
 @kernel
 def solve_nominal(description: Record, memory: Record) -> None:
-    """Write joint values of the nominal arm near `memory.q` into `memory.nominal`, NaN where there are none."""
+    """Write joint values of the nominal arm near `memory.q` into `memory.nominal`, NaN if there are none."""
     newton(description, memory, NOMINAL, memory.pose, memory.q, tolerances.TOLERANCE)
     fill(memory.nominal, math.nan)
     if within(memory.best, tolerances.ACCEPTED, tolerances.ACCEPTED):
@@ -187,7 +187,7 @@ def solve_nominal(description: Record, memory: Record) -> None:
 
 @kernel
 def distance_from(arms: Record, q: Array, near: Array) -> float:
-    """Squared distance of joint values, radians and metres alike."""
+    """Return the squared distance of joint values, with radians and metres weighted equally."""
     total = 0.0
     for j in range(arms.dof):
         total += (q[j] - near[j]) ** 2
@@ -196,22 +196,22 @@ def distance_from(arms: Record, q: Array, near: Array) -> float:
 
 @kernel
 def is_redundant(description: Record, memory: Record) -> bool:
-    """Whether the arm has more joints than axes count, or is to reach an elbow angle."""
+    """Return whether the arm has more joints than axes in use, or an elbow angle is requested."""
     return memory.rows < description.arms.dof or not math.isnan(memory.elbow)
 
 
 @kernel
 def solve_redundant(description: Record, memory: Record, has_near: bool, branch: int) -> int:
-    """Solve for the best of many joint values: nearest to `memory.near`, else away from limits and singularities.
+    """Solve a redundant arm: nearest to `memory.near`, else far from limits and singularities.
 
     Args:
         description: the calibrated arm.
-        memory: to work in, with the pose; the joint values are written into `memory.solution`.
-        has_near: whether there are joint values to be near to.
-        branch: index of the branch wanted, or -1.
+        memory: working memory with the pose; joint values are written into `memory.solution`.
+        has_near: whether there are reference joint values.
+        branch: index of the requested branch, or -1.
 
     Returns:
-        Index of the branch on which they lie, -1 where nothing was out.
+        Index of their branch, -1 if nothing was found.
     """
     closed = description.closed_form.kind != NO_CLOSED_FORM
     candidates = _candidates(description, memory, has_near, branch) if closed else 0
@@ -246,7 +246,7 @@ def solve_redundant(description: Record, memory: Record, has_near: bool, branch:
 
 @kernel
 def _worth(description: Record, memory: Record, has_near: bool) -> tuple[float, bool]:
-    """What joint values `memory.trial` are worth, which are brought onto the turn to command; whether inside limits."""
+    """Shift `memory.trial` to the turns to command; return its merit, and whether it is inside the limits."""
     arms, q = description.arms, memory.trial
     inside = wrap_into_limits(arms, q)
     if has_near:
@@ -262,7 +262,7 @@ def _worth(description: Record, memory: Record, has_near: bool) -> tuple[float, 
 
 @kernel
 def _margin(arms: Record, q: Array) -> float:
-    """Smallest distance of a joint from its limits over half its travel, at most 1."""
+    """Return the smallest distance of a joint from its limits divided by half its travel, at most 1."""
     least = 1.0
     for j in range(arms.dof):
         half = max((arms.limits[j, 1] - arms.limits[j, 0]) / 2, 1e-9)
@@ -272,9 +272,9 @@ def _margin(arms: Record, q: Array) -> float:
 
 @kernel
 def settle(description: Record, memory: Record, has_near: bool, q: Array) -> bool:
-    """Bring q to the pose, to the elbow angle and, with joints to spare, where it is preferred; whether it gets there.
+    """Move q to the pose, the elbow angle and, for redundant arms, preferred values; return whether it succeeds.
 
-    Preferred are the joint values nearest to `memory.near`, or to the middle of their travel, each over its half.
+    Preferred values are `memory.near` or the middle of the travel, with distances scaled by half the travel.
     """
     arms = description.arms
     if not search(description, memory, memory.pose, q):
@@ -304,7 +304,7 @@ def settle(description: Record, memory: Record, has_near: bool, q: Array) -> boo
 
 @kernel
 def _approach_preferred(description: Record, memory: Record, q: Array) -> bool:
-    """Move joints to preferred values as `kinematics.numeric.approach_preferred`; whether they still reach the pose."""
+    """Move joints to preferred values; see `kinematics.numeric.approach_preferred`; return whether the pose is kept."""
     arms, arm = description.arms, CORRECTED if description.arms.corrected else IDENTIFIED
     reach, share, before = arms.reach[IDENTIFIED], 1.0, math.inf
     for _ in range(tolerances.MAX_STEPS):
@@ -337,7 +337,7 @@ def _approach_preferred(description: Record, memory: Record, q: Array) -> bool:
 
 @kernel
 def _turn_elbow(description: Record, memory: Record, q: Array) -> bool:
-    """Turn the elbow to `memory.elbow`, the shorter way or the other; whether it comes there."""
+    """Rotate the elbow to `memory.elbow` in either sense, the shorter first; return whether it gets there."""
     arms, arm = description.arms, CORRECTED if description.arms.corrected else IDENTIFIED
     use_elbow(memory, True)
     memory.elbow_now = memory.elbow
@@ -363,7 +363,7 @@ def _turn_elbow(description: Record, memory: Record, q: Array) -> bool:
 
 @kernel
 def _candidates(description: Record, memory: Record, has_near: bool, branch: int) -> int:
-    """Keep joint values of the nominal arm for orientations that the task leaves free, the best first; their number."""
+    """Store joint values of the nominal arm for free orientations, the best first; return their number."""
     arms, form, count = description.arms, description.closed_form, 0
     for index in range(free_orientations(memory)):
         orient(memory, index)
@@ -376,7 +376,7 @@ def _candidates(description: Record, memory: Record, has_near: bool, branch: int
 
 @kernel
 def _keep_candidate(description: Record, memory: Record, has_near: bool, q: Array, count: int) -> int:
-    """Put joint values where their rank is among the candidates, if it is among the first; the number of these."""
+    """Insert joint values into the candidates by rank, if it is high enough; return the number of candidates."""
     arms, rank = description.arms, 0.0
     inside = wrap_into_limits(arms, q)
     if has_near:

@@ -7,7 +7,7 @@ from pisigma.robot.kernels.rows import Array, kernel
 
 @kernel
 def rotation_vector(R: Array) -> tuple[float, float, float]:
-    """Rotation vector [rad] of the rotation in the first three columns: axis times angle in [0, pi]."""
+    """Write the rotation vector [rad] of the rotation in the first three columns: axis times angle in [0, pi]."""
     x, y, z = R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]
     cosine = (R[0, 0] + R[1, 1] + R[2, 2] - 1) / 2
     square = (x * x + y * y + z * z) / 4
@@ -22,7 +22,7 @@ def rotation_vector(R: Array) -> tuple[float, float, float]:
 
 @kernel
 def _near_pi(R: Array, x: float, y: float, z: float, cosine: float) -> tuple[float, float, float]:
-    """Axis from the symmetric part, whose columns are `axis · axis_k (1 - cos)`; its sign from the other."""
+    """Compute the axis from the symmetric part, with columns `axis · axis_k (1 - cos)`; its sign from the other."""
     angle = math.atan2(math.sqrt(x * x + y * y + z * z) / 2, cosine)
     k = 0
     for i in range(1, 3):
@@ -42,13 +42,13 @@ def _near_pi(R: Array, x: float, y: float, z: float, cosine: float) -> tuple[flo
 
 @kernel
 def pose_error(wanted: Array, actual: Array, R: Array, error: Array) -> None:
-    """What moves the actual pose onto the wanted one, in the base frame.
+    """Compute the displacement from the actual to the wanted pose in the base frame.
 
     Args:
-        wanted: `(3 or 4, 4)`.
-        actual: `(3, 4)`.
+        wanted: `(3 or 4, 4)`: wanted pose.
+        actual: `(3, 4)`: actual pose.
         R: `(3, 3)`, overwritten.
-        error: `(6,)`, written: translation [m] and rotation vector [rad].
+        error: `(6,)`, output: translation [m] and rotation vector [rad].
     """
     for i in range(3):
         error[i] = wanted[i, 3] - actual[i, 3]
@@ -84,7 +84,7 @@ def rotation_from_vector(x: float, y: float, z: float, R: Array) -> None:
 
 @kernel
 def wrap(angle: float) -> float:
-    """The same angle [rad] in (-pi, pi]; an angle that is there already keeps every digit."""
+    """Wrap an angle [rad] to (-pi, pi]; an angle in that range is returned unchanged."""
     if -math.pi < angle <= math.pi:
         return angle
     wrapped = angle - 2 * math.pi * math.floor((angle + math.pi) / (2 * math.pi))

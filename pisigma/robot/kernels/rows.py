@@ -1,4 +1,4 @@
-"""What all kernels are made with: numba's decorators, and copying and filling of plain rows of numbers."""
+"""Decorators of kernels by numba, and functions to copy and fill rows of numbers."""
 
 import inspect
 from collections.abc import Callable
@@ -9,7 +9,7 @@ from numba import njit
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 Array = Any
-"""Numbers: an array, or a field of a record that is one."""
+"""An array of numbers, or a field of a record that is one."""
 Record = Any
 """One of the structs of `kernels.layout`, or a part of one."""
 
@@ -18,12 +18,12 @@ Record = Any
 
 
 def kernel(function: Function) -> Function:
-    """Have numba compile a function of numbers and arrays; dividing by 0 gives infinity or NaN, as with NumPy."""
+    """Compile a function of numbers and arrays by numba; division by 0 returns infinity or NaN, as in NumPy."""
     return njit(error_model="numpy")(inspect.unwrap(function))  # type: ignore[return-value]
 
 
 def contracted_kernel(function: Function) -> Function:
-    """The same, and a product and a sum may be rounded once instead of twice."""
+    """Do the same, but allow fused multiply-add operations."""
     return njit(error_model="numpy", fastmath={"contract"})(inspect.unwrap(function))  # type: ignore[return-value]
 
 
@@ -32,20 +32,20 @@ def contracted_kernel(function: Function) -> Function:
 
 @kernel
 def copy(source: Array, target: Array) -> None:
-    """Write all numbers of one row into another."""
+    """Copy all numbers of a row into another."""
     for i in range(target.shape[0]):
         target[i] = source[i]
 
 
 @kernel
 def copy_rows(source: Array, target: Array) -> None:
-    """Write all rows of one matrix into another."""
+    """Copy all rows of a matrix into another."""
     for i in range(target.shape[0]):
         copy(source[i], target[i])
 
 
 @kernel
 def fill(target: Array, value: float) -> None:
-    """Write one number all over a row."""
+    """Fill a row with one number."""
     for i in range(target.shape[0]):
         target[i] = value

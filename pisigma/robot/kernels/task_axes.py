@@ -1,4 +1,4 @@
-"""Which axes of the tool's frame a task asks for: pose errors and Jacobians in these axes only, on plain numbers.
+"""Pose errors and Jacobians in the tool axes of a task, on plain numbers.
 
 The formulas are those of `kinematics.task_error`, which explains them.
 """
@@ -9,21 +9,21 @@ from pisigma.robot.kernels.rotations import pose_error, wrap
 from pisigma.robot.kernels.rows import Array, Record, copy_rows, fill, kernel
 
 ELBOW = 6
-"""Row of the elbow angle behind the six axes."""
+"""Row of the elbow angle after the six axes."""
 
 _TURNS, _ORIENTATIONS = 12, 24
-"""How many orientations are tried of a tool that may turn about one axis, and of one that may turn about two or all."""
+"""Number of orientations that are tried for a tool that may rotate about one axis, and about two or all axes."""
 
 
 @kernel
 def state_task(arms: Record, memory: Record, reach: float, stated: Array) -> None:
-    """Keep what a task asks for in memory.
+    """Write a task into memory.
 
     Args:
         arms: the arms.
-        memory: to work in.
+        memory: working memory.
         reach: characteristic length [m].
-        stated: `(0 or 1, 8)`, see `kinematics.task_axes.TaskAxes.row`; without row all six axes count.
+        stated: `(0 or 1, 8)`, see `kinematics.task_axes.TaskAxes.row`; without a row all six axes are exact.
     """
     memory.whole, memory.elbow, memory.pivot = 1, math.nan, -1
     fill(memory.tolerance, 0.0)
@@ -46,13 +46,13 @@ def state_task(arms: Record, memory: Record, reach: float, stated: Array) -> Non
 
 @kernel
 def is_free(tolerance: float) -> bool:
-    """Whether an axis does not count in least squares: infinite, or free within minus the tolerance."""
+    """Return whether an axis is excluded from least squares: ignored, or free within its negative tolerance."""
     return tolerance < 0.0 or tolerance == math.inf
 
 
 @kernel
 def count_axes(memory: Record, with_tolerances: bool) -> int:
-    """How many axes count exactly, or also within tolerances."""
+    """Return the number of exact axes, optionally with those within tolerances."""
     count = 0
     for i in range(6):
         if memory.tolerance[i] == 0.0 or (with_tolerances and not is_free(memory.tolerance[i])):
@@ -62,12 +62,12 @@ def count_axes(memory: Record, with_tolerances: bool) -> int:
 
 @kernel
 def use_axes(memory: Record, with_tolerances: bool, weighted: bool) -> None:
-    """Choose which rows of errors and Jacobians count from now on, and by which weights.
+    """Select the rows of errors and Jacobians in use, and their weights.
 
     Args:
-        memory: to work in.
-        with_tolerances: whether the axes count that have a tolerance, not only the exact ones.
-        weighted: whether they count the less the more they may deviate; exact axes then count a thousand times as much.
+        memory: working memory.
+        with_tolerances: whether to use axes with a tolerance, not only the exact ones.
+        weighted: whether to weight them by their inverse tolerances; exact axes then have 1000 times the weight.
     """
     least = math.inf
     for i in range(6):
@@ -88,7 +88,7 @@ def use_axes(memory: Record, with_tolerances: bool, weighted: bool) -> None:
 
 @kernel
 def use_elbow(memory: Record, used: bool) -> None:
-    """Ask for the elbow angle `memory.elbow_now` [rad] too, or no longer."""
+    """Add the elbow angle `memory.elbow_now` [rad] to the task, or remove it."""
     if used and memory.height == ELBOW:
         memory.height, memory.rows = ELBOW + 1, memory.rows + 1
     elif not used and memory.height > ELBOW:
@@ -98,14 +98,14 @@ def use_elbow(memory: Record, used: bool) -> None:
 
 @kernel
 def in_task_axes(arms: Record, memory: Record, T: Array, error: Array, raw: bool) -> None:
-    """Turn a pose error and the Jacobian in memory into the axes of the tool, and leave out those that do not count.
+    """Convert a pose error and the Jacobian in memory to the tool axes in use.
 
     Args:
         arms: the arms.
-        memory: to work in, with the pose reached in `T`, the Jacobian in `J` and the joints' axes.
+        memory: working memory with the reached pose `T`, the Jacobian `J` and the joint axes.
         T: wanted T_base_tool.
-        error: as `pose_error` gives it; overwritten.
-        raw: whether all axes stay, without weights.
+        error: output of `pose_error`; overwritten.
+        raw: whether to keep all axes, without weights.
     """
     reached, J, R, e = memory.T, memory.J, memory.R, memory.turned
     _relative(reached, T, R)
@@ -130,7 +130,7 @@ def in_task_axes(arms: Record, memory: Record, T: Array, error: Array, raw: bool
 
 @kernel
 def _relative(reached: Array, T: Array, R: Array) -> None:
-    """Write the rotation from the tool's frame reached to the wanted one, in the former."""
+    """Write the rotation from the reached to the wanted tool frame, in the former."""
     for i in range(3):
         for k in range(3):
             R[i, k] = reached[0, i] * T[0, k] + reached[1, i] * T[1, k] + reached[2, i] * T[2, k]
@@ -138,7 +138,7 @@ def _relative(reached: Array, T: Array, R: Array) -> None:
 
 @kernel
 def _split(arms: Record, memory: Record, k: int) -> None:
-    """Replace the rotation vector in `memory.turned` by the swing of an axis and the twist about it, J likewise."""
+    """Replace the rotation vector in `memory.turned` by swing of an axis and twist about it, and J accordingly."""
     R, e, J = memory.R, memory.turned, memory.J
     i, m = (k + 1) % 3, (k + 2) % 3
     sine = math.sqrt(R[i, k] * R[i, k] + R[m, k] * R[m, k])
@@ -152,9 +152,9 @@ def _split(arms: Record, memory: Record, k: int) -> None:
 
 @kernel
 def elbow_angle(arms: Record, memory: Record) -> float:
-    """Angle [rad] of the elbow about the line from shoulder to wrist, its derivatives in row `ELBOW` of the Jacobian.
+    """Return the elbow angle [rad] about the line from shoulder to wrist, with its derivatives in row `ELBOW` of J.
 
-    See `kinematics.task_axes`. Both are of the arm whose joint axes stand in memory.
+    See `kinematics.task_axes`. Both refer to the arm whose joint axes are in memory.
     """
     axes, J, w, n, p, t = memory.axes, memory.J, memory.line, memory.upright, memory.bend, memory.beside
     square, along_n, along_p = 0.0, 0.0, 0.0
@@ -190,7 +190,7 @@ def elbow_angle(arms: Record, memory: Record) -> float:
 
 @kernel
 def _speed(axes: Array, joint: int, point: int, along: Array) -> float:
-    """Speed along a vector of the origin of a joint's axis per motion of another revolute joint."""
+    """Return the velocity along a vector of the origin of a joint axis per motion of another revolute joint."""
     if joint >= point:
         return 0.0
     x, y, z = axes[joint, 0], axes[joint, 1], axes[joint, 2]
@@ -214,7 +214,7 @@ def _cross(a: Array, b: Array, c: Array) -> None:
 
 @kernel
 def miss(arms: Record, memory: Record, T: Array, error: Array) -> None:
-    """Write what moves the arm, whose pose and Jacobian stand in memory, to a pose, in the axes that count."""
+    """Write the error of the arm, whose pose and Jacobian are in memory, from a pose in the axes in use."""
     pose_error(T, memory.T, memory.R, error)
     if not memory.whole or memory.height > ELBOW:
         in_task_axes(arms, memory, T, error, False)
@@ -222,13 +222,13 @@ def miss(arms: Record, memory: Record, T: Array, error: Array) -> None:
 
 @kernel
 def write_residuals(arms: Record, memory: Record, e: Array, out: Array) -> bool:
-    """Write distance [m] and angle [rad] of a pose error in the axes that count; whether tolerances allow the error.
+    """Write distance [m] and angle [rad] of a pose error in the axes in use; return whether it is tolerated.
 
     Args:
         arms: the arms.
-        memory: to work in, with the pose and Jacobian that the error is of; the latter is turned into the axes.
-        e: the error, as `pose_error` gives it; overwritten.
-        out: its entries 2 · dof and the next are written.
+        memory: working memory with pose and Jacobian of the error; the latter is converted to the tool axes.
+        e: output of `pose_error`; overwritten.
+        out: output in the entries 2 · dof and 2 · dof + 1.
     """
     place, tolerated = 2 * arms.dof, True
     if not memory.whole:
@@ -244,7 +244,7 @@ def write_residuals(arms: Record, memory: Record, e: Array, out: Array) -> bool:
 
 @kernel
 def is_tolerated(memory: Record, error: Array) -> bool:
-    """Whether a raw error stays within the tolerances of all axes that have one."""
+    """Return whether a raw error is within all tolerances."""
     for i in range(6):
         tolerance = abs(memory.tolerance[i])
         if tolerance > 0.0 and abs(error[i]) > tolerance * (1 + 1e-9):
@@ -254,7 +254,7 @@ def is_tolerated(memory: Record, error: Array) -> bool:
 
 @kernel
 def level_pose(description: Record, memory: Record) -> bool:
-    """Write the pose that the nominal arm is to take into `memory.level`; whether it leans no farther than allowed."""
+    """Write the pose for the nominal arm into `memory.level`; return whether its tilt is allowed."""
     arms, allowed = description.arms, memory.tolerance
     if arms.dof == 4 and description.closed_form.kind > 0 and allowed[3] != 0.0 and allowed[4] != 0.0:
         lean = _straighten(description.closed_form, memory.pose, memory.level)
@@ -265,9 +265,9 @@ def level_pose(description: Record, memory: Record) -> bool:
 
 @kernel
 def _straighten(form: Record, T: Array, out: Array) -> float:
-    """Write the pose with the tool turned about its point so that the last joint's axis is parallel to the first's.
+    """Write the pose rotated about the tool's origin so that the last joint's axis is parallel to the first's.
 
-    That is the pose which a SCARA can take; its closed form refuses others. Gives the angle [rad] of the turn.
+    A SCARA can reach that pose; its closed form rejects others. Returns the angle of the rotation [rad].
     """
     v, u = form.first[2], out[3]
     for i in range(3):
@@ -289,7 +289,7 @@ def _straighten(form: Record, T: Array, out: Array) -> float:
 
 @kernel
 def free_orientations(memory: Record) -> int:
-    """How many orientations to try of a tool that may turn about some of its axes."""
+    """Return the number of orientations to try for a tool with free rotations."""
     free = 0
     for k in range(3):
         free += 1 if is_free(memory.tolerance[3 + k]) else 0
@@ -298,7 +298,7 @@ def free_orientations(memory: Record) -> int:
 
 @kernel
 def orient(memory: Record, index: int) -> None:
-    """Write the wanted pose with the tool turned about its free axes into `memory.level`."""
+    """Write the wanted pose with the tool rotated about its free axes into `memory.level`."""
     free = free_orientations(memory) > _TURNS
     turn, axis = index * 2 * math.pi / _TURNS, max(memory.pivot, 0)
     if free:
@@ -317,7 +317,7 @@ def orient(memory: Record, index: int) -> None:
 
 @kernel
 def _turned(T: Array, axis: int, angle: float, out: Array) -> None:
-    """Write a pose turned about one of its axes."""
+    """Write a pose rotated about one of its axes."""
     copy_rows(T, out)
     u, v, cos, sin = (axis + 1) % 3, (axis + 2) % 3, math.cos(angle), math.sin(angle)
     for i in range(3):

@@ -1,4 +1,4 @@
-"""Compiled inverse kinematics: it reaches the poses, agrees with torch, and says what is wrong."""
+"""Compiled inverse kinematics reaches the poses, agrees with torch, and rejects invalid input."""
 
 import subprocess
 import sys
@@ -9,6 +9,7 @@ import pytest
 import torch
 from testing.closeness import assert_close
 from testing.models import hand_made_model, no_type_checker, with_limits
+from testing.refusals import refused
 
 from pisigma.calibration.hybrid.arm import HybridArm
 from pisigma.files.errors import ModelError, PoseError
@@ -30,7 +31,7 @@ def _torch_solutions(model, T, near=None, branch=None):
 
 
 def _both(name, arms, rows=40, near=False, **kind):
-    """Joint values, poses, the compiled solution and that of torch."""
+    """Return joint values, poses, the compiled solution and that of torch."""
     model = arms.calibrated(name, **kind)
     q = arms.draw_joints(model.robot, rows, seed=7, share=kind.get("covered", 1.0) * 1.05)
     T = model.forward(q)
@@ -40,15 +41,19 @@ def _both(name, arms, rows=40, near=False, **kind):
 
 
 def _left(kernels, model, q, T):
-    """Errors from the poses in the axes of the tool that count, which are all six but for a SCARA."""
+    """Return pose errors in the tool axes that are not free: all six except for a SCARA."""
     error, _ = task_error(kernels.axes, T, model.forward(torch.from_numpy(q)))
     return error[:, ~torch.tensor(kernels.axes.free)]
 
 
-@pytest.mark.parametrize("name", NAMES)
-@pytest.mark.parametrize("near", [False, True])
-@pytest.mark.parametrize(("hybrid", "covered"), [(True, 1.0), (True, 0.5), (False, 1.0)])
-def test_solutions_are_those_of_torch(name, near, hybrid, covered, arms):
+KINDS = [(False, True, 1.0), (True, True, 0.5), (True, False, 1.0)]
+"""Whether near other joint values, whether hybrid, and the covered share of the limits: each value once or twice."""
+OTHERS = [(True, True, 1.0), (False, True, 0.5), (False, False, 1.0)]
+CASES = [(name, *kind) for name in NAMES for kind in (KINDS + OTHERS if name == "ur5" else KINDS)]
+
+
+@pytest.mark.parametrize(("name", "near", "hybrid", "covered"), CASES)
+def test_solutions_agree_with_torch(name, near, hybrid, covered, arms):
     _, _, found, expected = _both(name, arms, near=near, hybrid=hybrid, covered=covered)
     reached = (found.status != Status.UNREACHABLE) & (expected.status.numpy() != Status.UNREACHABLE)
     same = reached & (found.branch == expected.branch.numpy())
@@ -68,7 +73,7 @@ def test_solutions_are_those_of_torch(name, near, hybrid, covered, arms):
 
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("covered", [1.0, 0.5])
-def test_what_is_called_reached_is_reached(name, covered, arms):
+def test_reached_poses_are_reached(name, covered, arms):
     model, kernels = arms.calibrated(name, covered=covered), arms.compiled(name, covered=covered)
     q = arms.draw_joints(model.robot, 2000, seed=8, share=covered)
     T = model.forward(q)
@@ -83,10 +88,10 @@ def test_what_is_called_reached_is_reached(name, covered, arms):
 
 
 @pytest.mark.parametrize("name", ["kiro3", "kiro4", "ur5"])  # one for every closed form
-def test_every_branch_is_that_of_torch(name, arms):
+def test_every_branch_agrees_with_torch(name, arms):
     model, kernels = arms.calibrated(name), arms.compiled(name)
-    T = model.forward(arms.draw_joints(model.robot, 8, seed=9))
-    for branch in kernels.branches:
+    T = model.forward(arms.draw_joints(model.robot, 4, seed=9))
+    for branch in kernels.branches[:: 1 if len(kernels.branches) == 2 else 3]:  # both values of every fork
         found, expected = (
             kernels.solve_batch(T.numpy(), branch=branch),
             _torch_solutions(model, T, branch=branch),
@@ -105,19 +110,19 @@ def test_every_branch_is_that_of_torch(name, arms):
 @pytest.mark.parametrize("name", NAMES)
 def test_batches_equal_single_poses_on_any_number_of_threads(name, arms):
     model, kernels = arms.calibrated(name), arms.compiled(name)
-    q = arms.draw_joints(model.robot, 5000, seed=10)
+    q = arms.draw_joints(model.robot, 2000, seed=10)
     T = model.forward(q).numpy()
     found = kernels.solve_batch(T, threads=2)
     again = kernels.solve_batch(T, threads=1)
     assert np.array_equal(found.q, again.q, equal_nan=True)
-    for i in range(0, 5000, 500):
+    for i in range(0, 2000, 200):
         single = kernels.solve(T[i])
         assert np.array_equal(single.q, found.q[i], equal_nan=True)
         assert (single.status, single.branch) == (found.status[i], found.branch[i])
     assert kernels.solve_batch(T[:0]).q.shape == (0, model.robot.dof)
 
 
-def test_poses_at_half_a_turn_and_no_orientation_error_are_no_special_case(arms):
+def test_orientation_errors_of_half_a_turn_are_solved(arms):
     model, kernels = arms.calibrated("ur5"), arms.compiled("ur5")
     q = arms.draw_joints(model.robot, 50, seed=11)
     flipped = model.forward(q) @ torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
@@ -129,7 +134,7 @@ def test_poses_at_half_a_turn_and_no_orientation_error_are_no_special_case(arms)
 
 @pytest.mark.parametrize("name", ["kiro3", "kiro4", "ur5", "rb5", "fanuc_r2000"])
 def test_poses_that_only_the_calibrated_arm_reaches_are_solved(name, arms):
-    """They lie near singular poses: no nominal branch reaches them, and one of them comes near."""
+    """They are near singular poses: no nominal branch reaches them, but one comes near."""
     model = arms.calibrated(name)
     T = model.forward(arms.draw_joints(model.robot, 200 if name == "kiro3" else 10_000, seed=21))
     nominal = torch.isfinite(closed_form_solver(model.robot).solve(T).q).all(-1).any(-1)
@@ -142,7 +147,7 @@ def test_poses_that_only_the_calibrated_arm_reaches_are_solved(name, arms):
     assert_close(left, 0.0, atol=1e-10)
 
 
-def test_statuses_say_what_became_of_a_pose(arms):
+def test_statuses_describe_the_result(arms):
     model, kernels = arms.calibrated("ur5", covered=0.5), arms.compiled("ur5", covered=0.5)
     far = np.eye(4)
     far[:3, 3] = 9.0
@@ -161,7 +166,7 @@ def test_statuses_say_what_became_of_a_pose(arms):
     assert CompiledIK.of(nominal).solve(T, near=stretched.numpy()).status == Status.SINGULAR
 
 
-def test_limits_bind_what_is_commanded(arms):
+def test_limits_apply_to_the_corrected_values(arms):
     model = arms.calibrated("ur5", hybrid=False)
     q = torch.tensor([0.3, -0.7, 1.0, 0.5, 0.6, 0.2], dtype=torch.float64)
     T = model.forward(q[None])[0].numpy()
@@ -183,7 +188,7 @@ def test_limits_bind_what_is_commanded(arms):
     assert_close(near.q, turned, atol=1e-9)
 
 
-def test_a_correction_that_is_another_on_the_next_turn_is_solved_there(arms):
+def test_a_correction_that_differs_between_turns_is_solved_on_the_given_turn(arms):
     model, kernels = arms.calibrated("ur5", joints=True), arms.compiled("ur5", joints=True)
     q = arms.draw_joints(model.robot, 50, seed=12)
     q[:, 5] += torch.where(q[:, 5] > 0, -2 * torch.pi, 2 * torch.pi)
@@ -196,72 +201,72 @@ def test_a_correction_that_is_another_on_the_next_turn_is_solved_there(arms):
 
 
 GOOD = np.eye(4)
-HOSTILE = {
-    "nan": (np.where(np.eye(4) == 0, np.nan, 1.0), "entries that are not finite"),
-    "infinite": (GOOD + np.inf, "entries that are not finite"),
-    "scaled": (np.diag([2.0, 2.0, 2.0, 1.0]), "not orthonormal"),
-    "mirrored": (np.diag([1.0, 1.0, -1.0, 1.0]), "left-handed"),
-    "last row": (2 * np.eye(4), "does not end with the row"),
-    "shape": (np.eye(3), r"shape \(3, 3\)"),
-    "text": ([["a"] * 4] * 4, "no array of numbers"),
-    "ragged": ([[1.0], [1.0, 2.0]], "no array of numbers"),
+INVALID = {
+    "nan": np.where(np.eye(4) == 0, np.nan, 1.0),
+    "infinite": GOOD + np.inf,
+    "scaled": np.diag([2.0, 2.0, 2.0, 1.0]),
+    "mirrored": np.diag([1.0, 1.0, -1.0, 1.0]),
+    "last row": 2 * np.eye(4),
+    "shape": np.eye(3),
+    "text": [["a"] * 4] * 4,
+    "ragged": [[1.0], [1.0, 2.0]],
 }
 
 
-@pytest.mark.parametrize("case", HOSTILE)
-def test_what_is_no_pose_is_refused_in_one_sentence(case, arms):
-    kernels, (T, words) = arms.compiled("ur5"), HOSTILE[case]
-    with pytest.raises(PoseError, match=words) as caught:
+@pytest.mark.parametrize("case", INVALID)
+def test_invalid_poses_are_rejected_on_one_line(case, arms):
+    kernels, T = arms.compiled("ur5"), INVALID[case]
+    with pytest.raises(PoseError) as caught:
         kernels.solve(T)
     assert "\n" not in str(caught.value)
     if case not in ("text", "ragged", "shape"):
-        with pytest.raises(PoseError, match="at index 3 ") as caught:
+        with pytest.raises(PoseError, match="index 3 ") as caught:
             kernels.solve_batch(np.stack([GOOD, GOOD, GOOD, T, GOOD]))
 
 
 @pytest.mark.parametrize(
-    ("options", "words"),
+    ("options", "data"),
     [
-        ({"near": np.zeros(5)}, r"near has the shape \(5,\)"),
-        ({"near": np.full(6, np.nan)}, "no finite numbers"),
-        ({"near": "here"}, "near is no array"),
-        ({"branch": "front/elbow_up/no_flop"}, "did you mean 'front/elbow_up/no_flip'"),
+        ({"near": np.zeros(5)}, r"near.*\(5,\)"),
+        ({"near": np.full(6, np.nan)}, "near"),
+        ({"near": "here"}, "near"),
+        ({"branch": "front/elbow_up/no_flop"}, "'front/elbow_up/no_flip'"),
     ],
 )
-def test_what_does_not_fit_is_refused(options, words, arms):
-    with pytest.raises(PoseError, match=words):
+def test_invalid_options_are_rejected(options, data, arms):
+    with pytest.raises(PoseError, match=data):
         arms.compiled("ur5").solve(GOOD, **options)
-    with pytest.raises(PoseError, match=words):
+    with pytest.raises(PoseError, match=data):
         arms.compiled("ur5").solve_batch(GOOD[None], **options)
 
 
-def test_batches_refuse_what_is_no_batch(arms):
+def test_invalid_batches_are_rejected(arms):
     kernels = arms.compiled("ur5")
-    with pytest.raises(PoseError, match=r"shape \(3, 4\)"):
+    with pytest.raises(PoseError, match=r"\(3, 4\)"):
         kernels.solve_batch(GOOD[:3])
-    with pytest.raises(PoseError, match="threads=0"):
+    with pytest.raises(PoseError, match="threads"):
         kernels.solve_batch(GOOD[None], threads=0)
-    with pytest.raises(PoseError, match="no array of numbers"):
+    with pytest.raises(PoseError):
         kernels.solve_batch([["a"] * 4] * 4)
 
 
-def test_models_without_compiled_form_are_refused(arms):
+def test_models_without_a_compiled_form_are_rejected(arms):
     model = arms.calibrated("ur5")
-    with pytest.raises(ModelError, match="corrects nominal joint values"):
+    with pytest.raises(ModelError, match="ur10"):
         describe(replace(hand_made_model("ur10"), calibrated=model.calibrated))
     correction = JointCorrection(model.robot, [NominalPose(model.robot)])
     arm = HybridArm(model.calibrated, correction, model.hybrid.coverage)
-    with pytest.raises(ModelError, match="feature 'pose'"):
+    with pytest.raises(ModelError, match="'pose'"):
         describe(replace(model, hybrid=arm))
     panda = arms.calibrated("panda")
-    with pytest.raises(ModelError, match="no closed-form inverse"):
+    with pytest.raises(ModelError):
         describe(replace(panda, starts=panda.starts[:0]))
-    with pytest.raises(ModelError, match=r"starts\.q has the shape"):
+    with pytest.raises(ModelError, match=r"starts\.q"):
         CompiledIK.of(replace(panda, starts=panda.starts.repeat(2, 1)))
 
 
 @pytest.mark.parametrize("name", ["ur5", "panda"])
-def test_a_file_gives_the_same_back_without_torch(name, arms, tmp_path):
+def test_a_file_is_restored_without_torch(name, arms, tmp_path):
     model, kernels = arms.calibrated(name), arms.compiled(name)
     T = model.forward(arms.draw_joints(model.robot, 1, seed=13))[0].numpy()
     file = tmp_path / "compiled.npz"
@@ -284,24 +289,16 @@ def test_a_file_gives_the_same_back_without_torch(name, arms, tmp_path):
     assert (loaded.branches, loaded.joints, loaded.name) == (kernels.branches, kernels.joints, kernels.name)
 
 
-def test_files_that_are_no_models_are_refused(arms, tmp_path):
+def test_invalid_files_are_rejected(arms, tmp_path):
     file = tmp_path / "compiled.npz"
     save_compiled(arms.calibrated("ur5"), file)
     content = file.read_bytes()
-    with pytest.raises(ModelError, match="cannot be read"):
+    with refused(ModelError, file="missing.npz", value="No such file or directory"):
         CompiledIK.load(tmp_path / "missing.npz")
     for wrong in (b"", b"nothing", content[: len(content) // 2], content[:3000] + b"x" + content[3001:]):
         file.write_bytes(wrong)
-        with pytest.raises(ModelError, match="again"):
+        with refused(ModelError, file=file):
             CompiledIK.load(file)
-    with np.load(
-        tmp_path / "other.npz" if (tmp_path / "other.npz").exists() else _foreign(tmp_path)
-    ) as foreign:
-        assert foreign.files
-    with pytest.raises(ModelError, match="no compiled model of format 6"):
+    np.savez(tmp_path / "other.npz", q=np.zeros(3))
+    with refused(ModelError, file="other.npz", expected="format 6", value=None):
         CompiledIK.load(tmp_path / "other.npz")
-
-
-def _foreign(folder):
-    np.savez(folder / "other.npz", q=np.zeros(3))
-    return folder / "other.npz"

@@ -63,7 +63,7 @@ def test_branches_are_tried_in_the_order_of_training_rows_and_limits_count(case,
     assert (found.status == Status.UNREACHABLE).sum() <= (~solved).sum()
 
 
-def test_all_branches_are_those_of_torch_and_those_asked_for_by_name(arms):
+def test_all_branches_agree_with_torch_and_with_single_branches(arms):
     model, kernels = arms.calibrated("ur5"), arms.compiled("ur5")
     T = model.forward(arms.draw_joints(model.robot, 30, seed=22))
     found = kernels.all_branches(T.numpy())
@@ -97,7 +97,7 @@ def test_control_loops_get_a_status_instead_of_an_exception(case, arms):
     assert np.isnan(found.q).all()
     assert np.isnan(found.q_nominal).all()
     assert np.isnan([found.position_residual, found.rotation_residual, found.domain_measure]).all()
-    assert "is no pose" in found.sentences[0]
+    assert found.sentences[0] == Status.INVALID_POSE.sentence
     assert not Status(found.status).reaches
     if case != "text":
         T = model.forward(arms.draw_joints(model.robot, 5, seed=23)).numpy()
@@ -108,25 +108,25 @@ def test_control_loops_get_a_status_instead_of_an_exception(case, arms):
         every = kernels.all_branches(T, throw=False)
         assert (every.status[3] == Status.INVALID_POSE).all()
         assert every.branch[3].tolist() == list(range(8))
-        with pytest.raises(PoseError, match="at index 3 "):
+        with pytest.raises(PoseError, match="index 3 "):
             kernels.all_branches(T)
 
 
-def test_joint_values_that_are_not_finite_are_a_status_too(arms):
+def test_joint_values_that_are_not_finite_have_a_status(arms):
     kernels, model = arms.compiled("ur5"), arms.calibrated("ur5")
     q = arms.draw_joints(model.robot, 4, seed=24).numpy()
     T = model.forward(arms.draw_joints(model.robot, 4, seed=24)).numpy()
     q[2, 1] = np.inf
     found = kernels.solve_batch(T, near=q, throw=False)
     assert np.flatnonzero(found.status == Status.INVALID_POSE).tolist() == [2]
-    assert "to be near to" in found.sentences[2]
+    assert found.sentences[2] == Status.INVALID_POSE.sentence
     assert kernels.solve(T[2], near=q[2], throw=False).status == Status.INVALID_POSE
-    with pytest.raises(PoseError, match="near at index 2 holds"):
+    with pytest.raises(PoseError, match=r"near.* index 2 "):
         kernels.solve_batch(T, near=q)
 
 
 @pytest.mark.parametrize("values", [np.eye(3), [[1.0], [1.0, 2.0]], np.zeros(0)])
-def test_shapes_that_do_not_fit_raise_all_the_same(values, arms):
+def test_invalid_shapes_raise_even_without_throw(values, arms):
     with pytest.raises(PoseError):
         arms.compiled("ur5").solve(values, throw=False)
     with pytest.raises(PoseError):

@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from testing.refusals import refused
 
 from pisigma.files.errors import ModelError
 from pisigma.robot.kernels import build, machine_code
@@ -50,13 +51,13 @@ def test_code_of_other_sources_or_damaged_code_is_not_used(tmp_path, monkeypatch
         assert build.read_ready() is None
 
 
-def test_without_code_and_without_numba_one_sentence_says_what_to_install(monkeypatch):
+def test_without_code_and_numba_the_error_names_the_extra(monkeypatch):
     def missing() -> str:
         raise ImportError
 
     monkeypatch.setattr(machine_code, "_ready_forms", lambda: None)
     monkeypatch.setattr(machine_code, "intermediate_code", missing)
-    with pytest.raises(ModelError, match=r"install pisigma\[compile\]"):
+    with refused(ModelError, value="pisigma[compile]"):
         machine_code._intermediate_code(KernelForms())
     monkeypatch.setattr(machine_code, "intermediate_code", lambda: "made now")
     assert machine_code._intermediate_code(KernelForms()) == "made now"
