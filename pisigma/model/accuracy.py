@@ -1,4 +1,4 @@
-"""How well a model knows the positions that it predicts."""
+"""Predicted accuracy of a model's positions."""
 
 from dataclasses import replace
 
@@ -13,14 +13,14 @@ from pisigma.model.calibrated_model import CalibratedModel, corrected_joints, kn
 
 
 def position_accuracy(model: CalibratedModel, q: Float[Tensor, "*batch dof"]) -> Float64[Tensor, "*batch"]:
-    """Standard deviation of the tool's predicted position [m], `sqrt(σx² + σy² + σz²)`.
+    """Compute the standard deviation of the tool's predicted position [m], `sqrt(σx² + σy² + σz²)`.
 
     Args:
-        model: the model; its tool is that of the first target, in the first frame.
+        model: calibrated model; the position is that of its first target in its first frame.
         q: commanded joint values [rad or m].
 
     Returns:
-        NaN where a joint value is NaN, and everywhere where the model holds no uncertainty.
+        NaN where a joint value is NaN, and everywhere if the model has no uncertainty.
     """
     flat = q.detach().to("cpu", torch.float64).reshape(-1, q.shape[-1])
     result = torch.full((len(flat),), torch.nan, dtype=torch.float64)
@@ -43,15 +43,15 @@ def position_accuracy(model: CalibratedModel, q: Float[Tensor, "*batch dof"]) ->
 
 
 def deviation_of_rows(model: CalibratedModel, measurements: Measurements) -> Float64[Tensor, "rows 3"]:
-    """Standard deviation of the position of every row's target along the axes of its frame [m], without noise.
+    """Compute the standard deviation of every row's target position along the axes of its frame [m].
 
-    It is that of the posterior, at measured joint values and beyond them.
+    It is that of the posterior, without measurement noise, inside and outside the measured joint values.
 
     Returns:
-        NaN where the model holds no uncertainty.
+        NaN if the model has no uncertainty.
 
     Raises:
-        MeasurementError: the model does not know a frame or target of the rows.
+        MeasurementError: the model was not calibrated for a frame or target of the rows.
     """
     if model.uncertainty is None:
         return torch.full((measurements.rows, 3), torch.nan, dtype=torch.float64)
@@ -62,11 +62,11 @@ def deviation_of_rows(model: CalibratedModel, measurements: Measurements) -> Flo
 
 
 def parameter_posterior(model: CalibratedModel) -> ParameterPosterior | None:
-    """Return what the calibration says of all parameters together, in the user's coordinates.
+    """Return the joint posterior of all geometric parameters, in the user's coordinates.
 
     Returns:
-        Geometry, bases, tools and sensors' unknowns with all their correlations, also with the weights of the joint
-        correction; None where the model holds no uncertainty.
+        Geometry, bases, tools and unknown sensor parameters with all their correlations, including those with the
+        weights of the joint correction; None if the model has no uncertainty.
     """
     known = model.uncertainty
     return None if known is None else ParameterPosterior.of(known.space, known.geometry, known.root)

@@ -1,4 +1,4 @@
-"""A calibrated robot: geometry, learned joint corrections and where both hold, and the poses that it predicts."""
+"""A calibrated robot: its geometry, learned joint corrections, their domain, and the poses that it predicts."""
 
 import platform
 from dataclasses import dataclass, field
@@ -32,25 +32,25 @@ if TYPE_CHECKING:
 Frames = dict[str, Float64[np.ndarray, " 6"]]
 """Bases per frame or tools per target: x, y, z [m], roll, pitch, yaw [rad]."""
 CHUNK = 4_096
-"""Poses whose features are in memory at a time: a few hundred columns a joint."""
-STEP = 1e-5
-"""[rad or m] Of differences: with 100 cycles a turn their error is a millionth of a slope."""
+"""Poses whose features are held in memory at a time; each has a few hundred feature columns per joint."""
+DIFFERENCE_STEP = 1e-5
+"""[rad or m] Step of central differences; for a correction with 100 cycles per turn the error is 1e-6 of the slope."""
 
 
 @dataclass(frozen=True)
 class Provenance:
-    """Where a model comes from.
+    """Record of the recipe, data and software that a model was made with.
 
     Attributes:
-        recipe: the recipe's name.
-        recipe_sha256: hash of the recipe file.
-        data_source: the measured file, or "simulation".
-        data_sha256: hash of the training measurements.
-        rows: training rows used.
-        rows_left_out: training rows left out, with the rule in `rule`.
-        rule: why rows were left out.
-        seed: of the training.
-        versions: of pisigma, torch and python.
+        recipe: name of the recipe.
+        recipe_sha256: SHA-256 of the recipe file.
+        data_source: measurement file, or "simulation".
+        data_sha256: SHA-256 of the training measurements.
+        rows: number of training rows used.
+        rows_left_out: number of training rows left out by `rule`.
+        rule: rule by which rows were left out.
+        seed: random seed of the training.
+        versions: versions of pisigma, torch and python.
     """
 
     recipe: str = ""
@@ -65,40 +65,40 @@ class Provenance:
 
     @staticmethod
     def present_versions() -> dict[str, str]:
-        """Give the versions of pisigma, torch and python that are running."""
+        """Return the versions of pisigma, torch and python that are running."""
         return {"pisigma": version("pisigma"), "torch": version("torch"), "python": platform.python_version()}
 
 
 @dataclass(frozen=True, eq=False)
 class CalibratedModel:
-    """Everything that `pisigma.load` needs.
+    """A calibrated robot with everything that corrected inverse kinematics needs.
 
     Attributes:
-        name: of the model.
-        kind: how it was made, such as "inverse_calibration".
-        robot: its kinematics give the nominal joint values; base and tool as fitted.
-        network: joint corrections, or None.
-        domain: where the corrections hold, or None.
-        branches: branches of the closed-form inverse that the training rows lie on, most frequent first;
-            empty where there is no closed form.
-        starts: commanded joint values [rad or m] of training rows: on the turns that the network knows, and
-            where there is no closed form the starts of the numeric inverse.
-        calibrated: the robot with its geometry as identified, base and tool those of `robot`; None where the
-            geometry is the nominal one.
-        bases: per frame of the measurements ("" where it had no name) x, y, z [m], roll, pitch, yaw [rad] of
-            the base in it; the first is that of `robot`. Empty where frames were not told apart.
-        tools: the same per target for the tool.
-        hybrid: the arm with a joint correction that was fitted through the kinematics, with a geometry of its own
-            beside the one of `calibrated`; None where there is none.
-        hybrid_bases: the bases that go with the hybrid's geometry, by the names of `bases`.
+        name: name of the model.
+        kind: how the model was made, for example "inverse_calibration".
+        robot: robot whose kinematics yield the nominal joint values; its base and tool are the fitted ones.
+        network: network that corrects nominal joint values, or None.
+        domain: region in which the corrections of `network` are valid, or None.
+        branches: branches of the closed-form inverse on which the training rows are, most frequent first; empty if the
+            robot has no closed-form inverse.
+        starts: commanded joint values [rad or m] of training rows. The network is evaluated at joint values wrapped
+            near them; without a closed form they are the initial values of the numeric inverse.
+        calibrated: robot with the identified geometry and the base and tool of `robot`; None if the geometry is the
+            nominal one.
+        bases: for every frame of the measurements ("" if it has no name) x, y, z [m], roll, pitch, yaw [rad] of the
+            base in it; the first is that of `robot`. Empty if the measurements did not distinguish frames.
+        tools: the same for the tool, for every target.
+        hybrid: arm with a joint correction that was fitted through the kinematics; its geometry differs from that of
+            `calibrated`. None without such a correction.
+        hybrid_bases: bases that belong to the hybrid's geometry, with the names of `bases`.
         hybrid_tools: the same for the tools.
-        uncertainty: of predicted positions, or None.
-        made_of: joint values and readings of rows that it was made of, by which they are recognised when they come
-            again; None where these were not kept. See `pisigma.model.training_rows`.
-        conditions: payload [kg] and temperature [deg C] that it was put under, by name; empty for the usual ones of
-            the rows. See `pisigma.model.stated_conditions`.
-        measured_conditions: the lowest and the highest value of these that it was calibrated at, of stated ones only.
-        provenance: recipe, data, versions.
+        uncertainty: uncertainty of predicted positions, or None.
+        made_of: joint values and readings of the training rows, by which repeated rows are recognised; None if they
+            were not kept. See `pisigma.model.training_rows`.
+        conditions: payload [kg] and temperature [deg C] at which the model is evaluated, by name; empty for the mean
+            conditions of the calibration rows. See `pisigma.model.stated_conditions`.
+        measured_conditions: lowest and highest calibrated value of every condition in `conditions` that was stated.
+        provenance: recipe, data and versions that the model was made with.
         metrics: figures for the card, by name.
     """
 
@@ -124,12 +124,12 @@ class CalibratedModel:
 
     @property
     def identified(self) -> Robot:
-        """The geometry that commanded joint values go through: of the hybrid, as identified, or else nominal."""
+        """Robot with the best known geometry: that of the hybrid, else `calibrated`, else the nominal one."""
         return self.calibrated or self.robot if self.hybrid is None else self.hybrid.robot
 
     @property
     def drawn(self) -> Robot | None:
-        """The robot as drawn, with its own base and tool, where a hybrid calibration knows it."""
+        """Nominal robot with its own base and tool; None if the model does not come from a hybrid calibration."""
         if self.hybrid is not None:
             return self.hybrid.correction.robot
         return None if self.uncertainty is None else self.uncertainty.space.robot
@@ -137,51 +137,50 @@ class CalibratedModel:
     def correction(
         self, T: Float64[Tensor, "*batch 4 4"], q_nominal: Float64[Tensor, "*batch dof"]
     ) -> Float64[Tensor, "*batch dof"]:
-        """Correction [rad or m] that `network` adds to the nominal joint values of poses T; 0 without one."""
+        """Compute the correction [rad or m] that `network` adds to nominal joint values of poses T; 0 without one."""
         if self.network is None:
             return torch.zeros_like(q_nominal)
         with torch.no_grad():
             result: Tensor = self.network(T, q_nominal)
         return result
 
-    def as_trained(self, q: Float64[Tensor, "*batch dof"]) -> Float64[Tensor, "*batch dof"]:
-        """Joint values [rad or m] turned as those of the training rows, which `network` knows."""
+    def wrapped_near_training(self, q: Float64[Tensor, "*batch dof"]) -> Float64[Tensor, "*batch dof"]:
+        """Wrap joint values [rad or m] near those of the training rows, for which `network` was trained."""
         if not len(self.starts):
             return q
         return nearest_turn(self.robot, q, middle_of_starts(self.starts), within_limits=False)
 
     def forward(self, q: Float64[Tensor, "*batch dof"]) -> Float64[Tensor, "*batch 4 4"]:
-        """Pose T_base_tool that the robot takes when commanded to q [rad or m], as far as the model knows.
+        """Predict the pose T_base_tool that the robot takes when commanded to q [rad or m].
 
-        With an identified geometry it is its forward kinematics, with the joint correction of a hybrid. Else
-        it is the pose whose corrected joint values are q, see `nominal_joints`.
+        With an identified geometry this is its forward kinematics, including the joint correction of a hybrid.
+        Otherwise it is the pose whose corrected joint values are q, see `nominal_joints`.
 
         Returns:
-            The poses; NaN where the iteration does not settle because the correction is steeper than the
-            joints, as it may be far outside the domain, and where a joint value is NaN.
+            The poses; NaN where a joint value is NaN, and where the fixed-point iteration does not converge because the
+            slope of the correction exceeds 1, which can happen far outside the domain.
         """
         if self.hybrid is not None:
             return hybrid_poses(self.hybrid, q)
         if self.calibrated is not None:
             return forward_kinematics(self.calibrated, q)
         q_nominal = self.nominal_joints(q)
-        settled = torch.isfinite(q_nominal).all(-1, keepdim=True)
-        T = forward_kinematics(self.robot, torch.where(settled, q_nominal, q))
-        return torch.where(settled[..., None], T, torch.nan)
+        converged = torch.isfinite(q_nominal).all(-1, keepdim=True)
+        T = forward_kinematics(self.robot, torch.where(converged, q_nominal, q))
+        return torch.where(converged[..., None], T, torch.nan)
 
     def to_pytorch_kinematics(self) -> "pytorch_kinematics.SerialChain":
-        """Give the identified geometry as a chain of pytorch-kinematics in float64.
+        """Return the identified geometry as a chain of pytorch-kinematics in float64.
 
-        The joint correction is no part of such a chain: with a hybrid, or a network on nominal joint values, the chain
-        is where the tool would be at joint values without it. Without an identified geometry it is the nominal robot
-        with base and tool as fitted.
+        The chain does not include the joint correction of a hybrid or of a network on nominal joint values. Without an
+        identified geometry it is the nominal robot with the fitted base and tool.
         """
         return (self.calibrated or self.robot).to_pytorch_kinematics()
 
     def jacobian(self, q: Float64[Tensor, "*batch dof"]) -> Float64[Tensor, "*batch 6 dof"]:
-        """Geometric Jacobian of the arm at commanded joint values q [rad or m], see `joint_jacobian`.
+        """Compute the geometric Jacobian of the arm at commanded joint values q [rad or m], see `joint_jacobian`.
 
-        The slope of the correction, some 1e-3, is left out, and so is a network that corrects nominal joint values.
+        The slope of the joint correction, about 1e-3, is neglected, and so is a network on nominal joint values.
         """
         if self.hybrid is None:
             return joint_jacobian(self.calibrated or self.robot, q)[1]
@@ -189,10 +188,10 @@ class CalibratedModel:
         return J.reshape(*q.shape[:-1], 6, q.shape[-1])
 
     def nominal_joints(self, q: Float64[Tensor, "*batch dof"]) -> Float64[Tensor, "*batch dof"]:
-        """Joint values `q_nominal = q - Δ(FK(q_nominal), q_nominal)` [rad or m] that `network` corrects to q.
+        """Solve `q_nominal = q - Δ(FK(q_nominal), q_nominal)` [rad or m] by fixed-point iteration.
 
         Returns:
-            NaN where the iteration does not settle; q itself without a network.
+            Joint values that `network` corrects to q: NaN where the iteration does not converge, q without a network.
         """
         q_nominal, moved = q, torch.zeros_like(q)
         for _ in range(FORWARD_ITERATIONS if self.network is not None else 0):
@@ -200,19 +199,22 @@ class CalibratedModel:
             moved, q_nominal = (following - q_nominal).abs(), following
             if bool((moved <= FORWARD_TOLERANCE).all()):
                 break
-        settled = (moved <= FORWARD_ACCEPTED).all(-1, keepdim=True)
-        return torch.where(settled, q_nominal, torch.nan)
+        converged = (moved <= FORWARD_ACCEPTED).all(-1, keepdim=True)
+        return torch.where(converged, q_nominal, torch.nan)
 
 
 def poses_of_rows(model: CalibratedModel, measurements: Measurements) -> Float64[Tensor, "rows 4 4"]:
-    """Where a model of any kind says that the targets were, each in the frame of its row.
+    """Predict the pose of every row's target in the frame of the row.
 
-    NaN where the model predicts nothing; see `CalibratedModel.forward`. Under the conditions (payload, temperature)
-    of the rows, where a hybrid knows of them; `CalibratedModel.forward` is under the usual ones.
+    A hybrid that learned the effect of payload or temperature is evaluated at the conditions of the rows, whereas
+    `CalibratedModel.forward` uses the mean ones of the calibration.
+
+    Returns:
+        The poses; NaN where the model has no prediction, see `CalibratedModel.forward`.
 
     Raises:
-        MeasurementError: the model does not know a frame or target of the rows.
-        PoseError: the joint values do not fit the robot.
+        MeasurementError: the model was not calibrated for a frame or target of the rows.
+        PoseError: the number of joint values is not that of the robot's joints.
     """
     arm = model.hybrid
     if arm is not None:
@@ -223,7 +225,7 @@ def poses_of_rows(model: CalibratedModel, measurements: Measurements) -> Float64
 
 
 def nominal_poses_of_rows(model: CalibratedModel, measurements: Measurements) -> Float64[Tensor, "rows 4 4"]:
-    """The same for the model's robot without any correction, its bases and tools as fitted.
+    """Predict the poses of the rows without any correction, from the nominal arm with fitted bases and tools.
 
     For errors see `poses_of_rows`.
     """
@@ -232,7 +234,7 @@ def nominal_poses_of_rows(model: CalibratedModel, measurements: Measurements) ->
 
 
 def bases_of_rows(model: CalibratedModel, measurements: Measurements) -> Float64[Tensor, "#rows 4 4"]:
-    """Where the robot's base stands in the frame of every row; for errors see `poses_of_rows`."""
+    """Return the pose of the robot's base in the frame of every row; for errors see `poses_of_rows`."""
     bases = _of_rows(model.bases, measurements.frame, "frame", measurements)
     return transform_from_xyzrpy(torch.from_numpy(model.robot.base[None].copy())) if bases is None else bases
 
@@ -240,19 +242,19 @@ def bases_of_rows(model: CalibratedModel, measurements: Measurements) -> Float64
 def known_names(
     known: Frames, names: tuple[str, ...], what: str, measurements: Measurements
 ) -> tuple[str, ...]:
-    """The frame or target of every row as the model calls it.
+    """Return the frame or target of every row under the model's name for it.
 
-    A model that was fitted to rows without names takes rows of any one name, and one that was fitted to a
-    single name takes rows without.
+    A model that was fitted to rows without names accepts rows with any single name, and one that was fitted to a
+    single name accepts rows without names.
 
     Args:
-        known: what the model knows.
-        names: of the rows.
+        known: frames or targets of the model.
+        names: names of the rows' frames or targets.
         what: "frame" or "target".
         measurements: the rows, for messages.
 
     Raises:
-        MeasurementError: the model does not know a name.
+        MeasurementError: the model was not calibrated for one of the names.
     """
     if not set(known) - {""}:
         if len(set(names)) > 1:
@@ -278,7 +280,7 @@ def known_names(
 def _seen(
     T: Float64[Tensor, "rows 4 4"], robot: Robot, bases: Frames, tools: Frames, measurements: Measurements
 ) -> Float64[Tensor, "rows 4 4"]:
-    """Poses T_base_tool as poses of the rows' targets in the rows' frames."""
+    """Convert poses T_base_tool to poses of the rows' targets in the rows' frames."""
     before = _of_rows(bases, measurements.frame, "frame", measurements)
     behind = _of_rows(tools, measurements.target, "target", measurements)
     if before is not None:
@@ -291,7 +293,7 @@ def _seen(
 def _of_rows(
     known: Frames, names: tuple[str, ...], what: str, measurements: Measurements
 ) -> Float64[Tensor, "rows 4 4"] | None:
-    """The base or tool of every row; None where there is one only, which the robot has already."""
+    """Return the base or tool of every row; None if there is only one, which the robot already includes."""
     names = known_names(known, names, what, measurements)
     if len(known) < 2:
         return None
@@ -301,10 +303,10 @@ def _of_rows(
 
 
 def hybrid_poses(arm: HybridArm, q: Float[Tensor, "*batch dof"]) -> Float[Tensor, "*batch 4 4"]:
-    """Poses T_base_tool of an arm at commanded joint values [rad or m], of any number of rows.
+    """Compute poses T_base_tool of an arm at commanded joint values [rad or m], in chunks of bounded memory.
 
     Raises:
-        PoseError: q has another number of columns than the robot has joints.
+        PoseError: the number of columns of q is not the robot's number of joints.
     """
     arm.robot.check_joint_count(q.shape[-1])
     flat = q.reshape(-1, q.shape[-1])
@@ -312,7 +314,7 @@ def hybrid_poses(arm: HybridArm, q: Float[Tensor, "*batch dof"]) -> Float[Tensor
 
 
 def corrected_joints(arm: HybridArm, measurements: Measurements) -> Float64[Tensor, "rows dof"]:
-    """Joint values of measured rows with the correction of the network in full, `q + Δ(q)` [rad or m]."""
+    """Compute the corrected joint values `q + Δ(q)` [rad or m] of measured rows at their measured conditions."""
     chunks = JointState.of(measurements).split(CHUNK)
     with torch.no_grad():
         return torch.cat([state.q + arm.correction(state) for state in chunks])
@@ -321,13 +323,13 @@ def corrected_joints(arm: HybridArm, measurements: Measurements) -> Float64[Tens
 def hybrid_motion(
     arm: HybridArm, q: Float[Tensor, "poses dof"], exact: bool = True
 ) -> tuple[Float[Tensor, "poses 4 4"], Float[Tensor, "poses 6 dof"]]:
-    """Poses and joint Jacobian `J(q + Δ) (1 + dΔ/dq)` of a hybrid arm.
+    """Compute poses and joint Jacobian `J(q + Δ) (1 + dΔ/dq)` of a hybrid arm.
 
     Args:
-        arm: the arm.
+        arm: arm with its joint correction.
         q: commanded joint values [rad or m].
-        exact: whether dΔ/dq is computed, which costs some times as much as Δ. Without it Newton steps contract by
-            |dΔ/dq|, of the order of 1e-2.
+        exact: whether to include dΔ/dq, which costs several evaluations of Δ. Without it every Newton step reduces the
+            error by a factor |dΔ/dq|, of the order of 1e-2.
     """
     chunk = CHUNK // (2 * q.shape[1]) if exact else CHUNK
     with torch.no_grad():
@@ -344,8 +346,8 @@ def _motion(arm: HybridArm, q: Tensor, exact: bool) -> tuple[Tensor, Tensor]:
 
 
 def _slope(arm: HybridArm, q: Float[Tensor, "poses dof"]) -> Float[Tensor, "poses dof dof"]:
-    """Derivatives of the corrections by the joint values, by central differences in one call."""
-    step = STEP * torch.eye(q.shape[1], dtype=q.dtype, device=q.device)
+    """Compute the derivatives of the corrections by the joint values, by central differences in one call."""
+    step = DIFFERENCE_STEP * torch.eye(q.shape[1], dtype=q.dtype, device=q.device)
     above, below = torch.chunk(arm.delta(q[:, None] + torch.cat([step, -step])), 2, 1)
-    slope: Tensor = (above - below).mT / (2 * STEP)
+    slope: Tensor = (above - below).mT / (2 * DIFFERENCE_STEP)
     return slope

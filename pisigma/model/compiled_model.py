@@ -1,4 +1,4 @@
-"""A calibrated model as plain arrays for the compiled inverse kinematics."""
+"""Conversion of calibrated models to the plain arrays of the compiled inverse kinematics."""
 
 import os
 from collections.abc import Sequence
@@ -26,17 +26,17 @@ _NUMERIC = ("numeric",)
 _Input = tuple[int, list[float]]
 _Member = tuple[JointGroup, PiSigma]
 _COARSE = 0.01
-"""Coordinates that vary by less, of the one that varies most, say next to nothing about a distance."""
+"""Coordinates whose range is below this share of the largest one contribute hardly anything to a distance."""
 _FUNCTIONS = {"": arrays.ANGLE, "sin": arrays.SINE, "cos": arrays.COSINE}
 
 
 def save_compiled(model: CalibratedModel, file: str | os.PathLike[str], belongs_to: str = "") -> None:
-    """Write what `CompiledIK.load` reads.
+    """Write the file that `CompiledIK.load` reads.
 
     Args:
-        model: the model.
-        file: to write.
-        belongs_to: `folder_hash` of the folder that says the same, kept in the file: one with another is stale.
+        model: model to convert.
+        file: file to write.
+        belongs_to: `content_hash` of the model folder, stored in the file; a file with another hash is stale.
 
     Raises:
         ModelError: see `describe`.
@@ -49,33 +49,39 @@ def save_compiled(model: CalibratedModel, file: str | os.PathLike[str], belongs_
 
 
 def describe(model: CalibratedModel) -> tuple[arrays.Description, tuple[str, ...]]:
-    """A model as arrays, and the names of its branches.
+    """Convert a model to arrays, and return these with the names of its branches.
 
     Raises:
         ModelError: the model has a network and an identified geometry, its learned correction uses features without
-            compiled form, it has neither a closed-form inverse nor joint values to start from, or its joints are
-            coupled: kernels take DH values, which nobody should command.
+            compiled form, it has neither a closed-form inverse nor initial joint values, or its joints are coupled
+            (kernels take DH values, which must not be commanded to a controller).
     """
     if model.robot.dof > MAX_JOINTS:
         raise ModelError(
-            f"model '{model.name}': its robot has {model.robot.dof} joints, but compiled models have "
-            f"{MAX_JOINTS} at most; use pisigma.load, which solves without kernels."
+            f"expected at most {MAX_JOINTS} joints for a compiled model, got model '{model.name}' with "
+            f"{model.robot.dof}",
+            value=model.robot.dof,
+            remedy="use pisigma.load, which solves without kernels",
         )
     if model.robot.coupling is not None:
         raise ModelError(
-            f"model '{model.name}': its joints are coupled, which compiled models do not know; use pisigma.load, which "
-            "turns the controller's values into those of the joints."
+            f"compiled models do not support coupled joints, which model '{model.name}' has",
+            value="coupling",
+            remedy="use pisigma.load, which converts the controller's values to joint values",
         )
     if model.network is not None and model.calibrated is not None:
         raise ModelError(
-            f"model '{model.name}': it has an identified geometry and a network that corrects nominal joint values, "
-            "which has no compiled form; leave one out."
+            f"model '{model.name}' has both an identified geometry and a network that corrects nominal joint values, "
+            "which has no compiled form",
+            value="network",
+            remedy="leave one of them out",
         )
     solver = closed_form_solver(model.robot)
     if solver is None and not len(model.starts):
         raise ModelError(
-            f"model '{model.name}': its robot has no closed-form inverse, and the model holds no joint values to "
-            "start from; calibrate it again."
+            f"the robot of model '{model.name}' has no closed-form inverse, and the model has no initial joint values",
+            value="starts",
+            remedy="calibrate it again",
         )
     correction, features = _correction(model)
     stored = StoredStarts(model.identified, model.starts.double().cpu())
@@ -108,7 +114,7 @@ def _arms(model: CalibratedModel) -> arrays.Arms:
 
 
 def _correction(model: CalibratedModel) -> tuple[arrays.Correction, tuple[str, ...]]:
-    """The joint correction of a model, and the names of its features in the order of their numbers.
+    """Convert the joint correction of a model, and return it with the names of its features in order.
 
     Raises:
         ModelError: a feature has no compiled form, or two have the same name.
@@ -124,8 +130,10 @@ def _correction(model: CalibratedModel) -> tuple[arrays.Correction, tuple[str, .
             numbers[feature.name] = feature.pack(weight.detach().numpy())
         elif not feature.usually_zero:
             raise ModelError(
-                f"model '{model.name}': its correction uses the feature '{feature.name}', which has no compiled form "
-                "(or stands twice)."
+                f"the correction of model '{model.name}' uses the feature '{feature.name}', which has no compiled form "
+                "or appears twice",
+                value=feature.name,
+                remedy="use pisigma.load, which solves without kernels",
             )
     fixed, starts = correction.fixed.numpy(), np.cumsum([0, *(len(values) for values in numbers.values())])
     compiled = arrays.Correction(
@@ -160,8 +168,9 @@ def _closed_form(model: CalibratedModel, solver: AbstractClosedForm | None) -> a
         return arrays.ClosedForm(1, first, 1, none, none, *[zeros] * 6)
     if solver.compiled is None:
         raise ModelError(
-            f"model '{model.name}': the closed form {type(solver).__name__} of its robot has no compiled form; use "
-            "pisigma.load, which solves without kernels."
+            f"the closed-form inverse {type(solver).__name__} of model '{model.name}' has no compiled form",
+            value=type(solver).__name__,
+            remedy="use pisigma.load, which solves without kernels",
         )
     rows, names = solver.rows, solver.branches
     trained = [names.index(name) for name in model.branches] or list(range(len(names)))
@@ -181,7 +190,7 @@ def _closed_form(model: CalibratedModel, solver: AbstractClosedForm | None) -> a
 
 
 def _network(model: CalibratedModel) -> arrays.Network:
-    """The network of a model and its domain; one that is not used where the model has none."""
+    """Convert the network of a model and its domain; without a network the result is marked as unused."""
     dof = model.robot.dof
     members = model.network.members() if model.network else []
     inputs = [_input(group, name) for group, _ in members for name in group.inputs.names]
@@ -226,7 +235,7 @@ def _network(model: CalibratedModel) -> arrays.Network:
 
 
 class _Domain(NamedTuple):
-    """Rows of a domain by the coordinates that differ, those that vary most first; see `compiled.arrays.Network`."""
+    """Samples of a domain in its distinct coordinates, widest first; see `robot.kernels.arrays.Network`."""
 
     samples: np.ndarray
     column: np.ndarray
@@ -235,7 +244,7 @@ class _Domain(NamedTuple):
 
     @staticmethod
     def of(model: CalibratedModel, inputs: Sequence[_Input], members: Sequence[_Member]) -> "_Domain":
-        """The domain of a model; one without rows where it has none."""
+        """Convert the domain of a model; without a domain the result has no rows."""
         none = np.zeros(0, dtype=np.int64)
         if model.network is None or model.domain is None:
             return _Domain(np.zeros((0, 0)), none, np.zeros(0), 0)
@@ -259,7 +268,7 @@ class _Domain(NamedTuple):
 
 
 def _input(group: JointGroup, name: str) -> _Input:
-    """What kind of input a name means, and the factor of every joint in it."""
+    """Return the kind of an input, and the factor of every joint in it."""
     function, factors = group.inputs.combination(name)
     if not factors:
         return POSE_INPUTS.index(name), [0.0] * len(group.inputs.joint_names)

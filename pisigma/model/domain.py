@@ -1,29 +1,29 @@
-"""How far a pose lies from the data that a correction was learned from."""
+"""Distance of a pose from the training data of a joint correction."""
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-MAXIMUM_SAMPLES = 2048
+MAX_SAMPLES = 2048
 MARGIN = 1.05
-"""A pose may lie this much farther from the data than the data lie from each other."""
+"""Factor between the radius of a domain and the largest distance between neighbouring training rows."""
 
 REPEAT = 1e-3
-"""Training rows nearer than this, in scaled inputs that range over 2, count as repeats of one measurement."""
+"""Training rows that are closer than this, in scaled inputs from -1 to 1, count as repeats of one measurement."""
 
 _CHUNK = 4096
 
 
 class Domain(nn.Module):
-    """The region of the network's scaled inputs that the training rows cover.
+    """Region of the network's scaled inputs that the training rows cover.
 
-    The measure of a pose is its distance to the nearest training row over `radius`, the largest distance of a
-    training row to its nearest neighbour (with 5 % of margin; repeats are no neighbours); up to 1 a pose is
-    inside.
+    The measure of a pose is its distance to the nearest training row divided by `radius`, which is the largest distance
+    of a training row to its nearest neighbour plus 5 % (repeats do not count as neighbours). A pose with a measure of
+    at most 1 is inside.
 
     Attributes:
         samples: `(samples, inputs)`: scaled inputs of training rows.
-        radius: in scaled units.
+        radius: radius in scaled inputs.
     """
 
     samples: Tensor
@@ -33,22 +33,21 @@ class Domain(nn.Module):
         """Keep samples and radius as buffers.
 
         Raises:
-            ValueError: there is no sample, or the radius is not above 0.
+            ValueError: there is no sample, or the radius is not positive.
         """
         super().__init__()
         if samples.shape[0] == 0 or not float(radius) > 0:
             raise ValueError(
-                f"a domain needs a sample and a radius above 0, got {samples.shape[0]} samples, radius "
-                f"{radius:g}."
+                f"expected at least one sample and a radius > 0, got {samples.shape[0]} samples and radius {radius:g}."
             )
         self.register_buffer("samples", samples)
         self.register_buffer("radius", radius)
 
     @staticmethod
     def around(scaled: Float[Tensor, "rows inputs"], generator: torch.Generator) -> "Domain":
-        """The region around training rows; of more than 2048, as many are drawn."""
-        if scaled.shape[0] > MAXIMUM_SAMPLES:
-            drawn = torch.randperm(scaled.shape[0], generator=generator)[:MAXIMUM_SAMPLES]
+        """Make the region around training rows, of which at most `MAX_SAMPLES`, drawn at random, are kept."""
+        if scaled.shape[0] > MAX_SAMPLES:
+            drawn = torch.randperm(scaled.shape[0], generator=generator)[:MAX_SAMPLES]
             scaled = scaled[drawn.to(scaled.device)]
         distances = _distances(scaled, scaled)
         nearest = torch.where(distances > REPEAT, distances, torch.inf).amin(-1)
@@ -56,18 +55,18 @@ class Domain(nn.Module):
         return Domain(scaled, spacing * MARGIN)
 
     def measure(self, scaled: Float[Tensor, "*batch inputs"]) -> Float[Tensor, "*batch"]:
-        """Distance to the nearest training row over the radius; NaN where an input is NaN."""
+        """Compute the distance to the nearest training row divided by the radius; NaN where an input is NaN."""
         chunks = torch.split(scaled.reshape(-1, scaled.shape[-1]), _CHUNK)
         nearest = torch.cat([_distances(chunk, self.samples).amin(-1) for chunk in chunks])
         return (nearest / self.radius).reshape(scaled.shape[:-1])
 
     def contains(self, scaled: Float[Tensor, "*batch inputs"]) -> Bool[Tensor, "*batch"]:
-        """Whether poses are inside; a NaN never is."""
+        """Return whether poses are inside; False where an input is NaN."""
         return self.measure(scaled) <= 1
 
 
 def _distances(
     a: Float[Tensor, "rows inputs"], b: Float[Tensor, "samples inputs"]
 ) -> Float[Tensor, "rows samples"]:
-    """Euclidean distances from differences: products of matrices would lose half the digits of small ones."""
+    """Compute Euclidean distances from differences; the faster way by matrix products loses half of the digits."""
     return torch.cdist(a, b, compute_mode="donot_use_mm_for_euclid_dist")

@@ -1,4 +1,4 @@
-"""A geometric or hybrid calibration as a model that corrected inverse kinematics can be made from."""
+"""Make a calibrated model from the result of a geometric or hybrid calibration."""
 
 from dataclasses import replace
 
@@ -28,15 +28,15 @@ def model_of_calibration(
 ) -> CalibratedModel:
     """Make the model of a geometric calibration.
 
-    Its poses are those of the first target in the first frame of the measurements. Nominal joint values are
-    those of the nominal arm on the base and with the tool that were identified.
+    Its poses are those of the first target in the first frame of the measurements. Nominal joint values are those of
+    the nominal arm with the identified base and tool.
 
     Args:
-        name: of the model.
-        nominal: the robot as drawn.
+        name: name of the model.
+        nominal: nominal robot.
         result: its calibration.
-        measurements: the rows it was calibrated with.
-        recipe: name and SHA-256 of the recipe, where there was one.
+        measurements: rows that it was calibrated with.
+        recipe: name and SHA-256 of the recipe; empty texts without one.
     """
     made_of = kept_rows(nominal, measurements)
     robot = nominal.with_geometry(base=result.robot.base, tool=result.robot.tool)
@@ -72,7 +72,7 @@ def model_of_hybrid(
     measurements: Measurements,
     recipe: tuple[str, str] = ("", ""),
 ) -> CalibratedModel:
-    """Make the model of a hybrid calibration; without a joint correction that of its geometric calibration.
+    """Make the model of a hybrid calibration, or of its geometric part if no joint correction was learned.
 
     For the arguments see `model_of_calibration`.
     """
@@ -80,7 +80,7 @@ def model_of_hybrid(
 
 
 def with_hybrid(model: CalibratedModel, result: HybridResult) -> CalibratedModel:
-    """Add to the model of a geometric calibration what a hybrid calibration that builds upon it has learned."""
+    """Add the joint correction and the uncertainty of a hybrid calibration to the model of its geometric part."""
     known, learned = result.geometric, result.learned
     if learned is None:
         geometry = IdentifiedGeometry(known.robot, model.bases, model.tools, known.unknowns)
@@ -98,11 +98,11 @@ def with_hybrid(model: CalibratedModel, result: HybridResult) -> CalibratedModel
 
 
 def _kept(uncertainty: PositionUncertainty, geometry: IdentifiedGeometry) -> PositionUncertainty:
-    """An uncertainty at the geometry of a model, with a root in the form that a folder holds."""
+    """Return the uncertainty at the geometry of a model, with the covariance root in the form that folders store."""
     return replace(uncertainty, geometry=geometry, covariance_root=CovarianceRoot(uncertainty.root))
 
 
 def branches_of(nominal: Robot, q: Float64[Tensor, "rows dof"]) -> tuple[str, ...]:
-    """Name the branches of the nominal arm that joint values lie on, most frequent first; none without closed form."""
+    """Name the nominal arm's branches that occur in joint values, most frequent first; none without closed form."""
     solver = closed_form_solver(nominal)
     return () if solver is None else solver.frequent(nearest_branch(solver, q))

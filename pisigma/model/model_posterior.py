@@ -1,4 +1,4 @@
-"""What a calibrated model knows: the values of all unknowns of its arm, and the root of their covariance."""
+"""Posterior of a calibrated model: values of all unknowns of its arm, and a root of their covariance."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -11,7 +11,7 @@ from torch import Tensor
 
 from pisigma.calibration.geometric.problem.parameters import ParameterSpace
 from pisigma.calibration.geometric.problem.setup import IdentifiedGeometry
-from pisigma.files.errors import MeasurementError, ModelError
+from pisigma.files.errors import MeasurementError, ModelError, Place
 from pisigma.joint_correction.feature import AbstractFeature
 from pisigma.joint_correction.input_products import InputProducts
 from pisigma.joint_correction.joint_correction import JointCorrection
@@ -19,34 +19,37 @@ from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel
 
 FLEET_PRIOR = "fleet_prior"
-"""Kind of a model of what robots of one type have in common; each robot stands elsewhere."""
+"""Kind of a model that holds the prior of a fleet: what robots of one type have in common, except base and tool."""
 
 
 def check_fleet_prior(model: CalibratedModel) -> None:
-    """Refuse a model that is not what robots of one type have in common.
+    """Raise an error unless a model is the prior of a fleet.
 
     Raises:
-        ModelError: it is of another kind.
+        ModelError: the model is of another kind.
     """
     if model.kind != FLEET_PRIOR:
         raise ModelError(
-            f"model '{model.name}' is a model of one robot ({model.kind.replace('_', ' ')}), while what the robots of "
-            "a fleet have in common was wanted as the prior; estimate that with `pisigma fleet prior FLEET --out DIR`, "
-            "or add rows of the same robot with `pisigma recalibrate MODEL ROWS --out DIR`."
+            f"expected the prior of a fleet, got model '{model.name}' of one robot ({model.kind.replace('_', ' ')})",
+            expected="the prior of a fleet",
+            value=model.kind,
+            remedy="estimate the prior with `pisigma fleet prior FLEET --out DIR`, or add rows of the same robot with "
+            "`pisigma recalibrate MODEL ROWS --out DIR`",
         )
 
 
 @dataclass(frozen=True, eq=False)
 class ModelPosterior:
-    """Normal distribution of geometry, bases, tools, sensors' unknowns and weights of the joint correction.
+    """Normal distribution of geometry, bases, tools, unknown sensor parameters and weights of the joint correction.
 
     Attributes:
-        space: the parameters, of the robot as drawn.
+        space: parameters, as deviations from the nominal robot.
         geometry: their most probable values.
-        features: of the joint correction, products of inputs among them.
-        weights: of the used columns of the features.
-        root: `R` with the covariance `R R^T` of the parameters, in the user's coordinates, and then of the weights.
-        noise: per sensor [m or rad], see `pisigma.calibration.hybrid.uncertainty.PositionUncertainty`.
+        features: features of the joint correction, including products of inputs.
+        weights: weights of the used columns of the features.
+        root: `R` with the covariance `R R^T`; first the rows of the parameters, in the user's coordinates, then those
+            of the weights.
+        noise: standard deviation of the noise by sensor [m or rad], see `PositionUncertainty`.
     """
 
     space: ParameterSpace
@@ -58,21 +61,23 @@ class ModelPosterior:
 
     @staticmethod
     def of(model: CalibratedModel) -> "ModelPosterior":
-        """Take what a model of `pisigma calibrate` or `pisigma recalibrate` holds.
+        """Take the posterior from a model of `pisigma calibrate` or `pisigma recalibrate`.
 
         Raises:
-            ModelError: it holds no posterior, or not that of all unknowns.
+            ModelError: the model has no posterior, or one that lacks unknowns.
         """
         known = model.uncertainty
         if known is None:
             raise ModelError(
-                f"model '{model.name}' ({model.kind}) holds no posterior of its parameters, which rows could be added "
-                "to; make it again with `pisigma calibrate ROBOT DATA --out DIR`, which calibrates a hybrid."
+                f"model '{model.name}' ({model.kind}) has no posterior of its parameters to which rows can be added",
+                value=model.kind,
+                remedy="calibrate a hybrid with `pisigma calibrate ROBOT DATA --out DIR`",
             )
         if not bool(torch.isfinite(known.geometry.values_of(known.space)).all()):
             raise ModelError(
-                f"model '{model.name}' is of a version that did not keep where its sockets or anchors are; make it "
-                "again with `pisigma calibrate ROBOT DATA --out DIR`."
+                f"model '{model.name}' was written by a version that did not store the positions of its sockets or "
+                "anchors",
+                remedy="calibrate it again with `pisigma calibrate ROBOT DATA --out DIR`",
             )
         correction = None if model.hybrid is None else model.hybrid.correction
         weights = known.root.new_zeros(0) if correction is None else _weights(correction, known.features)
@@ -80,7 +85,7 @@ class ModelPosterior:
 
     @cached_property
     def usual_weights(self) -> Float64[Tensor, " weights"]:
-        """Root mean square of the weights of every prior size, as far as the posterior says [rad or m]."""
+        """Posterior root mean square [rad or m] of the weights that share a prior size, for every weight."""
         square = self.weights.square() + self.root[len(self.space.parameters) :].square().sum(1)
         first, numbers = 0, []
         for feature in self.features:
@@ -92,16 +97,19 @@ class ModelPosterior:
         return mean.sqrt()[number]
 
     def renamed(self, rows: Measurements) -> Measurements:
-        """Name the frame and the target of rows as the model does where one of them has no name for its only one.
+        """Give the frame and target of rows the model's names where the rows or the model have a single unnamed one.
 
         Raises:
-            MeasurementError: the rows have the model's target for their frame, as where a camera is taken for fixed.
+            MeasurementError: the frame of the rows is a target of the model, as when a camera is wrongly taken as
+                fixed.
         """
         crossed = {*rows.frame} & {*self.geometry.tools} - {"", *self.geometry.bases}
         if crossed:
             raise MeasurementError(
-                f"{rows.source}: '{crossed.pop()}' is the frame of rows, but in the model it is on the flange; of a "
-                "camera, check --fixed-camera."
+                f"'{(name := crossed.pop())}' is the frame of rows, but in the model it is mounted on the flange",
+                value=name,
+                at=Place(rows.source, column="frame"),
+                remedy="check --fixed-camera if it is a camera",
             )
         for field, stated, known in (
             ("frame", rows.frame, tuple(self.geometry.bases)),
@@ -113,7 +121,7 @@ class ModelPosterior:
         return rows
 
     def positions_in(self, space: ParameterSpace) -> list[int]:
-        """Say where the parameters stand in a space that has all of their frames, targets and owners."""
+        """Return the positions of the parameters in a space that has all of their frames, targets and owners."""
         positions = list(range(self.space.arm_size))
         for group, names, among, size in (
             ("base", self.space.frames, space.frames, 6),
@@ -134,7 +142,7 @@ class ModelPosterior:
 def _weights(
     correction: JointCorrection, features: tuple[AbstractFeature, ...]
 ) -> Float64[Tensor, " weights"]:
-    """Weights of the used columns of all features in their order, those of products from the product units."""
+    """Return the weights of the used columns of all features, those of products from the product units."""
     linear = {own.name: weight for own, weight in zip(correction.features, correction.linear, strict=True)}
     blocks = [
         one.weights(correction.weight.detach())

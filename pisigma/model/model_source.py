@@ -1,4 +1,4 @@
-"""Where a model comes from: itself, what holds it, or its folder."""
+"""Sources of a model: the model itself, an object that has it, or its folder."""
 
 import os
 from typing import Protocol, runtime_checkable
@@ -6,18 +6,18 @@ from typing import Protocol, runtime_checkable
 from pisigma.model.calibrated_model import CalibratedModel
 
 ModelSource = CalibratedModel | str | os.PathLike[str]
-"""A model or its folder."""
+"""A model, or the path of its folder."""
 
 
 @runtime_checkable
 class HoldsModel(Protocol):
-    """A `pisigma.CorrectedIK`, such as `pisigma.load` gives, or what `pisigma.calibrate` and its kin return."""
+    """Object with a model: a `pisigma.CorrectedIK`, or a result of `pisigma.calibrate` and similar functions."""
 
     @property
     def model(self) -> CalibratedModel:
-        """The model."""
+        """The calibrated model."""
 
 
 def model_or_folder(source: ModelSource | HoldsModel) -> ModelSource:
-    """Give the model that something holds; a model or its folder as it is."""
+    """Return the model of an object that has one; a model or a folder is returned as it is."""
     return source.model if isinstance(source, HoldsModel) else source

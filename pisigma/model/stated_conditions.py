@@ -1,4 +1,4 @@
-"""A hybrid model under a stated payload and temperature; and which of these lie beyond the measured ones."""
+"""Hybrid models at a stated payload and temperature, and warnings where these are outside the measured range."""
 
 import math
 from collections.abc import Sequence
@@ -17,27 +17,27 @@ from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.robot.description import Robot
 
 _BEYOND = {
-    "payload_kg": "what the payload does is continued in proportion",
+    "payload_kg": "the effect of the payload is extrapolated linearly",
     "temperature_c": "the correction stays that of the nearest measured temperature",
 }
-"""What a model does beyond the measured values of a condition."""
+"""How a model extrapolates outside the measured values of a condition."""
 
 
 def under_stated_conditions(
     model: CalibratedModel, payload_kg: float | None = None, temperature_c: float | None = None
 ) -> CalibratedModel:
-    """The same model as a function of the joint values alone, under conditions that were learned.
+    """Return the model at fixed conditions, as a function of the joint values alone.
 
-    See `pisigma.joint_correction.conditions.at_conditions`; shifts of the joints go into the geometry's joint offsets.
-    Of conditions beyond the measured ones `condition_warnings` warns.
+    See `pisigma.joint_correction.conditions.at_conditions`; constant joint shifts are added to the joint offsets of the
+    geometry. `condition_warnings` warns of conditions outside the measured range.
 
     Args:
-        model: a hybrid one, calibrated on rows that state what is given here.
-        payload_kg: what the robot carries [kg]; as usual if None.
-        temperature_c: of the robot [deg C]; as usual if None.
+        model: hybrid model, calibrated on rows with columns for the conditions that are given here.
+        payload_kg: mass that the robot carries [kg]; None for the mean of the calibration rows.
+        temperature_c: temperature of the robot [deg C]; None for the mean of the calibration rows.
 
     Raises:
-        ModelError: the model did not learn what a stated condition does, or its value makes no sense.
+        ModelError: the model did not learn the effect of a given condition, or the value is not possible.
     """
     given = {"payload_kg": payload_kg, "temperature_c": temperature_c}
     stated = {name: value for name, value in given.items() if value is not None}
@@ -47,15 +47,19 @@ def under_stated_conditions(
     names = () if learned is None else learned.names
     for name, value in stated.items():
         if name not in names:
-            knows = ", ".join(names) or "joint values only"
             raise ModelError(
-                f"model '{model.name}' did not learn what {name} does; it knows {knows}. Calibrate with rows "
-                f"measured at several values of {name} (a column of that name)."
+                f"model '{model.name}' did not learn the effect of {name}, only of "
+                f"{', '.join(('joint values', *names))}",
+                value=value,
+                option=name,
+                remedy=f"calibrate with rows measured at several values of {name} (a column of that name)",
             )
         low, high = TEMPERATURES if name == "temperature_c" else (0.0, math.inf)
         if not math.isfinite(value) or not low <= value <= high:
-            wanted = "a mass of 0 or more" if high == math.inf else f"a temperature of {low:g} to {high:g}"
-            raise ModelError(f"model '{model.name}': {name}={value:g} was stated; give {wanted}.")
+            expected = (
+                "a mass >= 0 kg" if high == math.inf else f"a temperature from {low:g} to {high:g} deg C"
+            )
+            raise ModelError(expected=expected, value=value, option=name)
     assert arm is not None
     assert learned is not None
     usual = dict(zip(learned.names, learned.mean, strict=True))
@@ -69,11 +73,11 @@ def under_stated_conditions(
 
 
 def condition_warnings(model: CalibratedModel, rows: Measurements | None = None) -> tuple[str, ...]:
-    """Warn of conditions beyond those that the model was calibrated under: a sentence for each.
+    """Return a warning for every condition outside the range of the calibration.
 
     Args:
-        model: of any kind; only a hybrid learns what conditions do.
-        rows: whose conditions are meant; None for those that the model was put under.
+        model: model of any kind; only a hybrid learns the effect of conditions.
+        rows: rows whose conditions are checked; None for the conditions at which the model is evaluated.
     """
     if rows is None:
         stated = [
@@ -95,7 +99,7 @@ def condition_warnings(model: CalibratedModel, rows: Measurements | None = None)
 def _warning(
     name: str, low: float, high: float, values: Float64[Tensor, " rows"], model: str, single: bool
 ) -> Sequence[str]:
-    """The sentence on one condition; none where all values were measured or are not stated."""
+    """Return the warning on one condition; none if all values are in the measured range or not stated."""
     slack = 1e-9 * max(abs(low), abs(high), 1.0)
     beyond = values[(values < low - slack) | (values > high + slack)]
     if not len(beyond):
@@ -104,7 +108,7 @@ def _warning(
     span = f"{least:.4g}" if least == most else f"{least:.4g} to {most:.4g}"
     what = f"{name} {span}" if single else f"{len(beyond)} of {len(values)} rows have {name} {span}, which"
     return (
-        f"{what} lies beyond the {low:.4g} to {high:.4g} that {model} was calibrated at: {_BEYOND[name]}.",
+        f"{what} is outside {low:.4g} to {high:.4g}, the range of the calibration of {model}: {_BEYOND[name]}.",
     )
 
 
@@ -113,7 +117,7 @@ def _learned(model: CalibratedModel) -> ConditionFeatures | None:
 
 
 def _shifted(robot: Robot, shift: Float64[Tensor, " dof"]) -> Robot:
-    """The robot with joints that stand a little elsewhere: `q + shift` is commanded by q."""
+    """Return the robot with shifted joint offsets: at q it is where the given robot is at `q + shift`."""
     dh = robot.dh.copy()
     for row, turns, direction, value in zip(
         robot.joint_rows, robot.revolute, robot.directions, shift.tolist(), strict=True

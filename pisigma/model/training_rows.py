@@ -1,4 +1,4 @@
-"""Rows that a model was made of: they are recognised when they come again, and count once."""
+"""Training rows of a model, which are recognised in later data so that they count only once."""
 
 from dataclasses import replace
 
@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
-from pisigma.files.errors import MeasurementError
+from pisigma.files.errors import MeasurementError, Place
 from pisigma.measurement.copies import RowValues, copies_of_known, places_text
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.joint_range import with_limits_of_rows
@@ -14,20 +14,20 @@ from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.stored_starts import rows_at_starts
 from pisigma.robot.description import Robot
 
-MOST_KEPT = 10_000
-"""Rows of which a model keeps joint values and readings."""
+MAX_KEPT_ROWS = 10_000
+"""Most rows of which a model stores joint values and readings."""
 
 
 def kept_rows(robot: Robot, rows: Measurements, before: RowValues | None = None) -> RowValues:
-    """What a model keeps of the rows that it is made of, behind those that it was made of before."""
+    """Return the values of training rows that a model stores, after those of its earlier training rows `before`."""
     values = RowValues.of(rows.as_fields(), robot)
     values = values if before is None else before + values
     count = len(values.numbers)
-    return values.select(torch.linspace(0, count - 1, min(count, MOST_KEPT)).round().long())
+    return values.select(torch.linspace(0, count - 1, min(count, MAX_KEPT_ROWS)).round().long())
 
 
 def known_rows(model: CalibratedModel, rows: Measurements) -> Bool[Tensor, " rows"]:
-    """Whether rows are measurements that a model was made of, perhaps rounded, in another order or in part."""
+    """Return which rows are training rows of the model, even if they are rounded, reordered or only a part of them."""
     if model.made_of is None:
         whole = bool(model.provenance.data_sha256) and model.provenance.data_sha256 == rows.content_hash()
         return torch.full((rows.rows,), whole)
@@ -35,28 +35,30 @@ def known_rows(model: CalibratedModel, rows: Measurements) -> Bool[Tensor, " row
 
 
 def without_known_rows(model: CalibratedModel, rows: Measurements) -> tuple[Measurements, tuple[str, ...]]:
-    """Leave out rows that a model was made of, which count already; says which.
+    """Leave out rows that the model was calibrated with already, with a warning that names them.
 
     Raises:
-        MeasurementError: there are no others.
+        MeasurementError: all rows are training rows of the model.
     """
     known = known_rows(model, rows)
     if bool(known.all()):
         raise MeasurementError(
-            f"{rows.source}: expected new rows, got those that {model.name} was made of, by joint values and readings; "
-            "measure new ones."
+            f"expected new rows, got rows that {model.name} was calibrated with (equal joint values and readings)",
+            expected="new rows",
+            at=Place(rows.source),
+            remedy="measure new rows",
         )
-    return rows.select(~known), again_warnings(rows, known, f"those that {model.name} was made of")
+    return rows.select(~known), again_warnings(rows, known, f"training rows of {model.name}")
 
 
 def again_warnings(rows: Measurements, known: Bool[Tensor, " rows"], of: str) -> tuple[str, ...]:
-    """Say which rows came again and do not count: a sentence, or nothing."""
+    """Return a warning that names repeated rows, which are left out; empty if there are none."""
     count = int(known.sum())
     if not count:
         return ()
-    verb = "row is" if count == 1 else "rows are"
+    verbs = "repeats {}, and counts" if count == 1 else "repeat {}, and count"
     places = places_text(rows.as_fields(), known)
-    return (f"{count} of {rows.rows} {verb} {of} again, and count once: {places}.",)
+    return (f"{count} of {rows.rows} rows {verbs.format(of)} only once: {places}.",)
 
 
 def training_row_warnings(
@@ -65,39 +67,39 @@ def training_row_warnings(
     file: Measurements | None = None,
     consequence: str = "its figures say nothing about other poses",
 ) -> tuple[str, ...]:
-    """Warn of rows that a model was made of: a sentence, or nothing.
+    """Return a warning if rows that a model is evaluated on are among its training rows; else nothing.
 
-    A model keeps joint values and readings of its rows; one of an earlier version the hash of all of them and the joint
-    values of some. Poses that were measured again are said as well.
+    A model stores joint values and readings of its rows; one of an earlier version only a hash of all rows and the
+    joint values of some, so that poses that were measured again count as training rows too.
 
     Args:
-        model: of any kind.
-        rows: that it shall be judged by.
-        file: all rows of their file, where these are a part of it.
-        consequence: what follows.
+        model: model of any kind.
+        rows: rows that the model is evaluated on.
+        file: all rows of their file, if `rows` are a part of it.
+        consequence: what follows from it, as a clause of the warning.
     """
     made_of = model.provenance.data_sha256
     if made_of and made_of in (whole.content_hash() for whole in (rows, file or rows)):
-        return (f"{model.name} was made of these rows, so {consequence}.",)
+        return (f"{model.name} was calibrated with these rows, so {consequence}.",)
     known = known_rows(model, rows)
     if bool(known.any()):
         if bool(known.all()):
-            return (f"{model.name} was made of these rows, so {consequence}.",)
+            return (f"{model.name} was calibrated with these rows, so {consequence}.",)
         return (
-            f"{int(known.sum())} of {rows.rows} rows are those that {model.name} was made of "
-            f"({places_text(rows.as_fields(), known)}): as far as they count, {consequence}.",
+            f"{int(known.sum())} of {rows.rows} rows are training rows of {model.name} "
+            f"({places_text(rows.as_fields(), known)}); for these, {consequence}.",
         )
     at_starts = rows_at_starts(model.starts.double().cpu(), rows.q.cpu())
     if not at_starts:
         return ()
     return (
-        f"At least {at_starts} of {rows.rows} rows have joint values that {model.name} was made with (it keeps "
-        f"{len(model.starts)} of {model.provenance.rows}): as far as they are the same measurements, {consequence}.",
+        f"At least {at_starts} of {rows.rows} rows have joint values of training rows of {model.name} (it stores "
+        f"{len(model.starts)} of {model.provenance.rows}); if they are the same measurements, {consequence}.",
     )
 
 
 def with_wide_limits(model: CalibratedModel, rows: Measurements) -> CalibratedModel:
-    """Return the model with joint limits that are wide enough for the rows that it was made of."""
+    """Return the model with its joint limits widened to include its training rows."""
     calibrated = None if model.calibrated is None else with_limits_of_rows(model.calibrated, rows)
     hybrid = model.hybrid
     if hybrid is not None:

@@ -1,4 +1,4 @@
-"""The calibrated model: its forward kinematics inverts its correction."""
+"""The forward kinematics of a calibrated model inverts its correction."""
 
 from dataclasses import replace
 
@@ -37,7 +37,7 @@ def test_nan_stays_in_its_row():
     assert_close(T[[0, 2]], whole[[0, 2]], atol=1e-12)
 
 
-def test_a_correction_steeper_than_the_joints_gives_nan_and_no_number():
+def test_a_correction_with_a_slope_above_one_yields_nan():
     model = hand_made_model("kiro4", scale=0.02)
     model.network.networks[0].output_scale.fill_(50.0)
     T = model.forward(joints_around("kiro4", 20))
@@ -46,8 +46,8 @@ def test_a_correction_steeper_than_the_joints_gives_nan_and_no_number():
     assert torch.equal(rows.any(-1), rows.all(-1))
 
 
-def test_turns_stay_inside_the_limits_and_on_the_pose():
-    robot = hand_made_model("kiro3").robot  # theta_4 may turn by ±360 deg, d_3 slides
+def test_wrapped_values_stay_inside_the_limits_and_on_the_pose():
+    robot = hand_made_model("kiro3").robot  # theta_4 has limits of ±360 deg, d_3 is prismatic
     q = torch.tensor([3.0, 1.0, -0.2, 0.5], dtype=torch.float64)
     near = torch.tensor([-3.0, 40.0, 9.0, -7.0], dtype=torch.float64)
     inside = nearest_turn(robot, q, near, within_limits=True)

@@ -1,10 +1,10 @@
-"""The domain: distances to the training rows over their spacing."""
+"""The domain: distances to the training rows divided by their spacing."""
 
 import pytest
 import torch
 from testing.closeness import assert_close
 
-from pisigma.model.domain import MARGIN, MAXIMUM_SAMPLES, REPEAT, Domain
+from pisigma.model.domain import MARGIN, MAX_SAMPLES, REPEAT, Domain
 
 
 def grid(*, dtype: torch.dtype = torch.float64) -> torch.Tensor:
@@ -29,14 +29,14 @@ def test_measure_is_the_distance_over_the_radius(generator):
 
 
 def test_repeats_do_not_shrink_the_domain(generator):
-    """Every pose measured twice, with some scatter: the spacing is that of the poses."""
+    """Where every pose was measured twice with some scatter, the spacing is that of the poses."""
     scatter = 1e-2 * REPEAT * torch.rand(121, 2, generator=generator, dtype=torch.float64)
     for again in (grid(), grid() + scatter):
         domain = Domain.around(torch.cat([grid(), again]), generator)
         assert_close(domain.radius, 0.2 * MARGIN, atol=1e-4)
 
 
-def test_one_row_is_a_domain_of_its_own(generator):
+def test_one_row_makes_a_domain(generator):
     row = torch.tensor([[0.3, -0.2]], dtype=torch.float64)
     for rows in (row, row.repeat(5, 1)):
         domain = Domain.around(rows, generator)
@@ -57,7 +57,7 @@ def test_batches_and_dtypes(generator, dtype, batch):
     assert domain.contains(points).dtype == torch.bool
 
 
-def test_chunks_give_what_single_poses_give(generator):
+def test_chunks_equal_single_poses(generator):
     domain = Domain.around(grid(), generator)
     points = 2 * torch.rand(9001, 2, generator=generator, dtype=torch.float64)
     together = domain.measure(points)
@@ -71,17 +71,15 @@ def test_nan_is_never_inside(generator):
     assert domain.contains(point).tolist() == [False, True]
 
 
-def test_many_rows_are_thinned_alike_every_time():
-    rows = torch.rand(
-        MAXIMUM_SAMPLES + 500, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64
-    )
+def test_many_rows_are_thinned_reproducibly():
+    rows = torch.rand(MAX_SAMPLES + 500, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     one, two = (Domain.around(rows, torch.Generator().manual_seed(7)) for _ in range(2))
-    assert one.samples.shape == (MAXIMUM_SAMPLES, 3)
+    assert one.samples.shape == (MAX_SAMPLES, 3)
     assert torch.equal(one.samples, two.samples)
-    assert float(one.measure(rows).max()) < 3  # rows that were not drawn lie among those that were
+    assert float(one.measure(rows).max()) < 3  # rows that were not drawn are among those that were
 
 
 @pytest.mark.parametrize(("rows", "radius"), [(0, 1.0), (3, 0.0), (3, -1.0), (3, float("nan"))])
 def test_a_domain_without_extent_is_refused(rows, radius):
-    with pytest.raises(ValueError, match="needs a sample and a radius above 0"):
+    with pytest.raises(ValueError, match=f"{rows} samples and radius {radius:g}"):
         Domain(torch.zeros(rows, 2), torch.tensor(radius))

@@ -1,4 +1,4 @@
-"""What `pisigma.load` gives is taken wherever a model or its folder is."""
+"""The result of `pisigma.load` is accepted wherever a model or its folder is."""
 
 import pytest
 from testing.models import hand_made_model

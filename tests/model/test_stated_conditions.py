@@ -1,5 +1,6 @@
-"""Corrected inverse kinematics under a payload and temperature: as rows that state them are predicted."""
+"""Corrected inverse kinematics at a payload and temperature agrees with predictions of rows that state them."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -9,6 +10,7 @@ from testing.closeness import assert_close
 from testing.hybrid import hybrid_of, joints_in
 from testing.identified import hybrid_model
 from testing.models import joints_around
+from testing.refusals import numbers_in, refused
 
 from pisigma.files.errors import ModelError
 from pisigma.joint_correction.conditions import ConditionFeatures, learned_conditions
@@ -31,9 +33,9 @@ from pisigma.workflow.verify import verify
 pytestmark = pytest.mark.usefixtures("without_type_checker")
 
 MEASURED = ((0.0, 5.0), (15.0, 35.0))
-"""Payloads [kg] and temperatures [deg C]."""
+"""Measured payloads [kg] and temperatures [deg C]."""
 SIDEWAYS = (0.6, 0.0, -0.8)
-"""Gravity of a robot that is mounted on a slope."""
+"""Direction of gravity of a robot that is mounted on a slope."""
 BESIDE = {
     "nothing": lambda robot: [],
     "all": lambda robot: [GravityTorques(robot), FourierSeries(robot, 5), ScaledJoints(robot)],
@@ -42,7 +44,7 @@ BESIDE = {
 
 
 def model_with(name: str, beside: str, orders: tuple[int, ...] = ()) -> CalibratedModel:
-    """A model with random weights, those of both conditions among them."""
+    """A model with random weights, including those of both conditions."""
     robot = Robot.load(name)
     learned = ConditionFeatures(robot, ("payload_kg", "temperature_c"), (2.0, 25.0), (1.5, 6.0), MEASURED)
     return hybrid_model(name, [*BESIDE[beside](robot), learned], orders=orders)
@@ -68,7 +70,7 @@ def test_poses_are_those_of_rows_that_state_the_conditions(
     assert (float((expected - model.forward(q)).abs().max()) > 1e-6) is not usual
 
 
-def test_what_is_not_given_is_as_usual() -> None:
+def test_conditions_that_are_not_given_are_the_mean_ones() -> None:
     model = model_with("kiro4", "all")
     q = joints_around("kiro4", 20, seed=3)
     under = under_stated_conditions(model, temperature_c=31.0)
@@ -110,7 +112,7 @@ def test_the_accuracy_is_that_of_the_conditions() -> None:
 
 
 @pytest.mark.parametrize("name", ["kiro4", "kiro3"])
-def test_temperature_stays_at_its_edge_and_payload_goes_on(name: str) -> None:
+def test_temperature_is_clamped_and_payload_extrapolated(name: str) -> None:
     model, q = model_with(name, "all"), joints_around(name, 30, seed=3)
     for beyond, edge in ((60.0, 35.0), (-20.0, 15.0)):
         at_edge = under_stated_conditions(model, temperature_c=edge)
@@ -128,16 +130,17 @@ def test_temperature_stays_at_its_edge_and_payload_goes_on(name: str) -> None:
     assert float((measured - usual).abs().max()) > 1e-5
 
 
-def test_warnings_say_what_was_not_measured() -> None:
+def test_warnings_name_conditions_outside_the_measured_range() -> None:
     solver = CorrectedIK(model_with("kiro4", "all"))
     assert solver.warnings == ()
     assert solver.under(payload_kg=5.0, temperature_c=15.0).warnings == ()
     payload, temperature = solver.under(payload_kg=9.0, temperature_c=40.0).warnings
-    assert payload.startswith(
-        "payload_kg 9 lies beyond the 0 to 5 that hybrid_kiro4 was calibrated at: what the"
-    )
-    assert temperature.startswith("temperature_c 40 lies beyond the 15 to 35 that")
-    assert "stays that of the nearest measured temperature" in temperature
+    for sentence, name, numbers in (
+        (payload, "payload_kg", [9, 0, 5]),
+        (temperature, "temperature_c", [40, 15, 35]),
+    ):
+        assert sentence.startswith(name)
+        assert numbers_in(sentence.replace(solver.name, "")) == numbers
 
 
 def test_rows_beyond_the_measured_conditions_are_counted_by_all_that_judge(tmp_path) -> None:
@@ -146,9 +149,6 @@ def test_rows_beyond_the_measured_conditions_are_counted_by_all_that_judge(tmp_p
     rows = replace(rows, position=poses_of_rows(model, rows)[:, :3, 3])
     assert rows.temperature is not None
     warm = replace(rows, temperature=rows.temperature + torch.arange(30) * 0.5)
-    wanted = (
-        "9 of 30 rows have temperature_c 35.5 to 39.5, which lies beyond the 15 to 35 that hybrid_kiro4 was"
-    )
     for judged, expected in ((warm, True), (rows, False), (replace(rows, temperature=None), False)):
         for warnings in (
             condition_warnings(model, judged),
@@ -156,35 +156,35 @@ def test_rows_beyond_the_measured_conditions_are_counted_by_all_that_judge(tmp_p
             verify(model, judged).warnings,
             report_content(model, tmp_path, judged).advice,
         ):
-            assert any(sentence.startswith(wanted) for sentence in warnings) is expected
+            numbers = [
+                numbers_in(sentence.replace(model.name, ""))
+                for sentence in warnings
+                if "temperature_c" in sentence
+            ]
+            assert ([9, 30, 35.5, 39.5, 15, 35] in numbers) is expected
     assert condition_warnings(hybrid_model("kiro4", [FourierSeries(model.robot, 2)]), warm) == ()
 
 
 @pytest.mark.parametrize(
-    ("given", "complaint"),
-    [
-        ({"payload_kg": -0.5}, r"payload_kg=-0\.5 was stated; give a mass of 0 or more"),
-        ({"payload_kg": float("inf")}, "payload_kg=inf was stated"),
-        ({"temperature_c": float("nan")}, "temperature_c=nan was stated; give a temperature"),
-        ({"temperature_c": 293.0}, "temperature_c=293 was stated; give a temperature of -50 to 150"),
-    ],
+    ("name", "value"),
+    [("payload_kg", -0.5), ("payload_kg", math.inf), ("temperature_c", math.nan), ("temperature_c", 293.0)],
 )
-def test_conditions_that_make_no_sense_are_refused(given: dict[str, float], complaint: str) -> None:
-    with pytest.raises(ModelError, match=complaint):
-        CorrectedIK(model_with("kiro4", "all")).under(**given)
+def test_impossible_conditions_are_refused(name: str, value: float) -> None:
+    with refused(ModelError, option=name) as caught:
+        CorrectedIK(model_with("kiro4", "all")).under(**{name: value})
+    assert str(caught.value.value) == str(value)
+    assert caught.value.expected
 
 
-def test_what_was_not_learned_is_refused(tmp_path) -> None:
+def test_conditions_that_were_not_learned_are_refused(tmp_path) -> None:
     robot = Robot.load("kiro4")
     warm = hybrid_model(
         "kiro4", [ConditionFeatures(robot, ("temperature_c",), (25.0,), (6.0,), MEASURED[1:])]
     )
-    for model, knows in (
-        (warm, "temperature_c"),
-        (hybrid_model("kiro4", [FourierSeries(robot, 2)]), "joint values only"),
-    ):
-        with pytest.raises(ModelError, match=f"did not learn what payload_kg does; it knows {knows}"):
+    for model in (warm, hybrid_model("kiro4", [FourierSeries(robot, 2)])):
+        with refused(ModelError, option="payload_kg", value=1.0, expected="") as caught:
             under_stated_conditions(model, payload_kg=1.0)
-    with pytest.raises(ModelError, match="which a folder does not keep"):
+        assert ("temperature_c" in str(caught.value)) is (model is warm)
+    with refused(ModelError, value={"temperature_c": 20.0}):
         save_model(under_stated_conditions(warm, temperature_c=20.0), tmp_path)
     assert not list(tmp_path.iterdir())

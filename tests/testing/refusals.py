@@ -1,6 +1,7 @@
 """What an input is refused with: class and fields of an exception, never its sentence."""
 
 import os
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -42,3 +43,8 @@ def problem_of(result: Result) -> PisigmaError:
         problem = problem.__context__
     assert problem is not None, f"no PisigmaError ended the command: {result.output}"
     return problem
+
+
+def numbers_in(text: str) -> list[float]:
+    """The numbers that a sentence states, in their order; digits within names do not count."""
+    return [float(number) for number in re.findall(r"(?<![\w.])-?\d+(?:\.\d+)?(?:e[+-]?\d+)?(?![\w])", text)]

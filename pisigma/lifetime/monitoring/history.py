@@ -204,8 +204,8 @@ def new_rows(
         if one.rows_sha256 == sha256 and one.date != date
     ]
     others = [*(one for one in earlier if one.rows_sha256 != sha256), *judged]
-    those = [(model.made_of, f"those that {model.name} was calibrated with")]
-    those += [(one.values, f"those of {one.file} of {one.date}") for one in others]
+    those = [(model.made_of, f"training rows of {model.name}")]
+    those += [(one.values, f"rows of {one.file} of {one.date}") for one in others]
     for values, of in those:
         if values is not None and rows.rows:
             again = copies_of_known(rows.as_fields(), model.robot, values)

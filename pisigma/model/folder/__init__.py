@@ -1,1 +1,1 @@
-"""Models as folders on disk: written whole or not at all, checked when read."""
+"""Model folders on disk: written as a whole or not at all, and checked when read."""

@@ -1,8 +1,8 @@
-"""What a model folder holds of a hybrid calibration: sections of `model.yaml`, and tensors.
+"""Hybrid calibrations in a model folder: their sections of `model.yaml`, and their tensors.
 
-Geometry stands in `model.yaml` in mm and deg, for people, and once more in the weights file in SI units, so that
-predictions are the same to the last bit after reading. What the rows of the root of the covariance belong to, and in
-which order, stands in `model.yaml`.
+The geometry is stored in `model.yaml` in mm and deg, for people, and again in the weights file in SI units, so that
+predictions are equal to the last bit after reading. `model.yaml` states which unknowns the rows of the covariance root
+belong to, and in which order.
 """
 
 import math
@@ -19,6 +19,7 @@ from pisigma.calibration.geometric.problem.setup import IdentifiedGeometry
 from pisigma.calibration.hybrid.arm import HybridArm, JointCoverage
 from pisigma.calibration.hybrid.uncertainty import PositionUncertainty
 from pisigma.estimation.covariance_root import CovarianceRoot
+from pisigma.files.model_files import WEIGHTS
 from pisigma.joint_correction.feature import AbstractFeature, turning_rate
 from pisigma.joint_correction.input_products import InputProducts
 from pisigma.joint_correction.joint_correction import JointCorrection
@@ -27,6 +28,7 @@ from pisigma.measurement.sensors.sensor import UnknownGroup
 from pisigma.model.calibrated_model import CalibratedModel, Frames
 from pisigma.model.folder.model_document import (
     LearnedSection,
+    MisfitError,
     ModelDocument,
     UncertaintySection,
     UnknownsSection,
@@ -34,19 +36,19 @@ from pisigma.model.folder.model_document import (
 from pisigma.robot.description import Robot
 
 Shape = tuple[int | None, ...]
-"""Wanted shape of a tensor; None is any length."""
+"""Expected shape of a tensor; None stands for any length."""
 
 ROUNDING = 1e-9
-"""The geometry in `model.yaml` and in the weights file may differ by so much [m or rad]."""
+"""[m or rad] Largest difference between the geometry in `model.yaml` and that in the weights file."""
 
 DTYPES = {"coverage.joint": torch.int64, "rows.measured": torch.uint8}
-"""Tensors that are not in float64."""
+"""Types of the tensors that are not float64."""
 
 _GEOMETRY = ("dh", "base", "tool")
 
 
 def hybrid_sections(model: CalibratedModel) -> dict[str, Any]:
-    """Sections of `model.yaml` that only models of a hybrid calibration have."""
+    """Return the sections of `model.yaml` that only models of a hybrid calibration have."""
     result: dict[str, Any] = {}
     if (arm := model.hybrid) is not None:
         result["learned"] = {
@@ -71,7 +73,7 @@ def hybrid_sections(model: CalibratedModel) -> dict[str, Any]:
 
 
 def hybrid_tensors(model: CalibratedModel) -> dict[str, Tensor]:
-    """Tensors of the weights file that only models of a hybrid calibration have."""
+    """Return the tensors of the weights file that only models of a hybrid calibration have."""
     result: dict[str, Tensor] = {}
     if (drawn := model.drawn) is not None:
         result |= _geometry("drawn", drawn)
@@ -89,31 +91,35 @@ def hybrid_tensors(model: CalibratedModel) -> dict[str, Tensor]:
 
 
 def check_size(document: ModelDocument, robot: Robot, stored: int) -> None:
-    """Refuse a description that calls for more weights than a file holds: before they are allocated.
+    """Check, before weights are allocated, that the file has as many numbers as the description requires.
 
     Args:
-        document: the description.
-        robot: that it describes.
-        stored: numbers in the weights file.
+        document: description of the model.
+        robot: robot of the description.
+        stored: count of numbers in the weights file.
 
     Raises:
-        ValueError: it does.
+        MisfitError: the description requires more.
     """
-    wanted = sum(sum(group.orders) * len(group.inputs) * len(group.joints) for group in document.network)
+    required = sum(sum(group.orders) * len(group.inputs) * len(group.joints) for group in document.network)
     if (learned := document.learned) is not None:
         harmonics = sum(getattr(section, "harmonics", 0) for section in learned.features)
-        wanted += robot.dof * (robot.dof * sum(learned.orders) + 2 * harmonics)
+        required += robot.dof * (robot.dof * sum(learned.orders) + 2 * harmonics)
     if document.uncertainty is not None and InputProducts.name in document.uncertainty.features:
-        wanted += robot.dof * math.comb(robot.dof, 2)
-    if wanted > stored:
-        raise ValueError(f"it calls for {wanted:,} weights or more, but the file holds {stored:,} numbers")
+        required += robot.dof * math.comb(robot.dof, 2)
+    if required > stored:
+        raise MisfitError(
+            f"the description requires at least {required:,} weights, but the file has {stored:,} numbers",
+            column="orders",
+            value=required,
+        )
 
 
 def hybrid_shapes(document: ModelDocument, robot: Robot) -> dict[str, Shape]:
-    """Shapes of the tensors that a description calls for.
+    """Return the shapes of the tensors that a description requires.
 
     Raises:
-        ValueError: features cannot be made as described, or the uncertainty is of parameters that do not exist.
+        ValueError: features cannot be made as described, or the uncertainty refers to parameters that do not exist.
     """
     learned, known = document.learned, document.uncertainty
     if learned is None and known is None:
@@ -137,21 +143,21 @@ def hybrid_shapes(document: ModelDocument, robot: Robot) -> dict[str, Shape]:
 def with_hybrid(
     model: CalibratedModel, document: ModelDocument, tensors: Mapping[str, Tensor]
 ) -> CalibratedModel:
-    """Add what belongs to a hybrid calibration, and the geometry to the last bit; other models stay as they are.
+    """Add the parts of a hybrid calibration, and the geometry to the last bit; other models are returned unchanged.
 
     Args:
-        model: made from the description and all other tensors.
-        document: the description.
-        tensors: of the shapes of `hybrid_shapes`.
+        model: model made from the description and all other tensors.
+        document: description of the model.
+        tensors: tensors of the shapes of `hybrid_shapes`.
 
     Raises:
-        ValueError: parts do not fit together.
+        MisfitError: parts do not fit together.
     """
     learned, known = document.learned, document.uncertainty
     if learned is None and known is None:
         return model
     if model.calibrated is None:
-        raise ValueError("a hybrid calibration needs the calibrated robot")
+        raise MisfitError("a hybrid calibration requires the calibrated robot", column="calibrated")
     drawn = _with_limits(_exact("drawn", model.robot, tensors, ("dh",)), tensors["drawn.limits"])
     calibrated = _exact("calibrated", replace(model.calibrated, rows=drawn.rows), tensors, _GEOMETRY)
     robot = drawn.with_geometry(base=calibrated.base, tool=calibrated.tool)
@@ -159,7 +165,9 @@ def with_hybrid(
     place = (calibrated, model.bases, model.tools)
     if learned is not None:
         if (list(learned.bases), list(learned.tools)) != (list(model.bases), list(model.tools)):
-            raise ValueError("the learned part has other frames or targets than the geometric one")
+            raise MisfitError(
+                "the learned part has other frames or targets than the geometric one", column="learned"
+            )
         place = (_exact("learned", drawn, tensors, ()), _frames(learned.bases), _frames(learned.tools))
         arm = HybridArm(place[0], _correction(learned, drawn, tensors), _coverage(drawn, tensors))
         model = replace(model, hybrid=arm, hybrid_bases=place[1], hybrid_tools=place[2])
@@ -170,13 +178,13 @@ def with_hybrid(
 
 
 def _free_rows(known: PositionUncertainty) -> list[int]:
-    """Parameters that were free: those whose row of the root is not 0."""
+    """Return the indices of the free parameters: those whose row of the root is not 0."""
     result: list[int] = known.root[: len(known.space.parameters)].any(1).nonzero()[:, 0].tolist()
     return result
 
 
 def _limited(robot: Robot) -> np.ndarray:
-    """Which joints have limits, which a file holds both or none of."""
+    """Return which joints have limits; a file states both limits of a joint or none."""
     result: np.ndarray = np.isfinite(robot.limits).all(1)
     return result
 
@@ -186,19 +194,27 @@ def _geometry(name: str, robot: Robot) -> dict[str, Tensor]:
 
 
 def _exact(name: str, robot: Robot, tensors: Mapping[str, Tensor], same: Sequence[str]) -> Robot:
-    """The robot with the geometry of the weights file; some parts must be those it had, but for rounding."""
+    """Return the robot with the geometry of the weights file; the parts `same` must agree with it up to rounding."""
     values = {part: tensors[f"{name}.{part}"].numpy() for part in _GEOMETRY}
     for part in same:
         if np.abs(values[part] - getattr(robot, part)).max() > ROUNDING:
-            raise ValueError(f"the tensor '{name}.{part}' is not the geometry in the description")
+            raise MisfitError(
+                f"the tensor '{name}.{part}' differs from the geometry in the description",
+                file=WEIGHTS,
+                value=f"{name}.{part}",
+            )
     return robot.with_geometry(**values)
 
 
 def _with_limits(robot: Robot, limits: Tensor) -> Robot:
-    """The robot with its joints' limits to the last bit."""
+    """Return the robot with its joint limits to the last bit."""
     limited = _limited(robot)
     if len(limits) and np.abs(limits.numpy() - robot.limits[limited]).max() > ROUNDING:
-        raise ValueError("the tensor 'drawn.limits' are not the limits in the description")
+        raise MisfitError(
+            "the tensor 'drawn.limits' differs from the joint limits in the description",
+            file=WEIGHTS,
+            value="drawn.limits",
+        )
     rows = list(robot.rows)
     places = [row for row, bounded in zip(robot.joint_rows, limited, strict=True) if bounded]
     for place, (lower, upper) in zip(places, limits.tolist(), strict=True):
@@ -226,9 +242,15 @@ def _correction(learned: LearnedSection, robot: Robot, tensors: Mapping[str, Ten
 def _coverage(robot: Robot, tensors: Mapping[str, Tensor]) -> JointCoverage:
     joint, middle, half = (tensors[f"coverage.{name}"] for name in ("joint", "middle", "half"))
     if not len(joint) == len(middle) == len(half):
-        raise ValueError("the coverage has stretches of which joint, middle or half is missing")
+        raise MisfitError(
+            "the coverage has intervals without joint, middle or half width", file=WEIGHTS, value="coverage"
+        )
     if set(joint.tolist()) != set(range(robot.dof)) or bool((half < 0).any()):
-        raise ValueError("the coverage needs a stretch of at least no length for every joint, and no other")
+        raise MisfitError(
+            "the coverage must have an interval of width >= 0 for every joint of the robot, and no other",
+            file=WEIGHTS,
+            value="coverage",
+        )
     rate = torch.from_numpy(turning_rate(robot))
     turning = tuple(bool(turns) for turns in robot.revolute)
     return JointCoverage(joint, middle, half, rate, turning)
@@ -241,19 +263,25 @@ def _uncertainty(
     root: Tensor,
     place: tuple[Robot, Frames, Frames],
 ) -> PositionUncertainty:
-    """The uncertainty, its root with the rows of the parameters that were not free."""
+    """Make the uncertainty, with zero rows of the root for the parameters that were not free."""
     robot, bases, tools = place
     groups = [_unknowns(section) for section in known.unknowns]
     if len({group.name for group in groups}) < len(groups):
-        raise ValueError("a group of sensors' unknowns appears twice")
+        raise MisfitError("a group of unknown sensor parameters appears twice", column="uncertainty.unknowns")
     if elsewhere := {frame for group in groups for frame in group.frames} - {*bases}:
-        raise ValueError(
-            f"sensors' unknowns are in the frame '{min(elsewhere)}', which the model does not have"
+        raise MisfitError(
+            f"unknown sensor parameters are in the frame '{min(elsewhere)}', which the model does not have",
+            column="uncertainty.unknowns",
+            value=min(elsewhere),
         )
     space = ParameterSpace(drawn, tuple(bases), tuple(tools), tuple(groups))
     count, free = len(space.parameters), list(known.free)
     if sorted(set(free)) != free or (free and free[-1] >= count):
-        raise ValueError(f"the free parameters are rising numbers below {count}, got {free}")
+        raise MisfitError(
+            f"expected increasing indices of free parameters below {count}, got {free}",
+            column="uncertainty.free",
+            value=free,
+        )
     full = torch.zeros(count + len(root) - len(free), root.shape[1], dtype=torch.float64)
     full[[*free, *range(count, len(full))]] = root
     unknowns = {
@@ -263,7 +291,11 @@ def _uncertainty(
     for own in space.unknowns:
         wrong = {len(values) for values in unknowns.get(own.name, {}).values()} - {len(own.columns)}
         if wrong:
-            raise ValueError(f"{len(own.columns)} values of every {own.name} were wanted, got {wrong.pop()}")
+            raise MisfitError(
+                f"expected {len(own.columns)} values of every {own.name}, got {(count := wrong.pop())}",
+                column="uncertainty.values",
+                value=count,
+            )
     geometry = IdentifiedGeometry(robot, bases, tools, unknowns)
     features = _weighted(known, None if hybrid is None else hybrid.correction)
     return PositionUncertainty(
@@ -272,7 +304,7 @@ def _uncertainty(
 
 
 def _unknowns_section(group: UnknownGroup) -> dict[str, object]:
-    """What sensors of one kind had to find out about themselves."""
+    """Describe the unknown parameters of the sensors of one kind."""
     return {
         "name": group.name,
         "columns": list(group.columns),
@@ -285,7 +317,11 @@ def _unknowns_section(group: UnknownGroup) -> dict[str, object]:
 
 def _unknowns(section: UnknownsSection) -> UnknownGroup:
     if len(section.frames) not in (0, len(section.owners)):
-        raise ValueError(f"one frame for every {section.name} was wanted, got {len(section.frames)}")
+        raise MisfitError(
+            f"expected one frame for every {section.name}, got {len(section.frames)}",
+            column="uncertainty.unknowns",
+            value=len(section.frames),
+        )
     return UnknownGroup(
         section.name,
         section.columns,
@@ -297,18 +333,20 @@ def _unknowns(section: UnknownsSection) -> UnknownGroup:
 
 
 def _weighted(known: UncertaintySection, correction: JointCorrection | None) -> tuple[AbstractFeature, ...]:
-    """What the weights in the root belong to: the features, and the products that product units make up.
+    """Return the features whose weights are in the root, including the input products of the product units.
 
     Raises:
-        ValueError: the features are not those of the learned part.
+        MisfitError: the features are not those of the learned part.
     """
     learned = () if correction is None else correction.features
     of_name = {chosen.name: chosen for chosen in learned}
     if correction is not None and InputProducts.name in known.features:
         of_name[InputProducts.name] = InputProducts(correction.robot)
     if sorted(known.features) != sorted(of_name):
-        raise ValueError(
-            f"the uncertainty is of the features {', '.join(known.features) or 'none'}, "
-            f"but the learned part has {', '.join(chosen.name for chosen in learned) or 'none'}"
+        raise MisfitError(
+            f"the uncertainty refers to the features {', '.join(known.features) or 'none'}, "
+            f"but the learned part has {', '.join(chosen.name for chosen in learned) or 'none'}",
+            column="uncertainty.features",
+            value=list(known.features),
         )
     return tuple(of_name[name] for name in known.features)

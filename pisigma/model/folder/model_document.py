@@ -1,4 +1,4 @@
-"""`model.yaml`: what it holds, and the checksum by which a truncated or edited one is told."""
+"""Schema of `model.yaml`, and its checksum, by which truncated or edited files are recognised."""
 
 import hashlib
 import re
@@ -7,8 +7,8 @@ from typing import Annotated, Any, Literal
 
 from pydantic import ConfigDict, Field, FiniteFloat, PlainValidator
 
-from pisigma.files.errors import ModelError
-from pisigma.files.model_files import read_model_file
+from pisigma.files.errors import ModelError, Place
+from pisigma.files.model_files import DESCRIPTION, read_model_file
 from pisigma.files.yaml_file import Section, parse_yaml, yaml_text
 from pisigma.joint_correction.feature import FeatureSection
 from pisigma.joint_correction.registry import feature_section
@@ -16,9 +16,9 @@ from pisigma.measurement.sensors.sensor import OtherUnit
 from pisigma.robot.robot_file import RobotDocument
 
 FORMAT = 5
-"""Of this version; folders of earlier formats are upgraded by `pisigma.model.folder.upgrade`."""
-MOST_FACTORS, MOST_UNITS = 100, 1000
-"""Of a product unit; of a network."""
+"""Format that this version writes; `pisigma.model.folder.upgrade` converts folders of earlier formats."""
+MAX_FACTORS, MAX_UNITS = 100, 1000
+"""Most factors of a product unit, and most product units of a network."""
 _CHECKSUM = re.compile(r"(.*^)sha256: ([0-9a-f]{64})\n", re.DOTALL | re.MULTILINE)
 
 _Vector = tuple[float, float, float]
@@ -27,35 +27,51 @@ _Frame = tuple[float, float, float, float, float, float]
 _Feature = Annotated[FeatureSection, PlainValidator(feature_section)]
 
 
+class MisfitError(ValueError):
+    """Parts of a model folder do not fit together; `load_model` raises a `ModelError` with the same fields.
+
+    Attributes:
+        file: name of the file at fault.
+        column: key of `model.yaml` at fault, or None.
+        value: the value at fault, or the name of a tensor.
+    """
+
+    def __init__(
+        self, problem: str, *, file: str = DESCRIPTION, column: str | None = None, value: Any = None
+    ) -> None:
+        super().__init__(problem)
+        self.file, self.column, self.value = file, column, value
+
+
 class GroupSection(Section):
     """One joint group of the network: see `pisigma.network.correction_network.JointGroup`."""
 
     joints: Annotated[tuple[str, ...], Field(min_length=1)]
     inputs: Annotated[tuple[str, ...], Field(min_length=1)]
     orders: Annotated[
-        tuple[Annotated[int, Field(ge=1, le=MOST_FACTORS)], ...], Field(min_length=1, max_length=MOST_UNITS)
+        tuple[Annotated[int, Field(ge=1, le=MAX_FACTORS)], ...], Field(min_length=1, max_length=MAX_UNITS)
     ]
     reference: tuple[_Vector, _Vector, _Vector]
 
 
 class LearnedSection(Section):
-    """The joint correction of a hybrid calibration and the geometry that goes with it.
+    """The joint correction of a hybrid calibration and the geometry that belongs to it.
 
     Attributes:
-        features: of the unit of order 1.
+        features: features of the unit of order 1.
         orders: number of factors of every product unit.
-        bases: per frame, of the hybrid's geometry.
-        tools: per target.
+        bases: bases of the hybrid's geometry, by frame.
+        tools: tools of the hybrid's geometry, by target.
     """
 
-    features: Annotated[tuple[_Feature, ...], Field(max_length=MOST_UNITS)]
-    orders: Annotated[tuple[Annotated[int, Field(ge=2, le=MOST_FACTORS)], ...], Field(max_length=MOST_UNITS)]
+    features: Annotated[tuple[_Feature, ...], Field(max_length=MAX_UNITS)]
+    orders: Annotated[tuple[Annotated[int, Field(ge=2, le=MAX_FACTORS)], ...], Field(max_length=MAX_UNITS)]
     bases: dict[str, _Frame]
     tools: dict[str, _Frame]
 
 
 class UnknownsSection(Section):
-    """What sensors of a kind had to find out of themselves; see `pisigma.measurement.sensors.sensor.UnknownGroup`."""
+    """Unknown parameters of the sensors of one kind; see `pisigma.measurement.sensors.sensor.UnknownGroup`."""
 
     name: str
     columns: tuple[str, ...] = Field(min_length=1)
@@ -66,22 +82,24 @@ class UnknownsSection(Section):
 
 
 class UncertaintySection(Section):
-    """What the rows of the root of the covariance, which stands in the weights file, belong to, in their order.
+    """Unknowns to which the rows of the covariance root in the weights file belong, in order.
 
     Attributes:
-        unknowns: what the sensors had to find out about themselves, group by group.
-        values: by group and owner, the unknowns in the owner's frame [m or rad]; empty in folders that were upgraded
+        unknowns: unknown sensor parameters, group by group.
+        values: by group and owner, their values in the owner's frame [m or rad]; empty in folders that were upgraded
             from a format without them.
-        free: which parameters have a row in the root; the others' rows are 0. Behind them come all weights.
-        features: names of the features whose weights these are: those of the learned part, and `products` for the
-            products of inputs that its product units make up.
-        prior_scale: see `pisigma.calibration.hybrid.uncertainty.PositionUncertainty`, as for the noise.
+        free: indices of the parameters that have a row in the root, before the rows of all weights; the rows of other
+            parameters are 0.
+        features: names of the features whose weights follow: those of the learned part, and `products` for the products
+            of inputs in its product units.
+        prior_scale: see `pisigma.calibration.hybrid.uncertainty.PositionUncertainty`.
+        noise: see there.
     """
 
     unknowns: tuple[UnknownsSection, ...] = ()
     values: dict[str, dict[str, tuple[FiniteFloat, ...]]] = Field(default_factory=dict)
     free: tuple[Annotated[int, Field(ge=0)], ...]
-    features: Annotated[tuple[str, ...], Field(max_length=MOST_UNITS)]
+    features: Annotated[tuple[str, ...], Field(max_length=MAX_UNITS)]
     prior_scale: Annotated[float, Field(gt=0)]
     noise: dict[str, Annotated[FiniteFloat, Field(gt=0)]] = Field(default_factory=dict)
 
@@ -101,7 +119,7 @@ class ProvenanceSection(Section):
 
 
 class ModelDocument(Section):
-    """The whole of `model.yaml`, but for the checksum in its last line."""
+    """All of `model.yaml` except for the checksum in its last line."""
 
     model_config = ConfigDict(protected_namespaces=())
 
@@ -124,17 +142,17 @@ class ModelDocument(Section):
 
 
 def document_text(document: dict[str, Any]) -> str:
-    """Give the text of a document, but for its last two lines: see `write_document`."""
+    """Return the text of a document without its last two lines, see `write_document`."""
     return yaml_text({"format": FORMAT, **document})
 
 
 def write_document(text: str, compiled_sha256: str | None, path: Path) -> None:
-    """Write a document with the hash of `compiled.npz`, and as its last line the checksum of all before it.
+    """Write a document, followed by the hash of `compiled.npz` and by the checksum of all lines before the last.
 
     Args:
-        text: from `document_text`.
-        compiled_sha256: None where there is no such file.
-        path: to write.
+        text: text from `document_text`.
+        compiled_sha256: hash of `compiled.npz`; None without such a file.
+        path: file to write.
     """
     text = f"{text}compiled_sha256: {compiled_sha256 or 'null'}\n"
     path.write_text(f"{text}sha256: {_digest(text)}\n", encoding="utf-8", newline="\n")
@@ -144,45 +162,54 @@ def read_document(path: Path) -> ModelDocument:
     """Read the document and check it.
 
     Raises:
-        ModelError: the file cannot be read, is of another format, truncated, edited, or no model's.
+        ModelError: the file cannot be read, has another format, was truncated or edited, or does not describe a model.
     """
     text = read_signed_text(path)
     stated = stated_format(text)
     if stated is not None and 1 <= stated < FORMAT:
         raise ModelError(
-            f"{path}: format {stated} is of an earlier version; run `pisigma upgrade {path.parent}` once to read it."
+            f"format {stated} was written by an earlier version",
+            value=stated,
+            at=Place(path, column="format"),
+            remedy=f"run `pisigma upgrade {path.parent}` once to convert the folder",
         )
     return parse_yaml(text, ModelDocument, ModelError, source=str(path))
 
 
 def read_signed_text(path: Path) -> str:
-    """Read the lines before the checksum, of this format or an earlier one.
+    """Read the lines before the checksum, in this format or an earlier one.
 
     Raises:
-        ModelError: the file cannot be read, is of a newer format, truncated, edited, or no model's.
+        ModelError: the file cannot be read, has a newer format, was truncated or edited, or does not describe a model.
     """
     try:
         text = read_model_file(path.parent, path.name).decode("utf-8").replace("\r\n", "\n")
     except UnicodeDecodeError:
         raise ModelError(
-            f"{path}: cannot be read (it is no UTF-8 text); train or copy the model again."
+            expected="UTF-8 text", at=Place(path), remedy="train or copy the model again"
         ) from None
     stated = stated_format(text)
     if stated is not None and stated > FORMAT:
         raise ModelError(
-            f"{path}: format {stated} is newer than this pisigma reads ({FORMAT}); upgrade pisigma."
+            f"format {stated} is newer than the newest that this pisigma reads ({FORMAT})",
+            value=stated,
+            at=Place(path, column="format"),
+            remedy="upgrade pisigma",
         )
     signed = _CHECKSUM.fullmatch(text)
     if not signed or _digest(signed[1]) != signed[2]:
         raise ModelError(
-            f"{path}: is truncated, was edited, or is no model of pisigma (its last line is not the "
-            "checksum of the lines before it); train or copy the model again."
+            "the file was truncated or edited, or is not a model of pisigma: its last line is not the checksum of the "
+            "lines before it",
+            expected="a checksum",
+            at=Place(path),
+            remedy="train or copy the model again",
         )
     return signed[1]
 
 
 def stated_format(text: str) -> int | None:
-    """Give the format in the first line of a document; None where there is none."""
+    """Return the format in the first line of a document; None if there is none."""
     stated = re.match(r"format: ([0-9]{1,9})\n", text)
     return int(stated[1]) if stated else None
 

@@ -1,4 +1,4 @@
-"""Models as folders: `model.yaml` and `model.safetensors`, checked when read."""
+"""Reading and writing of model folders: `model.yaml` and `model.safetensors`."""
 
 import hashlib
 import os
@@ -13,7 +13,7 @@ from safetensors.torch import load as load_tensors
 from safetensors.torch import save as save_tensors
 from torch import Tensor
 
-from pisigma.files.errors import ModelError, PisigmaError, nearest_choice
+from pisigma.files.errors import ModelError, PisigmaError, Place, nearest_choice
 from pisigma.files.model_files import COMPILED, DESCRIPTION, DRAWING, WEIGHTS, content_hash, read_model_file
 from pisigma.measurement.copies import ROW_READINGS, ROW_STEPS, RowValues
 from pisigma.model.calibrated_model import CalibratedModel, Provenance
@@ -28,7 +28,13 @@ from pisigma.model.folder.hybrid_folder import (
     hybrid_tensors,
     with_hybrid,
 )
-from pisigma.model.folder.model_document import ModelDocument, document_text, read_document, write_document
+from pisigma.model.folder.model_document import (
+    MisfitError,
+    ModelDocument,
+    document_text,
+    read_document,
+    write_document,
+)
 from pisigma.network.correction_network import CorrectionNetwork, JointGroup
 from pisigma.network.inputs import Inputs
 from pisigma.network.pi_sigma import PiSigma
@@ -38,21 +44,24 @@ from pisigma.robot.writing import robot_document
 
 _PREFIX = "network."
 _ROWS = ("rows.numbers", "rows.measured", "rows.steps")
-"""Of the rows that a model was made of: what was measured, whether it was, and what it was rounded to."""
+"""Tensors of the training rows: values, whether each was measured, and the step that it was rounded to."""
 
 
 def save_model(model: CalibratedModel, folder: Path) -> None:
-    """Write the files of a model into a folder, such as `staged_folder` gives.
+    """Write the files of a model into a folder, for example one from `staged_folder`.
 
-    Next to `model.yaml` and `model.safetensors` it gets what the compiled kernels read, where they know the model's
-    kind of correction, and the URDF file that the robot was drawn in, where it was.
+    In addition to `model.yaml` and `model.safetensors` it writes the arrays of the compiled kernels, if they support
+    the model's kind of correction, and the URDF file of the robot, if it was described by one.
 
     Raises:
-        ModelError: the model is under given conditions.
+        ModelError: the model is evaluated at fixed conditions.
     """
     if model.conditions:
+        stated = {name: model.conditions[name] for name in model.measured_conditions}
         raise ModelError(
-            f"model '{model.name}' is under given conditions, which a folder does not keep; save it as calibrated."
+            f"model '{model.name}' is evaluated at fixed conditions, which a folder does not store",
+            value=stated,
+            remedy="save the model as it was calibrated",
         )
     weights = save_tensors(_tensors(model))
     groups = [
@@ -86,12 +95,12 @@ def save_model(model: CalibratedModel, folder: Path) -> None:
 
 
 def describe(text: str, model: CalibratedModel, folder: Path) -> None:
-    """Write the description of a model whose weights the folder holds, and what the compiled kernels read.
+    """Write the description of a model whose weights are in the folder, and the arrays of the compiled kernels.
 
     Args:
-        text: of the description, from `document_text`.
-        model: that it describes.
-        folder: with the weights file.
+        text: text of the description, from `document_text`.
+        model: model that it describes.
+        folder: folder with the weights file.
     """
     compiled, sha256 = folder / COMPILED, None
     with suppress(ModelError):  # the kernels do not evaluate every kind of model
@@ -104,18 +113,23 @@ def load_model(folder: str | os.PathLike[str]) -> CalibratedModel:
     """Read a model folder and check all of it.
 
     Raises:
-        ModelError: a file is missing, truncated, foreign, changed or of a newer format; nothing is half
-            loaded.
+        ModelError: a file is missing, truncated, changed, of another model or in a newer format; no part is loaded
+            then.
     """
     path = Path(folder)
     if not path.is_dir():
         raise ModelError(
-            f"{path}: there is no such model folder; give a folder that `pisigma calibrate` or `pisigma train` wrote."
+            "there is no such model folder",
+            at=Place(path),
+            remedy="give a folder that `pisigma calibrate` or `pisigma train` wrote",
         )
     for name in (DESCRIPTION, WEIGHTS):
         if not (path / name).exists():
             raise ModelError(
-                f"{path}: {name} is missing, so this is no whole model folder; train or copy it again."
+                f"{name} is missing, so the model folder is incomplete",
+                at=Place(path),
+                value=name,
+                remedy="train or copy the model again",
             )
     document = read_document(path / DESCRIPTION)
     tensors = read_weights(path / WEIGHTS, document.weights_sha256)
@@ -124,8 +138,12 @@ def load_model(folder: str | os.PathLike[str]) -> CalibratedModel:
         return _build_model(document, tensors, drawing or None)
     except (PisigmaError, ValueError) as problem:
         reason = " ".join(str(problem).rstrip(".").split())
+        file = problem.file if isinstance(problem, MisfitError) else DESCRIPTION
         raise ModelError(
-            f"{path}: {WEIGHTS} and {DESCRIPTION} do not fit ({reason}); train the model again."
+            f"{WEIGHTS} and {DESCRIPTION} do not fit together: {reason}",
+            value=getattr(problem, "value", None),
+            at=Place(path / file, column=getattr(problem, "column", None)),
+            remedy="train the model again",
         ) from None
 
 
@@ -145,34 +163,43 @@ def read_weights(path: Path, sha256: str) -> dict[str, Tensor]:
     """Read the tensors of a weights file.
 
     Raises:
-        ModelError: its hash is another one, it is no such file, or it holds numbers that are not finite.
+        ModelError: its hash differs, it is not a safetensors file, or it has numbers that are not finite.
     """
     content = _read_whole(path, sha256)
     try:
         tensors: dict[str, Tensor] = load_tensors(content)
     except SafetensorError as problem:
         raise ModelError(
-            f"{path}: is no safetensors file ({problem}); train or copy the model again."
+            f"expected a safetensors file: {problem}",
+            expected="a safetensors file",
+            at=Place(path),
+            remedy="train or copy the model again",
         ) from None
     for name, value in tensors.items():
         if not torch.isfinite(value).all():
             raise ModelError(
-                f"{path}: the tensor '{name}' has entries that are not finite; train the model again."
+                f"the tensor '{name}' has entries that are not finite",
+                value=name,
+                at=Place(path),
+                remedy="train the model again",
             )
     return tensors
 
 
 def _read_whole(path: Path, sha256: str) -> bytes:
-    """Read a file that the description states the hash of.
+    """Read a file whose hash the description states.
 
     Raises:
-        ModelError: its hash is another one, or it cannot be read.
+        ModelError: its hash differs, or it cannot be read.
     """
     content = read_model_file(path.parent, path.name)
     if hashlib.sha256(content).hexdigest() != sha256:
         raise ModelError(
-            f"{path}: is truncated, changed or of another model (its hash is not the one in {DESCRIPTION}); "
-            "train or copy the model again."
+            f"the file was truncated or changed, or belongs to another model: its SHA-256 is not the one in "
+            f"{DESCRIPTION}",
+            expected=f"the SHA-256 {sha256}",
+            at=Place(path),
+            remedy="train or copy the model again",
         )
     return content
 
@@ -180,10 +207,10 @@ def _read_whole(path: Path, sha256: str) -> bytes:
 def _build_model(
     document: ModelDocument, tensors: dict[str, Tensor], drawing: bytes | None
 ) -> CalibratedModel:
-    """Put the model together from parts that fit.
+    """Build the model from its description and tensors.
 
     Raises:
-        ValueError: a tensor is missing, too many or of another shape or type; or a name or count is wrong.
+        ValueError: a tensor is missing, unknown or of another shape or type; or a name or count is wrong.
     """
     robot = Robot(*document.robot.drawing()._replace(urdf=drawing))
     check_size(document, robot, sum(value.numel() for value in tensors.values()))
@@ -195,7 +222,7 @@ def _build_model(
         expected |= {_PREFIX + key: tuple(value.shape) for key, value in network.state_dict().items()}
         inputs = sum(len(group.inputs.names) for group in network.groups)
         expected |= {"domain.samples": (None, inputs), "domain.radius": ()} if samples else {}
-    if _ROWS[0] in tensors:  # folders do not have to keep them
+    if _ROWS[0] in tensors:  # optional in a folder
         columns = len(robot.axes) + ROW_READINGS
         expected |= dict(zip(_ROWS, ((None, columns), (None, columns), (None, ROW_STEPS)), strict=True))
     _check_tensors(tensors, expected)
@@ -228,7 +255,7 @@ def _build_model(
 
 def _made_of(robot: Robot, numbers: Tensor, measured: Tensor, steps: Tensor) -> RowValues:
     if not len(numbers) == len(measured) == len(steps):
-        raise ValueError("the rows that the model was made of lack numbers or steps")
+        raise MisfitError("the training rows lack numbers or steps", file=WEIGHTS, value=_ROWS[0])
     return RowValues.kept(torch.where(measured.bool(), numbers, torch.nan), steps, robot)
 
 
@@ -237,9 +264,11 @@ def _calibrated_robot(document: ModelDocument, robot: Robot) -> Robot | None:
         return None
     calibrated = Robot(*document.calibrated.drawing()._replace(urdf=robot.urdf))
     if [(row.name, row.type) for row in calibrated.rows] != [(row.name, row.type) for row in robot.rows]:
-        raise ValueError("the calibrated robot has other rows than the nominal one")
+        raise MisfitError("the calibrated robot has other rows than the nominal one", column="calibrated")
     if not (np.array_equal(calibrated.base, robot.base) and np.array_equal(calibrated.tool, robot.tool)):
-        raise ValueError("the calibrated robot has another base or tool than the nominal one")
+        raise MisfitError(
+            "the base or tool of the calibrated robot differs from the nominal one", column="calibrated"
+        )
     return calibrated
 
 
@@ -247,21 +276,31 @@ def _check_branches(robot: Robot, branches: tuple[str, ...]) -> None:
     solver = closed_form_solver(robot)
     for name in branches:
         if solver is None:
-            raise ValueError(f"branch '{name}' is named, but robot '{robot.name}' has no closed-form inverse")
+            raise MisfitError(
+                f"branch '{name}' is stated, but robot '{robot.name}' has no closed-form inverse",
+                column="branches",
+                value=name,
+            )
         if name not in solver.branches:
-            raise ValueError(
-                f"robot '{robot.name}' has no branch '{name}'; {nearest_choice(name, solver.branches)}"
+            raise MisfitError(
+                f"robot '{robot.name}' has no branch '{name}'; {nearest_choice(name, solver.branches)}",
+                column="branches",
+                value=name,
             )
 
 
 def _empty_network(document: ModelDocument, robot: Robot) -> CorrectionNetwork | None:
-    """The network as described, its weights still to be filled in."""
+    """Make the network as described, without its weights."""
     names = [joint.name for joint in robot.joints]
     groups, networks = [], []
     for section in document.network:
         for name in section.joints:
             if name not in names:
-                raise ValueError(f"the network corrects joint '{name}'; {nearest_choice(name, names)}")
+                raise MisfitError(
+                    f"the network corrects the unknown joint '{name}'; {nearest_choice(name, names)}",
+                    column="network",
+                    value=name,
+                )
         inputs = Inputs.of(robot, section.inputs, np.array(section.reference))
         groups.append(JointGroup(tuple(names.index(name) for name in section.joints), inputs))
         networks.append(PiSigma(len(section.inputs), len(section.joints), section.orders))
@@ -269,9 +308,10 @@ def _empty_network(document: ModelDocument, robot: Robot) -> CorrectionNetwork |
 
 
 def _check_tensors(tensors: dict[str, Tensor], expected: dict[str, Shape]) -> None:
-    """Refuse tensors that are not exactly the expected ones; None in a shape is any length."""
+    """Raise an error unless the tensors are exactly the expected ones; None in a shape stands for any length."""
     for name in sorted(set(tensors) ^ set(expected)):
-        raise ValueError(f"the tensor '{name}' is {'unknown' if name in tensors else 'missing'}")
+        problem = "unknown" if name in tensors else "missing"
+        raise MisfitError(f"the tensor '{name}' is {problem}", file=WEIGHTS, value=name)
     for name, shape in expected.items():
         value = tensors[name]
         fits = len(shape) == value.ndim and all(
@@ -279,8 +319,16 @@ def _check_tensors(tensors: dict[str, Tensor], expected: dict[str, Shape]) -> No
         )
         if not fits:
             wanted = str(tuple("any" if length is None else length for length in shape)).replace("'", "")
-            raise ValueError(f"the tensor '{name}' of shape {wanted} was wanted, got {tuple(value.shape)}")
+            raise MisfitError(
+                f"expected shape {wanted} of the tensor '{name}', got {tuple(value.shape)}",
+                file=WEIGHTS,
+                value=tuple(value.shape),
+            )
         dtype = DTYPES.get(name, torch.float64)
         if value.dtype != dtype:
             kind = str(dtype).removeprefix("torch.")
-            raise ValueError(f"the tensor '{name}' in {kind} was wanted, got {value.dtype}")
+            raise MisfitError(
+                f"expected {kind} of the tensor '{name}', got {str(value.dtype).removeprefix('torch.')}",
+                file=WEIGHTS,
+                value=value.dtype,
+            )

@@ -1,4 +1,4 @@
-"""Model folders of earlier versions made new: keys of `model.yaml` that have another name or form since."""
+"""Conversion of model folders of earlier versions, whose keys of `model.yaml` have other names or forms."""
 
 import hashlib
 import os
@@ -10,7 +10,7 @@ from typing import Any
 
 from safetensors.torch import save as save_tensors
 
-from pisigma.files.errors import ModelError
+from pisigma.files.errors import ModelError, Place
 from pisigma.files.model_files import CARD, COMPILED, DESCRIPTION, MODEL_FILES, WEIGHTS, read_model_file
 from pisigma.files.output_folder import staged_folder
 from pisigma.files.yaml_file import plain_content
@@ -40,7 +40,7 @@ _RENAMED = {
     "variance_widening": "prior_scale",
     "widening": "prior_scale",
 }
-"""Old and new names of keys, wherever they stand among metrics and in the section of the uncertainty."""
+"""Old and new names of keys, anywhere among the metrics and in the section of the uncertainty."""
 
 _LABELS = (
     (r"^identified; the data hardly .*$", "held by the prior"),
@@ -50,30 +50,30 @@ _LABELS = (
     (r"^.* is identified, the single values are not", "in a sum"),
     (r"; the data hardly .*$", "; prior"),
 )
-"""What earlier versions said of a parameter, and the few words for it that newer ones keep beside."""
+"""Remarks of earlier versions on a parameter, and the short labels that newer versions store in addition."""
 
 _FADED = re.compile(rb"beyond the measured joint values the correction fades to nothing over \d+ deg")
 _EXTRAPOLATED = b"beyond the measured joint values the correction is an extrapolation"
-"""What a card said of the fade, and what it says instead."""
+"""Clause of a card on the fade, and the clause that replaces it."""
 _NO_FADE = (
-    "The correction now holds at all joint values, and the predicted deviation says how well; up to format 3 it faded "
-    "to the geometric calibration beyond the measured ones."
+    "The correction now applies at all joint values, with a predicted standard deviation; up to format 3 it faded to "
+    "zero outside the measured ones."
 )
 
 ROOT = "uncertainty.root"
-MOST_SPREADS = 3.0
-"""Up to format 3 conditions counted as measured so many standard deviations from their mean."""
+MAX_DEVIATIONS = 3.0
+"""Up to format 3, conditions within so many standard deviations from their mean counted as measured."""
 
 
 @dataclass(frozen=True)
 class Upgrade:
-    """A folder that was made new.
+    """Result of the upgrade of a model folder.
 
     Attributes:
-        name: of the model.
-        before: format that the folder had.
-        after: format that it has now; the same where there was nothing to do.
-        changes: sentences on what the model does otherwise than before.
+        name: name of the model.
+        before: format of the folder before the upgrade.
+        after: format after the upgrade; equal to `before` if there was nothing to do.
+        changes: sentences on how the model behaves differently than before.
     """
 
     name: str
@@ -83,25 +83,30 @@ class Upgrade:
 
 
 def upgrade_folder(folder: str | os.PathLike[str], check: Callable[[CalibratedModel, Path], None]) -> Upgrade:
-    """Rewrite a model folder of an earlier version in the form of this one, whole or not at all.
+    """Convert a model folder of an earlier version to the format of this one, as a whole or not at all.
 
-    Tensors, figures and all other files stay as they are, but for the type of the root of a covariance, and so does the
-    card but for what is not true any more; the file for the compiled kernels is made again.
+    Tensors, figures and all other files stay as they are, except for the type of a covariance root, and so does the
+    card except for statements that are no longer true; the file for the compiled kernels is written again.
 
     Args:
-        folder: to upgrade.
-        check: raises where a folder does not say what a model in memory says: `pisigma.model.inverse.written_model`.
+        folder: folder to upgrade.
+        check: function that raises an error if the folder differs from the model in memory, such as
+            `pisigma.model.inverse.written_model.check_written`.
 
     Raises:
-        ModelError: the folder holds no model, it is truncated, was edited or is of a newer format, or it is a hybrid
-            with product units of an earlier version, or with an uncertainty whose order cannot be known.
+        ModelError: the folder is not a model, it was truncated or edited or has a newer format, or it is a hybrid with
+            product units of an earlier version, or with an uncertainty whose order cannot be determined.
         OutputError: the folder cannot be written.
     """
     path = Path(folder)
     text = read_signed_text(path / DESCRIPTION)
     before, document = stated_format(text), plain_content(text, ModelError, str(path / DESCRIPTION))
     if before is None or not isinstance(document, dict) or not isinstance(document.get("metrics"), dict):
-        raise ModelError(f"{path / DESCRIPTION}: does not describe a model; train or copy the model again.")
+        raise ModelError(
+            expected="the description of a model",
+            at=Place(path / DESCRIPTION),
+            remedy="train or copy the model again",
+        )
     if before == FORMAT:
         return Upgrade(load_model(path).name, before, FORMAT)
     document["metrics"] = _metrics(str(document.get("kind")), _renamed(document["metrics"]))
@@ -128,7 +133,11 @@ def upgrade_folder(folder: str | os.PathLike[str], check: Callable[[CalibratedMo
 
 
 def _without_fade(document: dict[str, Any]) -> tuple[str, ...]:
-    """Take out how a correction faded to the geometric calibration, as it did up to format 3; says so where it did."""
+    """Remove the fade of the correction outside the measured joint values, which formats up to 3 had.
+
+    Returns:
+        A sentence if the folder had one.
+    """
     document.get("uncertainty", {}).pop("unexplained_m", None)
     learned = (document["metrics"].get("hybrid") or {}).get("learned") or {}
     learned.pop("fades_over_deg", None)
@@ -136,15 +145,17 @@ def _without_fade(document: dict[str, Any]) -> tuple[str, ...]:
 
 
 def _without_turns(uncertainty: dict[str, Any], path: Path) -> dict[str, Any]:
-    """Say that there are no products of inputs, where up to format 3 the factors of product units were named.
+    """Replace the list of product-unit factors of formats up to 3 by the statement that there are no input products.
 
     Raises:
-        ModelError: there are such factors, whose uncertainty is not that of products.
+        ModelError: there are such factors; their uncertainty cannot be converted to that of products.
     """
     if uncertainty.pop("turns", []):
         raise ModelError(
-            f"{path}: a joint correction without product units was wanted, but this one has them from an earlier "
-            "version, whose uncertainty cannot be converted; calibrate again."
+            "the uncertainty of product units of an earlier version cannot be converted",
+            expected="a joint correction without product units",
+            at=Place(path),
+            remedy="calibrate again",
         )
     return {"products": False, **uncertainty}
 
@@ -152,9 +163,9 @@ def _without_turns(uncertainty: dict[str, Any], path: Path) -> dict[str, Any]:
 def _in_order(uncertainty: dict[str, Any], document: Mapping[str, Any], path: Path) -> dict[str, Any]:
     """State the order of the root's rows, which folders up to format 4 do not.
 
-    Their weights are in the order in which the calibration tried the features: products of inputs behind all others,
-    but for single lines, which were looked for in what all others leave. Sensors' unknowns are in the order of their
-    values.
+    Their weights are in the order in which the calibration tried the features: products of inputs after all others,
+    except for gear lines, which were fitted last, to the residuals of all others. Unknown sensor parameters are in the
+    order of their values.
 
     Raises:
         ModelError: rows were added to a model whose weights were read in another order.
@@ -163,9 +174,11 @@ def _in_order(uncertainty: dict[str, Any], document: Mapping[str, Any], path: Pa
     if uncertainty.pop("products"):
         if GearLines.name in features and document.get("kind") != "hybrid_calibration":
             raise ModelError(
-                f"{path}: expected an uncertainty whose weights are in a known order, got one of products and lines to "
-                "which an earlier version added rows in another order, so that the model itself is wrong; calibrate "
-                "again, or upgrade the calibration and recalibrate that again."
+                "an earlier version recalibrated products and gear lines with weights in the wrong order, so that the "
+                "model itself is wrong",
+                expected="an uncertainty whose weights are in a known order",
+                at=Place(path),
+                remedy="calibrate again, or upgrade the original calibration and recalibrate that",
             )
         features.insert(
             features.index(GearLines.name) if GearLines.name in features else len(features),
@@ -192,10 +205,10 @@ def _in_order(uncertainty: dict[str, Any], document: Mapping[str, Any], path: Pa
 
 
 def _with_exact_root(path: Path, sha256: str) -> str:
-    """Write the root of the covariance in float64, which is in float32 up to format 4; gives the new hash of the file.
+    """Convert the covariance root to float64, which is float32 up to format 4, and return the new hash of the file.
 
     Raises:
-        ModelError: the file is not the one that the description states.
+        ModelError: the hash of the file is not the one in the description.
     """
     tensors = read_weights(path, sha256)
     if ROOT in tensors:
@@ -205,40 +218,40 @@ def _with_exact_root(path: Path, sha256: str) -> str:
 
 
 def _with_measured_conditions(document: Mapping[str, Any]) -> tuple[str, ...]:
-    """State the measured payloads and temperatures, which folders up to format 3 lack: about their means."""
+    """Estimate the measured ranges of payload and temperature, which formats up to 3 lack, from mean and spread."""
     for feature in document.get("learned", {}).get("features", ()):
         if feature["name"] == "conditions" and "measured" not in feature:
             spans = zip(feature["names"], feature["mean"], feature["spread"], strict=True)
             feature["measured"] = [
-                [max(low, 0.0) if name == "payload_kg" else low, mean + MOST_SPREADS * spread]
+                [max(low, 0.0) if name == "payload_kg" else low, mean + MAX_DEVIATIONS * spread]
                 for name, mean, spread in spans
-                for low in [mean - MOST_SPREADS * spread]
+                for low in [mean - MAX_DEVIATIONS * spread]
             ]
             named = " and ".join(
                 f"{name} {low:.4g} to {high:.4g}"
                 for name, (low, high) in zip(feature["names"], feature["measured"], strict=True)
             )
             return (
-                f"The folder does not say which conditions were measured; {named} are taken, three standard "
-                "deviations to either side of the mean. Calibrate again to keep the measured ones.",
+                f"The folder does not state which conditions were measured; {named} are assumed, three standard "
+                "deviations to either side of the mean. Calibrate again to store the measured ones.",
             )
     return ()
 
 
 def _renamed(values: Any) -> Any:
-    """The same values with the keys of today."""
+    """Return the values with the keys of the present format."""
     if isinstance(values, dict):
         return {_RENAMED.get(key, key): _renamed(value) for key, value in values.items()}
     return [_renamed(value) for value in values] if isinstance(values, list) else values
 
 
 def _metrics(kind: str, metrics: dict[str, Any]) -> dict[str, Any]:
-    """Metrics in the form of today; see `pisigma.validation.held_out`."""
+    """Convert metrics to the present form; see `pisigma.validation.held_out`."""
     if kind == "distilled":
         return metrics | {"joints": [_joint(joint) for joint in metrics.get("joints", ())]}
     if kind not in ("geometric_calibration", "hybrid_calibration"):
         return metrics
-    if "parameters" not in metrics:  # of a study that kept other figures, which nothing reads
+    if "parameters" not in metrics:  # a study stored other figures, which nothing reads
         return {}
     metrics = metrics | {"parameters": [_labelled(row) for row in metrics["parameters"]]}
     held_out = metrics.get("held_out")
@@ -249,7 +262,7 @@ def _metrics(kind: str, metrics: dict[str, Any]) -> dict[str, Any]:
 
 
 def _labelled(row: Mapping[str, Any]) -> dict[str, Any]:
-    """A row of the parameter table with its label."""
+    """Add the label to a row of the parameter table."""
     label = row["remark"]
     for pattern, words in _LABELS:
         label = re.sub(pattern, words, label)
@@ -257,7 +270,7 @@ def _labelled(row: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _joint(joint: Mapping[str, Any]) -> dict[str, Any]:
-    """Corrections of a joint of a distilled model, and their errors, without units in the names."""
+    """Convert the figures of a joint of a distilled model to names without units."""
     if "correction" in joint:
         return dict(joint)
     names: Sequence[str] = ("mean", "rms", "max")

@@ -291,7 +291,7 @@ class NumericIK:
         measure = torch.full((len(T),), torch.nan, dtype=torch.float64)
         if self._network is None:
             return q, measure
-        turned = self.model.as_trained(q)
+        turned = self.model.wrapped_near_training(q)
         if self.model.domain is not None:
             measure = self.model.domain.measure(self._network.scaled_inputs(T, turned))
         return q + self.model.correction(T, turned), measure

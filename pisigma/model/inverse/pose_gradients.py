@@ -94,7 +94,7 @@ def differentiable(
         return replace(result, q=q_nominal + result.correction, q_nominal=q_nominal)
     known = torch.isfinite(result.q).all(-1, keepdim=True)
     safe = torch.where(known, q_nominal, 0.0)
-    on_turn = safe + (model.as_trained(safe.detach()) - safe.detach())
+    on_turn = safe + (model.wrapped_near_training(safe.detach()) - safe.detach())
     correction = torch.where(known, model.network(T, on_turn), torch.nan)
     return replace(result, q=q_nominal + correction, q_nominal=q_nominal)
 
