@@ -303,7 +303,7 @@ def _entries(pose: Any, name: str) -> tuple[float, ...]:
 
 def _near(model: ServedModel, request: dict[str, Any]) -> list[float] | None:
     near = _joints(model, request, *_NEAR) if request.keys() & _NEAR else None
-    if near is not None and not model.ik.postures.hold(near):
+    if near is not None and not model.ik.postures.contains(near):
         raise RequestError(
             f"'{_NEAR[model.joints_key != 'q_deg']}' lies more than a full turn (or 1 m) beyond the joint limits of "
             f"model '{model.name}'; give the joint values where the robot stands, in {_units(model)}."

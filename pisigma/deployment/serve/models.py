@@ -90,7 +90,7 @@ class ServedModel:
             What `CompiledIK.solve_packed` gives.
         """
         values, kernels = self._near.unpack(near), self.direct
-        if kernels is not None and self.ik.postures.hold(values):
+        if kernels is not None and self.ik.postures.contains(values):
             return kernels.solve_packed(T_base_tool, near)
         none = all(map(math.isnan, values))
         if kernels is not None:

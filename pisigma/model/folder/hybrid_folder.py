@@ -249,7 +249,7 @@ def _coverage(robot: Robot, tensors: Mapping[str, Tensor]) -> JointCoverage:
         raise MisfitError(
             "the coverage must have an interval of width >= 0 for every joint of the robot, and no other",
             file=WEIGHTS,
-            value="coverage",
+            value="coverage.joint",
         )
     rate = torch.from_numpy(turning_rate(robot))
     turning = tuple(bool(turns) for turns in robot.revolute)

@@ -320,7 +320,7 @@ def _check_tensors(tensors: dict[str, Tensor], expected: dict[str, Shape]) -> No
         if not fits:
             wanted = str(tuple("any" if length is None else length for length in shape)).replace("'", "")
             raise MisfitError(
-                f"expected shape {wanted} of the tensor '{name}', got {tuple(value.shape)}",
+                f"expected shape {wanted} for the tensor '{name}', got {tuple(value.shape)}",
                 file=WEIGHTS,
                 value=tuple(value.shape),
             )
@@ -328,7 +328,7 @@ def _check_tensors(tensors: dict[str, Tensor], expected: dict[str, Shape]) -> No
         if value.dtype != dtype:
             kind = str(dtype).removeprefix("torch.")
             raise MisfitError(
-                f"expected {kind} of the tensor '{name}', got {str(value.dtype).removeprefix('torch.')}",
+                f"expected type {kind} for the tensor '{name}', got {str(value.dtype).removeprefix('torch.')}",
                 file=WEIGHTS,
                 value=value.dtype,
             )

@@ -1,4 +1,4 @@
-"""Corrected inverse kinematics for control loops: NumPy in, NumPy out, some microseconds a pose."""
+"""Compiled corrected inverse kinematics for control loops, on NumPy arrays, in a few microseconds per pose."""
 
 import ctypes
 import os
@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pisigma.files.errors import PoseError, nearest_choice
-from pisigma.model.inverse.joint_input import FAULTS, joint_rows, numbers
+from pisigma.files.errors import PoseError, check_choice
+from pisigma.model.inverse.joint_input import fault_error, joint_rows, numbers
 from pisigma.model.inverse.solution import AbstractInverse, Solution
 from pisigma.robot.kernels import arrays
 from pisigma.robot.kernels.array_kinematics import address_of
@@ -20,25 +20,25 @@ from pisigma.robot.kernels.layout import make_memory, pack
 from pisigma.robot.kernels.machine_code import IGNORED, Said, kernel_forms, load_kernels
 from pisigma.robot.kinematics.task_axes import WHOLE, TaskAxes, default_axes
 
-if TYPE_CHECKING:  # a name in full, which type checkers at run time find without this import
+if TYPE_CHECKING:  # a full name, which run-time type checkers resolve without this import
     import pisigma.model.calibrated_model
 
 CHUNK = 2_048
-"""Poses that a thread takes at a time."""
-SOLUTIONS = 8
-"""Different solutions of a pose that are looked for on arms without closed form."""
+"""Poses that a thread solves at a time."""
+MAX_SOLUTIONS = 8
+"""Most distinct solutions of a pose that are returned for arms without a closed-form inverse."""
 
 
 class CompiledIK:
-    """The corrected inverse kinematics of one arm, compiled. It may be called from several threads at a time.
+    """Compiled corrected inverse kinematics of one arm. It may be called from several threads at a time.
 
     Attributes:
         description: the arm as arrays.
-        name: of the model.
+        name: name of the model.
         branches: names of the branches.
         joints: names of the joints.
-        belongs_to: SHA-256 of the model folder that says the same; "" where there is none.
-        axes: which axes of the tool count where no task is stated.
+        belongs_to: SHA-256 of the model folder of the same state; "" without a folder.
+        axes: axes of the tool that are constrained unless a task states others.
     """
 
     def __init__(
@@ -49,7 +49,7 @@ class CompiledIK:
         name: str = "model",
         belongs_to: str = "",
     ) -> None:
-        """Take a description such as `model.compiled_model.describe` makes.
+        """Take a description from `model.compiled_model.describe`.
 
         Raises:
             ModelError: the arm is larger than the compiled kernels allow, or there are no kernels for this machine.
@@ -68,11 +68,10 @@ class CompiledIK:
 
     @staticmethod
     def of(model: "pisigma.model.calibrated_model.CalibratedModel") -> "CompiledIK":
-        """Take a model.
+        """Compile a model.
 
         Raises:
-            ModelError: it corrects by something that has no compiled form, see `model.compiled_model.describe`; or see
-                `__init__`.
+            ModelError: its correction has no compiled form, see `model.compiled_model.describe`; or see `__init__`.
         """
         from pisigma.model.compiled_model import describe
 
@@ -84,7 +83,7 @@ class CompiledIK:
         """Read a file that `model.compiled_model.save_compiled` wrote.
 
         Raises:
-            ModelError: the file is missing, truncated, foreign, changed or of another format.
+            ModelError: the file is missing, truncated, changed, of another kind or of another format.
         """
         description, names = read_description(file)
         return CompiledIK(description, **names)
@@ -102,48 +101,48 @@ class CompiledIK:
         """Find corrected joint values for one pose.
 
         Args:
-            T_base_tool: `(4, 4)`: wanted pose of the tool in the base frame [m].
-            near: `(dof,)` joint values [rad or m] such as the present ones: of the branches that reach the pose the
-                nearest is taken, on the nearest turns within the limits.
-            branch: name of the branch to take. With neither, branches are tried in the order of how many training
-                rows lie on them, then the others; the first that reaches the pose inside the joint limits is taken,
-                else the first that reaches it.
-            throw: whether a matrix that is no pose, and joint values `near` that are not finite, raise; else the
-                status is INVALID_POSE.
-            approach: `(dof,)`: +1 or -1 for the side from which every joint comes, 0 where that is not stated.
+            T_base_tool: `(4, 4)`: target pose of the tool in the base frame [m].
+            near: `(dof,)` joint values [rad or m], for example the present ones: of the branches that reach the pose,
+                the nearest is chosen, with revolute joints wrapped as near as their limits allow.
+            branch: name of the branch to use. Without `near` and `branch`, branches are tried in the order of their
+                number of training rows; the first that reaches the pose inside the joint limits is chosen, else the
+                first that reaches it.
+            throw: whether an invalid pose, or a `near` that is not finite, raises an error; otherwise the status is
+                INVALID_POSE.
+            approach: `(dof,)`: +1 or -1 for the direction in which every joint moves to the pose, 0 if it is not known.
             owner: see `Solution`.
-            axes: which axes of the tool count; None for `axes` of the arm.
+            axes: axes of the tool that are constrained; None for the arm's `axes`.
 
         Raises:
-            PoseError: the matrix is no pose, a shape does not fit, or there is no such branch.
+            PoseError: the matrix is not a valid pose, a shape is wrong, or there is no such branch.
         """
         T = numbers(T_base_tool, "T_base_tool", throw)
         if T.shape != (4, 4):
             raise PoseError(
-                f"T_base_tool has the shape {T.shape}; give one homogeneous transform of shape (4, 4)."
+                expected="one homogeneous transform of shape (4, 4)", value=T.shape, option="T_base_tool"
             )
-        beside, sides = self._rows(near, (), "near", throw), self._rows(approach, (), "approach", True)
+        near_row, sides = self._rows(near, (), "near", throw), self._rows(approach, (), "approach", True)
         task, dof = self._checked(axes), len(self.joints)
         wrong, out = self._solve_bytes(
-            T.tobytes(), beside.tobytes(), sides.tobytes(), task, self._branch(branch), not throw
+            T.tobytes(), near_row.tobytes(), sides.tobytes(), task, self._branch(branch), not throw
         )
         if wrong >= 0:
-            raise PoseError(FAULTS[wrong % 8].format(""))
+            raise fault_error(wrong % 8)
         row = np.frombuffer(memoryview(out))
         position, rotation, measure, status, index = row[2 * dof :].tolist()
         lies = row[:dof], row[dof : 2 * dof], int(index), self.branches, int(status)
         return Solution(*lies, position, rotation, measure, owner, task.ignored)
 
     def solve_packed(self, T_base_tool: bytes, near: bytes) -> list[float]:
-        """Find corrected joint values for one pose whose numbers stand in bytes, as they come from a socket.
+        """Find corrected joint values for one pose that is given as bytes, as received from a socket.
 
         Args:
             T_base_tool: 16 doubles, row by row [m].
-            near: a double for every joint [rad or m], or nothing.
+            near: one double for every joint [rad or m], or empty.
 
         Returns:
             Corrected and nominal joint values, residuals of position [m] and rotation [rad], domain measure, status
-            (INVALID_POSE for what is no pose) and branch, see `Solution`.
+            (INVALID_POSE for an invalid pose) and branch, see `Solution`.
         """
         try:
             solve, rest, out = self._threads.packed
@@ -169,23 +168,26 @@ class CompiledIK:
         """Find corrected joint values for poses `(*batch, 4, 4)`, several threads at a time.
 
         Args:
-            T_base_tool: `(*batch, 4, 4)`: wanted poses [m].
+            T_base_tool: `(*batch, 4, 4)`: target poses [m].
             near: `(*batch, dof)` or `(dof,)`: see `solve`.
             branch: see `solve`.
-            threads: how many; None for one per processor that this process may use.
-            throw: see `solve`; with False bad rows get the status INVALID_POSE and the others are solved.
+            threads: number of threads; None for one per processor that this process may use.
+            throw: see `solve`; with False invalid rows get the status INVALID_POSE and the others are solved.
             approach: `(*batch, dof)` or `(dof,)`: see `solve`.
-            single: whether the poses were rounded to float32, which widens what counts as rounding.
+            single: whether the poses were rounded to float32, which widens the tolerances for rounding.
             axes: see `solve`.
 
         Raises:
-            PoseError: a matrix is no pose (the message gives its index), or see `solve`.
+            PoseError: a matrix is not a valid pose (the message states its index), or see `solve`.
         """
         task = self._checked(axes)
         T = self._poses(T_base_tool, throw)
         batch = T.shape[:-2]
-        beside, sides = self._rows(near, batch, "near", throw), self._rows(approach, batch, "approach", True)
-        out = self._solve_rows(T, beside, sides, self._branch(branch), 1, threads, throw, single, task)
+        near_rows, sides = (
+            self._rows(near, batch, "near", throw),
+            self._rows(approach, batch, "approach", True),
+        )
+        out = self._solve_rows(T, near_rows, sides, self._branch(branch), 1, threads, throw, single, task)
         return self._solution(out.reshape(*batch, out.shape[-1]), task)
 
     def all_branches(
@@ -197,30 +199,31 @@ class CompiledIK:
         single: bool = False,
         axes: TaskAxes | None = None,
     ) -> Solution:
-        """Solutions `(*batch, branches)` of poses `(*batch, 4, 4)` on every branch; for the rest see `solve_batch`.
+        """Find solutions `(*batch, branches)` of poses `(*batch, 4, 4)` on every branch; see `solve_batch`.
 
-        An arm without closed form gets up to `SOLUTIONS` different ones instead, UNREACHABLE where there are fewer.
+        For an arm without a closed-form inverse these are up to `MAX_SOLUTIONS` distinct ones; missing ones are
+        UNREACHABLE.
         """
         task = self._checked(axes)
         T = self._poses(T_base_tool, throw)
         sides = self._rows(approach, T.shape[:-2], "approach", True)
         several = not self.description.forms.closed_forms and not self.description.network.used
-        count = SOLUTIONS if several else len(self.branches)
+        count = MAX_SOLUTIONS if several else len(self.branches)
         out = self._solve_rows(T, self._none, sides, arrays.EVERY_BRANCH, count, threads, throw, single, task)
         return self._solution(out.reshape(*T.shape[:-2], count, out.shape[-1]), task)
 
     def forward(self, q: Any, arm: int | None = None, approach: Any = None) -> tuple[Any, Any, Any, Any]:
-        """Where the calibrated arm goes.
+        """Evaluate the calibrated arm.
 
         Args:
             q: `(poses, dof)` commanded joint values [rad or m].
-            arm: another of the arms in `kernels.arrays`.
+            arm: another of the arms in `kernels.arrays`; None for the calibrated one.
             approach: `(poses, dof)` or `(dof,)`: see `solve`.
 
         Returns:
             T_base_tool `(poses, 4, 4)` [m], Jacobian `(poses, 6, dof)` without the slope of the correction, the
-            correction `(poses, dof)` [rad or m], and the angle [rad] by which a joint lies beyond its measured values
-            `(poses,)`.
+            correction `(poses, dof)` [rad or m], and the largest angle [rad] by which a joint is outside its measured
+            values `(poses,)`.
         """
         dof = len(self.joints)
         rows = self._rows(q, (len(q),), "q", True)
@@ -233,16 +236,19 @@ class CompiledIK:
         return T, J, out[:, 6 * dof : 7 * dof], out[:, 7 * dof]
 
     def _checked(self, axes: TaskAxes | None) -> TaskAxes:
-        """Which axes count; models that correct by the whole pose leave out no others than usual."""
+        """Return the constrained axes; models that correct by the whole pose accept no others than the default ones."""
         if axes is None or not self.description.network.used or axes == self.axes:
             return axes or self.axes
         raise PoseError(
-            f"model '{self.name}' corrects nominal joint values by the whole pose, so that other axes of the tool than "
-            f"the usual ones ({', '.join(self.axes.ignored) or 'none'}) cannot be ignored; calibrate a hybrid."
+            f"model '{self.name}' corrects nominal joint values by the whole pose, so only the default axes "
+            f"({', '.join(self.axes.ignored) or 'none'}) can be ignored",
+            value=axes.ignored,
+            option="ignore_axes",
+            remedy="calibrate a hybrid",
         )
 
     def _solution(self, out: Any, axes: TaskAxes) -> Solution:
-        """The solutions of poses, `(*batch, 2 · dof + 5)`."""
+        """Make solutions from the rows that the kernels write, `(*batch, 2 · dof + 5)`."""
         dof = len(self.joints)
         position, rotation, measure, status, branch = np.moveaxis(out[..., 2 * dof :], -1, 0)
         lies, found = (branch.astype(int), self.branches, status.astype(int)), (position, rotation, measure)
@@ -260,9 +266,14 @@ class CompiledIK:
         single: bool,
         axes: TaskAxes,
     ) -> Any:
-        """What the kernels write, `(poses, count, 2 · dof + 5)`."""
+        """Solve poses with the kernels, which write rows `(poses, count, 2 · dof + 5)`."""
         if threads is not None and threads < 1:
-            raise PoseError(f"threads={threads}: at least one is needed; give None for one per processor.")
+            raise PoseError(
+                expected="a count >= 1",
+                value=threads,
+                option="threads",
+                remedy="give None for one per processor",
+            )
         rows = T.reshape(-1, 4, 4)
         out = np.empty((len(rows), count, 2 * len(self.joints) + 5))
 
@@ -281,16 +292,15 @@ class CompiledIK:
         wrong = next((result for result in list(results) if result >= 0), -1)
         if wrong >= 0:
             index = tuple(int(i) for i in np.unravel_index(wrong // 8, T.shape[:-2])) if T.ndim > 2 else ()
-            at = f" at index {index if len(index) > 1 else index[0]}" if index else ""
-            raise PoseError(FAULTS[wrong % 8].format(at))
+            raise fault_error(wrong % 8, index)
         return out
 
     def _solve_bytes(
         self, T: bytes, near: bytes, approach: bytes, axes: TaskAxes, branch: int, mark: bool
     ) -> tuple[int, ctypes.Array[ctypes.c_double]]:
-        """What the kernels say of one pose, and the row that they write.
+        """Solve one pose with the kernels, and return their fault code and the row that they write.
 
-        ctypes passes the address of bytes in a fraction of the time in which NumPy states that of an array.
+        ctypes passes the address of bytes in a fraction of the time that NumPy takes for the address of an array.
         """
         said, out = Said(), self._row()
         arm = self._address, self._memory(), arrays.SOLVE, 1
@@ -312,11 +322,11 @@ class CompiledIK:
         axes: Any,
         single: bool = False,
     ) -> int:
-        """Have the kernels work on the rows from `start` to `stop`; what they say, with the row of the whole."""
+        """Run the kernels on the rows from `start` to `stop`, and return the fault code with the row of the whole."""
         pairs = []
         for values in (near, approach):
-            beside, rows = address_of(values), len(values)
-            pairs += [beside, rows] if rows < 2 else [beside + start * values.strides[0], stop - start]
+            address, rows = address_of(values), len(values)
+            pairs += [address, rows] if rows < 2 else [address + start * values.strides[0], stop - start]
         said, arm = Said(), (self._address, self._memory(), task, stop - start)
         self._kernels(
             said,
@@ -335,7 +345,7 @@ class CompiledIK:
         return said[0] if said[0] < 0 else said[0] + 8 * start
 
     def _memory(self) -> int:
-        """Address of memory to work in that no other thread uses."""
+        """Return the address of working memory that no other thread uses."""
         address: int | None = getattr(self._threads, "address", None)
         if address is None:
             self._threads.memory = make_memory()
@@ -346,22 +356,22 @@ class CompiledIK:
         if name is None:
             return arrays.ANY_BRANCH
         if name not in self.branches:
-            raise PoseError(f"there is no branch '{name}'; {nearest_choice(name, self.branches)}")
+            check_choice(PoseError, "branch", name, self.branches)
         return self.branches.index(name)
 
     def _poses(self, T_base_tool: Any, throw: bool) -> Any:
         T = numbers(T_base_tool, "T_base_tool", throw)
         if T.ndim < 2 or T.shape[-2:] != (4, 4):
             raise PoseError(
-                f"T_base_tool has the shape {T.shape}; give homogeneous transforms of shape (*batch, 4, 4)."
+                expected="homogeneous transforms of shape (*batch, 4, 4)", value=T.shape, option="T_base_tool"
             )
         return T
 
     def _rows(self, values: Any, batch: tuple[int, ...], what: str, throw: bool) -> Any:
-        """Joint values, or approaches, as `(1 or poses, dof)`; `(0, dof)` for None."""
+        """Convert joint values or approach directions to `(1 or poses, dof)`, None to `(0, dof)`."""
         return self._none if values is None else joint_rows(values, batch, what, throw, self.joints)
 
 
 def _processors() -> int:
-    """How many processors this process may use."""
+    """Return the number of processors that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -1,4 +1,4 @@
-"""Corrected inverse kinematics of coupled joints: the controller's values in and out, DH values in between."""
+"""Corrected inverse kinematics of coupled joints, in the controller's values, which are solved as DH values."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -16,24 +16,24 @@ from pisigma.robot.kinematics import tolerances
 from pisigma.robot.kinematics.status import Status
 from pisigma.robot.kinematics.task_axes import MAX_TILT, TaskAxes
 
-if TYPE_CHECKING:  # a name in full, which type checkers at run time find without this import
+if TYPE_CHECKING:  # a full name, which run-time type checkers resolve without this import
     import pisigma.robot.coupling
 
-STARTS = 4
-"""Stored joint values, those whose poses are nearest, that are tried one after the other."""
-IGNORED = 1e-6
-"""Weight of the rotations about the tool's x and y axes where there are fewer than six axes: too few to choose them, so
-that they only decide between joint values that reach all else. The tool may lean by `MAX_TILT` then, and no more."""
+MAX_STARTS = 4
+"""Stored joint values with the nearest poses that are tried one after the other."""
+IGNORED_WEIGHT = 1e-6
+"""Weight of rotations about the tool's x and y axes for arms with fewer than six axes, which cannot control them: they
+only decide between joint values that reach the other axes. The tool may then be tilted by up to `MAX_TILT`."""
 Values = Float64[np.ndarray, "rows axes"]
 Motion = Callable[[Values], tuple[Any, Any]]
 """Pose `(rows, 4, 4)` and Jacobian `(rows, 6, axes)` of an arm by the controller's values."""
 
 
 class ControllerValues:
-    """Solves in DH values, where limits are wider than the controller's, and brings the answers into these.
+    """Solver in DH values, with wider limits than the controller's, that wraps the solutions into the latter.
 
-    Full turns of coupled joints change the controller's values together. Where no turns bring a solution into the
-    controller's limits, the other branches are tried, in order or the nearest first.
+    Full turns of coupled joints change several of the controller's values. If a solution cannot be wrapped into the
+    controller's limits, the other branches are tried, in their order or with `near` the nearest first.
     """
 
     def __init__(
@@ -41,18 +41,21 @@ class ControllerValues:
         ik: AbstractInverse,
         coupling: "pisigma.robot.coupling.Coupling",
     ) -> None:
-        """Take the inverse kinematics of DH values, and how these follow the controller's."""
+        """Store the inverse kinematics in DH values, and the coupling between these and the controller's values."""
         self.ik, self.coupling = ik, coupling
 
     def with_axes(self, axes: TaskAxes) -> "ControllerValues":
-        """The same where other axes of the tool count.
+        """Return a copy in which other axes of the tool are constrained.
 
         Raises:
-            PoseError: the arm has passive joints, which are solved in the usual axes only.
+            PoseError: the arm has passive joints, which are solved in the default axes only.
         """
         if self.coupling.passive:
             raise PoseError(
-                "an arm with passive joints takes no other axes of the tool than the usual; state none."
+                "other axes than the default ones are not supported for an arm with passive joints",
+                value=axes.ignored,
+                option="ignore_axes",
+                remedy="leave it out, and tolerances too",
             )
         return ControllerValues(self.ik.with_axes(axes), self.coupling)
 
@@ -60,21 +63,21 @@ class ControllerValues:
         """See `CorrectedIK.__call__`.
 
         Args:
-            T: poses.
-            near: checked, of the controller; None without.
-            owner: of the solutions.
-            branch: name of the only branch that may be taken.
-            options: of `CorrectedIK.__call__`.
+            T: target poses.
+            near: checked values of the controller, or None.
+            owner: owner of the solutions.
+            branch: name of the only branch that may be used, or None.
+            options: further options of `CorrectedIK.__call__`.
         """
         if self.coupling.passive:
             return self._solve_passive(T, near, owner)
         if (sides := options.get("approach")) is not None:
             options["approach"] = self.coupling.approach_to_dh(np.asarray(sides, dtype=np.float64))
-        beside = None if near is None else self.coupling.to_dh(np.asarray(near, dtype=np.float64))
-        first = self.ik(T, near=beside, branch=branch, **options)
-        q, outside = self._inside(np.asarray(as_array(first.q)), beside)
+        near_rows = None if near is None else self.coupling.to_dh(np.asarray(near, dtype=np.float64))
+        first = self.ik(T, near=near_rows, branch=branch, **options)
+        q, outside = self._inside(np.asarray(as_array(first.q)), near_rows)
         if outside.any() and branch is None:
-            self._other_branches(pose_array(T)[0], q, outside, beside, options)
+            self._other_branches(pose_array(T)[0], q, outside, near_rows, options)
         if not np.array_equal(q, as_array(first.q), equal_nan=True):
             first = self.ik(T, near=np.nan_to_num(q), branch=branch, **options)
         return self._answer(first, owner)
@@ -93,7 +96,7 @@ class ControllerValues:
         return self.ik.forward(self._to_dh(q), approach=sides)
 
     def jacobian(self, q: Any) -> Any:
-        """See `CorrectedIK.jacobian`: by the controller's values."""
+        """See `CorrectedIK.jacobian`; the derivatives are with respect to the controller's values."""
         return self.ik.jacobian(self._to_dh(q)) @ _as(self.coupling.slope(as_array(q)), q)
 
     def accuracy(self, q: Any) -> Any:
@@ -104,7 +107,7 @@ class ControllerValues:
         return self.coupling.to_dh(q if is_tensor(q) else np.asarray(q, dtype=np.float64))
 
     def _solve_passive(self, T: Any, near: Any, owner: Any) -> Solution:
-        """Solve an arm with passive joints, from `near` or from the stored joint values whose poses are nearest."""
+        """Solve an arm with passive joints, from `near` or from the stored joint values with the nearest poses."""
         poses, axes = pose_array(T)[0], len(self.coupling.axes)
         rows, batch = poses.reshape(-1, 4, 4), poses.shape[:-2]
         if near is None:
@@ -134,7 +137,7 @@ class ControllerValues:
         return solution.map(T.new_tensor) if is_tensor(T) else solution
 
     def _motion(self, q: Any, nominal: bool = False) -> tuple[Any, Any]:
-        """Pose and Jacobian at the controller's values of the calibrated arm, or of the nominal one."""
+        """Compute pose and Jacobian of the calibrated or the nominal arm at the controller's values."""
         dh, slope = self.coupling.to_dh(q), self.coupling.slope(q)
         if nominal:
             robot = self.ik.model.robot
@@ -142,14 +145,14 @@ class ControllerValues:
         return self.ik.forward(dh), self.ik.jacobian(dh) @ slope
 
     def _inside(self, q: Any, near: Any) -> tuple[Any, Any]:
-        """DH values turned so that the controller's are within its limits, and which of them cannot be."""
+        """Wrap DH values so that the controller's values are within its limits, and return which of them cannot be."""
         rows = q.reshape(-1, q.shape[-1])
-        beside = None if near is None else np.broadcast_to(near, q.shape).reshape(rows.shape)
-        turned, inside = self.coupling.wrapped_inside(rows, beside)
+        near_rows = None if near is None else np.broadcast_to(near, q.shape).reshape(rows.shape)
+        turned, inside = self.coupling.wrapped_inside(rows, near_rows)
         return turned.reshape(q.shape), (~inside & np.isfinite(rows).all(-1)).reshape(q.shape[:-1])
 
     def _other_branches(self, T: Any, q: Any, outside: Any, near: Any, options: dict[str, Any]) -> None:
-        """Put joint values of the best branch within the limits into `q`, where there is one."""
+        """Replace joint values in `q` by those of the best branch within the limits, if there is one."""
         poses = T[outside] if T.ndim > 2 else T[None]
         every, excluded = self._inside(
             np.asarray(self.ik.all_branches(poses, approach=_of_rows(options.get("approach"), outside)).q),
@@ -169,7 +172,7 @@ class ControllerValues:
         q[...] = rows.reshape(q.shape)
 
     def _answer(self, solution: Solution, owner: Any) -> Solution:
-        """The solution in the controller's values, with the status that its limits give."""
+        """Convert a solution to the controller's values, with the status according to the controller's limits."""
         status = np.asarray(as_array(solution.status))
         dh = np.asarray(as_array(solution.q))
         beyond = ~self.coupling.is_inside(dh) & np.isfinite(dh).all(-1)
@@ -185,24 +188,24 @@ class ControllerValues:
 
 
 def _as(values: Any, like: Any) -> Any:
-    """Values as a tensor where others are one."""
+    """Convert values to a tensor if `like` is one."""
     return like.new_tensor(values) if is_tensor(like) else values
 
 
 def _of_rows(values: Any, rows: Any) -> Any:
-    """Those of some rows, where there is one a row."""
+    """Select rows of values that have one entry per row."""
     return values[rows] if values is not None and np.ndim(values) > 1 else values
 
 
 @dataclass(frozen=True, eq=False)
 class Reached:
-    """What was reached.
+    """Result of the iteration towards poses.
 
     Attributes:
         q: the controller's values [rad or m].
-        reached: whether the pose is, in all that the arm can choose.
-        position: distance from the wanted position [m].
-        rotation: angle to the wanted orientation [rad], of which arms with fewer than six axes choose a part.
+        reached: whether the pose is reached in all axes that the arm can control.
+        position: distance from the target position [m].
+        rotation: angle to the target orientation [rad], which arms with fewer than six axes control only in part.
     """
 
     q: Values
@@ -211,21 +214,21 @@ class Reached:
     rotation: Float64[np.ndarray, " rows"]
 
     def known(self, values: np.ndarray) -> np.ndarray:
-        """Values of every pose, NaN where it is not reached."""
+        """Replace values of poses that are not reached by NaN."""
         return np.where(self.reached if values.ndim == 1 else self.reached[:, None], values, np.nan)
 
 
 def solve(motion: Motion, T: Float64[np.ndarray, "rows 4 4"], start: Values) -> Reached:
-    """Bring an arm to poses by damped least squares from given values.
+    """Solve for poses by damped least squares from initial values.
 
     Args:
-        motion: of the arm.
-        T: wanted poses T_base_tool [m].
-        start: the controller's values to begin with [rad or m].
+        motion: function for pose and Jacobian of the arm.
+        T: target poses T_base_tool [m].
+        start: initial values of the controller [rad or m].
     """
     q = start.copy()
     weight = np.ones(6)
-    weight[3:5] = 1.0 if q.shape[1] >= 6 else IGNORED
+    weight[3:5] = 1.0 if q.shape[1] >= 6 else IGNORED_WEIGHT
     error, J = _errors(motion, T, q)
     for _ in range(tolerances.MAX_ITERATIONS):
         A, b = J * weight[:, None], error * weight
@@ -248,7 +251,7 @@ def solve_from(
     starts: Float64[np.ndarray, "rows tried axes"],
     is_inside: Callable[[Values], Bool[np.ndarray, " rows"]],
 ) -> Reached:
-    """Solve poses from the first of their starts that leads there within the limits, else from one that leads there."""
+    """Solve every pose from the first start that reaches it within the limits, else from one that reaches it."""
     result = solve(motion, T, starts[:, 0])
     for tried in starts[:, 1:].swapaxes(0, 1):
         left = ~(result.reached & is_inside(result.q))
@@ -263,14 +266,14 @@ def solve_from(
 def nearest_starts(
     motion: Motion, T: Float64[np.ndarray, "rows 4 4"], starts: Float64[np.ndarray, "starts axes"]
 ) -> Float64[np.ndarray, "rows tried axes"]:
-    """Of stored values, per pose those whose poses are nearest, the nearest first."""
+    """Return for every pose the stored values with the nearest poses, nearest first."""
     position = motion(starts)[0][:, :3, 3]
     off = np.linalg.norm(T[:, None, :3, 3] - position, axis=-1)
-    return starts[np.argsort(off, axis=1)[:, :STARTS]]
+    return starts[np.argsort(off, axis=1)[:, :MAX_STARTS]]
 
 
 def _errors(motion: Motion, T: Any, q: Values) -> tuple[Any, Any]:
-    """What is missing in the tool's axes, [m] and rotation vector [rad], and the Jacobian there."""
+    """Compute position error [m] and rotation vector [rad] in the tool's axes, and the Jacobian in these."""
     here, J = motion(q)
     R = here[:, :3, :3]
     shift = (R.mT @ (T[:, :3, 3] - here[:, :3, 3])[..., None])[..., 0]
@@ -280,7 +283,7 @@ def _errors(motion: Motion, T: Any, q: Values) -> tuple[Any, Any]:
 
 
 def _rotation_vector(R: Any) -> Any:
-    """Rotation vectors [rad] of rotations; near half a turn of the right length, if not in the right direction."""
+    """Compute rotation vectors [rad]; near an angle of pi only their length is accurate."""
     axis = np.stack([R[:, 2, 1] - R[:, 1, 2], R[:, 0, 2] - R[:, 2, 0], R[:, 1, 0] - R[:, 0, 1]], -1) / 2
     sine, cosine = np.linalg.norm(axis, axis=-1), (np.trace(R, axis1=1, axis2=2) - 1) / 2
     angle = np.arctan2(sine, cosine)

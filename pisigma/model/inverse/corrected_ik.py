@@ -10,14 +10,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pisigma.files.errors import ModelError, PoseError
+from pisigma.files.errors import ModelError, Place, PoseError
 from pisigma.files.model_files import COMPILED, model_hash, ready_hash
 from pisigma.model.inverse.joint_input import Postures, as_array, checked_approach, pose_array
 from pisigma.model.inverse.solution import AbstractInverse, Solution
 from pisigma.robot.kernels.array_kinematics import by_torch, is_tensor
 from pisigma.robot.kinematics.task_axes import TaskAxes, task_axes
 
-if TYPE_CHECKING:  # names in full, which type checkers at run time find without these imports
+if TYPE_CHECKING:  # full names, which run-time type checkers resolve without these imports
     import pytorch_kinematics
 
     import pisigma.model.calibrated_model
@@ -28,23 +28,23 @@ if TYPE_CHECKING:  # names in full, which type checkers at run time find without
 
 
 class CorrectedIK(AbstractInverse):
-    """The corrected inverse kinematics of a model: call it with poses.
+    """Corrected inverse kinematics of a model; call it with poses.
 
-    Poses go through compiled kernels on the CPU. NumPy arrays and nested lists come back as NumPy arrays, without torch
-    being imported; tensors come back as tensors on their own device, with gradients (see `pose_gradients`). A model
-    without compiled form, and every one where the machine has no kernels, goes through `NumericIK` instead.
+    Poses are solved by compiled kernels on the CPU. For NumPy arrays and nested lists the solutions are NumPy arrays,
+    and torch is not imported; for tensors they are tensors on the same device, with gradients (see `pose_gradients`).
+    Models without a compiled form, and all models on machines without kernels, are solved by `NumericIK` instead.
 
     Attributes:
-        name: of the model.
-        branches: names of the branches it knows.
+        name: name of the model.
+        branches: names of the branches.
         joints: names of the joints.
-        order: indices of the branches, those that most training rows lie on first.
+        order: indices of the branches, those with most training rows first.
         limits: `(dof, 2)` joint limits [rad or m].
-        revolute: `(dof,)`: which turn.
+        revolute: `(dof,)`: which joints are revolute.
         closed_form: whether the nominal robot has a closed-form inverse, so that all branches are known.
-        warnings: sentences on conditions of `under` that lie beyond those of the calibration.
-        controller: of coupled joints, what turns the controller's values, which are taken and given, into those of the
-            joints; else None.
+        warnings: warnings of conditions of `under` that are outside the range of the calibration.
+        controller: for coupled joints, conversion between the controller's values, which this class takes and returns,
+            and the joint values; else None.
     """
 
     controller: "pisigma.model.inverse.controller_values.ControllerValues | None"
@@ -53,7 +53,8 @@ class CorrectedIK(AbstractInverse):
         """Prepare a model for calls.
 
         Raises:
-            ModelError: the model names branches that its robot does not have, or gives the numeric inverse no start.
+            ModelError: the model states branches that its robot does not have, or has no initial values for the numeric
+                inverse.
         """
         from pisigma.model.inverse.numeric_ik import NUMERIC, NumericIK
         from pisigma.model.stated_conditions import condition_warnings
@@ -83,7 +84,7 @@ class CorrectedIK(AbstractInverse):
         kernels: "pisigma.model.inverse.compiled_ik.CompiledIK",
         read: "Callable[[], pisigma.model.calibrated_model.CalibratedModel]",
     ) -> "CorrectedIK":
-        """The same of kernels, without the model, which is read when it is asked for."""
+        """Make it from kernels alone; `read` loads the model when it is first needed."""
         ik = cls.__new__(cls)
         arms, form = kernels.description.arms, kernels.description.closed_form
         ik.name, ik.branches, ik.joints = kernels.name, kernels.branches, kernels.joints
@@ -96,19 +97,19 @@ class CorrectedIK(AbstractInverse):
 
     @cached_property
     def model(self) -> "pisigma.model.calibrated_model.CalibratedModel":
-        """What it was made from."""
+        """The calibrated model."""
         return self._read()
 
     @cached_property
     def numeric(self) -> "pisigma.model.inverse.numeric_ik.NumericIK":
-        """The route without kernels."""
+        """The solver without kernels."""
         from pisigma.model.inverse.numeric_ik import NumericIK
 
         return NumericIK(self.model)
 
     @cached_property
     def compiled(self) -> "pisigma.model.inverse.compiled_ik.CompiledIK | None":
-        """The kernels of the model; None where its correction has no compiled form, or this machine no kernels."""
+        """The kernels of the model; None if its correction has no compiled form, or this machine no kernels."""
         from pisigma.model.inverse.compiled_ik import CompiledIK
 
         try:
@@ -118,7 +119,7 @@ class CorrectedIK(AbstractInverse):
 
     @cached_property
     def postures(self) -> Postures:
-        """What `near` may be."""
+        """Plausible joint values for `near`."""
         return Postures(self.limits, self.revolute, self.joints)
 
     def __call__(
@@ -137,27 +138,26 @@ class CorrectedIK(AbstractInverse):
         """Find corrected joint values for poses.
 
         Args:
-            T_base_tool: `(*batch, 4, 4)` wanted poses of the tool in the base frame [m].
-            near: joint values `(*batch, dof)` or `(dof,)` [rad or m], such as the robot's present ones; of the branches
-                that reach a pose the nearest is taken, and revolute joints come as near as full turns within the limits
-                bring them. Distances count radians and metres alike.
-            branch: name of the branch to take; with `near` too, that only chooses the turns. With neither it is the
-                first in `order` that reaches the pose, inside the joint limits if there is one.
-            throw: False for control loops: a matrix that is no pose, or `near` that is not finite or no posture of the
-                robot, raises nothing but gets the status INVALID_POSE and NaN.
-            approach: `(*batch, dof)` or `(dof,)`: +1 or -1 for the side from which every joint will come to the pose,
-                which matters to joints with backlash; 0, or None for all, where that is not stated.
+            T_base_tool: `(*batch, 4, 4)` target poses of the tool in the base frame [m].
+            near: joint values `(*batch, dof)` or `(dof,)` [rad or m], for example the robot's present ones. Of the
+                branches that reach a pose, the nearest is chosen, and revolute joints are wrapped as near to `near` as
+                their limits allow. Distances add radians and metres with equal weight.
+            branch: name of the branch to use; `near` then only affects how joint values are wrapped. By default, the
+                first branch in `order` that reaches the pose, preferably inside the joint limits.
+            throw: False for control loops: an invalid pose, or a `near` that is not finite or implausible for the
+                robot, then does not raise an error; its solution is NaN with the status INVALID_POSE.
+            approach: `(*batch, dof)` or `(dof,)`: +1 or -1 for the direction in which every joint moves to the pose,
+                which affects joints with backlash; 0 for a joint, or None for all, if it is not known.
             ignore_axes: see `for_task`.
-            tolerance_mm: see there.
-            tolerance_deg: see there.
-            elbow_angle: see there [rad].
+            tolerance_mm: see `for_task`.
+            tolerance_deg: see `for_task`.
+            elbow_angle: see `for_task` [rad].
 
         Returns:
-            One solution per pose: arrays for arrays, in float64; tensors for tensors, in their dtype and on their
-            device.
+            One solution per pose: float64 arrays for arrays; for tensors, tensors of the same dtype and device.
 
         Raises:
-            PoseError: a matrix is no pose, `near` lies far beyond the joint limits, or an argument does not fit.
+            PoseError: a matrix is not a valid pose, `near` is far outside the joint limits, or an argument is invalid.
         """
         task = self.for_task(ignore_axes, tolerance_mm, tolerance_deg, elbow_angle)
         if near is not None:
@@ -178,10 +178,10 @@ class CorrectedIK(AbstractInverse):
         return self._like(T_base_tool, solution, task.axes)
 
     def all_branches(self, T_base_tool: Any, *, approach: Any = None) -> Solution:
-        """Solutions on every branch, as `(*batch, branches)`; see `__call__` and `for_task`.
+        """Find solutions on every branch, as `(*batch, branches)`; see `__call__` and `for_task`.
 
-        A robot without closed-form inverse gets up to eight different solutions instead, such as those of an elbow to
-        either side, where it has kernels, and else one.
+        For a robot without a closed-form inverse these are up to eight distinct solutions if it has kernels, for
+        example with the elbow to either side, and otherwise one.
         """
         approach = checked_approach(approach)
         if self.controller is not None:
@@ -194,14 +194,14 @@ class CorrectedIK(AbstractInverse):
     def path(
         self, T_base_tool: Any, *, near: Any = None, branch: str | None = None
     ) -> "pisigma.model.inverse.path.JointPath":
-        """Find joint values along a path: one branch as long as possible, and word of every place where that ends.
+        """Find joint values along a path on as few branches as possible, with a report of every discontinuity.
 
-        From which side every joint comes to a pose follows from the direction in which it moves.
+        The approach direction of every joint follows from its motion along the path.
 
         Args:
-            T_base_tool: `(poses, 4, 4)` wanted poses in order [m]; as NumPy array or nested lists.
-            near: `(dof,)` joint values [rad or m] where the robot is before the path.
-            branch: name of the branch to begin on if that costs no jump.
+            T_base_tool: `(poses, 4, 4)` target poses in order [m], as a NumPy array or nested lists.
+            near: `(dof,)` joint values [rad or m] of the robot before the path.
+            branch: name of the branch to start on, if that causes no jump.
 
         Raises:
             PoseError: see `__call__`.
@@ -211,14 +211,15 @@ class CorrectedIK(AbstractInverse):
         return follow_path(self, T_base_tool, near, branch)
 
     def forward(self, q: Any, *, approach: Any = None) -> Any:
-        """Pose T_base_tool `(*batch, 4, 4)` that the calibrated arm takes at commanded joint values `(*batch, dof)`.
+        """Compute poses T_base_tool `(*batch, 4, 4)` of the calibrated arm at commanded joint values `(*batch, dof)`.
 
         Args:
-            q: joint values [rad or m]; arrays go through kernels without torch, tensors through torch with gradients.
-            approach: see `__call__`; for arrays.
+            q: joint values [rad or m]; kernels evaluate arrays without torch, and torch evaluates tensors with
+                gradients.
+            approach: see `__call__`; for arrays only.
 
         Raises:
-            PoseError: q has another number of columns than the robot has joints, or approach does not fit or is given
+            PoseError: the number of columns of q is not the robot's number of joints, or `approach` is invalid or given
                 where torch evaluates the arm.
         """
         approach = checked_approach(approach)
@@ -226,7 +227,11 @@ class CorrectedIK(AbstractInverse):
             return self.controller.forward(q, approach)
         kernels = self._kernels_of(q)
         if kernels is None and approach is not None:
-            raise PoseError("approach is read with arrays of models that have kernels; give q as an array.")
+            raise PoseError(
+                "is supported only for arrays and models with compiled kernels",
+                option="approach",
+                remedy="give q as an array",
+            )
         if kernels is None:
             return by_torch(self.model.forward, q)
         values = np.asarray(q, dtype=np.float64)
@@ -234,10 +239,10 @@ class CorrectedIK(AbstractInverse):
         return T.reshape(*values.shape[:-1], 4, 4)
 
     def jacobian(self, q: Any) -> Any:
-        """Geometric Jacobian `(*batch, 6, dof)` of the calibrated arm, in the base frame at the tool's origin.
+        """Compute the geometric Jacobian `(*batch, 6, dof)` of the calibrated arm.
 
-        The slope of the correction, some 1e-3, is left out. For the arguments see `forward`; a network that corrects
-        nominal joint values is left out too.
+        It is in the base frame at the tool's origin. The slope of the correction, about 1e-3, is neglected, and so is a
+        network on nominal joint values. For the arguments see `forward`.
         """
         if self.controller is not None:
             return self.controller.jacobian(q)
@@ -249,26 +254,27 @@ class CorrectedIK(AbstractInverse):
         return J.reshape(*values.shape[:-1], 6, values.shape[-1])
 
     def under(self, *, payload_kg: float | None = None, temperature_c: float | None = None) -> "CorrectedIK":
-        """The same of the robot under other conditions than the usual ones of the calibration rows.
+        """Return the corrected inverse kinematics at another payload or temperature than the mean of the calibration.
 
-        Beyond the measured temperatures the correction stays that of the nearest one, and what a payload does is
-        continued in proportion; then `warnings` of what is given back says so.
+        Outside the measured range the correction stays that of the nearest measured temperature, and the effect of the
+        payload is extrapolated linearly; `warnings` of the result then says so.
 
         Args:
-            payload_kg: what it carries [kg]; as usual if None.
-            temperature_c: of the robot [deg C]; as usual if None.
+            payload_kg: mass that the robot carries [kg]; None for the mean of the calibration rows.
+            temperature_c: temperature of the robot [deg C]; None for the mean of the calibration rows.
 
         Raises:
-            ModelError: the model did not learn what a stated condition does, or its value makes no sense.
+            ModelError: the model did not learn the effect of a given condition, or the value is not possible.
         """
         from pisigma.model.stated_conditions import under_stated_conditions
 
         return CorrectedIK(under_stated_conditions(self.model, payload_kg, temperature_c))
 
     def accuracy(self, q: Any) -> Any:
-        """Predicted standard deviation [m] of the tool's position at joint values `(*batch, dof)`, in float64.
+        """Predict the standard deviation [m] of the tool's position at joint values `(*batch, dof)`, in float64.
 
-        A tensor for a tensor, else an array.
+        Returns:
+            A tensor if q is a tensor, else an array.
         """
         from pisigma.model.accuracy import position_accuracy
 
@@ -277,20 +283,20 @@ class CorrectedIK(AbstractInverse):
         return by_torch(partial(position_accuracy, self.model), q)
 
     def to_pytorch_kinematics(self) -> "pytorch_kinematics.SerialChain":
-        """The geometry as a chain of pytorch-kinematics; see `CalibratedModel.to_pytorch_kinematics`."""
+        """Return the geometry as a chain of pytorch-kinematics; see `CalibratedModel.to_pytorch_kinematics`."""
         return self.model.to_pytorch_kinematics()
 
     def _kernels_of(
         self, q: Any, forward: bool = True
     ) -> "pisigma.model.inverse.compiled_ik.CompiledIK | None":
-        """The kernels, where they say where the arm is at such joint values."""
+        """Return the kernels if they can evaluate the arm at these joint values, else None."""
         if is_tensor(q) or self.compiled is None:
             return None
         return None if forward and self.compiled.description.network.used else self.compiled
 
     @cached_property
     def axes(self) -> TaskAxes:
-        """Which axes of the tool count where a call does not state that."""
+        """Axes of the tool that are constrained unless a call states others."""
         if self.controller is not None:
             return self.controller.ik.axes
         return self.numeric.axes if self.compiled is None else self.compiled.axes
@@ -302,22 +308,24 @@ class CorrectedIK(AbstractInverse):
         tolerance_deg: float | Sequence[float] | None = None,
         elbow_angle: float | None = None,
     ) -> "CorrectedIK":
-        """The same for paths, all branches and calls that do not state what is stated here.
+        """Return a copy for a task that leaves axes of the tool free, for paths, all branches and calls.
 
-        A robot with more joints than axes of the tool count comes as near to `near` as it can; without `near` it keeps
-        away from joint limits and singularities.
+        A robot with more joints than constrained axes moves as near to `near` as it can; without `near` it keeps away
+        from joint limits and singularities.
 
         Args:
-            ignore_axes: axes of the tool's frame that do not count, of "x", "y", "z" (along them) and "roll", "pitch",
-                "yaw" (about x, y and z): ("yaw",) for a torch that may turn about its z axis. None: none from six
-                joints on, "yaw" with five, with four "roll" and "pitch" up to 10 deg, with three all rotations.
-            tolerance_mm: how far the tool may be off along its axes where it cannot reach the pose exactly [mm], one
-                number or three; the deviations are then least, each over its tolerance.
-            tolerance_deg: the same about its axes [deg]. An axis without tolerance that is not ignored counts exactly.
-            elbow_angle: of an arm with seven revolute joints [rad], see `kinematics.task_axes.TaskAxes`.
+            ignore_axes: axes of the tool's frame that are not constrained, of "x", "y", "z" (translations along them)
+                and "roll", "pitch", "yaw" (rotations about x, y and z): ("yaw",) for a torch that may rotate about its
+                z axis. None: none for robots with six or more joints, "yaw" for five, "roll" and "pitch" up to 10 deg
+                for four, and all rotations for three.
+            tolerance_mm: accepted deviations along the tool's axes where the pose cannot be reached exactly [mm], one
+                number or three. The deviations, each divided by its tolerance, are then minimised.
+            tolerance_deg: the same about the tool's axes [deg]. Axes without a tolerance are met exactly unless
+                ignored.
+            elbow_angle: elbow angle of an arm with seven revolute joints [rad], see `kinematics.task_axes.TaskAxes`.
 
         Raises:
-            PoseError: there is no such axis, a tolerance is none, or the robot has no elbow.
+            PoseError: there is no such axis, a tolerance is invalid, or the robot has no elbow.
         """
         if ignore_axes is None and tolerance_mm is None and tolerance_deg is None and elbow_angle is None:
             return self
@@ -325,16 +333,19 @@ class CorrectedIK(AbstractInverse):
             self.revolute.tolist() == [True] * 7 and np.isfinite(elbow_angle)
         ):
             raise PoseError(
-                f"elbow_angle={elbow_angle:g}: only a robot of seven revolute joints has an elbow to turn; give it a "
-                "finite angle [rad], and other robots none."
+                "expected a finite angle [rad] and a robot with seven revolute joints",
+                expected="a finite angle",
+                value=elbow_angle,
+                option="elbow_angle",
+                remedy="leave it out for other robots",
             )
         return self.with_axes(task_axes(self.axes, ignore_axes, tolerance_mm, tolerance_deg, elbow_angle))
 
     def with_axes(self, axes: TaskAxes) -> "CorrectedIK":
-        """The same where other axes of the tool count.
+        """Return a copy in which other axes of the tool are constrained.
 
         Raises:
-            PoseError: the robot has passive joints, which are solved in the usual axes only.
+            PoseError: the robot has passive joints, which are solved in the default axes only.
         """
         ik = copy(self)
         ik.axes = axes
@@ -343,7 +354,7 @@ class CorrectedIK(AbstractInverse):
         return ik
 
     def _like(self, poses: Any, solution: Solution, axes: TaskAxes) -> Solution:
-        """The solutions of tensors as tensors, with gradients where these are wanted; other ones as arrays."""
+        """Convert the solutions of tensors to tensors, with gradients if required, and others to arrays."""
         if not is_tensor(poses):
             return replace(solution.map(as_array), owner=self)
         from pisigma.model.inverse.pose_gradients import as_tensors
@@ -352,7 +363,7 @@ class CorrectedIK(AbstractInverse):
 
 
 def _flat(values: Any) -> Any:
-    """Approaches as rows."""
+    """Flatten the batch axes of approach directions."""
     return None if values is None else np.asarray(values).reshape(-1, np.shape(values)[-1])
 
 
@@ -360,10 +371,10 @@ def load(folder: str | os.PathLike[str]) -> CorrectedIK:
     """Load a model folder as corrected inverse kinematics.
 
     Args:
-        folder: what `pisigma calibrate` or `pisigma train` wrote.
+        folder: folder that `pisigma calibrate` or `pisigma train` wrote.
 
     Raises:
-        ModelError: the folder is no whole model; the message says what is wrong with which file.
+        ModelError: the folder is not a complete model; the message names the file at fault.
     """
     path = Path(folder)
     kernels = _stored_kernels(path)
@@ -377,14 +388,16 @@ def load(folder: str | os.PathLike[str]) -> CorrectedIK:
         from pisigma.model.folder.model_folder import load_model
 
         if model_hash(path) != stated:
-            raise ModelError(f"{path}: was changed after it was loaded; load it again.")
+            raise ModelError(
+                "the model was changed after it was loaded", at=Place(path), remedy="load it again"
+            )
         return load_model(path)
 
     return CorrectedIK._of_kernels(kernels, read)
 
 
 def _stored_kernels(path: Path) -> "pisigma.model.inverse.compiled_ik.CompiledIK | None":
-    """What stands ready in a model folder; None where that is missing, damaged or of another state of the model."""
+    """Read the compiled arrays of a model folder; None if they are missing, damaged or out of date."""
     stated = ready_hash(path)
     if stated is None:
         return None

@@ -1,9 +1,9 @@
-"""What users give as poses and joint values, as arrays; known without torch."""
+"""Checks and conversion of the poses and joint values that users pass, without importing torch."""
 
 from collections.abc import Sequence
 from contextlib import suppress
 from operator import le
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -11,50 +11,76 @@ from pisigma.files.errors import PoseError
 from pisigma.robot.kernels import arrays
 from pisigma.robot.kernels.array_kinematics import is_tensor
 
-FAULTS = {
-    arrays.NOT_FINITE: "T_base_tool{} has entries that are not finite numbers; give 16 finite numbers.",
-    arrays.LAST_ROW: "T_base_tool{} does not end with the row 0 0 0 1; give a homogeneous transform.",
-    arrays.NOT_ORTHONORMAL: (
-        "T_base_tool{} has a rotation part that is not orthonormal; normalise it or check its source."
+
+class _Fault(NamedTuple):
+    """What an argument has to be, and how to correct it."""
+
+    option: str
+    expected: str
+    remedy: str
+
+
+_FAULTS = {
+    arrays.NOT_FINITE: _Fault("T_base_tool", "finite entries", "check the source of the pose"),
+    arrays.LAST_ROW: _Fault("T_base_tool", "the last row 0 0 0 1", "give a homogeneous transform"),
+    arrays.NOT_ORTHONORMAL: _Fault(
+        "T_base_tool", "an orthonormal rotation part", "normalise it or check its source"
     ),
-    arrays.LEFT_HANDED: (
-        "T_base_tool{} has a left-handed rotation part (determinant -1); a reflection is no pose, check its axes."
+    arrays.LEFT_HANDED: _Fault(
+        "T_base_tool", "a right-handed rotation part (determinant +1)", "check the direction of its axes"
     ),
-    arrays.NEAR_NOT_FINITE: "near{} holds joint values that are no finite numbers; give a number for every joint.",
+    arrays.NEAR_NOT_FINITE: _Fault("near", "finite joint values", "give a number for every joint"),
 }
-"""What the kernels find wrong with a pose, or with joint values to be near to."""
+"""Faults of a pose, or of the joint values `near`, by the code that the kernels return."""
 
 _POSES = "homogeneous transforms of shape (*batch, 4, 4)"
+_METRES = "an array of real numbers, lengths in metres"
+
+
+def fault_error(code: int, index: tuple[int, ...] = ()) -> PoseError:
+    """Make the error for a fault that the kernels found, at an index of the batch."""
+    option, expected, remedy = _FAULTS[code]
+    at = f" at index {index if len(index) > 1 else index[0]}" if index else ""
+    return PoseError(f"expected {expected}{at}", expected=expected, option=option, remedy=remedy)
 
 
 def as_array(values: Any) -> Any:
-    """The values, of which a tensor becomes an array without its gradients."""
+    """Convert a tensor to an array without its gradients; other values are returned as they are."""
     return values.detach().numpy(force=True) if is_tensor(values) else values
 
 
 def pose_array(values: Any) -> tuple[Any, bool]:
-    """Matrices `(*batch, 4, 4)` as a float64 array, and whether they were rounded to float32 before.
+    """Convert matrices `(*batch, 4, 4)` to a float64 array, and return whether they were float32 before.
 
     Raises:
-        PoseError: they are no numbers, of another type, or of another shape.
+        PoseError: they are not numbers, or have another type or shape.
     """
     if is_tensor(values) and str(values.dtype) not in ("torch.float32", "torch.float64"):
-        raise PoseError(f"T_base_tool holds {values.dtype}; give float64 or float32, lengths in metres.")
+        raise PoseError(
+            expected="float64 or float32, lengths in metres", value=values.dtype, option="T_base_tool"
+        )
     try:
         given = np.asarray(as_array(values))
         T = given.astype(np.float64, copy=False)
     except (TypeError, ValueError):
-        raise PoseError(f"T_base_tool is no array of numbers; give {_POSES}.") from None
+        raise PoseError(
+            "expected an array of real numbers",
+            expected=_METRES,
+            option="T_base_tool",
+            remedy=f"give {_POSES}",
+        ) from None
     if T.ndim < 2 or T.shape[-2:] != (4, 4):
-        raise PoseError(f"T_base_tool has the shape {T.shape}; give {_POSES}.")
+        raise PoseError(expected=_POSES, value=T.shape, option="T_base_tool")
     return T, given.dtype == np.float32
 
 
 def numbers(values: Any, what: str, throw: bool) -> Any:
-    """The values as a contiguous float64 array, itself where it is one; NaN for what is none, or a complaint.
+    """Convert values to a contiguous float64 array, without a copy if possible.
+
+    Values that are not numbers become NaN with `throw` False.
 
     Raises:
-        PoseError: they are ragged, or no numbers and `throw`.
+        PoseError: the values are ragged, or they are not numbers and `throw` is True.
     """
     try:
         return np.ascontiguousarray(values, dtype=np.float64)
@@ -62,20 +88,23 @@ def numbers(values: Any, what: str, throw: bool) -> Any:
         with suppress(ValueError):  # of ragged values
             if not throw:
                 return np.full(np.shape(values), np.nan)
-        raise PoseError(f"{what} is no array of numbers; give real numbers, lengths in metres.") from None
+        raise PoseError(expected=_METRES, option=what) from None
 
 
 def joint_rows(values: Any, batch: tuple[int, ...], what: str, throw: bool, joints: Sequence[str]) -> Any:
-    """Joint values, or approaches, as `(1 or poses, dof)`.
+    """Convert joint values or approach directions to shape `(1 or poses, dof)`.
 
     Raises:
-        PoseError: they do not fit the joints or the poses, or see `numbers`.
+        PoseError: their shape does not match the joints or the poses, or see `numbers`.
     """
     rows, dof = numbers(values, what, throw), len(joints)
     if rows.shape[-1:] != (dof,):
         raise PoseError(
-            f"{what} has the shape {rows.shape}, but the robot has {dof} joints; give a value for each of "
-            f"{', '.join(joints)}, once or for every pose."
+            f"expected {dof} columns, got shape {rows.shape}",
+            expected=f"{dof} columns",
+            value=rows.shape,
+            option=what,
+            remedy=f"give a value for each of the joints {', '.join(joints)}, once or for every pose",
         )
     if rows.ndim == 1:
         return rows.reshape(1, dof)
@@ -83,19 +112,21 @@ def joint_rows(values: Any, batch: tuple[int, ...], what: str, throw: bool, join
         return np.ascontiguousarray(np.broadcast_to(rows, (*batch, dof))).reshape(-1, dof)
     except ValueError:
         raise PoseError(
-            f"{what} has the batch shape {rows.shape[:-1]}, which does not broadcast to {batch} of the poses; give "
-            "one row of joint values for each pose, or one for all."
+            expected=f"a batch shape that broadcasts to {batch} of the poses",
+            value=rows.shape[:-1],
+            option=what,
+            remedy="give one row for each pose, or one for all",
         ) from None
 
 
 def checked_approach(approach: Any) -> Any:
-    """Give back from which sides joints come, if that is what the values say; what is no numbers is left as it came.
+    """Check the approach directions of joints; values that are not numbers are returned as they are.
 
     Args:
-        approach: +1 or -1 for the side from which a joint comes, 0 where that is not stated; or None.
+        approach: +1 or -1 for the direction in which a joint moves before it stops, 0 if not stated; or None.
 
     Raises:
-        PoseError: another number stands there, which a learned backlash would be multiplied by.
+        PoseError: a value is another number, which would scale a learned backlash.
     """
     if approach is None:
         return None
@@ -106,44 +137,47 @@ def checked_approach(approach: Any) -> Any:
     wrong = values[~np.isin(values, (-1.0, 0.0, 1.0))]
     if wrong.size:
         raise PoseError(
-            f"approach holds {wrong[0]:g}; give +1 (the joint's value grows before it stops), -1 (it falls) or 0 (not "
-            "stated) for every joint."
+            expected="+1 (the joint's value increases before it stops), -1 (it decreases) or 0 (not stated)",
+            value=float(wrong[0]),
+            option="approach",
         )
     return values
 
 
 class Postures:
-    """What joint values a robot may be at: a full turn beyond the joint limits at most, or the stroke and 1 m at least.
+    """Joint values that are plausible for a robot: at most one turn beyond the joint limits.
 
-    Solutions may lie outside the limits, and a robot may stand a little beyond them; what lies farther off is no
-    posture of the robot, but a value in degrees or millimetres.
+    For prismatic joints it is their stroke, but at least 1 m. Solutions, and a real robot, may be somewhat outside the
+    joint limits; values farther outside are assumed to be in degrees or millimetres by mistake.
     """
 
     def __init__(self, limits: np.ndarray, revolute: np.ndarray, joints: Sequence[str]) -> None:
-        """Take the joint limits `(dof, 2)` [rad or m], which joints turn, and their names."""
+        """Store the joint limits `(dof, 2)` [rad or m], which joints are revolute, and the names of the joints."""
         slack = np.where(revolute, 2 * np.pi, np.maximum(1.0, limits[:, 1] - limits[:, 0]))
         self._limits, self._revolute, self._joints = limits, revolute, tuple(joints)
         self._lowest, self._highest = limits[:, 0] - slack, limits[:, 1] + slack
         self._lows, self._highs = self._lowest.tolist(), self._highest.tolist()
 
     def clip(self, q: np.ndarray) -> np.ndarray:
-        """The postures nearest to joint values `(*batch, dof)` [rad or m]."""
+        """Clip joint values `(*batch, dof)` [rad or m] to plausible ones."""
         clipped: np.ndarray = np.clip(q, self._lowest, self._highest)
         return clipped
 
-    def hold(self, values: Sequence[float]) -> bool:
-        """Whether joint values `(dof,)` are a posture; several times as fast as the comparison of arrays."""
+    def contains(self, values: Sequence[float]) -> bool:
+        """Return whether joint values `(dof,)` are plausible; several times as fast as a comparison of arrays."""
         return all(map(le, self._lows, values)) and all(map(le, values, self._highs))
 
     def checked(self, near: Any, throw: bool = True) -> Any:
-        """`near` as a float64 array, with NaN for values that are in no posture; what does not fit at all as it came.
+        """Convert `near` to a float64 array with NaN for implausible values.
+
+        Values that are not numbers, or of another shape, are returned unchecked.
 
         Args:
             near: joint values `(*batch, dof)` [rad or m]: a tensor, an array or nested lists.
-            throw: whether to raise instead.
+            throw: whether to raise an error for implausible values.
 
         Raises:
-            PoseError: a value is in no posture, and `throw`.
+            PoseError: a value is implausible and `throw` is True.
         """
         try:
             values = np.asarray(as_array(near), dtype=np.float64)
@@ -151,20 +185,23 @@ class Postures:
             return near
         if values.shape[-1:] != (len(self._joints),):
             return values
-        if values.ndim == 1 and self.hold(values.tolist()):
+        if values.ndim == 1 and self.contains(values.tolist()):
             return values
         beyond = (values < self._lowest) | (values > self._highest)
         if not beyond.any():
             return values
         if throw:
-            raise PoseError(self._complaint(values, tuple(int(index) for index in np.argwhere(beyond)[0])))
+            raise self._error(values, tuple(int(index) for index in np.argwhere(beyond)[0]))
         return np.where(beyond, np.nan, values)
 
-    def _complaint(self, values: np.ndarray, row: tuple[int, ...]) -> str:
+    def _error(self, values: np.ndarray, row: tuple[int, ...]) -> PoseError:
         joint = row[-1]
         (low, high), beyond = self._limits[joint], self._highest[joint]
         what, unit = ("a full turn", "rad") if self._revolute[joint] else (f"{beyond - high:g} m", "m")
-        return (
-            f"near holds {values[row]:g} for joint {self._joints[joint]}, more than {what} beyond its limits "
-            f"{low:g} to {high:g} {unit}; give joint values in radians and metres."
+        return PoseError(
+            f"{values[row]:g} {unit} for joint {self._joints[joint]} is more than {what} outside its limits {low:g} to "
+            f"{high:g} {unit}",
+            value=float(values[row]),
+            option="near",
+            remedy="give joint values in radians and metres",
         )

@@ -1,4 +1,4 @@
-"""A calibrated arm that is brought to poses from given joint values, in the axes of the tool that count; in torch."""
+"""Newton iterations of a calibrated arm towards poses, in the constrained axes of the tool, in torch."""
 
 from dataclasses import dataclass
 from functools import cached_property, partial
@@ -25,18 +25,18 @@ from pisigma.robot.kinematics.status import Status
 from pisigma.robot.kinematics.task_axes import TaskAxes
 
 EXACT_ITERATIONS = 25
-"""Steps with the slope of the correction, where those without it come near a pose but not there."""
+"""Steps with the slope of the correction, after steps without it came near a pose but did not converge."""
 
 
 @dataclass(frozen=True, eq=False)
 class NumericArm:
-    """An arm as identified, with its joint correction.
+    """An arm with its identified geometry and its joint correction.
 
     Attributes:
-        nominal: the arm as drawn, which has the joint limits.
-        robot: its geometry, of a hybrid the one that goes with its correction.
-        hybrid: the arm with its correction, where it has one.
-        axes: which axes of the tool count.
+        nominal: nominal arm, which has the joint limits.
+        robot: arm with the identified geometry; for a hybrid the one that belongs to its correction.
+        hybrid: arm with its correction, or None.
+        axes: axes of the tool that are constrained.
     """
 
     nominal: Robot
@@ -46,23 +46,23 @@ class NumericArm:
 
     @cached_property
     def weights(self) -> tuple[float, ...]:
-        """Of the axes in least squares."""
+        """Weights of the axes in least squares."""
         return self.axes.weights(self.robot.dof)
 
     @cached_property
     def has_spare_joints(self) -> bool:
-        """Whether it has more joints than axes count."""
+        """Whether the arm has more joints than constrained axes."""
         return sum(self.weights) < self.robot.dof
 
     @cached_property
     def motions(self) -> tuple[Motion, ...]:
-        """Where the tool is and how it moves: cheaply, and of a hybrid with the slope of the correction too."""
+        """Functions for pose and Jacobian: first without the slope of the correction, for a hybrid then with it."""
         if self.hybrid is None:
             return (partial(joint_jacobian, self.robot),)
         return tuple(partial(hybrid_motion, self.hybrid, exact=exact) for exact in (False, True))
 
     def within_reach(self, T: Float64[Tensor, "*batch 4 4"]) -> Bool[Tensor, "*batch"]:
-        """Whether poses T_base_tool are not farther away than the arm is long, as far as their position counts."""
+        """Return whether poses T_base_tool are within the arm's length; True if the position is not constrained."""
         if any(self.axes.free[:3]):
             return torch.ones_like(T[..., 0, 0], dtype=torch.bool)
         distance: Tensor = (T[..., :3, 3] - T.new_tensor(self.robot.base[:3].tolist())).norm(dim=-1)
@@ -71,9 +71,10 @@ class NumericArm:
     def reach(
         self, T: Float64[Tensor, "poses 4 4"], start: Float64[Tensor, "poses dof"]
     ) -> tuple[Float64[Tensor, "poses dof"], Bool[Tensor, " poses"]]:
-        """Joint values [rad or m] from a start for each pose, on its turns, and whether they reach it.
+        """Iterate from the start of each pose, and return joint values [rad or m] and whether they reach the pose.
 
-        Poses that cannot be met exactly are met within the tolerances of the axes.
+        The joint values are wrapped near the starts. Poses that cannot be reached exactly are solved within the
+        tolerances of the axes.
         """
         q, reached = start, torch.zeros(len(T), dtype=torch.bool)
         near, rounds = ~reached, tolerances.MAX_ITERATIONS
@@ -103,13 +104,13 @@ class NumericArm:
             q, reached = q.index_copy(0, rows, better), reached.index_copy(0, rows, met)
         return start + wrapped_difference(self.nominal, q, start), reached
 
-    def settled(
+    def with_redundancy_resolved(
         self,
         T: Float64[Tensor, "poses 4 4"],
         q: Float64[Tensor, "poses dof"],
         near: Float64[Tensor, "poses dof"] | None,
     ) -> Float64[Tensor, "poses dof"]:
-        """Joint values that reach poses with joints to spare, moved to `near`, else to the middle of their travel."""
+        """Move redundant joints, at constant poses, as near as possible to `near` or to the middle of their limits."""
         limits, half = self._travel
         q, _ = wrap_into_limits(self.nominal, q)
         if near is None:
@@ -121,7 +122,7 @@ class NumericArm:
     def freedom(
         self, T: Float64[Tensor, "poses 4 4"], q: Float64[Tensor, "poses dof"]
     ) -> Float64[Tensor, " poses"]:
-        """Singularity measure times the smallest distance of a joint from its limits, over half its travel."""
+        """Rate joint values: singularity measure times the smallest distance to a joint limit over half its range."""
         limits, half = self._travel
         margin = torch.minimum(q - limits[:, 0], limits[:, 1] - q).div(half).clamp(max=1.0).amin(-1)
         return margin * self.singularity_measure(T, q)
@@ -129,7 +130,7 @@ class NumericArm:
     def singularity_measure(
         self, T: Float64[Tensor, "poses 4 4"], q: Float64[Tensor, "poses dof"]
     ) -> Float64[Tensor, " poses"]:
-        """Smallest singular value of the Jacobian in the axes that count, in characteristic lengths."""
+        """Compute the smallest singular value of the dimensionless Jacobian in the constrained axes."""
         _, J = self._task.errors(T, q)
         return smallest_singular_value(self.robot, J, self._task.rows)
 
@@ -140,6 +141,6 @@ class NumericArm:
 
     @cached_property
     def _travel(self) -> tuple[Tensor, Tensor]:
-        """Limits of the joints, and half their travel [rad or m]."""
+        """Joint limits and half the range between them [rad or m]."""
         limits = torch.from_numpy(self.nominal.limits)
         return limits, ((limits[:, 1] - limits[:, 0]) / 2).clamp(min=1e-9)

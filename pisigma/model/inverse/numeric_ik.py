@@ -1,4 +1,4 @@
-"""Corrected inverse kinematics in torch, for models and machines without compiled kernels: some milliseconds a pose."""
+"""Corrected inverse kinematics in torch, for models and machines without compiled kernels."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -8,9 +8,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pisigma.files.errors import ModelError, PoseError, nearest_choice
+from pisigma.files.errors import ModelError, PoseError, check_choice
 from pisigma.model.calibrated_model import CalibratedModel
-from pisigma.model.inverse.joint_input import FAULTS, checked_approach, joint_rows, pose_array
+from pisigma.model.inverse.joint_input import checked_approach, fault_error, joint_rows, pose_array
 from pisigma.model.inverse.numeric_arm import NumericArm
 from pisigma.model.inverse.solution import Solution
 from pisigma.model.stored_starts import SAME, StoredStarts, nearest_branch
@@ -26,47 +26,47 @@ from pisigma.robot.kinematics.task_error import task_error, tolerated
 from pisigma.robot.se3 import check_transforms, pose_error, transform_faults
 
 NUMERIC = "numeric"
-"""Name of the only branch of a robot without closed-form inverse."""
+"""Name of the only branch of a robot without a closed-form inverse."""
 _OUTSIDE, _LOST = 1e9, 1e15
-"""What is added to the rank of joint values outside their limits, and of starts that lead nowhere."""
+"""Added to the rank of solutions outside the joint limits, and of starts that do not converge."""
 
 
 class NumericIK:
-    """The corrected inverse kinematics of a model. Solutions are tensors in float64 on the CPU.
+    """Corrected inverse kinematics of a model by iteration. Solutions are float64 tensors on the CPU.
 
-    Every pose is solved from several starts by damped Newton steps: the branches of the nominal arm, those that do not
-    reach the pose as near as they come, `near`, and stored joint values whose poses are nearest. The best of all that
-    lead there is taken.
+    Every pose is solved by damped Newton steps, a few milliseconds each, from several starts: the nominal arm's
+    branches (or their nearest joint values where they do not reach the pose), `near`, and stored joint values with the
+    nearest poses. The best solution is returned.
 
     Attributes:
-        model: the model.
+        model: calibrated model.
         branches: names of the branches.
-        order: indices of the branches: those that training rows lie on, most frequent first, then the others.
-        axes: which axes of the tool count.
+        order: indices of the branches: those of training rows, most frequent first, then the others.
+        axes: axes of the tool that are constrained.
     """
 
     def __init__(self, model: CalibratedModel, axes: TaskAxes | None = None) -> None:
         """Prepare a model.
 
         Args:
-            model: the model.
-            axes: which axes of the tool count; None for those that do by default.
+            model: calibrated model.
+            axes: axes of the tool that are constrained; None for the default ones.
 
         Raises:
-            ModelError: the model names branches that its robot does not have, or gives the numeric inverse no
-                start.
-            PoseError: an elbow angle is wanted, which only kernels solve for.
+            ModelError: the model states branches that its robot does not have, or has no initial values for the numeric
+                inverse.
+            PoseError: an elbow angle is given, which only the kernels support.
         """
         self.model, self._solver = model, closed_form_solver(model.robot)
         self.branches: tuple[str, ...] = self._solver.branches if self._solver else (NUMERIC,)
         for name in model.branches:
-            if name not in self.branches:
-                choices = nearest_choice(name, self.branches)
-                raise ModelError(f"model '{model.name}': its robot has no branch '{name}'; {choices}")
+            check_choice(ModelError, "branches", name, self.branches)
         if self._solver is None and not len(model.starts):
             raise ModelError(
-                f"model '{model.name}': its robot has no closed-form inverse, and the model holds no joint "
-                "values to start from; train it again."
+                f"the robot of model '{model.name}' has no closed-form inverse, and the model has no initial joint "
+                "values",
+                value="starts",
+                remedy="train it again",
             )
         trained = [self.branches.index(name) for name in model.branches] or list(range(len(self.branches)))
         self.order = (*trained, *(index for index in range(len(self.branches)) if index not in trained))
@@ -75,7 +75,10 @@ class NumericIK:
         self.axes = axes or (TaskAxes() if whole else default_axes(model.robot.dof))
         if self.axes.elbow_angle is not None:
             raise PoseError(
-                f"model '{model.name}' is solved without compiled kernels, which alone know elbow_angle; leave it out."
+                f"is supported only by compiled kernels, which are not available for model '{model.name}'",
+                value=self.axes.elbow_angle,
+                option="elbow_angle",
+                remedy="leave it out",
             )
         self._network = model.network if model.calibrated is None else None
         self._arm = NumericArm(model.robot, model.identified, model.hybrid, self.axes)
@@ -93,32 +96,32 @@ class NumericIK:
         single: bool | None = None,
         axes: TaskAxes | None = None,
     ) -> Solution:
-        """Find corrected joint values for poses; for arguments, errors and what comes back see `CorrectedIK`.
+        """Find corrected joint values for poses; for arguments, errors and solutions see `CorrectedIK`.
 
         Args:
             T_base_tool: `(*batch, 4, 4)`.
             near: `(*batch, dof)` or `(dof,)`.
-            branch: name of the branch to take.
-            throw: whether what is no pose, or no posture, raises.
+            branch: name of the branch to use.
+            throw: whether invalid poses and joint values raise an error.
             approach: `(*batch, dof)` or `(dof,)`.
-            single: whether the poses were rounded to float32; None to see that from their type.
-            axes: which axes of the tool count, where these are others than `axes`.
+            single: whether the poses were rounded to float32; None to infer it from their type.
+            axes: axes of the tool that are constrained; None for `axes`.
         """
-        if branch is not None and branch not in self.branches:
-            raise PoseError(f"there is no branch '{branch}'; {nearest_choice(branch, self.branches)}")
+        if branch is not None:
+            check_choice(PoseError, "branch", branch, self.branches)
         wanted = self.order if branch is None else (self.branches.index(branch),)
         poses = _Poses.of(T_base_tool, single, throw)
-        fine, beside = poses.fine, None
+        valid, near_rows = poses.valid, None
         if near is not None:
-            beside = self._joint_rows(near, "near", poses, throw)
-            fine = fine & torch.isfinite(beside).all(-1)
+            near_rows = self._joint_rows(near, "near", poses, throw)
+            valid = valid & torch.isfinite(near_rows).all(-1)
 
         def solve(ik: "NumericIK", rows: Tensor) -> Solution:
-            start = None if beside is None else beside[rows].nan_to_num()
+            start = None if near_rows is None else near_rows[rows].nan_to_num()
             return _best(*ik._candidates(poses.T[rows], poses.single, start, wanted), wanted)
 
         result = self._by_approach(approach, poses, axes, solve)
-        return _without(result, ~fine, Status.INVALID_POSE).map(poses.shaped)
+        return _without(result, ~valid, Status.INVALID_POSE).map(poses.shaped)
 
     def all_branches(
         self,
@@ -128,7 +131,7 @@ class NumericIK:
         single: bool | None = None,
         axes: TaskAxes | None = None,
     ) -> Solution:
-        """Solutions on every branch, as `(*batch, branches)`; one for a robot without closed-form inverse."""
+        """Find solutions on every branch, as `(*batch, branches)`; one for a robot without a closed-form inverse."""
         poses = _Poses.of(T_base_tool, single, True)
 
         def solve(ik: "NumericIK", rows: Tensor) -> Solution:
@@ -145,7 +148,7 @@ class NumericIK:
         axes: TaskAxes | None,
         solve: Callable[["NumericIK", Tensor], Solution],
     ) -> Solution:
-        """Solve rows of poses, those together that are to be reached from the same sides."""
+        """Solve rows of poses, grouped by their approach directions."""
         ik = self if axes is None or axes == self.axes else NumericIK(self.model, axes)
         hybrid, rows = self.model.hybrid, torch.arange(len(poses.T))
         if approach is None or hybrid is None or not len(rows):
@@ -160,21 +163,21 @@ class NumericIK:
         return parts[0].map(lambda *values: torch.cat(values)[place], *parts[1:])
 
     def _joint_rows(self, values: Any, what: str, poses: "_Poses", throw: bool) -> Tensor:
-        """Joint values `(poses, dof)`, one row for each pose.
+        """Convert joint values to `(poses, dof)`, one row for each pose.
 
         Raises:
-            PoseError: they do not fit, or are not finite and `throw`.
+            PoseError: their shape is wrong, or they are not finite and `throw` is True.
         """
         joints = [joint.name for joint in self.model.robot.joints]
         rows = torch.tensor(joint_rows(values, poses.batch, what, throw, joints))
         if throw and not bool(torch.isfinite(rows).all()):
-            raise PoseError(FAULTS[NEAR_NOT_FINITE].format(""))
+            raise fault_error(NEAR_NOT_FINITE)
         return rows.expand(len(poses.T), -1)
 
     def _candidates(
         self, T: Tensor, single: bool, near: Tensor | None, wanted: Sequence[int]
     ) -> tuple[Solution, Tensor]:
-        """Solutions `(poses, starts)` from all starts, and their ranks, of which the lowest is the best."""
+        """Find solutions `(poses, starts)` from all starts, and their ranks, of which the lowest is the best."""
         starts, branch = self._starts(T, single)
         plausible = torch.isfinite(starts).all(-1).any(1) | (self._solver is None)
         if near is not None and len(wanted) == len(self.branches):
@@ -195,38 +198,38 @@ class NumericIK:
         return every.map(lambda *values: torch.cat(values, 1), others), torch.cat([rank, ranks], 1)
 
     def _starts(self, T: Tensor, single: bool) -> tuple[Tensor, Tensor]:
-        """Nominal joint values `(poses, branches, dof)`, and on which branch they are if they reach the pose, else -1.
+        """Return nominal joint values `(poses, branches, dof)` and their branch, -1 if they do not reach the pose.
 
-        Where they do not they come near to it, or are NaN.
+        In that case they are the nearest ones to it, or NaN.
         """
         if self._solver is None:
             return T.new_zeros(len(T), 0, self.model.robot.dof), torch.zeros(len(T), 0, dtype=torch.int64)
         if len(self.model.robot.joints) == 4 and all(self.axes.tolerance[3:5]):
             T = self._solver.upright(T)
-        q, beside = self._solver.solve(T.float() if single else T).q.double(), self._solver.starts(T)
+        q, near_rows = self._solver.solve(T.float() if single else T).q.double(), self._solver.starts(T)
         reached, robot = torch.isfinite(q).all(-1), self.model.identified
-        each = T[:, None].expand(*beside.shape[:-1], 4, 4).reshape(-1, 4, 4)
-        off, _ = task_error(self.axes, each, forward_kinematics(robot, beside.reshape(-1, robot.dof)))
+        each = T[:, None].expand(*near_rows.shape[:-1], 4, 4).reshape(-1, 4, 4)
+        off, _ = task_error(self.axes, each, forward_kinematics(robot, near_rows.reshape(-1, robot.dof)))
         off = off * off.new_tensor([*[1 / robot.reach] * 3, 1, 1, 1]) * off.new_tensor(self._arm.weights)
         plausible = (off.norm(dim=-1) <= tolerances.BRANCH_MISS).reshape(reached.shape)
-        q = torch.where(reached[..., None], q, torch.where(plausible[..., None], beside, torch.nan))
+        q = torch.where(reached[..., None], q, torch.where(plausible[..., None], near_rows, torch.nan))
         known = torch.arange(q.shape[1]).expand(len(T), -1)
         return q, torch.where(reached & (not self._spare), known, -1)
 
     def _solved(
         self, T: Tensor, starts: Tensor, branch: Tensor, near: Tensor | None
     ) -> tuple[Solution, Tensor]:
-        """Solutions and ranks of starts, of which those that are NaN and of poses beyond the reach are not tried."""
+        """Solve from the starts that are not NaN, for poses within reach, and return solutions and ranks."""
         usable = torch.isfinite(starts).all(-1) & self._arm.within_reach(T)[:, None]
         pose, place = usable.nonzero().unbind(1)
         start, known = starts[pose, place], branch[pose, place] >= 0
         q, reached = self._arm.reach(T[pose], start)
-        if self.model.calibrated is None:  # the closed form knows what is rounding of the pose
+        if self.model.calibrated is None:  # the closed form already allows for the rounding of the pose
             q, reached = torch.where(known[:, None], start, q), known | reached
         kept = reached.nonzero()[:, 0]
         pose, place = pose[kept], place[kept]
-        beside = None if near is None else near[pose]
-        solution, rank = self._finished(T[pose], q[kept], start[kept], branch[pose, place], beside)
+        near_rows = None if near is None else near[pose]
+        solution, rank = self._finished(T[pose], q[kept], start[kept], branch[pose, place], near_rows)
         index = pose * branch.shape[1] + place
 
         def spread(values: Tensor, nothing: float = 0.0) -> Tensor:
@@ -238,20 +241,20 @@ class NumericIK:
     def _finished(
         self, T: Tensor, q: Tensor, start: Tensor, branch: Tensor, near: Tensor | None
     ) -> tuple[Solution, Tensor]:
-        """Solutions, and their ranks, of joint values that reach poses.
+        """Make solutions and their ranks from joint values that reach poses.
 
         Args:
-            T: `(rows, 4, 4)`.
-            q: `(rows, dof)` of the arm as identified; of a network those that it corrects.
-            start: where they were found from.
-            branch: on which the starts reach the pose, else -1.
-            near: joint values to be near to.
+            T: `(rows, 4, 4)` target poses.
+            q: `(rows, dof)` joint values of the identified arm, or nominal ones that a network corrects.
+            start: joint values that the iteration started from.
+            branch: branch of the starts that reach the pose, else -1.
+            near: joint values that the solutions should be near, or None.
         """
         robot, known = self.model.robot, branch >= 0
         if self._spare:
-            q = self._arm.settled(T, q, near)
-        lies = torch.zeros_like(branch) if self._solver is None else nearest_branch(self._solver, q)
-        branch = torch.where(known, branch, lies)
+            q = self._arm.with_redundancy_resolved(T, q, near)
+        nearest = torch.zeros_like(branch) if self._solver is None else nearest_branch(self._solver, q)
+        branch = torch.where(known, branch, nearest)
         nominal = self._nominal(T, torch.where(known[:, None], start, q), known)
         q, measure = self._corrected(T, q)
         commanded, inside = wrap_into_limits(robot, q)
@@ -259,7 +262,7 @@ class NumericIK:
             commanded = nearest_turn(robot, commanded, near, within_limits=True)
         reached = torch.ones_like(inside)
         if self.model.hybrid is not None:
-            if not self.model.hybrid.correction.is_periodic:  # the turns to command are others
+            if not self.model.hybrid.correction.is_periodic:  # the correction differs between wraps
                 commanded, reached = self._arm.reach(T, commanded)
                 inside = (wrap_into_limits(robot, commanded)[0] == commanded).all(-1) & inside
             measure = 1 + self.model.hybrid.coverage.beyond(commanded).amax(-1)
@@ -279,7 +282,7 @@ class NumericIK:
         return replace(solution, ignored_axes=self.axes.ignored), torch.where(reached, rank, _LOST)
 
     def _nominal(self, T: Tensor, q: Tensor, known: Tensor) -> Tensor:
-        """Joint values of the nominal arm near to others, which are known to be those, or not; NaN without solution."""
+        """Return the nominal arm's joint values near q, or q itself where `known`; NaN without a solution."""
         if self.model.calibrated is None:
             return q
         solved = solve_numeric(self.model.robot, T, q, axes=self.axes, weights=self._arm.weights)
@@ -287,7 +290,7 @@ class NumericIK:
         return torch.where(known[:, None], q, found)
 
     def _corrected(self, T: Tensor, q: Tensor) -> tuple[Tensor, Tensor]:
-        """Joint values with what a network corrects of nominal ones, and how far those are from its training rows."""
+        """Add the network's correction to joint values, and return them with the domain measure."""
         measure = torch.full((len(T),), torch.nan, dtype=torch.float64)
         if self._network is None:
             return q, measure
@@ -297,7 +300,7 @@ class NumericIK:
         return q + self.model.correction(T, turned), measure
 
     def _is_outside(self, measure: Tensor, branch: Tensor) -> Tensor:
-        """Whether solutions are where nothing was measured."""
+        """Return whether solutions are outside the measured region."""
         if self.model.hybrid is not None:
             return measure > 1 + tolerances.MEASURED_ROUNDING
         if self._network is None or self.model.domain is None:
@@ -305,14 +308,14 @@ class NumericIK:
         return ~(measure <= 1) | ~torch.isin(branch, self._trained)
 
     def _error(self, T: Tensor, reached: Tensor) -> Tensor:
-        """What is left [m, rad] in the axes of the tool; NaN where it is not known where the arm goes."""
+        """Compute the residuals [m, rad] in the axes of the tool; NaN where the model has no prediction."""
         known = torch.isfinite(reached).flatten(1).all(-1)[:, None]
         safe = torch.nan_to_num(reached)
         error = pose_error(T, safe) if self.axes.whole else task_error(self.axes, T, safe)[0]
         return torch.where(known, error, torch.nan)
 
     def _rank(self, T: Tensor, q: Tensor, branch: Tensor, near: Tensor | None) -> Tensor:
-        """Ranks of joint values inside their limits: by how near they come, how free they are, or by their branch."""
+        """Rank joint values inside their limits by their distance to `near`, by `freedom`, or by their branch."""
         if near is not None:
             rank: Tensor = ((q - near).norm(dim=-1) / SAME).round()
         elif self._spare:
@@ -327,23 +330,23 @@ class _Poses:
     """Poses as rows.
 
     Attributes:
-        T: `(poses, 4, 4)`, identities for what is no pose.
-        fine: which are poses.
+        T: `(poses, 4, 4)`, identity where a pose is invalid.
+        valid: which poses are valid.
         single: whether they were rounded to float32.
-        batch: shape in which they were given.
+        batch: batch shape of the argument.
     """
 
     T: Tensor
-    fine: Tensor
+    valid: Tensor
     single: bool
     batch: tuple[int, ...]
 
     @staticmethod
     def of(values: Any, single: bool | None, throw: bool) -> "_Poses":
-        """What was given.
+        """Convert and check poses.
 
         Raises:
-            PoseError: see `pose_array`; a matrix is no pose, and `throw`.
+            PoseError: see `pose_array`; or a matrix is not a valid pose and `throw` is True.
         """
         array, rounded = pose_array(values)
         T = torch.from_numpy(np.array(array))
@@ -352,22 +355,22 @@ class _Poses:
         if throw:
             check_transforms(T, "T_base_tool", tolerance)
         rows = T.reshape(-1, 4, 4)
-        fine = ~torch.stack([bad for bad, *_ in transform_faults(rows, tolerance)]).any(0)
-        rows = torch.where(fine[:, None, None], rows, torch.eye(4, dtype=torch.float64))
-        return _Poses(rows, fine, single, tuple(T.shape[:-2]))
+        valid = ~torch.stack([bad for bad, *_ in transform_faults(rows, tolerance)]).any(0)
+        rows = torch.where(valid[:, None, None], rows, torch.eye(4, dtype=torch.float64))
+        return _Poses(rows, valid, single, tuple(T.shape[:-2]))
 
     def shaped(self, values: Tensor) -> Tensor:
-        """Values of the rows in the shape in which the poses were given."""
+        """Reshape values of the rows to the batch shape of the argument."""
         return values.reshape((*self.batch, *values.shape[1:]))
 
 
 def _among(every: Solution, rank: Tensor, wanted: Sequence[int]) -> Tensor:
-    """Ranks of solutions, of which those on other than the wanted branches do not count."""
+    """Return ranks of solutions, `_LOST` on other branches than the requested ones."""
     return torch.where(torch.isin(every.branch, torch.tensor(wanted)), rank, _LOST)
 
 
 def _best(every: Solution, rank: Tensor, wanted: Sequence[int]) -> Solution:
-    """The best solution of every pose on the wanted branches."""
+    """Select the best solution of every pose on the requested branches."""
     least, index = _among(every, rank, wanted).min(1)
     lost = least >= _LOST
     best = every.map(lambda values: values[torch.arange(len(index)), index])
@@ -376,7 +379,7 @@ def _best(every: Solution, rank: Tensor, wanted: Sequence[int]) -> Solution:
 
 
 def _without(result: Solution, lost: Tensor, status: Status) -> Solution:
-    """Solutions with NaN and another status where something holds."""
+    """Replace solutions by NaN and another status where `lost`."""
 
     def kept(values: Tensor) -> Tensor:
         where = lost.reshape(-1, *[1] * (values.ndim - 1))

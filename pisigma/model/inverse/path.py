@@ -1,4 +1,4 @@
-"""Joint values along a path of poses: one branch as long as possible, and word of every place where that ends."""
+"""Joint values along a path of poses on as few branches as possible, with a report of every discontinuity."""
 
 import math
 from collections.abc import Sequence
@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from pisigma.files.errors import PoseError, nearest_choice
+from pisigma.files.errors import PoseError, check_choice
 from pisigma.model.inverse.solution import AbstractInverse
 from pisigma.robot.kinematics.status import Status
 from pisigma.robot.kinematics.tolerances import LIMIT_TOLERANCE
@@ -15,31 +15,34 @@ from pisigma.robot.kinematics.tolerances import LIMIT_TOLERANCE
 Array = Any
 
 JUMP = 1e6
-"""[rad²] What a jump counts beside squared joint motions: no path moves as much."""
+"""[rad²] Cost of a jump, more than the sum of squared joint motions of any path."""
 _LIMITS = 1e8
+"""[rad²] Cost of a pose outside joint limits."""
 _NONE = 1e12
+"""[rad²] Cost of a pose without a solution."""
 _SMALL = 0.1
-"""[rad or m] A smaller step on one branch is no jump, whatever lies between."""
+"""[rad or m] A smaller step on one branch never counts as a jump."""
 CHUNK = 8_192
 _TURN = 2 * math.pi
-_OTHERS = 1e4
-"""[rad²] What it costs to begin on another branch than the wanted one; less than a jump."""
+_OTHER_BRANCH = 1e4
+"""[rad²] Cost of a start on another branch than the requested one; less than that of a jump."""
 _LATER = 1e-3
-"""The same where none is wanted, per place in the order of branches."""
+"""[rad²] Cost of a start on a later branch if none is requested, per place in the order of branches."""
 _STILL = 1e-9
-"""[rad or m] A joint that moves by less stands still."""
+"""[rad or m] A joint that moves by less does not count as moving."""
 
 
 @dataclass(frozen=True)
 class PathSwitch:
-    """A place on a path where the joints do not simply go on.
+    """A place on a path where the branch changes or the joint values are discontinuous.
 
     Attributes:
-        index: of the first pose behind it.
-        kind: "branch": over to another branch, smoothly through a singular pose or by a jump; "jump": by a jump on one
-            branch; "turn": a joint turns back by full turns to stay within its limits; "gap": a pose is not reached.
-        jump: largest joint motion [rad or m] that the joints make without the path needing it; 0 where it is smooth.
-        sentence: all of that in words.
+        index: index of the first pose after it.
+        kind: "branch": change to another branch, continuously through a singular pose or by a jump; "jump": jump on the
+            same branch; "turn": a joint is rewound by full turns to stay within its limits; "gap": poses that are not
+            reached.
+        jump: largest joint motion [rad or m] of the discontinuity; 0 for a continuous change of the branch.
+        sentence: a sentence that describes it.
     """
 
     index: int
@@ -53,8 +56,8 @@ class JointPath:
     """Joint values along a path.
 
     Attributes:
-        solution: solutions of all poses, as a call with `near` gives them; NaN where a pose is not reached.
-        switches: all places where the joints do not simply go on, in order; empty for a path on one branch.
+        solution: solutions of all poses; NaN where a pose is not reached.
+        switches: changes of the branch, discontinuities and gaps in order; empty for a continuous path on one branch.
     """
 
     solution: Any
@@ -69,28 +72,33 @@ def follow_path(
 ) -> JointPath:
     """Find joint values along a path.
 
-    On arms with a closed form the branches are chosen for the path as a whole, by dynamic programming: as few jumps
-    as possible, then as little squared joint motion as possible. On others, and where the task leaves the arm joints to
-    spare, every pose is solved from the one before.
+    For arms with a closed-form inverse, dynamic programming chooses the branches of the whole path with the fewest
+    jumps and, among these, the least sum of squared joint motions. For other arms, and for redundant tasks, every pose
+    is solved from the solution of the previous one.
 
     Args:
-        ik: the corrected inverse kinematics.
-        T_base_tool: `(poses, 4, 4)` [m].
-        near: `(dof,)` joint values [rad or m] where the robot is before the path.
-        branch: name of the branch to begin on if that costs no jump; with neither it is the one most measured.
+        ik: corrected inverse kinematics.
+        T_base_tool: `(poses, 4, 4)` target poses [m].
+        near: `(dof,)` joint values [rad or m] of the robot before the path.
+        branch: name of the branch to start on, if that causes no jump; without `near` and `branch`, the one with most
+            training rows.
 
     Raises:
-        PoseError: a matrix is no pose, there are none, or `near` or `branch` do not fit.
+        PoseError: there are no poses, a matrix is not a valid pose, or `near` or `branch` is invalid.
     """
     T = np.asarray(T_base_tool, dtype=np.float64)
     if T.ndim != 3 or len(T) == 0:
-        raise PoseError(f"a path of shape (poses, 4, 4) was wanted, got {T.shape}; give at least one pose.")
-    if branch is not None and branch not in ik.branches:
-        raise PoseError(f"there is no branch '{branch}'; {nearest_choice(branch, ik.branches)}")
-    beside = None if near is None else np.asarray(ik.postures.checked(near), dtype=np.float64)
+        raise PoseError(
+            expected="a path of shape (poses, 4, 4) with at least one pose",
+            value=T.shape,
+            option="T_base_tool",
+        )
+    if branch is not None:
+        check_choice(PoseError, "branch", branch, ik.branches)
+    near_rows = None if near is None else np.asarray(ik.postures.checked(near), dtype=np.float64)
     on_branches = ik.closed_form and len(ik.joints) <= ik.axes.free.count(False)
-    guide = _guide(ik, T, beside, branch) if on_branches else _one_by_one(ik, T, beside)
-    solution = _solve(ik, T, guide, _approaches(guide, beside))
+    guide = _guide(ik, T, near_rows, branch) if on_branches else _one_by_one(ik, T, near_rows)
+    solution = _solve(ik, T, guide, _approaches(guide, near_rows))
     return JointPath(solution, _switches(ik, T, np.asarray(solution.q), solution))
 
 
@@ -100,17 +108,17 @@ def _solve(
     near: Array | None,
     approach: Array | None = None,
 ) -> Any:
-    """Solutions near joint values, which may be those of a solution far outside the joint limits."""
+    """Solve poses near joint values, which may be those of a solution far outside the joint limits."""
     return ik(T, near=None if near is None else ik.postures.clip(near), approach=approach)
 
 
 def _approaches(q: Array, near: Array | None) -> Array:
-    """From which side every joint comes to its values `(poses, dof)`: +1 where they rise, -1 where they fall.
+    """Return the direction in which every joint moves to its values `(poses, dof)`: +1 if they increase, else -1.
 
-    A joint that does not move keeps the side that it came from; 0 before it has moved at all.
+    A joint that does not move keeps its last direction; 0 before its first motion.
     """
     first = q[:1] if near is None else near[None]
-    step = np.nan_to_num(np.diff(np.concatenate([first, q]), axis=0))  # poses without solution say nothing
+    step = np.nan_to_num(np.diff(np.concatenate([first, q]), axis=0))  # poses without a solution are skipped
     sides = np.where(np.abs(step) < _STILL, 0.0, np.sign(step))
     moved = np.where(sides != 0, np.arange(len(q))[:, None], -1)
     last = np.maximum.accumulate(moved, axis=0)
@@ -118,7 +126,7 @@ def _approaches(q: Array, near: Array | None) -> Array:
 
 
 def _guide(ik: AbstractInverse, T: Array, near: Array | None, branch: str | None) -> Array:
-    """Joint values near which to solve all poses: of chosen branches, on chosen turns."""
+    """Return joint values near which to solve all poses: wrapped values of the chosen branches."""
     every = ik.all_branches(T)
     q, status = np.asarray(every.q), np.asarray(every.status)
     reached = np.flatnonzero(np.isfinite(q).all(-1).any(-1))
@@ -128,7 +136,7 @@ def _guide(ik: AbstractInverse, T: Array, near: Array | None, branch: str | None
     for place, index in enumerate(ik.order):
         first[index] = _LATER * place
     if branch is not None:
-        first += _OTHERS * (np.arange(len(first)) != ik.branches.index(branch))
+        first += _OTHER_BRANCH * (np.arange(len(first)) != ik.branches.index(branch))
     elif near is not None:
         first = np.nan_to_num((wrapped(q[reached[0]] - near, ik.revolute) ** 2).sum(-1), nan=0.0)
     q, status = q[reached], status[reached]
@@ -139,7 +147,7 @@ def _guide(ik: AbstractInverse, T: Array, near: Array | None, branch: str | None
 
 
 def _jumps(ik: AbstractInverse, T: Array, q: Array) -> Array:
-    """Whether staying on a branch is a jump `(poses - 1, branches)`; long steps are looked at halfway."""
+    """Return whether staying on a branch is a jump `(poses - 1, branches)`; long steps are checked halfway."""
     step = np.abs(wrapped(np.diff(q, axis=0), ik.revolute)).max(-1)
     result = np.zeros(step.shape, dtype=bool)
     rows = np.flatnonzero((np.nan_to_num(step, nan=0.0) > 0.1).any(-1))
@@ -150,7 +158,7 @@ def _jumps(ik: AbstractInverse, T: Array, q: Array) -> Array:
 
 
 def _one_by_one(ik: AbstractInverse, T: Array, near: Array | None) -> Array:
-    """Joint values of every pose from those of the pose before."""
+    """Solve every pose from the joint values of the previous one."""
     result, last = np.empty((len(T), len(ik.joints))), near
     for row, wanted in enumerate(T):
         q = np.asarray(_solve(ik, wanted, last).q)
@@ -163,18 +171,25 @@ def _one_by_one(ik: AbstractInverse, T: Array, near: Array | None) -> Array:
 def _switches(ik: AbstractInverse, T: Array, q: Array, solution: Any) -> tuple[PathSwitch, ...]:
     reached = np.isfinite(q).all(-1)
     rows = np.flatnonzero(reached)
-    status, lies = np.asarray(solution.status), np.asarray(solution.branch)
+    status, branch_index = np.asarray(solution.status), np.asarray(solution.branch)
     gaps = np.flatnonzero(np.diff(reached.astype(int), prepend=1) < 0)
     result = [_gap(int(index), status, reached) for index in gaps]
     before, after = rows[:-1], rows[1:]
     step = q[after] - q[before]
-    far = np.flatnonzero((np.abs(step).max(-1) > 0.1) | (lies[after] != lies[before]))
+    far = np.flatnonzero((np.abs(step).max(-1) > 0.1) | (branch_index[after] != branch_index[before]))
     middle = halfway(T[before[far]], T[after[far]])
     between = q[before[far]] + wrapped(step[far], ik.revolute) / 2
     way = np.asarray(_solve(ik, middle, between).q) if len(far) else between
     jumps = is_jump(q[before[far]], way, q[after[far]], ik.revolute)
     for place, jump in zip(far, jumps, strict=True):
-        result += _at(ik, int(after[place]), step[place], bool(jump), lies[before[place]], lies[after[place]])
+        result += _at(
+            ik,
+            int(after[place]),
+            step[place],
+            bool(jump),
+            branch_index[before[place]],
+            branch_index[after[place]],
+        )
     return tuple(sorted(result, key=lambda switch: switch.index))
 
 
@@ -186,23 +201,23 @@ def _at(
     left: int,
     taken: int,
 ) -> Sequence[PathSwitch]:
-    """What happens before a pose, if anything does."""
+    """Describe the discontinuity before a pose, if there is one."""
     turned = np.abs(step - wrapped(step, ik.revolute)) > 1
     names = f"from branch '{ik.branches[left]}' to '{ik.branches[taken]}'"
     if jump:
         joint = int(np.abs(step).argmax())
         kind, where = ("branch", names) if left != taken else ("jump", f"on branch '{ik.branches[taken]}'")
         words = (
-            f"the joints jump {where}, most of all {ik.joints[joint]}, by {_amount(ik, joint, step[joint])}"
+            f"the joints jump {where}; {ik.joints[joint]} moves most, by {_amount(ik, joint, step[joint])}"
         )
         return [PathSwitch(index, kind, float(np.abs(step).max()), f"Before pose {index} {words}.")]
     if turned.any():
         joint = int(np.flatnonzero(turned)[0])
         turn = wrapped(step, ik.revolute)[joint] - step[joint]
-        words = f"{ik.joints[joint]} turns back by {_amount(ik, joint, turn)} to stay within its limits"
+        words = f"{ik.joints[joint]} is rewound by {_amount(ik, joint, turn)} to stay within its limits"
         return [PathSwitch(index, "turn", abs(float(turn)), f"Before pose {index} {words}.")]
     if left != taken:
-        words = f"the path goes over {names} smoothly, close to a singular pose"
+        words = f"the branch changes {names} continuously, near a singular pose"
         return [PathSwitch(index, "branch", 0.0, f"Before pose {index} {words}.")]
     return []
 
@@ -221,17 +236,17 @@ def _gap(index: int, status: Array, reached: Array) -> PathSwitch:
 def unroll(
     q: Array, limits: Array, revolute: Array, near: Array | None
 ) -> tuple[Array, list[tuple[int, int]]]:
-    """Put the joints of a path on turns so that they go on from pose to pose and stay within their limits.
+    """Unwrap the joint values of a path so that they are continuous and stay within their limits.
 
     Args:
-        q: `(poses, dof)` joint values [rad or m] on any turns, none NaN.
-        limits: `(dof, 2)` [rad or m].
-        revolute: `(dof,)`.
-        near: `(dof,)` joint values whose turns the path should begin on, or None: those next to 0.
+        q: `(poses, dof)` joint values [rad or m] with any wrapping, without NaN.
+        limits: `(dof, 2)` joint limits [rad or m].
+        revolute: `(dof,)`: which joints are revolute.
+        near: `(dof,)` joint values that the path should start near, or None for 0.
 
     Returns:
-        The joint values, and `(pose, joint)` where a joint must turn back by full turns before it reaches the pose,
-        because a limit is in the way. A value that fits on no turn stays beyond its limit.
+        The joint values, and `(pose, joint)` where a joint must be rewound by full turns before the pose because it
+        reaches a limit. A value that has no wrap within the limits stays outside.
     """
     rolled = q.copy()
     rolled[1:] = q[0] + np.cumsum(wrapped(np.diff(q, axis=0), revolute), axis=0)
@@ -244,21 +259,22 @@ def unroll(
 
 
 def _within(values: Array, lower: float, upper: float, meant: float) -> tuple[Array, list[int]]:
-    """One joint's continuous values, moved by turns into its limits; and where that needs another turn than before."""
+    """Shift one joint's continuous values by full turns into its limits; also return where the shift changes."""
     result, breaks, start = values.copy(), [], 0
     lower, upper = lower - LIMIT_TOLERANCE, upper + LIMIT_TOLERANCE
     while start < len(values):
-        rest = values[start:]
-        highest = np.floor((upper - np.maximum.accumulate(rest)) / _TURN)
-        lowest = np.ceil((lower - np.minimum.accumulate(rest)) / _TURN)
+        following = values[start:]
+        # numbers of turns that keep all values up to each one inside the limits
+        highest = np.floor((upper - np.maximum.accumulate(following)) / _TURN)
+        lowest = np.ceil((lower - np.minimum.accumulate(following)) / _TURN)
         fits = lowest <= highest
-        length = int(fits.argmin()) if not fits.all() else len(rest)
+        length = int(fits.argmin()) if not fits.all() else len(following)
         if length == 0:
-            turns, length = np.round((meant - rest[0]) / _TURN), 1
+            turns, length = np.round((meant - following[0]) / _TURN), 1
         else:
             last = length - 1
-            turns = np.clip(np.round((meant - rest[0]) / _TURN), lowest[last], highest[last])
-        result[start : start + length] = rest[:length] + turns * _TURN
+            turns = np.clip(np.round((meant - following[0]) / _TURN), lowest[last], highest[last])
+        result[start : start + length] = following[:length] + turns * _TURN
         if start and abs(result[start] - result[start - 1] - (values[start] - values[start - 1])) > 1:
             breaks.append(start)
         start += length
@@ -267,15 +283,15 @@ def _within(values: Array, lower: float, upper: float, meant: float) -> tuple[Ar
 
 
 def wrapped(step: Array, revolute: Array) -> Array:
-    """Joint motions `(..., dof)` [rad or m], those of revolute joints by less than half a turn."""
+    """Wrap joint motions `(..., dof)` [rad or m] of revolute joints to at most half a turn."""
     return step - np.where(revolute, _TURN * np.round(step / _TURN), 0.0)
 
 
 def is_jump(before: Array, middle: Array, after: Array, revolute: Array) -> Array:
-    """Whether solutions `(..., dof)` do not lead through the one of the pose halfway.
+    """Return whether solutions `(..., dof)` are not connected through the solution of the halfway pose.
 
-    On the way the joints pass near the middle of a step, so both halves are shorter than three quarters of it; where
-    the halfway pose has no solution (NaN) there is no way.
+    A continuous motion passes near the middle of a step, so that both halves are shorter than three quarters of it. If
+    the halfway pose has no solution (NaN), the solutions are not connected.
     """
     whole, first, second = (
         np.abs(wrapped(step, revolute)).max(-1) for step in (after - before, middle - before, after - middle)
@@ -285,7 +301,7 @@ def is_jump(before: Array, middle: Array, after: Array, revolute: Array) -> Arra
 
 
 def halfway(T: Array, U: Array) -> Array:
-    """Poses `(..., 4, 4)` halfway between poses: the mean position, and the rotation nearest to the mean of both."""
+    """Compute poses `(..., 4, 4)` halfway between poses: mean position, and rotation nearest to the mean matrix."""
     mean = (T + U) / 2
     left, _, right = np.linalg.svd(mean[..., :3, :3])
     sign = np.linalg.det(left @ right)
@@ -296,17 +312,17 @@ def halfway(T: Array, U: Array) -> Array:
 
 
 def choose_branches(q: Array, status: Array, jumps: Array, first: Array, revolute: Array) -> Array:
-    """The branch of every pose, by dynamic programming over all branches.
+    """Choose the branch of every pose by dynamic programming over all branches.
 
-    The sum over the path of squared joint motions and `JUMP` for every jump is least; a pose outside joint limits
-    counts more than any number of jumps, one without solution more than any number of those.
+    The sum of squared joint motions, plus `JUMP` for every jump, is minimised. A pose outside joint limits costs more
+    than any number of jumps, and one without a solution more than any number of poses outside joint limits.
 
     Args:
         q: `(poses, branches, dof)` solutions [rad or m], NaN where there is none.
         status: `(poses, branches)`: their `Status`.
         jumps: `(poses - 1, branches)`: whether staying on a branch is a jump.
-        first: `(branches,)` what it costs to begin on a branch [rad²].
-        revolute: `(dof,)`.
+        first: `(branches,)` cost of a start on each branch [rad²].
+        revolute: `(dof,)`: which joints are revolute.
 
     Returns:
         `(poses,)`: indices of branches.
@@ -318,7 +334,7 @@ def choose_branches(q: Array, status: Array, jumps: Array, first: Array, revolut
     for start in range(0, poses - 1, CHUNK):
         stop = min(start + CHUNK, poses - 1)
         moving = _transitions(q[start : stop + 1], jumps[start:stop], revolute)
-        for i in range(start, stop):  # every pose needs the one before
+        for i in range(start, stop):  # every step depends on the previous one
             through = cost[:, None] + moving[i - start]
             came[i + 1] = through.argmin(0)
             cost = through[came[i + 1], np.arange(branches)] + nodes[i + 1]
@@ -330,7 +346,7 @@ def choose_branches(q: Array, status: Array, jumps: Array, first: Array, revolut
 
 
 def _transitions(q: Array, jumps: Array, revolute: Array) -> Array:
-    """Cost `(steps, branches, branches)` of going from one branch to another."""
+    """Compute the costs `(steps, branches, branches)` of transitions between branches."""
     step = wrapped(q[1:, None] - q[:-1, :, None], revolute)
     motion = np.nan_to_num((step**2).sum(-1), nan=0.0)
     far = np.nan_to_num(np.abs(step).max(-1), nan=0.0) > _SMALL

@@ -1,4 +1,4 @@
-"""Gradients of joint values with respect to the wanted pose, by the implicit function theorem."""
+"""Gradients of joint values with respect to the target pose, by the implicit function theorem."""
 
 from dataclasses import replace
 from functools import partial
@@ -29,15 +29,15 @@ def as_tensors(
     owner: AbstractInverse,
     axes: TaskAxes,
 ) -> Solution:
-    """Solutions as they are handed out for tensors: like the poses, and with gradients to them.
+    """Convert solutions to tensors with the dtype and device of the poses, and with gradients to them.
 
     Args:
-        solution: in float64 on the CPU, as arrays or tensors; with a last batch axis more than the poses where it is of
-            all branches.
-        poses: as they were given.
-        model: what solved for the poses, where gradients are wanted.
+        solution: float64 arrays or tensors on the CPU; solutions of all branches have one batch axis more than the
+            poses.
+        poses: poses as they were passed.
+        model: calibrated model; None without gradients.
         owner: see `Solution`.
-        axes: which axes of the tool count.
+        axes: axes of the tool that are constrained.
     """
     result = solution.map(_tensor)
     if model is not None and torch.is_grad_enabled():
@@ -61,24 +61,24 @@ def _tensor(values: Any) -> Tensor:
 def differentiable(
     model: CalibratedModel, result: Solution, T: Float[Tensor, "*batch 4 4"], axes: TaskAxes = WHOLE
 ) -> Solution:
-    """The same solutions, from whose `q` and `q_nominal` gradients flow to the poses.
+    """Return the solutions with gradients of `q` and `q_nominal` with respect to the poses.
 
-    A solution satisfies `FK(q) = T`. When the pose moves by a twist ξ (translation, rotation vector, both in the base
-    frame) the joints follow it by `dq = J⁺ ξ`, with J the Jacobian of the whole calibrated arm, the slope of its
-    correction within. A network on nominal joint values is differentiated as such: `q = q_nominal + Δ(T, q_nominal)`,
-    with `dq_nominal = J_nominal⁺ ξ`.
+    A solution satisfies `FK(q) = T`. When the pose moves by a twist ξ (translation and rotation vector in the base
+    frame), the joints follow by `dq = J⁺ ξ`, where J is the Jacobian of the calibrated arm including the slope of its
+    correction. A network on nominal joint values is differentiated as `q = q_nominal + Δ(T, q_nominal)` with
+    `dq_nominal = J_nominal⁺ ξ`.
 
-    J⁺ is the pseudo-inverse in characteristic lengths, without singular values below `SINGULAR_TOLERANCE`: the
-    inverse where there is one; with joints to spare the least motion of them; with fewer than six joints, or at a
-    singular pose, that part of ξ which the tool can follow. Changes of T that are no motion (shear, scale) count as
-    none. A solution that is NaN has the gradient 0, so that it can be masked. There are first derivatives only. Where
-    some axes of the tool do not count, ξ and J are taken in the others alone.
+    J⁺ is the pseudo-inverse of the dimensionless Jacobian, without singular values below `SINGULAR_TOLERANCE`. It is
+    the inverse if that exists; for a redundant arm it yields the least joint motion, and for fewer than six joints or
+    at a singular pose it follows the part of ξ that the tool can follow. Changes of T that are not motions (shear,
+    scale) do not contribute. The gradient of a solution that is NaN is 0, so that it can be masked. Only first
+    derivatives are available. If some axes of the tool are not constrained, ξ and J are restricted to the others.
 
     Args:
-        model: what solved for the poses.
-        result: the solutions, on the CPU in float64.
-        T: the poses that require gradients, in any dtype and on any device.
-        axes: which axes of the tool count.
+        model: calibrated model.
+        result: float64 solutions on the CPU.
+        T: poses that require gradients, of any dtype and device.
+        axes: axes of the tool that are constrained.
     """
     T = T.to("cpu", torch.float64)
     q_nominal = _attached(model.robot, T, axes, result.q_nominal, partial(joint_jacobian, model.robot))
@@ -94,13 +94,13 @@ def differentiable(
         return replace(result, q=q_nominal + result.correction, q_nominal=q_nominal)
     known = torch.isfinite(result.q).all(-1, keepdim=True)
     safe = torch.where(known, q_nominal, 0.0)
-    on_turn = safe + (model.wrapped_near_training(safe.detach()) - safe.detach())
-    correction = torch.where(known, model.network(T, on_turn), torch.nan)
+    near_training = safe + (model.wrapped_near_training(safe.detach()) - safe.detach())
+    correction = torch.where(known, model.network(T, near_training), torch.nan)
     return replace(result, q=q_nominal + correction, q_nominal=q_nominal)
 
 
 def _twist(T: Float64[Tensor, "*batch 4 4"]) -> Float64[Tensor, "*batch 6"]:
-    """Motion of poses from where they are [m, rad]: 0, with the derivatives of the motion."""
+    """Return the twist of poses relative to themselves [m, rad]: 0, with its derivatives."""
     still = T.detach()
     turn = T[..., :3, :3] @ still[..., :3, :3].mT
     turned = [turn[..., k, j] - turn[..., j, k] for j, k in ((1, 2), (2, 0), (0, 1))]
@@ -108,7 +108,7 @@ def _twist(T: Float64[Tensor, "*batch 4 4"]) -> Float64[Tensor, "*batch 6"]:
 
 
 def _attached(robot: Robot, T: Tensor, axes: TaskAxes, q: Tensor, motion: Motion) -> Tensor:
-    """Joint values that follow the poses; the motion is that of rows of joint values."""
+    """Attach gradients with respect to the poses to joint values; `motion` evaluates rows of joint values."""
     flat = q.detach().reshape(-1, q.shape[-1])
     rows = torch.isfinite(flat).all(-1).nonzero()[:, 0]
     inverse = flat.new_zeros(len(flat), q.shape[-1], 6)
@@ -119,18 +119,18 @@ def _attached(robot: Robot, T: Tensor, axes: TaskAxes, q: Tensor, motion: Motion
 
 
 def _inverse(robot: Robot, T: Tensor, axes: TaskAxes, reached: Tensor, J: Tensor) -> Tensor:
-    """Takes twists of wanted poses to joint motions in the axes that count, `(poses, dof, 6)`."""
+    """Compute matrices from twists of target poses to joint motions in the constrained axes, `(poses, dof, 6)`."""
     if axes.whole:
         return pseudo_inverse(robot, J)
     _, turn = task_error(axes, T, reached)
     turn = turn * turn.new_tensor(axes.weights(robot.dof))[:, None]
-    wanted = turn.clone()  # what is off along axes that do not count turns with the wanted tool
+    wanted = turn.clone()  # the deviation along free axes rotates with the target tool
     wanted[:, :, 3:] += turn[:, :, :3] @ skew(T[:, :3, 3] - reached[:, :3, 3])
     return pseudo_inverse(robot, turn @ J) @ wanted
 
 
 def pseudo_inverse(robot: Robot, J: Float64[Tensor, "poses 6 dof"]) -> Float64[Tensor, "poses dof 6"]:
-    """Takes twists [m, rad] to joint motions [rad or m]; see `differentiable`."""
+    """Compute matrices from twists [m, rad] to joint motions [rad or m]; see `differentiable`."""
     length = characteristic_length(robot)
     result: Tensor = torch.linalg.pinv(
         dimensionless_jacobian(robot, J).contiguous(), atol=SINGULAR_TOLERANCE, rtol=0.0
@@ -141,7 +141,7 @@ def pseudo_inverse(robot: Robot, J: Float64[Tensor, "poses 6 dof"]) -> Float64[T
 
 
 class _Implicit(torch.autograd.Function):
-    """Values as they are, with a derivative that is known by other means than differentiating what made them."""
+    """Identity with a given derivative."""
 
     @staticmethod
     def forward(ctx: Any, twist: Tensor, q: Tensor, inverse: Tensor) -> Tensor:

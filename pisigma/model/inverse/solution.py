@@ -1,4 +1,4 @@
-"""What corrected inverse kinematics gives back, and what it is asked for by what is built on it."""
+"""Solutions of corrected inverse kinematics, and the interface of its solvers."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
@@ -12,12 +12,12 @@ from pisigma.model.inverse.joint_input import Postures
 from pisigma.robot.kinematics.status import Status
 from pisigma.robot.kinematics.task_axes import TaskAxes
 
-if TYPE_CHECKING:  # a name in full, which type checkers at run time find without this import
+if TYPE_CHECKING:  # a full name, which run-time type checkers resolve without this import
     import pisigma.model.calibrated_model
 
 
 class AbstractInverse(ABC):
-    """Corrected inverse kinematics as solutions, paths and coupled joints see it; for attributes see `CorrectedIK`."""
+    """Interface of corrected inverse kinematics; for the attributes see `CorrectedIK`."""
 
     branches: tuple[str, ...]
     joints: tuple[str, ...]
@@ -29,22 +29,22 @@ class AbstractInverse(ABC):
     @property
     @abstractmethod
     def model(self) -> "pisigma.model.calibrated_model.CalibratedModel":
-        """What it was made from."""
+        """The calibrated model."""
 
     @property
     @abstractmethod
     def compiled(self) -> object | None:
-        """Its kernels; None where it has none."""
+        """The compiled kernels; None without such."""
 
     @property
     @abstractmethod
     def axes(self) -> TaskAxes:
-        """Which axes of the tool count."""
+        """Axes of the tool that are constrained."""
 
     @property
     @abstractmethod
     def postures(self) -> Postures:
-        """What `near` may be."""
+        """Plausible joint values for `near`."""
 
     @abstractmethod
     def __call__(
@@ -56,57 +56,56 @@ class AbstractInverse(ABC):
         throw: bool = True,
         approach: Any = None,
     ) -> "Solution":
-        """Joint values for poses."""
+        """Find joint values for poses."""
 
     @abstractmethod
     def all_branches(self, T_base_tool: Any, *, approach: Any = None) -> "Solution":
-        """Joint values on every branch."""
+        """Find joint values on every branch."""
 
     @abstractmethod
     def forward(self, q: Any, *, approach: Any = None) -> Any:
-        """Poses of the calibrated arm."""
+        """Compute poses of the calibrated arm."""
 
     @abstractmethod
     def jacobian(self, q: Any) -> Any:
-        """Its Jacobian."""
+        """Compute the Jacobian of the calibrated arm."""
 
     @abstractmethod
     def accuracy(self, q: Any) -> Any:
-        """Predicted standard deviation of the tool's position [m]."""
+        """Predict the standard deviation of the tool's position [m]."""
 
     @abstractmethod
     def with_axes(self, axes: TaskAxes) -> "AbstractInverse":
-        """The same where other axes of the tool count."""
+        """Return a copy in which other axes of the tool are constrained."""
 
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """What the robot has to be commanded to reach poses, and how far that can be trusted.
+    """Joint values to command so that the robot reaches poses, and measures of their validity.
 
-    All values are NumPy arrays (numbers for a single pose) where the poses were arrays or lists, and tensors on the
-    poses' device where these were tensors: joint values and `domain_measure` in the dtype of the poses, residuals in
+    All values are NumPy arrays (scalars for a single pose) if the poses were arrays or lists, and tensors on the device
+    of the poses if these were tensors: joint values and `domain_measure` in the dtype of the poses, residuals in
     float64.
 
     Attributes:
-        q: `(*batch, dof)`: corrected joint values [rad or m], NaN where, and only where, the status is UNREACHABLE or
+        q: `(*batch, dof)`: corrected joint values [rad or m]; NaN if and only if the status is UNREACHABLE or
             INVALID_POSE.
-        q_nominal: `(*batch, dof)`: joint values of the nominal robot, on the same turns; NaN too where an identified
-            geometry reaches the pose and the nominal one, on the same base and with the same tool, does not.
+        q_nominal: `(*batch, dof)`: joint values of the nominal robot, wrapped near `q`; NaN also where only the
+            identified geometry, not the nominal one with the same base and tool, reaches the pose.
         branch: `(*batch,)`: index into `branches`.
         branches: names of the branches.
-        status: `(*batch,)`: a `Status` as a number; the gravest finding counts, in the order unreachable, outside joint
-            limits, singular, outside domain, reached. Limits are those of the corrected values, which are commanded.
-        position_residual: `(*batch,)`: distance of the tool from the wanted position [m], as far as the model knows and
-            before joint values are rounded to float32; NaN without solution.
-        rotation_residual: `(*batch,)`: the same of the angle to the wanted orientation [rad]. Both without the
-            ignored axes.
-        domain_measure: `(*batch,)`: distance to the training rows over their spacing; above 1 the correction is
-            extrapolated, whatever the status says. For a hybrid 1 plus the angle [rad] of the joint that is farthest
-            beyond its measured values. NaN where nothing is learned or there is no solution.
-        owner: whose solution it is, which knows how accurate that is.
-        ignored_axes: axes of the tool that do not count, neither for the status nor in the residuals: those that the
-            task ignores or, of an arm with fewer than six joints, that are left to the arm by default; see
-            `kinematics.task_axes.TaskAxes`.
+        status: `(*batch,)`: a `Status` as a number. The most serious one is reported, in the order unreachable, outside
+            joint limits, singular, outside domain, reached. Joint limits apply to the corrected values, which are
+            commanded.
+        position_residual: `(*batch,)`: distance of the tool from the target position [m] as predicted by the model,
+            before joint values are rounded to float32, and without the ignored axes; NaN without a solution.
+        rotation_residual: `(*batch,)`: angle between the tool and the target orientation [rad], in the same way.
+        domain_measure: `(*batch,)`: distance to the training rows divided by their spacing; above 1 the correction is
+            extrapolated, whichever status is reported. For a hybrid it is 1 plus the largest angle [rad] by which a
+            joint is outside its measured values. NaN without a learned correction or without a solution.
+        owner: solver of the solution, which predicts its accuracy.
+        ignored_axes: axes of the tool that affect neither the status nor the residuals: those that the task ignores or
+            that an arm with fewer than six joints cannot control; see `kinematics.task_axes.TaskAxes`.
     """
 
     q: Any
@@ -127,27 +126,27 @@ class Solution:
 
     @cached_property
     def accuracy(self) -> Any:
-        """Predicted standard deviation of the tool's position [m], `(*batch,)`; NaN where the model does not know it.
+        """Predicted standard deviation of the tool's position [m], `(*batch,)`; NaN if the model has no uncertainty.
 
-        It is computed with torch when it is first read, in float64.
+        It is computed with torch in float64 when it is first read.
         """
         return np.full(np.shape(self.status), np.nan) if self.owner is None else self.owner.accuracy(self.q)
 
     @property
     def sentences(self) -> tuple[str, ...]:
-        """What every status means and what to do about it, all batch axes in a row."""
+        """A sentence for every status that says what it means and what to do, with flattened batch axes."""
         return tuple(Status(status).sentence for status in np.ravel(self.status).tolist())
 
     def select(self, index: Any) -> "Solution":
-        """The solutions at an index of the first batch axes."""
+        """Return the solutions at an index of the first batch axes."""
         return self.map(lambda values: values[index])
 
     def map(self, change: Callable[..., Any], *others: "Solution") -> "Solution":
-        """The same with all values changed by one function, which keeps an axis of joints last.
+        """Apply a function, which must keep the joint axis last, to all values.
 
         Args:
-            change: takes values, and the same values of every other solution.
-            others: further solutions, of the same branches.
+            change: function of the values, and of those of every other solution.
+            others: further solutions, with the same branches.
         """
         changed = {
             name: change(*(getattr(solution, name) for solution in (self, *others))) for name in _VALUES

@@ -1,4 +1,4 @@
-"""Models that are written are read again: they must say what the model in memory says before a folder gets its name."""
+"""Check of written models: the folder is read and compared with the model in memory before it gets its name."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -13,20 +13,20 @@ from pisigma.model.calibrated_model import CalibratedModel, poses_of_rows
 from pisigma.model.folder.model_folder import load_model, save_model
 from pisigma.model.inverse.corrected_ik import CorrectedIK, load
 
-PROBED = 20
-"""Joint values at which the model in memory and the one in the folder are compared."""
-AROUND = 0.1
-"""[rad or m] They are so near to those of training rows."""
-SAME, SAME_JOINTS = 1e-12, 1e-9
-"""[m or rad] Largest difference of predictions, and of joint values, which come out of an iteration."""
+PROBES = 20
+"""Number of joint values at which the model in memory and the one in the folder are compared."""
+PROBE_RADIUS = 0.1
+"""[rad or m] Largest distance of these from the joint values of training rows."""
+TOLERANCE, JOINT_TOLERANCE = 1e-12, 1e-9
+"""[m or rad] Largest difference of predictions, and of joint values, which result from an iteration."""
 
 
 def write_model(model: CalibratedModel, folder: Path) -> None:
-    """Write the files of a model into a scratch folder, and make sure that they say what the model says.
+    """Write the files of a model into a scratch folder, and check that they load as the same model.
 
     Raises:
         ModelError: see `save_model`.
-        AssertionError: the folder does not load, or says something else, which is a defect of pisigma.
+        AssertionError: the folder does not load or differs from the model, which is a defect of pisigma.
     """
     save_model(model, folder)
     check_written(model, folder)
@@ -44,18 +44,18 @@ def check_written(model: CalibratedModel, folder: Path) -> None:
         raise AssertionError(f"the folder that was just written cannot be read: {problem}") from problem
     rows = _probe(model)
     with torch.no_grad():
-        _check("poses", poses_of_rows(model, rows), poses_of_rows(loaded, rows), SAME)
+        _check("poses", poses_of_rows(model, rows), poses_of_rows(loaded, rows), TOLERANCE)
         T = model.forward(rows.q)
-    _check("predicted deviations", deviation_of_rows(model, rows), deviation_of_rows(loaded, rows), SAME)
+    _check("predicted deviations", deviation_of_rows(model, rows), deviation_of_rows(loaded, rows), TOLERANCE)
     _check("prior sizes of weights", _prior_sizes(model), _prior_sizes(loaded), 0.0)
     finite = T[torch.isfinite(T).flatten(1).all(1)].numpy()
     before, after = CorrectedIK(model)(finite, throw=False), ik(finite, throw=False)
-    _check("joint values", torch.as_tensor(before.q), torch.as_tensor(after.q), SAME_JOINTS)
+    _check("joint values", torch.as_tensor(before.q), torch.as_tensor(after.q), JOINT_TOLERANCE)
     _check("statuses", torch.as_tensor(before.status).double(), torch.as_tensor(after.status).double(), 0.0)
 
 
 def _prior_sizes(model: CalibratedModel) -> Tensor:
-    """By weight, the number and the usual value of its prior size, which is how far it may drift."""
+    """Return for every weight the index and the usual value of its prior size, which limits its drift."""
     rows = [torch.zeros(0, 2, dtype=torch.float64)]
     for feature in model.uncertainty.features if model.uncertainty else ():
         number = feature.group[feature.used]
@@ -64,29 +64,29 @@ def _prior_sizes(model: CalibratedModel) -> Tensor:
 
 
 def _probe(model: CalibratedModel) -> Measurements:
-    """Rows near those that were trained on, in all frames and of all targets in turn, with all that a row may state."""
+    """Make rows near the training rows, in all frames and of all targets, with approach, payload and temperature."""
     generator = torch.Generator().manual_seed(0)
     starts = model.starts.double().cpu()
     if not len(starts):
         starts = torch.zeros(1, model.robot.dof, dtype=torch.float64)
-    numbers = torch.linspace(0, len(starts) - 1, PROBED).round().long()
-    around = 2 * torch.rand((PROBED, model.robot.dof), generator=generator, dtype=torch.float64) - 1
+    numbers = torch.linspace(0, len(starts) - 1, PROBES).round().long()
+    around = 2 * torch.rand((PROBES, model.robot.dof), generator=generator, dtype=torch.float64) - 1
     frames, targets = list(model.bases) or [""], list(model.tools) or [""]
     rows = Measurements(
-        q=starts[numbers] + AROUND * around,
-        frame=tuple(frames[k % len(frames)] for k in range(PROBED)),
-        target=tuple(targets[k // len(frames) % len(targets)] for k in range(PROBED)),
+        q=starts[numbers] + PROBE_RADIUS * around,
+        frame=tuple(frames[k % len(frames)] for k in range(PROBES)),
+        target=tuple(targets[k // len(frames) % len(targets)] for k in range(PROBES)),
     )
     return replace(
         rows,
         approach=2.0 * torch.randint(0, 2, rows.q.shape, generator=generator).double() - 1.0,
-        payload=torch.linspace(0.0, 5.0, PROBED, dtype=torch.float64),
-        temperature=torch.linspace(15.0, 30.0, PROBED, dtype=torch.float64),
+        payload=torch.linspace(0.0, 5.0, PROBES, dtype=torch.float64),
+        temperature=torch.linspace(15.0, 30.0, PROBES, dtype=torch.float64),
     )
 
 
 def _check(what: str, before: Tensor, after: Tensor, tolerance: float) -> None:
-    """Refuse values that are not the same; NaN is the same as NaN."""
+    """Raise an error unless values are equal within a tolerance; NaN equals NaN."""
     same = torch.isclose(before, after, rtol=0.0, atol=tolerance, equal_nan=True)
     if before.shape != after.shape or not bool(same.all()):
         most = float((before - after).abs().nan_to_num(torch.inf).max())

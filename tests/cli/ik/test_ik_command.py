@@ -93,7 +93,7 @@ def test_all_branches_of_a_pose(run, models):
 def test_unreachable_pose(run, refuses, models, name):
     pose = (9000, 0, 0, 0, 0, 0)
     sentence = refuses("ik", models / name, "--pose", *pose, stdout=None)
-    assert sentence.startswith("the pose 9000 0 0 0 0 0: unreachable. No joint values reach the pose")
+    assert sentence.startswith("the pose 9000 0 0 0 0 0: unreachable. ")
     result = run("ik", models / name, "--pose", *pose, "--json")
     assert result.exit_code == 2
     (solution,) = json.loads(result.stdout)["solutions"]
@@ -108,7 +108,7 @@ def test_unreachable_pose(run, refuses, models, name):
 )
 def test_singular_pose(run, refuses, models, name, q):
     pose = pose_of(name, torch.tensor(q, dtype=torch.float64))
-    assert ": singular. The joint values reach the pose, but it is singular" in refuses(
+    assert ": singular. " in refuses(
         "ik", models / name, "--pose", *pose, stdout=None
     )
     result = run("ik", models / name, "--pose", *pose, "--json")

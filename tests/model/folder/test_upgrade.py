@@ -162,5 +162,5 @@ def test_a_folder_that_does_not_load_stays_as_it_was(tmp_path):
 
 
 def test_a_folder_without_a_model_is_refused(tmp_path):
-    with pytest.raises(ModelError, match="model.yaml"):
+    with pytest.raises(ModelError, match=r"model\.yaml"):
         upgrade_folder(tmp_path, check_written)

@@ -1,4 +1,4 @@
-"""Corrected inverse kinematics of hybrid models: the arm with its correction really takes the poses."""
+"""Corrected inverse kinematics of hybrid models: the arm with its correction reaches the poses."""
 
 import math
 from dataclasses import replace
@@ -12,7 +12,7 @@ from testing.hybrid import hybrid_of, joints_in
 from pisigma.model.accuracy import position_accuracy
 from pisigma.model.folder.model_folder import save_model
 from pisigma.model.geometric_model import model_of_hybrid
-from pisigma.model.inverse.compiled_ik import SOLUTIONS
+from pisigma.model.inverse.compiled_ik import MAX_SOLUTIONS
 from pisigma.model.inverse.corrected_ik import CorrectedIK, load
 from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.robot.kinematics.singularity import singularity_measure
@@ -42,7 +42,7 @@ def solver_of(name: str):
 
 
 def wanted(arm, ik, rows: int, seed: int = 11) -> tuple[torch.Tensor, torch.Tensor]:
-    """Joint values where it was measured, and the poses there."""
+    """Joint values in the measured region, and the poses there."""
     share = SET_UPS[arm.true.nominal.name.lower()].get("share", 1.0)
     q = joints_in(arm.true.nominal, rows, seed=seed, share=share)
     return q, ik.model.forward(q)
@@ -52,7 +52,7 @@ def found(solution) -> torch.Tensor:
     return solution.status != Status.UNREACHABLE
 
 
-def test_the_hybrid_arm_takes_the_poses(solver):
+def test_the_hybrid_arm_reaches_the_poses(solver):
     arm, ik = solver
     q, T = wanted(arm, ik, 150)
     solution = ik(T, near=q)
@@ -67,11 +67,11 @@ def test_the_hybrid_arm_takes_the_poses(solver):
     )  # seven axes may go elsewhere
 
 
-def test_all_branches_take_the_poses(solver):
+def test_all_branches_reach_the_poses(solver):
     arm, ik = solver
     _, T = wanted(arm, ik, 40)
     every = ik.all_branches(T)
-    assert every.q.shape == (40, len(ik.branches) if ik.closed_form else SOLUTIONS, ik.model.robot.dof)
+    assert every.q.shape == (40, len(ik.branches) if ik.closed_form else MAX_SOLUTIONS, ik.model.robot.dof)
     reached = found(every)
     assert bool(reached.any(-1).all())
     each = T[:, None].expand(*reached.shape, 4, 4)
@@ -91,7 +91,7 @@ def test_all_branches_take_the_poses(solver):
         assert_close(alone.q[clear], every.q[:, ik.branches.index(name)][clear], atol=1e-9)
 
 
-def test_nominal_values_and_correction_go_with_the_solution(solver):
+def test_nominal_values_and_correction_belong_to_the_solution(solver):
     arm, ik = solver
     q, T = wanted(arm, ik, 60)
     solution = ik(T, near=q)
@@ -159,7 +159,7 @@ def test_batched_equals_looped():
         assert_close(alone.q.nan_to_num(), whole.q[index].nan_to_num(), atol=1e-9)
 
 
-def test_outside_the_measured_joints_the_status_says_so():
+def test_the_status_reports_unmeasured_joint_values():
     arm, ik = solver_of("kiro4")
     q = joints_in(arm.true.nominal, 120, seed=3)
     coverage = ik.model.hybrid.coverage
@@ -179,7 +179,7 @@ def test_outside_the_measured_joints_the_status_says_so():
     assert "outside the region that the measurements covered" in solution.sentences[index]
 
 
-def test_where_the_nominal_arm_does_not_reach_the_hybrid_may():
+def test_the_hybrid_may_reach_where_the_nominal_arm_does_not():
     arm, ik = solver_of("fanuc_r2000")
     q = joints_in(arm.true.nominal, 200, seed=6)
     generator = torch.Generator().manual_seed(0)
@@ -193,7 +193,7 @@ def test_where_the_nominal_arm_does_not_reach_the_hybrid_may():
 
 
 def straight_elbow(ik) -> float:
-    """Value of the third joint [rad] at which the nominal arm reaches farthest."""
+    """Value of the third joint [rad] at which the nominal arm is longest."""
     q = torch.zeros(4000, 6, dtype=torch.float64)
     q[:, 2] = torch.linspace(*ik.model.robot.limits[2].tolist(), len(q), dtype=torch.float64)
     q[:, 4] = math.pi / 2
@@ -215,8 +215,8 @@ def test_far_poses_are_unreachable(name):
             assert bool(values.isnan().all())
 
 
-def test_turns_that_a_correction_tells_apart_are_solved_on_their_own():
-    """Scaled joint values as features: a full turn away the correction is another one."""
+def test_wraps_that_a_correction_distinguishes_are_solved_separately():
+    """With scaled joint values as features the correction differs after a full turn."""
     arm, ik = solver_of("ur5")
     q, T = wanted(arm, ik, 40)
     turned = q + 2 * torch.pi * torch.tensor([1.0, 0.0, 0.0, 0.0, 0.0, -1.0]) * -torch.sign(q)

@@ -1,4 +1,4 @@
-"""Models of hybrid calibrations: predictions, their folder, and folders that cannot be true."""
+"""Models of hybrid calibrations: predictions, their folder, and inconsistent folders."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -9,6 +9,7 @@ import torch
 from testing.closeness import assert_close
 from testing.edited_folders import edit, edit_tensors
 from testing.hybrid import hybrid_of, joints_in
+from testing.refusals import refused
 
 from pisigma.estimation.covariance_root import CovarianceRoot
 from pisigma.files.errors import MeasurementError, ModelError, PoseError
@@ -40,7 +41,7 @@ def model_of(set_up: str):
 
 @pytest.fixture(scope="module", params=SET_UPS)
 def hybrid(request):
-    """What was simulated, and the model of its calibration."""
+    """A simulation, and the model of its calibration."""
     return model_of(request.param)
 
 
@@ -71,7 +72,7 @@ def test_the_model_predicts_what_the_calibration_does(hybrid):
     assert float(errors.square().mean()) < 0.2 * float(nominal.square().mean())
 
 
-def test_frames_and_targets_are_told_apart():
+def test_frames_and_targets_are_distinguished():
     arm, model = model_of("products")
     assert list(model.bases) == list(model.hybrid_bases) == ["wall", "floor"]
     q = everywhere(arm, 4)
@@ -94,7 +95,7 @@ def test_deviations_are_those_of_the_calibration(hybrid):
     assert_close(found[0], expected[rows].norm(dim=-1), atol=1e-12, rtol=1e-5)
 
 
-def test_without_a_name_the_only_frame_is_meant():
+def test_rows_without_a_name_use_the_only_frame():
     arm, model = model_of("additive")
     rows = Measurements(q=everywhere(arm, 3), frame=("anything",) * 3)
     assert_close(deviation_of_rows(model, rows), deviation_of_rows(model, replace(rows, frame=())))
@@ -111,7 +112,7 @@ def test_the_accuracy_of_nothing_is_nan():
     assert position_accuracy(model, q[:0]).shape == (0,)
 
 
-def test_beyond_the_measured_joints_the_correction_holds_and_is_less_certain():
+def test_outside_the_measured_joints_the_correction_is_less_certain():
     arm, model = model_of("half")
     q = everywhere(arm)
     inside, moved = model.hybrid.coverage.contains(q), q + model.hybrid.correction(q)
@@ -120,7 +121,7 @@ def test_beyond_the_measured_joints_the_correction_holds_and_is_less_certain():
     assert float(predicted[~inside].median()) > 1.2 * float(predicted[inside].median())
 
 
-def test_a_folder_gives_the_same_predictions_to_the_last_bit(hybrid, tmp_path):
+def test_a_folder_predicts_the_same_to_the_last_bit(hybrid, tmp_path):
     arm, model = hybrid
     save_model(model, tmp_path)
     loaded = load_model(tmp_path)
@@ -171,7 +172,7 @@ def test_poses_of_batches(batch):
     T = hybrid_poses(model.hybrid, q)
     assert T.shape == (*batch, 4, 4)
     assert_close(T, model.hybrid.forward(q), atol=1e-14)
-    with pytest.raises(PoseError, match="has 6 joints"):
+    with pytest.raises(PoseError, match="theta_6"):
         hybrid_poses(model.hybrid, q[..., :5])
 
 
@@ -197,13 +198,13 @@ def folder(tmp_path) -> Path:
     return tmp_path
 
 
-def refused(folder: Path) -> str:
-    """The complaint: one sentence that names the folder."""
+def refusal(folder: Path) -> str:
+    """The message of the refusal: one line that names the folder."""
     with pytest.raises(ModelError) as caught:
         load_model(folder)
     sentence = str(caught.value)
     assert "\n" not in sentence
-    assert sentence.startswith(str(folder))
+    assert str(folder) in sentence
     assert len(sentence) < 600
     return sentence
 
@@ -218,7 +219,7 @@ def test_an_unchanged_folder_survives_the_editing_of_these_tests(folder):
 def test_truncated_files(folder, name, share):
     content = (folder / name).read_bytes()
     (folder / name).write_bytes(content[: int(share * len(content))])
-    assert "truncated" in refused(folder)
+    assert refusal(folder)
 
 
 def _learned(**values):
@@ -230,49 +231,46 @@ def _known(**values):
 
 
 @pytest.mark.parametrize(
-    ("change", "complaint"),
+    ("change", "named"),
     [
-        (lambda document: document.update(format=99), "format 99 is newer"),
+        (lambda document: document.update(format=99), "99"),
         (_learned(features=[{"name": "seris", "harmonics": 3}]), "features"),
-        (_learned(features=[{"name": "series", "harmonics": 3}]), "uncertainty is of the features"),
-        (_learned(features=[{"name": "series", "harmonics": 3}] * 2), "uncertainty is of the features"),
+        (_learned(features=[{"name": "series", "harmonics": 3}]), "key 'uncertainty.features'"),
+        (_learned(features=[{"name": "series", "harmonics": 3}] * 2), "key 'uncertainty.features'"),
         (_learned(features=[{"name": "series", "harmonics": 10**9}]), "100000"),
         (_learned(features=[{"name": "series", "harmonics": 4, "gravity": [0, 0, 1]}]), "gravity"),
-        (_learned(features=[{"name": "gravity", "gravity": [0.0, 0.0, 0.0]}]), "needs a direction"),
-        (_learned(features=[]), "uncertainty is of the features"),
-        (_learned(orders=[2, 2]), "of shape"),
+        (_learned(features=[{"name": "gravity", "gravity": [0.0, 0.0, 0.0]}]), "[0.0, 0.0, 0.0]"),
+        (_learned(features=[]), "key 'uncertainty.features'"),
+        (_learned(orders=[2, 2]), "(6, 4, 12)"),
         (_learned(orders=[1]), "orders"),
-        (_learned(orders=[]), "of shape"),
-        (_learned(fade_rad=0.1), "unknown key 'fade_rad'"),
-        (lambda document: document["learned"]["bases"].pop("floor"), "other frames or targets"),
-        (lambda document: document["bases"].pop("floor"), "other frames or targets"),
-        (_learned(tools={}), "other frames or targets"),
-        (lambda document: document.pop("learned"), "is unknown"),
-        (lambda document: document.pop("uncertainty"), "'uncertainty.root' is unknown"),
-        (lambda document: document.update(calibrated=None), "needs the calibrated robot"),
-        (_known(free=[0, 1]), "of shape"),
-        (lambda document: document["uncertainty"]["free"].reverse(), "rising numbers"),
-        (lambda document: document["uncertainty"]["free"].__setitem__(-1, 9999), "rising numbers"),
-        (lambda document: document["uncertainty"]["features"].pop(0), "uncertainty is of the features"),
-        (lambda document: document["uncertainty"]["features"].remove("products"), "of shape"),
+        (_learned(orders=[]), "(6, 0, 12)"),
+        (_learned(fade_rad=0.1), "fade_rad"),
+        (lambda document: document["learned"]["bases"].pop("floor"), "key 'learned'"),
+        (lambda document: document["bases"].pop("floor"), "key 'learned'"),
+        (_learned(tools={}), "key 'learned'"),
+        (lambda document: document.pop("learned"), "correction."),
+        (lambda document: document.pop("uncertainty"), "'uncertainty.root'"),
+        (lambda document: document.update(calibrated=None), "key 'calibrated'"),
+        (_known(free=[0, 1]), "(494, any)"),
+        (lambda document: document["uncertainty"]["free"].reverse(), "key 'uncertainty.free'"),
+        (lambda document: document["uncertainty"]["free"].__setitem__(-1, 9999), "key 'uncertainty.free'"),
+        (lambda document: document["uncertainty"]["features"].pop(0), "key 'uncertainty.features'"),
+        (lambda document: document["uncertainty"]["features"].remove("products"), "(168, any)"),
         (_known(features=3), "features"),
         (_known(unknowns=[{"name": "socket"}]), "unknowns"),
         (_known(prior_scale=-1.0), "prior_scale"),
         (_known(values={"socket": {"A": [0.0, "far"]}}), "values"),
-        (
-            lambda document: document["robot"]["rows"][0].update(d_mm=1.0),
-            "not the geometry in the description",
-        ),
+        (lambda document: document["robot"]["rows"][0].update(d_mm=1.0), "'drawn.dh'"),
         (
             lambda document: document["robot"]["rows"][0].update(limits_deg=[-10.0, 10.0]),
-            "not the limits in the description",
+            "'drawn.limits'",
         ),
-        (lambda document: document["robot"]["rows"][0].pop("limits_deg"), "of shape"),
+        (lambda document: document["robot"]["rows"][0].pop("limits_deg"), "(5, 2)"),
     ],
 )
-def test_descriptions_that_do_not_fit(folder, change, complaint):
+def test_descriptions_that_do_not_fit(folder, change, named):
     edit(folder, change)
-    assert complaint in refused(folder)
+    assert named in refusal(folder)
 
 
 def _put(name: str, value: torch.Tensor):
@@ -280,32 +278,33 @@ def _put(name: str, value: torch.Tensor):
 
 
 @pytest.mark.parametrize(
-    ("change", "complaint"),
+    ("change", "value"),
     [
-        (lambda tensors: tensors.pop("learned.dh"), "'learned.dh' is missing"),
-        (lambda tensors: tensors.pop("coverage.half"), "'coverage.half' is missing"),
-        (lambda tensors: tensors.pop("correction.linear.0"), "'correction.linear.0' is missing"),
-        (_put("correction.linear.9", torch.zeros(1).double()), "'correction.linear.9' is unknown"),
-        (_put("correction.weight", torch.zeros(6, 3, 12).double()), "'correction.weight' of shape"),
+        (lambda tensors: tensors.pop("learned.dh"), "learned.dh"),
+        (lambda tensors: tensors.pop("coverage.half"), "coverage.half"),
+        (lambda tensors: tensors.pop("correction.linear.0"), "correction.linear.0"),
+        (_put("correction.linear.9", torch.zeros(1).double()), "correction.linear.9"),
+        (_put("correction.weight", torch.zeros(6, 3, 12).double()), (6, 3, 12)),
         (
             lambda tensors: tensors.update({"correction.bias": tensors["correction.bias"].float()}),
-            "'correction.bias' in float64 was wanted",
+            torch.float32,
         ),
-        (_put("coverage.joint", torch.zeros(6).double()), "'coverage.joint' in int64 was wanted"),
-        (_put("coverage.joint", torch.zeros(6, dtype=torch.int64)), "a stretch"),
-        (_put("coverage.middle", torch.zeros(99).double()), "joint, middle or half is missing"),
-        (lambda tensors: tensors["coverage.half"].fill_(-1.0), "at least no length"),
-        (lambda tensors: tensors["coverage.half"].fill_(torch.nan), "not finite"),
-        (lambda tensors: tensors["correction.weight"].view(-1)[3:4].fill_(torch.inf), "not finite"),
-        (lambda tensors: tensors["drawn.dh"].add_(1e-6), "'drawn.dh' is not the geometry"),
-        (lambda tensors: tensors["calibrated.base"].add_(1e-6), "'calibrated.base' is not the geometry"),
-        (lambda tensors: tensors["drawn.limits"].add_(1e-6), "not the limits"),
+        (_put("coverage.joint", torch.zeros(6).double()), torch.float64),
+        (_put("coverage.joint", torch.zeros(6, dtype=torch.int64)), "coverage.joint"),
+        (_put("coverage.middle", torch.zeros(99).double()), "coverage"),
+        (lambda tensors: tensors["coverage.half"].fill_(-1.0), "coverage.joint"),
+        (lambda tensors: tensors["coverage.half"].fill_(torch.nan), "coverage.half"),
+        (lambda tensors: tensors["correction.weight"].view(-1)[3:4].fill_(torch.inf), "correction.weight"),
+        (lambda tensors: tensors["drawn.dh"].add_(1e-6), "drawn.dh"),
+        (lambda tensors: tensors["calibrated.base"].add_(1e-6), "calibrated.base"),
+        (lambda tensors: tensors["drawn.limits"].add_(1e-6), "drawn.limits"),
         (
             lambda tensors: tensors.update({"uncertainty.root": tensors["uncertainty.root"].float()}),
-            "'uncertainty.root' in float64 was wanted",
+            torch.float32,
         ),
     ],
 )
-def test_tensors_that_do_not_fit(folder, change, complaint):
+def test_tensors_that_do_not_fit(folder, change, value):
     edit_tensors(folder, change)
-    assert complaint in refused(folder)
+    with refused(ModelError, file="model.safetensors", value=value):
+        load_model(folder)

@@ -1,4 +1,4 @@
-"""Arms with passive joints: poses of a palletiser, solved in the values of its four axes."""
+"""Arms with passive joints: poses of a palletiser are solved in the values of its four axes."""
 
 import numpy as np
 import pytest
@@ -20,7 +20,7 @@ def robot() -> Robot:
 
 @pytest.fixture(scope="module")
 def ik(robot: Robot) -> CorrectedIK:
-    """Of a robot whose geometry is off, tilt of the flange included."""
+    """Corrected inverse kinematics of a robot with geometric errors, including a tilt of the flange."""
     errors = np.random.default_rng(0).normal(0, 3e-4, robot.dh.shape)
     starts = JointsRandom(kind="joints_random", count=100, seed=1).joints(robot)
     identified = robot.with_geometry(dh=robot.dh + errors)
@@ -53,7 +53,7 @@ def test_of_a_level_flange_position_and_yaw_are_reached(ik, robot, q):
     assert_close(solution.q_nominal, q, atol=1e-9)
 
 
-def test_what_no_axis_can_do_is_said(ik, robot, q):
+def test_rotations_that_no_axis_can_control_are_residuals(ik, robot, q):
     T = pisigma.forward_kinematics(robot, q[:2])
     T[:, :3, 3] *= 5
     solution = ik(T)
@@ -61,7 +61,7 @@ def test_what_no_axis_can_do_is_said(ik, robot, q):
     assert np.isnan(solution.q).all()
 
 
-def test_a_tool_that_leans_far_is_not_reached(ik, robot, q):
+def test_poses_with_a_large_tilt_are_not_reached(ik, robot, q):
     T = pisigma.forward_kinematics(robot, q[:3])
     c, s = np.cos(0.5), np.sin(0.5)
     T[:, :3, :3] = T[:, :3, :3] @ np.array([[1, 0, 0], [0, c, -s], [0, s, c]])

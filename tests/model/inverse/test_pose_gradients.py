@@ -1,4 +1,4 @@
-"""Gradients of joint values with respect to the wanted pose against finite differences."""
+"""Gradients of joint values with respect to the target pose agree with finite differences."""
 
 import pytest
 import torch
@@ -19,13 +19,13 @@ STEP = 1e-5
 
 
 def moved(T: torch.Tensor, twist: torch.Tensor) -> torch.Tensor:
-    """Poses moved by a translation and a rotation vector in the base frame."""
+    """Move poses by a translation and a rotation vector in the base frame."""
     rotation = rotation_from_vector(twist[..., 3:]) @ T[..., :3, :3]
     return transform(rotation, T[..., :3, 3] + twist[..., :3])
 
 
 def directions(model, T, q) -> torch.Tensor:
-    """Twists that the tool can follow: of six joints or more any, else those of the joints."""
+    """Twists that the tool can follow: any for six or more joints, else those of the joints."""
     generator = torch.Generator().manual_seed(0)
     if model.robot.dof >= 6:
         return torch.randn(len(T), 6, generator=generator, dtype=torch.float64)
@@ -69,7 +69,7 @@ def test_a_network_on_nominal_joint_values(name):
     check(model, T, torch.tensor(HOMES[name], dtype=torch.float64))
 
 
-def test_pose_inputs_of_a_network_count_too():
+def test_pose_inputs_of_a_network_contribute():
     model = hand_made_model("kiro4", inputs=("x", "y", "z", "roll", "theta_2"))
     T = forward_kinematics(model.robot, joints_around("kiro4", 20, spread=0.15))
     check(model, T, torch.tensor(HOMES["kiro4"], dtype=torch.float64))
@@ -102,7 +102,7 @@ def test_seven_joints_follow_with_the_least_motion():
     assert_close((rest * step).sum(-1), 0.0, atol=1e-9)
 
 
-def test_changes_that_are_no_motion_count_as_none():
+def test_shear_and_scale_do_not_contribute():
     model = calibrated_arm("ur5")
     q = joints_of(model.robot, 5, seed=3, share=0.4)
     T = model.forward(q).requires_grad_()
@@ -112,7 +112,7 @@ def test_changes_that_are_no_motion_count_as_none():
     assert_close(slope[:, 3], 0.0)
 
 
-def test_what_is_not_reached_has_no_gradient_and_what_is_singular_a_finite_one():
+def test_unreached_poses_have_zero_gradient_and_singular_ones_a_finite_one():
     model = calibrated_arm("ur5", hybrid=False)
     stretched = torch.tensor([0.3, -0.7, 0.0, 0.5, 0.6, 0.2], dtype=torch.float64)
     singular = CorrectedIK(model)

@@ -1,4 +1,4 @@
-"""A simulated RB5 with every source of errors is commanded to poses by its hybrid, and where its tool really comes."""
+"""A simulated RB5 with every source of errors reaches the poses to which its hybrid commands it."""
 
 import torch
 from testing.closeness import assert_close
