@@ -1,1 +1,1 @@
-"""Corrected inverse kinematics for whatever can open a socket: lines of JSON, binary frames, ZeroMQ."""
+"""Server of corrected inverse kinematics for socket clients: lines of JSON, binary frames, ZeroMQ."""

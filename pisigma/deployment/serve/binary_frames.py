@@ -1,4 +1,4 @@
-"""Requests and answers as frames of fixed length, for control loops: poses only."""
+"""Requests and answers as frames of fixed length, for poses in control loops."""
 
 import enum
 import math
@@ -12,23 +12,22 @@ from pisigma.files.errors import RequestError
 
 MAGIC = b"PSI1"
 JOINTS = 8
-"""Of every frame, whatever the robot has."""
+"""Joint values in every frame, regardless of the robot."""
 HEAD = struct.Struct("<4sIQII")
 """Magic, length of the whole frame, id; then model index and flags, or status and number of joints."""
 REQUEST = struct.Struct(f"<4sIQII16d{JOINTS}d")
-"""The pose T_base_tool row by row [m], and the joint values to be near to [rad or m], NaN for none."""
+"""The pose T_base_tool row by row [m], and joint values that the solution should be near [rad or m], NaN for none."""
 _POSE, _NEAR = HEAD.size, HEAD.size + 128
 ANSWER = struct.Struct(f"<4sIQII{JOINTS}d2d")
-"""Joint values [rad or m], NaN behind the last joint, and the residuals of position [m] and rotation [rad]."""
-LONGEST_TOKEN = 1024
-"""[bytes]"""
+"""Joint values [rad or m], NaN after the last joint, and the residuals of position [m] and rotation [rad]."""
+MAX_TOKEN_BYTES = 1024
 
 TOKEN = 1
-"""Flag of a first frame that holds a token behind its head."""
+"""Flag of a first frame that has a token after its head."""
 
 
 class Refusal(enum.IntEnum):
-    """Statuses of answers besides those of `Status`."""
+    """Statuses of answers in addition to those of `Status`."""
 
     NO_SUCH_MODEL = 100
     UNKNOWN_FLAGS = 101
@@ -41,13 +40,13 @@ _NO_JOINTS = (math.nan,) * JOINTS
 
 
 class BinaryFrames(AbstractProtocol):
-    """A frame in, a frame out; see docs/reference/serve-protocol.md."""
+    """Protocol with one frame per request and answer; see docs/reference/serve-protocol.md."""
 
     def __init__(self, models: ServedModels, metrics: Metrics) -> None:
         self._models, self._metrics = models, metrics
 
     def cut(self, received: bytearray) -> int:
-        """Give the length of the first frame; see `AbstractProtocol`.
+        """Return the length of the first frame; see `AbstractProtocol`.
 
         Raises:
             BrokenStreamError: the magic or the length is wrong.
@@ -58,7 +57,7 @@ class BinaryFrames(AbstractProtocol):
         if count < HEAD.size:
             return 0
         _, length, name, _, flags = HEAD.unpack_from(received)
-        fits = HEAD.size < length <= HEAD.size + LONGEST_TOKEN if flags == TOKEN else length == REQUEST.size
+        fits = HEAD.size < length <= HEAD.size + MAX_TOKEN_BYTES if flags == TOKEN else length == REQUEST.size
         if not fits:
             raise BrokenStreamError(_refusal(name, Refusal.BROKEN_FRAME))
         return length if count >= length else 0
@@ -78,15 +77,15 @@ class BinaryFrames(AbstractProtocol):
         return lambda: self._solve(model, message, name, begun)
 
     def broken(self) -> bytes:
-        """Say that what came is no frame."""
+        """Return the answer to bytes that are not a frame."""
         return _refusal(0, Refusal.BROKEN_FRAME)
 
     def token_of(self, message: bytes) -> bytes | None:
-        """What stands behind the head of a frame with the flag `TOKEN`."""
+        """Return the bytes after the head of a frame with the flag `TOKEN`."""
         return message[HEAD.size :] if HEAD.unpack_from(message)[4] == TOKEN else None
 
     def admission(self, admitted: bool) -> bytes:
-        """Say whether the token was the right one: status 0 if so."""
+        """Return the answer to a token: status 0 if it is valid."""
         return _refusal(0, 0 if admitted else Refusal.WRONG_TOKEN)
 
     def _solve(self, model: ServedModel, message: bytes, name: int, begun: int) -> bytes:

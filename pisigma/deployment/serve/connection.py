@@ -1,4 +1,4 @@
-"""One connection of a server: what it has received, what it still has to send, and since when it keeps us waiting."""
+"""One connection of a server: its received and unsent bytes, and the time since which it has been waited for."""
 
 import selectors
 import socket
@@ -8,26 +8,26 @@ from collections.abc import Callable
 from pisigma.deployment.serve.protocol import AbstractProtocol, BrokenStreamError, is_token
 
 CHUNK = 4096
-"""[bytes] Are read at a time, so that no client keeps the others waiting with what it sends at once."""
-MOST_REST = 2**22
-"""[bytes] Are read of a client when the server stops, so that none that sends on and on keeps it."""
-AT_ONCE = 100
-"""Messages of a client are answered before those of others when the server stops."""
+"""[bytes] Read at a time, so that no client delays the others by sending a lot at once."""
+MAX_DRAIN_BYTES = 2**22
+"""[bytes] Most that is read of a client when the server stops, so that a client that keeps sending cannot delay it."""
+MESSAGES_PER_TURN = 100
+"""Messages of a client that are answered before those of others when the server stops."""
 
 Submit = Callable[["Connection", Callable[[], bytes]], None]
 
 
 class Connection:
-    """A client. Its messages are answered one after the other, in their order.
+    """Connection to a client, whose messages are answered one after the other, in order.
 
-    It is not read while an answer is worked out or waits for the client to take it, so that what is kept for a client
-    is bounded by one message, one answer and a chunk.
+    It is not read while an answer is computed or waits to be received by the client, so that the memory for a client is
+    bounded by one message, one answer and a chunk.
 
     Attributes:
-        closed: whether it is over.
-        waits_since: `time.monotonic()` since when the rest of a message, the token, or room for an answer is
-            awaited; None where nothing is.
-        busy: whether an answer is worked out in another thread.
+        closed: whether the connection is closed.
+        waits_since: `time.monotonic()` since which the remainder of a message, the token, or space for an answer has
+            been awaited; None if the client owes nothing.
+        busy: whether another thread computes an answer.
     """
 
     def __init__(
@@ -41,11 +41,11 @@ class Connection:
         """Take a new connection.
 
         Args:
-            stream: of the client.
-            protocol: that it speaks.
-            selector: that says when it can be read or written.
-            submit: has an answer worked out by another thread, which ends with `take`.
-            token: that its first message has to hold; None where none is wanted.
+            stream: socket of the client.
+            protocol: protocol of the client.
+            selector: selector that reports when the socket can be read or written.
+            submit: function that has another thread compute an answer and pass it to `take`.
+            token: token that the first message must have; None if none is required.
         """
         stream.setblocking(False)
         stream.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
@@ -59,7 +59,7 @@ class Connection:
         selector.register(stream, self._watched, self.ready)
 
     def ready(self, events: int) -> None:
-        """Go on: the client has sent something, or takes something."""
+        """Continue after the client has sent something or can receive something."""
         try:
             if self._unsent:
                 self._send(b"")
@@ -74,7 +74,7 @@ class Connection:
             self.close()
 
     def take(self, reply: bytes) -> None:
-        """Send the answer that another thread worked out, and go on."""
+        """Send the answer that another thread computed, and continue."""
         self.busy = False
         if self.closed:
             return
@@ -84,11 +84,11 @@ class Connection:
         except OSError:
             self.close()
 
-    def read_rest(self) -> None:
-        """Take what the client has sent before the server stops; what it sends from now on is not read."""
+    def drain(self) -> None:
+        """Read what the client has sent before the server stops; later bytes are not read."""
         self._stopping = self._ending = True
         try:
-            while len(self._received) < MOST_REST and not self.closed:
+            while len(self._received) < MAX_DRAIN_BYTES and not self.closed:
                 if not (data := self._stream.recv(CHUNK)):
                     break
                 self._received += data
@@ -97,8 +97,8 @@ class Connection:
         except OSError:
             self.close()
 
-    def answer_rest(self) -> bool:
-        """Answer some of what came in whole, and close after the last answer; whether there is more."""
+    def answer_remaining(self) -> bool:
+        """Answer some of the complete messages, close after the last one, and return whether there are more."""
         try:
             if not self.closed:
                 self.proceed()
@@ -107,7 +107,7 @@ class Connection:
         return not (self.closed or self.busy or self._unsent)
 
     def close(self) -> None:
-        """Close at once."""
+        """Close immediately."""
         if not self.closed:
             self.closed = True
             if self._watched:
@@ -115,13 +115,13 @@ class Connection:
             self._stream.close()
 
     def proceed(self) -> None:
-        """Answer the messages that are whole, as far as answers can be sent; some of them when the server stops."""
+        """Answer the complete messages as far as answers can be sent; when the server stops, only some at a time."""
         answered = 0
         try:
             while not self.busy and not self._unsent:
                 if not self._received or not (length := self._protocol.cut(self._received)):
                     break
-                if self._stopping and answered == AT_ONCE:
+                if self._stopping and answered == MESSAGES_PER_TURN:
                     self.waits_since = None
                     return
                 message = bytes(memoryview(self._received)[:length])
@@ -139,19 +139,19 @@ class Connection:
         except BrokenStreamError as problem:
             self._received.clear()
             self._ending = True
-            self._send(problem.last_words)
+            self._send(problem.final_answer)
         if self._ending and not self.busy and not self._unsent:
-            self.close()  # what is left of a half message is dropped
+            self.close()  # an incomplete message is dropped
         else:
             self._watch(answered > 0)
 
     def _admit(self, message: bytes, token: bytes) -> None:
         admitted = is_token(self._protocol.token_of(message), token)
-        words = self._protocol.admission(admitted)
+        reply = self._protocol.admission(admitted)
         if not admitted:
-            raise BrokenStreamError(words)
+            raise BrokenStreamError(reply)
         self._token = None
-        self._send(words)
+        self._send(reply)
 
     def _send(self, reply: bytes) -> None:
         unsent = self._unsent + reply
@@ -161,7 +161,7 @@ class Connection:
             self._unsent = unsent
 
     def _watch(self, answered: bool) -> None:
-        """Wait for what is needed next, and keep the time since when the client owes it."""
+        """Wait for the next event, and store the time since which the client owes it."""
         watched = 0 if self.busy else selectors.EVENT_WRITE if self._unsent else selectors.EVENT_READ
         owed = not self.busy and bool(self._unsent or self._received or self._token is not None)
         if not owed:

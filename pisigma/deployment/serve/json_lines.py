@@ -1,4 +1,4 @@
-"""Requests and answers as JSON objects, one a line."""
+"""Requests and answers as JSON objects, one per line."""
 
 import json
 import math
@@ -14,20 +14,19 @@ from pydantic_core import from_json
 from pisigma.deployment.serve.metrics import Metrics
 from pisigma.deployment.serve.models import ServedModel, ServedModels, solution_row
 from pisigma.deployment.serve.protocol import STATUS_NAMES, AbstractProtocol, BrokenStreamError, Reply
-from pisigma.files.errors import PisigmaError, RequestError, nearest_choice, printable
+from pisigma.files.errors import PisigmaError, RequestError, check_choice, nearest_choice, printable
 from pisigma.model.inverse.corrected_ik import CorrectedIK
 from pisigma.robot.kernels.array_kinematics import transform_entries, xyzrpy_of
 from pisigma.robot.kinematics.status import Status
 
-LONGEST_LINE = 2**20
-"""[bytes] A path of some 8,000 poses."""
-LARGEST = 1e9
-"""[mm or deg] No pose or joint has a larger value."""
-LONGEST_ID = 200
-"""Letters of an id that is a text."""
+MAX_LINE_BYTES = 2**20
+"""A path of about 8,000 poses."""
+MAX_NUMBER = 1e9
+"""[mm or deg] Largest accepted value of a pose or joint."""
+MAX_ID_CHARACTERS = 200
 
 _TASKS = ("pose", "path", "q_deg", "q", "ask")
-"""Keys of which a request has exactly one; it says what is wanted."""
+"""Keys of which a request has exactly one, which determines its task."""
 _NEAR = ("near_deg", "near")
 _AXES = ("ignore_axes", "tolerance_mm", "tolerance_deg", "elbow_deg")
 _KEYS = {
@@ -37,11 +36,11 @@ _KEYS = {
     "q": {"id", "model", "approach", "accuracy"},
     "ask": {"id", "model"},
 }
-"""Of every task the keys that a request may hold besides."""
+"""Further keys that a request of each task may have."""
 _QUESTIONS = ("health", "models", "reload")
 
 _PLAIN = {"id", "model", "pose", *_NEAR, "brief"}
-"""Keys of requests for poses that state no task of their own."""
+"""Keys of requests for poses in the default axes."""
 _POSE = struct.Struct("<16d")
 
 _REACHING = frozenset(float(status) for status in Status if status.reaches)
@@ -49,13 +48,13 @@ _encode = json.JSONEncoder(allow_nan=False, separators=(", ", ": ")).encode
 
 
 def _refuse_constant(name: str) -> Any:
-    raise ValueError(f"{name} is no number of JSON")
+    raise ValueError(f"{name} is not a valid JSON number")
 
 
 def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     values = dict(pairs)
     if len(values) < len(pairs):
-        raise ValueError("a key stands there twice")
+        raise ValueError("a key appears twice")
     return values
 
 
@@ -63,10 +62,12 @@ _decode_strictly = json.JSONDecoder(object_pairs_hook=_object, parse_constant=_r
 
 
 def _decode(message: bytes) -> Any:
-    """Read JSON in which no key stands twice: every key takes a colon, so where there are no more of them, none does.
+    """Read JSON in which no key appears twice.
+
+    Every key needs a colon, so an object with as many keys as there are colons has no repeated key.
 
     Raises:
-        ValueError: it is no such JSON.
+        ValueError: it is not valid JSON, or a key appears twice.
         RecursionError: it is nested too deeply.
     """
     try:
@@ -74,24 +75,24 @@ def _decode(message: bytes) -> Any:
         if isinstance(values, dict) and message.count(b":") == len(values):
             return values
     except ValueError:
-        pass  # what is wrong is said below
+        pass  # the strict decoder below reports the fault
     return _decode_strictly(message.decode())
 
 
 class JsonLines(AbstractProtocol):
-    """A line of JSON in, a line of JSON out; see docs/reference/serve-protocol.md."""
+    """Protocol with one line of JSON per request and answer; see docs/reference/serve-protocol.md."""
 
     def __init__(self, models: ServedModels, metrics: Metrics) -> None:
         self._models, self._metrics = models, metrics
 
     def cut(self, received: bytearray) -> int:
-        """Give the length of the first line with its end; see `AbstractProtocol`.
+        """Return the length of the first line with its end; see `AbstractProtocol`.
 
         Raises:
-            BrokenStreamError: the line is longer than `LONGEST_LINE`.
+            BrokenStreamError: the line is longer than `MAX_LINE_BYTES`.
         """
         length = received.find(b"\n") + 1
-        if length > LONGEST_LINE or (not length and len(received) > LONGEST_LINE):
+        if length > MAX_LINE_BYTES or (not length and len(received) > MAX_LINE_BYTES):
             raise BrokenStreamError(self.broken())
         return length
 
@@ -109,12 +110,14 @@ class JsonLines(AbstractProtocol):
         return self._carry_out(request, job, begun)
 
     def broken(self) -> bytes:
-        """Say that what came is no line."""
-        words = f"this is no line, or one that is longer than {LONGEST_LINE} bytes; send a path in pieces."
-        return _line({"id": None, "error": words})
+        """Return the answer to bytes that are not a line."""
+        problem = RequestError(
+            expected=f"a line of at most {MAX_LINE_BYTES} bytes", remedy="send long paths in several requests"
+        )
+        return _line({"id": None, "error": str(problem)})
 
     def token_of(self, message: bytes) -> bytes | None:
-        """The token of `{"token": "..."}`."""
+        """Return the token of `{"token": "..."}`."""
         try:
             request = _decode(message)
         except (ValueError, RecursionError):
@@ -123,26 +126,32 @@ class JsonLines(AbstractProtocol):
         return token.encode() if isinstance(token, str) else None
 
     def admission(self, admitted: bool) -> bytes:
-        """Say whether the token was the right one."""
+        """Return the answer to a token."""
         if admitted:
             return _line({"status": "admitted"})
-        words = 'the token is missing or wrong; send {"token": "..."} as the first line, by ZeroMQ in every message.'
-        return _line({"id": None, "error": words})
+        problem = RequestError(
+            "the token is missing or wrong",
+            option="token",
+            remedy='send {"token": "..."} as the first line, or with ZeroMQ in every message',
+        )
+        return _line({"id": None, "error": str(problem)})
 
     def _job(self, request: dict[str, Any]) -> tuple[Callable[[], tuple[str, dict[str, Any]]], bool]:
-        """What gives the status and the values of an answer, and whether that takes its time.
+        """Return the function that computes status and values of an answer, and whether it is slow.
 
         Raises:
-            RequestError: the request cannot be understood.
+            RequestError: the request is invalid.
         """
         tasks = [key for key in _TASKS if key in request]
         if len(tasks) != 1:
-            raise RequestError(
-                f"a request has exactly one of the keys {', '.join(_TASKS)}; this one has {len(tasks)} of them."
-            )
+            raise RequestError(expected=f"exactly one of the keys {', '.join(_TASKS)}", value=len(tasks))
         task = tasks[0]
         for key in request.keys() - _KEYS[task] - {task}:
-            raise RequestError(f"'{key}' does not go with '{task}'; {nearest_choice(key, _KEYS[task])}")
+            raise RequestError(
+                f"the key cannot be combined with '{task}'",
+                option=key,
+                remedy=nearest_choice(key, _KEYS[task]),
+            )
         if task == "ask":
             return self._question(request)
         model = self._models.find(request.get("model"))
@@ -151,14 +160,13 @@ class JsonLines(AbstractProtocol):
         return (lambda: solve(model, request)), slow
 
     def _question(self, request: dict[str, Any]) -> tuple[Callable[[], tuple[str, dict[str, Any]]], bool]:
-        """Answer on the server itself.
+        """Return the function that answers a question about the server, and whether it is slow.
 
         Raises:
             RequestError: there is no such question.
         """
         asked = request["ask"]
-        if asked not in _QUESTIONS:
-            raise RequestError(f"'ask' is {asked!r}; {nearest_choice(str(asked), _QUESTIONS)}")
+        check_choice(RequestError, "ask", asked if isinstance(asked, str) else repr(asked), _QUESTIONS)
         if asked == "health":
             return (lambda: ("health", asdict(self._metrics.summary()))), False
         if asked == "models":
@@ -178,14 +186,14 @@ class JsonLines(AbstractProtocol):
         return reply
 
     def _refuse(self, request: dict[str, Any], problem: Exception, begun: int) -> bytes:
-        """Say what is wrong with a request; its id is given back where that could be read."""
+        """Return the answer to an invalid request, with its id if that could be read."""
         if isinstance(problem, PisigmaError | ValueError):
             sentence = printable(str(problem))
         elif isinstance(problem, RecursionError):
-            sentence = "the line is no request: it is nested too deeply."
+            sentence = "the request is nested too deeply."
         else:
             sentence = printable(
-                f"a defect of pisigma ({type(problem).__name__}: {problem}); please report it."
+                f"this is a defect of pisigma ({type(problem).__name__}: {problem}); please report it."
             )
         reply = _line({"id": request.get("id"), "error": sentence})
         self._metrics.count("refused", begun)
@@ -197,20 +205,26 @@ def _line(values: dict[str, Any]) -> bytes:
 
 
 def _read(message: bytes) -> dict[str, Any]:
-    """Read a request, of which only the id is checked.
+    """Read a request and check its id only.
 
     Raises:
-        RequestError: it is no JSON object, or its id is neither a whole number nor a short text.
+        RequestError: it is not a JSON object, or its id is neither an integer nor a short string.
     """
     try:
         request = _decode(message)
     except ValueError as problem:
-        raise RequestError(f"the line is no JSON object ({problem}).") from None
+        raise RequestError(f"expected a JSON object: {problem}", expected="a JSON object") from None
     if not isinstance(request, dict):
-        raise RequestError(f"the line holds a JSON {type(request).__name__}; send an object.")
+        raise RequestError(expected="a JSON object", value=type(request).__name__)
     name = request.get("id")
-    if name is not None and type(name) is not int and not (isinstance(name, str) and len(name) <= LONGEST_ID):
-        raise RequestError(f"'id' has to be a whole number or a text of at most {LONGEST_ID} letters.")
+    if (
+        name is not None
+        and type(name) is not int
+        and not (isinstance(name, str) and len(name) <= MAX_ID_CHARACTERS)
+    ):
+        raise RequestError(
+            f"expected an integer or a string of at most {MAX_ID_CHARACTERS} characters", option="id"
+        )
     return request
 
 
@@ -232,7 +246,7 @@ def _solve(model: ServedModel, request: dict[str, Any]) -> tuple[str, dict[str, 
 
 
 def _record(model: ServedModel, row: list[float], ignored_axes: tuple[str, ...]) -> dict[str, Any]:
-    """The values of an answer to one pose, from what `CompiledIK.solve_packed` gives."""
+    """Make the answer to one pose from the row of `CompiledIK.solve_packed`."""
     units = model.per_file_unit
     position, rotation, measure, status, branch = row[2 * len(units) :]
     values: dict[str, Any] = {model.joints_key: None, "status": STATUS_NAMES[status]}
@@ -250,7 +264,7 @@ def _record(model: ServedModel, row: list[float], ignored_axes: tuple[str, ...])
 
 
 def _brief(model: ServedModel, values: dict[str, Any]) -> dict[str, Any]:
-    """Joint values to 1e-6 deg or mm, and the status: what controllers with short strings can read."""
+    """Reduce an answer to the status and joint values to 1e-6 deg or mm, for controllers with short strings."""
     q = values[model.joints_key]
     return {model.joints_key: q and [round(value, 6) for value in q], "status": values["status"]}
 
@@ -260,7 +274,7 @@ def _follow(model: ServedModel, request: dict[str, Any]) -> tuple[str, dict[str,
     poses = request["path"]
     if not isinstance(poses, list) or not poses:
         raise RequestError(
-            "'path' has to be a list of poses [x_mm, y_mm, z_mm, roll_deg, pitch_deg, yaw_deg]."
+            "expected a list of poses [x_mm, y_mm, z_mm, roll_deg, pitch_deg, yaw_deg]", option="path"
         )
     T = np.reshape([_entries(pose, f"path[{row}]") for row, pose in enumerate(poses)], (-1, 4, 4))
     path = _for_task(model, request).path(T, near=_near(model, request), branch=_branch(request))
@@ -273,7 +287,7 @@ def _follow(model: ServedModel, request: dict[str, Any]) -> tuple[str, dict[str,
 
 
 def _forward(model: ServedModel, request: dict[str, Any]) -> tuple[str, dict[str, Any]]:
-    """Where the calibrated arm goes."""
+    """Compute the pose of the calibrated arm."""
     q = _joints(model, request, "q_deg", "q")
     approach = _numbers(request, "approach", len(q)) if "approach" in request else None
     x, y, z, *angles = xyzrpy_of(model.ik.forward(q, approach=approach))
@@ -296,7 +310,7 @@ def _model_record(model: ServedModel) -> dict[str, Any]:
 
 
 def _entries(pose: Any, name: str) -> tuple[float, ...]:
-    """The 16 entries of the wanted pose T_base_tool [m], row by row, of x, y, z [mm], roll, pitch, yaw [deg]."""
+    """Convert x, y, z [mm], roll, pitch, yaw [deg] to the 16 entries of T_base_tool [m], row by row."""
     x, y, z, *angles = _numbers({name: pose}, name, 6)
     return transform_entries(x / 1e3, y / 1e3, z / 1e3, *map(math.radians, angles))
 
@@ -305,21 +319,26 @@ def _near(model: ServedModel, request: dict[str, Any]) -> list[float] | None:
     near = _joints(model, request, *_NEAR) if request.keys() & _NEAR else None
     if near is not None and not model.ik.postures.contains(near):
         raise RequestError(
-            f"'{_NEAR[model.joints_key != 'q_deg']}' lies more than a full turn (or 1 m) beyond the joint limits of "
-            f"model '{model.name}'; give the joint values where the robot stands, in {_units(model)}."
+            f"a value is more than a full turn (or 1 m) outside the joint limits of model '{model.name}'",
+            option=_NEAR[model.joints_key != "q_deg"],
+            remedy=f"give the present joint values of the robot in {_units(model)}",
         )
     return near
 
 
 def _joints(model: ServedModel, request: dict[str, Any], in_degrees: str, mixed: str) -> list[float]:
-    """Joint values [rad or m]; the key says whether all joints have to turn.
+    """Read joint values [rad or m] from `in_degrees` if all joints are revolute, else from `mixed`.
 
     Raises:
-        RequestError: another key is wanted, or the values do not fit.
+        RequestError: the request has the other key, or the values are invalid.
     """
     wanted, other = (in_degrees, mixed) if model.joints_key == "q_deg" else (mixed, in_degrees)
     if other in request:
-        raise RequestError(f"'{other}' is not for model '{model.name}'; give '{wanted}', in {_units(model)}.")
+        raise RequestError(
+            f"the key does not apply to model '{model.name}'",
+            option=other,
+            remedy=f"give '{wanted}' in {_units(model)}",
+        )
     values, units = _numbers(request, wanted, len(model.ik.joints)), model.per_file_unit
     return [value / unit for value, unit in zip(values, units, strict=True)]
 
@@ -329,35 +348,37 @@ def _units(model: ServedModel) -> str:
 
 
 def _numbers(request: dict[str, Any], key: str, count: int) -> list[float]:
-    """A list of finite numbers.
+    """Read a list of finite numbers.
 
     Raises:
-        RequestError: it is anything else.
+        RequestError: the value is anything else.
     """
     values = request[key]
     if not isinstance(values, list) or len(values) != count:
-        length = len(values) if isinstance(values, list) else "no list"
-        raise RequestError(f"'{key}' has to be a list of {count} numbers; {length} came.")
+        length = len(values) if isinstance(values, list) else str(values)[:40]
+        raise RequestError(expected=f"a list of {count} numbers", value=length, option=key)
     for value in values:
-        if type(value) not in (float, int) or not -LARGEST <= value <= LARGEST:
+        if type(value) not in (float, int) or not -MAX_NUMBER <= value <= MAX_NUMBER:
             raise RequestError(
-                f"'{key}' holds {str(value)[:40]!r}; give {count} numbers [mm or deg] below {LARGEST:g}."
+                expected=f"{count} numbers [mm or deg] up to {MAX_NUMBER:g}",
+                value=str(value)[:40],
+                option=key,
             )
     return values
 
 
 def _for_task(model: ServedModel, request: dict[str, Any]) -> CorrectedIK:
-    """The inverse kinematics for the axes of the tool that count.
+    """Return the inverse kinematics for the constrained axes of the tool.
 
     Raises:
-        RequestError: a value is of another kind.
+        RequestError: a value has the wrong type.
         PoseError: see `CorrectedIK.for_task`.
     """
     if not request.keys() & {*_AXES}:
         return model.ik
     names = request.get("ignore_axes")
     if names is not None and not (isinstance(names, list) and all(isinstance(name, str) for name in names)):
-        raise RequestError(f"'ignore_axes' is {names!r}; give a list of names of axes.")
+        raise RequestError(expected="a list of names of axes", value=repr(names)[:40], option="ignore_axes")
     elbow = None
     if "elbow_deg" in request:
         elbow = math.radians(_numbers({"elbow_deg": [request["elbow_deg"]]}, "elbow_deg", 1)[0])
@@ -367,7 +388,7 @@ def _for_task(model: ServedModel, request: dict[str, Any]) -> CorrectedIK:
 
 
 def _tolerance(request: dict[str, Any], key: str) -> list[float] | None:
-    """Tolerances of three axes, of which one number says all; None where none is stated."""
+    """Read the tolerances of three axes, as a list or one number for all; None if not given."""
     if key not in request:
         return None
     stated = request[key]
@@ -378,14 +399,14 @@ def _branch(request: dict[str, Any]) -> str | None:
     branch = request.get("branch")
     if branch is None or isinstance(branch, str):
         return branch
-    raise RequestError(f"'branch' is {branch!r}; give the name of a branch.")
+    raise RequestError(expected="the name of a branch", value=repr(branch)[:40], option="branch")
 
 
 def _flag(request: dict[str, Any], key: str) -> bool:
     value = request.get(key, False)
     if isinstance(value, bool):
         return value
-    raise RequestError(f"'{key}' is {value!r}; give true or false.")
+    raise RequestError(expected="true or false", value=repr(value)[:40], option=key)
 
 
 def _millimetres(length: Any) -> float | None:

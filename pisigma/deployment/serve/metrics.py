@@ -1,27 +1,27 @@
-"""What a server has answered, and how long that took."""
+"""Counts and durations of a server's answers."""
 
 import threading
 import time
 from collections import Counter, deque
 from dataclasses import dataclass
 
-KEPT = 4096
-"""Of so many last calls the durations are known."""
+KEPT_DURATIONS = 4096
+"""Number of latest requests whose durations are stored."""
 
 
 @dataclass(frozen=True)
 class MetricsSummary:
-    """What a server says of itself.
+    """Figures of a server.
 
     Attributes:
-        uptime_s: since when it serves [s].
-        calls: requests that were answered.
-        p50_us: median time of the last `KEPT` requests, from when one was read until its answer stood ready [µs]; None
-            before the first.
-        p99_us: the time that 99 % of them stay below [µs].
-        statuses: how many calls ended with which status; "forward", "path" and "refused" among them.
-        connections: that are open now.
-        cut_off: connections that were closed because they were slow or broken.
+        uptime_s: time since the start of the server [s].
+        calls: number of answered requests.
+        p50_us: median of the last `KEPT_DURATIONS` durations from reading a request to its answer [µs]; None before the
+            first.
+        p99_us: their 99 % quantile [µs].
+        statuses: number of requests by status, including "forward", "path" and "refused".
+        connections: number of open connections.
+        cut_off: number of connections that were closed because they were slow or broken.
     """
 
     uptime_s: float
@@ -34,32 +34,32 @@ class MetricsSummary:
 
 
 class Metrics:
-    """Counts requests; one call costs less than a microsecond.
+    """Counters of requests; one count takes less than a microsecond.
 
     Attributes:
-        connections: that are open now.
-        cut_off: connections that were closed because they were slow or broken.
+        connections: number of open connections.
+        cut_off: number of connections that were closed because they were slow or broken.
     """
 
     def __init__(self) -> None:
         self.connections = self.cut_off = 0
         self._begun, self._lock = time.monotonic(), threading.Lock()
         self._statuses: Counter[str] = Counter()
-        self._durations: deque[int] = deque(maxlen=KEPT)
+        self._durations: deque[int] = deque(maxlen=KEPT_DURATIONS)
 
     def count(self, status: str, begun_ns: int) -> None:
         """Count an answer.
 
         Args:
-            status: of the answer.
-            begun_ns: `time.perf_counter_ns()` when its request was read.
+            status: status of the answer.
+            begun_ns: `time.perf_counter_ns()` when the request was read.
         """
         with self._lock:
             self._statuses[status] += 1
             self._durations.append(time.perf_counter_ns() - begun_ns)
 
     def summary(self) -> MetricsSummary:
-        """Give the present figures."""
+        """Return the present figures."""
         with self._lock:
             durations, statuses = list(self._durations), dict(self._statuses.most_common())
         durations.sort()

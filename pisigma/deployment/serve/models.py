@@ -1,4 +1,4 @@
-"""The models that a server answers for; they are loaded again without a call being dropped."""
+"""Models of a server, which can be reloaded without dropping a request."""
 
 import math
 import struct
@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pisigma.files.errors import ModelError, PisigmaError, RequestError, nearest_choice
+from pisigma.files.errors import ModelError, PisigmaError, Place, RequestError, nearest_choice
 from pisigma.files.model_files import is_model, model_hash
 from pisigma.model.inverse.compiled_ik import CompiledIK
 from pisigma.model.inverse.corrected_ik import CorrectedIK, load
@@ -20,12 +20,12 @@ from pisigma.model.inverse.solution import Solution
 
 @dataclass(frozen=True, eq=False)
 class ServedModel:
-    """One model.
+    """A model of a server.
 
     Attributes:
-        folder: that it was read from.
+        folder: folder that it was read from.
         ik: its corrected inverse kinematics.
-        sha256: of its `model.yaml`.
+        sha256: SHA-256 of its `model.yaml`.
     """
 
     folder: Path
@@ -37,33 +37,32 @@ class ServedModel:
         """Load a model folder, and solve one pose so that the first request does not wait for the kernels.
 
         Raises:
-            ModelError: the folder is no whole model.
+            ModelError: the folder is not a complete model.
         """
-        sha256 = (
-            model_hash(folder) if is_model(folder) else ""
-        )  # before it is loaded: it may be written anew meanwhile
+        # before it is loaded, as the folder may be written again meanwhile
+        sha256 = model_hash(folder) if is_model(folder) else ""
         ik = load(folder)
         ik(np.eye(4), near=np.zeros(len(ik.joints)), throw=False)
         return ServedModel(folder, ik, sha256)
 
     @property
     def name(self) -> str:
-        """What requests call it: the name of its folder."""
+        """Name of the model in requests: that of its folder."""
         return self.folder.name
 
     @cached_property
     def per_file_unit(self) -> list[float]:
-        """For every joint, degrees in a radian or millimetres in a metre."""
+        """For every joint, degrees per radian or millimetres per metre."""
         return [180 / math.pi if turns else 1e3 for turns in self.ik.revolute]
 
     @cached_property
     def joints_key(self) -> str:
-        """What messages call its joint values: `q_deg` where all joints turn, else `q` [deg or mm]."""
+        """Key of joint values in messages: `q_deg` if all joints are revolute, else `q` [deg or mm]."""
         return "q_deg" if self.ik.revolute.all() else "q"
 
     @cached_property
     def quick(self) -> bool:
-        """Whether the compiled kernels solve its poses, in microseconds; coupled joints are solved around them."""
+        """Whether compiled kernels solve its poses in microseconds, for coupled joints in DH values."""
         controller = self.ik.controller
         if controller is None:
             return self.ik.compiled is not None
@@ -71,23 +70,23 @@ class ServedModel:
 
     @cached_property
     def _near(self) -> struct.Struct:
-        """How joint values stand in bytes."""
+        """Byte layout of joint values."""
         return struct.Struct(f"<{len(self.ik.joints)}d")
 
     @cached_property
     def direct(self) -> CompiledIK | None:
-        """The kernels, where they solve its poses from numbers as they stand in a message."""
+        """The kernels, if they can solve poses directly from the bytes of a message, else None."""
         return self.ik.compiled if self.ik.controller is None and sys.byteorder == "little" else None
 
     def solve(self, T_base_tool: bytes, near: bytes) -> list[float]:
-        """Solve a pose whose numbers stand in bytes, little-endian; what is no pose gets INVALID_POSE.
+        """Solve a pose that is given as little-endian bytes; the status of an invalid pose is INVALID_POSE.
 
         Args:
             T_base_tool: 16 doubles, row by row [m].
-            near: a double for every joint [rad or m]; all NaN for none.
+            near: one double for every joint [rad or m]; all NaN for none.
 
         Returns:
-            What `CompiledIK.solve_packed` gives.
+            The row of `CompiledIK.solve_packed`.
         """
         values, kernels = self._near.unpack(near), self.direct
         if kernels is not None and self.ik.postures.contains(values):
@@ -102,14 +101,14 @@ class ServedModel:
 
 
 def solution_row(solution: Solution) -> list[float]:
-    """The solution of one pose as `CompiledIK.solve_packed` gives it."""
+    """Convert the solution of one pose to a row as from `CompiledIK.solve_packed`."""
     residuals = float(solution.position_residual), float(solution.rotation_residual)
     numbers = *residuals, float(solution.domain_measure), float(solution.status), float(solution.branch)
     return [*solution.q.tolist(), *solution.q_nominal.tolist(), *numbers]
 
 
 def model_folders(folder: Path) -> list[Path]:
-    """Give the model folders in a folder, by name; damaged ones, too, so that loading them names the damage.
+    """List the model folders in a folder by name, including damaged ones, so that loading reports the damage.
 
     Raises:
         ModelError: there are none.
@@ -117,12 +116,16 @@ def model_folders(folder: Path) -> list[Path]:
     inside = sorted(path for path in folder.iterdir() if path.is_dir()) if folder.is_dir() else []
     folders = [path for path in inside if is_model(path) or any(path.glob("*.safetensors"))]
     if not folders:
-        raise ModelError(f"{folder}: holds no model folders; give the folder that your model folders lie in.")
+        raise ModelError(
+            "the folder has no model folders",
+            at=Place(folder),
+            remedy="give the folder that contains your models",
+        )
     return folders
 
 
-def _sound(folders: Iterable[Path], problems: list[str]) -> list[ServedModel]:
-    """Load the models that can be loaded; `problems` gets a sentence for every other one."""
+def _loadable(folders: Iterable[Path], problems: list[str]) -> list[ServedModel]:
+    """Load the models that can be loaded, and append a sentence to `problems` for every other one."""
     models = []
     for folder in folders:
         try:
@@ -133,31 +136,32 @@ def _sound(folders: Iterable[Path], problems: list[str]) -> list[ServedModel]:
 
 
 class ServedModels:
-    """Models by index and by name; an index stays that of its model for as long as the server runs.
+    """Models by index and by name; an index keeps referring to its model while the server runs.
 
     Attributes:
-        problems: with `within`, sentences on the folders that could not be loaded and are not served.
+        problems: with `within`, sentences on folders that could not be loaded and are not served.
     """
 
     def __init__(self, folders: Iterable[Path], within: Path | None = None) -> None:
         """Load model folders.
 
         Args:
-            folders: of the models.
-            within: folder that is searched for further models when they are loaded again; of the models in it, damaged
-                ones are left out.
+            folders: model folders.
+            within: folder that is searched for further models on reload; damaged models in it are left out.
 
         Raises:
-            ModelError: a folder is no whole model; with `within`, none is.
+            ModelError: a folder is not a complete model; with `within`, no folder is one.
         """
         self._within, self._lock = within, threading.Lock()
         self.problems: list[str] = []
         if within is None:
             self._models: Sequence[ServedModel] = [ServedModel.read(folder) for folder in folders]
             return
-        self._models = _sound(folders, self.problems)
+        self._models = _loadable(folders, self.problems)
         if not self._models:
-            raise ModelError(f"{within}: none of its model folders can be served: {' '.join(self.problems)}")
+            raise ModelError(
+                f"none of the model folders can be served: {' '.join(self.problems)}", at=Place(within)
+            )
 
     def __len__(self) -> int:
         return len(self._models)
@@ -166,10 +170,10 @@ class ServedModels:
         return self._models[index]
 
     def find(self, name: object) -> ServedModel:
-        """Give the model of a name or an index; without one the only model.
+        """Return the model with a name or an index; None stands for the only model.
 
         Raises:
-            RequestError: there is none, or there are several and None is given.
+            RequestError: there is no such model, or None is given and there are several.
         """
         models = self._models
         if name is None and len(models) == 1:
@@ -180,13 +184,16 @@ class ServedModels:
         if isinstance(name, str) and name in names:
             return models[names.index(name)]
         raise RequestError(
-            f"'model' is {name!r}; give the name or the index of a model. {nearest_choice(str(name), names)}"
+            expected="the name or the index of a model",
+            value=repr(name)[:40],
+            option="model",
+            remedy=nearest_choice(str(name), names),
         )
 
     def reload(self) -> list[str]:
-        """Load the models whose folders have changed and, with `within`, new ones; give what went wrong.
+        """Reload the models whose folders have changed and, with `within`, load new ones; return the problems.
 
-        The others, and those that cannot be loaded, answer on as they are.
+        A model that cannot be reloaded continues to answer as before.
         """
         with self._lock:
             problems: list[str] = []
@@ -197,7 +204,7 @@ class ServedModels:
             except (PisigmaError, OSError) as problem:
                 problems.append(str(problem))
                 new = []
-            self._models = models + _sound([folder for folder in new if folder not in there], problems)
+            self._models = models + _loadable([folder for folder in new if folder not in there], problems)
         return problems
 
     @staticmethod

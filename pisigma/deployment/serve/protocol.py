@@ -1,4 +1,4 @@
-"""What the protocols of a server have in common: cutting a stream into messages, and answering one."""
+"""Interface of a server's protocols, which cut a stream into messages and answer them."""
 
 import hmac
 from abc import ABC, abstractmethod
@@ -7,49 +7,49 @@ from collections.abc import Callable
 from pisigma.robot.kinematics.status import Status
 
 STATUS_NAMES = {float(status): status.name.lower() for status in Status}
-"""Of statuses as solutions hold them."""
+"""Names of statuses by their value in solutions."""
 Reply = bytes | Callable[[], bytes]
-"""The answer to a message, or what gives it when it is called in a thread that may take its time."""
+"""The answer to a message, or a slow function that computes it and is called in another thread."""
 
 
 class BrokenStreamError(Exception):
-    """What came is no message and never becomes one, so nothing behind it can be trusted either.
+    """The received bytes cannot become a message, so later bytes cannot be interpreted either.
 
     Attributes:
-        last_words: the answer to send before the connection is closed.
+        final_answer: answer to send before the connection is closed.
     """
 
-    def __init__(self, last_words: bytes) -> None:
+    def __init__(self, final_answer: bytes) -> None:
         super().__init__()
-        self.last_words = last_words
+        self.final_answer = final_answer
 
 
 class AbstractProtocol(ABC):
-    """How bytes become messages, and messages answers. One object serves all connections."""
+    """Conversion of bytes to messages and of messages to answers. One object serves all connections."""
 
     @abstractmethod
     def cut(self, received: bytearray) -> int:
-        """Give the length of the first message in what was received; 0 as long as it is not whole.
+        """Return the length of the first message in the received bytes; 0 while it is incomplete.
 
         Raises:
-            BrokenStreamError: it never becomes a message.
+            BrokenStreamError: the bytes cannot become a message.
         """
 
     @abstractmethod
     def answer(self, message: bytes) -> Reply:
-        """Answer one whole message; whatever it holds, nothing is raised."""
+        """Answer one complete message; never raises an error."""
 
     @abstractmethod
     def broken(self) -> bytes:
-        """Say that what came is no message."""
+        """Return the answer to bytes that are not a message."""
 
     @abstractmethod
     def token_of(self, message: bytes) -> bytes | None:
-        """The token that a first message holds; None where it holds none."""
+        """Return the token of a first message; None if it has none."""
 
     @abstractmethod
     def admission(self, admitted: bool) -> bytes:
-        """Say whether a token was the right one."""
+        """Return the answer to a token."""
 
 
 def is_token(given: bytes | None, wanted: bytes) -> bool:

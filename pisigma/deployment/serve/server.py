@@ -1,4 +1,4 @@
-"""The server: one thread that waits for all connections at once, and another for what takes its time."""
+"""The server: one thread that waits for all connections, and another for slow answers."""
 
 import contextlib
 import functools
@@ -23,27 +23,27 @@ from pisigma.deployment.serve.settings import ServeSettings
 from pisigma.deployment.serve.zeromq import ZeroMq
 from pisigma.files.errors import OutputError
 
-MOST_CONNECTIONS = 512
-SWITCHING = 1e-4
-"""[s] A thread that works out a path holds the interpreter at most, while quick answers wait for it."""
+MAX_CONNECTIONS = 512
+SWITCH_INTERVAL = 1e-4
+"""[s] Longest time for which the thread of slow answers holds the interpreter while quick answers wait."""
 
 
 class Server:
-    """Answers requests until it is stopped.
+    """Server that answers requests until it is stopped.
 
     Attributes:
-        json_port: where lines of JSON are answered.
-        binary_port: where binary frames are answered.
-        zmq: the answers over ZeroMQ, if they are wanted.
-        metrics: what was answered.
+        json_port: port for lines of JSON.
+        binary_port: port for binary frames.
+        zmq: server over ZeroMQ, or None.
+        metrics: counts and durations of answers.
     """
 
     def __init__(self, models: ServedModels, settings: ServeSettings) -> None:
-        """Listen.
+        """Start listening.
 
         Raises:
-            OutputError: the host is no address of this machine, a port is taken, or a token is wanted and missing.
-            ImportError: pyzmq is wanted and not installed.
+            OutputError: the host is not an address of this machine, a port is in use, or a required token is missing.
+            ImportError: pyzmq is required and not installed.
         """
         check_host(settings)
         self.metrics = Metrics()
@@ -70,19 +70,19 @@ class Server:
 
     @property
     def ports(self) -> dict[str, int]:
-        """Where the server listens, by protocol."""
+        """Ports of the server by protocol."""
         ports = {"json_port": self.json_port, "binary_port": self.binary_port}
         return ports if self.zmq is None else ports | {"zmq_port": self.zmq.port}
 
     def run(self) -> None:
-        """Answer until `stop`, then finish what was begun."""
+        """Answer until `stop` is called, then finish the pending requests."""
         gc.collect()
-        gc.freeze()  # what is loaded is never looked through again, which would take milliseconds
+        gc.freeze()  # excludes loaded objects from garbage collection, which would take milliseconds
         switching = sys.getswitchinterval()
-        sys.setswitchinterval(SWITCHING)
-        swept, interval = time.monotonic(), self._settings.patience / 10
+        sys.setswitchinterval(SWITCH_INTERVAL)
+        swept, interval = time.monotonic(), self._settings.client_timeout / 10
         while not self._stops:
-            self._turn(interval)
+            self._step(interval)
             if time.monotonic() - swept > interval:
                 swept = time.monotonic()
                 self._sweep(swept)
@@ -91,18 +91,18 @@ class Server:
         gc.unfreeze()
 
     def stop(self) -> None:
-        """Have `run` end when all that came in is answered, or the second time at once.
+        """Let `run` end after all received requests are answered, or immediately at the second call.
 
-        From any thread, or a signal's handler.
+        May be called from any thread or a signal handler.
         """
         self._stops += 1
         self._notify()
 
     def reload(self, report: Callable[[str], None]) -> None:
-        """Load the models again, meanwhile answering with the old ones.
+        """Reload the models while the old ones continue to answer.
 
         Args:
-            report: gets a sentence for every model that could not be loaded.
+            report: function that is called with a sentence for every model that could not be loaded.
         """
 
         def load() -> None:
@@ -115,15 +115,16 @@ class Server:
         return ZeroMq(self._models, self.metrics, self._settings.host, port, self._token)
 
     def _listen(self, port: int, protocol: AbstractProtocol) -> int:
-        """Have a protocol answered at a port; gives the port."""
+        """Listen for a protocol at a port, and return the port."""
         host = self._settings.host
         try:
             family, *_, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
             listener = socket.create_server(address, family=family, backlog=128)
         except OSError as problem:
             raise OutputError(
-                f"port {port} of '{host}' cannot be served ({problem.strerror}); give a free port, or 0 for any, and "
-                "an address of this machine."
+                f"port {port} of '{host}' cannot be used ({problem.strerror})",
+                value=port,
+                remedy="give a free port, or 0 for any, and an address of this machine",
             ) from None
         listener.setblocking(False)
         accept = functools.partial(self._accept, listener, protocol)
@@ -132,14 +133,14 @@ class Server:
         return int(listener.getsockname()[1])
 
     def _accept(self, listener: socket.socket, protocol: AbstractProtocol, events: int) -> bool:
-        """Take a new connection; whether there was one."""
+        """Accept a new connection, and return whether there was one."""
         try:
             stream, _ = listener.accept()
         except OSError:
             return False
-        if len(self._connections) >= MOST_CONNECTIONS:
-            self._sweep(time.monotonic())  # some of them may be closed
-        if len(self._connections) >= MOST_CONNECTIONS:
+        if len(self._connections) >= MAX_CONNECTIONS:
+            self._sweep(time.monotonic())  # some of them may be closed already
+        if len(self._connections) >= MAX_CONNECTIONS:
             stream.close()
             self.metrics.cut_off += 1
             return True
@@ -153,14 +154,14 @@ class Server:
             self._selector.unregister(listener)
             listener.close()
 
-    def _turn(self, timeout: float) -> None:
-        """Wait for connections, and go on with those that can."""
+    def _step(self, timeout: float) -> None:
+        """Wait for ready connections and process them."""
         for key, events in self._polling.ready() or self._selector.select(timeout):
             key.data(events)
-        self._polling.went_on()
+        self._polling.record_activity()
 
     def _submit(self, connection: Connection, job: Callable[[], bytes]) -> None:
-        """Have an answer worked out beside the others."""
+        """Compute an answer in the thread of slow answers."""
 
         def hand_back(done: Future[bytes]) -> None:
             if done.cancelled():
@@ -171,7 +172,7 @@ class Server:
         self._slow.submit(job).add_done_callback(hand_back)
 
     def _notify(self) -> None:
-        with contextlib.suppress(OSError):  # it is full: somebody has done it already
+        with contextlib.suppress(OSError):  # the buffer is full, so the server is notified already
             self._wake.send(b"\0")
 
     def _take_ready(self, events: int) -> None:
@@ -181,10 +182,10 @@ class Server:
             connection.take(reply)
 
     def _sweep(self, now: float) -> None:
-        """Forget connections that are closed, and cut off those that are too slow."""
+        """Remove closed connections, and close those that are too slow."""
         for connection in list(self._connections):
             since = connection.waits_since
-            if since is not None and now - since > self._settings.patience:
+            if since is not None and now - since > self._settings.client_timeout:
                 connection.close()
                 self.metrics.cut_off += 1
             if connection.closed:
@@ -192,20 +193,20 @@ class Server:
         self.metrics.connections = len(self._connections)
 
     def _finish(self) -> None:
-        """Answer what has come in whole, from clients that wait to be accepted too, then close everything."""
+        """Answer all complete requests, including those of clients that wait to be accepted, then close everything."""
         for listener in self._listeners:
             accept = self._selector.get_key(listener).data
             while accept(selectors.EVENT_READ):
                 pass
         self._listen_no_more()
         for connection in self._connections:
-            connection.read_rest()
+            connection.drain()
         if self.zmq is not None:
             self.zmq.stop()
         while self._stops < 2 and (self._connections or (self.zmq is not None and self.zmq.is_running)):
-            more = [connection.answer_rest() for connection in self._connections]
-            self._turn(0.0 if any(more) else 0.05)
-            self._sweep(time.monotonic())  # who does not take an answer is not waited for
+            more = [connection.answer_remaining() for connection in self._connections]
+            self._step(0.0 if any(more) else 0.05)
+            self._sweep(time.monotonic())  # closes clients that do not receive their answers
         for connection in self._connections:
             connection.close()
         self._slow.shutdown(wait=False, cancel_futures=True)
@@ -215,10 +216,10 @@ class Server:
 
 
 def check_host(settings: ServeSettings) -> None:
-    """Make sure that only programs of this machine are served without a token.
+    """Check that only programs on this machine are served without a token.
 
     Raises:
-        OutputError: the host is no address, or others reach it and there is no token.
+        OutputError: the host is not an address, or other machines can reach it and there is no token.
     """
     try:
         addresses = {
@@ -226,12 +227,21 @@ def check_host(settings: ServeSettings) -> None:
         }
     except OSError as problem:
         raise OutputError(
-            f"'{settings.host}' is no address of this machine ({problem.strerror}); give 127.0.0.1, or 0.0.0.0 for all."
+            f"'{settings.host}' is not an address of this machine ({problem.strerror})",
+            option="--host",
+            value=settings.host,
+            remedy="give 127.0.0.1, or 0.0.0.0 for all addresses",
         ) from None
     if settings.token is None and not all(ipaddress.ip_address(one).is_loopback for one in addresses):
         raise OutputError(
-            f"other machines reach '{settings.host}', so clients have to send a token; give its file with "
-            "--token-file, or serve at 127.0.0.1."
+            f"other machines can reach '{settings.host}', so clients must send a token",
+            option="--token-file",
+            remedy="give a file with a token, or serve at 127.0.0.1",
         )
     if settings.token is not None and not settings.token.strip():
-        raise OutputError("the token is empty; give one that nobody guesses.")
+        raise OutputError(
+            "the token is empty",
+            option="--token-file",
+            value=settings.token,
+            remedy="give one that cannot be guessed",
+        )

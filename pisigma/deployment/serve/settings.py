@@ -4,18 +4,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-from pisigma.deployment.serve.polling import DURATION
+from pisigma.deployment.serve.polling import POLL_DURATION
 from pisigma.files.errors import OutputError
 from pisigma.files.input_file import read_input
 from pisigma.files.setting import HIDDEN, Option
 
 LAST_PORT = 65535
-PATIENCE = 10.0
-"""[s] A client may take for the rest of a message, for its token, or to take an answer; then it is cut off."""
+CLIENT_TIMEOUT = 10.0
+"""[s] A client that takes longer for the remainder of a message, its token, or to receive an answer is cut off."""
 
 
 def token_in(file: Path) -> str:
-    """The token that a file holds."""
+    """Read the token from a file."""
     return read_input(file, OutputError).decode(errors="replace").strip()
 
 
@@ -29,7 +29,7 @@ class ServeSettings:
         binary_port: port for binary frames (0: any free port).
         zmq_port: port for ZeroMQ (0: any free port). Needs the extra serve. None: no ZeroMQ.
         token: token that every client has to send first; on a command line, a file that contains it.
-        patience: see `PATIENCE`.
+        client_timeout: see `CLIENT_TIMEOUT`.
         polling: time to busy-poll for the next request [s] (0: sleep at once). The server polls only where requests
             come that often and no other program needs the processor.
     """
@@ -39,5 +39,5 @@ class ServeSettings:
     binary_port: Annotated[int, Option(min=0, max=LAST_PORT)] = 0
     zmq_port: Annotated[int | None, Option(min=0, max=LAST_PORT)] = None
     token: Annotated[str | None, Option("--token-file", kind=Path, read=token_in)] = None
-    patience: Annotated[float, HIDDEN] = PATIENCE
-    polling: Annotated[float, Option("--poll-ms", unit="ms", min=0, max=100)] = DURATION
+    client_timeout: Annotated[float, HIDDEN] = CLIENT_TIMEOUT
+    polling: Annotated[float, Option("--poll-ms", unit="ms", min=0, max=100)] = POLL_DURATION

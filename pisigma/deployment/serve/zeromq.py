@@ -1,45 +1,45 @@
-"""The same requests over ZeroMQ: a message is a line of JSON without its end, or a binary frame."""
+"""Requests over ZeroMQ: a message is a line of JSON with or without its end, or a binary frame."""
 
 import threading
 
 from pisigma.deployment.serve.binary_frames import MAGIC, BinaryFrames
-from pisigma.deployment.serve.connection import MOST_REST
-from pisigma.deployment.serve.json_lines import LONGEST_LINE, JsonLines
+from pisigma.deployment.serve.connection import MAX_DRAIN_BYTES
+from pisigma.deployment.serve.json_lines import MAX_LINE_BYTES, JsonLines
 from pisigma.deployment.serve.metrics import Metrics
 from pisigma.deployment.serve.models import ServedModels
 from pisigma.deployment.serve.protocol import AbstractProtocol, BrokenStreamError, is_token
 from pisigma.files.errors import OutputError
 
 SILENCE_MS = 500
-"""[ms] Without a message, after which all that was sent before the server stops has come."""
-PATIENCE_MS = 2000
-"""[ms] Wait for a client that does not read its answers, before one of them is dropped."""
+"""[ms] After this time without a message, all messages sent before the server stops have arrived."""
+SEND_TIMEOUT_MS = 2000
+"""[ms] Longest wait for a client that does not read its answers, before one of them is dropped."""
 MAX_QUEUED = 100
-"""Messages of a client, and answers to it, that wait at most."""
+"""Largest number of messages of a client, and of answers to it, in a queue."""
 
 
 class ZeroMq:
-    """A ROUTER socket in a thread of its own, so that any number of REQ and DEALER sockets can ask.
+    """A ROUTER socket in a separate thread, for any number of REQ and DEALER sockets.
 
     Attributes:
-        port: where it listens.
+        port: port of the socket.
     """
 
     def __init__(
         self, models: ServedModels, metrics: Metrics, host: str, port: int, token: bytes | None
     ) -> None:
-        """Listen.
+        """Start listening.
 
         Args:
-            models: that answer.
-            metrics: that count the answers.
+            models: models of the server.
+            metrics: counters of the answers.
             host: address of this machine.
-            port: to listen at; 0 for a free one.
-            token: that stands as a part of its own before every message; None where none is wanted.
+            port: port to listen at; 0 for a free one.
+            token: token in a separate part before every message; None if none is required.
 
         Raises:
             ImportError: pyzmq is not installed.
-            OutputError: the port is taken.
+            OutputError: the port is in use.
         """
         try:
             import zmq
@@ -49,14 +49,14 @@ class ZeroMq:
         self._token, self._context = token, zmq.Context(1)
         self._socket, self._stopping = self._context.socket(zmq.ROUTER), threading.Event()
         options = {
-            zmq.LINGER: PATIENCE_MS,
-            zmq.MAXMSGSIZE: LONGEST_LINE,
+            zmq.LINGER: SEND_TIMEOUT_MS,
+            zmq.MAXMSGSIZE: MAX_LINE_BYTES,
             zmq.RCVTIMEO: SILENCE_MS,
-            zmq.SNDTIMEO: PATIENCE_MS,
+            zmq.SNDTIMEO: SEND_TIMEOUT_MS,
             zmq.IPV6: int(":" in host),
             zmq.RCVHWM: MAX_QUEUED,
             zmq.SNDHWM: MAX_QUEUED,
-            # else a ROUTER drops answers silently as soon as so many of them wait
+            # otherwise a ROUTER silently drops answers when the queue is full
             zmq.ROUTER_MANDATORY: 1,
         }
         for option, value in options.items():
@@ -66,8 +66,10 @@ class ZeroMq:
         except zmq.ZMQError as problem:
             self._close()
             raise OutputError(
-                f"port {port} of '{host}' cannot be served by ZeroMQ ({problem.strerror}); give a free port, or 0 for "
-                "any."
+                f"port {port} of '{host}' cannot be used by ZeroMQ ({problem.strerror})",
+                value=port,
+                option="--zmq-port",
+                remedy="give a free port, or 0 for any",
             ) from None
         self.port = int(self._socket.getsockopt_string(zmq.LAST_ENDPOINT).rpartition(":")[2])
         self._again, self._no_wait, self._unreachable = zmq.Again, zmq.DONTWAIT, zmq.ZMQError
@@ -77,43 +79,41 @@ class ZeroMq:
 
     @property
     def is_running(self) -> bool:
-        """Whether it answers still."""
+        """Whether the thread is still answering."""
         return self._thread.is_alive()
 
     def stop(self) -> None:
-        """Have what has come in answered, and the socket closed then."""
+        """Let the thread answer all received messages, then close the socket."""
         self._stopping.set()
 
     def _run(self) -> None:
-        rest = 0
-        while rest < MOST_REST:
-            stopping = (
-                self._stopping.is_set()
-            )  # before the look for a message: what came until then is answered
+        drained = 0
+        while drained < MAX_DRAIN_BYTES:
+            stopping = self._stopping.is_set()  # before reading, so that earlier messages are answered
             try:
-                # waits when it stops, too, as the next messages of a full queue take a moment
+                # waits also when stopping, as the next messages of a full queue take a moment
                 client, *parts = self._socket.recv_multipart()
             except self._again:
                 if stopping:
                     break
                 continue
-            rest += sum(map(len, parts)) if stopping else 0
+            drained += sum(map(len, parts)) if stopping else 0
             envelope = [client, b""] if len(parts) > 1 and not parts[0] else [client]
             self._send(client, [*envelope, self._reply(parts[len(envelope) - 1 :])])
         self._close()
 
     def _send(self, client: bytes, parts: list[bytes]) -> None:
-        """Send, and wait for a client that does not read only once, so that it does not hold up the others."""
+        """Send, and wait only once for a client that does not read, so that it does not delay the others."""
         try:
             self._socket.send_multipart(parts, self._no_wait if client in self._not_reading else 0)
             self._not_reading.discard(client)
         except self._again:
             self._not_reading.add(client)
-        except self._unreachable:  # it has gone
+        except self._unreachable:  # the client has disconnected
             self._not_reading.discard(client)
 
     def _reply(self, parts: list[bytes]) -> bytes:
-        """Answer the parts of a message behind its envelope: the token, where one is wanted, and the request."""
+        """Answer the parts of a message after its envelope: the token, if one is required, and the request."""
         message = parts[-1] if parts else b""
         protocol: AbstractProtocol = self._binary if message.startswith(MAGIC) else self._json
         if len(parts) != (1 if self._token is None else 2) or (
@@ -126,7 +126,7 @@ class ZeroMq:
             if protocol.cut(bytearray(message)) != len(message):
                 return protocol.broken()
         except BrokenStreamError as problem:
-            return problem.last_words
+            return problem.final_answer
         reply = protocol.answer(message)
         return reply if isinstance(reply, bytes) else reply()
 

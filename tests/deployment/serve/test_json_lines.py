@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from testing.calibrated_arm import calibrated_arm
 from testing.closeness import assert_close
+from testing.refusals import numbers_in
 from testing.serving import json_client, running
 
 import pisigma
@@ -92,7 +93,7 @@ def test_forward_is_the_inverse_of_a_pose(ask):
     assert "accuracy_mm" in answer
 
 
-def test_a_path_is_that_of_python(ask, ik):
+def test_a_path_equals_that_of_python(ask, ik):
     poses = [[*POSE[:2], 600.0 + 5 * step, *POSE[3:]] for step in range(20)]
     answer = ask(path=poses, near_deg=NEAR, model="kiro4")
     path = ik.path(np.stack([_matrix(pose) for pose in poses]), near=np.radians(NEAR))
@@ -101,7 +102,7 @@ def test_a_path_is_that_of_python(ask, ik):
     assert answer["switches"] == []
 
 
-def test_axes_that_do_not_count_are_those_of_python(repository, tmp_path):
+def test_ignored_axes_are_those_of_python(repository, tmp_path):
     model = calibrated_arm("ur10")
     save_model(model, tmp_path)
     ik = pisigma.load(tmp_path)
@@ -120,15 +121,15 @@ def test_axes_that_do_not_count_are_those_of_python(repository, tmp_path):
         assert_close(answer["q_deg"], np.degrees(solution.q), atol=1e-9)
         path = client.ask(path=[pose, pose], near_deg=np.degrees(near).tolist(), ignore_axes=["yaw"])
         assert path["status"] == ["reached"] * 2
-        for wrong, sentence in (
-            ({"ignore_axes": ["jaw"]}, "did you mean 'yaw'"),
-            ({"ignore_axes": "yaw"}, "give a list of names of axes"),
-            ({"tolerance_mm": [1, 2]}, "a list of 3 numbers"),
-            ({"tolerance_deg": "1"}, "'tolerance_deg' holds '1'"),
-            ({"tolerance_deg": -1}, "give a number of at least 0"),
-            ({"elbow_deg": 10}, "only a robot of seven revolute joints has an elbow"),
+        for wrong, named in (
+            ({"ignore_axes": ["jaw"]}, "jaw.*yaw"),
+            ({"ignore_axes": "yaw"}, "^ignore_axes: .*yaw"),
+            ({"tolerance_mm": [1, 2]}, "^tolerance_mm: .* 3 .* 2"),
+            ({"tolerance_deg": "1"}, "^tolerance_deg: .* '1'"),
+            ({"tolerance_deg": -1}, "tolerance_deg.* -1|-1.* 0"),
+            ({"elbow_deg": 10}, "elbow_angle: .* 0[.]174"),
         ):
-            with pytest.raises(RuntimeError, match=sentence):
+            with pytest.raises(RuntimeError, match=named):
                 client.ask(**asked, **wrong)
 
 
@@ -140,7 +141,7 @@ def test_a_robot_with_a_linear_joint_says_q(ask):
     answer = ask(pose=pose, near=[10.0] * len(units), model="kiro3")
     assert_close(answer["q"], [10.0] * len(units), atol=1e-6)
     for request in ({"q_deg": [10.0] * len(units)}, {"pose": pose, "near_deg": [10.0] * len(units)}):
-        with pytest.raises(RuntimeError, match=r"is not for model 'kiro3'; give '(q|near)', in deg and mm"):
+        with pytest.raises(RuntimeError, match=r"^(q|near)_deg: .*'kiro3'.*'(q|near)'"):
             ask(**request, model="kiro3")
 
 
@@ -154,36 +155,33 @@ def test_health_counts_what_was_answered(ask):
 
 
 @pytest.mark.parametrize(
-    ("request_", "sentence"),
+    ("request_", "named"),
     [
-        ({"pose": POSE}, "'model' is None; give the name or the index of a model"),
-        ({"pose": POSE, "model": "kiro5"}, "did you mean 'kiro"),
-        ({"pose": POSE, "model": True}, "'model' is True"),
-        ({"pose": POSE[:5], "model": 0}, "'pose' has to be a list of 6 numbers; 5 came"),
-        ({"pose": [True, *POSE[1:]], "model": 0}, "'pose' holds 'True'"),
-        ({"pose": [1e300, *POSE[1:]], "model": 0}, "'pose' holds '1e.300'"),
-        ({"pose": POSE, "model": 0, "near_deg": [90] * 5}, "'near_deg' has to be a list of 6"),
-        (
-            {"pose": POSE, "model": 0, "near_deg": [9e4] * 6},
-            "'near_deg' lies more than a full turn .* in deg.",
-        ),
-        ({"pose": POSE, "model": 0, "branch": "upside"}, "there is no branch 'upside'"),
-        ({"pose": POSE, "model": 0, "braunch": "x"}, "did you mean 'branch'"),
-        ({"pose": POSE, "q_deg": NEAR, "model": 0}, "this one has 2 of them"),
-        ({"model": 0}, "exactly one of the keys"),
-        ({"ask": "heath"}, "did you mean 'health'"),
-        ({"path": [], "model": 0}, "'path' has to be a list of poses"),
-        ({"path": [POSE, 7], "model": 0}, r"'path\[1\]' has to be a list of 6 numbers"),
-        ({"pose": POSE, "model": 0, "accuracy": 1}, "give true or false"),
-        ({"pose": POSE, "model": 0, "approach": [2] * 6}, "approach holds 2"),
+        ({"pose": POSE}, "^model: .*None"),
+        ({"pose": POSE, "model": "kiro5"}, "^model: .*kiro5.*kiro4"),
+        ({"pose": POSE, "model": True}, "^model: .*True"),
+        ({"pose": POSE[:5], "model": 0}, "^pose: .* 6 .* 5[.]$"),
+        ({"pose": [True, *POSE[1:]], "model": 0}, "^pose: .*'True'"),
+        ({"pose": [1e300, *POSE[1:]], "model": 0}, "^pose: .*'1e.300'"),
+        ({"pose": POSE, "model": 0, "near_deg": [90] * 5}, "^near_deg: .* 6 .* 5[.]$"),
+        ({"pose": POSE, "model": 0, "near_deg": [9e4] * 6}, "^near_deg: .* deg[.]$"),
+        ({"pose": POSE, "model": 0, "branch": "upside"}, "^branch: .*'upside'"),
+        ({"pose": POSE, "model": 0, "braunch": "x"}, "^braunch: .*'branch'"),
+        ({"pose": POSE, "q_deg": NEAR, "model": 0}, "pose, path, q_deg, q, ask.* 2[.]$"),
+        ({"model": 0}, "pose, path, q_deg, q, ask.* 0[.]$"),
+        ({"ask": "heath"}, "^ask: .*'heath'.*'health'"),
+        ({"path": [], "model": 0}, "^path: "),
+        ({"path": [POSE, 7], "model": 0}, r"^path\[1\]: .* 6 .*'7'"),
+        ({"pose": POSE, "model": 0, "accuracy": 1}, "^accuracy: .*'1'"),
+        ({"pose": POSE, "model": 0, "approach": [2] * 6}, "^approach: .* 2[.]$"),
     ],
 )
-def test_a_request_that_cannot_be_answered_gets_a_sentence(ask, request_, sentence):
-    with pytest.raises(RuntimeError, match=sentence):
+def test_an_invalid_request_is_answered_with_the_key_at_fault(ask, request_, named):
+    with pytest.raises(RuntimeError, match=named):
         ask(**request_)
 
 
-def test_lines_that_are_no_requests_get_a_sentence_and_the_others_their_answers(raw):
+def test_lines_that_are_not_requests_get_an_error_and_the_others_their_answers(raw):
     good = json.dumps({"id": "a", "pose": POSE, "model": 0}).encode() + b"\n"
     lines = [
         b"\n",
@@ -202,7 +200,7 @@ def test_lines_that_are_no_requests_get_a_sentence_and_the_others_their_answers(
         assert answered["status"] == "reached"
 
 
-def test_half_a_line_is_never_answered(raw):
+def test_an_incomplete_line_is_never_answered(raw):
     whole = json.dumps({"id": 1, "pose": POSE, "model": 0}).encode()
     assert raw(whole) == []
     assert raw(whole + b"\n", whole[:-30]) == raw(whole + b"\n")
@@ -210,7 +208,7 @@ def test_half_a_line_is_never_answered(raw):
 
 def test_a_line_that_is_too_long_ends_the_connection(raw):
     (answer,) = raw(b" " * (2**20 + 1))
-    assert "longer than" in answer["error"]
+    assert numbers_in(answer["error"]) == [2**20]
 
 
 @contextmanager
@@ -228,7 +226,7 @@ def _lines_of(server):
         yield exchange
 
 
-def test_the_example_of_the_documentation_is_answered_so(repository):
+def test_the_example_of_the_documentation_is_answered_as_documented(repository):
     page = (repository / "docs" / "reference" / "serve-protocol.md").read_text()
     lines = [json.loads(line) for line in page.split("```text\n")[1].split("```")[0].splitlines()]
     with running(repository / "models" / "kiro4") as server, _lines_of(server) as exchange:

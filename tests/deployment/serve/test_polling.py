@@ -3,7 +3,7 @@
 import pytest
 
 from pisigma.deployment.serve import polling
-from pisigma.deployment.serve.polling import REST, TAKEN_AWAY, Polling
+from pisigma.deployment.serve.polling import MAX_GAP, REST_FACTOR, Polling
 
 DURATION = 0.02
 
@@ -12,7 +12,7 @@ class _Sockets:
     """A clock, and sockets where a request comes at the stated look; each look takes a while."""
 
     def __init__(self):
-        self.now, self.look, self.looks, self.request_at = 100.0, TAKEN_AWAY / 5, 0, None
+        self.now, self.look, self.looks, self.request_at = 100.0, MAX_GAP / 5, 0, None
 
     def monotonic(self):
         return self.now
@@ -33,9 +33,9 @@ def sockets(monkeypatch):
 
 def _after_two_requests(sockets, apart=0.0, duration=DURATION):
     polling = Polling(sockets, duration)
-    polling.went_on()
+    polling.record_activity()
     sockets.now += apart
-    polling.went_on()
+    polling.record_activity()
     return polling
 
 
@@ -59,17 +59,17 @@ def test_after_rare_requests_or_without_a_duration_the_server_sleeps_at_once(soc
 
 def test_one_request_alone_keeps_nobody_awake(sockets):
     polling = Polling(sockets, DURATION)
-    polling.went_on()
+    polling.record_activity()
     assert polling.ready() == []
     assert sockets.looks == 0
 
 
 def test_the_server_rests_where_others_want_the_processor(sockets):
-    sockets.look = 2 * TAKEN_AWAY
+    sockets.look = 2 * MAX_GAP
     busy = _after_two_requests(sockets)
     for looks, pause in ((1, 0.0), (1, 0.6), (2, 0.6)):
-        sockets.now += pause * REST * sockets.look
-        busy.went_on()
-        busy.went_on()
+        sockets.now += pause * REST_FACTOR * sockets.look
+        busy.record_activity()
+        busy.record_activity()
         assert busy.ready() == []
         assert sockets.looks == looks
