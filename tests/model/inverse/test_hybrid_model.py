@@ -239,7 +239,7 @@ def _known(**values):
         (_learned(features=[{"name": "series", "harmonics": 3}] * 2), "key 'uncertainty.features'"),
         (_learned(features=[{"name": "series", "harmonics": 10**9}]), "100000"),
         (_learned(features=[{"name": "series", "harmonics": 4, "gravity": [0, 0, 1]}]), "gravity"),
-        (_learned(features=[{"name": "gravity", "gravity": [0.0, 0.0, 0.0]}]), "[0.0, 0.0, 0.0]"),
+        (_learned(features=[{"name": "gravity", "gravity": [0.0, 0.0, 0.0]}]), "gravity"),
         (_learned(features=[]), "key 'uncertainty.features'"),
         (_learned(orders=[2, 2]), "(6, 4, 12)"),
         (_learned(orders=[1]), "orders"),
