@@ -148,10 +148,10 @@ def export(
 
 def _print(exported: "Exported", form: str, out: Path, contents: str, as_json: bool) -> None:
     """Say what was written, with what is in doubt on stderr."""
-    for sentence in exported.doubts:
+    for sentence in exported.warnings:
         print_line(f"pisigma: {sentence}", to_stderr=True)
     if as_json:
-        remarks = [*exported.remarks, *exported.doubts]
+        remarks = [*exported.remarks, *exported.warnings]
         print_json({"file": str(out), "format": form, **exported.facts, "remarks": remarks})
     else:
         for line in (*exported.shown.splitlines(), *exported.remarks):

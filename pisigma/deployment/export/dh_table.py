@@ -1,4 +1,4 @@
-"""DH + Hayati tables of a robot as CSV and YAML, in millimetres and degrees with all digits."""
+"""DH + Hayati tables of a robot as CSV and YAML, in millimetres and degrees at full precision."""
 
 import csv
 import io
@@ -24,14 +24,14 @@ TABLE_SUFFIXES = (".csv", ".yaml", ".yml")
 
 
 def dh_yaml(robot: Robot, comments: tuple[str, ...] = ()) -> str:
-    """The robot as a robot file, which `Robot.load` reads back, with sentences on top."""
+    """Write a robot file, which `Robot.load` reads, with comments at the top."""
     return head((CONVENTION, *comments)) + robot_to_yaml(robot)
 
 
 def dh_csv(robot: Robot, comments: tuple[str, ...] = ()) -> str:
-    """The robot as a table: base, one line a row, tool; cells that do not apply are empty.
+    """Write the robot as a table: base, one line per row, tool; cells that do not apply are empty.
 
-    Lines at the top that begin with # hold the convention and the sentences given.
+    Lines at the top that start with # state the convention and the comments.
     """
     limits = ("lower_deg", "upper_deg", "lower_mm", "upper_mm")
     parameters = (*in_file_units(DH_COLUMNS, robot.dh[0]), *in_file_units(FRAME_COLUMNS, robot.base))
@@ -48,19 +48,19 @@ def dh_csv(robot: Robot, comments: tuple[str, ...] = ()) -> str:
 
 
 def _coupling_sentences(robot: Robot) -> tuple[str, ...]:
-    """How coupled joints follow the controller's values, of which the table holds the limits of the joints alone."""
+    """Return a comment on the coupling of joints; the table itself has limits of the joints only."""
     if robot.coupling is None:
         return ()
     stated = json.dumps(coupling_document(robot.coupling, robot.joints))
     return (
-        f"q_i are the joints' values, which follow the controller's as a robot file says: coupling: {stated}",
+        f"q_i are joint values, which follow from the controller's values by the coupling of a robot file: {stated}",
     )
 
 
 def csv_table(
     columns: Iterable[str], lines: Iterable[Mapping[str, object]], sentences: tuple[str, ...]
 ) -> str:
-    """Lines as CSV with sentences on top; cells that a line does not have are empty."""
+    """Write lines as CSV with comments at the top; cells that a line does not have are empty."""
     text = io.StringIO()
     writer = csv.DictWriter(text, tuple(columns), restval="", lineterminator="\n")
     writer.writeheader()
@@ -69,12 +69,12 @@ def csv_table(
 
 
 def cells(names: tuple[str, ...], values: np.ndarray) -> dict[str, str]:
-    """Parameters by column [mm, deg], with all digits."""
+    """Return parameters by column [mm, deg] at full precision."""
     return {column: repr(value) for column, value in in_file_units(names, values).items()}
 
 
 def head(sentences: tuple[str, ...]) -> str:
-    """Sentences as lines that begin with #."""
+    """Format sentences as lines that start with #."""
     return "".join(f"# {' '.join(sentence.split())}\n" for sentence in sentences)
 
 

@@ -1,4 +1,4 @@
-"""What an export is: a format with its files, the options it takes, and how a model is written in it."""
+"""Export formats, requests and results."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -11,25 +11,25 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class ExportRequest:
-    """What is to be exported; an option is None where it is not stated.
+    """Request of an export; options that are not given are None.
 
     Attributes:
-        model: the model folder.
-        out: the file to write.
-        like: the file whose other content stays; with urdf and xacro a URDF file, else the one in the model folder.
-        tip: with `like`, the link that is the tool.
-        geometry: with urdf and dh, "geometric" or "hybrid".
-        poses: with targets, the file of poses.
-        targets: with targets, "joints" or "cartesian".
-        branch: with targets, the branch to take instead of the trained one.
-        config: with FANUC's Cartesian targets, the arm's configuration.
-        program: with targets, an existing program whose targets are rewritten.
-        frames: with `program`, the file of frames and tools that it does not state.
-        tolerance_mm: with `program`, how far the tool may leave a straight line between way points [mm].
-        counts_per_turn: with counts, encoder counts a turn of every joint, with commas between.
-        present_counts: with counts, those that the controller has now.
-        payload_kg: what the robot carries [kg].
-        temperature_c: of the robot [deg C].
+        model: model folder.
+        out: file to write.
+        like: file whose other content is kept; for urdf and xacro a URDF file, by default the one in the model folder.
+        tip: link of the tool in `like`.
+        geometry: "geometric" or "hybrid", for urdf and dh.
+        poses: file of poses, for targets.
+        targets: "joints" or "cartesian", for targets.
+        branch: branch to use instead of the trained one, for targets.
+        config: configuration of the arm, for Cartesian targets of FANUC.
+        program: existing program whose targets are rewritten.
+        frames: file of frames and tools that `program` does not state.
+        tolerance_mm: largest deviation of the tool from a straight line between way points of `program` [mm].
+        counts_per_turn: comma-separated encoder counts per turn of every joint, for counts.
+        present_counts: comma-separated present counts of the controller, for counts.
+        payload_kg: mass that the robot carries [kg].
+        temperature_c: temperature of the robot [deg C].
     """
 
     model: Path
@@ -51,7 +51,7 @@ class ExportRequest:
 
     @property
     def stated(self) -> tuple[str, ...]:
-        """Names of the options that are stated."""
+        """Names of the options that are given."""
         return tuple(name for name in OPTIONS if getattr(self, name) is not None)
 
     @property
@@ -61,15 +61,15 @@ class ExportRequest:
 
     @property
     def conditions(self) -> dict[str, float]:
-        """Stated payload and temperature, by the columns of measurement files."""
+        """Given payload and temperature, by column of measurement files."""
         values = {"payload_kg": self.payload_kg, "temperature_c": self.temperature_c}
         return {name: value for name, value in values.items() if value is not None}
 
     def load(self) -> "CalibratedModel":
-        """The model, under the stated conditions.
+        """Load the model at the given conditions.
 
         Raises:
-            ModelError: the folder holds no model, or the model did not learn what a stated condition does.
+            ModelError: the folder is not a model, or the model did not learn the effect of a given condition.
         """
         from pisigma.model.folder.model_folder import load_model
         from pisigma.model.stated_conditions import under_stated_conditions
@@ -94,29 +94,29 @@ OPTIONS = (
     "payload_kg",
     "temperature_c",
 )
-"""Options of which every format declares those that it takes."""
+"""All options; every format declares those that it accepts."""
 
 
 @dataclass(frozen=True)
 class Exported:
-    """A file's content and what to say about it.
+    """Content of an exported file, and what is reported about it.
 
     Attributes:
-        content: of the file, or of several by their names in a folder.
-        facts: what `--json` prints, by key.
-        remarks: sentences that a reader of the file should know.
-        doubts: sentences on what may not be as wanted; they go to stderr.
-        summary: what was written, as a sentence that ends before the file's name; "" for the format's contents.
-        details: what the sentence says behind the file's name.
-        failure: why the input is at fault though the file was written; None where all is well.
-        shortfall: which limit is missed though the file was written; None where none is.
-        shown: what is printed before all else, such as a diff.
+        content: content of the file, or of several files by name in a folder.
+        facts: values for `--json`, by key.
+        remarks: sentences for the reader of the file.
+        warnings: warnings, which are printed to stderr.
+        summary: sentence on the written file up to its name; "" for the contents of the format.
+        details: part of that sentence after the file's name.
+        failure: fault of the input although the file was written; None without one.
+        shortfall: limit that is missed although the file was written; None without one.
+        shown: text that is printed first, such as a diff.
     """
 
     content: str | bytes | Mapping[str, bytes]
     facts: Mapping[str, object]
     remarks: tuple[str, ...] = ()
-    doubts: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
     summary: str = ""
     details: str = ""
     failure: str | None = None
@@ -126,15 +126,15 @@ class Exported:
 
 @dataclass(frozen=True)
 class ExportFormat:
-    """One format.
+    """An export format.
 
     Attributes:
-        name: what `--format` calls it.
-        contents: what a file holds, such as "a DH table".
-        suffixes: endings that its files may have; () where it writes a folder.
-        write: makes the content of a file; raises a `PisigmaError` where it cannot.
-        options: those of `OPTIONS` that it takes.
-        check: refuses requests before anything is loaded; raises a `PisigmaError`.
+        name: name of the `--format`.
+        contents: contents of a file, for example "a DH table".
+        suffixes: suffixes of its files; () if it writes a folder.
+        write: function that returns the content of a file, or raises a `PisigmaError`.
+        options: those of `OPTIONS` that it accepts.
+        check: function that raises a `PisigmaError` for invalid requests before anything is loaded.
     """
 
     name: str
@@ -146,5 +146,5 @@ class ExportFormat:
 
 
 def model_facts(model: "CalibratedModel") -> dict[str, object]:
-    """The model's robot and its number of joints, for `Exported.facts`."""
+    """Return the model's robot and its number of joints, for `Exported.facts`."""
     return {"robot": model.robot.name, "joints": model.robot.dof}

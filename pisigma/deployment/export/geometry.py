@@ -1,27 +1,27 @@
-"""The geometry of a model as one robot, and what has to be said where only that leaves pisigma."""
+"""The geometry of a model as one robot, and remarks for files that include nothing but the geometry."""
 
 from dataclasses import dataclass, replace
 
 from pisigma import __version__
 from pisigma.deployment.export.export_format import ExportRequest
-from pisigma.files.errors import ModelError, OutputError, nearest_choice
+from pisigma.files.errors import ModelError, OutputError, check_choice
 from pisigma.joint_correction.conditions import learned_conditions
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.stated_conditions import condition_warnings
 from pisigma.robot.description import Robot
 
 GEOMETRIC, HYBRID = "geometric", "hybrid"
-"""The geometries of a model: the geometric fit, used alone, and the one that goes with a hybrid's correction."""
+"""Geometries of a model: the geometric fit, used alone, and the one that belongs to a hybrid's correction."""
 
 
 @dataclass(frozen=True, eq=False)
 class ChosenGeometry:
-    """A geometry of a model, to be written.
+    """A geometry of a model for export.
 
     Attributes:
         name: `GEOMETRIC` or `HYBRID`.
-        robot: with the geometry, base and tool.
-        said: sentences for the head of the file, on what it holds.
+        robot: robot with the geometry, base and tool.
+        said: sentences for the head of the file.
     """
 
     name: str
@@ -30,18 +30,17 @@ class ChosenGeometry:
 
 
 def check_geometry(request: ExportRequest) -> None:
-    """Refuse a geometry that is none.
+    """Check the name of the geometry.
 
     Raises:
-        OutputError: it is none of `GEOMETRIC` and `HYBRID`.
+        OutputError: it is neither `GEOMETRIC` nor `HYBRID`.
     """
-    if request.geometry not in (None, GEOMETRIC, HYBRID):
-        known = nearest_choice(str(request.geometry), (GEOMETRIC, HYBRID))
-        raise OutputError(f"--geometry '{request.geometry}' is unknown; {known}")
+    if request.geometry is not None:
+        check_choice(OutputError, "--geometry", request.geometry, (GEOMETRIC, HYBRID))
 
 
 def chosen_geometry(model: CalibratedModel, name: str | None) -> ChosenGeometry:
-    """The geometry of a name, `GEOMETRIC` where None is stated.
+    """Return a geometry by name, `GEOMETRIC` for None.
 
     Raises:
         ModelError: the model has no geometry of this name.
@@ -58,85 +57,96 @@ def _signed(model: CalibratedModel, robot: Robot) -> Robot:
 
 
 def _hybrid_geometry(model: CalibratedModel) -> Robot:
-    """The geometry that the joint correction of --format onnx was fitted together with.
+    """Return the geometry that was fitted together with the joint correction of --format onnx.
 
     Raises:
-        ModelError: that graph does not hold such a correction.
+        ModelError: the model has no such correction.
     """
     if model.network is not None:
         raise ModelError(
-            f"model '{model.name}': its network corrects nominal joint values, which no geometry of its own goes with; "
-            "leave --geometry hybrid out, or export the model that it was distilled from."
+            f"the network of model '{model.name}' corrects nominal joint values and has no geometry",
+            option="--geometry",
+            value=HYBRID,
+            remedy="leave --geometry hybrid out, or export the model that it was distilled from",
         )
     if model.hybrid is None:
         raise ModelError(
-            f"model '{model.name}' has no learned joint correction, so there is no hybrid geometry; leave --geometry "
-            "hybrid out."
+            f"model '{model.name}' has no learned joint correction and therefore no hybrid geometry",
+            option="--geometry",
+            value=HYBRID,
+            remedy="leave --geometry hybrid out",
         )
     if model.robot.coupling is not None:
         raise ModelError(
-            f"model '{model.name}': its joints are coupled, and their correction cannot be exported with the hybrid "
-            "geometry; leave --geometry hybrid out, or use pisigma.load."
+            f"the joints of model '{model.name}' are coupled, so their correction cannot be exported with the hybrid "
+            "geometry",
+            option="--geometry",
+            value=HYBRID,
+            remedy="leave --geometry hybrid out, or use pisigma.load",
         )
     return model.hybrid.robot
 
 
 def _hybrid_remarks(model: CalibratedModel) -> tuple[str, ...]:
-    """Sentences for the head of a file of the geometry that goes with a joint correction."""
+    """Return comments for a file of the geometry that belongs to a joint correction."""
     return (
         f"Hybrid geometry of model {model.name} (robot {model.robot.name}), by pisigma {__version__}.",
-        "To be used together with the joint correction of the same model (--format onnx): the pose is that of this "
-        "geometry at q + correction. Without it, take a file of --geometry geometric.",
+        "Use it together with the joint correction of the same model (--format onnx): the pose is that of this "
+        "geometry at q + correction. Without the correction, use a file of --geometry geometric.",
         *condition_remarks(model),
         *frame_remarks(model),
     )
 
 
 def corrects_joints(model: CalibratedModel) -> bool:
-    """Whether a model has a learned joint correction, which files of geometry cannot hold."""
+    """Return whether a model has a learned joint correction, which files of geometry cannot include."""
     return model.network is not None or model.hybrid is not None
 
 
 def remarks(model: CalibratedModel) -> tuple[str, ...]:
-    """Sentences for the head of a file that holds the geometry of a model and nothing else."""
-    drawn = "as drawn, with the identified base and tool" if model.calibrated is None else "as identified"
-    said = [f"Geometry {drawn}, of model {model.name} (robot {model.robot.name}), by pisigma {__version__}."]
+    """Return comments for a file that includes only the geometry of a model."""
+    kind = (
+        "Nominal geometry with identified base and tool"
+        if model.calibrated is None
+        else "Identified geometry"
+    )
+    said = [f"{kind} of model {model.name} (robot {model.robot.name}), by pisigma {__version__}."]
     if corrects_joints(model):
         said.append(
-            "The learned joint correction of the model is not in this file: a program that reads it gets the geometric "
-            "fit alone, without the accuracy that the correction adds. Do not add the correction of --format onnx to "
-            "it: that goes with --geometry hybrid."
+            "The learned joint correction of the model is not in this file: it describes the geometric fit alone, "
+            "without the accuracy that the correction adds. Do not combine it with the correction of --format onnx, "
+            "which belongs to --geometry hybrid."
         )
     return (*said, *frame_remarks(model))
 
 
 def frame_remarks(model: CalibratedModel) -> tuple[str, ...]:
-    """Sentences on whose base and tool leave pisigma where the model knows several."""
+    """Return remarks on which base and tool are exported if the model has several."""
     several = (("base", "frame", list(model.bases)), ("tool", "target", list(model.tools)))
     return tuple(
-        f"The {part} is that of the {what} '{names[0]}'; the model knows {len(names)} {what}s ({', '.join(names)})."
+        f"The {part} is that of the {what} '{names[0]}'; the model has {len(names)} {what}s ({', '.join(names)})."
         for part, what, names in several
         if len(names) > 1
     )
 
 
 def condition_remarks(model: CalibratedModel) -> tuple[str, ...]:
-    """Sentences on the payload and temperature that joint values are for, where the model learned what these do."""
+    """Return remarks on the payload and temperature of joint values, if the model learned their effect."""
     learned = None if model.hybrid is None else learned_conditions(model.hybrid.correction)
     usual = {} if learned is None else dict(zip(learned.names, learned.mean, strict=True))
     stated = [f"{name} {value:g}" for name, value in model.conditions.items()]
-    stated += [f"{name} {mean:.4g} (usual)" for name, mean in usual.items()]
-    return (f"Made for {' and '.join(stated)}.", *condition_warnings(model)) if stated else ()
+    stated += [f"{name} {mean:.4g} (mean of the calibration)" for name, mean in usual.items()]
+    return (f"For {' and '.join(stated)}.", *condition_warnings(model)) if stated else ()
 
 
 def offset_remarks(model: CalibratedModel) -> tuple[str, ...]:
-    """The same for a file that holds joint offsets and nothing else."""
+    """Return comments for a file that includes only joint offsets."""
     title = f"Joint offsets of model {model.name} (robot {model.robot.name}), by pisigma {__version__}."
     if not corrects_joints(model):
         return (title,)
     return (
         title,
         *condition_remarks(model),
-        "The learned joint correction of the model is not in this file, but for the constant offsets that come "
-        "nearest to it.",
+        "The learned joint correction of the model is not in this file, except for the constant offsets that "
+        "approximate it best.",
     )

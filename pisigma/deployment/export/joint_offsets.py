@@ -1,4 +1,4 @@
-"""Joint offsets alone: the most that a controller can take which knows nothing but its zero positions."""
+"""Joint offsets alone, for controllers in which only the zero positions can be changed."""
 
 from dataclasses import asdict, dataclass
 
@@ -18,15 +18,15 @@ from pisigma.robot.row import FRAME_COLUMNS, in_file_units
 
 @dataclass(frozen=True, eq=False)
 class JointOffsets:
-    """The robot as drawn with the joint offsets, base and tool that come nearest to a model.
+    """Nominal robot with the joint offsets, base and tool that approximate a model best.
 
     Attributes:
-        robot: as drawn but for theta of turning and d of sliding joints, base and tool.
-        values: per axis of the controller [rad or m], as it counts: the real robot commanded to q stands where the
-            drawn one stands at q + offset.
-        unobservable: joints whose offset is 0 because base or tool take the same in.
-        lost: what is given up: departure from the whole model.
-        nominal: the departure of the robot as drawn, with the model's base and tool, for comparison.
+        robot: nominal robot except for theta of revolute and d of prismatic joints, base and tool.
+        values: offset of every axis of the controller [rad or m], in its direction: the real robot commanded to q is
+            where the nominal one is at q + offset.
+        unobservable: joints whose offset is set to 0 because base or tool have the same effect.
+        lost: remaining deviation from the whole model.
+        nominal: deviation of the nominal robot with the model's base and tool, for comparison.
     """
 
     robot: Robot
@@ -36,15 +36,15 @@ class JointOffsets:
     nominal: Departure
 
     def departures(self) -> dict[str, object]:
-        """Both departures, by their keys in files."""
+        """Return both deviations by their keys in files."""
         return {"off_the_whole_model": asdict(self.lost), "robot_as_drawn": asdict(self.nominal)}
 
 
 def fit_joint_offsets(model: CalibratedModel) -> JointOffsets:
-    """Fit joint offsets, base and tool of the robot as drawn to a model; see `project_model`.
+    """Fit joint offsets, base and tool of the nominal robot to a model; see `project_model`.
 
     Raises:
-        ModelError: the model stores no joint values, or predicts none of their poses.
+        ModelError: the model has no stored joint values, or no predictions at them.
         RobotError: see `joints_by_axes`.
     """
     nominal = model.robot
@@ -61,7 +61,7 @@ def fit_joint_offsets(model: CalibratedModel) -> JointOffsets:
 
 
 def offsets_between(nominal: Robot, moved: Robot) -> Float64[np.ndarray, " axes"]:
-    """Offsets [rad or m] of a robot's zeros against another's, as the controller counts.
+    """Compute the offsets [rad or m] of a robot's zero positions from the nominal ones, per axis of the controller.
 
     Raises:
         RobotError: see `joints_by_axes`.
@@ -72,48 +72,52 @@ def offsets_between(nominal: Robot, moved: Robot) -> Float64[np.ndarray, " axes"
 
 
 def joints_by_axes(robot: Robot) -> Float64[np.ndarray, "dof axes"]:
-    """How theta or d of every joint changes with the offset of every axis that the controller commands.
+    """Return the derivative of theta or d of every joint by the offset of every axis of the controller.
 
     Raises:
-        RobotError: a joint is passive or driven by a four-bar linkage, whose zero is not that of an axis alone.
+        RobotError: a joint is passive or driven by a four-bar linkage, so that its zero is not that of a single axis.
     """
     if robot.coupling is None:
         return np.diag(robot.directions)
     if robot.coupling.passive or robot.coupling.four_bars:
         raise RobotError(
-            f"robot '{robot.name}' has joints that are passive or driven by a linkage: no offset of an axis of "
-            "the controller stands for theirs. Take --format dh or targets."
+            f"robot '{robot.name}' has joints that are passive or driven by a linkage, whose offsets are not offsets "
+            "of an axis of the controller",
+            value=robot.name,
+            remedy="choose --format dh or targets",
         )
     matrix: np.ndarray = robot.directions[:, None] * robot.coupling.matrix
     return matrix
 
 
 MEANING = (
-    "The real robot commanded to q stands where the robot as drawn stands at q + offset: command q - offset, "
-    "or put the offset into the controller's zero positions. Base and tool were fitted anew for this."
+    "The real robot commanded to q is where the nominal robot is at q + offset: command q - offset, or enter the "
+    "offset into the controller's zero positions. Base and tool were fitted together with the offsets."
 )
 
 
 def departure_sentence(what: str, lost: Departure, nominal: Departure) -> str:
-    """How far off the whole model something is, and for comparison the robot as drawn."""
+    """Return a sentence on the deviation from the whole model, compared with the nominal robot."""
     return (
-        f"{what} off the whole model by {lost.mean_mm:.4g} mm in the mean, {lost.p95_mm:.4g} mm in 95 "
-        f"% of its poses, {lost.max_mm:.4g} mm at most, and {lost.mean_mrad:.4g} mrad in the mean (the robot as "
-        f"drawn, on the model's base and tool: {nominal.mean_mm:.4g}, {nominal.p95_mm:.4g}, "
-        f"{nominal.max_mm:.4g} mm and {nominal.mean_mrad:.4g} mrad)."
+        f"{what} from the whole model by {lost.mean_mm:.4g} mm on average, {lost.p95_mm:.4g} mm at the 95 % quantile, "
+        f"{lost.max_mm:.4g} mm at most, and {lost.mean_mrad:.4g} mrad on average (the nominal robot with the model's "
+        f"base and tool: {nominal.mean_mm:.4g}, {nominal.p95_mm:.4g}, {nominal.max_mm:.4g} mm and "
+        f"{nominal.mean_mrad:.4g} mrad)."
     )
 
 
 def offset_sentences(offsets: JointOffsets) -> tuple[str, ...]:
-    """What the offsets mean and what they give up."""
-    said = [MEANING, departure_sentence("Offsets alone are", offsets.lost, offsets.nominal)]
+    """Return sentences on the meaning of the offsets and their loss of accuracy."""
+    said = [MEANING, departure_sentence("Offsets alone deviate", offsets.lost, offsets.nominal)]
     if offsets.unobservable:
-        said.append(f"Base or tool take in the offset of {', '.join(offsets.unobservable)}, which is 0 here.")
+        said.append(
+            f"Offsets of {', '.join(offsets.unobservable)} are 0 because base or tool have the same effect."
+        )
     return tuple(said)
 
 
 def offsets_csv(offsets: JointOffsets, comments: tuple[str, ...] = ()) -> str:
-    """One line a joint, then base and tool; cells that do not apply are empty."""
+    """Write one line per joint, then base and tool; cells that do not apply are empty."""
     frame = in_file_units(FRAME_COLUMNS, offsets.robot.base)
     columns = ("part", "name", "type", "offset_deg", "offset_mm", *frame)
     lines = [{"part": "joint", **entry} for entry in _joints(offsets)]
@@ -122,7 +126,7 @@ def offsets_csv(offsets: JointOffsets, comments: tuple[str, ...] = ()) -> str:
 
 
 def offsets_yaml(offsets: JointOffsets, comments: tuple[str, ...] = ()) -> str:
-    """Offsets, base, tool and what they give up."""
+    """Write offsets, base, tool and the loss of accuracy."""
     document: dict[str, object] = {"robot": offsets.robot.name, "joints": _joints(offsets)}
     for part in ("base", "tool"):
         document[part] = in_file_units(FRAME_COLUMNS, getattr(offsets.robot, part))

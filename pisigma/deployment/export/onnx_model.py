@@ -1,4 +1,4 @@
-"""A model's network or joint correction as an ONNX graph, for programs that run no Python."""
+"""A model's network or joint correction as an ONNX graph, for programs without Python."""
 
 import json
 import math
@@ -24,18 +24,18 @@ from pisigma.network.pi_sigma import PiSigma
 
 
 def needs_pose(network: CorrectionNetwork) -> bool:
-    """Whether an input is a coordinate of the pose."""
+    """Return whether an input of the network is a coordinate of the pose."""
     return any(set(group.inputs.names) & set(POSE_INPUTS) for group in network.groups)
 
 
 def add_network(graph: OnnxGraph, network: CorrectionNetwork, q: str, T: str | None) -> str:
-    """Add a network; gives the corrections `(batch, dof)` [rad or m].
+    """Add a network, and return the name of its corrections `(batch, dof)` [rad or m].
 
     Args:
-        graph: to add to.
-        network: of the model.
-        q: nominal joint values.
-        T: poses; None where no input is a coordinate of them.
+        graph: graph to extend.
+        network: network of the model.
+        q: name of the nominal joint values.
+        T: name of the poses; None if no input is a coordinate of them.
     """
     joints: list[int] = []
     outputs: list[str] = []
@@ -47,7 +47,7 @@ def add_network(graph: OnnxGraph, network: CorrectionNetwork, q: str, T: str | N
 
 
 def _add_group(graph: OnnxGraph, group: JointGroup, net: PiSigma, q: str, T: str | None) -> str:
-    """Outputs of one network, `(batch, outputs)`."""
+    """Add one network, and return the name of its outputs `(batch, outputs)`."""
     values, order = _add_inputs(graph, group, q, T)
     offset, scale = (part.detach().numpy()[order] for part in (net.input_offset, net.input_scale))
     scaled = graph.node("Div", graph.node("Sub", values, offset), scale)
@@ -61,7 +61,7 @@ def _add_group(graph: OnnxGraph, group: JointGroup, net: PiSigma, q: str, T: str
 
 
 def _add_inputs(graph: OnnxGraph, group: JointGroup, q: str, T: str | None) -> tuple[str, list[int]]:
-    """The inputs `(batch, inputs)` in an order of kinds, and which input stands where."""
+    """Add the inputs `(batch, inputs)` sorted by kind, and return their name and order."""
     names = group.inputs.names
     terms = [group.inputs.combination(name) for name in names]
     parts: list[str] = []
@@ -82,7 +82,7 @@ def _add_inputs(graph: OnnxGraph, group: JointGroup, q: str, T: str | None) -> t
 
 
 def _add_coordinates(graph: OnnxGraph, reference: np.ndarray, T: str) -> Sequence[str]:
-    """x, y, z, roll, pitch, yaw of poses, each `(batch, 1)`."""
+    """Add x, y, z, roll, pitch, yaw of poses, each `(batch, 1)`."""
     cells = graph.reshape(T, [16])
     place = [graph.column(cells, 4 * axis + 3) for axis in range(3)]
     rotation = graph.columns(cells, [0, 1, 2, 4, 5, 6, 8, 9, 10])
@@ -91,10 +91,10 @@ def _add_coordinates(graph: OnnxGraph, reference: np.ndarray, T: str) -> Sequenc
 
 
 def add_joint_correction(graph: OnnxGraph, correction: JointCorrection, q: str) -> str:
-    """Add a correction under the usual conditions; gives `(batch, dof)` [rad or m].
+    """Add a correction at the mean conditions, and return the name of its values `(batch, dof)` [rad or m].
 
     Raises:
-        ModelError: it uses features that have no ONNX form.
+        ModelError: it uses features without an ONNX form.
     """
     robot, terms = correction.robot, []
     for feature, weight in zip(correction.features, correction.linear, strict=True):
@@ -103,8 +103,9 @@ def add_joint_correction(graph: OnnxGraph, correction: JointCorrection, q: str) 
         term = feature.add_onnx(graph, weight.detach().numpy(), q)
         if term is None:
             raise ModelError(
-                f"the learned correction uses the feature '{feature.name}', which has no ONNX form; calibrate without "
-                "it, or give it the method `add_onnx`."
+                f"the learned correction uses the feature '{feature.name}', which has no ONNX form",
+                value=feature.name,
+                remedy="calibrate without it, or implement its method `add_onnx`",
             )
         terms.append(term)
     if correction.orders:
@@ -121,7 +122,7 @@ def add_joint_correction(graph: OnnxGraph, correction: JointCorrection, q: str) 
 
 
 def add_beyond(graph: OnnxGraph, coverage: JointCoverage, q: str) -> str:
-    """Add the angle of the joint farthest beyond its measured values, `(batch, 1)` [rad]; see `JointCoverage`."""
+    """Add the largest angle of a joint outside its measured values, `(batch, 1)` [rad]; see `JointCoverage`."""
     node, joint = graph.node, coverage.joint.numpy()
     angle = node("Mul", graph.columns(q, joint.tolist()), coverage.rate.numpy()[joint])
     off = node("Sub", angle, coverage.middle.numpy())
@@ -138,73 +139,78 @@ def add_beyond(graph: OnnxGraph, coverage: JointCoverage, q: str) -> str:
 
 FORWARD = "forward_joint_correction"
 INVERSE = "inverse_joint_correction"
-"""What a graph computes, in its metadata."""
+"""Values of `computes` in the metadata of a graph."""
 
 
 def export_onnx(model: CalibratedModel, model_sha256: str = "") -> bytes:
-    """A model's network as the content of an ONNX file.
+    """Convert a model's network to the content of an ONNX file.
 
-    All numbers are double, the first axis of every input and output is the batch. Units, frames, joints and the domain
-    stand in the descriptions of inputs and outputs and in the metadata.
+    All numbers are double, and the first axis of every input and output is the batch. Units, frames, joints and the
+    domain are in the descriptions of inputs and outputs and in the metadata.
 
-    With a network on nominal joint values (inverse calibration, distilled): `q_nominal`, and `T_base_tool` where the
-    network looks at the pose, to `q_corrected` and `correction`. With a hybrid's joint correction: `q` to `correction`
-    and `beyond_measured`.
+    The graph of a network on nominal joint values (inverse calibration, distilled) maps `q_nominal`, and `T_base_tool`
+    if the network uses the pose, to `q_corrected` and `correction`. That of a hybrid's joint correction maps `q` to
+    `correction` and `beyond_measured`.
 
     Args:
-        model: the model.
+        model: model to convert.
         model_sha256: hash of its `model.yaml`, for the metadata.
 
     Raises:
         MissingExtraError: onnx is not installed.
-        ModelError: the model has no network, or one without ONNX form, or its joints are coupled.
+        ModelError: the model has no network, one without an ONNX form, or coupled joints.
     """
     import_onnx()
     if model.robot.coupling is not None:
         raise ModelError(
-            f"model '{model.name}': its joints are coupled, and a graph would take their values, not the controller's; "
-            "use pisigma.load, which turns one into the other."
+            f"the joints of model '{model.name}' are coupled, and a graph would take their values, not the "
+            "controller's",
+            value="coupling",
+            remedy="use pisigma.load, which converts between them",
         )
     if model.network is not None:
         return _inverse(model, model.network, model_sha256)
     if model.hybrid is not None:
         return _forward(model, model.hybrid, model_sha256)
     raise ModelError(
-        f"model '{model.name}' has no network, only geometry; export that with --format urdf or dh, or make a network "
-        "of it with `pisigma distill`."
+        f"model '{model.name}' has no network, only a geometry",
+        value=model.kind,
+        remedy="export the geometry with --format urdf or dh, or make a network of it with `pisigma distill`",
     )
 
 
 def onnx_remarks(model: CalibratedModel) -> tuple[str, ...]:
-    """What a reader of the file should know."""
+    """Return remarks for the user of the file."""
     if model.network is not None:
         return (
-            "q_nominal has to come from the model's nominal robot on its base and with its tool; inputs outside the "
-            "domain are not refused.",
+            "q_nominal has to be computed with the model's nominal robot, base and tool; inputs outside the domain are "
+            "not rejected.",
         )
     return (
-        "The graph corrects joint values on the way forward: the pose is that of the hybrid geometry (--format urdf or "
-        "dh --geometry hybrid), not of the geometric fit, at q + correction. For nominal to commanded "
-        "joint values export a model of `pisigma distill`.",
+        "The graph corrects joint values for forward kinematics: the pose is that of the hybrid geometry (--format "
+        "urdf or dh --geometry hybrid), not of the geometric fit, at q + correction. To convert nominal to commanded "
+        "joint values, export a model of `pisigma distill`.",
     )
 
 
 def _inverse(model: CalibratedModel, network: CorrectionNetwork, sha256: str) -> bytes:
     graph, dof, units = OnnxGraph(), model.robot.dof, _units(model)
-    about = f"{_joints(model)} [{units}], as the controller counts"
+    about = f"{_joints(model)} [{units}], in the controller's directions"
     q = graph.add_input("q_nominal", [dof], f"nominal joint values {about}")
     T = None
     if needs_pose(network):
-        T = graph.add_input("T_base_tool", [4, 4], "wanted poses of the tool in the base frame [m]")
+        T = graph.add_input("T_base_tool", [4, 4], "target poses of the tool in the base frame [m]")
     correction = add_network(graph, network, q, T)
     corrected = graph.node("Add", q, correction)
     graph.add_output(
         corrected, "q_corrected", [dof], f"joint values to command {about}: q_nominal + correction"
     )
-    graph.add_output(correction, "correction", [dof], f"what is added to the nominal joint values [{units}]")
+    graph.add_output(
+        correction, "correction", [dof], f"correction that is added to the nominal joint values [{units}]"
+    )
     doc = (
         f"Corrections of nominal joint values of robot {model.robot.name}, model {model.name}. Nominal joint values "
-        "are the inverse kinematics of the nominal robot on the base and with the tool of the model."
+        "are the inverse kinematics of the nominal robot with the base and tool of the model."
     )
     return graph.finish(f"pisigma {model.name}", doc, _metadata(model, INVERSE, sha256))
 
@@ -212,25 +218,28 @@ def _inverse(model: CalibratedModel, network: CorrectionNetwork, sha256: str) ->
 def _forward(model: CalibratedModel, arm: HybridArm, sha256: str) -> bytes:
     graph, dof, units = OnnxGraph(), model.robot.dof, _units(model)
     q = graph.add_input(
-        "q", [dof], f"commanded joint values {_joints(model)} [{units}], as the controller counts"
+        "q", [dof], f"commanded joint values {_joints(model)} [{units}], in the controller's directions"
     )
     correction = add_joint_correction(graph, arm.correction, q)
-    graph.add_output(correction, "correction", [dof], f"what is added to the joint values [{units}]")
+    graph.add_output(
+        correction, "correction", [dof], f"correction that is added to the joint values [{units}]"
+    )
     graph.add_output(
         add_beyond(graph, arm.coverage, q),
         "beyond_measured",
         [1],
-        "0 where every joint value was measured, else how far the farthest joint lies beyond [rad]",
+        "0 inside the measured joint values, else the largest angle of a joint outside of them [rad]",
     )
     doc = (
-        f"Joint corrections of robot {model.robot.name}, model {model.name}, under the usual conditions. The pose is "
-        "that of the hybrid geometry (pisigma export --geometry hybrid), not of the geometric fit, at q + correction."
+        f"Joint corrections of robot {model.robot.name}, model {model.name}, at the mean conditions of the "
+        "calibration. The pose is that of the hybrid geometry (pisigma export --geometry hybrid), not of the geometric "
+        "fit, at q + correction."
     )
     return graph.finish(f"pisigma {model.name}", doc, _metadata(model, FORWARD, sha256))
 
 
 def _metadata(model: CalibratedModel, computes: str, sha256: str) -> dict[str, str]:
-    """Everything as text, lists and tables as JSON; base and tool go with the graph."""
+    """Return the metadata as texts, lists and tables as JSON; base and tool belong to the graph."""
     arm = model.hybrid if computes == FORWARD else None
     robot = model.robot if arm is None else arm.robot
     values: dict[str, Any] = {
@@ -256,19 +265,19 @@ def _metadata(model: CalibratedModel, computes: str, sha256: str) -> dict[str, s
 
 
 def _domain(model: CalibratedModel) -> dict[str, Any]:
-    """Where it holds: the range of training rows, and of a hybrid the stretches of every joint that were measured."""
+    """Return the range of the training rows, and for a hybrid the measured intervals of every joint."""
     domain: dict[str, Any] = {}
     if len(model.starts):
         low, high = model.starts.aminmax(dim=0)
         domain |= {"q_lower": low.tolist(), "q_upper": high.tolist()}
     if model.network is None and model.hybrid is not None:
         coverage = model.hybrid.coverage
-        stretches: list[list[list[float]]] = [[] for _ in range(model.robot.dof)]
+        intervals: list[list[list[float]]] = [[] for _ in range(model.robot.dof)]
         columns = (coverage.joint.tolist(), coverage.middle.tolist(), coverage.half.tolist())
         for j, middle, half in zip(*columns, strict=True):
             rate = float(coverage.rate[j])
-            stretches[j].append([(middle - half) / rate, (middle + half) / rate])
-        domain["measured"] = stretches
+            intervals[j].append([(middle - half) / rate, (middle + half) / rate])
+        domain["measured"] = intervals
     return domain
 
 

@@ -1,4 +1,4 @@
-"""A model projected on what a file can say: the robot with few free parameters that comes nearest to it."""
+"""Projection of a model: the robot with few free parameters that approximates it best."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -23,19 +23,19 @@ from pisigma.robot.se3 import (
     xyzrpy_from_transform,
 )
 
-ITERATIONS = 50
+MAX_ITERATIONS = 50
 UNOBSERVABLE = 1e-6
-"""A parameter's column whose share outside those of base and tool is smaller determines nothing."""
+"""A parameter is unobservable if its column has a smaller share outside the span of base and tool."""
 NO_EFFECT = 1e-4
-"""Directions of the unknowns whose effect is smaller than this share of the largest are not moved along: base and
-tool would run away for next to nothing."""
-SETTLED = 1e-12
+"""Directions of the unknowns with a smaller effect, relative to the largest, are not changed: base and tool would move
+far without a benefit."""
+CONVERGENCE_TOLERANCE = 1e-12
 POSES = 1_000
-"""Poses that a robot is fitted to, and as many others that it is judged by."""
+"""Number of poses for the fit, and of other poses for its evaluation."""
 
 
 def joint_offsets(robot: Robot) -> tuple[int, ...]:
-    """Indices into the flattened `Robot.dh` of theta of turning and d of sliding joints."""
+    """Return the indices into the flattened `Robot.dh` of theta of revolute and d of prismatic joints."""
     columns = (0 if joint.type == "revolute" else 1 for joint in robot.joints)
     return tuple(
         len(DH_COLUMNS) * row + column for row, column in zip(robot.joint_rows, columns, strict=True)
@@ -43,19 +43,19 @@ def joint_offsets(robot: Robot) -> tuple[int, ...]:
 
 
 def whole_geometry(robot: Robot) -> tuple[int, ...]:
-    """Indices into the flattened `Robot.dh` of all parameters."""
+    """Return the indices into the flattened `Robot.dh` of all parameters."""
     return tuple(range(robot.dh.size))
 
 
 @dataclass(frozen=True, eq=False)
 class ProjectionProblem:
-    """Bring a robot to poses by moving some of its parameters, its base and its tool.
+    """Least-squares fit of some parameters, base and tool of a robot to poses.
 
     Attributes:
-        robot: the robot to begin with.
+        robot: initial robot.
         q: joint values [rad or m] of the poses.
-        T: where the tool shall be then.
-        parameters: indices into the flattened `Robot.dh` of those that are free.
+        T: target poses of the tool at these.
+        parameters: indices into the flattened `Robot.dh` of the free parameters.
     """
 
     robot: Robot
@@ -65,27 +65,27 @@ class ProjectionProblem:
 
     @property
     def lever(self) -> float:
-        """Length [m] that makes an angle [rad] count as much as a distance: half a reach."""
+        """Length [m] that converts angles [rad] to distances: half the reach."""
         return self.robot.reach / 2
 
     def residual(self, robot: Robot) -> tuple[Float64[Tensor, " values"], Float64[Tensor, "values unknowns"]]:
-        """What is missing [m], and its derivative by the parameters [rad or m], base and tool [m, rad].
+        """Compute the residual [m] and its derivatives by the parameters [rad or m], base and tool [m, rad].
 
-        Base and tool count as small shifts and turns, of the base in the frame that poses are given in, of the
-        tool in its own.
+        Base and tool change by small translations and rotations, of the base in the frame of the poses, of the tool in
+        the tool frame.
         """
         T, J = identification_jacobian(robot, self.q)
         J = J[..., list(self.parameters)]
         R, p = T[:, :3, :3], T[:, :3, 3]
         eye, none = torch.eye(3).to(R).expand_as(R), torch.zeros_like(R)
-        shifts = torch.cat([J[:, :3], eye, -skew(p), R, none], -1)
-        turns = self.lever * torch.cat([J[:, 3:], none, eye, none, R], -1)
+        translations = torch.cat([J[:, :3], eye, -skew(p), R, none], -1)
+        rotations = self.lever * torch.cat([J[:, 3:], none, eye, none, R], -1)
         missing = pose_error(self.T, T)
         missing = torch.cat([missing[:, :3], self.lever * missing[:, 3:]], -1)
-        return missing.flatten(), torch.cat([shifts, turns], 1).flatten(0, 1)
+        return missing.flatten(), torch.cat([translations, rotations], 1).flatten(0, 1)
 
     def moved(self, robot: Robot, step: Float64[Tensor, " unknowns"]) -> Robot:
-        """The robot with its parameters, base and tool changed by a step."""
+        """Return the robot with parameters, base and tool changed by a step."""
         count = len(self.parameters)
         dh = robot.dh.copy()
         dh.reshape(-1)[list(self.parameters)] += step[:count].numpy()
@@ -97,28 +97,28 @@ class ProjectionProblem:
 
 
 def solve_projection(problem: ProjectionProblem) -> tuple[Robot, tuple[bool, ...]]:
-    """Minimise the sum of squares by damped Gauss-Newton steps (Levenberg-Marquardt) from the robot as it is.
+    """Minimise the sum of squares from the initial robot by Levenberg-Marquardt steps.
 
     Returns:
-        The robot, and for every parameter whether it can be determined beside base, tool and the parameters before
-        it; else it is left as it is.
+        The robot, and for every parameter whether it is observable together with base, tool and the preceding
+        parameters; otherwise it is not changed.
     """
     robot = problem.robot
     missing, J = problem.residual(robot)
     observable = _observable(J, len(problem.parameters))
     free = torch.tensor([*observable, *[True] * 12])
     damping = 1e-3
-    for _ in range(ITERATIONS):
+    for _ in range(MAX_ITERATIONS):
         step = torch.zeros(len(free), dtype=torch.float64)
         step[free] = _step(J[:, free], missing, damping)
         there = problem.moved(robot, step)
         left, J_there = problem.residual(there)
         if left @ left < missing @ missing:
-            settled = float(step.abs().max()) < SETTLED
+            converged = float(step.abs().max()) < CONVERGENCE_TOLERANCE
             robot, missing, J, damping = there, left, J_there, damping / 10
-            if settled:
+            if converged:
                 break
-        elif damping > 1e6 or float(step.abs().max()) < SETTLED:
+        elif damping > 1e6 or float(step.abs().max()) < CONVERGENCE_TOLERANCE:
             break
         else:
             damping *= 10
@@ -128,7 +128,7 @@ def solve_projection(problem: ProjectionProblem) -> tuple[Robot, tuple[bool, ...
 def _step(
     J: Float64[Tensor, "values _free"], missing: Float64[Tensor, " values"], damping: float
 ) -> Float64[Tensor, " _free"]:
-    """Damped step by the singular values of the column-scaled derivative."""
+    """Compute a damped step from the singular values of the column-scaled Jacobian."""
     scale = J.norm(dim=0).clamp(min=1e-12)
     U, s, V = torch.linalg.svd(J / scale, full_matrices=False)
     gain = torch.where(s > NO_EFFECT * s[0], s / (s.square() + damping * s[0].square()), 0.0)
@@ -137,20 +137,20 @@ def _step(
 
 
 def _observable(J: Float64[Tensor, "values unknowns"], count: int) -> tuple[bool, ...]:
-    """For every parameter whether its column is no combination of those of base, tool and the parameters before."""
+    """Return whether each parameter's column is independent of base, tool and the preceding parameters."""
     basis = _basis(J[:, count:])
     observable = []
     for column in J[:, :count].unbind(1):
         column = column / column.norm().clamp(min=1e-12)
-        rest = column - basis @ (basis.mT @ column)
-        observable.append(bool(rest.norm() > UNOBSERVABLE))
+        residual = column - basis @ (basis.mT @ column)
+        observable.append(bool(residual.norm() > UNOBSERVABLE))
         if observable[-1]:
-            basis = torch.cat([basis, (rest / rest.norm())[:, None]], 1)
+            basis = torch.cat([basis, (residual / residual.norm())[:, None]], 1)
     return tuple(observable)
 
 
 def _basis(columns: Float64[Tensor, "values columns"]) -> Float64[Tensor, "values rank"]:
-    """Orthonormal basis of what columns span, whatever their sizes."""
+    """Return an orthonormal basis of the span of columns, regardless of their norms."""
     U, s, _ = torch.linalg.svd(columns / columns.norm(dim=0).clamp(min=1e-12), full_matrices=False)
     basis: Tensor = U[:, s > UNOBSERVABLE * s[0]]
     return basis
@@ -162,13 +162,13 @@ def _small(step: Float64[Tensor, " 6"]) -> Float64[Tensor, "4 4"]:
 
 @dataclass(frozen=True)
 class Departure:
-    """How far a robot's tool is from where the whole model has it.
+    """Deviation of a robot's tool from that of the whole model.
 
     Attributes:
-        mean_mm: of the distances [mm].
-        p95_mm: their 95 % quantile [mm].
-        max_mm: the largest [mm].
-        mean_mrad: mean angle between the two rotations [mrad].
+        mean_mm: mean distance [mm].
+        p95_mm: 95 % quantile of the distances [mm].
+        max_mm: largest distance [mm].
+        mean_mrad: mean angle between the rotations [mrad].
     """
 
     mean_mm: float
@@ -179,13 +179,13 @@ class Departure:
 
 @dataclass(frozen=True, eq=False)
 class Projection:
-    """A robot that comes nearest to a model, and the poses that it is judged by, which it was not fitted to.
+    """Robot that approximates a model best, and held-out poses for its evaluation.
 
     Attributes:
-        robot: the robot, with base and tool fitted as well.
-        observable: for every free parameter whether it can be determined beside base, tool and those before it.
-        q: joint values [rad or m].
-        T: where the model has the tool there.
+        robot: robot with fitted parameters, base and tool.
+        observable: for every free parameter whether it is observable together with base, tool and preceding ones.
+        q: held-out joint values [rad or m].
+        T: poses of the model's tool at these.
     """
 
     robot: Robot
@@ -194,7 +194,7 @@ class Projection:
     T: Float64[Tensor, "poses 4 4"]
 
     def departure(self, robot: Robot) -> Departure:
-        """How far a robot is from the model."""
+        """Compute the deviation of a robot from the model."""
         T = forward_kinematics(robot, self.q)
         distance = (T[:, :3, 3] - self.T[:, :3, 3]).norm(dim=-1)
         angle = rotation_vector(T[:, :3, :3].mT @ self.T[:, :3, :3]).norm(dim=-1)
@@ -207,9 +207,9 @@ class Projection:
 
 
 def departure_from_drawn(robot: Robot, drawn: Robot) -> Departure:
-    """How far a robot's tool is from where the robot as drawn has it, on the bases and with the tools that they have.
+    """Compute the deviation of a robot's tool from that of another robot, each with its base and tool.
 
-    Judged at random joint values within the limits of the drawn robot, and within 180 deg (3 m).
+    It is evaluated at random joint values within the limits of `drawn`, and within 180 deg (3 m).
     """
     low, high = torch.from_numpy(drawn.limits.clip(-torch.pi, torch.pi)).unbind(1)
     share = torch.rand((POSES, drawn.dof), generator=torch.Generator().manual_seed(0), dtype=torch.float64)
@@ -222,19 +222,17 @@ def project_model(
 ) -> Projection:
     """Fit parameters, base and tool of a robot to a model by least squares.
 
-    An angle counts as much as the distance that it makes at half the robot's reach.
-
-    The poses are those of the model over the region that it was calibrated in: at its stored joint values and
-    between random two of them.
+    Angles are weighted by half the robot's reach. The poses are predictions of the model in its calibrated region, at
+    random joint values between pairs of its stored ones.
 
     Args:
-        model: the model.
-        start: the robot to begin with, whose other parameters stay.
-        parameters: indices into the flattened `Robot.dh` of the free ones.
-        seed: of the draw.
+        model: model to approximate.
+        start: initial robot, whose other parameters are kept.
+        parameters: indices into the flattened `Robot.dh` of the free parameters.
+        seed: random seed of the joint values.
 
     Raises:
-        ModelError: the model stores no joint values, or predicts none of their poses.
+        ModelError: the model has no stored joint values, or no predictions at them.
     """
     generator = torch.Generator().manual_seed(seed)
     problem = ProjectionProblem(start, *_poses(model, generator), parameters)
@@ -244,11 +242,13 @@ def project_model(
 def _poses(
     model: CalibratedModel, generator: torch.Generator
 ) -> tuple[Float64[Tensor, "poses dof"], Float64[Tensor, "poses 4 4"]]:
-    """Joint values within the calibrated region, and where the model has the tool there."""
+    """Draw joint values in the calibrated region, and return them with the predicted poses."""
     starts = model.starts
     if not len(starts):
         raise ModelError(
-            f"model {model.name} stores no joint values, so its region is not known; train it again."
+            f"model '{model.name}' has no stored joint values, so its calibrated region is not known",
+            value=0,
+            remedy="train it again",
         )
     pair = torch.randint(len(starts), (2, POSES), generator=generator)
     share = torch.rand((POSES, 1), generator=generator, dtype=torch.float64)
@@ -260,6 +260,8 @@ def _poses(
             usable &= model.domain.contains(model.network.scaled_inputs(T, q))
     if not usable.any():
         raise ModelError(
-            f"model {model.name} predicts no pose between the joint values that it stores; train it again."
+            f"model '{model.name}' has no predictions between its stored joint values",
+            value=len(q),
+            remedy="train it again",
         )
     return q[usable], T[usable]

@@ -1,4 +1,4 @@
-"""Corrected targets: a table for any robot, in millimetres and degrees with all digits, or a program."""
+"""Corrected targets as a table in millimetres and degrees at full precision, or as a program."""
 
 import csv
 import io
@@ -14,7 +14,7 @@ from pisigma.deployment.export.programs.languages import LANGUAGES, cautions, ch
 from pisigma.deployment.export.programs.targets import Targets, targets_of
 from pisigma.deployment.export.programs.text import millimetres_and_euler
 from pisigma.deployment.export.rewriting.export import SCANNERS, check_rewriting, rewrite_program
-from pisigma.files.errors import OutputError, nearest_choice
+from pisigma.files.errors import OutputError, Place, check_choice
 from pisigma.measurement.csv.poses import read_poses
 from pisigma.model.inverse.corrected_ik import load
 from pisigma.planning.plan_file import joint_columns
@@ -25,7 +25,7 @@ POSE_COLUMNS = tuple(in_file_units(FRAME_COLUMNS, np.zeros(6)))
 
 
 def sentences(targets: Targets) -> tuple[str, ...]:
-    """What stands on top of the table."""
+    """Return the comments at the top of the table."""
     frames = {
         part: ", ".join(
             f"{column} {value + 0.0:.9g}"
@@ -35,20 +35,20 @@ def sentences(targets: Targets) -> tuple[str, ...]:
     }
     return (
         targets.title,
-        "q: joint values to command, with the zeros and directions of the description of that robot.",
-        "x to yaw: where the nominal robot stands at q, FK_nominal(q): what a controller that computes with the robot "
-        "as drawn has to be commanded, on this base and with this tool. Rotation = RotZ(roll) RotY(pitch) RotX(yaw).",
-        f"Nominal robot: {targets.robot.name} as drawn; base: {frames['base']}; tool: {frames['tool']}.",
-        "sigma: predicted standard deviation of the position reached; empty where it is not known.",
+        "q: joint values to command, with the zeros and directions of the robot description.",
+        "x to yaw: pose of the nominal robot at q, FK_nominal(q), to command to a controller that computes with the "
+        "nominal robot, this base and this tool. Rotation = RotZ(roll) RotY(pitch) RotX(yaw).",
+        f"Nominal robot: {targets.robot.name}; base: {frames['base']}; tool: {frames['tool']}.",
+        "sigma: predicted standard deviation of the reached position; empty if it is not known.",
         *targets.remarks,
     )
 
 
 def targets_csv(targets: Targets) -> str:
-    """One row a pose; the values of a pose without target are empty.
+    """Write one row per pose; the values of a pose without a target are empty.
 
-    Columns are line (in the file of poses), status, branch, the joint values to command, the pose that the
-    nominal robot takes there, and the predicted accuracy (1 sigma).
+    Columns are line (in the file of poses), status, branch, the joint values to command, the nominal robot's pose at
+    these, and the predicted accuracy (1 sigma).
     """
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
@@ -56,7 +56,7 @@ def targets_csv(targets: Targets) -> str:
     turns = torch.tensor([axis.type == "revolute" for axis in targets.robot.axes])
     q = torch.where(turns, torch.rad2deg(targets.q), targets.q * 1e3)
     pose = millimetres_and_euler(targets.T)
-    # The angles of a matrix of NaN are finite where the functions are made safe, so the gaps come from q.
+    # The safe angle functions return finite angles for a matrix of NaN, so the gaps are taken from q.
     pose = torch.where(torch.isfinite(q).all(-1, keepdim=True), pose, torch.nan)
     values = torch.cat([q, pose, targets.deviation[:, None] * 1e3], -1).tolist()
     for line, status, branch, row in zip(targets.line, targets.status, targets.branch, values, strict=True):
@@ -67,36 +67,48 @@ def targets_csv(targets: Targets) -> str:
 
 def _check(request: ExportRequest) -> None:
     if request.poses is not None and request.program is not None:
-        raise OutputError("--poses and --program both name poses to make targets for; give one of them.")
+        raise OutputError("cannot be combined with --program", option="--poses", remedy="give one of them")
     if request.poses is None and request.program is None:
         raise OutputError(
-            "--format targets needs the poses to make them for; give them with --poses, or a --program that has them."
+            "--format targets needs poses", option="--poses", remedy="give --poses, or a --program with poses"
         )
     if request.program is not None:
         check_rewriting(request)
     elif request.out.suffix.lower() in set(SCANNERS) - set(LANGUAGES):
-        raise OutputError(f"{request.out}: is written with --program only; take a .csv file or a program.")
+        raise OutputError(
+            "this kind of file is written with --program only",
+            option="--out",
+            value=request.out.suffix,
+            at=Place(request.out),
+            remedy="choose a .csv file or a program",
+        )
     elif request.frames is not None or request.tolerance_mm is not None:
-        raise OutputError("--frames and --tolerance-mm go with --program; leave them out.")
+        option = "--frames" if request.frames is not None else "--tolerance-mm"
+        raise OutputError("is an option of --program", option=option, remedy="leave it out")
 
 
 def _check_options(request: ExportRequest) -> None:
-    """Refuse options that do not go together."""
+    """Check that options can be combined."""
     kind = request.targets
-    if kind is not None and kind not in KINDS:
-        raise OutputError(f"--targets '{kind}' is unknown; {nearest_choice(kind, KINDS)}")
+    if kind is not None:
+        check_choice(OutputError, "--targets", kind, KINDS)
     if request.as_csv:
         for name, value in (("--targets", kind), ("--config", request.config)):
             if value is not None:
-                raise OutputError(f"{name} goes with a program; a .csv file holds all targets. Leave it out.")
+                raise OutputError(
+                    "is an option of programs; a .csv file includes all targets",
+                    option=name,
+                    value=value,
+                    remedy="leave it out",
+                )
 
 
 def _write(request: ExportRequest) -> Exported:
-    """Make the targets, and say what about them is in doubt."""
+    """Make the targets, with warnings."""
     if request.program is not None:
         return rewrite_program(request)
     _check_options(request)
-    assert request.poses is not None  # checked before
+    assert request.poses is not None  # checked in `_check`
     table, cartesian = request.as_csv, request.targets == "cartesian"
     solver = load(request.model)
     if request.conditions:
@@ -117,8 +129,8 @@ def _write(request: ExportRequest) -> Exported:
             "rows": len(targets.line),
             "statuses": dict(statuses),
         },
-        doubts=(
-            *([targets.doubt] if targets.doubt else []),
+        warnings=(
+            *([targets.domain_warning] if targets.domain_warning else []),
             *(() if table else cautions(request.out, cartesian)),
         ),
         summary=f"Targets for {len(targets.line)} poses",

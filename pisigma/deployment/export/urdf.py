@@ -1,4 +1,4 @@
-"""The calibrated geometry as URDF: the file that the robot was drawn in with other numbers, else a new one."""
+"""The calibrated geometry as URDF: the robot's file with calibrated origins, or a new file."""
 
 import os
 import re
@@ -8,7 +8,7 @@ import numpy as np
 
 from pisigma.deployment.export.export_format import Exported, ExportFormat, ExportRequest, model_facts
 from pisigma.deployment.export.geometry import check_geometry, chosen_geometry
-from pisigma.files.errors import OutputError, RobotError
+from pisigma.files.errors import OutputError, Place, RobotError
 from pisigma.files.model_files import DRAWING
 from pisigma.robot.description import Robot
 from pisigma.robot.drawing import Drawing
@@ -32,16 +32,21 @@ _SOURCE = re.compile(re.escape(URDF_SOURCE) + r".+, from link '(?P<base>.*)' to 
 CALIBRATED_FRAME = "calibrated_frame"
 CALIBRATED_TOOL = "calibrated_tool"
 MISSING = (
-    f"Masses, inertias, efforts and velocities that the file lacked or had as 0 are placeholders ({MASS} kg, "
-    f"{INERTIA} kg m2, {EFFORT}, {VELOCITY}), in {{links}}. Put in the maker's before you simulate forces."
+    f"Masses, inertias, efforts and velocities that were missing or 0 in the file are placeholders ({MASS} kg, "
+    f"{INERTIA} kg m2, {EFFORT}, {VELOCITY}), in {{links}}. Enter the maker's values before you simulate forces."
 )
 SAME = 1e-9
-"""Largest difference [m or rad] of rows that are taken for those of the file."""
+"""[m or rad] Largest difference of rows that count as those of the file."""
 
 
 def _check(request: ExportRequest) -> None:
     if request.tip is not None and request.like is None:
-        raise OutputError("--tip names a link of the file that --like gives; give both or none.")
+        raise OutputError(
+            "is a link of the file of --like",
+            option="--tip",
+            value=request.tip,
+            remedy="give both options or none",
+        )
     check_geometry(request)
 
 
@@ -52,20 +57,20 @@ def _write(request: ExportRequest) -> Exported:
         chosen.robot, chosen.said
     )
     facts = model_facts(model) | {"geometry": chosen.name}
-    return Exported(text, facts, chosen.said, doubts=_doubts(request, model.robot, text))
+    return Exported(text, facts, chosen.said, warnings=_warnings(request, model.robot, text))
 
 
 def drawn_into(request: ExportRequest, robot: Robot, nominal: Robot, said: tuple[str, ...]) -> str | None:
-    """A robot in the URDF file of --like, or else in the one that it was drawn in, which the model folder holds.
+    """Write a robot into the URDF file of --like, or by default into the one that the model folder includes.
 
     Args:
-        request: the model and the options.
-        robot: with the geometry to write.
-        nominal: the robot of the model, whose `source` names the links.
+        request: model and options.
+        robot: robot with the geometry to write.
+        nominal: robot of the model, whose `source` names the links.
         said: sentences for the head of the file.
 
     Returns:
-        The text; None where there is no such file.
+        The text; None without such a file.
     """
     drawn = _SOURCE.search(nominal.source)
     like = request.like or (request.model / DRAWING if nominal.urdf else None)
@@ -75,20 +80,20 @@ def drawn_into(request: ExportRequest, robot: Robot, nominal: Robot, said: tuple
     return robot_into_urdf(robot, nominal, like, request.tip or tip, said, base)
 
 
-def _doubts(request: ExportRequest, nominal: Robot, text: str) -> tuple[str, ...]:
-    """What to say of the other content of the file."""
+def _warnings(request: ExportRequest, nominal: Robot, text: str) -> tuple[str, ...]:
+    """Return warnings about the other content of the file."""
     if _SOURCE.search(nominal.source) and request.like is None and nominal.urdf is None:
         return (
-            "The model was made before models kept the URDF file of their robot: with --like FILE its links, meshes, "
-            "masses and limits stay; this file has placeholders.",
+            "The model was made by a version that did not store the URDF file of the robot: use --like FILE to keep "
+            "its links, meshes, masses and limits; this file has placeholders.",
         )
     meshes = re.findall(r'<mesh\s[^>]*filename="([^":]+)"', text)
     lost = [name for name in meshes if not (request.out.parent / name).is_file()]
     if not lost:
         return ()
     return (
-        f"{len(lost)} meshes that the file names by their path from it, such as {lost[0]}, are not there; put it where "
-        "they are, or simulators that read meshes refuse it.",
+        f"{len(lost)} meshes that the file names by relative paths, such as {lost[0]}, do not exist; write the file to "
+        "the folder of the meshes, otherwise simulators that read meshes reject it.",
     )
 
 
@@ -103,25 +108,24 @@ def robot_into_urdf(
     comments: tuple[str, ...] = (),
     base: str | None = None,
 ) -> str:
-    """The file with the origins of a calibrated robot; links, meshes, limits and all else stay.
+    """Return the file with the origins of a calibrated robot; links, meshes, limits and all else are kept.
 
-    Every joint after the first stands in the link before it where the calibration has it. Links keep their
-    places at the joints that carry them, so meshes still fit. Two links are added: `calibrated_frame`, the
-    parent of the base, is the frame that the model's poses are given in, and
-    `calibrated_tool`, a child of the tip, is the model's tool; from one to the other the forward kinematics is the
-    calibrated robot's. Masses, inertias, efforts and velocities that the file lacks, or has as 0, are placeholders, as
-    simulators refuse files without; a comment says so.
+    Every joint after the first has its calibrated pose in the preceding link. Links keep their poses relative to their
+    joints, so that meshes still fit. Two links are added: `calibrated_frame`, the parent of the base, is the frame of
+    the model's poses, and `calibrated_tool`, a child of the tip, is the model's tool; the forward kinematics between
+    them is that of the calibrated robot. Masses, inertias, efforts and velocities that are missing or 0 become
+    placeholders, as simulators require them; a comment says so.
 
     Args:
-        calibrated: the robot as identified.
-        nominal: the robot as loaded from the file, base and tool apart.
-        path: the file.
-        tip: the link that was the tool.
+        calibrated: robot with identified geometry.
+        nominal: robot as loaded from the file, except for base and tool.
+        path: URDF file.
+        tip: link that was the tool.
         comments: sentences to write at the top.
-        base: the link that poses were given in; the root where None is stated.
+        base: link of the frame of poses; None for the root.
 
     Raises:
-        RobotError: the file cannot be used, or is of another robot.
+        RobotError: the file cannot be used, or describes another robot.
     """
     from lxml import etree
 
@@ -152,35 +156,43 @@ def robot_into_urdf(
 
 
 def _check_same(drawn: Drawing, nominal: Robot, path: str) -> None:
-    """Refuse a file of another robot."""
+    """Raise an error if a file describes another robot."""
     kinds, wanted = ([(row.name, row.type, row.direction) for row in r.rows] for r in (drawn, nominal))
     if kinds != wanted:
         joints, other = (", ".join(row.name for row in r.rows) for r in (drawn, nominal))
         raise RobotError(
-            f"{path}: has the joints {joints}, but the model those of {other}; give the file that the robot was "
-            "loaded from, and the same tip."
+            f"expected the joints {other} of the model, got {joints}",
+            expected=f"the joints {other}",
+            value=joints,
+            at=Place(path),
+            option="--like",
+            remedy="give the file that the robot was loaded from, and the same tip",
         )
     far = float(np.abs(drawn.dh - nominal.dh)[:-1].max(initial=0.0))
     if far > SAME:
         raise RobotError(
-            f"{path}: its nominal geometry is not the model's (off by {far:.2g} m or rad); give the file that the "
-            "robot was loaded from."
+            f"the nominal geometry differs from that of the model by {far:.2g} m or rad",
+            expected="the nominal geometry of the model",
+            value=far,
+            at=Place(path),
+            option="--like",
+            remedy="give the file that the robot was loaded from",
         )
 
 
 def _new_origins(chain: Chain, rows: ChainRows, calibrated: Robot, urdf: Any) -> dict[str, Frame]:
-    """Origins of the joints that move, in the links before them; that of the first stays."""
+    """Compute the origins of the movable joints in the preceding links, except for the first."""
     origins: dict[str, Frame] = {}
     for i, joint in enumerate(chain.joints[1:], 1):
         whole = rows.frames[i - 1] @ row_frame(*calibrated.dh[i - 1].tolist()) @ inverse(rows.frames[i])
-        # Fixed joints between the two stay; what is before the joint's own origin is their product.
+        # Fixed joints in between are kept; their product precedes the joint's own origin.
         before = joint.origin @ inverse(origin_of(urdf.joint_map[joint.name]))
         origins[joint.name] = inverse(before) @ whole
     return origins
 
 
 def _widen_limits(elements: dict[str, Any], nominal: Robot) -> None:
-    """Widen limits of the file that the rows of a calibration exceeded, as those of the model were."""
+    """Widen limits of the file that calibration rows exceeded, like those of the model."""
     for axis in nominal.axes:
         limit = next(elements[axis.name].iterchildren("{*}limit"), None)
         if limit is None or limit.get("lower") is None or limit.get("upper") is None:
@@ -192,7 +204,7 @@ def _widen_limits(elements: dict[str, Any], nominal: Robot) -> None:
 
 
 def _fill_in(root: Any) -> tuple[str, ...]:
-    """Put placeholders where what a simulator asks for is missing or 0; gives the links and joints that got some."""
+    """Fill in placeholders for missing or zero values that simulators require, and return the links and joints."""
     from lxml import etree
 
     links = {element.get("name"): element for element in root.iterchildren("{*}link")}
@@ -225,7 +237,7 @@ def _link_of(joint: Any, end: str) -> str:
 
 
 def _has_mass(link: Any) -> bool:
-    """Whether a link has a mass and an inertia that a simulator takes."""
+    """Return whether a link has a mass and an inertia that a simulator accepts."""
     mass, inertia = (next(link.iterfind(f"{{*}}inertial/{{*}}{name}"), None) for name in ("mass", "inertia"))
     if mass is None or inertia is None:
         return False
@@ -250,7 +262,7 @@ def _set_origin(element: Any, origin: Frame) -> None:
 
 
 def _add_link(root: Any, name: str, parent: str | None = None, origin: Frame | None = None) -> str:
-    """A link with a fixed joint to its parent, where it has one; gives its name."""
+    """Add a link, with a fixed joint to its parent if there is one, and return its name."""
     from lxml import etree
 
     name = unused_name(name, {element.get("name") for element in root.iterchildren("{*}link")})
@@ -261,7 +273,7 @@ def _add_link(root: Any, name: str, parent: str | None = None, origin: Frame | N
 
 
 def _add_joint(root: Any, name: str, links: tuple[str, str], origin: Frame) -> None:
-    """A fixed joint, named by a link, from the first of two links to the second."""
+    """Add a fixed joint, named after a link, from the first of two links to the second."""
     from lxml import etree
 
     joints = {element.get("name") for element in root.iterchildren("{*}joint")}

@@ -1,4 +1,4 @@
-"""What a controller's own file is: what it can hold, how it is written and read, and what it gives up."""
+"""Files of robot controllers: which parameters they have, how they are written and read, and their loss of accuracy."""
 
 import re
 from collections.abc import Callable, Sequence
@@ -21,13 +21,13 @@ _NUMBER = r"-?\d+(?:\.\d+)?(?:e[-+]?\d+)?"
 
 @dataclass(frozen=True)
 class FileText:
-    """What the text of a file is made from.
+    """Data from which the text of a file is written.
 
     Attributes:
-        robot: with the geometry that the file is to hold.
-        nominal: the robot as the controller has it without the file.
-        request: the model, the file and the options.
-        said: sentences for its comments.
+        robot: robot with the geometry for the file.
+        nominal: robot of the controller without the file.
+        request: model, file and options.
+        said: sentences for the comments of the file.
     """
 
     robot: Robot
@@ -38,12 +38,12 @@ class FileText:
 
 @dataclass(frozen=True, eq=False)
 class Frames:
-    """How the frames of a controller lie to those that a robot is drawn in.
+    """Frames of a controller relative to those of a robot description.
 
     Attributes:
-        said: it as a sentence.
-        base: the controller's base frame in the frame of the drawing's poses, as `FRAME_COLUMNS`.
-        tool: the drawing's tool on the controller's flange.
+        said: a sentence that states them.
+        base: the controller's base frame in the frame of the description's poses, as `FRAME_COLUMNS`.
+        tool: the description's tool relative to the controller's flange.
     """
 
     said: str
@@ -51,20 +51,20 @@ class Frames:
     tool: Float64[np.ndarray, " 6"]
 
     def to_json(self) -> dict[str, object]:
-        """The plain values for `--json`."""
+        """Return plain values for `--json`."""
         parts = {part: in_file_units(FRAME_COLUMNS, getattr(self, part)) for part in ("base", "tool")}
         return {"said": self.said, **parts}
 
 
 @dataclass(frozen=True, eq=False)
 class Convention:
-    """How a controller has a robot.
+    """A controller's description of a robot.
 
     Attributes:
-        nominal: the robot as the controller has it without the file, in its own frames and parameters.
-        frames: how these lie to the frames of the robot's drawing; None where they are the same.
-        published: values that the maker or a user published of this robot and that the file was tried against, with
-            their source; None where there are none.
+        nominal: robot of the controller without the file, in its frames and parameters.
+        frames: these frames relative to those of the robot description; None if they are the same.
+        published: values published by the maker or a user that the file was tested against, with their source; None
+            without such values.
     """
 
     nominal: Robot
@@ -73,12 +73,12 @@ class Convention:
 
     @property
     def remarks(self) -> tuple[str, ...]:
-        """What the file was tried against, and in which frames its poses are, as sentences."""
+        """Sentences on what the file was tested against, and on the frames of its poses."""
         tried = (
-            f"Reading and writing were tried against {self.published}."
+            f"Reading and writing were tested against {self.published}."
             if self.published
-            else f"No published values were found to try this file against for robot '{self.nominal.name}': compare "
-            "the controller's position with pisigma's at several joint values before you use it."
+            else f"No published values were found to test this file for robot '{self.nominal.name}': compare the "
+            "controller's position with that of pisigma at several joint values before you use it."
         )
         return (tried, self.frames.said) if self.frames else (tried,)
 
@@ -88,20 +88,19 @@ class ControllerFile:
     """One kind of file.
 
     Attributes:
-        name: what `--format` calls it.
-        contents: what a file holds, with its article.
-        suffixes: endings that its files may have.
-        source: where it is described, and where it was tried, as a sentence; see `untried`.
-        convention: how the controller has a robot that is drawn otherwise; raises a `PisigmaError` where it cannot have
-            it.
-        relies: sentences on what has to be true of the controller.
-        text: gives the text of a file.
-        read: gives the robot that a text says, from the nominal one; the second argument is the file's name. None where
-            the file holds base and tool too and is loaded as a robot file.
-        check: refuses robots that the file cannot hold; raises a `PisigmaError`.
-        parameters: indices into the flattened `Robot.dh` that the file can hold.
-        options: those of `OPTIONS` that it takes.
-        refuse: refuses requests before anything is loaded; raises a `PisigmaError`.
+        name: name of the `--format`.
+        contents: contents of a file, with an article.
+        suffixes: suffixes of its files.
+        source: a sentence on where the format is described and where it was tested; see `untried`.
+        convention: function for the controller's description of a robot; raises a `PisigmaError` if there is none.
+        relies: sentences on what the file requires of the controller.
+        text: function that returns the text of a file.
+        read: function from text, file name and nominal robot to the robot of a file. None if the file includes base and
+            tool and is loaded as a robot file.
+        check: function that raises a `PisigmaError` for robots that the file cannot describe.
+        parameters: function for the indices into the flattened `Robot.dh` that the file includes.
+        options: those of `OPTIONS` that the format accepts.
+        refuse: function that raises a `PisigmaError` for invalid requests before anything is loaded.
     """
 
     name: str
@@ -118,16 +117,16 @@ class ControllerFile:
     refuse: Callable[[ExportRequest], None] = lambda request: None
 
     def export_format(self) -> ExportFormat:
-        """The format of `pisigma export`."""
+        """Return the format of `pisigma export`."""
         return ExportFormat(
             self.name, self.contents, self.suffixes, self.write, self.options | CONDITIONS, self.refuse
         )
 
     def write(self, request: ExportRequest) -> Exported:
-        """Project the model on what the file can hold, and state what that gives up, judged by reading the file back.
+        """Project the model on the parameters of the file, and evaluate the loss of accuracy by reading the file back.
 
         Raises:
-            PisigmaError: the model cannot be loaded or projected, or the file cannot hold its robot.
+            PisigmaError: the model cannot be loaded or projected, or the file cannot describe its robot.
         """
         model = request.load()
         nominal = model.robot
@@ -142,10 +141,16 @@ class ControllerFile:
         lost, drawn = fit.departure(held), fit.departure(nominal)
         title = f"{self.contents[0].upper()}{self.contents[1:]} of model {model.name} (robot {nominal.name})."
         convention = self.convention(model.drawn or nominal)
-        said = [title, self.source, *convention.remarks, departure_sentence("This file is", lost, drawn)]
+        said = [
+            title,
+            self.source,
+            *convention.remarks,
+            departure_sentence("This file deviates", lost, drawn),
+        ]
         if corrects_joints(model):
             said.append(
-                "It holds no learned joint correction: its geometry is the one that comes nearest to both."
+                "It does not include a learned joint correction: its geometry is the nearest approximation of the "
+                "whole model."
             )
         said += [*self.relies, *condition_remarks(model), *frame_remarks(model)]
         facts = {"off_the_whole_model": asdict(lost), "robot_as_drawn": asdict(drawn)}
@@ -157,12 +162,12 @@ class ControllerFile:
 
 
 def untried(source: str) -> str:
-    """The sentence on a file that nobody could try."""
+    """Return the sentence on a file that was not tested on a controller."""
     return f"Written from the published description ({source}), not tried on a controller."
 
 
 def frame_sentences(robot: Robot) -> tuple[str, ...]:
-    """Base and tool as comments, which the files themselves cannot hold; `with_frames` reads them back."""
+    """Return base and tool as comments for files without them; `with_frames` reads them back."""
     sentences = []
     for part in ("base", "tool"):
         values = in_file_units(FRAME_COLUMNS, getattr(robot, part)).items()
@@ -171,7 +176,7 @@ def frame_sentences(robot: Robot) -> tuple[str, ...]:
 
 
 def with_frames(robot: Robot, text: str) -> Robot:
-    """The robot with the base and the tool that stand in the comments of a text; its own where there are none."""
+    """Return the robot with base and tool from the comments of a text, if there are any."""
     frames: dict[str, np.ndarray] = {}
     for part in ("base", "tool"):
         columns = in_file_units(FRAME_COLUMNS, np.zeros(6))
@@ -183,25 +188,31 @@ def with_frames(robot: Robot, text: str) -> Robot:
 
 
 def check_plain_joints(robot: Robot, kind: str, count: int | None = None) -> None:
-    """Refuse robots that have anything but joints in their rows, or other than so many that turn.
+    """Check that all rows of a robot are joints, and optionally their number and type.
 
     Args:
-        robot: the robot.
-        kind: what the file is called, for the complaint.
-        count: joints that are wanted, all turning and counting as their axes turn; None for any.
+        robot: robot to check.
+        kind: name of the file for messages.
+        count: expected number of joints, all revolute and not reversed; None for any.
 
     Raises:
-        RobotError: it is no such robot.
+        RobotError: the robot does not comply.
     """
     turning = sum(robot.revolute)
     if count is not None and ((turning, robot.dof) != (count, count) or (robot.directions < 0).any()):
         raise RobotError(
-            f"{kind} is for robots with {count} joints that turn and count as their axes do; robot '{robot.name}' has "
-            f"{turning} that turn and {robot.dof - turning} that slide, {int((robot.directions < 0).sum())} counted "
-            "the other way. Take another --format."
+            f"{kind} requires {count} revolute joints without reversed directions; robot '{robot.name}' has {turning} "
+            f"revolute and {robot.dof - turning} prismatic joints, {int((robot.directions < 0).sum())} of them "
+            "reversed",
+            value=robot.name,
+            expected=f"{count} revolute joints",
+            remedy="choose another --format",
         )
     if len(robot.rows) != robot.dof:
         raise RobotError(
-            f"{kind} has one row a joint; robot '{robot.name}' has {len(robot.rows) - robot.dof} fixed rows besides. "
-            "Take --format urdf or dh."
+            f"{kind} has one row per joint, but robot '{robot.name}' has {len(robot.rows) - robot.dof} additional "
+            "fixed rows",
+            value=robot.name,
+            expected="one row per joint",
+            remedy="choose --format urdf or dh",
         )

@@ -20,16 +20,16 @@ COLUMNS = ("counts_per_turn", "present_count", "new_count")
 
 @dataclass(frozen=True)
 class Counts:
-    """Zero positions of joints as an encoder counts.
+    """Zero positions of joints in encoder counts.
 
-    The controller has a joint at (encoder - count) / (counts per turn), so an offset that is added to the joint value
-    is taken from the count.
+    The controller computes a joint value as (encoder - count) / (counts per turn), so an offset that is added to the
+    joint value is subtracted from the count.
 
     Attributes:
-        per_turn: encoder counts for a turn of the joint, the gear in between included, or for 1 mm where it slides;
-            negative where the encoder counts the other way.
-        present: the counts that the controller has now.
-        new: those that it shall have.
+        per_turn: encoder counts per turn of the joint, including its gear, or per 1 mm of a prismatic joint; negative
+            if the encoder counts in the opposite direction.
+        present: present counts of the controller.
+        new: counts to enter.
     """
 
     per_turn: Float64[np.ndarray, " axes"]
@@ -37,23 +37,27 @@ class Counts:
     new: Int64[np.ndarray, " axes"]
 
     def offsets(self, robot: Robot) -> Float64[np.ndarray, " axes"]:
-        """The joint offsets [rad or m] that the new counts make."""
+        """Return the joint offsets [rad or m] that result from the new counts."""
         offsets: np.ndarray = (self.present - self.new) / self.per_turn * _unit(robot)
         return offsets
 
 
 def _unit(robot: Robot) -> Float64[np.ndarray, " axes"]:
-    """What one turn, or 1 mm, is [rad or m] per axis of the controller."""
+    """Return one turn or 1 mm in [rad or m] for every axis of the controller."""
     return np.where([axis.type == "revolute" for axis in robot.axes], 2 * np.pi, 1e-3)
 
 
 def write_counts(content: FileText) -> str:
-    """One line a joint with its offset and counts, then base and tool; the offset is that of whole counts."""
+    """Write one line per joint with its counts and the offset of the rounded counts, then base and tool."""
     nominal, robot, request = content.nominal, content.robot, content.request
     per_turn = _numbers(request.counts_per_turn, "counts-per-turn", nominal)
     present = _numbers(request.present_counts, "present-counts", nominal)
     if (present % 1).any() or not per_turn.all():
-        raise OutputError("--present-counts are whole numbers, and no --counts-per-turn is 0; correct them.")
+        raise OutputError(
+            "expected integers in --present-counts and no zero in --counts-per-turn",
+            option="--present-counts" if (present % 1).any() else "--counts-per-turn",
+            value=request.present_counts if (present % 1).any() else request.counts_per_turn,
+        )
     moved = offsets_between(nominal, robot) / _unit(nominal) * per_turn
     counts = Counts(per_turn, present.astype(np.int64), np.rint(present - moved).astype(np.int64))
     lines: list[dict[str, object]] = []
@@ -67,21 +71,22 @@ def write_counts(content: FileText) -> str:
 
 
 def _numbers(stated: str | None, option: str, robot: Robot) -> Float64[np.ndarray, " axes"]:
-    """Numbers of an option, one a joint."""
+    """Read the numbers of an option, one per joint."""
     try:
         values = np.array([float(word) for word in (stated or "").split(",")])
     except ValueError:
         values = np.array([np.nan])
     if len(values) != len(robot.axes) or not np.isfinite(values).all():
         raise OutputError(
-            f"--{option} '{stated}': {len(robot.axes)} numbers with commas between were wanted, one a joint of robot "
-            f"'{robot.name}'."
+            expected=f"{len(robot.axes)} comma-separated numbers, one per joint of robot '{robot.name}'",
+            value=stated or "",
+            option=f"--{option}",
         )
     return values
 
 
 def check_robot(robot: Robot) -> None:
-    """Refuse robots whose axes have no zeros of their own; see `joints_by_axes`."""
+    """Raise an error for robots whose axes have no separate zero positions; see `joints_by_axes`."""
     joints_by_axes(robot)
 
 
@@ -92,17 +97,18 @@ def _refuse(request: ExportRequest) -> None:
     ):
         if value is None:
             raise OutputError(
-                f"this format counts in pulses of the encoders and needs --{name}, one number a joint: give both "
-                "--counts-per-turn (pulses of the encoder for a turn of the joint, with the gear, or for 1 mm) and "
-                "--present-counts (those that the controller has now)."
+                "this format needs one number per joint in encoder counts",
+                option=f"--{name}",
+                remedy="give both --counts-per-turn (encoder counts per turn of the joint, including its gear, or "
+                "per 1 mm) and --present-counts (present counts of the controller)",
             )
 
 
 _SIGN = (
-    "The controller has to compute joint values as (encoder - count) / (counts per turn); try one joint first, and "
-    "give negative counts per turn where it moves the other way.",
-    "The file holds neither links nor angles between axes. Command the joint values of the controller as before; set "
-    "base and tool below on the controller.",
+    "The controller has to compute joint values as (encoder - count) / (counts per turn); test one joint first, and "
+    "give negative counts per turn if it moves in the opposite direction.",
+    "The file includes neither link lengths nor angles between axes. Command the joint values of the controller as "
+    "before; set the base and tool below on the controller.",
 )
 
 
@@ -126,13 +132,13 @@ EPSON = _file(
     "epson",
     "the home offsets of an Epson controller",
     "download.epson.biz/robots, SPEL+ language reference, Hofs and HofsJointAccuracy",
-    "Enter the new counts with Hofs (or HofsJointAccuracy), joint 1 first; its present values are those that Hofs "
-    "shows.",
+    "Enter the new counts with Hofs (or HofsJointAccuracy), joint 1 first; the present counts are those that Hofs "
+    "displays.",
 ).export_format()
 FANUC = _file(
     "fanuc-mastering",
     "the mastering counts of a FANUC controller",
     "industrialmonitordirect.com, Reset FANUC Extended Axis Master Count; position = (encoder - master count) * scale",
-    "Enter the new counts into $DMR_GRP[1].$MASTER_COUN, joint 1 first; its present values are those of that variable. "
-    "Counts per turn are the pulses of the motor's encoder times the gear ratio of the joint.",
+    "Enter the new counts into $DMR_GRP[1].$MASTER_COUN, joint 1 first; the present counts are those of that variable. "
+    "Counts per turn are the encoder counts per motor turn times the gear ratio of the joint.",
 ).export_format()

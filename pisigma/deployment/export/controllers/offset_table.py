@@ -1,4 +1,4 @@
-"""Tables of joint offsets that `pisigma export` writes, read back as a robot."""
+"""Reading of the tables of joint offsets that `pisigma export` writes."""
 
 import csv
 from collections.abc import Mapping
@@ -7,7 +7,7 @@ import numpy as np
 
 from pisigma.deployment.export.joint_offsets import joints_by_axes
 from pisigma.deployment.export.projection import joint_offsets
-from pisigma.files.errors import RobotError
+from pisigma.files.errors import Place, RobotError
 from pisigma.files.yaml_file import plain_content
 from pisigma.robot.description import Robot
 from pisigma.robot.robot_file import FrameSection
@@ -15,19 +15,21 @@ from pisigma.robot.row import Row
 
 
 def read_offsets(text: str, source: str, nominal: Robot) -> Robot:
-    """The robot that a table of joint offsets makes of the nominal one, with base and tool of the table.
+    """Apply a table of joint offsets to the nominal robot, with base and tool of the table.
 
-    The table is CSV or YAML as `--format offsets` writes it, or CSV with counts, which then say the offsets.
+    The table is CSV or YAML as written by `--format offsets`, or CSV with counts, which then determine the offsets.
 
     Raises:
-        RobotError: an entry is missing or no number, or the joints are not the robot's.
+        RobotError: an entry is missing or not a number, or the joints are not those of the robot.
     """
     entries = _csv_entries(text) if text.lstrip("# ").find("part,") >= 0 else _yaml_entries(text, source)
     joints = {str(entry.get("name")): entry for entry in entries if entry.get("part") == "joint"}
     if set(joints) != {axis.name for axis in nominal.axes}:
         names = ", ".join(axis.name for axis in nominal.axes)
         raise RobotError(
-            f"{source}: offsets of the joints {names} were wanted, got {', '.join(joints) or 'none'}."
+            expected=f"offsets of the joints {names}",
+            value=", ".join(joints) or "none",
+            at=Place(source),
         )
     offsets = np.array([_offset(axis, joints[axis.name], source) for axis in nominal.axes])
     dh = nominal.dh.copy()
@@ -49,7 +51,10 @@ def _yaml_entries(text: str, source: str) -> list[Mapping[str, object]]:
     content = plain_content(text, RobotError, source)
     joints = content.get("joints") if isinstance(content, dict) else None
     if not isinstance(joints, list) or not all(isinstance(joint, dict) for joint in joints):
-        raise RobotError(f"{source}: a table of joint offsets was wanted, as --format offsets writes it.")
+        raise RobotError(
+            expected="a table of joint offsets as written by --format offsets",
+            at=Place(source, column="joints"),
+        )
     frames = [
         {"part": part, **content[part]} for part in ("base", "tool") if isinstance(content.get(part), dict)
     ]
@@ -57,7 +62,7 @@ def _yaml_entries(text: str, source: str) -> list[Mapping[str, object]]:
 
 
 def _offset(axis: Row, entry: Mapping[str, object], source: str) -> float:
-    """The offset [rad or m], of the counts where there are some."""
+    """Return the offset [rad or m], from the counts if there are some."""
     turn, millimetre = 2 * np.pi, 1e-3
     if entry.get("new_count"):
         present, new, per_turn = (
@@ -80,6 +85,9 @@ def _number(entry: Mapping[str, object], column: str, source: str) -> float:
         value = np.nan
     if not np.isfinite(value):
         raise RobotError(
-            f"{source}: {column} of {entry.get('name', entry.get('part'))} is no finite number; correct it."
+            f"expected a finite number for {entry.get('name', entry.get('part'))}, got {entry.get(column)!r}",
+            expected="a finite number",
+            value=entry.get(column),
+            at=Place(source, column=column),
         )
     return value

@@ -1,4 +1,4 @@
-"""Controllers' own files read back as robots."""
+"""Reading of controllers' files as robots."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -12,16 +12,16 @@ from pisigma.deployment.export.controllers.controller_file import (
 )
 from pisigma.deployment.export.controllers.offset_table import read_offsets
 from pisigma.deployment.export.projection import Departure, departure_from_drawn
-from pisigma.files.errors import RobotError
+from pisigma.files.errors import Place, RobotError
 from pisigma.files.input_file import read_text
 from pisigma.robot.description import Robot
 
 MAX_CHANGE = 5.0
-"""Mean distance [mm] of the tool from that of the nominal robot, on the same base, that a calibration makes at most: of
-five published ones of Universal Robots 4.2 mm is the largest."""
+"""[mm] Largest plausible mean distance between the tools of a calibrated and the nominal robot on the same base; the
+largest of five published calibrations of Universal Robots is 4.2 mm."""
 
 LEVER = 0.1
-"""[m] So far from the flange the distance holds, too: a turned flange moves no other point."""
+"""[m] The limit also applies to points at this distance from the flange, so that rotations of the flange count too."""
 
 READERS: dict[str, ControllerFile | None] = {
     ".conf": universal_robots.FILE,
@@ -30,19 +30,18 @@ READERS: dict[str, ControllerFile | None] = {
     ".yaml": None,
     ".yml": None,
 }
-"""By the suffix of the file, which is of a maker or, where it is None, a table of pisigma; the kinematics of a ROS
-driver are YAML too."""
+"""Maker's file by suffix; None for tables of pisigma. The kinematics of a ROS driver are YAML too."""
 
 
 @dataclass(frozen=True, eq=False)
 class ControllerReading:
-    """What a controller's own file says.
+    """Result of reading a controller's file.
 
     Attributes:
-        robot: as the file makes it of the nominal one; its `source` names the file and the frames of its poses.
-        change: how far its tool is from that of the nominal robot, in the same frame.
-        frames: how the controller's frames lie to those of the nominal robot; None where they are the same.
-        remarks: where the kind of file is described, what it was tried against, and in which frames poses are.
+        robot: nominal robot with the parameters of the file; its `source` names the file and the frames of its poses.
+        change: distance of its tool from that of the nominal robot, in the same frame.
+        frames: the controller's frames relative to those of the nominal robot; None if they are the same.
+        remarks: sentences on the description of the format, its tests, and the frames of poses.
     """
 
     robot: Robot
@@ -52,46 +51,56 @@ class ControllerReading:
 
 
 def read_controller_file(path: Path, nominal: Robot, max_change: float = MAX_CHANGE) -> ControllerReading:
-    """The robot that a controller's own file makes of the nominal one.
+    """Read a controller's file as a robot.
 
-    Files are Universal Robots' calibration.conf and the kinematics YAML of their ROS driver, Staubli's arm.cfx, and
-    tables of joint offsets or counts that pisigma wrote. A file of xacro or URDF needs no nominal robot: load it with
-    `Robot.load`.
+    Supported files are calibration.conf of Universal Robots and the kinematics YAML of their ROS driver, Staubli's
+    arm.cfx, and tables of joint offsets or counts that pisigma wrote. Load xacro and URDF files, which need no nominal
+    robot, with `Robot.load`.
 
     Args:
-        path: the file.
-        nominal: the robot as the controller has it without the file; names and limits are taken from it, and base and
-            tool where the file has none.
-        max_change: mean distance [mm] of the two tools, and of points `LEVER` from them by their rotations, in the same
-            frame, above which the file is refused.
+        path: file to read.
+        nominal: robot of the controller without the file, for names and limits, and for base and tool if the file has
+            none.
+        max_change: largest accepted mean distance [mm] between the two tools in the same frame, and between points at
+            `LEVER` from them due to their rotations.
 
     Raises:
-        RobotError: the file cannot be read, is none of these, does not fit the robot, or changes it by more than
+        RobotError: the file cannot be read, is of another kind, does not match the robot, or changes it by more than
             `max_change`.
     """
     suffix = path.suffix.lower()
     if suffix not in READERS:
-        raise RobotError(f"{path}: a file of a controller was wanted, which ends in {', '.join(READERS)}.")
+        raise RobotError(
+            expected=f"a file of a controller with the suffix {', '.join(READERS)}",
+            value=suffix,
+            at=Place(path),
+        )
     text = read_text(path, RobotError, "text")
     kinematics = suffix != ".csv" and any(line.startswith("kinematics:") for line in text.splitlines())
     file = ur_ros.FILE if kinematics else READERS[suffix]
     read = read_offsets if file is None or file.read is None else file.read
     robot = read(text, str(path), nominal)
     convention = file.convention(nominal) if file else Convention(nominal)
-    # Base and tool that the file states belong to the poses, not to the calibration, which moves base and tool, too.
+    # The base and tool of the file define the frames of its poses and do not count as changes by the calibration.
     there = nominal.with_geometry(base=robot.base, tool=robot.tool)
     change = departure_from_drawn(robot, with_frames(convention.nominal, text) if file else there)
     if not max(change.mean_mm, LEVER * change.mean_mrad) <= max_change:
         raise RobotError(
-            f"{path}: expected a calibration that moves the tool by {max_change:g} mm and {max_change / LEVER:g} mrad "
-            f"in the mean at most, got {change.mean_mm:.4g} mm and {change.mean_mrad:.4g} mrad against robot "
-            f"'{nominal.name}'; check that --like is the robot of this file and that its units are radians and metres, "
-            "or state --max-change-mm."
+            f"expected a calibration that moves the tool by at most {max_change:g} mm and {max_change / LEVER:g} mrad "
+            f"on average, got {change.mean_mm:.4g} mm and {change.mean_mrad:.4g} mrad relative to robot "
+            f"'{nominal.name}'",
+            expected=f"a mean change of at most {max_change:g} mm",
+            value=change.mean_mm,
+            at=Place(path),
+            remedy="check that --like is the robot of this file and that its units are radians and metres, or state "
+            "--max-change-mm",
         )
     frames = convention.frames
     source = f"Read from {path.name} with the nominal robot '{nominal.name}'."
     source = f"{source} {frames.said}" if frames else source
     remarks = (
-        (file.source, *convention.remarks) if file else ("Tables of offsets and counts are pisigma's own.",)
+        (file.source, *convention.remarks)
+        if file
+        else ("Tables of offsets and counts are a format of pisigma.",)
     )
     return ControllerReading(replace(robot, source=source), change, frames, remarks)

@@ -1,4 +1,4 @@
-"""Staubli's `arm.cfx`: differences of DH parameters with beta, one element `DH` a joint in `dhOffset`."""
+"""Staubli's `arm.cfx`: differences of DH parameters including beta, one element `DH` per joint in `dhOffset`."""
 
 from typing import Any
 
@@ -12,7 +12,7 @@ from pisigma.deployment.export.controllers.controller_file import (
     untried,
     with_frames,
 )
-from pisigma.files.errors import RobotError
+from pisigma.files.errors import Place, RobotError
 from pisigma.files.input_file import read_input
 from pisigma.robot.description import Robot
 from pisigma.robot.row import DH_COLUMNS
@@ -20,12 +20,12 @@ from pisigma.robot.writing import comment_text
 
 ARRAY, ELEMENT, NAME = "DhArray", "DH", "dhOffset"
 ATTRIBUTES = ("theta", "d", "a", "b", "alpha", "beta")
-"""In the order of the maker; degrees and millimetres. b is a shift along y, which is 0 here."""
+"""In the maker's order, in degrees and millimetres. b is a shift along y, which is 0 here."""
 _FACTORS = np.array([np.pi / 180 if name in ("theta", "alpha", "beta") else 1e-3 for name in DH_COLUMNS])
 
 
 def write_arm(content: FileText) -> str:
-    """The element `dhOffset`, in the controller's own file where one is stated."""
+    """Write the element `dhOffset`, inside the controller's file if one is given."""
     from lxml import etree
 
     difference = (content.robot.dh - content.nominal.dh) / _FACTORS
@@ -49,25 +49,31 @@ def write_arm(content: FileText) -> str:
 
 
 def read_arm(text: str, source: str, nominal: Robot) -> Robot:
-    """The robot that an `arm.cfx` makes of the nominal one.
+    """Apply an `arm.cfx` to the nominal robot.
 
-    Base and tool are those of the comments that pisigma writes, else the nominal robot's.
+    Base and tool come from the comments that pisigma writes, else from the nominal robot.
 
     Raises:
-        RobotError: the file is no XML or holds no `dhOffset` of the robot's joints, or b is not 0.
+        RobotError: the file is not XML or has no `dhOffset` for the robot's joints, or b is not 0.
     """
     check_robot(nominal)
     elements = list(_array(_parse(text.encode(), source), source).iterchildren(ELEMENT))
     if len(elements) != nominal.dof:
         raise RobotError(
-            f"{source}: {NAME} has {len(elements)} joints, robot '{nominal.name}' {nominal.dof}."
+            f"expected {nominal.dof} joints of robot '{nominal.name}' in {NAME}, got {len(elements)}",
+            expected=f"{nominal.dof} joints",
+            value=len(elements),
+            at=Place(source),
         )
     dh = nominal.dh.copy()
     for row, element in zip(dh, elements, strict=True):
         values = {name: _number(element, name, source) for name in ATTRIBUTES}
         if values["b"]:
             raise RobotError(
-                f"{source}, line {element.sourceline}: b is not 0, which DH + Hayati rows cannot hold."
+                "expected b = 0, as DH + Hayati rows have no such parameter",
+                expected="0",
+                value=values["b"],
+                at=Place(source, element.sourceline, "b"),
             )
         row += np.array([values[name] for name in DH_COLUMNS]) * _FACTORS
     return with_frames(nominal.with_geometry(dh=dh), text)
@@ -80,14 +86,18 @@ def _parse(content: bytes, source: str) -> Any:
     try:
         return etree.fromstring(content, parser)
     except (etree.XMLSyntaxError, ValueError):
-        raise RobotError(f"{source}: is no whole XML file; give the controller's arm.cfx.") from None
+        raise RobotError(
+            expected="a complete XML file", at=Place(source), remedy="give the controller's arm.cfx"
+        ) from None
 
 
 def _array(root: Any, source: str) -> Any:
     array = next((element for element in root.iter(ARRAY) if element.get("name") == NAME), None)
     if array is None:
         raise RobotError(
-            f'{source}: holds no element <{ARRAY} name="{NAME}">; give the controller\'s arm.cfx.'
+            expected=f'an element <{ARRAY} name="{NAME}">',
+            at=Place(source),
+            remedy="give the controller's arm.cfx",
         )
     return array
 
@@ -98,12 +108,14 @@ def _number(element: Any, name: str, source: str) -> float:
     except ValueError:
         value = np.nan
     if not np.isfinite(value):
-        raise RobotError(f"{source}, line {element.sourceline}: {name} is no finite number; correct it.")
+        raise RobotError(
+            expected="a finite number", value=element.get(name), at=Place(source, element.sourceline, name)
+        )
     return value
 
 
 def check_robot(robot: Robot) -> None:
-    """Refuse robots that have anything but joints in their rows.
+    """Raise an error for robots with rows that are not joints.
 
     Raises:
         RobotError: there is a fixed row.
@@ -118,9 +130,9 @@ FILE = ControllerFile(
     source=untried("github.com/ros-industrial/staubli_experimental/issues/35"),
     relies=(
         "The controller adds these differences to its nominal DH parameters, which have to be those of this robot's "
-        "description. In which order it multiplies is not published; taken is RotZ(theta) Trans(a, b, d) RotX(alpha) "
-        "RotY(beta). Compare the controller's position with pisigma's at several joint values before you use it.",
-        "The file holds neither base nor tool: set them on the controller.",
+        "description. Its order of multiplication is not published; RotZ(theta) Trans(a, b, d) RotX(alpha) RotY(beta) "
+        "is assumed. Compare the controller's position with that of pisigma at several joint values before you use it.",
+        "The file includes neither base nor tool: set them on the controller.",
     ),
     text=write_arm,
     read=read_arm,

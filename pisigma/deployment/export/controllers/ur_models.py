@@ -1,4 +1,4 @@
-"""Universal Robots' own DH parameters, and where a drawing of an arm has their frames."""
+"""DH parameters of Universal Robots, and their frames relative to those of a robot description."""
 
 from dataclasses import dataclass
 
@@ -27,17 +27,17 @@ _D_AND_A = {
     "UR20": ((0.2363, 0.2010, 0.1593, 0.1543), (0.8620, 0.7287)),
     "UR30": ((0.2363, 0.2010, 0.1593, 0.1543), (0.6370, 0.5037)),
 }
-"""Of the UR30 from UniversalRobots/Universal_Robots_ROS2_Description, config/ur30/default_kinematics.yaml.
+"""By model, d of the joints 1, 4, 5 and 6, and minus a of the joints 2 and 3 [m].
 
-By model d of the joints 1, 4, 5 and 6, and how much shorter than 0 a of the joints 2 and 3 is [m]."""
+The UR30 is from UniversalRobots/Universal_Robots_ROS2_Description, config/ur30/default_kinematics.yaml."""
 _ALPHA = np.array([1.0, 0.0, 0.0, 1.0, -1.0, 0.0]) * np.pi / 2
 
 FARTHEST = 5e-3
-"""Mean distance [m] of the tool from that of a model up to which a drawing may be of it: factory calibrations move it
-by 1 to 4 mm, and the models differ by 10 mm and more."""
+"""[m] Largest mean distance of the tool up to which a description belongs to a model: factory calibrations move it by 1
+to 4 mm, and the models differ by 10 mm and more."""
 _EXACT = 1e-9
 _NEAR_ANGLE, _NEAR_LENGTH = np.deg2rad(0.5), 0.01
-"""Frames of a calibrated robot that are as near to right angles [rad] and to the origin [m] are taken for these."""
+"""Frames of a calibrated robot this close to right angles [rad] and to the origin [m] are rounded to these."""
 _POSES = 200
 
 
@@ -51,20 +51,20 @@ _USERS = {
     "UR10": "two calibrations and two positions of the driver's tests (ur_calibration/test/calibration_test.cpp)",
     "UR10e": "the calibration of the driver's documentation (ur_calibration/doc/algorithm.rst)",
 }
-"""By model whose values the files were tried against, besides `_DEFAULTS` of `_WITH_DEFAULTS`."""
+"""Published values by model that the files were tested against, in addition to `_DEFAULTS` of `_WITH_DEFAULTS`."""
 _WITH_DEFAULTS = frozenset(("UR3", "UR3e", "UR5", "UR5e", "UR10", "UR10e"))
 
 
 @dataclass(frozen=True, eq=False)
 class OwnGeometry:
-    """An arm as its controller computes it, `Π RotZ(theta + q) Trans(a, 0, d) RotX(alpha)`, from `base` to the flange.
+    """Geometry in the controller's convention, `Π RotZ(theta + q) Trans(a, 0, d) RotX(alpha)` from `base` to flange.
 
     Attributes:
-        model: the maker's name, such as "UR5e", or the robot's name where it is drawn in this way and not in the table.
-        robot: the nominal parameters, with the names and limits of the drawing.
-        T_drawn_base: maps the controller's frame `base` into the frame of the drawing's poses.
-        T_flange_tool: maps the drawing's tool into the controller's flange.
-        drawing: the robot as it is drawn.
+            model: the maker's name, for example "UR5e", or the robot's name if it is not in the table.
+            robot: nominal parameters, with the names and limits of the description.
+            T_drawn_base: maps the controller's frame `base` into the frame of the description's poses.
+            T_flange_tool: maps the description's tool into the controller's flange.
+            drawing: robot as described.
     """
 
     model: str
@@ -74,15 +74,15 @@ class OwnGeometry:
     drawing: Robot
 
     def origins(self, calibrated: Robot) -> tuple[list[Frame], Robot]:
-        """The frames of a calibrated robot's joints where the controller has them, each in the one before.
+        """Return the frames of a calibrated robot's joints in the controller's convention, each in the previous one.
 
-        A joint's frame may be moved along and about its axis without changing the motion, so the tool stays.
+        Shifting a joint's frame along and about its axis does not change the motion, so the tool stays in place.
 
         Args:
-            calibrated: the drawing with other parameters, base and tool.
+            calibrated: the description with other parameters, base and tool.
 
         Returns:
-            The frames, the first in `base`, and the nominal robot with the base and the tool that belong to them.
+            The frames, the first in `base`, and the nominal robot with the base and tool that belong to them.
         """
         T_rows_base = inverse(frame_of(self.drawing.base)) @ self.T_drawn_base
         before, moved = T_rows_base, []
@@ -95,17 +95,17 @@ class OwnGeometry:
         return moved, self.robot.with_geometry(base=xyzrpy_of(base), tool=xyzrpy_of(tool))
 
     def _screws(self, T_rows_base: Frame) -> list[Frame]:
-        """By joint how far along and about its axis the controller has the frame that the drawing has elsewhere."""
+        """Return every joint's shift along and about its axis from the description's frame to the controller's."""
         drawn, own, screws = np.eye(4), T_rows_base, []
         origins, end = joint_origins(self.drawing)
         for drawn_origin, own_origin in zip(origins[:-1], joint_origins(self.robot)[0][:-1], strict=True):
             drawn, own = drawn @ drawn_origin, own @ own_origin
             screws.append(_screw(inverse(drawn) @ own))
-        # Behind the last joint is the flange and nothing else.
+        # After the last joint there is only the flange.
         return [*screws, _screw(end @ frame_of(self.drawing.tool) @ inverse(self.T_flange_tool))]
 
     def frames(self) -> Frames:
-        """What differs between the drawing's frames and the controller's."""
+        """Return the differences between the description's frames and the controller's."""
         base, tool = xyzrpy_of(self.T_drawn_base), xyzrpy_of(self.T_flange_tool)
         return Frames(self._said(), base, tool)
 
@@ -113,23 +113,23 @@ class OwnGeometry:
         base, tool = _frame_words(self.T_drawn_base), _frame_words(self.T_flange_tool)
         said = f"Poses are those of the {self.model}'s flange in the controller's frame 'base'"
         if not base and not tool:
-            return f"{said}, which are the frames of robot '{self.drawing.name}' too."
+            return f"{said}, which are also the frames of robot '{self.drawing.name}'."
         differences = [
             f"'base' is at {base} in the frame of its poses" if base else "",
             f"its tool is at {tool} on the flange" if tool else "",
         ]
-        return f"{said}; robot '{self.drawing.name}' is drawn otherwise: {' and '.join(filter(None, differences))}."
+        return f"{said}; robot '{self.drawing.name}' has other frames: {' and '.join(filter(None, differences))}."
 
 
 def _screw(T: Frame) -> Frame:
-    """What of a transform is along and about the z axis."""
+    """Return the part of a transform along and about the z axis."""
     angle = float(np.arctan2(T[1, 0] - T[0, 1], T[0, 0] + T[1, 1]))
     screw: Frame = turn(2, angle) @ shift(0.0, 0.0, float(T[2, 3]))
     return screw
 
 
 def _frame_words(T: Frame) -> str:
-    """A frame in words; "" where it is none."""
+    """Format a frame as text; "" for the identity."""
     x, y, z, *angles = xyzrpy_of(T)
     lengths = [f"{name} {value * 1e3:.6g} mm" for name, value in zip("xyz", (x, y, z), strict=True) if value]
     names = ("roll", "pitch", "yaw")
@@ -138,10 +138,10 @@ def _frame_words(T: Frame) -> str:
 
 
 def own_geometry(drawing: Robot) -> OwnGeometry:
-    """The model of Universal Robots that a robot is, as drawn or calibrated, and how the two lie to each other.
+    """Identify the model of Universal Robots that a nominal or calibrated robot belongs to, and their relative frames.
 
     Raises:
-        RobotError: it is none of those that are known.
+        RobotError: it is not a known model.
     """
     check_robot(drawing)
     candidates = [_placed(model, _robot(drawing, model), drawing) for model in _D_AND_A]
@@ -152,14 +152,17 @@ def own_geometry(drawing: Robot) -> OwnGeometry:
         plain = drawing.with_geometry(base=np.zeros(6), tool=np.zeros(6))
         return OwnGeometry(drawing.name, plain, frame_of(drawing.base), frame_of(drawing.tool), drawing)
     raise RobotError(
-        f"expected an arm of Universal Robots ({', '.join(_D_AND_A)}), got robot '{drawing.name}', whose tool is "
-        f"{distance * 1e3:.3g} mm from that of a {own.model} in the mean; for another of their arms give a robot file "
-        "in the maker's DH parameters (theta 0, a negative, alpha 90, 0, 0, 90, -90, 0 deg)."
+        f"expected an arm of Universal Robots ({', '.join(_D_AND_A)}), got robot '{drawing.name}', whose tool is on "
+        f"average {distance * 1e3:.3g} mm from that of a {own.model}",
+        expected="an arm of Universal Robots",
+        value=drawing.name,
+        remedy="for another of their arms give a robot file in the maker's DH parameters (theta 0, a negative, "
+        "alpha 90, 0, 0, 90, -90, 0 deg)",
     )
 
 
 def convention(drawing: Robot) -> Convention:
-    """How the controller has an arm, and what its files were tried against."""
+    """Return the controller's description of an arm, and the values that its files were tested against."""
     own = own_geometry(drawing)
     values = [_USERS[own.model]] if own.model in _USERS else []
     if own.model in _WITH_DEFAULTS:
@@ -168,16 +171,16 @@ def convention(drawing: Robot) -> Convention:
 
 
 def check_robot(robot: Robot) -> None:
-    """Refuse robots that the maker's files cannot hold.
+    """Raise an error for robots that the maker's files cannot describe.
 
     Raises:
-        RobotError: there are other than six joints that turn.
+        RobotError: the robot does not have exactly six joints, all revolute.
     """
     check_plain_joints(robot, "a file of Universal Robots", JOINTS)
 
 
 def _robot(drawing: Robot, model: str) -> Robot:
-    """The nominal robot of a model with the names and limits of a drawing."""
+    """Make the nominal robot of a model with the names and limits of a description."""
     (d_1, *wrist), (a_2, a_3) = _D_AND_A[model]
     dh = np.zeros((JOINTS, 5))
     dh[:, 1], dh[:, 2], dh[:, 3] = (d_1, 0, 0, *wrist), (0, -a_2, -a_3, 0, 0, 0), _ALPHA
@@ -185,7 +188,7 @@ def _robot(drawing: Robot, model: str) -> Robot:
 
 
 def _drawn_as_own(robot: Robot) -> bool:
-    """Whether a robot is drawn in the maker's way, with lengths of its own."""
+    """Return whether a robot is described in the maker's convention, with any lengths."""
     theta, _, a, alpha, beta = robot.dh.T
     return not (theta.any() or beta.any() or a[[0, 3, 4, 5]].any()) and bool(
         (a[[1, 2]] < 0).all() and np.allclose(alpha, _ALPHA, atol=1e-8)
@@ -193,7 +196,7 @@ def _drawn_as_own(robot: Robot) -> bool:
 
 
 def _placed(model: str, own: Robot, drawing: Robot) -> tuple[float, OwnGeometry]:
-    """A model laid on a drawing, and the mean distance [m] of their tools."""
+    """Align a model with a description, and return the mean distance [m] of their tools."""
     base, tool = _by_first_axes(own, drawing)
     q = torch.rand((_POSES, JOINTS), generator=torch.Generator().manual_seed(0), dtype=torch.float64) * 6 - 3
     T = forward_kinematics(drawing, q)
@@ -211,14 +214,14 @@ def _placed(model: str, own: Robot, drawing: Robot) -> tuple[float, OwnGeometry]
 
 
 def _by_first_axes(own: Robot, drawing: Robot) -> tuple[Frame, Frame]:
-    """The controller's base in a drawing's frame by axes 1 and 2, and the drawing's tool on the flange at zero."""
+    """Determine the controller's base from axes 1 and 2, and the description's tool on the flange at zero."""
     first, second = _zero_frames(drawing)[:2]
     z, across = first[:3, 2], second[:3, 2] - first[:3, 2] * (second[:3, 2] @ first[:3, 2])
     base = np.eye(4)
     if np.linalg.norm(across) > _EXACT:
         y = -across / np.linalg.norm(across)
         base[:3, :3] = np.column_stack([np.cross(y, z), y, z])
-    # the foot of the common normal of both axes: along the first as far as both are apart in the plane of the normal
+    # the foot of the common normal on the first axis
     apart = second[:3, 3] - first[:3, 3]
     along = apart @ z - (apart @ base[:3, 1]) * (second[:3, 2] @ z) / (second[:3, 2] @ base[:3, 1] or 1.0)
     base[:3, 3] = first[:3, 3] + (along - own.dh[0, 1]) * z
@@ -229,7 +232,7 @@ def _by_first_axes(own: Robot, drawing: Robot) -> tuple[Frame, Frame]:
 
 
 def _zero_frames(robot: Robot) -> list[Frame]:
-    """Frames of the joints where all are at 0, in the frame of poses."""
+    """Return the frames of the joints at zero joint values, in the frame of poses."""
     frames, last = [], frame_of(robot.base)
     for origin in joint_origins(robot)[0]:
         last = last @ origin
@@ -238,12 +241,12 @@ def _zero_frames(robot: Robot) -> list[Frame]:
 
 
 def _clean(T: Frame) -> Frame:
-    """A frame without rounding errors: right angles to 1e-9 rad, zeros to 1e-12 m."""
+    """Remove rounding errors from a frame: right angles to 1e-9 rad, zeros to 1e-12 m."""
     return frame_of(_rounded(xyzrpy_of(T), 1e-9, 1e-12))
 
 
 def _right(T: Frame) -> Frame:
-    """The frame that a calibrated robot's one was before, where that is one of right angles at the origin."""
+    """Return the frame before calibration, if that had right angles at the origin, else the frame itself."""
     values = xyzrpy_of(T)
     rounded = _rounded(values, _NEAR_ANGLE, _NEAR_LENGTH)
     quarters = rounded[3:] / (np.pi / 2)

@@ -1,4 +1,4 @@
-"""The kinematics YAML of Universal Robots' ROS driver: one transform a link, and the hash of the calibration."""
+"""The kinematics YAML of Universal Robots' ROS driver: one transform per link, and the hash of the calibration."""
 
 import numpy as np
 from pydantic import Field
@@ -21,11 +21,11 @@ from pisigma.robot.row import Bounded
 from pisigma.robot.urdf_frames import Frame, frame_of, shift, turn, xyzrpy_of
 
 COLUMNS = ("x", "y", "z", "yaw", "pitch", "roll")
-"""In the order of `frame_of`: the driver's roll is about x, pisigma's about z."""
+"""In the order of `frame_of`: the driver's roll is about x, that of pisigma about z."""
 
 
 class LinkSection(Section):
-    """A joint's frame in that of the joint before: x, y, z [m], then roll about x, pitch about y, yaw about z [rad]."""
+    """A joint's frame in that of the previous joint: x, y, z [m], roll about x, pitch about y, yaw about z [rad]."""
 
     x: Bounded = 0.0
     y: Bounded = 0.0
@@ -35,11 +35,11 @@ class LinkSection(Section):
     yaw: Bounded = 0.0
 
     def frame(self, as_urdf: bool) -> Frame:
-        """The frame.
+        """Return the frame.
 
         Args:
-            as_urdf: the rotation is `RotZ(yaw) · RotY(pitch) · RotX(roll)`, as URDF reads the numbers, else
-                `RotX(roll) · RotY(pitch) · RotZ(yaw)`, as the driver writes them.
+            as_urdf: whether the rotation is `RotZ(yaw) · RotY(pitch) · RotX(roll)`, as in URDF, or
+                `RotX(roll) · RotY(pitch) · RotZ(yaw)`, as the driver writes it.
         """
         if as_urdf:
             return frame_of([getattr(self, column) for column in COLUMNS])
@@ -62,7 +62,7 @@ class KinematicsSection(Section):
 
 
 class KinematicsDocument(Section):
-    """The whole file."""
+    """The complete file."""
 
     kinematics: KinematicsSection
 
@@ -71,11 +71,11 @@ LINKS = tuple(KinematicsSection.model_fields)[:JOINTS]
 
 
 ORDER = "Rotations are RotZ(yaw) RotY(pitch) RotX(roll), as URDF reads them."
-"""Sentence in the files of pisigma, by which it knows them."""
+"""Sentence by which files of pisigma are recognised."""
 
 
 def write_kinematics(content: FileText) -> str:
-    """The text of the file; what is behind the last joint goes into the tool of the comments."""
+    """Write the file; the frame after the last joint is part of the tool in the comments."""
     origins, own = own_geometry(content.nominal).origins(content.robot)
     links: dict[str, object] = {
         link: {column: float(value) + 0.0 for column, value in zip(COLUMNS, xyzrpy_of(origin), strict=True)}
@@ -86,17 +86,17 @@ def write_kinematics(content: FileText) -> str:
 
 
 def read_kinematics(text: str, source: str, nominal: Robot) -> Robot:
-    """The robot that the file describes, with the names and limits of the nominal one.
+    """Read the robot of the file, with the names and limits of the nominal one.
 
     The driver extracts angles in one order and URDF reads them in the other (ur_calibration/src/calibration.cpp,
-    `eulerAngles(0, 1, 2)`), which makes some 0.1 mm. The order is taken that gives the hash of the file; where none
-    does, URDF's if pisigma wrote the file, else the driver's.
+    `eulerAngles(0, 1, 2)`), which moves the tool by about 0.1 mm. The order that yields the hash of the file is used;
+    if neither does, that of URDF if pisigma wrote the file, else that of the driver.
 
-    Poses are those of the link `tool0` in the controller's frame `base` (the driver's `base_link_inertia`), or of the
-    tool and in the base of the comments that pisigma writes.
+    Poses are those of the link `tool0` in the controller's frame `base` (the driver's `base_link_inertia`), or with the
+    base and tool of the comments that pisigma writes.
 
     Raises:
-        RobotError: the file is no such YAML, or the robot has other joints.
+        RobotError: the file is not such a YAML file, or the robot has other joints.
     """
     own = own_geometry(nominal).robot
     links = parse_yaml(text, KinematicsDocument, RobotError, source).kinematics
@@ -108,10 +108,10 @@ def read_kinematics(text: str, source: str, nominal: Robot) -> Robot:
 
 
 def calibration_hash(robot: Robot) -> str:
-    """The driver's hash of DH parameters, which it compares with those of the robot that it connects to.
+    """Compute the driver's hash of DH parameters, which it compares with that of the connected robot.
 
-    `calib_` and the GNU C++ library's `std::hash` of theta, d, a and alpha of joint after joint as C++ streams print
-    them, to 6 digits and with nothing between.
+    It is `calib_` and the GNU C++ library's `std::hash` of theta, d, a and alpha of all joints as printed by C++
+    streams, with 6 digits and no separators.
     """
     text = "".join(
         f"{value + 0.0:g}" for theta, d, a, alpha, _ in robot.dh.tolist() for value in (theta, d, a, alpha)
@@ -123,7 +123,7 @@ _WORD = 2**64 - 1
 
 
 def _murmur_hash(data: bytes) -> int:
-    """MurmurHash64A (A. Appleby) with the GNU library's seed and its rounds, which differ in the shifts."""
+    """Compute MurmurHash64A (A. Appleby) with the GNU library's seed and shifts."""
     factor = 0xC6A4A7935BD1E995
 
     def mixed(value: int) -> int:
@@ -147,11 +147,11 @@ FILE = ControllerFile(
         "github.com/UniversalRobots/Universal_Robots_ROS2_Driver, ur_calibration/doc/algorithm.rst"
     ),
     relies=(
-        "The driver warns where the hash is not that of the robot it connects to: it is that of the calibration.conf "
-        "which --format ur-calibration writes of the same model.",
+        "The driver warns if the hash is not that of the connected robot; it is the hash of the calibration.conf that "
+        "--format ur-calibration writes for the same model.",
         ORDER,
-        "The file holds neither base nor tool: it leads from the controller's frame 'base' (the driver's link "
-        "base_link_inertia) to the link tool0. The lines 'base' and 'tool' below say where these two are.",
+        "The file includes neither base nor tool: it leads from the controller's frame 'base' (the driver's link "
+        "base_link_inertia) to the link tool0. The lines 'base' and 'tool' below state where these two are.",
     ),
     text=write_kinematics,
     read=read_kinematics,

@@ -1,4 +1,4 @@
-"""A xacro file that lays calibrated origins over a URDF: every origin is a property, and all else is the URDF's."""
+"""A xacro file with the calibrated origins of a URDF file as properties."""
 
 import re
 
@@ -9,7 +9,7 @@ from pisigma.robot.urdf_file import XACRO
 
 
 def with_properties(urdf: str) -> str:
-    """URDF text with the origins of its joints as properties on top."""
+    """Convert URDF text to xacro with the origins of its joints as properties at the top."""
     from lxml import etree
 
     root = etree.fromstring(urdf.encode())
@@ -29,15 +29,17 @@ def with_properties(urdf: str) -> str:
 
 
 def write_overlay(content: FileText) -> str:
-    """The text of the overlay over the URDF file that the nominal robot was loaded from.
+    """Write the xacro file from the URDF file that the nominal robot was loaded from.
 
     Raises:
-        OutputError: there is none.
+        OutputError: there is no such file.
     """
     urdf = drawn_into(content.request, content.robot, content.nominal, content.said)
     if urdf is None:
         raise OutputError(
-            "--format xacro lays origins over a URDF file; give the one of the robot with --like."
+            "--format xacro needs the URDF file of the robot",
+            option="--like",
+            remedy="give that file with --like",
         )
     return with_properties(urdf)
 

@@ -1,4 +1,4 @@
-"""The compiled inverse kinematics as a shared library with a header, and a model for it."""
+"""The compiled inverse kinematics as a shared library with a header, and a model file for it."""
 
 import os
 import platform
@@ -31,30 +31,31 @@ _OPTIONS = ("-std=c11", "-O2", "-Wall", "-Wextra", "-Werror", "-fPIC", "-shared"
 _HEAD = struct.Struct(f"=8s7Qq{2 * DOF}dQ8d")
 _WORD = 8
 _GAP = 16
-"""Words of zeros that are written rather than a new segment begun."""
+"""Runs of at most this many zero words are written instead of starting a new segment."""
 
 
 def _compiler() -> str:
-    """The compiler for C: that of the variable CC, or the first that there is.
+    """Find a C compiler: that of the environment variable CC, or the first available one.
 
     Raises:
-        OutputError: there is none.
+        OutputError: there is no compiler.
     """
     names = (os.environ["CC"],) if os.environ.get("CC") else _COMPILERS
     path = next(filter(None, map(shutil.which, names)), None)
     if path is None or os.name == "nt":
         raise OutputError(
-            f"the library is linked by a C compiler, but there is none ({', '.join(names)}); install gcc, or name "
-            "another compiler in the environment variable CC."
+            f"no C compiler was found to link the library ({', '.join(names)})",
+            value=names[0],
+            remedy="install gcc, or name another compiler in the environment variable CC",
         )
     return path
 
 
 def _link(code: bytes, compiler: str) -> bytes:
-    """The library of the kernels' object code.
+    """Link the kernels' object code to a library.
 
     Raises:
-        OutputError: the compiler fails; the message says why.
+        OutputError: the compiler fails; the message includes its output.
     """
     sources = Path(__file__).parent
     sizes = {
@@ -69,7 +70,7 @@ def _link(code: bytes, compiler: str) -> bytes:
         command += [str(sources / SOURCE), str(kernels), "-o", str(library), "-lm"]
         done = subprocess.run(command, capture_output=True, text=True, check=False)
         if done.returncode != 0:
-            raise OutputError(f"{compiler} cannot link the library: {done.stderr.strip()[-500:]}")
+            raise OutputError(f"{compiler} failed to link the library: {done.stderr.strip()[-500:]}")
         return library.read_bytes()
 
 
@@ -81,7 +82,7 @@ def _write(request: ExportRequest) -> Exported:
         LIBRARY: _link(library_object(describe(model)[0].forms), compiler),
     }
     remarks = (
-        f"The library is for {sys.platform} on {platform.machine()}; export it again for other machines.",
+        f"The library is for {sys.platform} on {platform.machine()}; export it again for other platforms.",
     )
     return Exported(content, {**model_facts(model), "files": sorted(content)}, remarks)
 
@@ -90,18 +91,18 @@ FORMAT = ExportFormat("library", "a C library", (), _write, frozenset(("payload_
 
 
 def layout_key() -> int:
-    """What ties a model file to the library that was exported with it: the first 64 bits of the sources' hash."""
+    """Return the first 64 bits of the sources' hash, by which a library recognises its model files."""
     return int(source_hash()[:16], 16)
 
 
 def model_file(model: CalibratedModel) -> bytes:
-    """Write a model as the library reads it, in the byte order of this machine.
+    """Return the model file of the library, in the byte order of this machine.
 
-    It is a head, the names of the branches, the parts of the struct that are not zero, and a checksum (CRC-32) of all
-    of it; see `pisigma_ik.c`.
+    It consists of a head, the names of the branches, the parts of the struct that are not zero, and a checksum (CRC-32)
+    of all these; see `pisigma_ik.c`.
 
     Raises:
-        ModelError: the model corrects by something that has no compiled form.
+        ModelError: the correction of the model has no compiled form.
     """
     compiled = CompiledIK.of(model)
     description, branches = compiled.description, compiled.branches
@@ -124,7 +125,7 @@ def model_file(model: CalibratedModel) -> bytes:
 
 
 def _segments(packed: np.ndarray) -> list[bytes]:
-    """The words that are not zero, in runs, each with the index of its first byte and its number of bytes."""
+    """Return the runs of nonzero words, each with the index of its first byte and its number of bytes."""
     words = packed.view(np.uint64).ravel()
     used = np.flatnonzero(words)
     runs = np.split(used, np.flatnonzero(np.diff(used) > _GAP) + 1)

@@ -1,1 +1,1 @@
-"""Corrected targets as a table and as programs for robot controllers."""
+"""Corrected targets as tables and as programs for robot controllers."""

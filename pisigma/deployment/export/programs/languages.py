@@ -1,4 +1,4 @@
-"""Controllers' languages: how programs are named and written, what they cannot hold, and the program for a file."""
+"""Languages of controllers: names and limits of programs, and writing them."""
 
 import functools
 import re
@@ -20,37 +20,34 @@ from pisigma.deployment.export.programs.text import (
     numbers,
     quaternion,
 )
-from pisigma.files.errors import OutputError
+from pisigma.files.errors import OutputError, Place
 from pisigma.files.templates import template_environment
 from pisigma.robot.description import Robot
 from pisigma.robot.kinematics.status import Status
 
-TEST = "TEST IT AT LOW SPEED FIRST: nothing was checked for collisions, neither the targets nor the ways between them."
-COUNTING = (
-    "Joint values count from the zeros and in the directions of the robot description '{robot}'; the controller has to "
-    "count the same."
-)
+TEST = "TEST IT AT LOW SPEED FIRST: neither the targets nor the motions between them were checked for collisions."
+COUNTING = "Joint values have the zeros and directions of the robot description '{robot}'; the controller has to use the same."
 CARTESIAN = (
-    "Poses are those that the robot as drawn takes at the corrected joint values: the controller has to compute with "
-    "the robot as drawn, and any accuracy option of its own has to be off.",
-    "Frame and tool are those of the model, as seen from the origin and from the last row of the robot description, "
-    "which have to be the controller's origin and flange.",
+    "Poses are those of the nominal robot at the corrected joint values: the controller has to compute with the "
+    "nominal robot, and its accuracy options have to be off.",
+    "Frame and tool are those of the model, relative to the origin and to the last row of the robot description, which "
+    "have to be the controller's origin and flange.",
 )
 
 
 @dataclass(frozen=True, eq=False)
 class Program:
-    """What a program is to hold: stops of a robot with six joints that turn.
+    """Content of a program: stops of a robot with six revolute joints.
 
     Attributes:
-        name: of the program.
-        robot: as drawn.
-        heading: sentences on what the program does and on what it relies.
+        name: name of the program.
+        robot: nominal robot.
+        heading: sentences on what the program does and requires.
         q: joint values of every stop [rad].
-        labels: what is said before the move to every stop.
-        waits: how long the robot waits at every stop [s]; 0 for not at all.
-        cartesian: the targets, where it holds poses instead of joint values; else None.
-        config: configuration of the arm in all poses, where the language wants one; else "".
+        labels: comment before the move to every stop.
+        waits: waiting time at every stop [s]; 0 for none.
+        cartesian: targets, if the program has poses instead of joint values; else None.
+        config: configuration of the arm in all poses, if the language requires one; else "".
     """
 
     name: str
@@ -64,10 +61,10 @@ class Program:
 
     @staticmethod
     def of_targets(targets: Targets, name: str, cartesian: bool, config: str = "") -> "Program":
-        """Give the program that goes to targets, of which none is missing."""
+        """Make the program that moves to targets, none of which may be missing."""
         said = [targets.title, TEST, COUNTING.format(robot=targets.robot.name)]
         said += [*CARTESIAN, *targets.remarks] if cartesian else []
-        said += [targets.doubt] if targets.doubt else []
+        said += [targets.domain_warning] if targets.domain_warning else []
         labels = [
             f"line {line}{' OUTSIDE DOMAIN' if status == Status.OUTSIDE_DOMAIN else ''}"
             for line, status in zip(targets.line, targets.status, strict=True)
@@ -85,20 +82,20 @@ class Program:
 
 @dataclass(frozen=True)
 class Language:
-    """One language.
+    """A language.
 
     Attributes:
-        name: of the language.
-        template: the file of the folder `templates` that lays its programs out.
-        longest: characters that a program's name may have.
-        reserved: words of the language that may be no name, in capitals.
-        line_end: what its lines end with.
-        most_lines: numbered lines that a program may have; None for any number.
-        keeps_branch: whether Cartesian targets may lie on several branches.
+        name: name of the language.
+        template: template of its programs in the folder `templates`.
+        longest: largest number of characters of a program's name.
+        reserved: words of the language that cannot be names, in capitals.
+        line_end: line ending.
+        most_lines: largest number of numbered lines of a program; None for any number.
+        keeps_branch: whether Cartesian targets may be on several branches.
         capitals: whether names are written in capitals.
-        configuration: what the arm's configuration looks like, where Cartesian targets need one.
-        cautions: what has to be known before a program is used, besides what is true of all languages.
-        cartesian_cautions: the same of Cartesian targets.
+        configuration: pattern of the arm's configuration, if Cartesian targets require one.
+        cautions: notes for the user of a program, in addition to those for all languages.
+        cartesian_cautions: the same for Cartesian targets.
     """
 
     name: str
@@ -114,10 +111,10 @@ class Language:
     cartesian_cautions: tuple[str, ...] = ()
 
     def program_name(self, path: Path) -> str:
-        """The program's name, which is that of its file.
+        """Return the program's name, which is that of its file.
 
         Raises:
-            OutputError: the language has no such names; the message proposes one that it has.
+            OutputError: the name is not valid in the language; the message proposes a valid one.
         """
         stem = path.stem.upper() if self.capitals else path.stem
         fits = re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", stem, re.ASCII) and len(stem) <= self.longest
@@ -127,16 +124,20 @@ class Language:
         other = other if other[:1].isalpha() else f"P{'_' if other else ''}{other}"
         other = f"P_{other}" if other.upper() in self.reserved else other
         raise OutputError(
-            f"{path}: the program is called as its file, and {self.name} takes names of letters, digits and _ "
-            f"that begin with a letter, have at most {self.longest} characters and are no word of its own; "
-            f"choose another --out, such as {other[: self.longest].rstrip('_')}{path.suffix}."
+            f"expected a file name that is a valid {self.name} program name: at most {self.longest} letters, digits "
+            "and _, with a letter first, and not a reserved word",
+            expected=f"a {self.name} program name of at most {self.longest} characters",
+            value=path.stem,
+            option="--out",
+            at=Place(path),
+            remedy=f"choose another name, such as {other[: self.longest].rstrip('_')}{path.suffix}",
         )
 
     def write(self, program: Program) -> str:
-        """The text of a program.
+        """Write the text of a program.
 
         Raises:
-            OutputError: it has more lines than the language takes.
+            OutputError: it has more lines than the language allows.
         """
         said = [*self.cautions, *(self.cartesian_cautions if program.cartesian else ())]
         content = {"program": program, "targets": program.cartesian, "cautions": said}
@@ -144,8 +145,11 @@ class Language:
         lines = len(_NUMBERED_LINE.findall(text))
         if self.most_lines is not None and lines > self.most_lines:
             raise OutputError(
-                f"the program {program.name} would have {lines} lines, of which a {self.name} controller takes "
-                f"{self.most_lines}; split the file of poses."
+                f"expected at most {self.most_lines} lines for a {self.name} controller, got {lines} in the program "
+                f"{program.name}",
+                expected=f"at most {self.most_lines} lines",
+                value=lines,
+                remedy="split the file of poses",
             )
         return text.replace("\n", self.line_end)
 
@@ -170,12 +174,12 @@ def _templates() -> jinja2.Environment:
 
 
 def words(text: str) -> frozenset[str]:
-    """Words of a language in capitals, for `Language.reserved`."""
+    """Split words of a language, in capitals, for `Language.reserved`."""
     return frozenset(text.upper().split())
 
 
 FILES_OF_SYSTEMS = words("con prn aux nul") | {f"{p}{i}" for p in ("COM", "LPT") for i in range(1, 10)}
-"""Names that some controllers' file systems keep for devices."""
+"""Names that some controllers' file systems reserve for devices."""
 
 URSCRIPT = Language(
     name="URScript",
@@ -188,8 +192,8 @@ URSCRIPT = Language(
     line_end="\n",
     keeps_branch=True,
     cartesian_cautions=(
-        "The controller computes poses with the lengths of its factory calibration where it has one, not with the "
-        "robot as drawn; joint targets do not depend on that.",
+        "The controller computes poses with its factory calibration if it has one, not with the nominal robot; joint "
+        "targets do not depend on that.",
     ),
 )
 KRL = Language(
@@ -209,7 +213,7 @@ KRL = Language(
 RAPID = Language(
     name="RAPID",
     template="rapid.j2",
-    longest=27,  # of 32, with _tool behind it
+    longest=27,  # of 32, with _tool appended
     reserved=words(
         "alias and backward bool case connect const default div do else elseif endfor endfunc endif endmodule endproc "
         "endrecord endtest endtrap endwhile error exit false for from func goto if inout local mod module nostepin not "
@@ -226,11 +230,11 @@ FANUC = Language(
     capitals=True,
     configuration=re.compile(r"[NF] ([LR] )?[UD] [TB], -?\d, -?\d, -?\d"),
     cautions=(
-        "On FANUC pendants J3 counts from the horizontal, so it changes with J2. The values here count as the joint "
-        "values of the model's measurements did; where those were angles between links, J3 has to be converted.",
+        "On FANUC pendants J3 is measured from the horizontal, so it changes with J2. The values here are defined like "
+        "the joint values of the model's measurements; if those were angles between links, J3 has to be converted.",
     ),
     cartesian_cautions=(
-        "UFRAME counts from the world frame, which on FANUC robots lies at the height of J2.",
+        "UFRAME is relative to the world frame, which on FANUC robots is at the height of J2.",
     ),
 )
 
@@ -239,35 +243,48 @@ LANGUAGES = {".script": URSCRIPT, ".src": KRL, ".mod": RAPID, ".ls": FANUC}
 
 
 def check_program(path: Path, robot: Robot, cartesian: bool, config: str | None) -> None:
-    """Make sure that a program can be written, before the targets are computed.
+    """Check that a program can be written before the targets are computed.
 
     Raises:
-        OutputError: the name of the file, the robot or the options do not do.
+        OutputError: the name of the file, the robot or the options are invalid.
     """
     language = LANGUAGES[path.suffix.lower()]
     language.program_name(path)
     turning = sum(axis.type == "revolute" for axis in robot.axes)
     if len(robot.axes) != 6 or turning != 6:
         raise OutputError(
-            f"{path}: {language.name} programs are written for robots with six joints that turn; robot "
-            f"'{robot.name}' has {turning} that turn and {len(robot.axes) - turning} that slide. Take a .csv file."
+            f"{language.name} programs require a robot with six revolute joints; robot '{robot.name}' has {turning} "
+            f"revolute and {len(robot.axes) - turning} prismatic joints",
+            expected="six revolute joints",
+            value=robot.name,
+            at=Place(path),
+            remedy="choose a .csv file",
         )
     needed = language.configuration if cartesian else None
     if needed is None:
         if config is not None:
             endings = " or ".join(suffix for suffix, other in LANGUAGES.items() if other.configuration)
-            raise OutputError(f"--config goes with a {endings} file and --targets cartesian; leave it out.")
+            raise OutputError(
+                f"is an option of {endings} files with --targets cartesian",
+                option="--config",
+                value=config,
+                remedy="leave it out",
+            )
     elif config is None:
         raise OutputError(
-            f"{path}: {language.name}'s Cartesian targets need the arm's configuration, which pisigma does not know; "
-            "give it as the pendant shows it, such as --config 'N U T, 0, 0, 0', or take --targets joints."
+            f"Cartesian targets of {language.name} require the arm's configuration, which pisigma does not know",
+            option="--config",
+            at=Place(path),
+            remedy="give it as displayed by the pendant, such as --config 'N U T, 0, 0, 0', or choose --targets joints",
         )
     elif not needed.fullmatch(config):
-        raise OutputError(f"--config '{config}': one such as 'N U T, 0, 0, 0' was wanted.")
+        raise OutputError(
+            expected="a configuration such as 'N U T, 0, 0, 0'", value=config, option="--config"
+        )
 
 
 def cautions(path: Path, cartesian: bool) -> tuple[str, ...]:
-    """What has to be known before a program is used, besides what is true of all of them."""
+    """Return notes for the user of a program, in addition to those for all programs."""
     language = LANGUAGES[path.suffix.lower()]
     return (*language.cautions, *(language.cartesian_cautions if cartesian else ()))
 
@@ -301,11 +318,13 @@ def program_text(targets: Targets, path: Path, cartesian: bool, config: str | No
 
 
 def _check_turns(targets: Targets) -> None:
-    """Refuse joint values that lie on several turns, as one configuration names one turn for all."""
+    """Check that all joint values have the same number of turns, as one configuration states it for all."""
     turns = torch.floor(targets.q / (2 * torch.pi) + 0.5)
     if len(turns) and bool((turns != turns[0]).any()):
         row = int((turns != turns[0]).any(-1).nonzero()[0, 0])
         raise OutputError(
-            f"{targets.source}, line {targets.line[row]}: a joint stands on another turn than in line "
-            f"{targets.line[0]}, so one --config does not fit both; take --targets joints or write two programs."
+            f"a joint has another number of turns than in line {targets.line[0]}, so one --config cannot describe both",
+            option="--config",
+            at=Place(targets.source, targets.line[row]),
+            remedy="choose --targets joints or write two programs",
         )

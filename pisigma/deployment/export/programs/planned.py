@@ -1,4 +1,4 @@
-"""Planned poses as programs: stops at every pose until it is measured, and by way points where the way is blocked."""
+"""Planned poses as programs that stop at every pose for its measurement and use way points around obstacles."""
 
 from pathlib import Path
 
@@ -9,20 +9,20 @@ from pisigma.deployment.export.programs.languages import COUNTING, LANGUAGES, Pr
 from pisigma.planning.plan_file import StoredPlan
 
 TEST = (
-    "TEST IT AT LOW SPEED FIRST: the poses and the ways between them keep out of what the cell states. Nothing else "
-    "was checked, nor was the way to the first pose."
+    "TEST IT AT LOW SPEED FIRST: the poses and the motions between them avoid the obstacles that the cell states. "
+    "Nothing else was checked, nor was the motion to the first pose."
 )
 
 
 def planned_program(plan: StoredPlan, path: Path) -> str:
-    """The program that goes to all poses of a plan, and waits at each until it is measured.
+    """Write the program that moves to all poses of a plan and waits at each for its measurement.
 
     Args:
-        plan: of a robot with six joints that turn.
-        path: the file; its suffix is that of a language, its name is the program's.
+        plan: plan of a robot with six revolute joints.
+        path: file to write; its suffix determines the language, its stem is the name of the program.
 
     Raises:
-        OutputError: the program cannot be written so.
+        OutputError: the program cannot be written to this file.
     """
     robot = plan.arm.robot
     check_program(path, robot, False, None)

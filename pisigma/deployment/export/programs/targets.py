@@ -1,4 +1,4 @@
-"""Corrected targets: what to command for every wanted pose, and where the robot as drawn stands then."""
+"""Corrected targets: joint values for every requested pose, and the nominal robot's poses at these."""
 
 from dataclasses import dataclass
 
@@ -16,26 +16,26 @@ from pisigma.robot.kinematics.status import Status
 from pisigma.robot.se3 import invert, transform_from_xyzrpy
 
 WITH_TARGET = (Status.REACHED, Status.OUTSIDE_DOMAIN)
-"""A pose of any other status gets no target."""
+"""Statuses of poses that have a target."""
 
 _LISTED = 10
 
 
 @dataclass(frozen=True, eq=False)
 class Targets:
-    """One target for each wanted pose, in the order of its file.
+    """One target for each requested pose, in the order of its file.
 
     Attributes:
-        model: name of the model that they were made with.
-        robot: the nominal robot: as drawn, with the base and tool of the model.
-        source: the file of poses.
-        line: line of every pose in it.
-        status: of every pose.
+        model: name of the model.
+        robot: nominal robot with the base and tool of the model.
+        source: file of the poses.
+        line: line of every pose in this file.
+        status: status of every pose.
         branch: name of the branch of every target.
-        q: corrected joint values [rad or m], NaN where there is no target.
-        T: T_base_tool that the nominal robot takes at q, `FK_nominal(q)`, NaN where there is no target. A
-            controller that computes with the nominal robot commands q when it is told to go there.
-        deviation: predicted standard deviation of the position reached [m]; NaN where it is not known.
+        q: corrected joint values [rad or m], NaN without a target.
+        T: pose T_base_tool of the nominal robot at q, `FK_nominal(q)`, NaN without a target. A controller that computes
+            with the nominal robot commands q for this pose.
+        deviation: predicted standard deviation of the reached position [m]; NaN if it is not known.
         remarks: sentences about the model's frames and conditions.
     """
 
@@ -52,7 +52,7 @@ class Targets:
 
     @property
     def title(self) -> str:
-        """Whose targets they are."""
+        """Title of files with the targets."""
         return (
             f"Corrected targets for {len(self.line)} poses, model {self.model} (robot {self.robot.name}), "
             f"by pisigma {__version__}."
@@ -60,21 +60,21 @@ class Targets:
 
     @property
     def T_root_poses(self) -> Float64[Tensor, "4 4"]:
-        """The frame that T is given in, seen from the origin of the robot description."""
+        """Pose of the frame of T relative to the origin of the robot description."""
         return invert(transform_from_xyzrpy(torch.from_numpy(self.robot.base.copy())))
 
     @property
     def T_flange_tool(self) -> Float64[Tensor, "4 4"]:
-        """The tool that T is of, seen from the last row of the robot description."""
+        """Pose of the tool of T relative to the last row of the robot description."""
         return transform_from_xyzrpy(torch.from_numpy(self.robot.tool.copy()))
 
     def lines_with(self, *statuses: Status) -> tuple[int, ...]:
-        """The lines of the poses of some statuses."""
+        """Return the lines of the poses with the given statuses."""
         return tuple(line for line, status in zip(self.line, self.status, strict=True) if status in statuses)
 
     @property
     def failure(self) -> str | None:
-        """Which poses have no target, and why; None where all have one."""
+        """Sentence on poses without a target, and the reasons; None if all have one."""
         failed = [(n, s) for n, s in zip(self.line, self.status, strict=True) if s not in WITH_TARGET]
         if not failed:
             return None
@@ -85,8 +85,8 @@ class Targets:
         return f"{self.source}, line {line}: {status.name.lower()}. {status.sentence}{also}"
 
     @property
-    def doubt(self) -> str | None:
-        """Which targets lie outside the domain; None where none does."""
+    def domain_warning(self) -> str | None:
+        """Sentence on targets outside the domain; None without such targets."""
         lines = self.lines_with(Status.OUTSIDE_DOMAIN)
         if not lines:
             return None
@@ -96,25 +96,25 @@ class Targets:
         )
 
     def check_complete(self) -> None:
-        """Refuse targets of which one is missing: a program without it would be another program.
+        """Check that no target is missing, as a program must not skip one.
 
         Raises:
-            UnreachablePoseError: a pose has no target; the message names line and status.
+            UnreachablePoseError: a pose has no target; the message states line and status.
         """
         if self.failure:
-            raise UnreachablePoseError(f"{self.failure} No program is written while a pose has no target.")
+            raise UnreachablePoseError(f"{self.failure} A program requires targets for all poses.")
 
 
 def targets_of(solution: Solution, source: str, line: tuple[int, ...], accuracy: bool = True) -> Targets:
-    """Take targets from the corrected inverse kinematics of a file of poses.
+    """Make targets from the corrected inverse kinematics of a file of poses.
 
     Args:
-        solution: of poses in a row, by a model, in torch.
-        source: the file.
-        line: line of every pose in it.
-        accuracy: whether to predict how accurate the targets are, which is slow with a hybrid.
+        solution: solutions of a model for poses with one batch axis, as tensors.
+        source: file of the poses.
+        line: line of every pose in this file.
+        accuracy: whether to predict the accuracy of the targets, which is slow for a hybrid.
     """
-    assert solution.owner is not None, "a solution as it is handed out knows its model"
+    assert solution.owner is not None, "a public solution has an owner"
     model = solution.owner.model
     status = tuple(Status(value) for value in solution.status.tolist())
     has_target = torch.tensor([s in WITH_TARGET for s in status])

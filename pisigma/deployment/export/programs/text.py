@@ -1,4 +1,4 @@
-"""Numbers, frames and comments of a program, as templates write them."""
+"""Formatting of numbers, frames and comments of a program for templates."""
 
 import math
 import textwrap
@@ -16,46 +16,46 @@ metres and quaternions have 9."""
 
 
 def numbers(values: Iterable[float], digits: int = DIGITS) -> str:
-    """Numbers with a comma and a blank between them; see `number`."""
+    """Format numbers with ", " between them; see `number`."""
     return ", ".join(number(value, digits) for value in values)
 
 
 def number(value: float, digits: int) -> str:
-    """A number with a decimal point, without exponent and without a sign before zero."""
-    assert math.isfinite(value), "a program holds finite numbers only"
+    """Format a number with a decimal point, without an exponent and without a sign of zero."""
+    assert math.isfinite(value), "a program has finite numbers only"
     written = f"{value:.{digits}f}"
     return written.removeprefix("-") if not float(written) else written
 
 
 def labelled(values: Iterable[float], labels: Iterable[str], unit: str = "") -> str:
-    """Numbers, each behind its label and before its unit, such as `X 1.000000, Y 2.000000`."""
+    """Format numbers with labels and units, such as `X 1.000000, Y 2.000000`."""
     return ", ".join(f"{label} {number(v, DIGITS)}{unit}" for label, v in zip(labels, values, strict=True))
 
 
 def comments(sentences: Iterable[str], mark: str, width: int = 100) -> str:
-    """Sentences as lines of printable ASCII, each behind a mark; other characters are written as `?`."""
+    """Wrap sentences to lines of printable ASCII with a comment mark; other characters are written as `?`."""
     lines = []
     for sentence in sentences:
         plain = " ".join(sentence.split()).encode("ascii", "replace").decode()
-        plain = "".join(letter if letter.isprintable() else "?" for letter in plain)
+        plain = "".join(character if character.isprintable() else "?" for character in plain)
         lines += [f"{mark}{line}" for line in textwrap.wrap(plain, width, break_on_hyphens=False)]
     return "\n".join(lines)
 
 
 def millimetres(T: Float64[Tensor, "*batch 4 4"]) -> list[float]:
-    """x, y, z [mm]."""
+    """Return x, y, z [mm]."""
     position: list[float] = (T[..., :3, 3] * 1e3).tolist()
     return position
 
 
 def metres_and_rotation_vector(T: Float64[Tensor, "4 4"]) -> list[float]:
-    """x, y, z [m] and rotation vector [rad]."""
+    """Return x, y, z [m] and the rotation vector [rad]."""
     values: list[float] = torch.cat([T[:3, 3], rotation_vector(T[:3, :3])]).tolist()
     return values
 
 
 def quaternion(T: Float64[Tensor, "4 4"]) -> list[float]:
-    """Unit quaternion (w, x, y, z) with w >= 0 of a rotation: `cos(t/2), n sin(t/2)` of axis n and angle t."""
+    """Return the unit quaternion (w, x, y, z), w >= 0, of a rotation: `cos(t/2), n sin(t/2)` for axis n and angle t."""
     vector = rotation_vector(T[:3, :3])
     half = torch.linalg.vector_norm(vector, dim=-1, keepdim=True) / 2
     values: list[float] = torch.cat([torch.cos(half), vector / 2 * torch.sinc(half / torch.pi)], -1).tolist()
@@ -63,10 +63,10 @@ def quaternion(T: Float64[Tensor, "4 4"]) -> list[float]:
 
 
 def millimetres_and_euler(T: Float64[Tensor, "*batch 4 4"]) -> Float64[Tensor, "*batch 6"]:
-    """x, y, z [mm] and the angles [deg] of `RotZ(a) RotY(b) RotX(c)` in the order a, b, c.
+    """Return x, y, z [mm] and the angles a, b, c [deg] of `RotZ(a) RotY(b) RotX(c)`.
 
-    Where b is near ±90 deg, a is hardly determined; c is computed from what is left of the rotation without a and
-    so makes up for it: `RotZ(-a) R = RotY(b) RotX(c)`, whose second row is `0, cos c, -sin c`.
+    Near b = ±90 deg, a is poorly determined; c is computed from the rotation without a and compensates its error:
+    `RotZ(-a) R = RotY(b) RotX(c)`, whose second row is `0, cos c, -sin c`.
     """
     R = T[..., :3, :3]
     a, b, _ = rpy_from_rotation(R).unbind(-1)

@@ -1,4 +1,4 @@
-"""Frames and tools that hold where a program stands, as far as the order of its statements makes them certain."""
+"""Frames and tools in force at a statement of a program, as far as control flow determines them."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -7,18 +7,18 @@ from typing import Literal, NamedTuple
 
 from pisigma.deployment.export.rewriting.scan import Frame
 
-_WAY = "depends on which way the program takes"
-_CALLER = "depends on where the routine is called from"
+_WAY = "depends on the path through the program"
+_CALLER = "depends on the caller of the routine"
 
 
 class Step(NamedTuple):
-    """One statement that matters for the order.
+    """One statement that affects control flow, frames or tools.
 
     Attributes:
-        kind: "routine", "loop" and "branch" begin a block, and "end" ends the innermost one; "else" begins another
-            part of a branch; "jump" is a label or a jump; "set" sets a frame or a tool; "call" calls a routine; "other"
-            is anything else.
-        name: of the routine that begins or is called, or of the frame or the tool that is set.
+        kind: "routine", "loop" and "branch" start a block, and "end" ends the innermost one; "else" starts another part
+            of a branch; "jump" is a label or a jump; "set" sets a frame or a tool; "call" calls a routine; "other" is
+            anything else.
+        name: name of the routine that starts or is called, or of the frame or tool that is set.
     """
 
     kind: Literal["routine", "loop", "branch", "else", "end", "jump", "set", "call", "other"]
@@ -26,28 +26,28 @@ class Step(NamedTuple):
 
 
 class FramesInForce:
-    """The frame or tool of every name, or why it is not certain, while a reader passes from step to step.
+    """Frame or tool of every name, or the reason why it is not certain, while a reader advances through the steps.
 
-    A value is certain where every way through the program leads to the same one. A value that is set in a loop or a
-    branch holds there from its place on, but neither after it nor earlier in the same loop. Values that a called
-    routine sets are not certain, nor those that a routine finds when it is called, if the program sets them in several
+    A value is certain if all paths through the program lead to the same one. A value that is set in a loop or a branch
+    is certain after its statement in that block, but neither after the block nor earlier in the same loop. Values that
+    a called routine sets are not certain, nor are those at the start of a routine, if the program sets them in several
     places. A routine of another file may set all of them.
     """
 
     def __init__(self, steps: Sequence[Step], before: dict[str, Frame | str]) -> None:
-        """Look at all statements.
+        """Analyse all statements.
 
         Args:
-            steps: of the whole program, in the order of the text.
-            before: the values before the first of them.
+            steps: steps of the whole program, in the order of the text.
+            before: values before the first step.
         """
         self._steps, self._values = steps, dict(before)
         self._saved: list[dict[str, Frame | str]] = []
         self._places = Counter(step.name for step in steps if step.kind == "set")
         self._open: list[tuple[int, ...]] = []
-        """Of every step, the steps that began the blocks it stands in."""
+        """For every step, the steps that started the blocks around it."""
         self._ends: dict[int, int] = {}
-        """Of the steps that end a block, the step that began it."""
+        """For steps that end a block, the step that started it."""
         blocks: list[int] = []
         for number, step in enumerate(steps):
             if step.kind == "end" and blocks:
@@ -56,11 +56,11 @@ class FramesInForce:
             if step.kind in ("routine", "loop", "branch"):
                 blocks.append(number)
         self._of_routine: dict[int, list[int]] = {-1: []}
-        """The steps of every routine by the step that began it, and those outside of all."""
+        """Steps of every routine by the step that started it; -1 for those outside all routines."""
         for number in range(len(steps)):
             self._of_routine.setdefault(self._routine(number), []).append(number)
         self._set_by: dict[str, set[str]] = {step.name: set() for step in steps if step.kind == "routine"}
-        """Names that every routine sets, itself or by the routines that it calls."""
+        """Names that every routine sets, directly or through routines that it calls."""
         acting = {
             first: [number for number in inside if steps[number].kind in ("set", "call")]
             for first, inside in self._of_routine.items()
@@ -68,20 +68,20 @@ class FramesInForce:
         }
         self._called = {step.name for step in steps if step.kind == "call"}
         self._certain_before = {name for name, value in before.items() if not isinstance(value, str)}
-        for _ in acting:  # a name passes through all routines at most
+        for _ in acting:  # a name propagates through at most all routines
             for first, inside in acting.items():
                 self._set_by[steps[first].name].update(*map(self._set_at, inside))
 
     def __getitem__(self, name: str) -> Frame | str:
-        """The value of a name, or why it is not certain."""
+        """Return the value of a name, or the reason why it is not certain."""
         return self._values[name]
 
     def advance(self, number: int, value: Frame | str = "") -> None:
-        """Pass a statement.
+        """Advance past a statement.
 
         Args:
-            number: of the step.
-            value: that a "set" sets, or why it is not known.
+            number: index of the step.
+            value: value of a "set", or the reason why it is not known.
         """
         step = self._steps[number]
         if step.kind == "set":
@@ -93,7 +93,7 @@ class FramesInForce:
                 self._values[name] = f"{name} {where} set by the routine {step.name}{whose}"
         elif step.kind == "else" and self._saved:
             self._values = dict(self._saved[-1])
-            # what is called in a condition holds in the parts that follow, too
+            # calls in a condition also affect the following parts
             begin = self._open[number][-1] if self._open[number] else number
             self._doubt(self._set_in(begin, ("call",)), _WAY)
         elif step.kind == "end":
@@ -118,7 +118,7 @@ class FramesInForce:
         self._values = {name: self._values[name] if name in kept else saved[name] for name in saved}
 
     def _set_elsewhere(self, routine: str) -> set[str]:
-        """Names whose values in a routine depend on where it is called from."""
+        """Return the names whose values in a routine depend on its caller."""
         several = {name for name, places in self._places.items() if places > 1}
         if routine not in self._called:
             return several
@@ -126,7 +126,7 @@ class FramesInForce:
         return several | {name for name in self._certain_before if foreign or self._places[name]}
 
     def _set_in(self, begin: int, kinds: Sequence[str] = ("set", "call")) -> set[str]:
-        """Names that steps of some kinds set in a block."""
+        """Return the names that steps of some kinds set in a block."""
         inside = takewhile(lambda step: begin in self._open[step], range(begin + 1, len(self._steps)))
         return {name for step in inside if self._steps[step].kind in kinds for name in self._set_at(step)}
 
@@ -136,17 +136,17 @@ class FramesInForce:
                 self._values[name] = f"{name} {why}"
 
     def _routine(self, number: int) -> int:
-        """The step that began the routine in which a step stands; -1 outside of all."""
+        """Return the step that started the routine around a step; -1 outside all routines."""
         return next((k for k in reversed(self._open[number]) if self._steps[k].kind == "routine"), -1)
 
     def _is_reached_twice(self, number: int) -> bool:
-        """Whether jumps may lead behind a place where a value is set, from another place where it is set."""
+        """Return whether jumps may skip a statement that sets a value after another one set it."""
         inside = self._of_routine[self._routine(number)]
         jumps = any(self._steps[other].kind == "jump" for other in inside)
         return jumps and sum(self._steps[number].name in self._set_at(other) for other in inside) > 1
 
     def _set_at(self, number: int) -> set[str]:
-        """Names that a step sets, itself or by what it calls; a routine of another file may set all."""
+        """Return the names that a step sets, directly or by a call; a routine of another file may set all."""
         step = self._steps[number]
         if step.kind == "set":
             return {step.name}

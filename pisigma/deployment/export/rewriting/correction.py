@@ -1,4 +1,4 @@
-"""Corrected targets in place of a program's, and way points where a move would leave its line or its arc."""
+"""Correction of a program's targets, with way points where a move would leave its line or arc."""
 
 import difflib
 import math
@@ -18,16 +18,17 @@ from pisigma.robot.kinematics.status import Status
 from pisigma.robot.se3 import invert, rotation_from_vector, rotation_vector, transform, transform_from_xyzrpy
 
 SPACING = 0.01
-"""[m] The way is looked at in steps of at most this length, or of two degrees."""
+"""[m] Largest step in which a path is evaluated."""
 STEP_ANGLE = 0.035
-MOST_STEPS = 512
+"""[rad] Largest rotation of a step, two degrees."""
+MAX_STEPS = 512
 LEVER = 0.1
-"""[m] An angle off the straight way counts as the distance that it makes at this distance from the tool."""
+"""[m] A rotational deviation from the path is converted to a distance at this distance from the tool."""
 
 
 _LINE_NUMBER = re.compile(r"(?m)^ *\d+:")
 STRAIGHT = 1e-4
-"""Sine of the angle between the chords to the second and the third point, below which there is no arc."""
+"""Sine of the angle between the chords to the second and the third point below which they define no arc."""
 
 Points = Float64[Tensor, "arcs 3"]
 
@@ -37,12 +38,12 @@ class CorrectedProgram:
     """A program with corrected targets.
 
     Attributes:
-        text: of the program.
-        statuses: of every target: its line, and whether it is reached.
-        way_points: how many were put in.
-        left: line and reason of whatever was left alone.
-        largest_shift: of a target [m].
-        branches: names of those that the targets were corrected on.
+        text: text of the program.
+        statuses: line and status of every target.
+        way_points: number of inserted way points.
+        left: line and reason of everything that was left unchanged.
+        largest_shift: largest shift of a target [m].
+        branches: names of the branches of the corrected targets.
     """
 
     text: str
@@ -54,11 +55,11 @@ class CorrectedProgram:
 
     @property
     def unreached(self) -> tuple[tuple[int, Status], ...]:
-        """Line and status of targets that keep their line."""
+        """Line and status of targets that were not changed."""
         return tuple((line, status) for line, status in self.statuses if status not in WITH_TARGET)
 
     def diff(self, before: str, names: tuple[str, str]) -> str:
-        """What has changed, as a unified diff, in which numbers of lines do not count."""
+        """Return the changes as a unified diff that ignores line numbers of the language."""
         old, new = (_LINE_NUMBER.sub(":", text).splitlines() for text in (before, self.text))
         lines = difflib.unified_diff(old, new, *names, lineterm="", n=0)
         return "\n".join(lines)
@@ -66,12 +67,12 @@ class CorrectedProgram:
 
 @dataclass(frozen=True, eq=False)
 class Commanded:
-    """What to command for wanted poses.
+    """Poses to command for target poses.
 
     Attributes:
-        T: poses of the robot as drawn, in the frame of the wanted ones.
-        status: of every pose.
-        branches: those that they lie on.
+        T: poses of the nominal robot, in the frame of the target poses.
+        status: status of every pose.
+        branches: indices of their branches.
     """
 
     T: Float64[Tensor, "poses 4 4"]
@@ -80,18 +81,18 @@ class Commanded:
 
     @property
     def reached(self) -> bool:
-        """Whether all poses are."""
+        """Whether all poses are reached."""
         return set(self.status) <= set(WITH_TARGET)
 
 
 @dataclass(frozen=True)
 class ProgramCorrection:
-    """Corrects programs for a controller that computes with the robot as drawn.
+    """Correction of programs for a controller that computes with the nominal robot.
 
     Attributes:
-        solver: the model.
-        branch: to take instead of the trained one.
-        tolerance: how far the tool may leave a straight line or an arc between way points [m].
+        solver: corrected inverse kinematics of the model.
+        branch: branch to use instead of the trained one.
+        tolerance: largest deviation of the tool from a straight line or an arc between way points [m].
     """
 
     solver: CorrectedIK
@@ -99,11 +100,11 @@ class ProgramCorrection:
     tolerance: float
 
     def correct(self, program: ScannedProgram) -> CorrectedProgram:
-        """Rewrite what is understood and can be reached; the rest keeps its text.
+        """Rewrite all targets that are understood and reached; other text is kept.
 
-        A target is the pose that the real tool shall take. Its place takes the pose at which the robot as drawn stands
-        at the corrected joint values. A straight move is cut where the line between two of these leaves the corrected
-        line by more than the tolerance; an arc likewise, into arcs.
+        A target is the pose for the real tool. It is replaced by the nominal robot's pose at the corrected joint
+        values. A straight move is split where the line between two of these poses deviates from the corrected line by
+        more than the tolerance; an arc is split into arcs in the same way.
         """
         targets, ways = program.targets, {move: self.path(move) for move in program.moves}
         paths = {move: way for move, way in ways.items() if isinstance(way, Tensor)}
@@ -133,7 +134,7 @@ class ProgramCorrection:
     def commanded(
         self, targets: Sequence[Target], poses: Sequence[Float64[Tensor, "_poses 4 4"]]
     ) -> list[Commanded]:
-        """What to command for the wanted poses of each target's tool in its frame."""
+        """Compute the poses to command for target poses of each target's tool in its frame."""
         robot, counts = self.solver.model.robot, torch.tensor([len(T) for T in poses])
         base, tool = (
             transform_from_xyzrpy(torch.from_numpy(frame.copy())) for frame in (robot.base, robot.tool)
@@ -151,29 +152,29 @@ class ProgramCorrection:
         ]
 
     def path(self, move: PathMove) -> Float64[Tensor, "points 4 4"] | str:
-        """The way that the program means, of the end's tool in the end's frame; or why that is not known."""
+        """Return the path of the end's tool in the end's frame, or the reason why it is not known."""
         if move.start is None or (move.circular and move.via is None):
-            where = "begins or what it passes" if move.circular else "begins"
-            return f"where the {_kind(move)} {where} is not stated, so only its end is corrected"
+            what = "start or via point" if move.circular else "start"
+            return f"the {what} of the {_kind(move)} is not stated, so only its end is corrected"
         start, end = _seen_from(move.end, move.start), move.end.pose.T[None]
         if move.via is None:
             return _between(start, end, _steps(start, end, _distance(start, end)))[0]
         via = _seen_from(move.end, move.via)
         if is_straight(*(T[:, :3, 3] for T in (start, via, end))):
-            return "the points of the arc lie on a line or in one place, so it has no way points"
+            return "the points of the arc are collinear or coincide, so it has no way points"
         arc = Arcs.through(*(T[:, :3, 3] for T in (start, via, end)))
         between = start[:, :3, :3] @ rotation_from_vector(arc.passing / arc.angle * _turn(start, end))
         if LEVER * float(rotation_vector(between.mT @ via[:, :3, :3]).norm()) > self.tolerance:
-            return "the tool turns along the arc otherwise than from its begin to its end, so it has no way points"
+            return "the orientation at the via point is not between those of start and end, so the arc has no way points"
         length = float(arc.angle * arc.radius.norm())
         return _round(start, via, end, _steps(start, end, length))[0]
 
     def way_points(self, move: PathMove, there: Commanded) -> list[Frame] | str:
-        """The way points of a move, see `PathMove.way_points`; or why it is not cut."""
+        """Return the way points of a move, see `PathMove.way_points`, or the reason why it is not split."""
         if not there.reached:
-            return f"the {_kind(move)} cannot be followed everywhere, so it has no way points"
+            return f"the {_kind(move)} has poses that are not reached, so it has no way points"
         if len(there.branches) > 1:
-            return f"the {_kind(move)} passes from one branch to another, so it has no way points"
+            return f"the {_kind(move)} changes from one branch to another, so it has no way points"
         whole = stride = len(there.T) - 1
         least = 2 if move.circular else 1
         while stride > least and _off(there.T, stride, move.circular) > self.tolerance:
@@ -189,7 +190,7 @@ def _kind(move: PathMove) -> str:
 def _edits(
     reached: Sequence[tuple[Pose, Commanded]], cuts: Sequence[tuple[PathMove, list[Frame]]]
 ) -> list[Edit]:
-    """The new poses of targets and the way points of moves, where an arc's replaces what it passed before."""
+    """Return the edits of targets and way points; the last way point of an arc replaces its via point."""
     added = [edit for move, way in cuts for edit in move.way_points(way)]
     replaced = [edit.span for edit in added if edit.span[0] < edit.span[1]]
     corrected = [Edit(pose.span, pose.write(there.T[0])) for pose, there in reached]
@@ -201,13 +202,13 @@ def _edits(
 
 
 def _seen_from(end: Target, target: Target) -> Float64[Tensor, "1 4 4"]:
-    """The pose of the end's tool in the end's frame when the robot stands at a target."""
+    """Return the pose of the end's tool in the end's frame when the robot is at a target."""
     T_flange = target.T_root_frame @ target.pose.T @ invert(target.T_flange_tool)
     return (invert(end.T_root_frame) @ T_flange @ end.T_flange_tool)[None]
 
 
 def _off(T: Float64[Tensor, "points 4 4"], stride: int, circular: bool) -> float:
-    """How far poses are at most off the straight lines, or arcs, between every so many of them [m]."""
+    """Compute the largest deviation of poses from the lines or arcs between every `stride`-th of them [m]."""
     start, end = T[:-1:stride], T[stride::stride]
     drawn = _round(start, T[stride // 2 :: stride], end, stride) if circular else _between(start, end, stride)
     drawn = drawn[:, :-1].flatten(0, 1)
@@ -216,10 +217,10 @@ def _off(T: Float64[Tensor, "points 4 4"], stride: int, circular: bool) -> float
 
 
 def _steps(start: Float64[Tensor, "1 4 4"], end: Float64[Tensor, "1 4 4"], length: float) -> int:
-    """A power of two: steps of a way of a length [m] that are short enough to see the correction change."""
+    """Return a power of two as the number of steps of a path, short enough to resolve the correction."""
     angle = float(_turn(start, end).norm())
     steps = 8
-    while steps < MOST_STEPS and steps < max(length / SPACING, angle / STEP_ANGLE):
+    while steps < MAX_STEPS and steps < max(length / SPACING, angle / STEP_ANGLE):
         steps *= 2
     return steps
 
@@ -229,7 +230,7 @@ def _distance(start: Float64[Tensor, "1 4 4"], end: Float64[Tensor, "1 4 4"]) ->
 
 
 def _turn(start: Float64[Tensor, "ways 4 4"], end: Float64[Tensor, "ways 4 4"]) -> Float64[Tensor, "ways 3"]:
-    """Rotation vectors from poses to others [rad], in the frames of the former."""
+    """Compute rotation vectors from start to end poses [rad], in the frames of the former."""
     return rotation_vector(start[:, :3, :3].mT @ end[:, :3, :3])
 
 
@@ -239,7 +240,7 @@ def _round(
     end: Float64[Tensor, "ways 4 4"],
     steps: int,
 ) -> Float64[Tensor, "ways points 4 4"]:
-    """Poses from ones by others to third ones: an arc, and a turn about one axis from begin to end."""
+    """Interpolate poses from start by via to end: an arc, and a rotation about one axis from start to end."""
     arcs = Arcs.through(*(T[:, :3, 3] for T in (start, via, end)))
     return transform(_between(start, end, steps)[..., :3, :3], arcs.points(steps))
 
@@ -247,14 +248,14 @@ def _round(
 def _between(
     start: Float64[Tensor, "ways 4 4"], end: Float64[Tensor, "ways 4 4"], steps: int
 ) -> Float64[Tensor, "ways points 4 4"]:
-    """Poses from ones to others: a straight line, and a turn about one axis."""
+    """Interpolate poses from start to end: a straight line, and a rotation about one axis."""
     share = torch.linspace(0, 1, steps + 1, dtype=torch.float64)[:, None]
     R = start[:, None, :3, :3] @ rotation_from_vector(share * _turn(start, end)[:, None])
     return transform(R, start[:, None, :3, 3] + share * (end - start)[:, None, :3, 3])
 
 
 def _edited(text: str, edits: Sequence[Edit]) -> str:
-    """The text with all edits; those at one place stay in their order."""
+    """Apply all edits to a text; edits at the same position keep their order."""
     parts, position = [], 0
     for edit in sorted(edits, key=lambda edit: edit.span):
         parts += [text[position : edit.span[0]], edit.text]
@@ -264,12 +265,12 @@ def _edited(text: str, edits: Sequence[Edit]) -> str:
 
 @dataclass(frozen=True, eq=False)
 class Arcs:
-    """Arcs that begin in first points, pass second ones and end in third ones.
+    """Arcs that start at first points, pass second ones and end at third ones.
 
     Attributes:
-        centre: of the circles [m].
+        centre: centres of the circles [m].
         radius: vectors from the centres to the first points [m].
-        axis: that the points go round counter-clockwise.
+        axis: axes of counter-clockwise motion.
         passing: angle at the second points [rad], from 0 at the first ones.
         angle: at the third points [rad], below a full turn.
     """
@@ -282,7 +283,7 @@ class Arcs:
 
     @staticmethod
     def through(first: Points, second: Points, third: Points) -> "Arcs":
-        """Arcs through points [m], which must not lie on a line, see `is_straight`."""
+        """Construct arcs through points [m], which must not be collinear, see `is_straight`."""
         u, v = second - first, third - first
         normal = torch.linalg.cross(u, v)
         # The circumcentre of the triangle 0, u, v.
@@ -294,20 +295,20 @@ class Arcs:
         return Arcs(first + middle, -middle, axis, passing, angle)
 
     def points(self, steps: int) -> Float64[Tensor, "arcs points 3"]:
-        """Points at equal distances along the arcs [m], from the first points to the third ones."""
+        """Return equidistant points along the arcs [m], from the first points to the third ones."""
         angles = torch.linspace(0, 1, steps + 1, dtype=torch.float64) * self.angle[:, None]
         turned = rotation_from_vector(angles[..., None] * self.axis[:, None]) @ self.radius[:, None, :, None]
         return self.centre[:, None] + turned[..., 0]
 
 
 def is_straight(first: Points, second: Points, third: Points) -> bool:
-    """Whether some three points lie on a line, or two of them in one place."""
+    """Return whether three points of any arc are collinear, or two of them coincide."""
     u, v = second - first, third - first
     bends = torch.linalg.cross(u, v).norm(dim=-1) > STRAIGHT * u.norm(dim=-1) * v.norm(dim=-1)
     return not bool(bends.all())
 
 
 def _angle(start: Points, end: Points, axis: Points) -> Float64[Tensor, " arcs"]:
-    """How far to turn about the axis to come from one direction to another, 0 to a full turn [rad]."""
+    """Compute the angle about the axis from one direction to another, 0 to 2 pi [rad]."""
     sine = (axis * torch.linalg.cross(start, end)).sum(-1)
     return torch.atan2(sine, (start * end).sum(-1)) % (2 * math.pi)

@@ -1,4 +1,4 @@
-"""`--format targets --program`: an existing program with corrected targets, and what has changed."""
+"""`--format targets --program`: an existing program with corrected targets, and a report of the changes."""
 
 from collections import Counter
 from collections.abc import Callable
@@ -13,7 +13,7 @@ from pisigma.deployment.export.rewriting.krl import scan_krl, scan_krl_data
 from pisigma.deployment.export.rewriting.rapid import scan_rapid
 from pisigma.deployment.export.rewriting.scan import ScannedProgram
 from pisigma.deployment.export.rewriting.urscript import scan_urscript
-from pisigma.files.errors import OutputError
+from pisigma.files.errors import OutputError, Place
 from pisigma.files.input_file import read_input
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.inverse.corrected_ik import load
@@ -28,59 +28,73 @@ SCANNERS: dict[str, Callable[[str, FrameFile], ScannedProgram]] = {
 """By the suffix of the file."""
 
 TOLERANCE_MM = 0.1
-MOST_BYTES = 2**24
-MOST_JOINTS = 6
+MAX_BYTES = 2**24
+MAX_JOINTS = 6
 TEST = (
-    "TEST IT AT LOW SPEED FIRST: the poses are commanded to a controller that computes with the robot as drawn, with "
-    "any accuracy option of its own off, and its origin and flange have to be those of the robot description. Targets "
-    "given as joint values, outputs, waits and speeds are as they were; nothing was checked for collisions."
+    "TEST IT AT LOW SPEED FIRST: the controller has to compute with the nominal robot, its accuracy options have to be "
+    "off, and its origin and flange have to be those of the robot description. Targets given as joint values, outputs, "
+    "waits and speeds are unchanged; nothing was checked for collisions."
 )
 
 
 def check_rewriting(request: ExportRequest) -> None:
-    """Refuse options that do not go with a program.
+    """Check the options for a program.
 
     Raises:
-        OutputError: the program's language is not known or not that of the file to write, or an option does not fit.
+        OutputError: the program's language is not known or not that of the output file, or an option is invalid.
     """
     assert request.program is not None
     suffix = request.program.suffix.lower()
     if suffix not in SCANNERS or request.out.suffix.lower() != suffix:
         raise OutputError(
-            f"{request.program}: a program ends in {', '.join(SCANNERS)}, and --out ends as the program does."
+            expected=f"a program ({', '.join(SCANNERS)}) and an --out file with the same suffix",
+            value=f"{suffix} and {request.out.suffix}",
+            at=Place(request.program),
+            option="--program" if suffix not in SCANNERS else "--out",
         )
     for name, value in (("targets", request.targets), ("config", request.config)):
         if value is not None:
             raise OutputError(
-                f"--{name} goes with --poses; a --program keeps its poses as poses. Leave it out."
+                "is an option of --poses; the poses of a --program stay poses",
+                option=f"--{name}",
+                value=value,
+                remedy="leave it out",
             )
     if request.tolerance_mm is not None and not 0 < request.tolerance_mm < float("inf"):
-        raise OutputError(f"--tolerance-mm {request.tolerance_mm:g}: a length above 0 was wanted.")
+        raise OutputError(expected="a length > 0 mm", value=request.tolerance_mm, option="--tolerance-mm")
 
 
 def rewrite_program(request: ExportRequest) -> Exported:
-    """Rewrite what is understood of a program, show what has changed, and name what stays.
+    """Rewrite the targets of a program that are understood, and report the changes and all that is left unchanged.
 
     Raises:
-        OutputError: the program cannot be read, or holds no target whose frame and tool are stated.
+        OutputError: the program cannot be read, or has no target whose frame and tool are stated.
     """
     assert request.program is not None
-    # Letters beyond ASCII stand in comments only; in this encoding every byte comes back as it was.
-    text = read_input(request.program, OutputError, MOST_BYTES).decode("latin-1")
+    # Characters beyond ASCII occur in comments only; this encoding preserves every byte.
+    text = read_input(request.program, OutputError, MAX_BYTES).decode("latin-1")
     scanned = SCANNERS[request.program.suffix.lower()](text, FrameFile.read(request.frames))
     if not scanned.targets:
         named = (
             _listed([f"line {line}: {reason}" for line, reason in scanned.left])
             or "only joint values, if any"
         )
-        raise OutputError(f"{request.program}: holds no pose that can be rewritten ({named}).")
+        raise OutputError(
+            f"the program has no pose that can be rewritten ({named})",
+            at=Place(request.program),
+            value=len(scanned.left),
+        )
     solver = load(request.model)
     if request.conditions:
         solver = solver.under(**request.conditions)
-    if solver.model.robot.dof > MOST_JOINTS:
+    if solver.model.robot.dof > MAX_JOINTS:
         raise OutputError(
-            f"--program: expected a robot of at most {MOST_JOINTS} joints, got {solver.model.robot.dof}: the poses of "
-            "a program do not say where the further joints are; export --poses with joint values instead."
+            f"expected a robot with at most {MAX_JOINTS} joints, got {solver.model.robot.dof}, as the poses of a "
+            "program do not determine further joints",
+            expected=f"at most {MAX_JOINTS} joints",
+            value=solver.model.robot.dof,
+            option="--program",
+            remedy="export --poses with joint values instead",
         )
     tolerance = TOLERANCE_MM if request.tolerance_mm is None else request.tolerance_mm
     corrected = ProgramCorrection(solver, request.branch, tolerance / 1e3).correct(scanned)
@@ -94,7 +108,7 @@ def _exported(
     corrected: CorrectedProgram,
     tolerance_mm: float,
 ) -> Exported:
-    """The new program, with what is to be said of it."""
+    """Make the result with the new program, facts and warnings."""
     assert request.program is not None
     diff = corrected.diff(scanned.text, (str(request.program), str(request.out)))
     language = LANGUAGES.get(request.program.suffix.lower())
@@ -119,10 +133,10 @@ def _exported(
             "diff": diff,
         },
         remarks=(*condition_remarks(model), *frame_remarks(model)),
-        doubts=(
+        warnings=(
             TEST,
             *(language.cartesian_cautions if language else ()),
-            *_in_doubt(corrected, str(request.program)),
+            *_warnings(corrected, str(request.program)),
         ),
         summary=f"Program with {reached} corrected targets (by {shift:.3f} mm at most) "
         f"and {corrected.way_points} way points",
@@ -131,15 +145,15 @@ def _exported(
     )
 
 
-def _in_doubt(corrected: CorrectedProgram, source: str) -> tuple[str, ...]:
-    """On which branches targets were corrected, and what was left alone."""
+def _warnings(corrected: CorrectedProgram, source: str) -> tuple[str, ...]:
+    """Return warnings on the branches of the targets, and on all that was left unchanged."""
     said = [
         f"Targets are corrected for the branch {' and '.join(corrected.branches) or 'of the model'}. The program's "
-        "configuration was not compared: where the arm stands otherwise, state --branch."
+        "configuration was not checked: if the arm is in another configuration, state --branch."
     ]
     if corrected.left:
         said.append(
-            f"Left alone in {source}: {'; '.join(f'line {line}: {reason}' for line, reason in corrected.left)}."
+            f"Left unchanged in {source}: {'; '.join(f'line {line}: {reason}' for line, reason in corrected.left)}."
         )
     return tuple(said)
 
@@ -150,7 +164,7 @@ def _shortfall(corrected: CorrectedProgram, source: str) -> str | None:
     line, status = corrected.unreached[0]
     others = _listed([f"line {n} {s.name.lower()}" for n, s in corrected.unreached[1:]])
     also = f" (Also: {others}.)" if others else ""
-    return f"{source}, line {line}: {status.name.lower()}, so the line is as it was. {status.sentence}{also}"
+    return f"{source}, line {line}: {status.name.lower()}, so the line is unchanged. {status.sentence}{also}"
 
 
 def _listed(sentences: list[str], most: int = 10) -> str:

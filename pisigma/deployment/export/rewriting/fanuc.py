@@ -47,10 +47,10 @@ _MODIFIED = re.compile(r"\b(Offset|Tool_Offset|INC|VOFFSET|TOOL_OFFSET|Skip|OFFS
 
 
 def scan_fanuc(text: str, stated: FrameFile) -> ScannedProgram:
-    """Read a program; a position is of its `UT` in its `UF`, of which 0 are the flange and the world.
+    """Scan a program; a position is that of its `UT` in its `UF`, where 0 is the flange and the world.
 
     Args:
-        text: of the program.
+        text: text of the program.
         stated: frames and tools by number, as `UFRAME 1` and `UTOOL 1`.
     """
     return _Reader(Scan(text), text, stated).read()
@@ -58,7 +58,7 @@ def scan_fanuc(text: str, stated: FrameFile) -> ScannedProgram:
 
 @dataclass
 class _Reader:
-    """Walks through the lines of a program."""
+    """Reader of the lines of a program."""
 
     scan: Scan
     text: str
@@ -68,7 +68,7 @@ class _Reader:
     redefined: list[re.Match[str]] = field(default_factory=list)
     axes_in_use: dict[str, int] = field(default_factory=dict)
     call: re.Match[str] | None = None
-    """The first call of a routine of another file, and where it makes frames and tools uncertain from."""
+    """The first call of a routine of another file; `uncertain` is the position after which it affects frames and tools."""
     uncertain: float = math.inf
 
     def read(self) -> ScannedProgram:
@@ -121,12 +121,12 @@ class _Reader:
             circular = move["kind"] == "C" and order == 1
             cuttable = isinstance(pose, Pose) and (circular or move["kind"] == "L")
             if move["kind"] == "A":
-                self.scan.leave(line.start(), "arcs of A get no way points, only their poses are corrected")
+                self.scan.leave(line.start(), "arcs of A have no way points, only their poses are corrected")
             cut = partial(self._way_points, line, move, match, len(names)) if cuttable and match else None
             self.scan.move(line.start(), pose, frame, tool, cut, circular)
 
     def _stated(self, kind: str, index: str, position: int) -> Frame | str:
-        """A frame or tool as stated, unless the program sets it, or what it has called may."""
+        """Return a stated frame or tool, unless the program, or a routine that it has called, may set it."""
         if any(kind in (match[1], match[3]) and match[2] in (None, index) for match in self.redefined):
             return f"the program sets {kind} {index}"
         name = f"{kind} {index}"
@@ -154,7 +154,7 @@ class _Reader:
         count: int,
         poses: Sequence[Frame],
     ) -> list[Edit]:
-        """Lines and positions of way points, with the speed of the move and continuous termination."""
+        """Return lines and positions of way points, with the speed of the move and continuous termination."""
         speed = re.match(r"(?:\s*:\s*P\[[^\]]*\])?\s*(\S+)", move["rest"])
         span = _VALUES.match(self.text, match.start("body"))
         assert span is not None
@@ -174,14 +174,14 @@ class _Reader:
 
 
 def _written(text: str, T: Frame) -> str:
-    """The values of a position with those of another pose."""
+    """Replace the values of a position by those of a pose."""
     x, y, z, r, p, w = millimetres_and_euler(T).tolist()
     values = iter([x, y, z, w, p, r])
     return _VALUE.sub(lambda match: match[1] + number(next(values), DIGITS), text)
 
 
 def _numbered(text: str) -> str:
-    """Lines numbered again from 1, and their count in the head."""
+    """Renumber the lines from 1, and update their count in the head."""
     numbers = count(1)
 
     def numbered(line: re.Match[str]) -> str:

@@ -1,4 +1,4 @@
-"""Frames and tools that a program names without stating them, as a YAML file."""
+"""YAML file of frames and tools that a program names without stating them."""
 
 from pathlib import Path
 
@@ -14,11 +14,11 @@ from pisigma.robot.se3 import transform_from_xyzrpy
 
 
 class FrameFile(Section):
-    """What a program names: frames in the origin of the robot description, tools in its flange (the last row).
+    """Frames relative to the origin of the robot description, and tools relative to its flange (the last row).
 
-    Names are the program's, such as `UFRAME 1`, `BASE_DATA[3]` or `wobj_table`; `tcp` is the tool that a URScript
-    program does not set. `routines` are those of other files that set neither frame nor tool: a program that calls any
-    other one leaves its poses until it sets them again.
+    Names are those of the program, such as `UFRAME 1`, `BASE_DATA[3]` or `wobj_table`; `tcp` is the tool that a
+    URScript program does not set. `routines` are routines of other files that set neither frame nor tool: after a call
+    of any other one, poses are left unchanged until the program sets frame and tool again.
     """
 
     frames: dict[str, FrameSection] = Field(default_factory=dict)
@@ -27,23 +27,23 @@ class FrameFile(Section):
 
     @staticmethod
     def read(path: Path | None) -> "FrameFile":
-        """Read a file; None is an empty one.
+        """Read a file; None stands for an empty one.
 
         Raises:
-            OutputError: the file is no such YAML; the message names file, line and key.
+            OutputError: the file is not such a YAML file; the message states file, line and key.
         """
         return FrameFile() if path is None else read_yaml(path, FrameFile, OutputError)
 
     def frame(self, name: str) -> Float64[Tensor, "4 4"] | str:
-        """The frame of a name, or why it is not known."""
+        """Return a frame by name, or the reason why it is not known."""
         return _lookup(self.frames, name, "frame")
 
     def sets_neither(self, routine: str) -> bool:
-        """Say whether a routine of another file is stated to set neither frame nor tool."""
+        """Return whether a routine of another file is stated to set neither frame nor tool."""
         return routine.upper() in map(str.upper, self.routines)
 
     def tool(self, name: str) -> Float64[Tensor, "4 4"] | str:
-        """The tool of a name, or why it is not known."""
+        """Return a tool by name, or the reason why it is not known."""
         return _lookup(self.tools, name, "tool")
 
 

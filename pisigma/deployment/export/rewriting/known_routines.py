@@ -1,4 +1,4 @@
-"""Functions of the controllers' languages that set neither frame nor tool; any other routine may set both."""
+"""Functions of the controllers' languages that set neither frame nor tool; other routines may set both."""
 
 _URSCRIPT = """
 movej movel movep movec servoj servoc speedj speedl stopj stopl freedrive_mode end_freedrive_mode
@@ -72,8 +72,8 @@ const pers var local task module endmodule proc endproc func endfunc trap endtra
 alias if elseif else endif for endfor while endwhile test case default endtest error undo backward
 """
 URSCRIPT = frozenset(_URSCRIPT.split())
-"""Of URScript, with words that may have brackets behind them."""
+"""Functions of URScript, and words that may be followed by brackets."""
 KRL = frozenset(_KRL.upper().split())
-"""Of KRL in capitals, with words that may have brackets behind them."""
+"""Functions of KRL in capitals, and words that may be followed by brackets."""
 RAPID = frozenset(_RAPID.upper().split())
-"""Instructions of RAPID in capitals, but for moves, and words that begin statements."""
+"""Instructions of RAPID in capitals, except for moves, and words that start statements."""

@@ -34,7 +34,7 @@ _HIDDEN = re.compile(r';[^\n]*|"[^"\n]*"')
 _SIX = r"\s*,\s*".join(rf"{letter}\s*{NUMBER}" for letter in "XYZABC")
 _AGGREGATE = re.compile(rf"\{{\s*(?:(?:FRAME|E?\d?POS)\s*:\s*)?({_SIX})\s*((?:,[^{{}}]*)?)\}}", re.IGNORECASE)
 _EXTERNAL = re.compile(r"(?:[{,]\s*|\.)(E[1-6])\s*[\s=]\s*([^,}\n]+)", re.IGNORECASE)
-"""Of an aggregate, or of the component of a variable."""
+"""External axis in an aggregate or as the component of a variable."""
 _WITH = re.compile(r"\$(BASE|TOOL)\b[^=\n]*=", re.IGNORECASE)
 _ASSIGNMENT = re.compile(
     r"(?im)^[ \t]*(?:DECL\s+|GLOBAL\s+)*(?:(?:E6|E3)?POS\s+|FRAME\s+)?(\w+)\s*=\s*(?=\{)"
@@ -61,10 +61,10 @@ _FRAMES_OF_MOVES = ("$BASE", "$TOOL")
 
 
 def scan_krl(text: str, stated: FrameFile) -> ScannedProgram:
-    """Read a program; poses are of `$TOOL` in `$BASE`, whose values or numbers the program has to say before them.
+    """Scan a program; poses are those of `$TOOL` in `$BASE`, which the program has to set before them.
 
     Args:
-        text: of the program.
+        text: text of the program.
         stated: frames that the program names but does not state, such as `BASE_DATA[1]` and `TOOL_DATA[2]`.
     """
     return _Reader(Scan(text), masked(text, _HIDDEN), stated).read()
@@ -78,12 +78,12 @@ _FRAMES = re.compile(
 
 
 def scan_krl_data(text: str, stated: FrameFile) -> ScannedProgram:
-    """Read a data list (`.dat`): points of inline forms, whose frame and tool stand in the `FDAT` of their name.
+    """Scan a data list (`.dat`): points of inline forms, whose frame and tool are in the `FDAT` of their name.
 
-    The moves stand in the program that belongs to it, so straight ones get no way points.
+    The moves are in the program that belongs to it, so they have no way points.
 
     Args:
-        text: of the data list.
+        text: text of the data list.
         stated: `BASE_DATA[n]` and `TOOL_DATA[n]`; number 0 is the origin and the flange.
     """
     scan, visible = Scan(text), masked(text, _HIDDEN)
@@ -103,7 +103,7 @@ def scan_krl_data(text: str, stated: FrameFile) -> ScannedProgram:
 
 @dataclass
 class _Reader:
-    """Walks through the statements of a program."""
+    """Reader of the statements of a program."""
 
     scan: Scan
     text: str
@@ -123,7 +123,7 @@ class _Reader:
                 where = f" (line {self.scan.line(match.start())})"
                 self.names.add(match[1], pose if isinstance(pose, Pose) else pose + where)
         steps = [(match, step) for match in _STATEMENT.finditer(self.text) for step in self._steps(match)]
-        unknown = "the tool stands still and the workpiece moves" if _FIXED_TOOL.search(self.text) else ""
+        unknown = "the tool is fixed and the workpiece moves" if _FIXED_TOOL.search(self.text) else ""
         self.frames = FramesInForce(
             [step for _, step in steps],
             {name: unknown or f"{name} is not stated before the move" for name in _FRAMES_OF_MOVES},
@@ -137,7 +137,7 @@ class _Reader:
         return self.scan.program(self.names)
 
     def _steps(self, match: re.Match[str]) -> list[Step]:
-        """What a statement means for the order."""
+        """Convert a statement to steps of control flow."""
         return [
             Step("other")
             if step.kind == "call" and (step.name in KRL or self.stated.sets_neither(step.name))
@@ -146,7 +146,7 @@ class _Reader:
         ]
 
     def _value(self, match: re.Match[str], step: Step) -> Frame | str:
-        """What a statement sets a frame or the tool to, or why that is not known."""
+        """Return the frame or tool that a statement sets, or the reason why it is not known."""
         if match["form"]:
             return f"{step.name} is that of FDAT_ACT"
         look_up = self.stated.frame if step.name == "$BASE" else self.stated.tool
@@ -172,13 +172,13 @@ class _Reader:
             circular, cut = len(operands) == 2, None
             if isinstance(pose, Pose) and (circular or kind.endswith("LIN")):
                 if circular and (len(spans) > 2 or _TURNING.search(self.text)):
-                    self.scan.leave(match.start(), "the angle of the arc, or how the tool turns, is stated")
+                    self.scan.leave(match.start(), "the angle of the arc or its orientation is stated")
                 else:
                     cut = partial(self._way_points, match, operands)
             self.scan.move(match.start(), pose, *self._frames(match["target"]), cut, circular)
 
     def _frames(self, target: str) -> tuple[Frame | str, Frame | str]:
-        """Frame and tool of a move, which it may state for itself behind WITH."""
+        """Return frame and tool of a move, which it may state itself after WITH."""
         own = {f"${match[1].upper()}" for match in _WITH.finditer(target)}
         base, tool = (
             f"the move states {name}" if name in own else self.frames[name] for name in _FRAMES_OF_MOVES
@@ -192,7 +192,7 @@ class _Reader:
         return self.names.target(name[0]) if name else COMPUTED
 
     def _way_points(self, move: re.Match[str], operands: Sequence[int], poses: Sequence[Frame]) -> list[Edit]:
-        """Straight moves or arcs to all way points, which are passed by distance."""
+        """Return straight moves or arcs to all way points, with approximate positioning."""
         start = self.scan.line_start(move.start())
         word = self.text[start : operands[0]]
         smooth = "" if re.match(r"\s*S(LIN|CIRC)", word, re.IGNORECASE) else " C_DIS"
@@ -209,7 +209,7 @@ class _Reader:
 
 
 def _steps(match: re.Match[str]) -> list[Step]:
-    """What a statement means for the order."""
+    """Convert a statement to steps of control flow."""
     word = (match["flow"] or "").upper()
     if name := match["system"] or match["bas"]:
         return [Step("set", f"${name.upper()}")]
@@ -231,7 +231,7 @@ def _steps(match: re.Match[str]) -> list[Step]:
 
 
 def _axes_in_use(scan: Scan, visible: str) -> dict[str, int]:
-    """Lines in which a text moves external axes, by their names; the first one of each."""
+    """Return the first line in which a text moves each external axis, by name."""
     lines: dict[str, int] = {}
     for match in _EXTERNAL.finditer(visible):
         for name in axes_in_use({match[1].upper(): match[2].strip()}):
@@ -240,7 +240,7 @@ def _axes_in_use(scan: Scan, visible: str) -> dict[str, int]:
 
 
 def _target_pose(literal: re.Match[str], in_use: Mapping[str, int]) -> Pose | str:
-    """The pose of a target, or why external axes leave it alone."""
+    """Return the pose of a target, or the reason why external axes leave it unchanged."""
     values = {match[1].upper(): match[2].strip() for match in _EXTERNAL.finditer(literal[2])}
     return external_axes(values, in_use) or _pose(literal)
 

@@ -43,7 +43,7 @@ def _list(count: int) -> str:
 _PLACEMENT = rf"{_list(3)}\s*,\s*{_list(4)}"
 _TARGET = re.compile(rf"\[\s*({_PLACEMENT})\s*,\s*{_list(4)}\s*,\s*({_list(6)})\s*\]")
 _EXTERNAL = re.compile(rf"\]\s*,\s*({_list(6)})\s*\]")
-"""Of robtargets and of jointtargets."""
+"""External axes of robtargets and jointtargets."""
 _AXES = ("eax_a", "eax_b", "eax_c", "eax_d", "eax_e", "eax_f")
 _TOOL = re.compile(rf"\[\s*TRUE\s*,\s*\[\s*({_PLACEMENT})\s*\]", re.IGNORECASE)
 _WOBJ = re.compile(
@@ -67,7 +67,7 @@ _CALL = re.compile(
     r"(?=(?P<name>[A-Za-z]\w*|%)(?:\s*;|[ \t]+[^\s:=;.{]|\\|(?<=%)))",
     re.MULTILINE,
 )
-"""A statement that is a call, or one of the words that begin statements."""
+"""A statement that is a call, or one of the words that start statements."""
 _FLOW = (
     "PROC|ENDPROC|FUNC|ENDFUNC|TRAP|ENDTRAP|IF|ELSEIF|ELSE|ENDIF|FOR|ENDFOR|WHILE|ENDWHILE|TEST|CASE|DEFAULT|ENDTEST|"
     "GOTO|RETURN|ERROR"
@@ -80,10 +80,10 @@ _STATEMENT = re.compile(
 
 
 def scan_rapid(text: str, stated: FrameFile) -> ScannedProgram:
-    """Read a module; tool and work object are those of each move.
+    """Scan a module; tool and work object are those of each move.
 
     Args:
-        text: of the module.
+        text: text of the module.
         stated: tools and work objects that are declared in other modules.
     """
     return _Reader(Scan(text), masked(text, _HIDDEN), stated).read()
@@ -91,7 +91,7 @@ def scan_rapid(text: str, stated: FrameFile) -> ScannedProgram:
 
 @dataclass
 class _Reader:
-    """Walks through the statements of a module."""
+    """Reader of the statements of a module."""
 
     scan: Scan
     text: str
@@ -99,7 +99,7 @@ class _Reader:
     frames: dict[str, Frame | str] = field(default_factory=dict)
     axes_in_use: dict[str, int] = field(default_factory=dict)
     foreign: str = ""
-    """Why no frame and no tool is certain."""
+    """Reason why no frame and no tool is certain; "" without one."""
 
     def __post_init__(self) -> None:
         self.names = NamedPoses(self.text, _SET, str.upper)
@@ -148,7 +148,7 @@ class _Reader:
         return ""
 
     def _placed(self, read: _Read | str, match: re.Match[str]) -> _Read | str:
-        """What a declaration states, or why not, with its line."""
+        """Return the value of a declaration, or the reason why there is none with its line."""
         return f"{read} (line {self.scan.line(match.start())})" if isinstance(read, str) else read
 
     def _move(self, match: re.Match[str]) -> None:
@@ -158,7 +158,7 @@ class _Reader:
         kind = re.match(r"Move([JLC])", match["move"], re.IGNORECASE)
         count = 2 if kind and kind[1].upper() == "C" else 1
         if kind is None or len(spans) < count + 3:
-            self.scan.move(match.start(), "the move is of a kind that is not understood", IDENTITY, IDENTITY)
+            self.scan.move(match.start(), "this kind of move is not understood", IDENTITY, IDENTITY)
             return
         frame, tool = self._frames(self.text[slice(*spans[count + 2])])
         if displaced := _DISPLACED.search(self.text):
@@ -171,9 +171,9 @@ class _Reader:
             circular, cut = index == 1, None
             if isinstance(pose, Pose) and (circular or kind[1].upper() == "L"):
                 if timed:
-                    self.scan.leave(match.start(), "the move has a time, so no way points are put in")
+                    self.scan.leave(match.start(), "the move has a time, so it has no way points")
                 elif circular and _TURNING.search(self.text):
-                    self.scan.leave(match.start(), "the module states how the tool turns along arcs")
+                    self.scan.leave(match.start(), "the module states the orientation along arcs")
                 else:
                     cut = partial(self._way_points, match, spans, count, pose)
             self.scan.move(match.start(), pose, frame, tool, cut, circular)
@@ -184,7 +184,7 @@ class _Reader:
         return self.names.target(expression)
 
     def _frames(self, expression: str) -> tuple[Frame | str, Frame | str]:
-        """Work object and tool of a move, from its last argument."""
+        """Return work object and tool of a move from its last argument."""
         words = re.split(r"\s*\\\s*", expression)
         wobj = next(
             (word.split(":=")[1].strip() for word in words if re.match(r"(?i)WObj\s*:=", word)), "wobj0"
@@ -203,7 +203,7 @@ class _Reader:
         pose: Pose,
         poses: Sequence[Frame],
     ) -> list[Edit]:
-        """The move again before itself, once a way point, past which the tool flies."""
+        """Repeat the move before itself for every way point, as fly-by points."""
         start = self.scan.line_start(move.start())
         text, (begin, end) = self.scan.text, pose.span
         literal = _TARGET.search(text, text.rfind("[", 0, begin))
@@ -230,17 +230,17 @@ def _pose(literal: re.Match[str]) -> Pose:
 
 
 def _axes(text: str) -> dict[str, str]:
-    """The values of external axes in a list of all six, as texts."""
+    """Return the values of external axes in a list of all six, as texts."""
     return dict(zip(_AXES, (value.strip() for value in text.strip("[]").split(",")), strict=True))
 
 
 def _target_pose(literal: re.Match[str], in_use: Mapping[str, int]) -> Pose | str:
-    """The pose of a robtarget, or why it is left alone."""
+    """Return the pose of a robtarget, or the reason why it is left unchanged."""
     return external_axes(_axes(literal[2]), in_use) or _not_normalised(literal[1]) or _pose(literal)
 
 
 def _product(literal: re.Match[str]) -> Frame | str:
-    """The frames of tooldata or wobjdata, one in the other; or why they are none."""
+    """Multiply the frames of tooldata or wobjdata, or return the reason why they are invalid."""
     T = IDENTITY
     for frame in literal.groups():
         if fault := _not_normalised(frame):
@@ -250,7 +250,7 @@ def _product(literal: re.Match[str]) -> Frame | str:
 
 
 def _not_normalised(text: str) -> str:
-    """Why a position and a quaternion are no frame; "" where they are one."""
+    """Return the reason why position and quaternion are not a frame; "" if they are one."""
     quaternion = numbers_in(text)[3:]
     norm = math.hypot(*quaternion)
     if abs(norm - 1) <= MAX_SKEWNESS:

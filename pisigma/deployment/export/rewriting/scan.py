@@ -1,4 +1,4 @@
-"""What is understood of a program: poses in its text, the frame and tool they are of, and the moves to them."""
+"""Poses in the text of a program, their frames and tools, and the moves to them."""
 
 import bisect
 import re
@@ -22,12 +22,12 @@ IDENTITY = torch.eye(4, dtype=torch.float64)
 
 @dataclass(frozen=True, eq=False)
 class Pose:
-    """A pose that stands in a text.
+    """A pose in a text.
 
     Attributes:
-        span: where its numbers stand.
-        T: the pose, of the tool in the frame [m].
-        write: gives the text of another pose in the same form.
+        span: span of its numbers.
+        T: pose of the tool in the frame [m].
+        write: function that formats another pose in the same way.
     """
 
     span: tuple[int, int]
@@ -37,7 +37,7 @@ class Pose:
 
 @dataclass(frozen=True)
 class Edit:
-    """Text to put in place of a stretch of a program; an empty stretch is a place to insert at."""
+    """Replacement of a span of a program; an empty span is an insertion."""
 
     span: tuple[int, int]
     text: str
@@ -45,13 +45,13 @@ class Edit:
 
 @dataclass(frozen=True, eq=False)
 class Target:
-    """A pose that the robot is sent to.
+    """A pose that the robot moves to.
 
     Attributes:
-        line: of the pose.
+        line: line of the pose.
         pose: the pose.
-        T_root_frame: the frame it is given in, seen from the origin of the robot description.
-        T_flange_tool: the tool, seen from the last row of the robot description.
+        T_root_frame: frame of the pose, relative to the origin of the robot description.
+        T_flange_tool: tool, relative to the last row of the robot description.
     """
 
     line: int
@@ -65,14 +65,14 @@ class PathMove:
     """A straight move to a target, or an arc through another one.
 
     Attributes:
-        line: of the move.
-        start: the target before; None where the program does not say where the move begins.
-        via: the target that an arc passes; None for a straight move, or where the program does not state it.
-        end: where it leads.
+        line: line of the move.
+        start: previous target; None if the program does not determine it.
+        via: via point of an arc; None for a straight move, or if the program does not state it.
+        end: target of the move.
         circular: whether it is an arc.
-        way_points: gives the edits that make it go by poses of the end's tool in the end's frame. Those of an arc
-            become arcs too: by turns a pose that one passes and the pose where it ends, and at last the one that the
-            move itself passes then.
+        way_points: function that returns the edits for way points, which are poses of the end's tool in the end's
+            frame. An arc is split into arcs: the poses alternate between via and end points, and the last one is the
+            new via point of the move itself.
     """
 
     line: int
@@ -85,15 +85,15 @@ class PathMove:
 
 @dataclass(frozen=True, eq=False)
 class ScannedProgram:
-    """A program as far as it is understood.
+    """The parts of a program that are understood.
 
     Attributes:
-        text: of the program.
-        targets: those whose frame and tool are known, in the order of the text.
-        moves: the straight ones and the arcs among the moves to them.
-        left: line and reason of whatever is left alone.
-        joint_lines: lines of moves to joint values, which stay.
-        finish: what is done to the text after the edits, such as numbering its lines.
+        text: text of the program.
+        targets: targets whose frame and tool are known, in the order of the text.
+        moves: straight moves and arcs to these.
+        left: line and reason of everything that is left unchanged.
+        joint_lines: lines of moves to joint values, which are not changed.
+        finish: function that is applied to the text after the edits, for example to number its lines.
     """
 
     text: str
@@ -105,15 +105,15 @@ class ScannedProgram:
 
 
 class NamedPoses:
-    """Poses that a program sets once, by their names, and whether moves are all that uses them."""
+    """Named poses that a program sets once, and whether they are used in moves only."""
 
     def __init__(self, text: str, assignment: re.Pattern[str], fold: Callable[[str], str]) -> None:
         """Count the names of a text.
 
         Args:
-            text: masked.
-            assignment: matches whatever sets a name, which is its first group.
-            fold: how the language writes a name alike, such as `str.upper`.
+            text: text with comments and strings masked.
+            assignment: pattern of statements that set a name, which is its first group.
+            fold: normalisation of names in the language, for example `str.upper`.
         """
         self._fold = fold
         self._words = Counter(fold(word) for word in re.findall(r"\w+", text))
@@ -123,36 +123,36 @@ class NamedPoses:
         self._reasons: dict[str, str] = {}
 
     def is_set_once(self, name: str) -> bool:
-        """Whether one statement sets the name."""
+        """Return whether exactly one statement sets the name."""
         return self._set[self._fold(name)] == 1
 
     def add(self, name: str, pose: Pose | str) -> None:
-        """A pose that is set once, or why it is left alone."""
+        """Add a pose that is set once, or the reason why it is left unchanged."""
         if isinstance(pose, str):
             self._reasons[self._fold(name)] = pose
         else:
             self._poses[self._fold(name)] = pose
 
     def target(self, name: str) -> Pose | str:
-        """The pose of a name as the target of a move, or why it is not known."""
+        """Return the pose of a name as the target of a move, or the reason why it is not known."""
         return self.get(name) or self._reasons.get(self._fold(name), COMPUTED)
 
     def get(self, name: str, target: bool = True) -> Pose | None:
-        """The pose of a name; as the target of a move, or as a frame."""
+        """Return the pose of a name, as the target of a move or as a frame."""
         pose = self._poses.get(self._fold(name))
         self._uses[self._fold(name)] += target and pose is not None
         return pose
 
     def used_otherwise(self) -> list[Pose]:
-        """Poses whose names stand elsewhere than where they are set and in moves to them."""
+        """Return poses whose names also occur outside their assignment and moves to them."""
         return [pose for name, pose in self._poses.items() if self._words[name] - 1 > self._uses[name]]
 
 
 class Scan:
-    """Collects what a reader of a language understands, move after move in the order of the text."""
+    """Collector of the moves that a reader of a language finds, in the order of the text."""
 
     def __init__(self, text: str) -> None:
-        """Begin with the text of a program."""
+        """Start with the text of a program."""
         self.text = text
         self.line_end = "\r\n" if "\r\n" in text else "\n"
         self._breaks = [match.start() for match in re.finditer("\n", text)]
@@ -164,28 +164,28 @@ class Scan:
         self._last_two: tuple[Target | None, Target | None] = (None, None)
 
     def line(self, position: int) -> int:
-        """The line of a place in the text, from 1."""
+        """Return the line of a position in the text, from 1."""
         return bisect.bisect_left(self._breaks, position) + 1
 
     def line_start(self, position: int) -> int:
-        """Where the line of a place begins."""
+        """Return the start of the line of a position."""
         return self.text.rfind("\n", 0, position) + 1
 
     def leave(self, position: int, reason: str) -> None:
-        """Name what is left alone; the first reason of a line counts."""
+        """Record that a line is left unchanged; its first reason is kept."""
         self._left.setdefault(self.line(position), reason)
 
     def interrupt(self) -> None:
-        """What follows may be reached from elsewhere: the next move begins nobody knows where."""
+        """Record that the next statement may be reached from elsewhere, so the start of the next move is unknown."""
         self._last_two = (None, None)
 
     def joints(self, position: int) -> None:
-        """A move to joint values, which stays."""
+        """Record a move to joint values, which is not changed."""
         self._joint_lines.append(self.line(position))
         self._last_two = (None, None)
 
     def blur(self, pose: Pose) -> None:
-        """A pose is used in ways that are not understood, so it stays."""
+        """Record that a pose is used in a way that is not understood, so it is not changed."""
         self._unclear.add(pose.span)
 
     def move(
@@ -197,15 +197,15 @@ class Scan:
         way_points: Callable[[Sequence[Frame]], list[Edit]] | None = None,
         circular: bool = False,
     ) -> None:
-        """A move to a pose.
+        """Record a move to a pose.
 
         Args:
-            position: where the move stands.
-            pose: the pose, or why it is not understood; likewise `frame` and `tool`.
-            frame: that the pose is given in, seen from the origin of the robot description.
-            tool: that is brought there, seen from the last row of the robot description.
-            way_points: of a straight move or an arc, see `PathMove`.
-            circular: whether it is the end of an arc, whose other target came before.
+            position: position of the move in the text.
+            pose: the pose, or the reason why it is not understood; likewise `frame` and `tool`.
+            frame: frame of the pose, relative to the origin of the robot description.
+            tool: tool, relative to the last row of the robot description.
+            way_points: function for the way points of a straight move or an arc, see `PathMove`.
+            circular: whether it is the end of an arc, whose via point is the previous target.
         """
         start, via = self._last_two if circular else (self._last_two[1], None)
         self._last_two = (self._last_two[1], None)
@@ -231,7 +231,7 @@ class Scan:
     def program(
         self, names: NamedPoses | None = None, finish: Callable[[str], str] = lambda text: text
     ) -> ScannedProgram:
-        """What was collected, without poses that are used in ways that are not understood."""
+        """Return the collected program, without poses that are used in ways that are not understood."""
         for pose in names.used_otherwise() if names else ():
             self.blur(pose)
         for span, target in self._targets.items():
@@ -253,28 +253,28 @@ def _among(kept: Mapping[tuple[int, int], Target], target: Target | None) -> Tar
 
 
 def masked(text: str, hidden: re.Pattern[str]) -> str:
-    """The text with blanks in place of comments and strings, so that every place stays where it is."""
+    """Replace comments and strings by blanks, so that all positions are preserved."""
     return hidden.sub(lambda match: re.sub(r"[^\n]", " ", match[0]), text)
 
 
 def arguments(text: str, start: int) -> Iterator[tuple[int, int]]:
-    """Spans of what stands between commas at one level of brackets, from `start` to the bracket that ends it.
+    """Yield the spans between commas at one level of brackets, from `start` to the closing bracket.
 
     Args:
-        text: masked.
-        start: behind the opening bracket, or where a list without brackets begins.
+        text: text with comments and strings masked.
+        start: position after the opening bracket, or the start of a list without brackets.
     """
     depth, begin = 0, start
     for position in range(start, len(text)):
-        letter = text[position]
-        if letter in "([{":
+        character = text[position]
+        if character in "([{":
             depth += 1
-        elif letter in ")]}" or (letter == ";" and depth == 0):
+        elif character in ")]}" or (character == ";" and depth == 0):
             depth -= 1
-            if depth < 0 or letter == ";":
+            if depth < 0 or character == ";":
                 yield _stripped(text, begin, position)
                 return
-        elif letter == "," and depth == 0:
+        elif character == "," and depth == 0:
             yield _stripped(text, begin, position)
             begin = position + 1
 
@@ -285,24 +285,24 @@ def _stripped(text: str, start: int, end: int) -> tuple[int, int]:
 
 
 def groups_of(poses: Sequence[_Item], count: int) -> list[Sequence[_Item]]:
-    """The way points, or their names, of every move that is put in: one each, or two for arcs; see `PathMove`."""
+    """Group way points, or their names, by inserted move: one each, or two for arcs; see `PathMove`."""
     return [poses[first : first + count] for first in range(0, len(poses) - count + 1, count)]
 
 
 def axes_in_use(values: Mapping[str, str]) -> dict[str, str]:
-    """The external axes that stand elsewhere than at 0, or nobody knows where.
+    """Return the external axes whose value is not 0 or not known.
 
     Args:
-        values: texts by name of the axis; 9E9 says that there is none, or that it stays where it is.
+        values: texts by name of the axis; 9E9 means that the axis does not exist or does not move.
     """
     return {name: text for name, text in values.items() if not _is_zero(text) and not _is_absent(text)}
 
 
 def external_axes(values: Mapping[str, str], in_use: Mapping[str, int]) -> str:
-    """Why a pose with values of external axes is left alone; "" where none of them is in use.
+    """Return the reason why external axes leave a pose unchanged; "" if none of them is in use.
 
-    The robot description has no external axes: it is the robot as it stands where all of them are 0. A pose that does
-    not state one leaves it where the program has moved it before.
+    The robot description has no external axes: it describes the robot with all of them at 0. A pose that does not state
+    an axis leaves it where the program has moved it before.
 
     Args:
         values: texts by name of the axis, see `axes_in_use`.
@@ -310,12 +310,12 @@ def external_axes(values: Mapping[str, str], in_use: Mapping[str, int]) -> str:
     """
     if used := axes_in_use(values):
         names = ", ".join(f"{name} = {_plain(text)}" for name, text in used.items())
-        return f"the external axes {names} move robot or workpiece, and are not drawn"
+        return f"the external axes {names} move robot or workpiece, and are not in the robot description"
     open_axes = [name for name in in_use if name not in values or _is_absent(values[name])]
     if not open_axes:
         return ""
     names = ", ".join(f"{name} (in use in line {in_use[name]})" for name in open_axes)
-    return f"the external axes {names} may stand elsewhere than at 0, as the pose does not state them"
+    return f"the external axes {names} may not be at 0, as the pose does not state them"
 
 
 def _is_zero(text: str) -> bool:
@@ -337,5 +337,5 @@ def _plain(text: str) -> str:
 
 
 def numbers_in(text: str) -> list[float]:
-    """All numbers of a stretch of text."""
+    """Return all numbers in a text."""
     return [float(number) for number in re.findall(NUMBER, text)]

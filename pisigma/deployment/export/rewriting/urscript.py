@@ -43,22 +43,22 @@ _TURNING = re.compile(r"mode\s*=\s*(?!0$)")
 _Span = tuple[int, int]
 
 BLEND = 1e-3
-"""[m] Radius at way points, smaller where the way is short."""
+"""[m] Blend radius at way points, smaller if they are close together."""
 
 
 def scan_urscript(text: str, stated: FrameFile) -> ScannedProgram:
-    """Read a program; poses count from the base, or from the frame of a `pose_trans`.
+    """Scan a program; poses are relative to the base, or to the frame of a `pose_trans`.
 
     Args:
-        text: of the program.
-        stated: frames that the program does not state; its tool `tcp` holds until a `set_tcp` of numbers.
+        text: text of the program.
+        stated: frames that the program does not state; its tool `tcp` applies until a `set_tcp` with numbers.
     """
     return _Reader(Scan(text), masked(text, _HIDDEN), stated).read()
 
 
 @dataclass
 class _Reader:
-    """Walks through the statements of a program."""
+    """Reader of the statements of a program."""
 
     scan: Scan
     text: str
@@ -89,7 +89,7 @@ class _Reader:
         return self.scan.program(self.names)
 
     def _step(self, match: re.Match[str]) -> Step:
-        """What a statement means for the order."""
+        """Convert a statement to steps of control flow."""
         step = _step(match)
         is_harmless = step.name in URSCRIPT or self.stated.sets_neither(step.name)
         return Step("other") if step.kind == "call" and is_harmless else step
@@ -112,22 +112,22 @@ class _Reader:
     def _cut(
         self, call: re.Match[str], spans: Sequence[_Span], operands: Sequence[_Span], pose: Pose | str
     ) -> Callable[[Sequence[Frame]], list[Edit]] | None:
-        """What puts way points in, if that can be."""
+        """Return the function that inserts way points, or None if that is not possible."""
         rest = [self.text[slice(*span)] for span in spans[len(operands) :]]
         if isinstance(pose, str) or call["name"] == "servoc":
             return None
         if any(re.match(r"t\s*=", argument) for argument in rest):
-            self.scan.leave(call.start(), "the move has a time, so no way points are put in")
+            self.scan.leave(call.start(), "the move has a time, so it has no way points")
             return None
         if sum("=" not in argument for argument in rest) > 2 or any(map(_TURNING.match, rest)):
             self.scan.leave(
-                call.start(), "a radius without its name or a mode is stated, so no way points are put in"
+                call.start(), "an unnamed radius or a mode is stated, so the move has no way points"
             )
             return None
         return partial(self._way_points, call, spans, operands, rest, pose)
 
     def _target(self, span: _Span) -> tuple[Pose | str, Frame | str, _Span]:
-        """The pose that an argument is, the frame it is given in, and where it stands."""
+        """Return the pose of an argument, its frame, and its span."""
         expression = self.text[slice(*span)]
         if function := re.match(r"(get_inverse_kin|pose_trans)\s*\(", expression):
             inner = list(arguments(self.text, span[0] + function.end()))
@@ -155,7 +155,7 @@ class _Reader:
         pose: Pose,
         poses: Sequence[Frame],
     ) -> list[Edit]:
-        """The move again before itself, once a way point, with a small blend radius."""
+        """Repeat the move before itself for every way point, with a small blend radius."""
         start, count = self.scan.line_start(call.start()), len(operands)
         ends = torch.stack([*poses[count - 1 :: count], pose.T])[:, :3, 3]
         nearest = float((ends[1:] - ends[:-1]).norm(dim=-1).min())
@@ -175,7 +175,7 @@ class _Reader:
 
 
 def _step(match: re.Match[str]) -> Step:
-    """What a statement means for the order."""
+    """Convert a statement to steps of control flow."""
     word = (match["flow"] or "").strip()
     if match["routine"]:
         return Step("routine", match["routine"])
