@@ -11,6 +11,7 @@ import torch
 from testing.closeness import assert_close
 from testing.identified import geometric_model, hybrid_model
 from testing.models import hand_made_model, joints_around, with_limits
+from testing.refusals import refused
 
 from pisigma.deployment.export.onnx_model import FORWARD, INVERSE, export_onnx
 from pisigma.files.errors import MissingExtraError, ModelError
@@ -175,15 +176,11 @@ def test_the_same_model_gives_the_same_file():
 
 
 def test_geometry_alone_is_no_network():
-    with pytest.raises(
-        ModelError, match="has no network, only geometry; export that with --format urdf or dh"
-    ):
+    with refused(ModelError, value=geometric_model("kiro4").kind):
         export_onnx(geometric_model("kiro4"))
 
 
 def test_without_onnx_it_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "onnx", None)
-    with pytest.raises(
-        MissingExtraError, match=r'onnx, which is not installed; .*`pip install "pisigma\[onnx\]"`'
-    ):
+    with pytest.raises(MissingExtraError, match=r'`pip install "pisigma\[onnx\]"`'):
         export_onnx(hand_made_model("kiro4"))

@@ -114,8 +114,8 @@ def test_a_hybrid_tells_its_accuracy_and_frames():
     for row, q in zip(rows, solution.q, strict=True):
         assert_close(pose_in(row), forward_kinematics(drawn, q), atol=1e-12)
     text = targets_csv(targets)
-    assert "# The base is that of the frame 'wall'; the model knows 2 frames (wall, floor)." in text
-    assert f"Nominal robot: rb5 as drawn; base: x_mm {model.robot.base[0] * 1e3:.9g}, " in text
+    assert "# The base is that of the frame 'wall'; the model has 2 frames (wall, floor)." in text
+    assert f"Nominal robot: rb5; base: x_mm {model.robot.base[0] * 1e3:.9g}, " in text
 
 
 def test_what_is_said_of_the_nominal_robot_fits_in_comment_lines():

@@ -7,6 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from lxml import etree
 from testing.closeness import assert_close
+from testing.refusals import refused
 from testing.urdf import DrawnJoint, peer_poses, urdf_text
 
 from pisigma.deployment.export.urdf import robot_into_urdf
@@ -128,12 +129,12 @@ def test_any_chain(tmp_path_factory, seed, count):
 
 def test_files_of_other_robots_are_refused(path):
     drawn = Robot.load(path, tip="tool0")
-    with pytest.raises(RobotError, match="has the joints one, two, three, but the model those of theta_1"):
+    with refused(RobotError, option="--like", value="one, two, three"):
         robot_into_urdf(Robot.load("ur10"), Robot.load("ur10"), path, "tool0")
     longer = drawn.with_geometry(drawn.dh + 0.01)
-    with pytest.raises(RobotError, match=r"nominal geometry is not the model's \(off by 0\.01 m or rad\)"):
+    with refused(RobotError, option="--like", expected="the nominal geometry of the model"):
         robot_into_urdf(longer, longer, path, "tool0")
-    with pytest.raises(RobotError, match="has 2 ends"):
+    with pytest.raises(RobotError, match="2"):
         robot_into_urdf(drawn, drawn, path)
 
 

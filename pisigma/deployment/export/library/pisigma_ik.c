@@ -1,6 +1,6 @@
-/* What stands between C programs and the kernels: reads a model file, checks arguments, lays out results.
+/* Interface between C programs and the kernels: reads a model file, checks arguments, stores results.
  *
- * PISIGMA_DESCRIPTION_SIZE, PISIGMA_MEMORY_SIZE and PISIGMA_LAYOUT come from the compiler's command line.
+ * PISIGMA_DESCRIPTION_SIZE, PISIGMA_MEMORY_SIZE and PISIGMA_LAYOUT are defined on the compiler's command line.
  */
 #include "pisigma_ik.h"
 
@@ -12,7 +12,7 @@
 
 enum { SOLVE = 0, EVALUATE = 1 };
 
-/* The entry of the kernels, see pisigma/robot/kernels/kernels.py: description, memory, task, rows, T, near, near_rows, approach,
+/* Entry point of the kernels, see pisigma/robot/kernels/kernels.py: description, memory, task, rows, T, near, near_rows, approach,
  * approach_rows, branch, mark, single, out, count. */
 int32_t pisigma_run(int64_t *result, void **raised, const void *description, void *memory, int64_t task, int64_t rows,
                     double *T, const double *near_q, int64_t near_rows, const double *approach, int64_t approach_rows,
@@ -22,15 +22,15 @@ int32_t pisigma_run(int64_t *result, void **raised, const void *description, voi
 typedef struct {
     char magic[8];
     uint64_t layout, description_size, memory_size, joints, branches, segments, names_size;
-    int64_t arm; /* to evaluate; -1 for none */
-    double lowest[PISIGMA_MOST_JOINTS], highest[PISIGMA_MOST_JOINTS]; /* that `near_q` may be */
-    uint64_t axes_rows; /* 0 where all axes of the tool count */
-    double axes[8];     /* else which do, see pisigma/robot/kinematics/task_axes.py */
+    int64_t arm; /* arm to evaluate; -1 for none */
+    double lowest[PISIGMA_MOST_JOINTS], highest[PISIGMA_MOST_JOINTS]; /* range of `near_q` */
+    uint64_t axes_rows; /* 0 if all axes of the tool are constrained */
+    double axes[8];     /* else the constrained axes, see pisigma/robot/kinematics/task_axes.py */
 } head;
 
 struct pisigma_model {
     head said;
-    char *names; /* of the branches, each with a zero behind it */
+    char *names; /* names of the branches, each terminated by a zero */
     unsigned char *description;
 };
 
@@ -51,14 +51,14 @@ static int take(FILE *stream, void *target, size_t size, uint32_t *sum) {
 }
 
 static const char *fill(pisigma_model *model, FILE *stream) {
-    static const char *const cut = "is truncated or changed; export the model again";
+    static const char *const cut = "is truncated or was changed; export the model again";
     head *said = &model->said;
     uint32_t sum = 0, stated;
     if (!take(stream, said, sizeof *said, &sum) || memcmp(said->magic, "PSIGIK01", 8) != 0)
-        return "is no model file of this library";
+        return "is not a model file of this library";
     if (said->layout != PISIGMA_LAYOUT || said->description_size != PISIGMA_DESCRIPTION_SIZE ||
         said->memory_size != PISIGMA_MEMORY_SIZE)
-        return "was exported by another version; use the library that was exported with it";
+        return "was exported by another version; use the library that was exported together with it";
     if (said->joints > PISIGMA_MOST_JOINTS || said->names_size > 4096) return cut;
     model->names = calloc(1, said->names_size + 1);
     model->description = calloc(1, PISIGMA_DESCRIPTION_SIZE);
@@ -120,7 +120,7 @@ int pisigma_solve(const pisigma_model *model, const double pose[16], const doubl
     memcpy(T, pose, sizeof T);
     for (int j = 0; near_q && j < dof; j++) {
         int possible = near_q[j] >= model->said.lowest[j] && near_q[j] <= model->said.highest[j];
-        beside[j] = possible ? near_q[j] : NAN; /* degrees, most likely: INVALID_POSE */
+        beside[j] = possible ? near_q[j] : NAN; /* probably in degrees: INVALID_POSE */
     }
     for (int j = 0; approach && j < dof; j++)
         if (approach[j] != -1.0 && approach[j] != 0.0 && approach[j] != 1.0) T[0] = NAN;

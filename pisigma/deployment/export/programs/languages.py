@@ -26,7 +26,10 @@ from pisigma.robot.description import Robot
 from pisigma.robot.kinematics.status import Status
 
 TEST = "TEST IT AT LOW SPEED FIRST: neither the targets nor the motions between them were checked for collisions."
-COUNTING = "Joint values have the zeros and directions of the robot description '{robot}'; the controller has to use the same."
+COUNTING = (
+    "Joint values have the zeros and directions of the robot description '{robot}'; the controller has to use the "
+    "same."
+)
 CARTESIAN = (
     "Poses are those of the nominal robot at the corrected joint values: the controller has to compute with the "
     "nominal robot, and its accuracy options have to be off.",
@@ -308,9 +311,12 @@ def program_text(targets: Targets, path: Path, cartesian: bool, config: str | No
     if cartesian and not language.keeps_branch and len(set(targets.branch)) > 1:
         other = next(row for row, name in enumerate(targets.branch) if name != targets.branch[0])
         raise OutputError(
-            f"{targets.source}, line {targets.line[other]}: the target lies on branch {targets.branch[other]}, "
-            f"that of line {targets.line[0]} on branch {targets.branch[0]}, which a {language.name} program of "
-            "poses cannot tell apart; take --targets joints or one --branch."
+            f"the target is on branch {targets.branch[other]}, that of line {targets.line[0]} on branch "
+            f"{targets.branch[0]}, which poses of a {language.name} program cannot distinguish",
+            expected=f"a target on branch {targets.branch[0]}",
+            value=targets.branch[other],
+            at=Place(targets.source, targets.line[other]),
+            remedy="choose --targets joints or one --branch",
         )
     if cartesian and language.configuration:
         _check_turns(targets)

@@ -7,8 +7,8 @@ from typing import Literal, NamedTuple
 
 from pisigma.deployment.export.rewriting.scan import Frame
 
-_WAY = "depends on the path through the program"
-_CALLER = "depends on the caller of the routine"
+DEPENDS_ON_PATH = "depends on the path through the program"
+DEPENDS_ON_CALLER = "depends on the caller of the routine"
 
 
 class Step(NamedTuple):
@@ -85,7 +85,9 @@ class FramesInForce:
         """
         step = self._steps[number]
         if step.kind == "set":
-            self._values[step.name] = f"{step.name} {_WAY}" if self._is_reached_twice(number) else value
+            self._values[step.name] = (
+                f"{step.name} {DEPENDS_ON_PATH}" if self._is_reached_twice(number) else value
+            )
         elif step.kind == "call":
             where = "is" if step.name in self._set_by else "may be"
             whose = "" if step.name in self._set_by else " of another file"
@@ -95,15 +97,15 @@ class FramesInForce:
             self._values = dict(self._saved[-1])
             # calls in a condition also affect the following parts
             begin = self._open[number][-1] if self._open[number] else number
-            self._doubt(self._set_in(begin, ("call",)), _WAY)
+            self._doubt(self._set_in(begin, ("call",)), DEPENDS_ON_PATH)
         elif step.kind == "end":
             self._end(number)
         elif step.kind in ("routine", "loop", "branch"):
             self._saved.append(dict(self._values))
             if step.kind == "loop":
-                self._doubt(self._set_in(number), _WAY)
+                self._doubt(self._set_in(number), DEPENDS_ON_PATH)
             elif step.kind == "routine":
-                self._doubt(self._set_elsewhere(step.name), _CALLER)
+                self._doubt(self._set_elsewhere(step.name), DEPENDS_ON_CALLER)
 
     def _end(self, number: int) -> None:
         """Leave a block."""
@@ -111,7 +113,7 @@ class FramesInForce:
             return
         begin, saved = self._ends[number], self._saved.pop()
         if self._steps[begin].kind != "routine":
-            self._doubt(self._set_in(begin), _WAY)
+            self._doubt(self._set_in(begin), DEPENDS_ON_PATH)
             return
         nested = bool(self._open[number])
         kept = {name for name, places in self._places.items() if places == 1 and not nested}

@@ -30,6 +30,11 @@ _LINE_NUMBER = re.compile(r"(?m)^ *\d+:")
 STRAIGHT = 1e-4
 """Sine of the angle between the chords to the second and the third point below which they define no arc."""
 
+COLLINEAR = "the points of the arc are collinear or coincide, so it has no way points"
+OTHER_ORIENTATION = (
+    "the orientation at the via point of the arc is not between start and end, so it has no way points"
+)
+
 Points = Float64[Tensor, "arcs 3"]
 
 
@@ -161,11 +166,11 @@ class ProgramCorrection:
             return _between(start, end, _steps(start, end, _distance(start, end)))[0]
         via = _seen_from(move.end, move.via)
         if is_straight(*(T[:, :3, 3] for T in (start, via, end))):
-            return "the points of the arc are collinear or coincide, so it has no way points"
+            return COLLINEAR
         arc = Arcs.through(*(T[:, :3, 3] for T in (start, via, end)))
         between = start[:, :3, :3] @ rotation_from_vector(arc.passing / arc.angle * _turn(start, end))
         if LEVER * float(rotation_vector(between.mT @ via[:, :3, :3]).norm()) > self.tolerance:
-            return "the orientation at the via point is not between those of start and end, so the arc has no way points"
+            return OTHER_ORIENTATION
         length = float(arc.angle * arc.radius.norm())
         return _round(start, via, end, _steps(start, end, length))[0]
 

@@ -68,7 +68,7 @@ class _Reader:
     redefined: list[re.Match[str]] = field(default_factory=list)
     axes_in_use: dict[str, int] = field(default_factory=dict)
     call: re.Match[str] | None = None
-    """The first call of a routine of another file; `uncertain` is the position after which it affects frames and tools."""
+    """The first call of a routine of another file; `uncertain` is the position after which frames are uncertain."""
     uncertain: float = math.inf
 
     def read(self) -> ScannedProgram:

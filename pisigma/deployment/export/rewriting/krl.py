@@ -60,6 +60,9 @@ _LOOPS = ("FOR", "WHILE", "LOOP", "REPEAT")
 _FRAMES_OF_MOVES = ("$BASE", "$TOOL")
 
 
+STATED_ARC = "the angle of the arc or its orientation is stated, so it has no way points"
+
+
 def scan_krl(text: str, stated: FrameFile) -> ScannedProgram:
     """Scan a program; poses are those of `$TOOL` in `$BASE`, which the program has to set before them.
 
@@ -172,7 +175,7 @@ class _Reader:
             circular, cut = len(operands) == 2, None
             if isinstance(pose, Pose) and (circular or kind.endswith("LIN")):
                 if circular and (len(spans) > 2 or _TURNING.search(self.text)):
-                    self.scan.leave(match.start(), "the angle of the arc or its orientation is stated")
+                    self.scan.leave(match.start(), STATED_ARC)
                 else:
                     cut = partial(self._way_points, match, operands)
             self.scan.move(match.start(), pose, *self._frames(match["target"]), cut, circular)

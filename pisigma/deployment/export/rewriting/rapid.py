@@ -173,7 +173,10 @@ class _Reader:
                 if timed:
                     self.scan.leave(match.start(), "the move has a time, so it has no way points")
                 elif circular and _TURNING.search(self.text):
-                    self.scan.leave(match.start(), "the module states the orientation along arcs")
+                    self.scan.leave(
+                        match.start(),
+                        "the module states the orientation along arcs, so they have no way points",
+                    )
                 else:
                     cut = partial(self._way_points, match, spans, count, pose)
             self.scan.move(match.start(), pose, frame, tool, cut, circular)

@@ -8,6 +8,7 @@ import pytest
 from testing.calibrated_arm import calibrated_arm, joints_of
 from testing.closeness import assert_close
 from testing.models import hand_made_model, no_type_checker
+from testing.refusals import refused
 from testing.serving import CLIENTS
 
 from pisigma.deployment.export.export_format import ExportRequest
@@ -83,11 +84,11 @@ def test_a_file_that_is_not_its_own_is_refused(exported, tmp_path):
     content = (exported / MODEL).read_bytes()
     middle = len(content) // 2
     cases = {
-        b"": "is no model file",
-        b"x" * 1000: "is no model file",
-        content[:8] + b"\0" * 8 + content[16:]: "was exported by another version",
-        content[:-1]: "is truncated or changed",
-        content[:middle] + bytes([content[middle] ^ 1]) + content[middle + 1 :]: "is truncated or changed",
+        b"": "not a model file",
+        b"x" * 1000: "not a model file",
+        content[:8] + b"\0" * 8 + content[16:]: "another version",
+        content[:-1]: "truncated",
+        content[:middle] + bytes([content[middle] ^ 1]) + content[middle + 1 :]: "truncated",
     }
     for wrong, sentence in cases.items():
         (tmp_path / MODEL).write_bytes(wrong)
@@ -102,12 +103,12 @@ def test_a_folder_gets_the_three_files_and_no_compiler_is_said(exported, reposit
     assert {HEADER, LIBRARY, MODEL} <= {path.name for path in exported.iterdir()}
     model = repository / "models" / "kiro4"
     monkeypatch.setenv("CC", "no-such-compiler")
-    with pytest.raises(OutputError, match="there is none \\(no-such-compiler\\); install gcc"):
+    with refused(OutputError, value="no-such-compiler"):
         export_model("library", ExportRequest(model, tmp_path / "made"))
     assert not (tmp_path / "made").exists()
-    with pytest.raises(OutputError, match="is an input of this command"):
+    with pytest.raises(OutputError, match=str(model)):
         export_model("library", ExportRequest(model, model))
     (tmp_path / "file").write_text("")
     monkeypatch.delenv("CC")
-    with pytest.raises(OutputError, match="no folder can be made there"):
+    with refused(OutputError, file=str(tmp_path / "file"), option="--out"):
         export_model("library", ExportRequest(model, tmp_path / "file"))

@@ -1,4 +1,4 @@
-"""Circular moves of rewritten programs: arcs that are cut, and those that are left alone."""
+"""Circular moves of rewritten programs: arcs that are split, and those that are left unchanged."""
 
 import json
 import math
@@ -22,7 +22,8 @@ from testing.rewritten_programs import (
 from pisigma.deployment.export.export_format import ExportRequest
 from pisigma.deployment.export.programs.text import millimetres_and_euler
 from pisigma.deployment.export.registry import export_model
-from pisigma.deployment.export.rewriting.correction import Arcs, is_straight
+from pisigma.deployment.export.rewriting.correction import COLLINEAR, OTHER_ORIENTATION, Arcs, is_straight
+from pisigma.deployment.export.rewriting.krl import STATED_ARC
 from pisigma.model.folder.model_folder import load_model
 
 POINTS = torch.tensor([[0.0, 0.0, 0.0], [0.05, 0.09, 0.02], [0.16, 0.1, 0.05]], dtype=torch.float64)
@@ -127,28 +128,28 @@ def test_an_arc_along_which_the_tool_turns_otherwise_is_not_cut(suffix, arm, tmp
 @pytest.mark.parametrize(
     ("change", "reason"),
     [
-        (lambda T: T[1, :3, :3].copy_(T[1, :3, :3] @ TOOL[:3, :3]), "turns along the arc otherwise"),
-        (lambda T: T[1, :3, 3].copy_((T[0, :3, 3] + T[2, :3, 3]) / 2), "lie on a line or in one place"),
+        (lambda T: T[1, :3, :3].copy_(T[1, :3, :3] @ TOOL[:3, :3]), OTHER_ORIENTATION),
+        (lambda T: T[1, :3, 3].copy_((T[0, :3, 3] + T[2, :3, 3]) / 2), COLLINEAR),
     ],
 )
 def test_arcs_without_one_meaning_are_named(change, reason, arm, tmp_path):
     T = _poses(arm)
     change(T)
     exported = export_model("targets", _request(".src", PROGRAMS[".src"].text, T, arm, tmp_path))
-    assert any(reason in sentence for sentence in _reasons(exported))
+    assert reason in _reasons(exported)
     assert exported.facts["way_points"] == 0
 
 
 def test_an_arc_behind_a_move_to_joint_values_is_named(arm, tmp_path):
     text = PROGRAMS[".src"].text.replace("CIRC", "PTP {{A1 0, A2 -90, A3 90, A4 0, A5 0, A6 0}}\nCIRC")
     exported = export_model("targets", _request(".src", text, _poses(arm), arm, tmp_path))
-    assert any("where the arc begins or what it passes is not stated" in why for why in _reasons(exported))
+    assert any(why.startswith("the start or via point of the arc") for why in _reasons(exported))
 
 
 def test_an_arc_that_goes_on_beyond_its_end_is_named(arm, tmp_path):
     text = PROGRAMS[".src"].text.replace("{P2} ;", "{P2}, CA 200 ;")
     exported = export_model("targets", _request(".src", text, _poses(arm), arm, tmp_path))
-    assert any("the angle of the arc" in why for why in _reasons(exported))
+    assert STATED_ARC in _reasons(exported)
     assert exported.facts["way_points"] == 0
 
 
