@@ -220,7 +220,7 @@ def test_external_axes_that_are_in_use_leave_the_pose_and_are_named(named):
         text = fanuc("L P[1] 100mm/sec FINE").replace("R = 0.0 deg", f"R = 0.0 deg,\n    E1= {value} mm")
         found = scan_fanuc(text, FRAMES)
         assert bool(found.targets) == understood
-        assert understood or "E1 = -90 " in found.left[0][1] and "(P[1], line 5)" in found.left[0][1]
+        assert understood or ("E1 = -90 " in found.left[0][1] and "(P[1], line 5)" in found.left[0][1])
     frames = "DECL FDAT FP={TOOL_NO 0,BASE_NO 0,IPO_FRAME #BASE}\n"
     data = frames + "DECL E6POS XP={X 1,Y 2,Z 3,A 4,B 5,C 6,E1 7}\n"
     assert "E1 = 7" in dict(scan_krl_data(data, FrameFile()).left)[2]
