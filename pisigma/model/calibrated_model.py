@@ -260,8 +260,12 @@ def known_names(
         if len(set(names)) > 1:
             other = next(row for row, name in enumerate(names) if name != names[0])
             raise MeasurementError(
-                f"{measurements.place(other)}: {what} '{names[other]}' stands there, but "
-                f"{measurements.place(0)} has '{names[0]}', and the model knows one {what} only; give a file for each."
+                f"{what} '{names[other]}' differs from '{names[0]}' ({measurements.at(0)}), but the model has only one "
+                f"{what}",
+                expected=f"{what} '{names[0]}'",
+                value=names[other],
+                at=measurements.at(other, what),
+                remedy=f"give a file for each {what}",
             )
         return ("",) * len(names)
     if len(known) == 1 and not any(names):
@@ -269,10 +273,12 @@ def known_names(
     for row, name in enumerate(names):
         if name not in known:
             crossed = (measurements.target if what == "frame" else measurements.frame)[row] in known
-            hint = " (of a camera, check --fixed-camera)" if name and crossed else ""
+            hint = " (check --fixed-camera if it is a camera)" if name and crossed else ""
             raise MeasurementError(
-                f"{measurements.place(row)}: the model was not fitted to {what} '{name}'{hint}; "
-                f"{nearest_choice(name, known)}"
+                f"the model was not calibrated for {what} '{name}'{hint}",
+                value=name,
+                at=measurements.at(row, what),
+                remedy=nearest_choice(name, known),
             )
     return names
 

@@ -56,9 +56,9 @@ def test_targets_for_a_payload(run, refuses, poses, tmp_path):
     save_model(hybrid_model("ur10", [FourierSeries(robot, 2), learned]), tmp_path / "arm")
     path, out = poses(good_poses("ur10")), tmp_path / "targets.csv"
     assert export(run, tmp_path / "arm", path, out).exit_code == 0
-    assert "Made for payload_kg 2 (usual)." in out.read_text()
+    assert "For payload_kg 2 (mean of the calibration)." in out.read_text()
     assert export(run, tmp_path / "arm", path, out, "--payload-kg", 5).exit_code == 0
-    assert "Made for payload_kg 5." in out.read_text()
+    assert "For payload_kg 5." in out.read_text()
     rows = list(csv.DictReader(line for line in out.read_text().splitlines() if not line.startswith("#")))
     degrees = [[float(row[f"q{i}_deg"]) for i in range(1, 7)] for row in rows]
     q = torch.deg2rad(torch.tensor(degrees, dtype=torch.float64))
@@ -67,7 +67,7 @@ def test_targets_for_a_payload(run, refuses, poses, tmp_path):
     assert_close(
         poses_of_rows(load_model(tmp_path / "arm"), Measurements(q=q, payload=payload)), wanted, atol=1e-9
     )
-    beyond = "payload_kg 9 lies beyond the 0 to 5 that hybrid_ur10 was calibrated at"
+    beyond = "payload_kg 9 is outside 0 to 5"
     assert export(run, tmp_path / "arm", path, out, "--payload-kg", 9).exit_code == 0
     assert beyond in out.read_text()
     written = run(
@@ -75,14 +75,14 @@ def test_targets_for_a_payload(run, refuses, poses, tmp_path):
     )
     assert json.loads(written.stdout)["warnings"][0].startswith(beyond)
     pose = run("ik", tmp_path / "arm", "--pose", *[500, 200, 300, 0, 0, 0], "--payload-kg", 9)
-    assert "Warning: payload_kg 9 lies beyond the 0 to 5" in pose.stdout
+    assert "Warning: payload_kg 9 is outside 0 to 5" in pose.stdout
     found = run("ik", tmp_path / "arm", "--poses", path, "--out", tmp_path / "q.csv", "--payload-kg", 5)
     assert found.exit_code == 0
     joints = list(csv.DictReader((tmp_path / "q.csv").read_text().splitlines()))
     assert [float(row["q1_deg"]) for row in joints] == pytest.approx([float(row["q1_deg"]) for row in rows])
     options = ("--format", "offsets", "--out", tmp_path / "offsets.csv", "--payload-kg")
     assert run("export", tmp_path / "arm", *options, 5).exit_code == 0
-    assert "Made for payload_kg 5." in (tmp_path / "offsets.csv").read_text()
+    assert "For payload_kg 5." in (tmp_path / "offsets.csv").read_text()
     assert "payload_kg=-1 was stated; give a mass of 0 or more" in refuses(
         "export", tmp_path / "arm", *options, -1
     )
@@ -200,9 +200,7 @@ def test_a_pose_outside_the_domain(run, models, poses, tmp_path):
         result = export(run, models / "ur10", path, out)
         assert result.exit_code == 0
         assert "1 reached, 1 outside_domain" in result.stdout
-        assert result.stderr.startswith(
-            "pisigma: 1 of 2 poses, line 4: outside_domain. "
-        )
+        assert result.stderr.startswith("pisigma: 1 of 2 poses, line 4: outside_domain. ")
         text = out.read_text()
         assert ("4,outside_domain," if suffix == ".csv" else "line 4 OUTSIDE DOMAIN") in text
 

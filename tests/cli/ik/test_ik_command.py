@@ -108,9 +108,7 @@ def test_unreachable_pose(run, refuses, models, name):
 )
 def test_singular_pose(run, refuses, models, name, q):
     pose = pose_of(name, torch.tensor(q, dtype=torch.float64))
-    assert ": singular. " in refuses(
-        "ik", models / name, "--pose", *pose, stdout=None
-    )
+    assert ": singular. " in refuses("ik", models / name, "--pose", *pose, stdout=None)
     result = run("ik", models / name, "--pose", *pose, "--json")
     assert result.exit_code == 2
     (solution,) = json.loads(result.stdout)["solutions"]
