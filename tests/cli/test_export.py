@@ -124,11 +124,11 @@ def test_offsets(run, geometric, tmp_path):
     assert 0 < lost["mean_mm"] < lost["p95_mm"] < lost["max_mm"]
     assert lost["mean_mm"] < drawn["mean_mm"]
     text = (tmp_path / "o.yaml").read_text()
-    assert f"off the whole model by {lost['mean_mm']:.4g} mm" in text
+    assert f" {lost['mean_mm']:.4g} mm" in text
     written = yaml.safe_load(text)
     assert written["off_the_whole_model"] == lost
     printed = run("export", geometric, "--format", "offsets", "--out", tmp_path / "o.csv")
-    assert f"{lost['mean_mm']:.4g} mm in the mean" in printed.stdout
+    assert f"{lost['mean_mm']:.4g} mm" in printed.stdout
     lines = (tmp_path / "o.csv").read_text().splitlines()
     assert f"{lost['max_mm']:.4g} mm at most" in "".join(line for line in lines if line.startswith("#"))
     *joints, base, tool = csv.DictReader(line for line in lines if not line.startswith("#"))
