@@ -1,4 +1,4 @@
-"""A hostile input: files in a folder, the command that is to read them, and what is allowed to come of it."""
+"""A hostile input: files in a folder, the command that reads them, and its allowed results."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -17,11 +17,11 @@ class Case:
     """One hostile input.
 
     Attributes:
-        what: was done to which clean input.
-        arguments: of the command, which runs in the folder of the case.
-        truth: clean measurements whose other rows a model is held against; None where there is no truth.
-        healthy: nothing is wrong with it, so that it has to be accepted.
-        check: says what is wrong with what the accepted command wrote into the folder; "" where nothing is.
+        what: description of the change, and of the clean input.
+        arguments: arguments of the command, which runs in the folder of the case.
+        truth: clean measurements, on whose other rows a model is evaluated; None where the truth is unknown.
+        healthy: whether the input is correct, so that it has to be accepted.
+        check: returns a fault of the outputs of an accepted command; "" without one.
     """
 
     what: str
@@ -36,10 +36,10 @@ Generator = Callable[[Rng, Clean, Path], Case]
 
 
 def one_of(rng: Rng, choices: Sequence[Choice]) -> Choice:
-    """Draw one of some choices of any type."""
+    """Draw one of the choices."""
     return choices[int(rng.integers(len(choices)))]
 
 
 def calibrate(robot: str, data: str, *more: str) -> tuple[str, ...]:
-    """The arguments of a quick calibration that writes the folder `out`."""
+    """Return the arguments of a quick calibration that writes the folder `out`."""
     return ("calibrate", robot, data, "--out", "out", "--model", "geometric", "--folds", "0", *more)

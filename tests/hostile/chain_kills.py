@@ -1,4 +1,4 @@
-"""Kill a chain of recalibrations, and the monitoring of its models, at random moments, and see that nothing is lost.
+"""Kill a chain of recalibrations, and the monitoring of its models, at random moments, and check that nothing is lost.
 
 `python tests/hostile/chain_kills.py --count 50 [--seed 0]`
 """
@@ -29,7 +29,7 @@ SECONDS = 6.0
 
 
 def _files(folder: Path) -> set[str]:
-    """All files below a folder, while others come and go."""
+    """List all files below a folder, while others are created and deleted."""
     return {os.path.join(place, name) for place, _, names in os.walk(folder) for name in names}
 
 
@@ -37,8 +37,8 @@ class Chain:
     """Models link-0, link-1, ... in a folder, each recalibrated from the one before, and the sessions of each.
 
     Attributes:
-        folder: where all lies.
-        links: how many models are whole.
+        folder: folder of the models.
+        links: number of whole models.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -49,7 +49,7 @@ class Chain:
         self._before, self._files = contents(folder), _files(folder)
 
     def start(self, number: int, monitor: bool) -> subprocess.Popen[bytes]:
-        """Start to monitor the last model, or to recalibrate it, with rows of their own."""
+        """Start to monitor the last model, or to recalibrate it, with new rows."""
         rows = self.folder / f"2026-01-{number % 28 + 1:02d}.csv"
         rows_later(10, number + 1000).write_csv(rows, model_before().robot)
         self._before, self._sessions = contents(self.folder), self.sessions()
@@ -60,12 +60,12 @@ class Chain:
         return start(("recalibrate", last, rows.name, "--out", f"link-{self.links}"), self.folder)
 
     def wait_for_writing(self, process: subprocess.Popen[bytes]) -> None:
-        """Wait until the command begins to write beside the models, or ends."""
+        """Wait until the command starts to write next to the models, or ends."""
         while process.poll() is None and _files(self.folder) == self._files:
             time.sleep(0.001)
 
     def sessions(self) -> set[tuple[str, str]]:
-        """Sessions that the histories of all models hold, by model and rows."""
+        """Return the sessions in the histories of all models, by model and rows."""
         held: set[tuple[str, str]] = set()
         for number in range(self.links):
             path = history_path(self.folder / f"link-{number}")
@@ -77,7 +77,7 @@ class Chain:
         return held
 
     def fault(self) -> str:
-        """What the last command lost or left in pieces; "" where all is well."""
+        """Return what the last command lost or left incomplete; "" for nothing."""
         now = contents(self.folder)
         kept = (path for path in self._before if path[0] != "." and ".sqlite" not in path)
         lost = [path for path in kept if now.get(path) != self._before[path]]
@@ -91,7 +91,7 @@ class Chain:
 
 
 def main() -> None:
-    """Kill recalibrations and monitorings in turn, at any time or while they write; run each to its end at last."""
+    """Kill recalibrations and monitorings alternately, at any time or while they write, and finally let each finish."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--count", type=int, default=50)
     parser.add_argument("--seed", type=int, default=0)

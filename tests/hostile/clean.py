@@ -1,4 +1,4 @@
-"""The clean inputs that hostile ones are made of: measurements, robots, URDFs, recipes, models and poses."""
+"""The clean inputs that hostile ones are made from: measurements, robots, URDFs, recipes, models and poses."""
 
 import os
 import warnings
@@ -34,7 +34,7 @@ class CleanRows:
     Attributes:
         robot: catalogue name or file.
         path: the file of the rows.
-        other: more rows of the same robot, for judging; None where there are none with positions.
+        other: further rows of the same robot, for evaluation; None where there are none with positions.
     """
 
     robot: str
@@ -43,7 +43,7 @@ class CleanRows:
 
     @property
     def nominal(self) -> Robot:
-        """The robot as drawn."""
+        """The nominal robot."""
         return Robot.load(self.robot)
 
 
@@ -69,7 +69,7 @@ class Clean:
 
 
 def write_clean(folder: Path) -> Clean:
-    """Write all clean inputs into a folder; those of measured robots and of the outside simulator where they are."""
+    """Write all clean inputs into a folder; those of measured robots and of the external simulator if available."""
     load_kernels()  # compiles them on a new machine, which would count as time of the first input
     rows = {
         name: simulated_rows(folder, name, turn=turn)
@@ -104,7 +104,7 @@ def simulated_rows(
 
 
 def _all_sensors(folder: Path) -> CleanRows:
-    """Tracker, touches, sockets, a wire and pairs in one file."""
+    """Write rows of a tracker, touches, sockets, a wire and pairs into one file."""
     q, path = joints(200, 77), folder / "welding.csv"
     T = forward_kinematics(true_robot().geometric_robot, q)
     mixed_data().write_csv(path, true_robot().nominal)
@@ -112,7 +112,7 @@ def _all_sensors(folder: Path) -> CleanRows:
 
 
 def _measured(folder: Path) -> dict[str, CleanRows]:
-    """A part of the files of measured robots, and the same number of other rows."""
+    """Return a part of the files of measured robots, and the same number of other rows."""
     files = {
         "ur5 measured": ("ur5", "ur5/grid.csv", 12),
         "ur10 measured": ("ur10", "ur10/series_c_train.csv", 24),
@@ -132,7 +132,7 @@ def _measured(folder: Path) -> dict[str, CleanRows]:
 
 
 def outside_rows(folder: Path, name: str, seed: int = 3, rows: int = 80) -> CleanRows:
-    """Measurements of an arm with gears and sag, drawn in URDF, by a simulator that shares no code with the package."""
+    """Simulate an arm with gears and sag, described in URDF, without any code of the package."""
     outside, stem = simulator(), str(folder / name)
     outside.URDF[stem] = outside.URDF[name]
     with warnings.catch_warnings():
@@ -148,7 +148,7 @@ def outside_rows(folder: Path, name: str, seed: int = 3, rows: int = 80) -> Clea
 
 
 def _explained_rows(folder: Path, model: CalibratedModel) -> Path:
-    """Positions that a model predicts at joint values that it keeps, with noise, as a file beside its folder."""
+    """Write positions that a model predicts at its stored joint values, with noise, next to its folder."""
     path, q = folder.with_suffix(".csv"), model.starts[:40]
     with torch.no_grad():
         position = poses_of_rows(model, Measurements(q=q))[:, :3, 3].contiguous()
@@ -158,7 +158,7 @@ def _explained_rows(folder: Path, model: CalibratedModel) -> Path:
 
 
 def _models(folder: Path) -> tuple[dict[Path, Path], Path]:
-    """A geometric, a hybrid and a network model, and poses of the first."""
+    """Write a geometric, a hybrid and a network model, and poses of the first."""
     geometric, q, T = calibrated_ur5(40)
     models = {}
     for name, model in {

@@ -1,4 +1,4 @@
-"""Damage to any text file: bytes, lines, cells and words, whatever the file means."""
+"""Damage to any text file: bytes, lines, cells and words, regardless of the format."""
 
 import re
 
@@ -9,19 +9,19 @@ NUMBERS = (
     "1'000", "1 000", "12.5 mm", "10°", "+-3", "--3", "1e", "1.2.3", "１２", "٣", "#N/A", "null", "None", "N/A", "-",
     "-999", "9999999", "2026-11-22", "12:30", "=1+1", "true", "1e999", "9" * 400, "0." + "3" * 400, "1d5", "½",
 )  # fmt: skip
-"""What stands in cells where a number was wanted."""
+"""Cells in place of a number."""
 TEXTS = (
     "", " ", "'", '"', '""', "\\", "\x00", "\x1b[31mred\x1b[0m", "\x07", "\u202eabc", "\ufeff", "ä", "🤖", "a" * 5000,
     "a\tb", ";", "#", "../../etc/passwd", "{{7*7}}", "<script>alert(1)</script>", "%s%n", "\x85", "\u2028", "CON",
     "~", "$HOME",
 )  # fmt: skip
-"""What stands where a text was wanted."""
+"""Words in place of a text."""
 _NUMBER = re.compile(rb"-?\d+\.?\d*(?:[eE][-+]?\d+)?")
 _WORD = re.compile(rb"[A-Za-z_][A-Za-z_0-9]+")
 
 
 def damaged(rng: Rng, content: bytes) -> tuple[str, bytes]:
-    """Damage the content of a text file; gives what was done in words, too."""
+    """Damage the content of a text file, and return it with a description of the damage."""
     harm = one_of(rng, (*_WHOLE, *_LINES, *_INSIDE, *_INSIDE))
     return harm.__name__.strip("_").replace("_", " "), harm(rng, content)
 

@@ -1,4 +1,4 @@
-"""Hostile YAML documents: robots and recipes with any value at any place, and YAML that means harm."""
+"""Hostile YAML documents: robots and recipes with wrong values at random places, and malicious YAML."""
 
 import copy
 from pathlib import Path
@@ -15,7 +15,7 @@ VALUES: tuple[Any, ...] = (
     {str(i): i for i in range(3000)}, "1", "1e3", *TEXTS,
 )  # fmt: skip
 Place = tuple[Any, Any]
-"""A mapping or a list, and the key in it."""
+"""A mapping or a list, and a key of it."""
 
 BOMBS = (
     "a: &a [x, x, x, x, x, x, x, x, x]\n"
@@ -45,13 +45,13 @@ BOMBS = (
 
 
 def places(node: Any) -> list[Place]:
-    """All places of a document where a value stands."""
+    """Return the places of all values of a document."""
     items = node.items() if isinstance(node, dict) else enumerate(node) if isinstance(node, list) else ()
     return [place for key, value in items for place in ((node, key), *places(value))]
 
 
 def mutated(rng: Rng, document: Any, times: int = 1) -> tuple[str, Any]:
-    """Change a document somewhere; gives what was done in words, too."""
+    """Change a document at a random place, and return it with a description of the change."""
     document, done = copy.deepcopy(document), []
     for _ in range(times):
         node, key = one_of(rng, places(document) or [({"": 0}, "")])
@@ -79,7 +79,7 @@ def mutated(rng: Rng, document: Any, times: int = 1) -> tuple[str, Any]:
 
 
 def written(rng: Rng, path: Path) -> tuple[str, bytes]:
-    """A YAML file damaged as text, changed as a document, or replaced by one that means harm."""
+    """Write a YAML file that is damaged as text, changed as a document, or malicious."""
     content, draw = path.read_bytes(), rng.random()
     if draw < 0.25:
         return damaged(rng, content)
@@ -95,7 +95,7 @@ def written(rng: Rng, path: Path) -> tuple[str, bytes]:
 
 
 def wrong_robot(rng: Rng, clean: Clean, folder: Path) -> Case:
-    """A robot file in YAML."""
+    """Write a wrong robot file in YAML."""
     path = one_of(rng, list(clean.robots))
     what, content = written(rng, path)
     (folder / "robot.yaml").write_bytes(content)
@@ -104,7 +104,7 @@ def wrong_robot(rng: Rng, clean: Clean, folder: Path) -> Case:
 
 
 def drawn_robot(rng: Rng, clean: Clean, folder: Path) -> Case:
-    """A robot of any rows: one joint or 20, prismatic only, of no length, with limits reversed."""
+    """Write a robot with random rows: one joint or 20, prismatic only, without lengths, with limits reversed."""
     count = one_of(rng, (1, 2, 3, 6, 7, 12, 20, 400))
     rows: list[dict[str, Any]] = []
     kinds = one_of(rng, (("revolute",), ("prismatic",), ("fixed",), ("revolute", "prismatic", "fixed")))
@@ -129,7 +129,7 @@ def drawn_robot(rng: Rng, clean: Clean, folder: Path) -> Case:
 
 
 def wrong_recipe(rng: Rng, clean: Clean, folder: Path) -> Case:
-    """A recipe, of which measurements are simulated."""
+    """Write a wrong recipe whose measurements are simulated."""
     path = one_of(rng, clean.recipes)
     what, content = written(rng, path)
     (folder / "recipe.yaml").write_bytes(content)

@@ -1,4 +1,4 @@
-"""Hostile exports of instruments and controllers: damaged text, and options that do not fit."""
+"""Hostile exports of instruments and controllers: damaged text, and wrong options."""
 
 from pathlib import Path
 
@@ -30,7 +30,7 @@ _OPTIONS = (
 
 
 def wrong_export(rng: Rng, clean: Clean, folder: Path) -> Case:
-    """An export with damaged text; what is imported nevertheless has to hold the values that it holds."""
+    """Write an export with damaged text; rows that are still imported need the values of the export."""
     names = one_of(rng, _FILES)
     hit = one_of(rng, names)
     what = ""
@@ -51,7 +51,7 @@ def wrong_export(rng: Rng, clean: Clean, folder: Path) -> Case:
 
 
 def _wrong_values(folder: Path) -> str:
-    """Say what is wrong where no row is one of the export's; a wrong unit or order makes all of them wrong."""
+    """Return a fault where no row is one of the export's: a wrong unit or order makes all rows wrong."""
     reference = Measurements.read_csv(EXPORTS / "reference.csv")
     with no_type_checker():
         data = Measurements.read_csv(folder / "data.csv")

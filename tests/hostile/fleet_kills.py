@@ -1,4 +1,4 @@
-"""Kill runs of a fleet with bad files at random moments, end workers and writes, and see that nothing is lost.
+"""Kill runs of a fleet with bad files at random moments, kill workers and writes, and check that nothing is lost.
 
 `python tests/hostile/fleet_kills.py --robots 200 --count 20 [--seed 0]`
 """
@@ -21,12 +21,12 @@ from hostile.kills import contents
 from testing.fleet_robots import DRAWN, rows_of
 from testing.simulated_arm import simulate
 
-LARGEST_FILE = 12_000
-"""[bytes] Of a full disk: records fit, models do not."""
+MAX_FILE_SIZE = 12_000
+"""Simulated space of a full disk [bytes]: records fit, models do not."""
 
 
 def _changed(change: Callable[[str], str]) -> Callable[[Path], None]:
-    """What writes a changed file of good rows."""
+    """Return a function that writes a changed file of good rows."""
 
     def write(path: Path) -> None:
         rows_of(0, 30, 0).write_csv(path, DRAWN)
@@ -54,20 +54,20 @@ BAD: dict[str, tuple[Callable[[Path], None], str]] = {
     "nan": (_changed(_with_nan), "line 6"),
     "columns": (_changed(lambda text: text.replace("q3", "p3")), "p3"),
     "empty": (_changed(lambda text: ""), "empty"),
-    "other": (_other_robot, "nothing to do with the joint values"),
-    "few": (_changed(lambda text: "\n".join(text.splitlines()[:4])), "more poses"),
+    "other": (_other_robot, "joint values"),
+    "few": (_changed(lambda text: "\n".join(text.splitlines()[:4])), "poses"),
     "directory": (Path.mkdir, "directory"),
     "unreadable": (lambda path: path.symlink_to(path), "symbolic link"),
     "units": (_changed(lambda text: text.replace("_mm", "_m")), "unit"),
-    "repeated": (_changed(_repeated), "more poses"),
+    "repeated": (_changed(_repeated), "poses"),
     "truncated": (_changed(lambda text: text[: len(text) // 2].rsplit(",", 1)[0]), "line"),
 }
-"""Robots with bad files: what writes the file, and words of the reason why it is refused. Not even root reads a link to
+"""Robots with bad files: a function that writes the file, and a word of the reason. Not even root can read a link to
 itself."""
 
 
 def write_plant(folder: Path, robots: int) -> None:
-    """Write a manifest of robots, the bad ones among them."""
+    """Write a manifest of robots, including the bad ones."""
     lines = ["id,robot,data,date"]
     bad = dict(zip(np.linspace(0, robots - 1, len(BAD)).astype(int).tolist(), BAD, strict=True))
     for number in range(robots):
@@ -82,7 +82,7 @@ def write_plant(folder: Path, robots: int) -> None:
 
 
 def faults_of(refused: dict[str, str]) -> list[str]:
-    """Bad files that are not refused with their reason, and good ones that are."""
+    """Return bad files that are not refused with their reason, and good ones that are refused."""
     faults = [f"{robot} is refused: {reason}" for robot, reason in refused.items() if "good" in robot]
     for name, (_, word) in BAD.items():
         reason = next((reason for robot, reason in refused.items() if robot.endswith(f"-{name}")), "")
@@ -91,20 +91,20 @@ def faults_of(refused: dict[str, str]) -> list[str]:
 
 
 def _start(folder: Path, out: str, *, full: bool = False) -> subprocess.Popen[str]:
-    """Run the fleet into a folder, where wanted on a full disk."""
+    """Run the fleet, optionally on a full disk."""
     options = ("--model", "geometric", "--jobs", "2", "--json")
     command = [sys.executable, "-m", "pisigma", "fleet", "run", "fleet.csv", "--out", out, *options]
 
     def limit() -> None:
         if full:
-            resource.setrlimit(resource.RLIMIT_FSIZE, (LARGEST_FILE, LARGEST_FILE))
+            resource.setrlimit(resource.RLIMIT_FSIZE, (MAX_FILE_SIZE, LARGEST_FILE))
 
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL}
     return subprocess.Popen(command, cwd=folder, text=True, preexec_fn=limit, **pipes)
 
 
 def _refused(process: subprocess.Popen[str], faults: list[str]) -> dict[str, str]:
-    """What a run that ends by itself refuses, and why; it ends with status 3."""
+    """Return which robots a complete run refuses, and why; it ends with status 3."""
     report = json.loads(process.communicate()[0] or '{"refused": []}')
     if process.returncode != 3:
         faults.append(f"a run ended with status {process.returncode}")
@@ -112,7 +112,7 @@ def _refused(process: subprocess.Popen[str], faults: list[str]) -> dict[str, str
 
 
 def _wait_for_records(process: subprocess.Popen[str], out: Path, more: int) -> None:
-    """Wait until so many more robots are done, or all."""
+    """Wait until a number of further robots is done, or all."""
     folder = out / "records"
     wanted = len(list(folder.glob("*.json"))) + more
     while process.poll() is None and len(list(folder.glob("*.json"))) < wanted:
@@ -129,7 +129,7 @@ def _kill_a_worker(process: subprocess.Popen[str]) -> None:
 
 
 def _same(folder: Path, out: str) -> list[str]:
-    """How the results of a folder differ from those of the run that nobody disturbed."""
+    """Return how the results of a folder differ from those of the undisturbed run."""
     left = [path for path in contents(folder / out) if Path(path).name.startswith(".")]
     table = "results.parquet"
     same = (folder / out / table).read_bytes() == (folder / "whole" / table).read_bytes()
@@ -137,7 +137,7 @@ def _same(folder: Path, out: str) -> list[str]:
 
 
 def main() -> None:
-    """Run the fleet once undisturbed; then kill runs, a worker and writes, and compare what later runs come to."""
+    """Run the fleet undisturbed; then kill runs, a worker and writes, and compare the results of later runs."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--robots", type=int, default=200)
     parser.add_argument("--count", type=int, default=20)

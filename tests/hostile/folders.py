@@ -1,4 +1,4 @@
-"""Hostile model folders: files that are missing, damaged, exchanged, special or made to fit again."""
+"""Hostile model folders: files that are missing, damaged, exchanged, special or consistently changed."""
 
 import hashlib
 import os
@@ -15,7 +15,7 @@ FILES = ("model.yaml", "model.safetensors", "compiled.npz")
 
 
 def wrong_model(rng: Rng, clean: Clean, folder: Path) -> Case:
-    """A model folder, for any command that reads one."""
+    """Write a wrong model folder, for any command that reads one."""
     models = list(clean.models)
     source = one_of(rng, models)
     model = folder / "model"
@@ -70,7 +70,7 @@ def _another_document(rng: Rng, file: Path, other: Path) -> None:
 
 
 def _signed_again(rng: Rng, file: Path, other: Path) -> None:
-    """Other weights under a hash that fits them, and another description."""
+    """Change the weights with a matching hash, or the description."""
     weights, description = file.parent / "model.safetensors", file.parent / "model.yaml"
     document = yaml.load(description.read_bytes(), Loader=yaml.CSafeLoader)
     if rng.random() < 0.5:

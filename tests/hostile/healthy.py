@@ -1,4 +1,4 @@
-"""Inputs with which nothing is wrong: whoever stops them raises a false alarm."""
+"""Correct inputs: refusing one of them is a false alarm."""
 
 import shutil
 from pathlib import Path
@@ -12,7 +12,7 @@ _OUTSIDE = ("kr10", "irb120", "arm7", "scara", "rail")
 
 
 def healthy_robot(rng: Rng, clean: Clean, folder: Path) -> Case:
-    """A simulated robot with the usual errors, measured well."""
+    """Write good measurements of a simulated robot with the usual errors."""
     seed, rows = int(rng.integers(1000)), int(rng.integers(30, 150))
     if rng.random() < 0.5 and SIMULATOR.is_file():
         name = one_of(rng, _OUTSIDE)
@@ -26,7 +26,7 @@ def healthy_robot(rng: Rng, clean: Clean, folder: Path) -> Case:
 
 
 def measured_robot(rng: Rng, clean: Clean, folder: Path) -> Case:
-    """Clean rows of a robot of the corpus, a random part of them in their order."""
+    """Write a random part of the clean rows of a measured robot, in their order."""
     name = one_of(rng, list(clean.rows))
     truth: CleanRows = clean.rows[name]
     header, *lines = truth.path.read_text(encoding="utf-8").splitlines()

@@ -1,4 +1,4 @@
-"""Kill commands that write at random moments, as a power cut does, and see that nothing is lost.
+"""Kill commands that write at random moments, like a power cut, and check that nothing is lost.
 
 `python tests/hostile/kills.py --count 50 [--seed 0]`
 """
@@ -31,19 +31,19 @@ COMMANDS = {
     "simulate": ("simulate", "recipe.yaml", "--out", "simulated.csv"),
     "report": ("report", "model", "rows.csv", "--out", "report.html", "--figures", "figures"),
 }
-"""Commands that replace what stands there."""
+"""Commands that replace existing outputs."""
 _FOLDERS = {"calibrate": "model", "train": "trained"}
 
 
 def start(command: tuple[str, ...], folder: Path) -> subprocess.Popen[bytes]:
-    """Run a command in a folder, in a process of its own."""
+    """Start a command in a folder, as a separate process."""
     program = [sys.executable, "-m", "pisigma", *command]
     quiet = {"stdin": subprocess.DEVNULL, "stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
     return subprocess.Popen(program, cwd=folder, **quiet)
 
 
 def write_inputs(folder: Path) -> None:
-    """Everything that the commands read, and all outputs once."""
+    """Write all inputs of the commands, and all outputs once."""
     arm = simulate("ur5", rows=40, noise=5e-5)
     arm.measurements.write_csv(folder / "rows.csv", arm.nominal)
     (folder / "recipe.yaml").write_text(small_recipe_text("kiro3"), encoding="utf-8")
@@ -51,13 +51,13 @@ def write_inputs(folder: Path) -> None:
 
 
 def contents(folder: Path) -> dict[str, str]:
-    """The hash of every file below a folder."""
+    """Return the hash of every file below a folder."""
     files = (path for path in sorted(folder.rglob("*")) if path.is_file())
     return {str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
 
 
 def after_kill(name: str, before: dict[str, str], folder: Path) -> str:
-    """What was lost, or is neither the old nor a whole new output; "" where all is well."""
+    """Return what was lost, or is neither the old nor a whole new output; "" for nothing."""
     now, output = contents(folder), _FOLDERS.get(name, "")
     if changed := [path for path in _INPUTS if now.get(path) != before[path]]:
         return f"{changed[0]} was changed"
@@ -73,7 +73,7 @@ _INPUTS = ("rows.csv", "recipe.yaml", "mine.txt")
 
 
 def main() -> None:
-    """Kill every command in turn, and run it to its end after every kill."""
+    """Kill every command, one after the other, and let it finish after every kill."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--count", type=int, default=50)
     parser.add_argument("--seed", type=int, default=0)

@@ -32,16 +32,16 @@ KINDS: dict[str, tuple[Generator, int]] = {
     "exports": (wrong_export, 20),
     "plans": (wrong_plan, 1),
 }
-"""By kind its generator and its share: those that are read or refused at once are most of them."""
+"""Generator and share of every kind: most inputs are of kinds that are fast to read or to refuse."""
 
 
 def make(kind: str, seed: int, number: int, clean: Clean, folder: Path) -> Case:
-    """Write the hostile input of a kind, a seed and a number into an empty folder; the same each time."""
+    """Write the hostile input of a kind, a seed and a number into an empty folder, reproducibly."""
     rng = np.random.default_rng([list(KINDS).index(kind), seed, number])
     return KINDS[kind][0](rng, clean, folder)
 
 
 def shares(count: int, kinds: tuple[str, ...] = tuple(KINDS)) -> dict[str, int]:
-    """How many inputs of every kind make up so many, one at least of each."""
+    """Return how many inputs of every kind add up to `count`, at least one of each."""
     whole = sum(KINDS[kind][1] for kind in kinds)
     return {kind: max(1, -(-count * KINDS[kind][1] // whole)) for kind in kinds}

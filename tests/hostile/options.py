@@ -1,4 +1,4 @@
-"""Hostile command lines: values of options that are none, and paths that lead to no good."""
+"""Hostile command lines: values of options that are not valid, and unsuitable paths."""
 
 import shutil
 from pathlib import Path
@@ -26,7 +26,7 @@ _CALIBRATE = {
 
 
 def wrong_calibrate(rng: Rng, clean: Clean, folder: Path) -> Case:
-    """`pisigma calibrate` with a strange option or path."""
+    """Return `pisigma calibrate` with a wrong option or path."""
     rows = clean.rows["ur5"]
     shutil.copy(rows.path, folder / "rows.csv")
     option = one_of(rng, (*_CALIBRATE, "ROBOT", "DATA", "--out"))
@@ -62,7 +62,7 @@ def wrong_calibrate(rng: Rng, clean: Clean, folder: Path) -> Case:
 
 
 def wrong_ik(rng: Rng, clean: Clean, folder: Path) -> Case:
-    """`pisigma ik` with a strange pose, option or path."""
+    """Return `pisigma ik` with a wrong pose, option or path."""
     model = str(one_of(rng, list(clean.models)))
     shutil.copy(clean.poses, folder / "poses.csv")
     pose = ["300", "200", "400", "0", "90", "0"]
@@ -95,13 +95,13 @@ def wrong_ik(rng: Rng, clean: Clean, folder: Path) -> Case:
 
 
 def _with(rng: Rng, words: list[str], values: tuple[str, ...]) -> list[str]:
-    """Words of which one is another."""
+    """Return the words with one of them replaced."""
     index = int(rng.integers(len(words)))
     return [*words[:index], one_of(rng, values), *words[index + 1 :]]
 
 
 def wrong_judging(rng: Rng, clean: Clean, folder: Path) -> Case:
-    """`pisigma evaluate`, `verify`, `report` or `export` with strange options or paths."""
+    """Return `pisigma evaluate`, `verify`, `report` or `export` with wrong options or paths."""
     model, rows = one_of(rng, list(clean.models.items()))
     shutil.copy(rows, folder / "rows.csv")
     path = one_of(rng, _INPUTS)

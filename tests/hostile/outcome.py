@@ -1,4 +1,4 @@
-"""What came of a hostile input, and whether that is allowed."""
+"""The result of a hostile input, and whether it is allowed."""
 
 import hashlib
 import os
@@ -28,16 +28,16 @@ from pisigma.robot import Robot
 from pisigma.workflow.calibrate import Calibration
 
 COMMAND = get_command(app)
-"""Made once, which takes as long as most of the cases."""
+"""Created once, as it takes as long as most of the cases."""
 LONGEST = 10.0
-"""[s] of computing that a command may take."""
+"""Maximum computing time of a command [s]."""
 WAITS = 4
-"""It may take so many times as long where other processes compute, too."""
+"""Factor on the maximum time where other processes compute as well."""
 MOST_MAPPED = 2**31
-"""[bytes] of memory that a command gets on top of what is there."""
+"""Additional memory of a command [bytes]."""
 LONGEST_SENTENCE = 2100
 WORSE = 1.05
-"""A model may be worse than nominal by this factor, which is what noise in few rows makes."""
+"""Factor by which a model may be worse than nominal, due to noise in few rows."""
 _CONTROL = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069]")
 
 
@@ -49,7 +49,7 @@ class Ending(Enum):
     NOT_TRUSTED = "not trusted (3)"
     FALSE_ALARM = "healthy, but refused or not trusted"
     INACCURATE = "accepted and inaccurate"
-    GARBLED = "refused without a plain sentence"
+    GARBLED = "refused with a garbled message"
     LOST = "an input was changed, or something left of a refused output"
     HANG = "took over 10 s"
     MEMORY = "took over 1 GB"
@@ -57,17 +57,17 @@ class Ending(Enum):
 
     @property
     def allowed(self) -> bool:
-        """Whether a hostile input may end so."""
+        """Whether a hostile input may end like this."""
         return self in (Ending.RIGHT, Ending.REFUSED, Ending.NOT_TRUSTED)
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """How a command ended, and what it said.
+    """How a command ended, and its output.
 
     Attributes:
         ending: the class.
-        said: the sentence, the traceback or the figures.
+        said: the error message, the traceback or the figures.
     """
 
     ending: Ending
@@ -75,11 +75,11 @@ class Outcome:
 
 
 class _TooLong(BaseException):
-    """A command took too long; no handler of errors may catch it."""
+    """A command took too long; error handlers must not catch it."""
 
 
 def attempt(case: Case, folder: Path) -> Outcome:
-    """Run the command of a case in its folder, in this process, and classify what comes of it.
+    """Run the command of a case in its folder, in this process, and classify its result.
 
     A calibration is written without its card and figures, which take a second.
     """
@@ -117,7 +117,7 @@ def attempt(case: Case, folder: Path) -> Outcome:
 
 
 def _accuracy(rows: CleanRows, calibration: Calibration) -> Outcome:
-    """Hold the identified arm against the drawn one, base and tool of both fitted to the same clean rows."""
+    """Compare the identified arm with the nominal one, with base and tool of both fitted to the same clean rows."""
     identified = calibration.model.calibrated
     if rows.other is None or identified is None or identified.dof != rows.other.dof:
         return Outcome(Ending.RIGHT)
@@ -127,7 +127,7 @@ def _accuracy(rows: CleanRows, calibration: Calibration) -> Outcome:
 
 
 def arm_error(robot: Robot, rows: Measurements) -> float:
-    """Root mean square of the position errors [m] of an arm whose base and tool are fitted to the rows."""
+    """Return the RMS position error [m] of an arm whose base and tool are fitted to the rows."""
     positions = rows if rows.rotation is None else Measurements(q=rows.q, position=rows.position)
     with no_type_checker(), torch.no_grad():
         return fit_base_and_tool(robot, positions).rms_position
@@ -145,7 +145,7 @@ def _inside(folder: Path) -> Iterator[None]:
 
 @contextmanager
 def _at_most(seconds: float) -> Iterator[None]:
-    """Bound the time, and the memory so that the machine goes on."""
+    """Limit time and memory, so that the machine stays usable."""
 
     def stop(number: int, frame: FrameType | None) -> None:
         raise _TooLong
@@ -171,7 +171,7 @@ def _at_most(seconds: float) -> Iterator[None]:
 
 
 def _contents(folder: Path) -> dict[str, str]:
-    """Every file below a folder with the hash of what is in it; large and special ones by their size."""
+    """Return every file below a folder with the hash of its content; large and special files with their size."""
     contents = {}
     for path in sorted(folder.rglob("*")):
         plain = path.is_file() and path.stat().st_size < 2**26
@@ -182,7 +182,7 @@ def _contents(folder: Path) -> dict[str, str]:
 
 
 def _lost(before: dict[str, str], after: dict[str, str], case: Case, status: int) -> str:
-    """The first file that was changed, or that a refused command left behind; "" where there is none."""
+    """Return the first file that was changed, or that a refused command left behind; "" for none."""
     for path, content in before.items():
         if after.get(path) != content:
             return path
@@ -193,7 +193,7 @@ def _lost(before: dict[str, str], after: dict[str, str], case: Case, status: int
 
 
 def _garbled(stdout: str, stderr: str, status: int) -> str:
-    """What is wrong with what a command printed; "" where nothing is."""
+    """Return a fault of the output of a command; "" for none."""
     if odd := _CONTROL.search(stdout + stderr):
         return f"the control character {odd[0]!r}"
     if "Traceback" in stderr:

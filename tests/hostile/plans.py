@@ -39,7 +39,7 @@ _VALUES = {
 
 
 def wrong_plan(rng: Rng, clean: Clean, folder: Path) -> Case:
-    """A plan in a damaged cell, or with a strange option."""
+    """Return a plan in a damaged cell, or with a wrong option."""
     cell, rows = folder / "cell.yaml", folder / "rows.csv"
     cell.write_text(yaml.safe_dump(CELL.model_dump(mode="json", exclude_none=True)), encoding="utf-8")
     q = rng.uniform(-40, 40, (int(rng.integers(1, 30)), 6))
@@ -69,7 +69,7 @@ def wrong_plan(rng: Rng, clean: Clean, folder: Path) -> Case:
 
 
 def _not_allowed(folder: Path) -> str:
-    """The first planned pose that its cell does not allow; "" where there is none."""
+    """Return the first planned pose that is not allowed in its cell; "" for none."""
     plan = read_plan(folder / "poses.csv")
     faults = plan.arm.faults(plan.q)
     return next((sentence for pose in range(len(plan.q)) if (sentence := faults.sentence(pose))), "")

@@ -1,4 +1,4 @@
-"""Run many hostile inputs, each in a process of its own with bounds on time and memory, and say what came of them.
+"""Run many hostile inputs, each in a separate process with limited time and memory, and print the results.
 
 `python tests/hostile/run.py --count 4000 [--seed 1] [--kind "wrong measurements"] [--number 17]`, or `--mistakes`
 """
@@ -22,11 +22,11 @@ from hostile.kinds import KINDS, make, shares
 from hostile.outcome import LONGEST, WAITS, Ending, Outcome, attempt
 
 MOST_MEMORY = 10**9
-"""[bytes] A process may use at most, of which the imported packages take 400 MB."""
+"""Maximum memory of a process [bytes], of which the imported packages use 400 MB."""
 
 
 def bounded(kind: str, seed: int, number: int, clean: Clean, folder: Path) -> tuple[str, Outcome]:
-    """Run one hostile input in a process of its own; gives what was done, and what came of it."""
+    """Run one hostile input in a separate process, and return its description and result."""
     folder.mkdir()
     answer = folder.with_suffix(".answer")
     child = os.fork()
@@ -44,7 +44,7 @@ def bounded(kind: str, seed: int, number: int, clean: Clean, folder: Path) -> tu
 
 
 def _answer(kind: str, seed: int, number: int, clean: Clean, folder: Path, answer: Path) -> None:
-    """Write what came of it into a file and end this process."""
+    """Write the result into a file, and end this process."""
     try:
         os.environ["PISIGMA_TRACEBACK"] = "1"
         sys.stdin = open(os.devnull)  # noqa: SIM115
@@ -58,7 +58,7 @@ def _answer(kind: str, seed: int, number: int, clean: Clean, folder: Path, answe
 
 
 def _wait(child: int, until: float) -> int:
-    """Wait for a process, or end it; gives the memory it used at most [bytes]."""
+    """Wait for a process, or end it, and return its peak memory [bytes]."""
     while True:
         done, _, usage = os.wait4(child, os.WNOHANG)
         if done:
@@ -71,7 +71,7 @@ def _wait(child: int, until: float) -> int:
 
 
 def main() -> None:
-    """Run them, print a table, and how each bad one is seen again."""
+    """Run the inputs, print a table, and how to repeat each failure."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--count", type=int, default=2000)
     parser.add_argument("--seed", type=int, default=0)

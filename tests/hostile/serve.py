@@ -2,7 +2,7 @@
 
 `python tests/hostile/serve.py [MODEL] --streams 5000 --clients 200 [--seed 1]`
 
-Meanwhile a good client asks all the time; each of its answers has to be the right one, and none may be missing but
+Meanwhile a good client sends requests all the time; each answer has to be right, and none may be missing except
 while the server is down.
 """
 
@@ -40,7 +40,7 @@ class Serving:
         self.ports = json.loads(self.process.stdout.readline())
 
     def port(self, protocol: str) -> int:
-        """Where a protocol is answered."""
+        """Return the port of a protocol."""
         return self.ports[f"{protocol}_port"]
 
     def memory(self) -> float:
@@ -50,7 +50,7 @@ class Serving:
 
 
 class GoodClient(threading.Thread):
-    """Asks all the time, and counts what came of it."""
+    """Sends requests all the time, and counts the answers."""
 
     def __init__(self, serving: Serving, ik: pisigma.CorrectedIK) -> None:
         super().__init__(daemon=True)
@@ -72,7 +72,7 @@ class GoodClient(threading.Thread):
 
 
 def stalled(rng: random.Random, serving: Serving, ik: pisigma.CorrectedIK) -> socket.socket:
-    """A client that has sent a part of its requests and falls silent."""
+    """Return a client that has sent a part of its requests and then stalls."""
     protocol = rng.choice(PROTOCOLS)
     stream = good_stream(rng, protocol, ik, 2)
     client = socket.create_connection(("127.0.0.1", serving.port(protocol)), 30)
@@ -81,7 +81,7 @@ def stalled(rng: random.Random, serving: Serving, ik: pisigma.CorrectedIK) -> so
 
 
 def main() -> int:
-    """Run all of it; gives the exit status."""
+    """Run all checks, and return the exit status."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("model", nargs="?", default="models/kiro4")
     parser.add_argument("--streams", type=int, default=5000)

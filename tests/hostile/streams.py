@@ -1,7 +1,7 @@
-"""Byte streams that no good client sends, and whether a server answered each as it has to.
+"""Byte streams of faulty clients, and whether a server answered each of them correctly.
 
-What was sent says what has to be answered: every whole message once, in order, under its id; and joint values only for
-a pose that was sent, to which they lead.
+The stream determines the answers: every whole message once, in order, with its id, and joint values only for poses
+that were sent, which they reach.
 """
 
 import functools
@@ -20,18 +20,18 @@ from pisigma.robot.kernels.array_kinematics import transform_of, xyzrpy_of
 REQUEST, ANSWER, HEAD = struct.Struct("<4sIQII16d8d"), struct.Struct("<4sIQII8d2d"), struct.Struct("<4sIQII")
 PROTOCOLS = ("json", "binary")
 NEAR = 1e-6
-"""[m] How near joint values have to lead to the pose that was sent."""
+"""Tolerance of the reached position [m]."""
 
 
 @functools.cache
 def _sources(ik: CorrectedIK) -> tuple[np.ndarray, np.ndarray]:
-    """Joint values of training rows, and the poses there."""
+    """Return joint values of training rows, and their poses."""
     q = ik.model.starts.double().numpy()[:200]
     return q, np.asarray(ik.forward(q))
 
 
 def good_stream(rng: random.Random, protocol: str, ik: CorrectedIK, messages: int) -> bytes:
-    """Requests for poses of training rows, under random ids."""
+    """Return requests for poses of training rows, with random ids."""
     parts = []
     for _ in range(messages):
         q, T = (values[rng.randrange(len(values))] for values in _sources(ik))
@@ -98,7 +98,7 @@ _MUTATIONS = (_flip, _cut, _lose, _insert, _repeat, _replace, _noise)
 
 
 def hostile_stream(rng: random.Random, protocol: str, ik: CorrectedIK) -> bytes:
-    """A good stream with one to three faults."""
+    """Return a good stream with one to three faults."""
     stream = bytearray(good_stream(rng, protocol, ik, rng.randint(1, 8)))
     for mutate in rng.choices(_MUTATIONS, k=rng.randint(1, 3)):
         if stream:
@@ -107,7 +107,7 @@ def hostile_stream(rng: random.Random, protocol: str, ik: CorrectedIK) -> bytes:
 
 
 def exchange(rng: random.Random, port: int, stream: bytes) -> tuple[bytes, bool]:
-    """Send a stream in pieces; gives what came back, and whether all of it had to come."""
+    """Send a stream in pieces, and return the answers and whether all of them are required."""
     received = bytearray()
     with socket.create_connection(("127.0.0.1", port), 10) as connection:
         whole = rng.random() < 0.9
@@ -134,7 +134,7 @@ def exchange(rng: random.Random, port: int, stream: bytes) -> tuple[bytes, bool]
 
 
 def check(protocol: str, stream: bytes, received: bytes, whole: bool, ik: CorrectedIK) -> str | None:
-    """Say what is wrong with the answers to a stream; None where all is well."""
+    """Return a fault of the answers to a stream; None for none."""
     wanted = _frames(stream) if protocol == "binary" else _lines(stream)
     answers = _answered_frames(received) if protocol == "binary" else _answered_lines(received)
     if answers is None:
@@ -160,7 +160,7 @@ def check(protocol: str, stream: bytes, received: bytes, whole: bool, ik: Correc
 
 
 def _frames(stream: bytes) -> list[tuple[int, np.ndarray | None]]:
-    """Ids and poses of the frames that are whole; a broken one is the last."""
+    """Return ids and poses of the whole frames; a broken one is the last."""
     wanted: list[tuple[int, np.ndarray | None]] = []
     while stream:
         if not b"PSI1".startswith(stream[:4]):
@@ -179,7 +179,7 @@ def _frames(stream: bytes) -> list[tuple[int, np.ndarray | None]]:
 
 
 def _lines(stream: bytes) -> list[tuple[object, np.ndarray | None]]:
-    """Ids and poses of the lines that are whole."""
+    """Return ids and poses of the whole lines."""
     wanted: list[tuple[object, np.ndarray | None]] = []
     for line in stream.split(b"\n")[:-1]:
         name, T = None, None

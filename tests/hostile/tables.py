@@ -13,11 +13,11 @@ from hostile.damage import NUMBERS, TEXTS, damaged
 
 @dataclass(eq=False)
 class Columns:
-    """A table of texts that are changed column by column.
+    """A table of texts, to be changed column by column.
 
     Attributes:
         header: names of the columns.
-        cells: `(rows, columns)`.
+        cells: texts `(rows, columns)`.
     """
 
     header: list[str]
@@ -25,25 +25,25 @@ class Columns:
 
     @staticmethod
     def read(path: Path) -> "Columns":
-        """Read a clean file, which holds no quotes."""
+        """Read a clean file, which has no quotes."""
         header, *lines = path.read_text(encoding="utf-8").splitlines()
         return Columns(header.split(","), np.array([line.split(",") for line in lines], dtype=object))
 
     def write(self, path: Path) -> None:
-        """Write it as a file."""
+        """Write the table as a file."""
         lines = [",".join(self.header), *(",".join(row) for row in self.cells.tolist())]
         path.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
     def named(self, *starts: str) -> list[int]:
-        """The columns whose names begin so."""
+        """Return the columns whose names have this prefix."""
         return [i for i, name in enumerate(self.header) if name.startswith(starts)]
 
     def numbers(self, columns: list[int]) -> np.ndarray:
-        """Columns as numbers, NaN where a cell is empty."""
+        """Return columns as numbers, NaN for empty cells."""
         return np.array([[float(cell or "nan") for cell in row] for row in self.cells[:, columns]])
 
     def put(self, columns: list[int], values: np.ndarray, digits: int = 9) -> None:
-        """Put numbers into columns; cells that were empty stay so."""
+        """Put numbers into columns, except into empty cells."""
         texts = [[f"{v:.{digits}f}" if v == v else "" for v in row] for row in values]
         self.cells[:, columns] = np.array(texts, dtype=object).reshape(len(texts), len(columns))
 
@@ -59,7 +59,7 @@ class Columns:
 
     @property
     def measured(self) -> list[int]:
-        """The columns of what was measured."""
+        """The measured columns."""
         return [*self.lengths, *self.named("qx", "qy", "qz", "qw")]
 
 
@@ -246,7 +246,7 @@ _CHANGES: tuple[Change, ...] = (
 
 
 def damaged_measurements(rng: Rng, clean: Clean, folder: Path) -> Case:
-    """A measurement file with damaged text, for any command that reads one."""
+    """Write a measurement file with damaged text, for any command that reads one."""
     name = one_of(rng, list(clean.rows))
     rows, (model, explained) = clean.rows[name], one_of(rng, list(clean.models.items()))
     commands = {
@@ -266,7 +266,7 @@ def damaged_measurements(rng: Rng, clean: Clean, folder: Path) -> Case:
 
 
 def wrong_measurements(rng: Rng, clean: Clean, folder: Path) -> Case:
-    """A measurement file that is well formed, but in which something is not as it is said to be."""
+    """Write a well-formed measurement file with wrong content."""
     name = one_of(rng, list(clean.rows))
     rows = clean.rows[name]
     table, done = Columns.read(rows.path), []
@@ -286,7 +286,7 @@ def _option(rng: Rng) -> tuple[str, ...]:
 
 
 def another_robot(rng: Rng, clean: Clean, folder: Path) -> Case:
-    """The measurements of one robot, calibrated as another."""
+    """Write the measurements of one robot, to be calibrated as another."""
     names = list(clean.rows)
     robot, data = clean.rows[one_of(rng, names)], one_of(rng, names)
     shutil.copy(clean.rows[data].path, folder / "rows.csv")
@@ -294,7 +294,7 @@ def another_robot(rng: Rng, clean: Clean, folder: Path) -> Case:
 
 
 def wrong_poses(rng: Rng, clean: Clean, folder: Path) -> Case:
-    """A file of wanted poses."""
+    """Write a wrong file of poses."""
     if rng.random() < 0.5:
         what, content = damaged(rng, clean.poses.read_bytes())
         (folder / "poses.csv").write_bytes(content)

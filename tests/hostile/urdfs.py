@@ -1,4 +1,4 @@
-"""Hostile URDF files: trees that are no chain, values that are none, and XML that means harm."""
+"""Hostile URDF files: trees that are not a chain, values that are not valid, and malicious XML."""
 
 import copy
 from pathlib import Path
@@ -46,7 +46,7 @@ _BOMBS = (
 
 
 def wrong_urdf(rng: Rng, clean: Clean, folder: Path) -> Case:
-    """A robot in URDF."""
+    """Write a wrong robot in URDF."""
     path, draw = one_of(rng, list(clean.urdfs)), rng.random()
     name = clean.urdfs[path]
     if draw < 0.2:
