@@ -1,4 +1,4 @@
-"""Shipped models: each folder loads, has its card and figures, and gives the figures that the card states."""
+"""Shipped models: each folder loads, has its card and figures, and reproduces the numbers of the card."""
 
 import csv
 from pathlib import Path
@@ -39,7 +39,7 @@ def test_a_folder_is_whole(folder):
 
 
 @each
-def test_a_card_says_everything(folder):
+def test_a_card_is_complete(folder):
     text = (folder / "README.md").read_text()
     assert text.startswith(f"# {folder.name}\n")
     headings = {line[3:] for line in text.splitlines() if line.startswith("## ")}
@@ -69,7 +69,7 @@ def test_energies_are_there_for_every_corrected_joint(folder):
 
 
 @each
-def test_figures_are_found_again(folder, repository):
+def test_figures_are_reproduced(folder, repository):
     """Training and held-out figures, computed again from the stored model and the recipe's true robot."""
     recipe = read_recipe(repository / "training" / f"{folder.name}.yaml")
     if not isinstance(recipe.data, SimulatedData):

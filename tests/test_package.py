@@ -41,13 +41,13 @@ ROOMS = (
     "workflow",
     "cli",
 )
-"""A file imports only from its own room and those before it; CONTRIBUTING.md says what each holds."""
+"""A file imports only from its room and those before it; CONTRIBUTING.md describes them."""
 
 PACKAGE = Path(pisigma.__file__).parent
 MODULES = sorted(PACKAGE.rglob("*.py"))
 TESTS = Path(__file__).parent
-MOST_LINES, MOST_FILES = 400, 20
-"""Of a file; of a folder."""
+MAX_LINES, MAX_FILES = 400, 20
+"""Maximum length of a file, and number of files in a folder."""
 
 
 def name_of(path: Path) -> str:
@@ -56,7 +56,7 @@ def name_of(path: Path) -> str:
 
 @functools.cache
 def imported(path: Path) -> frozenset[str]:
-    """Modules that a file imports anywhere, inside functions and for type checkers too."""
+    """Return the modules that a file imports anywhere, including inside functions and for type checkers."""
     found: set[str] = set()
     nodes: list[ast.AST] = [ast.parse(path.read_text(encoding="utf-8"))]
     while nodes:
@@ -76,8 +76,8 @@ def test_there_are_these_rooms_and_nothing_beside_them():
     assert tops == {"__init__", "__main__", *ROOMS}
 
 
-def test_contributing_says_what_every_room_holds():
-    """One line a room, in the order of imports."""
+def test_contributing_describes_every_room():
+    """One line per room, in the order of imports."""
     text = (TESTS.parent / "CONTRIBUTING.md").read_text(encoding="utf-8")
     assert re.findall(r"^- `(\w+)/`: \S.*\.$", text, re.MULTILINE) == list(ROOMS)
 
@@ -94,7 +94,7 @@ def test_imports_run_one_way():
 
 
 def test_no_two_files_import_each_other():
-    """There is no circle of files, whatever its length; imports inside functions and those for types count too."""
+    """There are no import cycles of any length, including imports inside functions and those for types."""
     files = {
         ".".join(("pisigma", *path.relative_to(PACKAGE).with_suffix("").parts)).removesuffix(
             ".__init__"
@@ -119,9 +119,9 @@ def test_lightning_is_imported_in_training_only():
 
 def test_files_and_folders_stay_small():
     lines = {name_of(path): path.read_text(encoding="utf-8").count("\n") for path in MODULES}
-    assert not {name for name, count in lines.items() if count > MOST_LINES}
+    assert not {name for name, count in lines.items() if count > MAX_LINES}
     folders = Counter(name_of(path.parent) for path in MODULES)
-    assert not {folder: count for folder, count in folders.items() if count > MOST_FILES}
+    assert not {folder: count for folder, count in folders.items() if count > MAX_FILES}
 
 
 def test_no_catch_all_modules():
@@ -201,8 +201,8 @@ def test_version_is_that_of_the_project(repository):
     assert pisigma.__version__ == project["version"]
 
 
-def test_what_is_published_says_the_same(repository):
-    """Version and licence of pyproject.toml and CITATION.cff; extras that a message names are extras."""
+def test_published_metadata_agree(repository):
+    """Version and licence agree in pyproject.toml and CITATION.cff, and extras named in messages exist."""
     project = tomllib.loads((repository / "pyproject.toml").read_text())["project"]
     citation = yaml.safe_load((repository / "CITATION.cff").read_text())
     assert (citation["version"], citation["license"]) == (project["version"], project["license"])
@@ -213,7 +213,7 @@ def test_what_is_published_says_the_same(repository):
     assert [hook["entry"].split()[0] for hook in hooks] == ["ruff", "ruff", "mypy"]
 
 
-def test_tests_compare_numbers_through_the_one_helper():
+def test_tests_compare_numbers_with_one_helper():
     """A bare allclose asserts nothing, and some of them pass NaN."""
     for path in TESTS.rglob("*.py"):
         calls = {
@@ -224,8 +224,8 @@ def test_tests_compare_numbers_through_the_one_helper():
         assert path.name == "closeness.py" or not calls & {"allclose", "isclose", "assert_allclose"}, path
 
 
-def test_nothing_is_said_about_machines(repository):
-    """No absolute path of a machine stands in what is shipped."""
+def test_no_absolute_paths_are_shipped(repository):
+    """Shipped files contain no absolute path of a machine."""
     pattern = re.compile(r"(?<![\w.])/(home|root|work|tmp|Users)/")
     suffixes = {".py", ".md", ".yaml", ".toml", ".txt"}
     folders = ("pisigma", "training", "models")
@@ -286,7 +286,7 @@ def test_the_wheel_shows_a_readme_whose_links_and_pictures_work(wheel, repositor
 
 
 def test_the_wheel_works_without_lightning(wheel, tmp_path):
-    """Installed into a fresh environment that sees the dependencies, but no lightning and no checkout."""
+    """It is installed into a fresh environment with the dependencies, but without lightning and the checkout."""
     folder = tmp_path / "environment"
     venv.create(folder, with_pip=False, symlinks=True)
     python = folder / "bin" / "python"
@@ -334,7 +334,7 @@ def test_the_wheel_works_without_lightning(wheel, tmp_path):
 
 
 def _compiled_kernels(folder):
-    """A folder for caches with the kernels of this checkout, which are those of its wheel, made already."""
+    """Return a cache folder with the compiled kernels of this checkout, which are those of its wheel."""
     kept = folder / "caches" / "pisigma"
     kept.mkdir(parents=True)
     for path in Path(pisigma.__file__).parent.glob("robot/kernels/__pycache__/*.o"):

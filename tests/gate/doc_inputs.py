@@ -1,4 +1,4 @@
-"""Files and models that the calls of README and docs name, made when they are missing."""
+"""Files and models that the calls of README and docs name, created when they are missing."""
 
 import functools
 import shutil
@@ -25,20 +25,20 @@ from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.robot.se3 import xyzrpy_from_transform
 
 Maker = Callable[[Path, Path], None]
-"""Makes a file or folder, from the folder of small inputs."""
+"""Creates a file or folder from the folder of small inputs."""
 _MOVED = (0.0, 0.0, 0.004, 0.0, 0.0, 0.0)
 
 
 @functools.cache
 def small_inputs(folder: Path) -> Path:
-    """A folder of the inputs of `options.txt`."""
+    """Return a folder of the inputs of `options.txt`."""
     folder.mkdir()
     prepare(folder)
     return folder
 
 
 def command(*words: str) -> None:
-    """Run a command that has to be done."""
+    """Run a command that has to succeed."""
     with no_type_checker():
         done = CliRunner().invoke(get_command(app), list(words), catch_exceptions=False)
     assert done.exit_code == 0, f"pisigma {' '.join(words)}: {done.output[-500:]}"
@@ -54,7 +54,7 @@ def copy(name: str) -> Maker:
 
 
 def measured(robot: str, begin: int = 0, end: int = 40, seed: int = 0) -> Maker:
-    """Measurements of a simulated robot, in its own frame: some of 60 rows."""
+    """Write some of 60 simulated rows of a robot, in its base frame."""
 
     def made(path: Path, small: Path) -> None:
         drawn = str(path.with_name(robot)) if path.with_name(robot).is_file() else robot
@@ -79,7 +79,7 @@ def calibrated(robot: str, *options: str, rows: Maker | None = None) -> Maker:
 
 
 def fleet(path: Path, small: Path) -> None:
-    """Five UR10, each measured once."""
+    """Write a fleet of five UR10, each measured once."""
     lines = ["id,robot,data,date"]
     for seed in range(5):
         measured("ur10", 0, 30, seed)(path.with_name(f"cell{seed}.csv"), small)
@@ -88,25 +88,25 @@ def fleet(path: Path, small: Path) -> None:
 
 
 def later(seed: int, moved: tuple[float, ...] = (0.0,) * 6) -> Maker:
-    """Rows of the RB5 of `model_before`."""
+    """Write rows of the RB5 of `model_before`."""
     return lambda path, small: rows_later(30, seed, moved).write_csv(path, model_before().robot)
 
 
 def before(path: Path, small: Path) -> None:
-    """The RB5 that was calibrated."""
+    """Write the model of the RB5."""
     path.mkdir(parents=True)
     save_model(model_before(), path)
 
 
 def renewed(path: Path, small: Path) -> None:
-    """The RB5 that was recalibrated after a joint had moved."""
+    """Write the model of the RB5 after a joint has moved."""
     before(path.with_name("aged"), small)
     later(7, _MOVED)(path.with_name("aged.csv"), small)
     command("recalibrate", str(path.with_name("aged")), str(path.with_name("aged.csv")), "--out", str(path))
 
 
 def poses_near(robot: str, q_deg: tuple[float, ...], count: int = 3) -> Maker:
-    """Poses that a robot takes near some joint values."""
+    """Write poses of a robot near some joint values."""
 
     def made(path: Path, small: Path) -> None:
         values = xyzrpy_from_transform(_near(robot, q_deg, count))
@@ -118,7 +118,7 @@ def poses_near(robot: str, q_deg: tuple[float, ...], count: int = 3) -> Maker:
 
 
 def joints_near(q_deg: tuple[float, ...], count: int = 6) -> Maker:
-    """Joint values near some others."""
+    """Write joint values near some others."""
 
     def made(path: Path, small: Path) -> None:
         rows = np.asarray(q_deg) + 5 * np.random.default_rng(1).normal(size=(count, len(q_deg)))
@@ -134,19 +134,19 @@ def _near(robot: str, q_deg: tuple[float, ...], count: int) -> torch.Tensor:
 
 
 def text(content: str) -> Maker:
-    """A file of some text."""
+    """Write a text file."""
     return lambda path, small: path.write_text(content, encoding="utf-8") and None
 
 
 def ur_program(path: Path, small: Path) -> None:
-    """A URScript program of a UR5."""
+    """Write a URScript program of a UR5."""
     poses = [numbers(metres_and_rotation_vector(T), 9) for T in _near("ur5", (10, -80, 90, -60, -70, 20), 2)]
     moves = "".join(f"  movel(p[{one}], a=0.5, v=0.1)\n" for one in poses)
     path.write_text(f"def cell():\n  set_tcp(p[0, 0, 0.1, 0, 0, 0])\n{moves}end\n")
 
 
 def fanuc_program(path: Path, small: Path) -> None:
-    """A FANUC program of the arm of six joints."""
+    """Write a FANUC program of the arm with six joints."""
     robot = Robot.load(small / "six.urdf", "base_link", "tool0")
     T = forward_kinematics(robot, torch.tensor([[0.2, 0.3, -0.4, 0.5, 0.6, 0.7]]).double())
     stated = FrameFile.read(path.with_name("frames.yaml"))
@@ -169,7 +169,7 @@ def fanuc_program(path: Path, small: Path) -> None:
 
 
 def tracked_plan(path: Path, small: Path) -> None:
-    """What a tracker measures at all poses of the plan that was written last."""
+    """Write what a tracker measures at all poses of the latest plan."""
     plan = read_plan(path.with_name("poses.csv"))
     true = simulate("ur10", rows=1, length=3e-4, angle=5e-4).true
     noise = torch.from_numpy(np.random.default_rng(3).normal(scale=3e-5, size=(len(plan.q), 3)))
@@ -178,7 +178,7 @@ def tracked_plan(path: Path, small: Path) -> None:
 
 
 def with_plumb(path: Path, small: Path) -> None:
-    """Positions of a UR5, and of other rows their distances from the z axis."""
+    """Write positions of a UR5, and distances of other rows from the z axis."""
     measured("ur5", 0, 60)(path, small)
     header, *lines = path.read_text().splitlines()
     x, y = (header.split(",").index(name) for name in ("x_mm", "y_mm"))
@@ -192,7 +192,7 @@ def with_plumb(path: Path, small: Path) -> None:
 
 
 def images(part: str, seed: int = 1) -> Maker:
-    """Rendered images of the camera's tutorial, or one file beside them."""
+    """Write the rendered images of the camera tutorial, or one file next to them."""
 
     def made(path: Path, small: Path) -> None:
         folder = small / f"cell{seed}"
@@ -213,7 +213,7 @@ def images(part: str, seed: int = 1) -> Maker:
 
 
 def exported(model: Maker, form: str) -> Maker:
-    """A file that a model is exported as."""
+    """Export a model as a file."""
 
     def made(path: Path, small: Path) -> None:
         source = path.parent / "exported_model"
@@ -226,7 +226,7 @@ def exported(model: Maker, form: str) -> Maker:
 
 
 def six_joints(path: Path, small: Path) -> None:
-    """A URDF of an arm of six joints."""
+    """Write a URDF file of an arm with six joints."""
     if not (small / "six.urdf").exists():
         rows = [
             ("0 0 0.4", "0 0 1"),
@@ -259,19 +259,19 @@ def six_joints(path: Path, small: Path) -> None:
 
 
 def six_rows(path: Path, small: Path) -> None:
-    """What was measured of that arm."""
+    """Write measurements of that arm."""
     six_joints(path.with_name("six.urdf"), small)
     shutil.copy(small / "six.csv", path)
 
 
 def six_calibrated(path: Path, small: Path) -> None:
-    """That arm, calibrated."""
+    """Write the model of that arm."""
     six_joints(path.with_name("six.urdf"), small)
     calibrated("six.urdf", "--model", "geometric", "--tip", "tool0", rows=six_rows)(path, small)
 
 
 def mast(path: Path, small: Path) -> None:
-    """The robot of the page on closed forms."""
+    """Write the robot of the page on closed forms."""
     rows = (
         "{name: lift, type: prismatic, limits_mm: [0, 2000], d_mm: 100}",
         "{name: turn, type: revolute, d_mm: 200}",
@@ -300,7 +300,7 @@ EVERYWHERE: Mapping[str, Maker] = {
     "calibration.conf": exported(MY_UR5, "ur-calibration"),
     "arm.urdf": six_joints,
 }
-"""What a name means on every page but those below."""
+"""How to create the files that pages name, except those below."""
 OF_RB5 = {
     **{
         name: later(seed)

@@ -1,7 +1,7 @@
-"""Every block of README and docs that can run here, as its reader runs it: `python tests/gate/run.py docs`.
+"""Run every block of README and docs that can run here, like a reader: `python tests/gate/run.py docs`.
 
-Python and bash blocks of a page run one after the other in a folder of their own. Files that no earlier block has
-written are made when they are named, see `gate.doc_inputs`.
+Python and bash blocks of a page run one after the other in a separate folder. Files that no earlier block has
+written are created when they are named; see `gate.doc_inputs`.
 """
 
 import contextlib
@@ -28,7 +28,7 @@ from gate.option_inputs import REPOSITORY
 from gate.options import COMMAND, HASH_OF, Call, run_call
 
 LONGEST_S = 600.0
-"""A call may take [s]; a session that goes on then is ended as by Ctrl-C."""
+"""Maximum time of a call [s]; a session that is still running is then ended as by Ctrl-C."""
 NOT_HERE: Mapping[str, str] = {
     "python3 -m venv": "installs from the network",
     "pip install": "installs from the network",
@@ -37,13 +37,13 @@ NOT_HERE: Mapping[str, str] = {
     "pisigma calibrate ur5 corners.csv tracker.csv --camera wrist.yaml": "needs two cameras and a tracker",
     "pisigma export models/my_arm --format fanuc-mastering": "has ... for the counts of the reader's robot",
 }
-"""What lines begin with that do not run here, and why."""
+"""Starts of lines that do not run here, and why."""
 STATUS: Mapping[str, int] = {
     "pisigma monitor models/my_rb5 2026-11-22.csv": 3,  # a joint has moved
     "pisigma evaluate models/my_rb5 new.csv --max": 3,  # the limits are missed
     "pisigma evaluate models/my_rb5 geometric nominal new.csv": 3,
 }
-"""What calls begin with that end with another status than 0, as the page says."""
+"""Starts of calls with an exit status other than 0, as the page says."""
 _BLOCK = re.compile(r"^(?:(?P<marked><!-- runs -->)\n+)?```(?P<language>\w*)\n(?P<text>.*?)^```", re.M | re.S)
 _OUTPUTS = ("--out", "--page", "--rest", "--save-map", "--figures")
 
@@ -53,10 +53,10 @@ class Block:
     """A block of a page.
 
     Attributes:
-        page: relative to the repository.
-        line: of the page.
-        language: such as "bash".
-        text: between the marks.
+        page: path of the page, relative to the repository.
+        line: its line on the page.
+        language: its language, such as "bash".
+        text: its text between the marks.
     """
 
     page: str
@@ -66,12 +66,12 @@ class Block:
 
     @property
     def lines(self) -> list[str]:
-        """Those of a bash block, each with those that go on with it."""
+        """Lines of a bash block, each with its continuation lines."""
         return [line for line in self.text.replace("\\\n", " ").splitlines() if line.strip()]
 
 
 def blocks(*languages: str) -> list[Block]:
-    """The blocks of README and all pages, by page and line."""
+    """Return the blocks of README and all pages, by page and line."""
     found = []
     for path in (REPOSITORY / "README.md", *sorted((REPOSITORY / "docs").rglob("*.md"))):
         text = path.read_text(encoding="utf-8")
@@ -83,7 +83,7 @@ def blocks(*languages: str) -> list[Block]:
 
 
 def reason_not_to_run(line: str) -> str:
-    """Why a line does not run here; "" where it does."""
+    """Return why a line does not run here; "" where it does."""
     return next((why for begin, why in NOT_HERE.items() if line.startswith(begin)), "")
 
 
@@ -92,9 +92,9 @@ class Page:
     """A page that is run in a folder.
 
     Attributes:
-        name: of the page.
-        small: folder of small inputs.
-        names: what its Python blocks have defined so far.
+        name: name of the page.
+        small: folder of the small inputs.
+        names: names that its Python blocks have defined so far.
     """
 
     name: str
@@ -102,7 +102,7 @@ class Page:
     names: dict[str, object]
 
     def run(self, block: Block) -> Iterator[tuple[str, str]]:
-        """Run a block; every line that ran, or the first one of Python, and what went wrong."""
+        """Run a block, and return every line that ran (for Python the first one), and the failures."""
         self._need("models/loaded")
         for begin, made in AT.items():
             for name, maker in made.items() if block.text.startswith(begin) else ():
@@ -150,7 +150,7 @@ class Page:
         return "" if status == wanted else f"status {status}, expected {wanted}\n{printed[-1500:]}"
 
     def _call(self, words: Sequence[str]) -> tuple[int, str]:
-        """Run a call; a question is answered with yes."""
+        """Run a call, and answer a question with yes."""
         asked = "pisigma.cli.import_"
         with (
             mock.patch(f"{asked}._is_asked", return_value=True),
@@ -159,7 +159,7 @@ class Page:
             return run_call(Call(0, 0, tuple(words[1:])))
 
     def _need(self, name: str) -> None:
-        """Make what a name means where it is missing."""
+        """Create the file or folder of a name where it is missing."""
         maker = MADE.get(self.name, {}).get(name) or inputs.EVERYWHERE.get(name)
         if maker is not None and not Path(name).exists():
             self._put(name, maker)
@@ -177,7 +177,7 @@ def _model(words: Sequence[str]) -> str:
 
 
 def _session(words: Sequence[str]) -> tuple[int, str]:
-    """Follow a session in a process of its own."""
+    """Follow a session in a separate process."""
     command = [*COMMAND, *words[1:]]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as process:
         try:
@@ -189,7 +189,7 @@ def _session(words: Sequence[str]) -> tuple[int, str]:
 
 
 def yaml_block(page: str, number: int, head: str = "") -> inputs.Maker:
-    """A YAML block of a page as a file."""
+    """Write a YAML block of a page as a file."""
     text = [block.text for block in blocks("yaml") if block.page == page][number]
     return inputs.text(head + text)
 
@@ -237,7 +237,7 @@ MADE: Mapping[str, Mapping[str, inputs.Maker]] = {
     },
     "docs/tutorial.md": {"grid.csv": inputs.measured("ur5")},
 }
-"""What names mean on a page."""
+"""How to create the files that a page names."""
 AT: Mapping[str, Mapping[str, inputs.Maker]] = {
     "pisigma robots --check mast.yaml": {"mast.yaml": inputs.mast},
     "pisigma calibrate my_robot.yaml": {
@@ -258,15 +258,15 @@ AT: Mapping[str, Mapping[str, inputs.Maker]] = {
     "pisigma monitor models/my_ur5 2026-11-20.csv": {"2026-11-20.csv": inputs.images("corners", 2)},
     "pisigma plan ur5 --sensor camera": {"cell.yaml": inputs.copy("view.yaml")},
 }
-"""What names mean from a block on that begins so."""
+"""How to create files that are named after a block with this start."""
 
 
 BEFORE = {"loaded = ik.under": 'ik = pisigma.load("models/loaded")'}
-"""What a Python block that begins so is run after, as its text says."""
+"""Code to run before a Python block with this start, as its text says."""
 
 
 def run_page(name: str, small: Path, folder: Path) -> int:
-    """Run all blocks of a page in a folder; prints what failed and gives how many."""
+    """Run all blocks of a page in a folder, print the failures and return their number."""
     import numpy as np
 
     folder.mkdir()
@@ -294,7 +294,7 @@ def run_page(name: str, small: Path, folder: Path) -> int:
 
 
 def main() -> int:
-    """Run all pages, each in a process of its own, as its plug-ins are known to all that follows; gives what failed."""
+    """Run every page in a separate process, as plug-ins stay registered, and return the number of failures."""
     chosen = os.environ.get("GATE_PAGES", "")
     failed = 0
     with tempfile.TemporaryDirectory() as folder:

@@ -1,6 +1,6 @@
 """Good measurements that `calibrate` has to trust with status 0: `python tests/gate/run.py good`.
 
-Subsets of measured robots and rows of simulated arms, 300 and more; what was judged is kept, so that a run goes on.
+More than 300 subsets of measured robots and rows of simulated arms. Results are stored, so that a run can be resumed.
 """
 
 import argparse
@@ -28,7 +28,7 @@ MEASURED = (
     ("fanuc_r2000", "fanuc_r2000/positions.csv", (), 0),
     ("panda", "panda_sockets/panda_3.csv", ("--socket-distance", "*/0,*/1,50"), 0),
 )
-"""Robot, file, options, and how many subsets of rows are drawn; 0: the whole file."""
+"""Robot, file, options, and number of random subsets of rows; 0 for the whole file."""
 SUBSET_ROWS = (30, 40, 60, 100)
 ARMS = {"kr10": 0, "irb120": 0, "arm7": 0, "scara": 0, "rail": 0}
 KINDS = ("positions", "poses", "zeros 20 mrad off", "zeros 40 mrad off")
@@ -37,16 +37,16 @@ SEEDS, ROWS = 3, (40, 60, 100)
 
 @dataclass(frozen=True)
 class Case:
-    """Rows that are right.
+    """Correct rows.
 
     Attributes:
-        name: by which what was judged is kept.
+        name: name under which the result is stored.
         robot: catalogue name or file.
         source: a measured file, or the name of a simulated arm.
-        options: of `calibrate`.
-        seed: of the subset or the arm.
-        rows: how many; 0 for all.
-        kind: what a simulated arm is measured with; empty of a measured file.
+        options: options of `calibrate`.
+        seed: random seed of the subset or the arm.
+        rows: number of rows; 0 for all.
+        kind: measurement and errors of a simulated arm; empty for a measured file.
     """
 
     name: str
@@ -59,7 +59,7 @@ class Case:
 
 
 def cases() -> Iterator[Case]:
-    """All cases, each as geometric and as hybrid calibration; those of different sources mixed."""
+    """Yield all cases, each as geometric and as hybrid calibration, with mixed sources."""
     for model in ("geometric", "hybrid"):
         for robot, file, options, subsets in MEASURED:
             for seed in range(max(subsets // 2, 1)):
@@ -93,7 +93,7 @@ def write_rows(case: Case, path: Path) -> None:
 
 
 def judge(case: Case) -> dict[str, object]:
-    """Calibrate with the rows of a case in a process of its own; gives its status and what was said."""
+    """Calibrate with the rows of a case in a separate process, and return its status and diagnostics."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "rows.csv"
         write_rows(case, path)
@@ -113,15 +113,15 @@ def judge(case: Case) -> dict[str, object]:
 
 
 def main(arguments: Sequence[str] = ()) -> int:
-    """Calibrate all cases that were not judged before; gives how many false alarms there are.
+    """Calibrate all cases without a stored result, and return the number of false alarms.
 
     Args:
-        arguments: options of `python tests/gate/good.py`; the environment may state GATE_JOBS.
+        arguments: options of `python tests/gate/good.py`; GATE_JOBS in the environment sets the default of --jobs.
     """
     parser = argparse.ArgumentParser(prog="run.py good", description=__doc__)
     parser.add_argument("--jobs", type=int, default=int(os.environ.get("GATE_JOBS", "1")), help="Processes")
     parser.add_argument("--every", type=int, default=1, help="Take every n-th case only")
-    parser.add_argument("--kept", type=Path, default=Path("runs/good.jsonl"), help="What was judged before")
+    parser.add_argument("--kept", type=Path, default=Path("runs/good.jsonl"), help="File of results")
     stated = parser.parse_args(arguments)
     stated.kept.parent.mkdir(parents=True, exist_ok=True)
     lines = stated.kept.read_text(encoding="utf-8").splitlines() if stated.kept.exists() else []

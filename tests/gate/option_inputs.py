@@ -52,7 +52,7 @@ def copy_files(folder: Path) -> None:
 
 
 def _rows(folder: Path) -> None:
-    """A UR5 with a tracker: rows to calibrate with, to judge with, months later; in a fleet; and an arm of a URDF."""
+    """Write rows of a UR5 with a tracker (calibration, test, months later), of a fleet, and of an arm of a URDF."""
     arm = simulate("ur5", rows=96, noise=3e-5, turn_noise=1e-4, length=3e-4, angle=5e-4)
     parts = {
         "tracker": (0, 40),
@@ -106,7 +106,7 @@ def _rows(folder: Path) -> None:
 
 
 def _sockets(folder: Path) -> None:
-    """A SCARA robot whose ball is put into two sockets of two placements 50 mm apart, in many ways of the wrist."""
+    """Write rows of a SCARA robot with its ball in pairs of sockets 50 mm apart, in many wrist orientations."""
     robot = Robot.load("ur5")
     arm = simulate("ur5", rows=1, length=3e-4, angle=5e-4)
     rng, lines = np.random.default_rng(1), []
@@ -134,7 +134,7 @@ def _sockets(folder: Path) -> None:
 
 
 def _corners(folder: Path) -> None:
-    """Corners of a board in the images of a camera on the flange, and of a fixed one."""
+    """Write corners of a board in the images of a camera on the flange, and of a fixed one."""
     for name, count, fixed in (
         ("corners", 40, False),
         ("corners_new", 12, False),
@@ -156,7 +156,7 @@ def _corners(folder: Path) -> None:
 
 
 def _images(folder: Path) -> None:
-    """Six images of a board by a small camera, with the joint values and times of each."""
+    """Write six images of a board by a small camera, with joint values and times."""
     board = Board("small_board", 4, 5, 0.03)
     (folder / "images").mkdir()
     lines = ["image,time,q1_deg,q2_deg"]
@@ -174,7 +174,7 @@ def _images(folder: Path) -> None:
 
 
 def _models(folder: Path) -> None:
-    """A UR10 that learned what payload and temperature do, and a SCARA robot."""
+    """Write models of a UR10 with effects of payload and temperature, and of a SCARA robot."""
     robot = Robot.load("ur10")
     learned = ConditionFeatures(
         robot, ("payload_kg", "temperature_c"), (2.0, 22.0), (1.5, 3.0), ((0.0, 5.0), (15.0, 30.0))
@@ -189,7 +189,7 @@ def _models(folder: Path) -> None:
 
 
 def _write_poses(path: Path, T: torch.Tensor) -> list[list[float]]:
-    """Write poses as a table, and give them [mm, deg]."""
+    """Write poses as a table, and return them [mm, deg]."""
     values = xyzrpy_from_transform(T)
     poses = torch.cat([values[:, :3] * 1e3, torch.rad2deg(values[:, 3:])], 1).tolist()
     lines = [",".join(map(str, one)) for one in poses]
@@ -198,7 +198,7 @@ def _write_poses(path: Path, T: torch.Tensor) -> list[list[float]]:
 
 
 def _programs(folder: Path) -> None:
-    """Poses, and programs with them."""
+    """Write poses, and programs with them."""
     near = {name: joints_around(name, 3, seed=6, spread=0.1) for name in ("ur10", "kiro3")}
     poses = _write_poses(folder / "poses.csv", forward_kinematics(Robot.load("ur10"), near["ur10"]))
     _write_poses(folder / "poses3.csv", forward_kinematics(Robot.load("kiro3"), near["kiro3"]))
@@ -219,7 +219,7 @@ def _programs(folder: Path) -> None:
 
 
 def _plugins(folder: Path) -> None:
-    """The plug-ins of the documentation's pages."""
+    """Write the plug-ins of the documentation's pages."""
     pages = {"belt": "add-a-feature", "limits": "add-an-export", "hanging_play": "add-an-error-source"}
     pages |= {"mast": "add-a-closed-form", "plumb": "add-a-sensor"}
     for name, page in pages.items():

@@ -21,9 +21,9 @@ from pisigma.cli.main import app
 TABLE = Path(__file__).with_suffix(".txt")
 COMMAND = (sys.executable, "-m", "pisigma")
 HASH_OF = "SHA256:"
-"""Before a file in a call: its hash is meant."""
+"""Prefix of a file in a call, which is replaced by the hash of the file."""
 LONGEST_S = 60.0
-"""In which a server ends [s]."""
+"""Time for a server to end [s]."""
 
 
 @dataclass(frozen=True)
@@ -31,8 +31,8 @@ class Call:
     """A line of the table.
 
     Attributes:
-        line: its number.
-        status: the exit status that is right.
+        line: number of the line.
+        status: expected exit status.
         words: arguments of `pisigma`.
     """
 
@@ -42,7 +42,7 @@ class Call:
 
 
 def calls() -> list[Call]:
-    """The table: `pisigma ...` a line; before it the status, where it is not 0."""
+    """Read the table: one line `pisigma ...` per call, after its exit status where that is not 0."""
     found = []
     for number, line in enumerate(TABLE.read_text(encoding="utf-8").splitlines(), 1):
         if match := re.fullmatch(r"(?:\[(\d)\] )?pisigma (.+)", line):
@@ -55,7 +55,7 @@ def calls() -> list[Call]:
 
 
 def run_call(call: Call) -> tuple[int, str]:
-    """Run a call in this folder: exit status, and what it printed; servers are stopped as soon as they are ready."""
+    """Run a call in this folder, and return exit status and output; servers are stopped as soon as they are ready."""
     if call.words[0] == "serve":
         return _served(call)
     words = [_hash(word) if word.startswith(HASH_OF) else word for word in call.words]
@@ -85,7 +85,7 @@ def _served(call: Call) -> tuple[int, str]:
 
 
 def main() -> int:
-    """Run all calls; prints those that end otherwise than they should and gives how many."""
+    """Run all calls, print those with an unexpected status and return their number."""
     from gate.option_inputs import prepare
 
     failed, before = 0, Path.cwd()

@@ -1,6 +1,6 @@
 """The long checks, by subject: `python tests/gate/run.py options`; without a subject all of them, one after the other.
 
-A subject is a module of this folder with a function `main`, which prints what failed and returns how many did.
+A subject is a module of this folder with a function `main`, which prints failures and returns their number.
 """
 
 import argparse
@@ -16,7 +16,7 @@ SUBJECTS = tuple(
 
 
 def main() -> int:
-    """Run subjects; 0 where nothing failed."""
+    """Run subjects, and return 0 where nothing failed."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("subjects", nargs="*", metavar="SUBJECT", help=f"of {', '.join(SUBJECTS)}")
     chosen = parser.parse_args().subjects or SUBJECTS

@@ -12,7 +12,7 @@ def test_every_line_runs_or_has_a_reason():
     assert [line for line in runs if " ... " in line] == []
 
 
-def test_what_is_said_of_lines_and_blocks_is_of_some():
+def test_exceptions_apply_to_existing_lines_and_blocks():
     texts = [block.text for block in blocks("bash", "python")]
     for begin in (*NOT_HERE, *STATUS):
         assert any(line.startswith(begin) for line in LINES), begin

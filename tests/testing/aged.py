@@ -17,7 +17,7 @@ NAME = "rb5"
 
 @functools.cache
 def model_before() -> CalibratedModel:
-    """The hybrid calibration of the arm."""
+    """Return the hybrid calibration of the arm."""
     under_test = hybrid_of(NAME)
     with no_type_checker():
         return model_of_hybrid(NAME, under_test.true.nominal, under_test.result, under_test.measurements)
@@ -30,14 +30,14 @@ def rows_later(
     base: tuple[float, ...] = (0.0,) * 6,
     noise: float = NOISE,
 ) -> Measurements:
-    """Positions of the arm at other joint values.
+    """Measure positions of the arm at other joint values.
 
     Args:
-        rows: how many.
-        seed: of joint values and noise.
-        moved: by how much the zeros of the joints have moved [rad].
+        rows: number of rows.
+        seed: random seed of joint values and noise.
+        moved: change of the joint zeros [rad].
         base: motion of the instrument, x, y, z [m], roll, pitch, yaw [rad].
-        noise: of a coordinate [m].
+        noise: standard deviation of a coordinate [m].
     """
     true = hybrid_of(NAME).true
     q = joints_in(true.nominal, rows, seed)

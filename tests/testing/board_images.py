@@ -13,11 +13,11 @@ cv2 = pytest.importorskip("cv2", reason="opencv-python-headless is not installed
 
 CAMERA = Camera("small", 640, 400, 500.0, 500.0, 320.0, 200.0)
 FINER = 8
-"""Pixels of a pixel along each axis, while polygons are drawn."""
+"""Oversampling along each axis, for drawing polygons."""
 
 
 def view(board: Board, distance: float, rpy: tuple[float, float, float]) -> tuple[np.ndarray, np.ndarray]:
-    """R_camera_board and t [m] where the middle of the board is on the camera's axis; 0, 0, 0 looks straight at it."""
+    """Return R_camera_board and t [m] with the board's centre on the camera's axis; 0, 0, 0 is a frontal view."""
     R = rotation_from_rpy(torch.tensor(rpy, dtype=torch.float64)).numpy()
     return R, np.array([0.0, 0.0, distance]) - R @ (board.corners.max(0) / 2)
 
@@ -30,7 +30,7 @@ def draw_board(
     blur: float = 0.8,
     noise: float = 1.0,
 ) -> np.ndarray:
-    """Gray image of a white sheet with a board on a gray ground."""
+    """Return a grey image of a white sheet with a board on a grey background."""
     pattern = board_pattern(board)
     image = np.full((FINER * camera.height, FINER * camera.width), 120, dtype=np.uint8)
     for rectangle, gray in ((pattern.sheet, 210), *((black, 40) for black in pattern.black)):

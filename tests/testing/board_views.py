@@ -1,4 +1,4 @@
-"""A camera on the flange of a UR5 before a board on a table, and whether a pose sees it, found point by point."""
+"""A UR5 with a camera on its flange and a board on a table, and a pointwise check of whether a pose sees it."""
 
 from pathlib import Path
 
@@ -49,7 +49,7 @@ def camera_settings(folder: Path, is_fixed: bool = False) -> CameraSettings:
 
 
 def arm_before_board(robot: Robot | None = None) -> ArmInCell:
-    """A robot (a UR5 where none is stated) in the cell."""
+    """Return a robot (default: a UR5) in the cell."""
     return ArmInCell.of(robot or Robot.load("ur5"), CELL)
 
 

@@ -20,7 +20,7 @@ ERRORS = np.array([1e-3, 5e-4, 5e-4, 1e-3, 1e-3])
 
 
 def joints_of(robot: Robot, rows: int, seed: int = 1, share: float = 1.0) -> torch.Tensor:
-    """Joint values [rad or m] over a share of the limits, at most a turn."""
+    """Draw joint values [rad or m] over a fraction of the limits, at most one turn."""
     limits = np.clip(robot.limits, -math.pi, math.pi) * share
     return torch.from_numpy(
         np.random.default_rng(seed).uniform(limits[:, 0], limits[:, 1], (rows, robot.dof))
@@ -30,7 +30,7 @@ def joints_of(robot: Robot, rows: int, seed: int = 1, share: float = 1.0) -> tor
 def random_correction(
     robot: Robot, shared: tuple[str, ...] = ("sin_cos",), harmonics: int = 12, size: float = 1.0
 ) -> JointCorrection:
-    """A correction of about `size` times 1e-3 rad with all kinds of features, and product units."""
+    """Return a correction of about `size` times 1e-3 rad with all kinds of features, and product units."""
     features = [FourierSeries(robot, harmonics), GravityTorques(robot, (0.1, -0.2, -1.0))]
     features += [FEATURES[name](robot) for name in shared]
     correction = JointCorrection(robot, features, (2, 3))
@@ -52,14 +52,14 @@ def calibrated_arm(
     shared: tuple[str, ...] = ("sin_cos",),
     size: float = 1.0,
 ) -> CalibratedModel:
-    """A calibrated robot of the catalogue.
+    """Return a calibrated robot of the catalogue.
 
     Args:
-        name: of the robot.
+        name: name of the robot.
         hybrid: whether it has a joint correction.
-        covered: share of the joint range that was measured.
-        shared: features besides the series and gravity.
-        size: of the correction [1e-3 rad].
+        covered: fraction of the joint range that was measured.
+        shared: features in addition to the series and gravity.
+        size: size of the correction [1e-3 rad].
     """
     return calibrated_robot(Robot.load(name), hybrid, covered, shared, size)
 
@@ -71,7 +71,7 @@ def calibrated_robot(
     shared: tuple[str, ...] = ("sin_cos",),
     size: float = 1.0,
 ) -> CalibratedModel:
-    """The same of any robot."""
+    """Return a calibrated robot of any description."""
     rng = np.random.default_rng(0)
     robot = robot.with_geometry(base=BASE, tool=TOOL)
     geometric = robot.with_geometry(dh=robot.dh + ERRORS * rng.normal(size=robot.dh.shape))

@@ -19,14 +19,14 @@ NOISE = 5e-5
 
 
 def measured(q: torch.Tensor, T: torch.Tensor, turned: bool) -> Measurements:
-    """Poses T `(rows, 4, 4)`, or their positions only, with noise in the positions."""
+    """Return measurements of poses T `(rows, 4, 4)`, or of their positions only, with noise in the positions."""
     noise = NOISE * torch.from_numpy(np.random.default_rng(4).normal(size=(len(q), 3)))
     return Measurements(q=q, position=T[:, :3, 3] + noise, rotation=T[:, :3, :3].clone() if turned else None)
 
 
 @functools.cache
 def calibrated_ur5(rows: int) -> tuple[CalibratedModel, torch.Tensor, torch.Tensor]:
-    """The model, new joint values `(rows, 6)` [rad] and the true poses there `(rows, 4, 4)`."""
+    """Return the model, new joint values `(rows, 6)` [rad] and their true poses `(rows, 4, 4)`."""
     with no_type_checker():
         found = simulate("ur5", rows=90, noise=NOISE, turn_noise=1e-4)
         result = GeometricCalibrator(found.nominal).fit(found.measurements)

@@ -1,4 +1,4 @@
-"""A UR5 with a camera on its flange, or beside it, and a board that it sees."""
+"""A UR5 with a camera on its flange, or next to it, and a board that the camera sees."""
 
 import functools
 from dataclasses import dataclass
@@ -26,9 +26,9 @@ CAMERA = Camera("wrist", 1920, 1200, 1400.0, 1400.0, 960.0, 600.0, -0.1, 0.05, 1
 BOARD = Board("board", 6, 9, 0.03)
 BOARD_IN_BASE = np.array([0.42, -0.12, 0.05, 0.0, 0.0, 0.0])
 CAMERA_IN_BASE = np.array([0.45, -0.1, 0.9, 0.0, 0.0, np.pi])
-"""Of a fixed camera, which looks down."""
+"""Pose of a fixed camera, which looks down."""
 ON_FLANGE = np.array([0.03, 0.02, 0.06, 0.1, 0.02, -0.03])
-"""Where the camera is on the flange, or the board."""
+"""Pose of the camera, or of the board, on the flange."""
 NOISE = ImageNoise()
 LENGTH, ANGLE = 1e-3, np.deg2rad(0.3)
 """Standard deviations of the arm's errors [m, rad]."""
@@ -36,7 +36,7 @@ LENGTH, ANGLE = 1e-3, np.deg2rad(0.3)
 
 @dataclass(frozen=True, eq=False)
 class CameraCell:
-    """A robot as drawn, the true one with base and tool, and what a camera saw of it."""
+    """The nominal robot, the true one with base and tool, and its images."""
 
     nominal: Robot
     true: Robot
@@ -46,7 +46,7 @@ class CameraCell:
 
 @functools.cache
 def camera_cell(count: int, seed: int = 0, noise: ImageNoise = NOISE, is_fixed: bool = False) -> CameraCell:
-    """Images of the whole board from 0.3 to 0.7 m, at most 40 deg oblique, by all branches of the arm."""
+    """Return images of the whole board from 0.3 to 0.7 m, at most 40 deg oblique, with all branches of the arm."""
     with no_type_checker():
         nominal = Robot.load("ur5")
         first = CAMERA_IN_BASE if is_fixed else BOARD_IN_BASE
@@ -61,7 +61,7 @@ def camera_cell(count: int, seed: int = 0, noise: ImageNoise = NOISE, is_fixed: 
 
 
 def _joints_of_views(robot: Robot, count: int, rng: np.random.Generator, is_fixed: bool) -> Tensor:
-    """Joint values [rad] at which the robot as drawn shows the board to the camera."""
+    """Return joint values [rad] at which the nominal robot shows the board to the camera."""
     solver, chosen = closed_form_solver(robot), list[Tensor]()
     assert solver is not None
     while len(chosen) < count:
@@ -79,7 +79,7 @@ def _joints_of_views(robot: Robot, count: int, rng: np.random.Generator, is_fixe
 
 
 def corner_lines(images: Images) -> list[str]:
-    """Lines of a file of corners, the header first."""
+    """Return the lines of a file of corners, the header first."""
     dof = images.q.shape[1]
     lines = ["image,corner,u_px,v_px," + ",".join(f"q{joint + 1}_deg" for joint in range(dof))]
     for name, q, corners, pixels in zip(images.names, images.q, images.corners, images.pixels, strict=True):
@@ -92,7 +92,7 @@ def corner_lines(images: Images) -> list[str]:
 
 
 def aligned_error(true: Tensor, estimated: Tensor) -> float:
-    """Root mean square distance of points `(points, 3)` [m] after the best rigid alignment (Kabsch 1976)."""
+    """Compute the RMS distance of points `(points, 3)` [m] after the best rigid alignment (Kabsch 1976)."""
     A, B = (points - points.mean(0) for points in (true, estimated))
     U, _, Vh = torch.linalg.svd(B.T @ A)
     U[:, 2] *= torch.sign(torch.det(U @ Vh))

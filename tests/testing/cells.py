@@ -1,4 +1,4 @@
-"""A cell with everything in it, and whether a pose is allowed there, found by points instead of distances of lines."""
+"""A cell with all kinds of obstacles, and a check of poses by points instead of distances between lines."""
 
 import numpy as np
 
@@ -28,11 +28,11 @@ CELL = Cell.model_validate(
 """For a robot of the size of the catalogue's fanuc_r2000."""
 
 POINTS = np.linspace(0.0, 1.0, 30)
-"""Along every line."""
+"""Number of points along every line."""
 
 
 def lines_of(robot: Robot, q: np.ndarray) -> list[np.ndarray]:
-    """Points on the middle of every link of a robot with joints that turn, `(points, 3)`, the tool's last [m]."""
+    """Return points on the centre line of every link of an arm with revolute joints, `(points, 3)` [m]; tool last."""
     T, lines = frame_of(robot.base), []
     for row, (theta, d, a, alpha, beta), value in zip(robot.rows, robot.dh, q, strict=True):
         along_axis = T @ row_frame(0.0, d, 0.0, 0.0, 0.0)
@@ -45,7 +45,7 @@ def lines_of(robot: Robot, q: np.ndarray) -> list[np.ndarray]:
 
 
 def is_collision_free(robot: Robot, cell: Cell, q: np.ndarray, radius: np.ndarray) -> bool:
-    """Whether all points of the links keep the clearance from floor, boxes and the links that are not beside theirs.
+    """Whether all points of the links keep the clearance from floor, boxes and non-adjacent links.
 
     Args:
         robot: with its tool; links are compared from the third on with those before their neighbour.

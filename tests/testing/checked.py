@@ -1,4 +1,4 @@
-"""Calibrations as checks see them."""
+"""Calibrations as inputs of the checks."""
 
 from pisigma.calibration.geometric.calibrator import GeometricCalibrator
 from pisigma.measurement.dataset import Measurements
@@ -8,10 +8,10 @@ from pisigma.validation.held_out.trained_calibrations import trained
 
 
 def checked(calibrator: GeometricCalibrator, rows: Measurements) -> CheckedCalibration:
-    """Calibrate, and give what checks look at."""
+    """Calibrate, and return the input of the checks."""
     return CheckedCalibration(calibrator, rows, trained(calibrator, rows))
 
 
 def kinds_of(calibrator: GeometricCalibrator, rows: Measurements) -> list[tuple[str, str]]:
-    """Kind and severity of all that the checks say of a calibration."""
+    """Return kind and severity of all diagnostics of a calibration."""
     return [(one.kind, one.severity) for one in diagnostics_of(checked(calibrator, rows))]

@@ -1,4 +1,4 @@
-"""The one way in which tests compare numbers: it asserts, and NaN never passes."""
+"""The only comparison of numbers in tests: it asserts, and NaN never passes."""
 
 import numpy as np
 import torch
@@ -22,6 +22,6 @@ def assert_close(actual: object, expected: object, *, atol: float = 0.0, rtol: f
 
 
 def joint_distance(robot: Robot, a: Tensor, b: Tensor) -> Tensor:
-    """Largest difference of two sets of joint values [rad or m], full turns of revolute joints not counted."""
+    """Compute the largest difference of two sets of joint values [rad or m], up to full turns of revolute joints."""
     difference = torch.where(torch.tensor(robot.revolute), wrap_to_pi(a - b), a - b)
     return difference.abs().amax(-1)

@@ -1,4 +1,4 @@
-"""Models of one simulated arm that were made of different rows, for tests."""
+"""Models of one simulated arm that were made from different rows, for tests."""
 
 import functools
 import math
@@ -14,16 +14,16 @@ from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.geometric_model import model_of_hybrid
 
 COLLISION = (0.0, 0.0, math.radians(0.1), 0.0, 0.0, 0.0)
-"""[rad] By how much the zeros of the joints have moved: joint 3 by 0.1 deg."""
+"""Change of the joint zeros [rad]: joint 3 by 0.1 deg."""
 CARRIED = (0.3, -0.2, 0.1, 0.4, 0.02, -0.03)
-"""Motion of an instrument that was carried elsewhere."""
+"""Motion of the relocated instrument."""
 
 
 @functools.cache
 def model_of(
     seed: int, moved: tuple[float, ...] = (0.0,) * 6, base: tuple[float, ...] = (0.0,) * 6
 ) -> CalibratedModel:
-    """A hybrid calibration of 80 rows; for the arguments see `testing.aged.rows_later`."""
+    """Return a hybrid calibration with 80 rows; for the arguments see `testing.aged.rows_later`."""
     nominal = hybrid_of(NAME).true.nominal
     rows = rows_later(80, seed, moved, base)
     calibrator = HybridCalibrator(
@@ -34,10 +34,10 @@ def model_of(
 
 
 def after_collision() -> CalibratedModel:
-    """The arm with joint 3 moved by 0.1 deg, as an instrument measured it that stands elsewhere."""
+    """Return the model of the arm with joint 3 moved by 0.1 deg, measured by a relocated instrument."""
     return model_of(60, COLLISION, CARRIED)
 
 
 def joints_of(model: CalibratedModel, count: int) -> torch.Tensor:
-    """Some joint values [rad or m] that a model keeps."""
+    """Return some joint values [rad or m] that a model stores."""
     return model.starts[:count]

@@ -1,4 +1,4 @@
-"""Enough of controllers' languages to run or to parse the clients that the documentation shows."""
+"""Subsets of controllers' languages, for running or parsing the clients in the documentation."""
 
 import math
 import re
@@ -76,11 +76,11 @@ LANGUAGES: dict[str, tuple[str, Sequence[tuple[str, str]], Sequence[str]]] = {
         ),
     ),
 }
-"""By file: what its remarks look like, its blocks with their ends, and its other statements, a line each."""
+"""For each file: pattern of remarks, blocks with their ends, and other statements, one per line."""
 
 
 def parse(name: str, text: str) -> int:
-    """Parse a program line by line; gives how many statements it has; ValueError says which line is none."""
+    """Parse a program line by line, and return its number of statements; ValueError names an invalid line."""
     remark, blocks, statements = LANGUAGES[name]
     open_blocks: list[str] = []
     count = 0
@@ -102,13 +102,13 @@ def parse(name: str, text: str) -> int:
 
 
 def run_urscript(text: str, q_now: Sequence[float]) -> dict[str, Callable[..., object]]:
-    """Give the functions of a URScript program as Python's, on real sockets.
+    """Return the functions of a URScript program as Python functions, which use real sockets.
 
-    URScript is written as Python is, but for its `end` and the scope of its variables.
+    URScript is like Python, except for `end` and the scope of variables.
 
     Args:
-        text: of the program.
-        q_now: joint values where the robot is [rad].
+        text: text of the program.
+        q_now: current joint values of the robot [rad].
     """
     lines = []
     for line in text.splitlines():
@@ -153,7 +153,7 @@ def run_urscript(text: str, q_now: Sequence[float]) -> dict[str, Callable[..., o
 
 
 def _roll_pitch_yaw(vector: Sequence[float]) -> list[float]:
-    """Angles about x, y and z of a rotation vector, for RotZ · RotY · RotX."""
+    """Return the angles about x, y and z of a rotation vector, for RotZ · RotY · RotX."""
     angle = float(np.linalg.norm(vector))
     x, y, z = np.array(vector) / angle
     K = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])

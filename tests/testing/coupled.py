@@ -1,4 +1,4 @@
-"""Robots with coupled joints, made up for tests."""
+"""Robots with coupled joints, invented for tests."""
 
 from pisigma.files.errors import RobotError
 from pisigma.files.yaml_file import parse_yaml
@@ -18,7 +18,7 @@ rows:
 coupling:
   - {joint: theta_3, factors: {theta_2: 1, theta_3: 1}}
 """
-"""Six joints, of which the third is counted against the horizontal."""
+"""Six joints, the third of which is measured from the horizontal."""
 
 PALLETISER = """\
 name: palletiser

@@ -1,4 +1,4 @@
-"""The regression of the hybrid with all columns in one matrix, by orthogonal factors: what its forms have to equal."""
+"""Reference for the regressions of the hybrid: all columns in one matrix, with orthogonal factorisation."""
 
 import math
 from collections.abc import Sequence
@@ -22,9 +22,9 @@ class DenseRegression(AbstractDesignRegression):
     Attributes:
         X: weighted columns.
         y: weighted values.
-        sensor: number of every value's sensor.
-        group: of the rows that are held out together; -1 of values that are certain.
-        sensors: how many values there are.
+        sensor: index of every value's sensor.
+        group: group of the rows that are held out together; -1 for certain values.
+        sensors: number of values of every sensor.
     """
 
     X: Tensor
@@ -35,7 +35,7 @@ class DenseRegression(AbstractDesignRegression):
 
     @staticmethod
     def of(design: Design, rows: Rows) -> "DenseRegression":
-        """All rows of all sensors, weighted."""
+        """Return the regression of all weighted rows of all sensors."""
         parts = []
         for number, values in enumerate(rows.values):
             root = values.root[:, None]
@@ -52,7 +52,7 @@ class DenseRegression(AbstractDesignRegression):
 
     @staticmethod
     def between(X: Sequence[Tensor], y: Sequence[Tensor], **known: tuple[bool, ...]) -> "DenseRegression":
-        """Of given columns and values of several sensors, every value a group of its own."""
+        """Return the regression of given columns and values of several sensors, with one group per value."""
         sensor = torch.arange(len(y)).repeat_interleave(torch.tensor([len(values) for values in y]))
         none = (False,) * len(y)
         flags = zip(y, known.get("stated", none), known.get("exact", none), strict=True)
@@ -62,7 +62,7 @@ class DenseRegression(AbstractDesignRegression):
         )
 
     def solve(self, prior: GaussianPrior, noise: tuple[float, ...]) -> Posterior:
-        """Least squares of the values and the prior together."""
+        """Solve the least-squares problem of values and prior."""
         sigma, precision = self._sigma(noise), prior.precision
         R, x = self._factor(prior, noise)
         residual = self.y - self.X @ x
@@ -85,15 +85,15 @@ class DenseRegression(AbstractDesignRegression):
         )
 
     def covariance_root(self, posterior: Posterior) -> CovarianceRoot:
-        """Inverse of the triangular root of the precision of values and prior together."""
+        """Compute the inverse of the triangular root of the precision of values and prior."""
         return CovarianceRoot(_inverse(self._factor(posterior.prior, posterior.noise)[0]))
 
     def select(self, design: Tensor) -> "DenseRegression":
-        """Of some columns, by their numbers."""
+        """Return the regression of some columns, by their indices."""
         return replace(self, X=self.X[:, design])
 
     def without(self, groups: Tensor) -> "DenseRegression":
-        """The values of the other groups."""
+        """Return the regression of the values of the other groups."""
         kept = ~torch.isin(self.group, groups)
         share = [float(kept[self.sensor == k].double().mean()) for k in range(len(self.sensors))]
         counts = zip(self.sensors, share, strict=True)
@@ -106,7 +106,7 @@ class DenseRegression(AbstractDesignRegression):
         )
 
     def left_out(self, posterior: Posterior, folds: Sequence[Tensor]) -> LeftOut:
-        """Fit again without every fold; what the other values say nothing of is fitted to the fold by least squares."""
+        """Fit again without each fold; directions that the other values do not determine are fitted to the fold."""
         parts = []
         for groups in folds:
             chosen = torch.isin(self.group, groups)
@@ -125,7 +125,7 @@ class DenseRegression(AbstractDesignRegression):
         return LeftOut.joined(parts)
 
     def _solution(self, prior: GaussianPrior, noise: Sequence[float]) -> tuple[Tensor, Tensor, Tensor]:
-        """Unknowns, root of their covariance, and the directions of which values and prior say nothing."""
+        """Return the unknowns, the root of their covariance, and the undetermined directions."""
         whole, right = self._whole(prior, noise)
         scale = whole.norm(dim=0).clamp(min=1.0)
         U, size, V = torch.linalg.svd(whole / scale, full_matrices=False)
@@ -134,13 +134,13 @@ class DenseRegression(AbstractDesignRegression):
         return root @ (U[:, known].t() @ right), root, V[~known].t() / scale[:, None]
 
     def _whole(self, prior: GaussianPrior, noise: Sequence[float]) -> tuple[Tensor, Tensor]:
-        """Values and prior as one least-squares problem."""
+        """Return values and prior as one least-squares problem."""
         sigma, precision = self._sigma(noise)[:, None], prior.precision
         whole = torch.cat([self.X / sigma, torch.diag(precision.sqrt())[precision > 0]])
         return whole, torch.cat([self.y / sigma[:, 0], torch.zeros(int((precision > 0).sum())).double()])
 
     def _factor(self, prior: GaussianPrior, noise: Sequence[float]) -> tuple[Tensor, Tensor]:
-        """Triangular root of the precision of all unknowns, and their most probable values."""
+        """Return the triangular root of the precision of all unknowns, and their most probable values."""
         whole, right = self._whole(prior, noise)
         Q, R = torch.linalg.qr(whole)
         return R, torch.linalg.solve_triangular(R, (Q.t() @ right)[:, None], upper=True)[:, 0]
@@ -153,5 +153,5 @@ class DenseRegression(AbstractDesignRegression):
 
 
 def _inverse(R: Tensor) -> Tensor:
-    """Of an upper triangular matrix."""
+    """Invert an upper triangular matrix."""
     return torch.linalg.solve_triangular(R, torch.eye(len(R)).double(), upper=True)

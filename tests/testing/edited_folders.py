@@ -1,4 +1,4 @@
-"""Model folders that another program changed and signed again."""
+"""Model folders that were edited and given a matching hash."""
 
 import hashlib
 from collections.abc import Callable
@@ -10,7 +10,7 @@ from safetensors.torch import load_file, save_file
 
 
 def edit(folder: Path, change: Callable[[Any], Any]) -> None:
-    """Change the description and sign it again, as a foreign program might."""
+    """Change the description, and store its new hash."""
     text = (folder / "model.yaml").read_text()
     document = yaml.load(text[: text.index("\nsha256: ") + 1], Loader=yaml.CSafeLoader)
     change(document)
@@ -19,7 +19,7 @@ def edit(folder: Path, change: Callable[[Any], Any]) -> None:
 
 
 def edit_tensors(folder: Path, change: Callable[[Any], Any]) -> None:
-    """Change the weights and note their new hash."""
+    """Change the weights, and store their new hash."""
     path = folder / "model.safetensors"
     tensors = load_file(path)
     change(tensors)

@@ -1,4 +1,4 @@
-"""Simulated robots of one type: errors that all share, and parts of each."""
+"""Simulated robots of one type, with shared and individual errors."""
 
 import torch
 from torch import Tensor
@@ -11,15 +11,15 @@ from pisigma.robot.kinematics.forward import forward_kinematics
 
 DRAWN = Robot.load("rb5")
 NOISE = 3.5e-5
-"""[m] Of a coordinate."""
+"""Standard deviation of a coordinate [m]."""
 SHARED, INDIVIDUAL = 1e-3, 2e-4
-"""[m or rad] Standard deviations of the geometric errors that all robots share, and of those of each."""
+"""Standard deviations of the shared and of the individual geometric errors [m or rad]."""
 GEARS = (2e-4, 1e-4, 0.0)
-"""[rad] Standard deviations of the harmonics of gears."""
+"""Standard deviations of the harmonics of gears [rad]."""
 
 
 def common_errors(seed: int = 5) -> Tensor:
-    """Errors of the geometry that all robots of a type share."""
+    """Return the geometric errors that all robots of a type share."""
     return (
         torch.randn(DRAWN.dh.shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
         * SHARED
@@ -27,7 +27,7 @@ def common_errors(seed: int = 5) -> Tensor:
 
 
 def common_gears() -> Tensor:
-    """Weights of harmonics that all robots of a type share, of every joint."""
+    """Return the weights of harmonics of every joint that all robots of a type share."""
     sizes = torch.tensor(GEARS * 2, dtype=torch.float64)
     return (
         torch.randn(DRAWN.dof, len(sizes), generator=torch.Generator().manual_seed(7), dtype=torch.float64)
@@ -44,16 +44,16 @@ def rows_of(
     individual: float = INDIVIDUAL,
     individual_gears: float = 1.0,
 ) -> Measurements:
-    """Positions that a robot takes.
+    """Measure positions of a robot.
 
     Args:
-        number: of the robot.
-        rows: how many.
-        seed: of joint values and noise.
-        odd: whether its shared errors are those of another type.
-        noise: of a coordinate [m].
-        individual: standard deviation of the geometric errors of its own [m or rad].
-        individual_gears: share of the variance of harmonics that differs from robot to robot.
+        number: number of the robot.
+        rows: number of rows.
+        seed: random seed of joint values and noise.
+        odd: whether it has the shared errors of another type.
+        noise: standard deviation of a coordinate [m].
+        individual: standard deviation of its individual geometric errors [m or rad].
+        individual_gears: fraction of the variance of harmonics that differs between robots.
     """
     of_robot = torch.Generator().manual_seed(1000 + number)
     errors = common_errors(6 if odd else 5)

@@ -19,12 +19,12 @@ from pisigma.simulation.errors.joint_compliance import JointCompliance, LinkMass
 from pisigma.simulation.errors.transmission import Harmonic, TransmissionHarmonics
 
 NOISE = 3e-5
-"""[m] Of a measured coordinate."""
+"""Standard deviation of a measured coordinate [m]."""
 
 
 @dataclass(frozen=True, eq=False)
 class HybridArmUnderTest:
-    """A simulated robot, what was measured on it, and its hybrid calibration."""
+    """A simulated robot, its measurements, and its hybrid calibration."""
 
     true: TrueRobot
     measurements: Measurements
@@ -32,10 +32,10 @@ class HybridArmUnderTest:
 
 
 def true_robot(robot: Robot, payload: float = 3.0) -> TrueRobot:
-    """A robot with errors of geometry, gears and, in its second and third joint, compliance.
+    """Return a robot with errors of geometry and gears, and with compliance of its second and third joint.
 
     Args:
-        robot: as drawn.
+        robot: the nominal robot.
         payload: mass at the tool [kg].
     """
     names = [joint.name for joint in robot.joints]
@@ -64,7 +64,7 @@ def true_robot(robot: Robot, payload: float = 3.0) -> TrueRobot:
 
 
 def joints_in(robot: Robot, rows: int, seed: int, share: float = 1.0) -> torch.Tensor:
-    """Joint values [rad or m], uniform over a share of the limits around their middle, at most one turn."""
+    """Draw joint values [rad or m], uniform over a central fraction of the limits, at most one turn."""
     limits = np.clip(robot.limits, -np.pi, np.pi)
     middle, half = limits.mean(1), np.diff(limits)[:, 0] / 2 * share
     return torch.from_numpy(
@@ -85,12 +85,12 @@ def hybrid_of(
     """Calibrate a simulated robot from measured positions.
 
     Args:
-        name: of the catalogue.
-        rows: measured positions.
-        share: of the joint ranges that is measured.
-        products: whether product units are tried.
+        name: catalogue name.
+        rows: number of measured positions.
+        share: fraction of the joint ranges that is measured.
+        products: whether to try product units.
         frames: measure in two frames and with two targets, else in one.
-        features: that are tried.
+        features: features to try.
         payloads: masses [kg] that the rows carry in turn, as they state; the usual one and not stated where none.
     """
     true = true_robot(Robot.load(name))

@@ -1,4 +1,4 @@
-"""Models with an identified geometry, and with a joint correction, made by hand."""
+"""Hand-made models with an identified geometry, and with a joint correction."""
 
 import numpy as np
 import torch
@@ -11,11 +11,11 @@ from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.robot import Robot
 
 ROWS, SPREAD = 60, 0.5
-"""Joint values that count as measured, and how far [rad] they spread to either side."""
+"""Number of joint values that count as measured, and half their range [rad]."""
 
 
 def off_by(robot: Robot, length: float = 3e-4, angle: float = 2e-3, seed: int = 0) -> Robot:
-    """The robot with all lengths [m] and angles [rad] of its rows off by about so much.
+    """Return the robot with errors of about `size` in all lengths [m] and angles [rad] of its rows.
 
     Axes of an arm of fewer than six joints stay parallel, or it could not take the poses of the nominal one.
     """
@@ -25,7 +25,7 @@ def off_by(robot: Robot, length: float = 3e-4, angle: float = 2e-3, seed: int = 
 
 
 def geometric_model(name: str, robot: Robot | None = None) -> CalibratedModel:
-    """A robot of `testing.models.HOMES` whose geometry is off."""
+    """Return a model of a robot of `testing.models.HOMES` with geometric errors."""
     robot = robot or Robot.load(name)
     return CalibratedModel(
         name=f"geometric_{name}",
@@ -49,7 +49,7 @@ def hybrid_model(
     size: float = 1e-3,
     robot: Robot | None = None,
 ) -> CalibratedModel:
-    """The same with a joint correction of random weights of some size [rad or m], over the columns of a joint."""
+    """Return such a model with a joint correction of random weights [rad or m] over the columns of a joint."""
     model = geometric_model(name, robot)
     correction = JointCorrection(model.robot, features, orders)
     generator = torch.Generator().manual_seed(5)

@@ -32,7 +32,7 @@ TARGETS = torch.tensor(
 
 
 def drawn_joints(robot: Robot, rows: int, seed: int, widest: float = np.pi) -> Tensor:
-    """Joint values [rad or m], uniform over the limits, turning joints at most so far from 0."""
+    """Draw joint values [rad or m], uniform over the limits, with a maximum angle of revolute joints."""
     most = np.where(robot.revolute, widest, np.inf)[:, None]
     low, high = np.clip(robot.limits, -most, most).T
     return torch.from_numpy(np.random.default_rng(seed).uniform(low, high, (rows, robot.dof)))
@@ -47,16 +47,16 @@ def tracker_data(
     several: bool = False,
     seed: int = 0,
 ) -> Measurements:
-    """What a tracker sees of a robot whose joints are off by `delta`.
+    """Measure a robot with joint errors `delta` by a tracker.
 
     Args:
-        true: the robot.
+        true: the true robot.
         q: commanded joint values.
         delta: joint errors.
-        noise: of a coordinate [m].
-        turn_noise: of an angle [rad]; positions only where None.
-        several: measure in two frames and with two targets by turns, else in one.
-        seed: of the noise.
+        noise: standard deviation of a coordinate [m].
+        turn_noise: standard deviation of an angle [rad]; None for positions only.
+        several: alternate two frames and two targets, instead of using one.
+        seed: random seed of the noise.
     """
     rng = np.random.default_rng(seed)
     number = torch.arange(len(q)) * int(several)
@@ -78,7 +78,7 @@ def tracker_data(
 
 @dataclass(frozen=True, eq=False)
 class LinearisedArm:
-    """The rows of a geometric calibration, seen from its solution."""
+    """The rows of a geometric calibration, linearised at its solution."""
 
     setup: CalibrationSetup
     rows: Rows
@@ -86,14 +86,14 @@ class LinearisedArm:
     prior_scale: tuple[float, ...]
 
     def fitted(self, features: Sequence[AbstractFeature], iterations: int = 40) -> Fitted:
-        """Geometry and a unit of order 1, prior sizes and noise by the evidence."""
+        """Fit geometry and a unit of order 1, with prior sizes and noise by the evidence."""
         design = Design(self.rows.problem, tuple(features))
         sums = NormalEquations.of(design, self.rows)
         return Fitted(design, sums.maximise_evidence(design.prior(self.prior_scale), self.noise, iterations))
 
 
 def linearised(robot: Robot, measurements: Measurements, **options: object) -> LinearisedArm:
-    """Calibrate the geometry by least squares, all rows alike, and linearise there."""
+    """Calibrate the geometry by unweighted least squares, and linearise at the solution."""
     solved = GeometricCalibrator(robot, loss=SquaredLoss(), **options).solve(measurements)  # type: ignore[arg-type]
     here, problem = solved.solution.linearisation, solved.problem
     view = view_of(here)
@@ -105,7 +105,7 @@ def linearised(robot: Robot, measurements: Measurements, **options: object) -> L
 
 
 def with_directions(robot: Robot, directions: Sequence[int]) -> Robot:
-    """The same robot whose joints count the other way where the direction is -1."""
+    """Return the robot with reversed joints where the direction is -1."""
     rows = list(robot.rows)
     for place, direction in zip(robot.joint_rows, directions, strict=True):
         row = rows[place]

@@ -1,4 +1,4 @@
-"""A small plan for a robot that errs, and what a tracker measures at its poses, for tests."""
+"""A small plan for a robot with errors, and measurements of its poses by a tracker, for tests."""
 
 from dataclasses import dataclass
 
@@ -17,9 +17,9 @@ from pisigma.robot.description import Robot
 from pisigma.robot.kinematics.forward import forward_kinematics
 
 CHECKS = 3
-"""Of the poses check the calibration."""
+"""Number of poses that test the calibration."""
 NOISE = 3e-5
-"""[m] Of the tracker."""
+"""Standard deviation of the tracker [m]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,25 +28,25 @@ class MeasuredPlan:
 
     Attributes:
         stored: the plan.
-        true: the robot as it is.
+        true: the true robot.
     """
 
     stored: StoredPlan
     true: Robot
 
     def measure(self, q: Float64[Tensor, "rows dof"], first_line: int = 2, seed: int = 5) -> Measurements:
-        """What a tracker measures at joint values [rad]."""
+        """Measure joint values [rad] by a tracker."""
         noise = np.random.default_rng(seed).normal(size=(len(q), 3)) * NOISE
         position = forward_kinematics(self.true, q)[:, :3, 3] + torch.from_numpy(noise)
         return Measurements(q=q, position=position, line=tuple(range(first_line, first_line + len(q))))
 
     def rows(self, count: int) -> Measurements:
-        """What is measured at the first poses."""
+        """Measure the first poses."""
         return self.measure(self.stored.q[:count])
 
 
 def measured_plan(name: str = "ur5", poses: int = 24, seed: int = 0) -> MeasuredPlan:
-    """A robot of the catalogue with errors of a usual size."""
+    """Plan for a robot of the catalogue with errors of a usual size."""
     robot = Robot.load(name)
     true = robot.with_geometry(
         dh=robot.dh + dh_errors(robot, 3e-4, 6e-4, np.random.default_rng(seed)), base=BASE, tool=TOOL
@@ -70,7 +70,7 @@ def measured_plan(name: str = "ur5", poses: int = 24, seed: int = 0) -> Measured
 
 
 def with_offset(rows: Measurements, row: int, offset: tuple[float, float, float]) -> Measurements:
-    """The same rows with the position of one of them moved [m]."""
+    """Return the rows with an offset [m] of one position."""
     assert rows.position is not None
     position = rows.position.clone()
     position[row] += torch.tensor(offset, dtype=torch.float64)
@@ -78,13 +78,13 @@ def with_offset(rows: Measurements, row: int, offset: tuple[float, float, float]
 
 
 def header(robot: Robot) -> str:
-    """Header of the rows that `row_lines` writes."""
+    """Return the header of the rows that `row_lines` writes."""
     joints = (f"q{number}_{joint.file_unit}" for number, joint in enumerate(robot.joints, start=1))
     return ",".join([*joints, "x_mm,y_mm,z_mm\n"])
 
 
 def row_lines(robot: Robot, rows: Measurements) -> list[str]:
-    """The rows as lines of a measurement file."""
+    """Return the rows as lines of a measurement file."""
     assert rows.position is not None
     lines = []
     for q, position in zip(rows.q.tolist(), (rows.position * 1e3).tolist(), strict=True):

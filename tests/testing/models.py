@@ -1,4 +1,4 @@
-"""Small calibrated models for tests: made by hand, or trained once per test run."""
+"""Small calibrated models for tests: hand-made, or trained once per test run."""
 
 import functools
 import math
@@ -26,14 +26,14 @@ HOMES = {
     "kiro4": (0.2, 0.5, 0.4, 0.3, 0.8, 0.2),
     "ur10": (0.3, -1.2, 1.4, -0.6, -1.2, 0.4),
 }
-"""Joint values [rad or m] in the middle of the rows of the hand-made models."""
+"""Centre of the joint values of the hand-made models' rows [rad or m]."""
 
 SPREAD = 0.25
-"""Half the range of the rows around HOMES [rad], a tenth of it [m] for joints that slide."""
+"""Half the range of the rows around HOMES [rad]; a tenth of it [m] for prismatic joints."""
 
 
 def joints_around(name: str, *batch: int, seed: int = 0, spread: float = SPREAD) -> torch.Tensor:
-    """Joint values [rad or m] uniform around the home of a robot."""
+    """Draw joint values [rad or m], uniform around the home of a robot."""
     home = torch.tensor(HOMES[name], dtype=torch.float64)
     generator = torch.Generator().manual_seed(seed)
     drawn = 2 * torch.rand(*batch, len(home), generator=generator, dtype=torch.float64) - 1
@@ -44,7 +44,7 @@ def joints_around(name: str, *batch: int, seed: int = 0, spread: float = SPREAD)
 def hand_made_model(
     name: str, *, scale: float = 0.02, inputs: tuple[str, ...] | None = None, robot: Robot | None = None
 ) -> CalibratedModel:
-    """A model that corrects by a smooth function of the joints, about `scale` [rad or m]; 0 gives 0."""
+    """Return a model with a smooth joint correction of about `scale` [rad or m], which is 0 at 0."""
     robot = robot or Robot.load(name)
     turning = [joint.name for joint in robot.joints if joint.type == "revolute"]
     names = inputs or tuple(f"{f}({joint})" for joint in turning for f in ("sin", "cos"))
@@ -76,7 +76,7 @@ def hand_made_model(
 
 
 def with_limits(robot: Robot, index: int, lower: float, upper: float) -> Robot:
-    """The robot with other limits [rad or m] of one of its joints."""
+    """Return the robot with other limits [rad or m] of one of its joints."""
     row = robot.joint_rows[index]
     limited = replace(robot.rows[row], lower=lower, upper=upper)
     return replace(robot, rows=(*robot.rows[:row], limited, *robot.rows[row + 1 :]))
@@ -86,7 +86,7 @@ REPOSITORY = Path(__file__).parents[2]
 
 
 def small_recipe_text(name: str) -> str:
-    """The shipped recipe of kiro3 or kiro4 with a shorter training, as YAML text."""
+    """Return the shipped recipe of kiro3 or kiro4 with a shorter training, as YAML text."""
     text = (REPOSITORY / "training" / f"{name}.yaml").read_text(encoding="utf-8")
     lines = []
     for line in text.splitlines():
@@ -103,7 +103,7 @@ def small_recipe_text(name: str) -> str:
 
 @functools.cache
 def shipped_training(name: str, seed: int | None = None):
-    """What `pisigma.train` gives for a shipped recipe, whole, with its own seed or another."""
+    """Train a complete shipped recipe with `pisigma.train`, with its seed or another one."""
     import pisigma
     from pisigma.workflow.recipes.reader import read_recipe
 
@@ -116,7 +116,7 @@ def shipped_training(name: str, seed: int | None = None):
 
 @functools.cache
 def trained_run(name: str):
-    """What a short training of the shipped recipe gives: the recipe and the run."""
+    """Return a shortened shipped recipe, and its training run."""
     from pisigma.files.errors import RecipeError
     from pisigma.files.yaml_file import parse_yaml
     from pisigma.workflow.recipes.data import load_data
@@ -130,7 +130,7 @@ def trained_run(name: str):
 
 @contextmanager
 def no_type_checker() -> Iterator[None]:
-    """Call pisigma as users do, whom no type checker stops or slows down."""
+    """Call pisigma without the type checker, like users do."""
     jaxtyping.config.update("jaxtyping_disable", True)
     try:
         yield
@@ -139,10 +139,10 @@ def no_type_checker() -> Iterator[None]:
 
 
 def poses_around(name: str, *batch: int, seed: int = 3) -> torch.Tensor:
-    """Poses of the nominal robot around its home."""
+    """Return poses of the nominal robot around its home."""
     return forward_kinematics(Robot.load(name), joints_around(name, *batch, seed=seed, spread=0.15))
 
 
 def statuses(solution: Solution) -> list[Status]:
-    """The statuses of solutions, one after the other."""
+    """Return the statuses of solutions."""
     return [Status(value) for value in solution.status.reshape(-1).tolist()]

@@ -1,4 +1,4 @@
-"""Arms with gears and sag by a simulator that shares no code with the package; skipped where it is missing."""
+"""Arms with gears and sag by a simulator that shares no code with the package; tests are skipped without it."""
 
 import functools
 import importlib.util
@@ -31,7 +31,7 @@ def simulator() -> ModuleType:
 
 
 def sample_joints(true: Any, rows: int, seed: int) -> np.ndarray:
-    """The joint values that the simulator's `sample` draws one by one, which takes seconds."""
+    """Return the joint values that the simulator's `sample` draws one by one, which takes seconds."""
     drawn = np.random.default_rng(seed)
     limits = [joint[5] for joint in true.js if joint[1] != "fixed"]
     turning = [joint[1] == "revolute" for joint in true.js if joint[1] != "fixed"]
@@ -44,7 +44,7 @@ def sample_joints(true: Any, rows: int, seed: int) -> np.ndarray:
 
 
 class OutsideArm:
-    """One arm of the simulator, and what a tracker measures of it."""
+    """One arm of the simulator, and its measurements by a tracker."""
 
     def __init__(self, name: str, seed: int, rows: int = 100, draw: int = 1) -> None:
         """Draw an arm and joint values."""
@@ -55,7 +55,7 @@ class OutsideArm:
         self.q = sample_joints(self.true, rows, draw)
 
     def measured(self, logged: np.ndarray | None = None, tool: np.ndarray | None = None) -> Measurements:
-        """Positions at the joint values, with others logged, or of another point of the tool."""
+        """Measure positions at the joint values, optionally with others logged, or of another point of the tool."""
         tip = None if tool is None else self.true.tool + tool
         x = self.true.measure(self.q, rng=np.random.default_rng(self.draw + 50), tool=tip)[0]
         q = torch.from_numpy(self.q if logged is None else logged)
@@ -63,7 +63,7 @@ class OutsideArm:
 
 
 def either(first: Measurements, second: Measurements, of_second: np.ndarray) -> Measurements:
-    """Rows of two measurements of the same joint values."""
+    """Combine rows of two measurements of the same joint values."""
     assert first.position is not None
     assert second.position is not None
     position = torch.where(torch.from_numpy(of_second)[:, None], second.position, first.position)

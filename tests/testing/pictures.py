@@ -1,4 +1,4 @@
-"""Stand-ins for pictures: to draw them takes half the time of a calibration in tests whose subject is no picture."""
+"""Blank figures, for tests of other subjects: drawing takes half the time of a calibration."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager

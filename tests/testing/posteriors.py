@@ -1,4 +1,4 @@
-"""Compares what two forms of a regression say."""
+"""Comparison of the results of two forms of a regression."""
 
 from dataclasses import replace
 
@@ -12,7 +12,7 @@ from pisigma.estimation.regression import Posterior
 
 
 def covariance(fit: AbstractDesignRegression, posterior: Posterior) -> Tensor:
-    """Covariance of the unknowns, from its root."""
+    """Compute the covariance of the unknowns from its root."""
     root = fit.covariance_root(posterior).dense
     return root @ root.t()
 
@@ -24,14 +24,14 @@ def assert_same_posterior(
     noise: tuple[float, ...],
     exactness: float,
 ) -> None:
-    """Unknowns and covariance in units of the standard deviations, and all sums, under two priors and noises.
+    """Compare unknowns and covariance in units of the standard deviations, and all sums, for two priors and noises.
 
     Args:
-        found: to be looked at.
-        expected: what it has to equal.
-        prior: of the unknowns; the second one is narrower.
-        noise: per sensor; the second one is larger.
-        exactness: of the unknowns.
+        found: the regression under test.
+        expected: the reference.
+        prior: priors of the unknowns; the second one is narrower.
+        noise: noise per sensor; the second one is larger.
+        exactness: tolerance of the unknowns in standard deviations.
     """
     narrow = replace(prior, sizes=prior.sizes / 3)
     ways = ((prior, noise), (narrow, tuple(2 * sigma for sigma in noise)))

@@ -1,6 +1,6 @@
-"""Grammars of what pisigma writes for robot controllers.
+"""Grammars of the programs that pisigma writes for robot controllers.
 
-They are written from the languages' manuals, not from the writers: every line has to be one that the grammar knows.
+They follow the languages' manuals, not the writers, and every line has to match.
 """
 
 URSCRIPT = r"""

@@ -1,4 +1,4 @@
-"""What programs for robot controllers say, read by their grammars."""
+"""Content of programs for robot controllers, read with their grammars."""
 
 from dataclasses import dataclass, field
 
@@ -10,18 +10,18 @@ EXTERNAL = [9e9] * 6
 
 @dataclass
 class Program:
-    """What a program says.
+    """Content of a program.
 
     Attributes:
-        name: of the program.
-        remarks: its comments in order, without their marks.
-        speeds: the constants that slow it down.
-        joints: of every move by joints, in the language's unit.
-        poses: of every move to a pose, as the language writes it.
-        frame: that the poses are in; None where there is none. FANUC's frame and tool stand in remarks.
-        tool: that the poses are of.
-        near: for URScript the joint values beside each pose.
-        config: for FANUC the configurations.
+        name: name of the program.
+        remarks: its comments in order, without comment marks.
+        speeds: constants that limit its speed.
+        joints: joint values of every joint move, in the language's unit.
+        poses: pose of every move to a pose, as the language writes it.
+        frame: frame of the poses; None without one. FANUC's frame and tool are in remarks.
+        tool: tool of the poses.
+        near: for URScript, the joint values next to each pose.
+        config: for FANUC, the configurations.
     """
 
     name: str = ""
@@ -66,7 +66,7 @@ def _remarks(tree: Tree) -> list[str]:
 
 
 def read_urscript(text: str) -> Program:
-    """Read a program and carry out its assignments."""
+    """Read a program, and evaluate its assignments."""
     tree = _tree(URSCRIPT, text)
     name, *_ = [child for child in tree.children if getattr(child, "type", "") == "NAME"]
     program, variables = Program(str(name), _remarks(tree)), {}
@@ -108,7 +108,7 @@ def _urscript_goal(goal: object, variables: dict, program: Program) -> None:
 
 
 def read_krl(text: str) -> Program:
-    """Read a program; the first move of a program of frames is by axes and stands in `joints`."""
+    """Read a program; the first move of a program of frames is a joint move in `joints`."""
     assert max(map(len, text.split("\r\n"))) <= 254
     tree = _tree(KRL, text)
     _, name, *rest = tree.children
@@ -142,7 +142,7 @@ def _krl_aggregate(tree: Tree) -> tuple[str, list[float]]:
 
 
 def read_rapid(text: str) -> Program:
-    """Read a module; the first move of a program of robtargets is by axes and stands in `joints`."""
+    """Read a module; the first move of a program of robtargets is a joint move in `joints`."""
     tree = _tree(RAPID, text)
     program = Program(str(tree.children[0]), _remarks(tree))
     data = {
@@ -214,7 +214,7 @@ def read_fanuc(text: str) -> Program:
 
 
 def _told(remarks: list[str], title: str) -> list[float]:
-    """X, Y, Z, W, P, R that stand in the three remarks behind a title."""
+    """Return X, Y, Z, W, P, R of the three remarks after a title."""
     begin = remarks.index(title) + 1
     words = " ".join(remarks[begin : begin + 3]).replace(",", "").split()
     assert words[::2] == list("XYZWPR")
@@ -222,4 +222,4 @@ def _told(remarks: list[str], title: str) -> list[float]:
 
 
 READERS = {".script": read_urscript, ".src": read_krl, ".mod": read_rapid, ".ls": read_fanuc}
-"""By the suffix of the file."""
+"""Readers by the suffix of the file."""

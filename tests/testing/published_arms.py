@@ -150,7 +150,7 @@ CALIBRATIONS = {
         },
     ),
 }
-"""By a name the robot of the catalogue and the four lines of the file [rad, m]."""
+"""Robot of the catalogue, and the four lines of the file [rad, m], by name."""
 
 NOMINAL = {
     "ur3": ((0.1519, 0, 0, 0.11235, 0.08535, 0.0819), (0, -0.24365, -0.21325, 0, 0, 0), 9122066269688285636),
@@ -202,7 +202,7 @@ DRIVERS_UR5 = {
         -3.14158677108863,
     ),
 }
-"""x, y, z, roll, pitch, yaw of the links of a user's UR5, as the driver extracted them."""
+"""Link transforms (x, y, z, roll, pitch, yaw) of a user's UR5, as extracted by the driver."""
 DRIVERS_UR5_HASH = "calib_15200003067234149431"
 
 USERS_DH = {

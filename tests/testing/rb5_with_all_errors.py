@@ -1,4 +1,4 @@
-"""A simulated RB5 with every source of errors, and what a tracker sees of it."""
+"""A simulated RB5 with all error sources, and its measurements by a tracker."""
 
 import functools
 import math
@@ -19,12 +19,12 @@ from pisigma.simulation.errors.transmission import Harmonic, TransmissionHarmoni
 from pisigma.simulation.true_robot import ErrorSource
 
 NOISE = 3e-5
-"""[m] Of a measured coordinate."""
+"""Standard deviation of a measured coordinate [m]."""
 TARGET = torch.tensor([0.04, -0.03, 0.12, 0.0, 0.0, 0.0], dtype=torch.float64)
 
 
 def error_sources(seed: int, geometry_only: bool = False) -> tuple[ErrorSource, ...]:
-    """Geometry, gears with three harmonics a joint, compliance of all joints, and encoders."""
+    """Return errors of geometry, gears (three harmonics per joint), compliance of all joints, and encoders."""
     geometry = RandomGeometricDeviation(
         kind="geometric_random", distribution="normal", seed=seed, length_mm=0.5, angle_deg=math.degrees(5e-4)
     )
@@ -59,7 +59,7 @@ def error_sources(seed: int, geometry_only: bool = False) -> tuple[ErrorSource, 
 
 @dataclass(frozen=True, eq=False)
 class SimulatedTracker:
-    """A true robot, what is measured of it with noise, and new poses without."""
+    """A true robot, its noisy measurements, and new poses without noise."""
 
     robot: Robot
     true: TrueRobot
@@ -67,7 +67,7 @@ class SimulatedTracker:
     test: Measurements
 
     def pose(self, q: Tensor) -> Tensor:
-        """Where the target really is."""
+        """Return the true pose of the target."""
         return self.true.forward(q) @ transform_from_xyzrpy(TARGET)
 
 
@@ -75,7 +75,7 @@ class SimulatedTracker:
 def simulated_tracker(
     seed: int = 0, rows: int = 150, geometry_only: bool = False, noise: float = NOISE
 ) -> SimulatedTracker:
-    """Positions all over the joints' ranges."""
+    """Measure positions over the joints' full ranges."""
     robot = Robot.load("rb5")
     true = TrueRobot(robot, error_sources(seed, geometry_only))
     generator = torch.Generator().manual_seed(seed)

@@ -1,4 +1,4 @@
-"""What an input is refused with: class and fields of an exception, never its sentence."""
+"""Assertions of refusals: class and fields of an exception, never its message."""
 
 import os
 import re
@@ -19,7 +19,7 @@ def refused(error: type[PisigmaError], **fields: Any) -> Iterator[pytest.Excepti
     Args:
         error: the class of the exception.
         **fields: attributes of the exception (`file`, `line`, `column`, `option`, `value`, `expected`, `remedy`) and
-            what they have to equal. Of `file`, the name alone may be given.
+            their expected values. For `file`, the file's name is enough.
     """
     with pytest.raises(error) as caught:
         yield caught
@@ -37,7 +37,7 @@ def assert_fields(problem: PisigmaError, **fields: Any) -> None:
 
 
 def problem_of(result: Result) -> PisigmaError:
-    """The exception that ended a command that `CliRunner` ran."""
+    """Return the exception that ended a command run by `CliRunner`."""
     problem: BaseException | None = result.exc_info[1] if result.exc_info else None
     while problem is not None and not isinstance(problem, PisigmaError):
         problem = problem.__context__

@@ -23,16 +23,16 @@ from pisigma.robot import Robot
 
 @dataclass(frozen=True, eq=False)
 class RegressionCase:
-    """What a regression is made from and solved with.
+    """Inputs of a regression.
 
     Attributes:
         design: all unknowns.
-        smaller: features that are a part of them, one of which may be smaller.
-        rows: linearised.
-        prior: of the unknowns.
-        noise: per sensor.
-        exactness: how near to the dense solution its other forms come, in standard deviations of the unknowns; less
-            where a sensor is nearly certain.
+        smaller: a subset of the features, one of which may be smaller.
+        rows: linearised rows.
+        prior: prior of the unknowns.
+        noise: noise per sensor.
+        exactness: tolerance of the other forms against the dense solution, in standard deviations of the unknowns;
+            larger where a sensor is nearly certain.
     """
 
     design: Design
@@ -44,19 +44,19 @@ class RegressionCase:
 
     @functools.cached_property
     def dense(self) -> DenseRegression:
-        """All columns in one matrix."""
+        """The regression with all columns in one matrix."""
         return DenseRegression.of(self.design, self.rows)
 
     @functools.cached_property
     def folds(self) -> tuple[Tensor, ...]:
-        """Groups of many rows, such as those of a placement of sockets or an anchor, and some others, a fold each."""
+        """Folds of one group each: large groups, such as of a placement of sockets or an anchor, and some others."""
         large = torch.bincount(self.rows.group) > 4
         others = torch.arange(self.rows.groups)[~large][:: max(self.rows.groups // 8, 1)]
         return tuple(torch.cat([large.nonzero()[:, 0], others])[:, None])
 
     @functools.cached_property
     def refitted(self) -> LeftOut:
-        """Values of the folds, predicted by fits without them."""
+        """Values of the folds, predicted without them."""
         return self.dense.left_out(self.dense.solve(self.prior, self.noise), self.folds)
 
 
@@ -66,7 +66,7 @@ def case_of(
     smaller: tuple[AbstractFeature, ...],
     exactness: float = 1e-6,
 ) -> RegressionCase:
-    """With prior sizes that differ from group to group."""
+    """Return a case with different prior sizes of the groups."""
     design = Design(arm.rows.problem, features)
     prior = design.prior(arm.prior_scale)
     factor = torch.linspace(0.5, 3.0, len(prior.sizes), dtype=torch.float64)
@@ -77,7 +77,7 @@ def case_of(
 
 @functools.cache
 def poses() -> RegressionCase:
-    """Positions and rotations of an arm with a sliding joint, rows that count more or less; unused columns."""
+    """Return positions and rotations of an arm with a prismatic joint, with weights and unused columns."""
     robot = Robot.load("kiro3")
     q = drawn_joints(robot, 30, 0)
     arm = linearised(robot, tracker_data(robot, q, 1e-4 * (3 * q).sin(), 1e-5, turn_noise=1e-5, several=True))
@@ -90,7 +90,7 @@ def poses() -> RegressionCase:
 
 @functools.cache
 def several_targets() -> RegressionCase:
-    """Two targets a configuration, whose residuals are alike."""
+    """Return two targets per configuration, with similar residuals."""
     robot = Robot.load("rb5")
     q = drawn_joints(robot, 25, 2).repeat_interleave(4, 0)
     arm = linearised(robot, tracker_data(robot, q, 3e-4 * (3 * q).sin(), 1e-5, several=True))
@@ -99,7 +99,7 @@ def several_targets() -> RegressionCase:
 
 @functools.cache
 def all_kinds() -> RegressionCase:
-    """All kinds of sensors, sides of pairs, and one row of a distance of sockets that is certain."""
+    """Return all kinds of sensors, both sides of pairs, and one certain distance of sockets."""
     robot, data = true_robot().nominal, mixed_data()
     off = 3e-5 * torch.randn(data.q.shape, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
     known = {("plate/0", "plate/1"): 0.05}
@@ -110,7 +110,7 @@ def all_kinds() -> RegressionCase:
 
 @functools.cache
 def few_values() -> RegressionCase:
-    """Far fewer values than unknowns, products among these."""
+    """Return far fewer values than unknowns, including products."""
     robot = Robot.load("rb5")
     q = drawn_joints(robot, 20, 1)
     arm = linearised(robot, tracker_data(robot, q, 2e-4 * q.sin(), 3e-5))

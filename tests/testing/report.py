@@ -1,4 +1,4 @@
-"""Models and measurements that reports are made of in tests."""
+"""Models and measurements for tests of reports."""
 
 import functools
 from dataclasses import replace
@@ -27,11 +27,11 @@ from pisigma.validation.held_out.calibration_validation import CalibrationValida
 from pisigma.validation.held_out.held_out_rows import HeldOutRows
 
 HOSTILE = "</script><script>alert(1)</script><img src=x onerror=alert(2)>\"'&\u2028$x_1$"
-"""A name that breaks pages which do not show it as text."""
+"""A name that breaks pages that do not escape it."""
 
 
 def measured(arm: HybridArmUnderTest, rows: int, seed: int) -> Measurements:
-    """Other rows of a simulated robot, with the noise of its calibration."""
+    """Return other rows of a simulated robot, with the noise of its calibration."""
     q = joints_in(arm.true.nominal, rows, seed)
     noise = NOISE * torch.from_numpy(np.random.default_rng(seed).normal(size=(rows, 3)))
     return Measurements(q=q, position=arm.true.forward(q)[:, :3, 3] + noise)
@@ -39,7 +39,7 @@ def measured(arm: HybridArmUnderTest, rows: int, seed: int) -> Measurements:
 
 @functools.cache
 def hybrid_under_test(frames: bool = False) -> tuple[HybridArmUnderTest, CalibratedModel]:
-    """A simulated arm, and its model with all metrics, judged on other rows as a test set."""
+    """Return a simulated arm, and its model with all metrics, tested on other rows."""
     arm = hybrid_of("rb5", 200, frames=frames)
     with no_type_checker():
         summary = summarise(arm.result).having(rows=200)
@@ -50,14 +50,14 @@ def hybrid_under_test(frames: bool = False) -> tuple[HybridArmUnderTest, Calibra
 
 
 def judged_on(arm: HybridArmUnderTest, rows: Measurements) -> CalibrationValidation:
-    """Judge the calibration of an arm on rows."""
+    """Evaluate the calibration of an arm on rows."""
     calibrator = HybridCalibrator(GeometricCalibrator(arm.true.nominal))
     return judge(calibrator, arm.result, arm.measurements, rows)
 
 
 @functools.cache
 def geometric_under_test() -> tuple[HybridArmUnderTest, CalibratedModel]:
-    """The same arm, its geometric calibration alone."""
+    """Return the same arm, and its geometric calibration."""
     arm = hybrid_of("rb5", 200)
     with no_type_checker():
         result = arm.result.geometric
@@ -66,7 +66,7 @@ def geometric_under_test() -> tuple[HybridArmUnderTest, CalibratedModel]:
 
 
 def folder_with_held_out(arm: HybridArmUnderTest, model: CalibratedModel, folder: Path) -> CalibratedModel:
-    """A model folder that keeps errors of "held-out" rows: those of the calibration, a tenth larger."""
+    """Write a model folder with errors of "held-out" rows: those of the calibration, enlarged by a tenth."""
     with no_type_checker():
         found = judged_on(arm, arm.measurements)
         for errors in found.models.values():
@@ -84,7 +84,7 @@ def folder_with_held_out(arm: HybridArmUnderTest, model: CalibratedModel, folder
 
 
 def bare_summary(**figures: object) -> CalibrationSummary:
-    """The figures of a calibration that found nothing, and some more."""
+    """Return the figures of a calibration without findings, and given ones."""
     return CalibrationSummary(
         status="converged",
         iterations=1,

@@ -1,4 +1,4 @@
-"""Programs of four controllers whose targets are rewritten, and where the real tool comes."""
+"""Programs of four controllers with rewritten targets, and the poses that the real tool reaches."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -33,7 +33,7 @@ TOLERANCE_MM = 0.02
 
 @dataclass(frozen=True)
 class Language:
-    """How a program of two straight moves, one by joints, one that is computed and one to a far pose is written."""
+    """A language's program of two linear moves, a joint move, a computed move and one to a far pose."""
 
     suffix: str
     pose: Callable[[Frame], str]
@@ -163,7 +163,7 @@ tools: {{"UTOOL 2": {{{tool}}}}}
 
 
 def wanted_poses(robot: Robot) -> torch.Tensor:
-    """Three poses of the tool in the frame, within the domain, and one that is too far."""
+    """Return three poses of the tool in the frame within the domain, and one that is too far."""
     bare = robot.with_geometry(base=np.zeros(6), tool=np.zeros(6))
     T = invert(FRAME) @ forward_kinematics(bare, joints_around("ur10", 3, seed=2, spread=0.2)) @ TOOL
     far = T[:1].clone()
@@ -172,7 +172,7 @@ def wanted_poses(robot: Robot) -> torch.Tensor:
 
 
 def program(language: Language, arm: Path, tmp_path: Path) -> ExportRequest:
-    """The program and what it does not state, as files, and the request to rewrite it."""
+    """Write the program and the frames it does not state as files, and return the request to rewrite it."""
     T = wanted_poses(load_model(arm).robot)
     written = {
         f"P{i}": (position(i + 1) if language.suffix == ".ls" else language.pose)(T[i]) for i in range(3)
@@ -202,7 +202,7 @@ def scanned(path: Path, frames: Path | None) -> ScannedProgram:
 
 
 def really(arm: Path, commanded: torch.Tensor, wanted: torch.Tensor) -> torch.Tensor:
-    """Where the real tool comes when a controller that computes with the robot as drawn is sent to poses."""
+    """Return the poses that the real tool reaches with a controller that uses the nominal robot."""
     model = load_model(arm)
     base, tool = (
         transform_from_xyzrpy(torch.from_numpy(f.copy())) for f in (model.robot.base, model.robot.tool)

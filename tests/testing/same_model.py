@@ -1,4 +1,4 @@
-"""In what two values differ, to the last bit and whatever they are made of: such as a model and what a folder holds."""
+"""Bitwise differences of two values of any classes, such as a model and its stored folder."""
 
 import dataclasses
 import math
@@ -9,7 +9,7 @@ import torch
 
 
 def differences(one: object, other: object, place: str = "") -> list[str]:
-    """Names of the parts that are not the same, with why.
+    """Return the names of the parts that differ, with reasons.
 
     Values of classes are compared by their attributes; functions and private attributes of modules are left out.
     """
@@ -29,7 +29,7 @@ def differences(one: object, other: object, place: str = "") -> list[str]:
 
 
 def _parts(value: object) -> dict[str, object] | None:
-    """What a value is made of, by name; None of one that is its own part."""
+    """Return the parts of a value by name; None for a value without parts."""
     if isinstance(value, torch.nn.Module):
         return {**value.state_dict(), **{key: own for key, own in vars(value).items() if key[0] != "_"}}
     if isinstance(value, Mapping):

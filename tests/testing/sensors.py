@@ -30,7 +30,7 @@ class TrueArm:
 
 @cache
 def true_robot() -> TrueArm:
-    """The welding robot as drawn, and with the errors of Lim et al., Table 2, "both"."""
+    """Return the welding robot with the errors of Lim et al., Table 2, "both"."""
     nominal = Robot.load("welding")
     dh, tool = nominal.dh.copy(), nominal.tool.copy()
     dh[:3, 2] += [-4.72e-3, -1.73e-3, 1.05e-3]
@@ -41,7 +41,7 @@ def true_robot() -> TrueArm:
 
 
 def joints(count: int, seed: int) -> Tensor:
-    """Joint values over a part of their ranges."""
+    """Draw joint values over a part of their ranges."""
     limits = torch.from_numpy(true_robot().nominal.limits).clamp(-2.0, 2.0)
     u = torch.rand(count, 6, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
     return limits[:, 0] + (limits[:, 1] - limits[:, 0]) * u
@@ -50,7 +50,7 @@ def joints(count: int, seed: int) -> Tensor:
 def touch_data(
     frames: tuple[str, ...] = ("right", "left"), count: int = 60, noise: float = 0.0, axes: str = "xyz"
 ) -> Measurements:
-    """Touches of faces wherever the tip is; axes by turns."""
+    """Return touches of faces at the positions of the tip, with alternating axes."""
     parts = []
     for number, frame in enumerate(frames):
         q = joints(count, 10 + number)
@@ -73,7 +73,7 @@ def touch_data(
 
 
 def wire_data(count: int = 80, known: bool = False) -> Measurements:
-    """A draw wire with a zero of 12 mm."""
+    """Return rows of a draw wire with a zero of 12 mm."""
     q, place = joints(count, 3), torch.tensor([1.5, -0.2, 0.9], dtype=torch.float64)
     p = forward_kinematics(true_robot().geometric_robot, q)[:, :3, 3]
     return Measurements(
@@ -85,7 +85,7 @@ def wire_data(count: int = 80, known: bool = False) -> Measurements:
 
 
 def pair_data(count: int = 120) -> Measurements:
-    """Distances between two poses each."""
+    """Return distances between pairs of poses."""
     q = joints(count, 4)
     p = forward_kinematics(true_robot().geometric_robot, q)[:, :3, 3]
     distance = (p[::2] - p[1::2]).norm(dim=-1).repeat_interleave(2)
@@ -94,7 +94,7 @@ def pair_data(count: int = 120) -> Measurements:
 
 @cache
 def socket_data() -> Measurements:
-    """A ball in sockets 50 mm apart in three pairs, with its orientation all over a cone."""
+    """Return rows of a ball in three pairs of sockets 50 mm apart, with orientations over a cone."""
     from pisigma.simulation import SimulatedSockets
     from pisigma.simulation.true_robot import TrueRobot
 
@@ -116,7 +116,7 @@ def socket_data() -> Measurements:
 
 
 def mixed_data() -> Measurements:
-    """All kinds in one data set: tracker, touches, sockets, wire and pairs, in four frames."""
+    """Return one data set of all sensors: tracker, touches, sockets, wire and pairs, in four frames."""
     q = joints(20, 5)
     T = transform_from_xyzrpy(torch.tensor([2.0, -1, 0.5, 1, 0.1, -0.2], dtype=torch.float64))
     T = T @ forward_kinematics(true_robot().geometric_robot, q)

@@ -1,4 +1,4 @@
-"""Servers that run beside a test, and the clients that the documentation shows."""
+"""Servers for tests, and the clients of the documentation."""
 
 import importlib.util
 import threading
@@ -27,7 +27,7 @@ client = _client_module()
 
 @contextmanager
 def running(*folders: Path, settings: ServeSettings | None = None, **options) -> Iterator[Server]:
-    """A server in a thread; it is stopped at the end, and has to end then."""
+    """Run a server in a thread, which is stopped at the end and has to end then."""
     with no_type_checker():
         server = Server(ServedModels(folders, **options), settings or ServeSettings())
         thread = threading.Thread(target=server.run, daemon=True)
@@ -42,7 +42,7 @@ def running(*folders: Path, settings: ServeSettings | None = None, **options) ->
 
 @contextmanager
 def json_client(server: Server, **options) -> Iterator[client.JsonClient]:
-    """The client of lines."""
+    """Return the client for lines of JSON."""
     connected = client.JsonClient(server.json_port, **options)
     try:
         yield connected
@@ -52,7 +52,7 @@ def json_client(server: Server, **options) -> Iterator[client.JsonClient]:
 
 @contextmanager
 def frame_client(server: Server, **options) -> Iterator[client.FrameClient]:
-    """The client of frames."""
+    """Return the client for binary frames."""
     connected = client.FrameClient(server.binary_port, **options)
     try:
         yield connected

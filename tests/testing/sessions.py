@@ -1,4 +1,4 @@
-"""States of a measuring session of a UR10 beside a tracker, for tests."""
+"""States of a measuring session of a UR10 with a tracker, for tests."""
 
 import math
 
@@ -24,7 +24,7 @@ POSES, JUDGED_FROM = 30, 8
 
 
 def arm_beside_tracker(robot: Robot | None = None) -> ArmInCell:
-    """A robot (a UR10 where none is stated) in a cell with all that a cell can have."""
+    """Return a robot (default: a UR10) in a cell with all kinds of surroundings."""
     cabinet = Box(name="control <cabinet>", center_mm=(-900, 900, 380), size_mm=(500, 600, 800), yaw_deg=20)
     tracker = TrackerSection(x_mm=2200, y_mm=-1200, z_mm=1100)
     cell = Cell(floor_mm=-20, boxes=(cabinet,), tracker=tracker, reflector=ReflectorSection())
@@ -32,12 +32,12 @@ def arm_beside_tracker(robot: Robot | None = None) -> ArmInCell:
 
 
 def planned(arm: ArmInCell) -> np.ndarray:
-    """Joint values `(POSES, dof)` [rad or m] of a plan."""
+    """Return joint values `(POSES, dof)` [rad or m] of a plan."""
     return np.random.default_rng(1).uniform(-1.5, 1.5, (POSES, arm.robot.dof))
 
 
 def session_state(arm: ArmInCell, rows: int, wrong: int | None = None) -> SessionState:
-    """A session after some rows, each sixth of which is a check row.
+    """Return a session after some rows, every sixth of which is a test row.
 
     Args:
         arm: the robot.

@@ -16,7 +16,7 @@ TOOL = np.array([0.06, -0.04, 0.13, 0.4, -0.3, 0.8])
 
 @dataclass(frozen=True, eq=False)
 class SimulatedArm:
-    """The nominal robot, the true one and what was measured on it."""
+    """The nominal robot, the true one and its measurements."""
 
     nominal: Robot
     true: Robot
@@ -24,13 +24,13 @@ class SimulatedArm:
 
 
 def draw_joints(robot: Robot, rows: int, rng: np.random.Generator) -> torch.Tensor:
-    """Joint values [rad or m], uniform over the limits, at most one turn."""
+    """Draw joint values [rad or m], uniform over the limits, at most one turn."""
     limits = np.clip(robot.limits, -np.pi, np.pi)
     return torch.from_numpy(rng.uniform(limits[:, 0], limits[:, 1], (rows, robot.dof)))
 
 
 def dh_errors(robot: Robot, length: float, angle: float, rng: np.random.Generator) -> np.ndarray:
-    """Normal errors of all DH parameters, standard deviations in m and rad."""
+    """Draw normal errors of all DH parameters, with standard deviations in m and rad."""
     return rng.normal(size=robot.dh.shape) * np.array([angle, length, length, angle, angle])
 
 
@@ -50,17 +50,17 @@ def simulate(
     """Measure random poses of a robot with random errors.
 
     Args:
-        name: of the catalogue.
-        seed: of everything random.
-        rows: poses.
-        noise: of a measured coordinate [m].
-        turn_noise: of a measured angle [rad]; no rotations where None.
+        name: catalogue name.
+        seed: random seed.
+        rows: number of poses.
+        noise: standard deviation of a measured coordinate [m].
+        turn_noise: standard deviation of a measured angle [rad]; None for no rotations.
         length: standard deviation of the length errors [m].
         angle: standard deviation of the angle errors [rad].
-        wrong: share of the rows that are off by another 3 mm per axis.
-        offset: size by which the zero of every joint is off, besides [rad]; of either sign.
-        base: of the true robot.
-        tool: of the true robot.
+        wrong: fraction of the rows with an additional error of 3 mm per axis.
+        offset: additional error of every joint zero [rad], with random sign.
+        base: base of the true robot.
+        tool: tool of the true robot.
     """
     rng = np.random.default_rng(seed)
     nominal = Robot.load(name)
@@ -81,7 +81,7 @@ def simulate(
 
 
 def mean_error(calibrated: Robot, true: Robot, rows: int = 2000, seed: int = 99) -> float:
-    """Mean distance of predicted and true positions on new random poses [m]."""
+    """Compute the mean distance of predicted and true positions at new random poses [m]."""
     q = draw_joints(true, rows, np.random.default_rng(seed))
     difference = forward_kinematics(calibrated, q) - forward_kinematics(true, q)
     return float(difference[:, :3, 3].norm(dim=-1).mean())

@@ -16,9 +16,9 @@ from jaxtyping import _storage as storage
 
 
 def type_checked(checked: Any = None, *, typechecker: Any = None) -> Any:
-    """Check the arguments and the result of a function, or what a dataclass is made of, against the annotations.
+    """Check the arguments and the result of a function, or the fields of a dataclass, against the annotations.
 
-    It stands in for `jaxtyping.jaxtyped`, which the import hook applies to all of pisigma. That one checks arguments
+    It replaces `jaxtyping.jaxtyped`, which the import hook applies to all of pisigma. That one checks arguments
     twice a call and prepares its checks at import; this one checks them once, and prepares at the first call.
     """
     if checked is None:
@@ -52,7 +52,7 @@ def type_checked(checked: Any = None, *, typechecker: Any = None) -> Any:
 
 
 def _with_resolved_annotations(function: FunctionType) -> FunctionType:
-    """Copy a function with types for annotations; a name that is imported for mypy alone is any type."""
+    """Copy a function with resolved annotations; a name that is only imported for mypy becomes Any."""
     copy = FunctionType(
         function.__code__,
         function.__globals__,
@@ -81,7 +81,7 @@ ARRAY = array_types._MetaAbstractArray
 WHOLE_CHECK = ARRAY.__instancecheck__
 """jaxtyping's check of an array, which takes 15 µs."""
 AXES: dict[Any, tuple[dict[str, int], dict[str, Any]] | None] = {}
-"""Sizes of the axes of an array by annotation, dtype and shape; None where that is not all that counts."""
+"""Sizes of an array's axes by annotation, dtype and shape; None where these do not decide."""
 
 
 def _axes(annotation: Any, value: Any) -> tuple[dict[str, int], dict[str, Any]] | None:
@@ -99,7 +99,7 @@ def _axes(annotation: Any, value: Any) -> tuple[dict[str, int], dict[str, Any]] 
 
 
 def is_of(annotation: Any, value: Any) -> bool:
-    """`isinstance` of an array, with what is remembered of others of its shape; five times as fast."""
+    """Like `isinstance` for an array, but cached by shape, and five times as fast."""
     stack = getattr(storage._shape_storage, "memo_stack", None)
     if stack and type(value) in (torch.Tensor, np.ndarray):
         key = (annotation, value.dtype, value.shape)

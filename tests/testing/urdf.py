@@ -1,4 +1,4 @@
-"""URDF files for tests, and peers that compute the pose of a chain in another way than pisigma does."""
+"""URDF files for tests, and other libraries' poses of a chain for comparison."""
 
 import warnings
 from collections.abc import Sequence
@@ -14,7 +14,7 @@ LIMITS = '<limit lower="-3.0" upper="3.0" effort="1" velocity="1"/>'
 
 @dataclass(frozen=True)
 class DrawnJoint:
-    """A joint of a file; rpy [rad] turns about the fixed axes x, y, z."""
+    """A joint of a file; rpy [rad] are rotations about the fixed axes x, y, z."""
 
     type: str
     xyz: Sequence[float]
@@ -23,7 +23,7 @@ class DrawnJoint:
 
 
 def urdf_text(joints: Sequence[DrawnJoint]) -> str:
-    """A chain of links l0, l1, ... by joints j1, j2, ..."""
+    """Return a chain of links l0, l1, ... with joints j1, j2, ..."""
     words = ['<robot name="chain"><link name="l0"/>']
     for i, joint in enumerate(joints, 1):
         xyz, rpy, axis = (" ".join(map(repr, map(float, v))) for v in (joint.xyz, joint.rpy, joint.axis))
@@ -36,7 +36,7 @@ def urdf_text(joints: Sequence[DrawnJoint]) -> str:
 
 
 def drawn_pose(joints: Sequence[DrawnJoint], q: Sequence[float]) -> np.ndarray:
-    """Pose of the last link by the definition of the format, with scipy's rotations."""
+    """Compute the pose of the last link by the definition of the format, with scipy's rotations."""
     values, T = iter(q), np.eye(4)
     for joint in joints:
         T = T @ _frame(Rotation.from_euler("xyz", joint.rpy), joint.xyz)
@@ -50,9 +50,9 @@ def drawn_pose(joints: Sequence[DrawnJoint], q: Sequence[float]) -> np.ndarray:
 
 
 def peer_poses(path: Path, tip: str, q: torch.Tensor) -> torch.Tensor:
-    """Poses of a link by pytorch-kinematics: its parser, its frames and its forward kinematics, in float64.
+    """Compute poses of a link with pytorch-kinematics: its parser, frames and forward kinematics, in float64.
 
-    Its own `build_chain_from_urdf` does the same in float32, whatever dtype is asked for afterwards.
+    Its `build_chain_from_urdf` does the same in float32, regardless of the dtype requested afterwards.
     """
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the peer's imports are not ours to mend

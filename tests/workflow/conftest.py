@@ -1,4 +1,4 @@
-"""Steps of the workflow write blank figures: what is drawn is tested in `reporting`."""
+"""Steps of the workflow write blank figures, as figures are tested in `reporting`."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""Plans for a camera from a robot to its files: every pose sees the board, and the same plan is read again."""
+"""Plans for a camera, from a robot to its files: every pose sees the board, and the plan is read back unchanged."""
 
 from dataclasses import replace
 from pathlib import Path

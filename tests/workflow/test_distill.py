@@ -1,4 +1,4 @@
-"""A distilled model follows the full solution in its region, and says how well."""
+"""A distilled model approximates the full solution in its region, and reports its error."""
 
 import functools
 import math
@@ -37,7 +37,7 @@ BOX = tuple(
     )
     for side in (-width, width)
 )
-"""[m] A box around the place that kiro3 is at home."""
+"""A box around the home position of kiro3 [m]."""
 
 
 @pytest.fixture(scope="module")
@@ -47,7 +47,7 @@ def without_type_checker():
 
 
 def rippled(name: str) -> CalibratedModel:
-    """With a series for every joint that turns: one that slides has no overtones that a network could see."""
+    """A model with a series for every revolute joint; a prismatic joint has no overtones."""
     robot = Robot.load(name)
     model = hybrid_model(name, [FourierSeries(robot, 24), GravityTorques(robot)])
     model.hybrid.correction.linear[0][~torch.tensor(robot.revolute)] = 0.0
@@ -61,7 +61,7 @@ def distilled(kind: str, name: str, size: Size | None, poses: int = 600):
 
 
 def tool_errors(found, q: torch.Tensor) -> torch.Tensor:
-    """How far the tool is from where it was wanted [m]."""
+    """Return the distances of the tool from the requested positions [m]."""
     return (found.parent.forward(q)[:, :3, 3] - found.held_out.T[:, :3, 3]).norm(dim=-1)
 
 
@@ -74,8 +74,8 @@ def tool_errors(found, q: torch.Tensor) -> torch.Tensor:
         ("hybrid", "kiro3", 0.2),
     ],
 )
-def test_the_tool_comes_near_where_the_full_solution_brings_it(kind, name, share):
-    """On poses that were not fitted to, for every kind of arm; the share is that of the nominal robot's error."""
+def test_the_tool_is_close_to_the_full_solution(kind, name, share):
+    """On held-out poses, for every kind of arm, relative to the nominal robot's error."""
     found = distilled(kind, name, Size((1, 2, 3)))
     poses = found.held_out
     assert_close(tool_errors(found, poses.q_nominal + poses.correction), 0.0, atol=1e-9)
@@ -121,7 +121,7 @@ def test_a_folder_gives_the_same_corrections(size, tmp_path):
 
 @pytest.mark.parametrize("size", [Size((1, 2, 3)), Size((1, 2), 24)])
 def test_poses_away_from_the_region_are_outside_the_domain(size):
-    """Overtones, which look alike everywhere, do not hide that a joint is elsewhere."""
+    """Overtones, which are similar everywhere, do not hide that a joint is outside."""
     found = distilled("hybrid", "kiro3", size)
     robot, q = found.model.robot, found.held_out.q_nominal.clone()
     q[:, 0] += 1.5

@@ -1,4 +1,4 @@
-"""A folder is worth what the model in memory is worth: every step makes the same of both, to the last bit."""
+"""A model folder and the model in memory are equivalent: every step gives bitwise equal results with both."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""Following a file while it grows."""
+"""Following a growing file."""
 
 import pytest
 from testing.measured_plans import header, measured_plan, row_lines

@@ -1,4 +1,4 @@
-"""Whatever goes to other processes can be pickled, and gives there what it gives here."""
+"""Work for other processes can be pickled, and gives the same results there."""
 
 import pytest
 from testing.engine_work import PicklingEngine
@@ -15,7 +15,7 @@ from pisigma.workflow.settings.training import TrainSettings
 
 @pytest.fixture
 def tasks(monkeypatch):
-    """How many items went to other processes."""
+    """Number of items that were sent to other processes."""
     counted = []
     monkeypatch.setattr(
         processes, "ProcessEngine", lambda jobs: PicklingEngine(jobs, lambda: counted.append(jobs))

@@ -111,7 +111,7 @@ def test_existing_measurements_are_used(planned: Plan, tmp_path: Path):
 def test_measurements_that_cannot_be_of_the_robot_are_refused(
     rows: int, scale: float, kind: str, tmp_path: Path
 ):
-    """Few rows in another unit, and many of another robot."""
+    """They are a few rows in another unit, and many of another robot."""
     robot = Robot.load("ur5")
     q = torch.rand(rows, 6, dtype=torch.float64, generator=torch.Generator().manual_seed(3)) * 4 - 2
     measured = {6: "ur5", 20: "ur5e", 60: "rb5"}[rows]
@@ -125,7 +125,7 @@ def test_measurements_that_cannot_be_of_the_robot_are_refused(
 
 
 def test_rows_that_a_model_was_made_from_do_not_count_twice(tmp_path: Path):
-    """All of them, a part, and some among others."""
+    """All rows or a part of them are refused; some among others give a warning."""
     arm, model = hybrid_under_test()
     rows = tmp_path / "rows.csv"
     settings = PlanSettings(count=2, check=0, candidates=12, measured=str(rows))

@@ -1,4 +1,4 @@
-"""Recalibration as users call it: the result, its folder, and what is refused."""
+"""`pisigma.recalibrate`: the result, its folder, and refusals."""
 
 import math
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""A report in Python: what the command writes, in one call."""
+"""`pisigma.report`: the command's outputs in one call."""
 
 import json
 
@@ -16,7 +16,7 @@ pytestmark = pytest.mark.usefixtures("without_type_checker")
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """A model folder and rows to judge it on."""
+    """A model folder and rows to evaluate it on."""
     path = tmp_path_factory.mktemp("report")
     arm, model = geometric_under_test()
     (path / "plain").mkdir()

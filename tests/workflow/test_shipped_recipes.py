@@ -1,4 +1,4 @@
-"""Every shipped recipe parses, and trains to the figures that are promised of it."""
+"""Every shipped recipe parses, and trains to its stated figures."""
 
 import json
 from pathlib import Path
@@ -31,7 +31,7 @@ def read(name: str) -> InverseRecipe:
 
 
 def trained(name: str, seed: int | None = None) -> tuple[TrainingRun, list[dict]]:
-    """What training a shipped recipe gives, and the figures of its joints."""
+    """Return the training of a shipped recipe, and the figures of its joints."""
     training = shipped_training(name) if seed is None else shipped_training(name, seed)
     return training.run, training.to_json()["joints"]
 

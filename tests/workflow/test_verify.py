@@ -46,13 +46,13 @@ def hybrid():
 
 
 def joints(rows: Measurements, factor=1.0, offset=0.0, order=None) -> Measurements:
-    """The rows with other joint values in the log."""
+    """Return the rows with other logged joint values."""
     q = rows.q if order is None else rows.q[:, order]
     return replace(rows, q=q * torch.as_tensor(factor) + torch.as_tensor(offset).double())
 
 
 def from_elsewhere(rows: Measurements, turned: bool) -> Measurements:
-    """The rows as a tracker that was moved measures them."""
+    """Return the rows as measured by a relocated tracker."""
     R, p = FRAME[:3, :3], FRAME[:3, 3]
     return replace(
         rows,
