@@ -189,7 +189,7 @@ def compare(
         PlanningError: the first model does not reach a pose of the program.
         PoseError: the joint values do not fit the robot.
     """
-    begin, first, second = time.perf_counter(), model_or_folder(first), model_or_folder(second)
+    started, first, second = time.perf_counter(), model_or_folder(first), model_or_folder(second)
     if (
         isinstance(first, CalibratedModel)
         and isinstance(second, CalibratedModel)
@@ -228,7 +228,7 @@ def compare(
         else Displacement.at(pair, read_task(program, pair.first), Path(program).name),
         diagnostics=diagnostics,
         warnings=warnings,
-        seconds=time.perf_counter() - begin,
+        seconds=time.perf_counter() - started,
     )
 
 

@@ -139,7 +139,7 @@ def evaluate(
         MeasurementError: the rows cannot be used, or no row can be compared.
         PoseError: the joint values do not fit a robot.
     """
-    settings, begin = settings or EvaluationSettings(), time.perf_counter()
+    settings, started = settings or EvaluationSettings(), time.perf_counter()
     if isinstance(models, str | os.PathLike | CalibratedModel | HoldsModel):
         models = [models]
     sources = labelled(models)
@@ -186,7 +186,7 @@ def evaluate(
             *(one for model in loaded.values() for one in condition_warnings(model, rows)),
             *row_warnings(next(iter(loaded.values())).robot, rows),
         ),
-        seconds=time.perf_counter() - begin,
+        seconds=time.perf_counter() - started,
     )
 
 

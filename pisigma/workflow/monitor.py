@@ -230,7 +230,7 @@ def monitor(
     posterior = ModelPosterior.of(loaded)
     rows = [read_rows(one, posterior.space.robot, settings.cameras) for one in sessions]
     warnings: list[str] = []
-    judged: list[Record] = []
+    trusted: list[Record] = []
     untrusted: list[UntrustedSession] = []
     folder = source if settings.history and not isinstance(source, CalibratedModel) else None
     earlier = () if folder is None else read_sessions(history_path(folder), model_hash(folder))
@@ -239,7 +239,7 @@ def monitor(
         warnings += row_warnings(loaded.robot, day)
         right = right_rows(RecalibrationSettings(settings.moved), loaded, posterior.renamed(day))
         warnings += right.warnings
-        day, again = new_rows(loaded, right.rows, date, earlier, judged)
+        day, again = new_rows(loaded, right.rows, date, earlier, trusted)
         warnings += again
         if not day.rows:
             continue
@@ -247,19 +247,19 @@ def monitor(
         if isinstance(record, UntrustedSession):
             untrusted.append(record)
             continue
-        judged.append(record)
-        warnings += [f"{judged[-1].file}: {one}" for one in condition_warnings(loaded, day)]
+        trusted.append(record)
+        warnings += [f"{trusted[-1].file}: {one}" for one in condition_warnings(loaded, day)]
         warnings += [
             f"{place} was left out: it contradicts the other rows of its session; measure it again."
-            for place in judged[-1].session.outliers
+            for place in trusted[-1].session.outliers
         ]
         if day.rows < MIN_ROWS:
             warnings.append(
-                f"{judged[-1].file}: {day.rows} rows show little of what moved; measure {MIN_ROWS} poses or more."
+                f"{trusted[-1].file}: {day.rows} rows show little of what moved; measure {MIN_ROWS} poses or more."
             )
-    if not (judged or untrusted):
+    if not (trusted or untrusted):
         raise MeasurementError(f"expected new rows, got none: {' '.join(warnings)}", expected="new rows")
-    records = new = in_order(judged)
+    records = new = in_order(trusted)
     if folder is not None:
         records = store_sessions(history_path(folder), model_hash(folder), new)
         warnings += [

@@ -149,18 +149,18 @@ def recalibrate(
     every = rows
     rows, adaptation, outliers = _adapted(parent, posterior, rows, elsewhere, right.numbers)
     calibrator = HybridCalibrator(drawn)
-    judged = choose_candidate(
+    choice = choose_candidate(
         parent, adaptation, elsewhere, rows, calibrator, stage(progress, "cross-validation")
     )
     consistency = _fleet_consistency(parent, rows)
     odd = consistency is not None and consistency.odd
     from_scratch = stage(progress, "from scratch")
-    judged, kept = _kept(judged, odd, parent, adaptation, rows, calibrator, from_scratch)
-    moved = significant_movements(adaptation) if consistency is None and _believable(judged, drawn) else None
+    choice, kept = _kept(choice, odd, parent, adaptation, rows, calibrator, from_scratch)
+    moved = significant_movements(adaptation) if consistency is None and _believable(choice, drawn) else None
     wrong = [one.row for one in outliers]
-    diagnostics = verdict.implausible or recalibration_diagnostics(parent, judged, every, wrong, moved or ())
+    diagnostics = verdict.implausible or recalibration_diagnostics(parent, choice, every, wrong, moved or ())
     moved = None if diagnostics else moved
-    summary = _summary(parent, rows, adaptation, judged, moved)
+    summary = _summary(parent, rows, adaptation, choice, moved)
     summary = summary.having(
         diagnostics=diagnostics,
         warnings=(*again, *summary.warnings),
@@ -174,7 +174,7 @@ def recalibrate(
         summary = summary.having(changed=consistency.sentence)
     kept = with_wide_limits(replace(kept, metrics=summary.to_json()), rows)
     return Recalibration(
-        kept, parent, adaptation, judged, moved or (), summary, seconds=time.perf_counter() - started
+        kept, parent, adaptation, choice, moved or (), summary, seconds=time.perf_counter() - started
     )
 
 
@@ -197,7 +197,7 @@ def _adapted(
 
 
 def _kept(
-    judged: CandidateChoice,
+    choice: CandidateChoice,
     odd: bool,
     parent: CalibratedModel,
     adaptation: Adaptation,
@@ -210,16 +210,16 @@ def _kept(
     A robot unlike its fleet keeps the calibration from scratch, if its rows are enough for one.
     """
     if odd:
-        alone = replace(judged, kept="scratch")
+        alone = replace(choice, kept="scratch")
         try:
             return alone, _kept_model(alone, parent, adaptation, rows, calibrator, progress)
         except IdentificationError:  # too few rows
-            judged = judged.with_least_error
-    return judged, _kept_model(judged, parent, adaptation, rows, calibrator, progress)
+            choice = choice.with_least_error
+    return choice, _kept_model(choice, parent, adaptation, rows, calibrator, progress)
 
 
 def _kept_model(
-    judged: CandidateChoice,
+    choice: CandidateChoice,
     parent: CalibratedModel,
     adaptation: Adaptation,
     rows: Measurements,
@@ -227,12 +227,12 @@ def _kept_model(
     progress: Progress,
 ) -> CalibratedModel:
     """Return the model of the candidate that is kept."""
-    if judged.kept == "scratch":
-        fitted = fit_where_it_helps if judged.rms["scratch"] is None else fit
+    if choice.kept == "scratch":
+        fitted = fit_where_it_helps if choice.rms["scratch"] is None else fit
         result = fitted(calibrator, rows, progress)
         assert isinstance(result, HybridResult)
         return replace(model_of_hybrid(parent.name, calibrator.geometric.robot, result, rows), kind=KIND)
-    if judged.kept == "old":
+    if choice.kept == "old":
         adaptation = adapt(adaptation.problem.without_arm(), adaptation.noise)
     return recalibrated_model(parent, adaptation, rows)
 
@@ -254,11 +254,11 @@ def _outliers(
     return tuple(outliers)
 
 
-def _believable(judged: CandidateChoice, robot: Robot) -> bool:
+def _believable(choice: CandidateChoice, robot: Robot) -> bool:
     """Whether the recalibrated model predicts held-out rows well enough for its changes of the arm to be credible."""
-    error, kept = judged.rms["recalibrated"], judged.rms[judged.kept]
+    error, kept = choice.rms["recalibrated"], choice.rms[choice.kept]
     if error is None or kept is None:
-        return not judged.rows
+        return not choice.rows
     return error <= min(PLAUSIBLE_SHARE * robot.reach, CLEAR_RATIO * kept)
 
 
@@ -266,7 +266,7 @@ def _summary(
     parent: CalibratedModel,
     rows: Measurements,
     adaptation: Adaptation,
-    judged: CandidateChoice,
+    choice: CandidateChoice,
     moved: tuple[Movement, ...] | None,
 ) -> RecalibrationSummary:
     """Return all figures; `moved` is None where it is unknown."""
@@ -275,19 +275,19 @@ def _summary(
         parent=ParentFigures(name=parent.name, kind=parent.kind, sha256=""),
         date=datetime.datetime.now(datetime.UTC).date().isoformat(),
         rows=rows.rows,
-        kept=judged.kept,
-        verdict=judged.sentence,
-        left_out=judged.rows,
+        kept=choice.kept,
+        verdict=choice.sentence,
+        left_out=choice.rows,
         cross_validation={
             name: LeftOutFigures(rms_mm=None if rms is None else rms * 1e3)
-            for name, rms in judged.rms.items()
+            for name, rms in choice.rms.items()
         },
         changed=UNBELIEVABLE if moved is None else movements_text(moved),
         moved=moved or (),
         elsewhere=(),
         effective_parameters=adaptation.effective,
         noise=adaptation.noise,
-        warnings=_warnings(parent, judged, rows),
+        warnings=_warnings(parent, choice, rows),
     )
 
 
@@ -314,12 +314,12 @@ def _elsewhere(
     return frame_keys(rows, settings.moved)
 
 
-def _warnings(model: CalibratedModel, judged: CandidateChoice, rows: Measurements) -> tuple[str, ...]:
+def _warnings(model: CalibratedModel, choice: CandidateChoice, rows: Measurements) -> tuple[str, ...]:
     """Return warnings, one sentence each."""
     warnings = [*row_warnings(model.robot, rows), *condition_warnings(model, rows)]
-    if judged.rows < MIN_ROWS:
+    if choice.rows < MIN_ROWS:
         warnings.append(
-            f"Only {judged.rows} of {rows.rows} rows could be held out and predicted, too few to compare the "
+            f"Only {choice.rows} of {rows.rows} rows could be held out and predicted, too few to compare the "
             f"candidates; measure {2 * MIN_ROWS} poses or more."
         )
     return tuple(warnings)

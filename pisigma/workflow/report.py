@@ -109,7 +109,7 @@ def report(
         ModelError: the folder cannot be used.
         MeasurementError: the model cannot be evaluated on the rows.
     """
-    begin, loaded = time.perf_counter(), load_model(model)
+    started, loaded = time.perf_counter(), load_model(model)
     progress("evaluating rows")
     rows: Measurements | None = None
     remarks: tuple[str, ...] = ()
@@ -120,7 +120,7 @@ def report(
     content = report_content(loaded, Path(model), rows, remarks, diagnostics)
     progress("drawing")
     figures = draw_figures(content)
-    return Report(content, figures, diagnostics, time.perf_counter() - begin)
+    return Report(content, figures, diagnostics, time.perf_counter() - started)
 
 
 def _right_rows(model: CalibratedModel, rows: Measurements) -> tuple[Measurements, tuple[str, ...]]:

@@ -174,7 +174,7 @@ def verify(
             the nominal robot.
         PoseError: the joint values do not fit the robot.
     """
-    settings, begin = settings or VerificationSettings(), time.perf_counter()
+    settings, started = settings or VerificationSettings(), time.perf_counter()
     source = model_or_folder(model)
     loaded = source if isinstance(source, CalibratedModel) else load_model(source)
     rows = data if isinstance(data, Measurements) else read_for_verification(data, loaded, settings.cameras)
@@ -225,7 +225,7 @@ def verify(
             *places_remark(rows),
             *image_remark(rows),
         ),
-        seconds=time.perf_counter() - begin,
+        seconds=time.perf_counter() - started,
     )
 
 

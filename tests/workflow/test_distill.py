@@ -201,7 +201,7 @@ def test_figures_and_card_are_those_of_the_held_out_poses(tmp_path):
     written = found.save(tmp_path / "small", command="pisigma distill it")
     assert DistillationSummary.read(written).parent == summary.parent
     card = (tmp_path / "small" / "README.md").read_text()
-    assert "Made by `pisigma distill it`." in card
+    assert "`pisigma distill it`" in card
     assert f"{summary.held_out.distilled.rms_mm:.4f} mm RMS" in card
     assert "24 cycles" in card
     assert "`hybrid_kiro3`" in card

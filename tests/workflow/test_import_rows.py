@@ -68,9 +68,8 @@ def test_rows_without_a_measurement_are_left_out_and_named(tmp_path: Path):
 
 
 def test_a_table_in_which_nothing_is_recognised(tmp_path: Path):
-    with pytest.raises(MeasurementError) as caught:
+    with refused(MeasurementError, file="0.csv"):
         import_rows(write(tmp_path, "Hz,V,D\n100.5,99.2,3.5\n101.5,98.2,3.6\n"))
-    assert "0.csv" in str(caught.value)
 
 
 def test_several_files_are_concatenated(tmp_path: Path):
@@ -79,9 +78,8 @@ def test_several_files_are_concatenated(tmp_path: Path):
     )
     rows = import_rows(paths)
     assert rows.content.text().splitlines()[1:] == ["1,2,3,4,5", "1,3,3,4,5"]
-    with pytest.raises(MeasurementError) as caught:
+    with refused(MeasurementError, file="1.csv"):
         import_rows(write(tmp_path, f"{HEADER}\np1,1,2,3,4,5\n", "name,X [mm],Y [mm],Z [mm]\np1,1,2,3\n"))
-    assert "1.csv" in str(caught.value)
 
 
 def test_a_join_needs_joint_values_and_measurements(tmp_path: Path):

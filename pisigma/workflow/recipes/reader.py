@@ -94,11 +94,11 @@ def _geometric_checks(recipe: GeometricRecipe, robot: Robot) -> Iterator[Check]:
     yield ("calibration", "free"), partial(calibrator.candidates, space)
 
 
-def _check_frames(calibrated: str, judged: str) -> None:
-    if judged != calibrated:
+def _check_frames(calibrated: str, compared: str) -> None:
+    if compared != calibrated:
         raise RecipeError(
             expected=f"the calibrated frame '{calibrated}'",
-            value=judged,
+            value=compared,
             remedy="name the same frame in both",
         )
 
