@@ -84,7 +84,7 @@ def amplitudes(both: Refined, prior: GaussianPrior) -> GaussianPrior:
     shift = len(prior.base) - design.unknowns
     for number, feature in enumerate(design.features):
         if feature.name == "series":
-            place = design.stretch(number)
+            place = design.weights_of(number)
             weight = torch.zeros(feature.used.shape).to(both.posterior.x)
             weight = weight.masked_scatter(feature.used, both.posterior.x[place])
             sine, cosine = weight.chunk(2, 1)

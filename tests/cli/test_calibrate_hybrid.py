@@ -70,7 +70,7 @@ def test_json_has_the_agreed_shape(calibrated):
     assert validation["hybrid"]["rms_mm"] < 0.6 * validation["geometric"]["rms_mm"]
     assert 0.88 <= validation["coverage"] <= 1.0
     hybrid = printed["hybrid"]
-    assert hybrid["verdict"].startswith("A joint correction was kept (gravity + series")
+    assert [feature["kind"] for feature in hybrid["learned"]["features"]][:2] == ["gravity", "series"]
     assert all(set(trial) == TRIAL for trial in hybrid["trials"])
     assert hybrid["trials"][0]["name"] == "geometry"
     assert hybrid["learned"]["orders"] == []
@@ -159,11 +159,11 @@ def test_nothing_to_learn_is_said_and_the_geometry_stands(run, tmp_path):
     result = run("calibrate", "kiro4", path, "--out", tmp_path / "arm", "--folds", 2, "--json")
     printed = json.loads(result.stdout)
     assert printed["hybrid"]["learned"] is None
-    assert printed["hybrid"]["verdict"].startswith("Nothing beyond the geometry was found")
+
     found = printed["cross_validation"]
     assert found["hybrid"] == found["geometric"]
     assert not (tmp_path / "arm" / "joint_corrections.png").exists()
-    assert "Nothing beyond the geometry was found" in (tmp_path / "arm" / "README.md").read_text()
+    assert printed["hybrid"]["verdict"] in " ".join((tmp_path / "arm" / "README.md").read_text().split())
 
 
 def test_rows_of_the_test_set_are_judged_with_all_three(run, rows, tmp_path):

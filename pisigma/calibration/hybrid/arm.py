@@ -1,4 +1,4 @@
-"""The calibrated arm with its joint correction, and which of its joints' values were measured."""
+"""Calibrated arm with its joint correction, and the measured ranges of its joint values."""
 
 import math
 from dataclasses import dataclass
@@ -15,19 +15,19 @@ from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.robot.kinematics.tolerances import MEASURED_ROUNDING
 
 LARGEST_GAP = math.radians(60)
-"""Joint values between two measured ones that are not farther apart than this count as measured."""
+"""[rad] Largest distance of two measured joint values between which all values count as measured."""
 
 
 @dataclass(frozen=True, eq=False)
 class JointCoverage:
-    """Stretches of every joint's values that were measured, as angles (see `turning_rate`).
+    """Measured ranges of every joint's values, as angles (see `turning_rate`).
 
     Attributes:
-        joint: number of the joint of every stretch.
-        middle: of the stretch [rad].
+        joint: number of the joint of every range.
+        middle: middle of every range [rad].
         half: half its length [rad].
-        rate: per joint, angle per joint value.
-        turning: per joint, whether values a full turn apart are the same.
+        rate: angle per joint value, per joint [rad/rad or rad/m].
+        turning: whether values that differ by 2π are the same, per joint.
     """
 
     joint: Int64[Tensor, " stretches"]
@@ -38,7 +38,7 @@ class JointCoverage:
 
     @staticmethod
     def of(robot: Robot, q: Float64[Tensor, "rows dof"]) -> "JointCoverage":
-        """Stretches around measured joint values."""
+        """Compute the ranges covered by measured joint values."""
         rate = torch.from_numpy(turning_rate(robot))
         turning = tuple(bool(turns) for turns in robot.revolute)
         return JointCoverage._around(list((q.cpu() * rate).t()), rate, turning)
@@ -51,7 +51,7 @@ class JointCoverage:
         return JointCoverage(joint, ends.mean(1), (ends[:, 1] - ends[:, 0]) / 2, rate, turning)
 
     def with_rows(self, q: Float64[Tensor, "rows dof"]) -> "JointCoverage":
-        """Stretches around these and more measured joint values."""
+        """Compute the ranges covered by these and more measured joint values."""
         angles = []
         for j in range(len(self.turning)):
             of_joint = [(q[:, j] * self.rate[j]).cpu()]
@@ -62,7 +62,7 @@ class JointCoverage:
         return JointCoverage._around(angles, self.rate, self.turning)
 
     def beyond(self, q: Float[Tensor, "*batch dof"]) -> Float[Tensor, "*batch dof"]:
-        """Angle from every joint value to the nearest measured stretch [rad], 0 within one."""
+        """Compute the angle from every joint value to the nearest measured range [rad]; 0 within one."""
         angle = q * self.rate.to(q)
         columns = []
         for j, turns in enumerate(self.turning):
@@ -74,12 +74,12 @@ class JointCoverage:
         return torch.stack(columns, -1)
 
     def contains(self, q: Float[Tensor, "*batch dof"]) -> Bool[Tensor, "*batch"]:
-        """Whether all values of the joints were measured, up to rounding; a NaN never was."""
+        """Say whether all joint values are in measured ranges, up to rounding; NaN never is."""
         return self.beyond(q).amax(-1) <= MEASURED_ROUNDING
 
 
 def _stretches(angles: np.ndarray, turns: bool) -> list[tuple[float, float]]:
-    """Lowest and highest angle of every stretch without a large gap; one may reach over the full turn."""
+    """Find the lowest and highest angle of every range without a large gap; one may extend beyond 2π."""
     values = np.unique(np.mod(angles, 2 * np.pi) if turns else angles)
     breaks = np.flatnonzero(np.diff(values) > LARGEST_GAP)
     lows = values[np.concatenate([[0], breaks + 1])]
@@ -95,15 +95,14 @@ def _stretches(angles: np.ndarray, turns: bool) -> list[tuple[float, float]]:
 class HybridArm:
     """`T(q) = base · Π A_i(q_i + Δ_i(q)) · tool` with the geometry and Δ that were fitted together.
 
-    It holds at all joint values. Beyond those that were measured it is an extrapolation, of which the uncertainty of
-    the fit says how good it is; see `PositionUncertainty`.
+    It is defined at all joint values. Outside the measured ranges it is an extrapolation, whose accuracy is given by
+    the posterior; see `PositionUncertainty`.
 
     Attributes:
-        robot: the geometry that goes with the correction.
-        correction: Δ.
-        coverage: the joint values that were measured.
-        approach: `(dof,)`: +1 or -1 for the side from which every joint comes, 0 where that is not stated; None for all
-            of them.
+        robot: the robot with the geometry that was fitted together with the correction.
+        correction: the joint correction Δ.
+        coverage: the measured ranges of joint values.
+        approach: direction of approach of every joint, +1 or -1, or 0 if it is not stated; None if none is stated.
     """
 
     robot: Robot
@@ -112,7 +111,7 @@ class HybridArm:
     approach: Float[Tensor, " dof"] | None = None
 
     def delta(self, q: Float[Tensor, "*batch dof"]) -> Float[Tensor, "*batch dof"]:
-        """Δ [rad or m] at commanded joint values q [rad or m], coming from the sides of `approach`."""
+        """Compute Δ [rad or m] at commanded joint values [rad or m], with the directions of `approach`."""
         sides = None if self.approach is None else self.approach.to(q).expand_as(q)
         delta: Tensor = self.correction(q, sides)
         return delta
@@ -120,7 +119,7 @@ class HybridArm:
     def forward(
         self, q: Float[Tensor, "*batch dof"], approach: Float[Tensor, "*batch dof"] | None = None
     ) -> Float[Tensor, "*batch 4 4"]:
-        """Pose T_base_tool at commanded joint values.
+        """Compute the pose T_base_tool at commanded joint values.
 
         Args:
             q: joint values [rad or m].

@@ -1,4 +1,4 @@
-"""The hybrid calibrator: geometry, base, tool, sensor unknowns and a Pi-Sigma joint correction together."""
+"""Hybrid calibration: geometry, base, tool, sensor unknowns and a Pi-Sigma joint correction together."""
 
 import math
 from collections.abc import Callable
@@ -26,7 +26,7 @@ from pisigma.calibration.hybrid.sensor_values import sensor_values
 from pisigma.calibration.hybrid.spectrum import lines, odds_against_a_line
 from pisigma.calibration.hybrid.uncertainty import position_uncertainty
 from pisigma.estimation.regression import SMALLEST_NOISE
-from pisigma.files.errors import IdentificationError, nearest_choice
+from pisigma.files.errors import IdentificationError, check_choice
 from pisigma.joint_correction.feature import AbstractFeature, FeatureOptions
 from pisigma.joint_correction.fourier_series import USUAL_HARMONICS
 from pisigma.joint_correction.gear_lines import GearLines
@@ -39,37 +39,39 @@ from pisigma.measurement.groups import groups_of_equal_joints, held_out_groups
 from pisigma.robot.description import Robot
 
 SEARCHED_ROWS = 4_000
-"""Features are chosen on so many rows at most; everything is fitted to all in the end."""
+"""Rows used to select features; the final fit uses all rows."""
 GROSS = 50.0
-"""[standard deviations of the geometric calibration] Rows that are farther off take no part in the first model."""
+"""[standard deviations of the geometric calibration] Rows with larger residuals are not used for the first model."""
+
+_NOTHING_FOUND = "The data show nothing beyond the geometry, so the geometric calibration is kept."
 
 _TOO_FEW_ROWS = (
-    "A joint correction would take up nearly all that the few rows say, so the geometric calibration stands; measure "
-    "more poses."
+    "A joint correction would use up nearly all degrees of freedom of the few rows, so the geometric calibration is "
+    "kept; measure more poses."
 )
 
-_NOTHING_SERVES = (
-    "No joint correction predicts left-out rows of every sensor at least as well as the geometry alone, and of one "
-    "clearly better, so the geometric calibration stands."
+_NOTHING_HELPS = (
+    "No joint correction predicts held-out rows of every sensor at least as well as the geometry alone, and those of "
+    "one sensor clearly better, so the geometric calibration is kept."
 )
 
 
 @dataclass(frozen=True)
 class HybridCalibrator:
-    """Fits `T(q) = base · Π A_i(q_i + Δ_i(q); dh_i + ε_i) · tool` to measurements, Δ a Pi-Sigma network.
+    """Fits `T(q) = base · Π A_i(q_i + Δ_i(q); dh_i + ε_i) · tool` to measurements, with a Pi-Sigma network Δ.
 
-    All unknowns are normal with means at nominal. The prior sizes of weights maximise the evidence, those of geometric
-    errors are the geometric calibration's. Whatever does not raise the evidence, or predicts left-out rows worse, is
-    left out, and what is left has to predict rows left out of exact fits better than the geometric calibration does; if
-    nothing is left, the result is that of the geometric calibration.
+    All unknowns have normal priors with nominal means. The prior sizes of weights maximise the evidence; those of
+    geometric errors are taken from the geometric calibration. Features that do not raise the evidence, or that increase
+    the leave-out errors, are rejected. The remaining ones must predict rows that are left out of exact fits better than
+    the geometric calibration does; if none remain, the result is the geometric calibration.
 
     Attributes:
-        robot: the nominal robot; or its geometric calibrator, where that needs other settings than its defaults.
-        features: that are tried, by the names of `joint_correction.registry.FEATURES`.
-        harmonics: of the Fourier series, tried in this order.
-        products: whether product units are tried, which need two joints; without them the correction is additive.
-        gravity: direction in which things fall, in the frame of the robot's base; None for the axis of the base that
-            has the highest evidence.
+        robot: the nominal robot, or its geometric calibrator if that needs settings other than the defaults.
+        features: names of the features to try, see `joint_correction.registry.FEATURES`.
+        harmonics: numbers of harmonics of the Fourier series, tried in this order.
+        products: whether to try product units, which need two joints; without them the correction is additive.
+        gravity: direction of gravity in the frame of the robot's base; None for the axis of the base with the highest
+            evidence.
     """
 
     robot: Robot | GeometricCalibrator
@@ -79,25 +81,26 @@ class HybridCalibrator:
     gravity: tuple[float, float, float] | None = None
 
     def __post_init__(self) -> None:
-        """Refuse choices that do not exist."""
+        """Refuse invalid settings."""
         for name in self.features:
-            if name not in FEATURES:
-                raise IdentificationError(
-                    f"features: '{name}' is no choice; {nearest_choice(name, FEATURES)}"
-                )
+            check_choice(IdentificationError, "features", name, FEATURES)
         if self.gravity is not None and not 0 < math.hypot(*self.gravity) < math.inf:
             raise IdentificationError(
-                f"gravity={self.gravity}: a direction in the frame of the robot's base was wanted, such as (0, 0, -1)."
+                option="gravity",
+                expected="a direction in the frame of the robot's base, such as (0, 0, -1)",
+                value=self.gravity,
             )
         if "series" in self.features and (not self.harmonics or min(self.harmonics) < 1):
             raise IdentificationError(
-                f"harmonics={self.harmonics}: whole numbers of at least 1 were wanted for the series; leave "
-                "'series' out of features for none."
+                option="harmonics",
+                expected="whole numbers >= 1",
+                value=self.harmonics,
+                remedy="omit 'series' from the features to use no series",
             )
 
     @property
     def geometric(self) -> GeometricCalibrator:
-        """The geometric calibrator, whose sensors, priors and loss are used."""
+        """Geometric calibrator, whose sensors, prior and loss are used."""
         return GeometricCalibrator(self.robot) if isinstance(self.robot, Robot) else self.robot
 
     def fit(
@@ -106,8 +109,8 @@ class HybridCalibrator:
         """Calibrate.
 
         Args:
-            measurements: what was measured.
-            progress: called with what is being tried.
+            measurements: the measurements.
+            progress: called with the current trial or step.
 
         Raises:
             IdentificationError: see `GeometricCalibrator.solve`.
@@ -117,12 +120,11 @@ class HybridCalibrator:
         group = held_out_groups(solved.setup.measurements)
         choice = self._chosen(solved, group, progress)
         if not choice.best.design.features:
-            verdict = "Nothing beyond the geometry was found in the data: the geometric calibration stands."
-            return _geometric_alone(solved, choice, verdict)
-        progress("looking at exact left-out rows")
+            return _geometric_alone(solved, choice, _NOTHING_FOUND)
+        progress("predicting left-out rows by exact fits")
         serving = delivered(solved, choice, progress)
         if serving is None:
-            return _geometric_alone(solved, choice, _NOTHING_SERVES)
+            return _geometric_alone(solved, choice, _NOTHING_HELPS)
         choice = serving.choice
         progress("solving for everything")
         whole = solved.problem.rows == choice.rows.problem.rows
@@ -132,7 +134,7 @@ class HybridCalibrator:
         falling = gravity_sentence(self.geometric.robot, choice.best.design.features)
         verdict, trials = " ".join(filter(None, (_kept_sentence(serving), falling))), choice.trials
         learned = self._learned(solved, refined)
-        progress("looking at left-out rows")
+        progress("predicting left-out rows")
         uncertainty = position_uncertainty(
             refined.rows,
             refined.design,
@@ -144,7 +146,7 @@ class HybridCalibrator:
         return HybridResult(solved.result(), learned, uncertainty, trials, verdict)
 
     def _learned(self, solved: SolvedCalibration, refined: Refined) -> LearnedPart:
-        """The correction with the geometry that belongs to it, and where it was measured."""
+        """Return the correction with the geometry fitted together with it, and its measured ranges."""
         noise = zip(solved.problem.sensors, refined.posterior.noise, strict=True)
         return LearnedPart(
             geometry=with_frames_of(solved, refined),
@@ -160,13 +162,13 @@ class HybridCalibrator:
     def _chosen(
         self, solved: SolvedCalibration, group: Int64[Tensor, " rows"], progress: Callable[[str], None]
     ) -> Choice:
-        """Features, chosen on at most `SEARCHED_ROWS` rows.
+        """Select features on at most `SEARCHED_ROWS` rows.
 
-        What a geometric calibration does not explain is not for that reason wrong: a first hybrid model is fitted to
-        all rows but those that are beyond any robot's errors, and rows are weighted by their distance from that.
+        Rows that the geometric calibration does not explain need not be outliers. Therefore a first hybrid model is
+        fitted to all rows except those with errors that no robot has, and rows are weighted by their residuals from it.
 
-        Where gravity seems to act in another direction than down, everything is tried with both: what torques along
-        other axes imitate may be products.
+        If gravity seems to act in another direction than down, both are tried, because torques along other axes may
+        imitate products.
         """
         problem, view = solved.problem, view_of(solved.solution.linearisation)
         noise, prior_scale = tuple(view.noise.tolist()), tuple(view.prior_scale.tolist())
@@ -184,7 +186,7 @@ class HybridCalibrator:
         rows = Rows.linearised(design, (point - problem.nominal)[problem.active], values, weights, group)
         pairs = zip(noise, values, strict=True)
         if all(sigma <= SMALLEST_NOISE for sigma, one in pairs if not one.certain):
-            # The geometry leaves nothing to learn; features would fit the errors of the linearisation.
+            # The geometry explains exact data, so features would only fit the errors of the linearisation.
             search = Search(rows, noise, prior_scale, [], progress)
             return search.extended(search.geometry, None)
         robot = self.geometric.robot
@@ -207,7 +209,7 @@ class HybridCalibrator:
         return max(choices, key=lambda choice: choice.best.posterior.log_evidence)
 
     def _lines(self, rows: Rows, best: Fitted) -> tuple[tuple[int, ...], ...]:
-        """Orders of the lines that stand out of what a fit leaves, beyond the harmonics of its series."""
+        """Find the orders of the lines in the residuals of a fit, beyond the harmonics of its series."""
         if "lines" not in self.features:
             return ()
         lowest = 1 + (max((one.size for one in best.design.features), default=0) or USUAL_HARMONICS)
@@ -216,10 +218,10 @@ class HybridCalibrator:
     def _features(
         self, solved: SolvedCalibration, problem: CalibrationProblem, gravity: Direction
     ) -> tuple[list[AbstractFeature], list[AbstractFeature]]:
-        """What is tried: ever larger features of one name, and one feature each of the other names.
+        """List the features to try: one in increasing sizes, and one each of the other names.
 
         Raises:
-            IdentificationError: two features would be tried in several sizes.
+            IdentificationError: two features have several sizes.
         """
         varying = stated_conditions(solved.setup.measurements)
         options = FeatureOptions(
@@ -233,8 +235,10 @@ class HybridCalibrator:
                 others += tried
             elif growing:
                 raise IdentificationError(
-                    f"features: '{growing[0].name}' and '{name}' both come in several sizes, but one such feature can "
-                    "be tried at a time; leave one out."
+                    f"'{growing[0].name}' and '{name}' both have several sizes, but only one such feature can be tried",
+                    option="features",
+                    value=(growing[0].name, name),
+                    remedy="omit one",
                 )
             else:
                 growing += tried
@@ -242,7 +246,7 @@ class HybridCalibrator:
 
 
 def _outliers(solved: SolvedCalibration, refined: Refined) -> tuple[Outlier, ...]:
-    """Rows that count for less than half by their distance from what the hybrid predicts, the worst first."""
+    """List rows with less than half of the full weight under the hybrid, the worst first."""
     problem, setup, found = solved.problem, solved.setup, []
     values = sensor_values(problem, refined.point, in_chunks(refined.correction))
     weights = weigh(problem, values, refined.posterior.effective)
@@ -254,16 +258,16 @@ def _outliers(solved: SolvedCalibration, refined: Refined) -> tuple[Outlier, ...
 
 
 def _kept_sentence(serving: Delivered) -> str:
-    """What was kept, and how much better left-out rows are predicted with it."""
+    """Write which correction was kept, and how much better held-out rows are predicted with it."""
     best = serving.choice.best
     return (
-        f"A joint correction was kept ({best.name}): left-out rows are predicted with {serving.left_out:.2f} times the "
+        f"A joint correction was kept ({best.name}): held-out rows are predicted with {serving.left_out:.2f} times the "
         "error of the geometric calibration."
     )
 
 
 def _geometric_alone(solved: SolvedCalibration, choice: Choice, verdict: str) -> HybridResult:
-    """The geometric calibration, with the uncertainty of its positions."""
+    """Return the geometric calibration, with the uncertainty of its positions."""
     geometry = identified_geometry(solved.setup, solved.solution.linearisation.point)
     first = choice.geometry
     fit = regression(first.design, choice.rows)

@@ -1,4 +1,4 @@
-"""Which joint correction is delivered: the largest part of the chosen one that predicts nothing worse than geometry."""
+"""Choice of the final joint correction: the largest part of the selected one that increases no leave-out error."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -11,8 +11,8 @@ from pisigma.calibration.geometric.problem.noise import view_of
 from pisigma.calibration.geometric.result import SolvedCalibration
 from pisigma.calibration.hybrid.design import Design, Rows, weigh
 from pisigma.calibration.hybrid.refinement import (
-    MOST_ROUNDS,
-    SETTLED,
+    CONVERGENCE_TOLERANCE,
+    MAX_LINEARISATIONS,
     Refined,
     in_chunks,
     linearised,
@@ -28,16 +28,16 @@ from pisigma.joint_correction.feature import AbstractFeature
 from pisigma.measurement.groups import groups_of_equal_joints
 
 FOLDS, FOLDS_OF_FEW, FEW_GROUPS = 4, 8, 60
-"""Folds that are left out, and of up to so many groups."""
+"""Folds that are left out, the same for few groups, and the number of groups that are few."""
 MANY_GROUPS = 600
-"""Up to so many, noise and prior sizes are updated for every fold."""
+"""Groups up to which noise and prior sizes are updated for every fold."""
 EXACT_GROUPS = 200
-"""Up to so many poses or positions, left-out rows are predicted by exact fits; other sensors always are."""
+"""Poses or positions up to which left-out rows are predicted by exact fits; those of other sensors always are."""
 
 TOLERANCE = 1.005
-"""Errors count as worse from this ratio of their RMS: a smaller difference is no difference to anybody."""
+"""Ratio of RMS errors above which errors count as larger; a smaller difference does not matter in practice."""
 REFITS = 10
-"""Gauss-Newton steps for unknowns of which only left-out rows say something, such as where their socket is."""
+"""Gauss-Newton steps for unknowns that only left-out rows determine, such as the position of their socket."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,9 +46,9 @@ class SensorErrors:
 
     Attributes:
         group: number of every row's group, see `Rows.group`.
-        fitted: lengths of the errors of all rows [m or rad], or in standard deviations where the rows state them.
-        left_out: the same under fits without the row's fold; NaN in rows that were in no fold.
-        weight: 1 in rows that the fit takes in full, 0 in those that it rejects.
+        fitted: lengths of the errors of all rows [m or rad], or in standard deviations if the rows state them.
+        left_out: the same under fits without the row's fold; NaN for rows that were in no fold.
+        weight: robust weight, 1 for full weight and 0 for rejected rows.
     """
 
     group: Int64[Tensor, " values"]
@@ -57,9 +57,9 @@ class SensorErrors:
     weight: Float64[Tensor, " values"]
 
     def compare(self, before: "SensorErrors") -> "Comparison":
-        """Compare with the errors of the same rows under another fit; a row counts that either of them takes."""
+        """Compare with the errors of the same rows under another fit; rows that either fit uses are compared."""
         weight = torch.maximum(self.weight, before.weight)
-        judged = torch.isfinite(before.left_out)  # a fit that predicts nothing is worse than any
+        judged = torch.isfinite(before.left_out)  # a fit without a prediction is worse than any other
         fitted = [(weight * one.fitted.square()).sum() for one in (self, before)]
         squares = [(weight * one.left_out.square())[judged] for one in (self, before)]
         gain = torch.zeros(int(self.group.max()) + 1 if len(self.group) else 0).to(weight)
@@ -78,7 +78,7 @@ class Comparison:
     Attributes:
         fitted: ratio of the RMS errors of all rows.
         left_out: ratio of the RMS errors of left-out rows.
-        gain: by how many standard errors the left-out squares are smaller, groups being independent.
+        gain: decrease of the left-out squares [standard errors], with independent groups.
     """
 
     fitted: float
@@ -87,7 +87,7 @@ class Comparison:
 
     @property
     def is_worse(self) -> bool:
-        """Whether rows or left-out rows are predicted worse."""
+        """Whether the errors of rows or left-out rows are larger."""
         return not (self.fitted <= TOLERANCE and self.left_out <= TOLERANCE)
 
 
@@ -98,20 +98,20 @@ def left_out_rows(
     folds: Sequence[Int64[Tensor, " _groups"]],
     updates: int = 0,
 ) -> tuple[SensorErrors | None, ...]:
-    """Leave out one fold after the other and predict its rows with an exact fit to the others.
+    """Leave out each fold and predict its rows with an exact fit to the others.
 
-    The fit is linearised again until linearised and true residuals of the rows that it is made of agree. An unknown of
-    which only left-out rows say something is fitted to them.
+    The fit is linearised again until linearised and true residuals of its rows agree. Unknowns that only left-out rows
+    determine are fitted to these.
 
     Args:
         design: the unknowns.
-        posterior: of all rows.
+        posterior: posterior by all rows.
         group: see `Rows.group`.
         folds: groups that are left out together.
-        updates: of noise and prior sizes for every fold.
+        updates: updates of noise and prior sizes for every fold.
 
     Returns:
-        Errors per sensor; None of sensors that are certain.
+        Errors per sensor; None for certain sensors.
     """
     values = _values(design, posterior.x)
     weights = weigh(design.problem, values, posterior.effective)
@@ -123,11 +123,11 @@ def left_out_rows(
         others = torch.unique(group[~held])
         rest = fit.without(groups).maximise_evidence(posterior.prior, posterior.noise, updates)
         here, x = rows, rest.x
-        for _ in range(MOST_ROUNDS):
+        for _ in range(MAX_LINEARISATIONS):
             seen = _values(design, x)
             there = Rows.linearised(design, x, seen, weights, group)
             differs = there.of(others).difference(here.of(others), x, design, rest.noise)
-            if not differs >= SETTLED * rest.effective:
+            if not differs >= CONVERGENCE_TOLERANCE * rest.effective:
                 break
             rest = regression(design, there).without(groups).solve(rest.prior, rest.noise)
             here, x = there, rest.x
@@ -142,7 +142,7 @@ def left_out_rows(
 
 
 def _values(design: Design, x: Float64[Tensor, " unknowns"]) -> tuple[SensorValues, ...]:
-    """All rows as they are under some unknowns."""
+    """Linearise all rows at some unknowns."""
     problem = design.problem
     point = problem.nominal.index_add(0, problem.active, x[: design.active])
     return sensor_values(problem, point, in_chunks(network(design, x)) if design.features else None)
@@ -155,7 +155,7 @@ def _with_own_unknowns(
     values: Sequence[SensorValues],
     held: Bool[Tensor, " rows"],
 ) -> Float64[Tensor, " unknowns"]:
-    """The unknowns with those that only left-out rows depend on fitted to these, from where all rows have them."""
+    """Fit the unknowns that only left-out rows depend on to these, starting with their values by all rows."""
     moving = torch.zeros(design.active, dtype=torch.bool, device=x.device)
     for one in values:
         if not one.certain:
@@ -180,7 +180,7 @@ def _with_own_unknowns(
 
 
 def _ratio(after: Tensor, before: Tensor) -> float:
-    """Ratio of root mean squares; 1 of two that are 0."""
+    """Compute the ratio of root mean squares; 1 if both are 0."""
     return 1.0 if float(after) == float(before) == 0 else float((after / before).sqrt())
 
 
@@ -189,12 +189,12 @@ Errors = Sequence[SensorErrors | None]
 
 @dataclass(frozen=True, eq=False)
 class Delivered:
-    """A joint correction that earns its place.
+    """A joint correction that reduces leave-out errors.
 
     Attributes:
-        choice: with the features that are delivered as the best.
-        refined: fitted to the rows of the search.
-        left_out: RMS error of left-out rows over that of the geometric calibration, of the sensor that gains most.
+        choice: the choice, with the final features as its best.
+        refined: the model fitted to the rows of the search.
+        left_out: leave-out RMS error over that of the geometric calibration, for the sensor with the largest gain [1].
     """
 
     choice: Choice
@@ -203,18 +203,18 @@ class Delivered:
 
 
 def delivered(solved: SolvedCalibration, choice: Choice, progress: Callable[[str], None]) -> Delivered | None:
-    """Give the largest part of the chosen features that serves every sensor, each part fitted exactly.
+    """Find the largest part of the selected features that increases no sensor's errors, with exact fits of each part.
 
-    Left-out errors of linearised rows are those of the exact fit only where the linearisation holds. It holds where
-    many poses or positions are measured; where few are, or anything else is, the rows of the search are left out again,
-    fold by fold, of exact fits with and without the correction. It is delivered where no sensor's rows and left-out
-    rows are predicted worse with it and one sensor's are predicted better beyond the scatter.
+    Leave-out errors by linearisation are those of an exact fit only if the linearisation is accurate. It is for many
+    poses or positions. For few of them, or for other sensors, the rows of the search are left out again, fold by fold,
+    of exact fits with and without the correction. A part is accepted if it increases the errors and leave-out errors of
+    no sensor, and clearly reduces the leave-out errors of one.
 
     Returns:
-        The part that serves; None where the geometric calibration is to be delivered.
+        The accepted part; None if the geometric calibration is to be kept.
     """
     problem = choice.rows.problem
-    # whole anchors and sockets are for the search: too little may be left to fit a few of them exactly
+    # The search leaves out whole anchors and sockets; exact fits to the few others may then be undetermined.
     group = choice.rows.group if problem.pairs else groups_of_equal_joints(problem.q)
     count = int(group.max()) + 1
     if count > EXACT_GROUPS and set(solved.setup.measurements.kinds) <= {"position", "rotation"}:
@@ -233,18 +233,18 @@ def delivered(solved: SolvedCalibration, choice: Choice, progress: Callable[[str
 
 
 def _left_out_of_search(choice: Choice) -> float:
-    """The ratio that the search found, of linearised rows."""
+    """Return the ratio of leave-out errors by the search, with linearised rows."""
     return [trial.left_out for trial in choice.trials if trial.kept][-1]
 
 
 def _compared(errors: Errors, before: Errors) -> list[Comparison]:
-    """The errors of every sensor that measures something."""
+    """Compare the errors of every measuring sensor."""
     pairs = zip(errors, before, strict=True)
     return [one.compare(other) for one, other in pairs if one is not None and other is not None]
 
 
 def _geometric_posterior(solved: SolvedCalibration, choice: Choice) -> Posterior:
-    """The geometric calibration as what the rows of the search say of its parameters."""
+    """Compute the posterior of the geometric calibration with the rows of the search."""
     problem, group = choice.rows.problem, choice.rows.group
     design, view = Design(problem, ()), view_of(solved.solution.linearisation)
     x = (solved.solution.linearisation.point - problem.nominal)[problem.active]
@@ -254,7 +254,7 @@ def _geometric_posterior(solved: SolvedCalibration, choice: Choice) -> Posterior
 
 
 def _parts(choice: Choice) -> Iterator[Choice]:
-    """The chosen features, and ever fewer of them, the last one that was tried going first."""
+    """Yield the selected features, then fewer and fewer of them, removing the one that was tried last."""
     yield choice
     features = choice.best.design.features
     for count in range(len(features) - 1, 0, -1):
@@ -262,7 +262,7 @@ def _parts(choice: Choice) -> Iterator[Choice]:
 
 
 def _part(choice: Choice, features: tuple[AbstractFeature, ...]) -> Choice:
-    """The choice with some of its features as the best."""
+    """Return the choice with some of its features as the best."""
     best, design = choice.best, Design(choice.rows.problem, features)
     fit = (choice.regression or regression(best.design, choice.rows)).select(design)
     prior = design.prior_like(best.design, best.posterior.prior)

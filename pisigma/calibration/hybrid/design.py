@@ -1,4 +1,4 @@
-"""Which unknowns there are, and the linearised values that they are fitted to."""
+"""Unknowns of a hybrid calibration, and the linearised values that they are fitted to."""
 
 import math
 from collections.abc import Sequence
@@ -22,17 +22,17 @@ CHUNK = 512
 """Rows whose columns are in memory at a time."""
 FOLDS = 4
 FOLDS_OF_FEW = 20
-MOST_GROUPS = 400
-"""So many groups of rows are held out at most."""
+MAX_GROUPS = 400
+"""Groups of rows that are held out."""
 
 
 @dataclass(frozen=True, eq=False)
 class Design:
-    """Which unknowns there are: the free parameters, and a weight for every used column of the features.
+    """Unknowns of a hybrid calibration: the free parameters, and a weight for every used column of the features.
 
     Attributes:
         problem: rows and free parameters.
-        features: of the joint corrections.
+        features: features of the joint correction.
     """
 
     problem: CalibrationProblem
@@ -53,23 +53,25 @@ class Design:
         """Number of unknowns."""
         return self.active + sum(int(chosen.used.sum()) for chosen in self.features)
 
-    def stretch(self, number: int) -> slice:
-        """Where the weights of a choice of features stand."""
+    def weights_of(self, number: int) -> slice:
+        """Return the indices of the weights of a feature."""
         start = self.active + sum(int(chosen.used.sum()) for chosen in self.features[:number])
         return slice(start, start + int(self.features[number].used.sum()))
 
     def correction(self, x: Float64[Tensor, " unknowns"], state: JointState) -> Float64[Tensor, "rows dof"]:
-        """Joint corrections [rad or m] of rows with the weights of some unknowns."""
+        """Compute the joint corrections of rows for given unknowns [rad or m]."""
         total = torch.zeros_like(state.q)
         for number, chosen in enumerate(self.features):
-            weight = torch.zeros(chosen.used.shape).to(x).masked_scatter(chosen.used, x[self.stretch(number)])
+            weight = (
+                torch.zeros(chosen.used.shape).to(x).masked_scatter(chosen.used, x[self.weights_of(number)])
+            )
             total = total + (chosen.columns(state) * weight).sum(-1)
         return total
 
     def moved(
         self, values: SensorValues, change: Float64[Tensor, " unknowns"]
     ) -> Float64[Tensor, "values components"]:
-        """Change of a sensor's predicted values with the unknowns, not weighted."""
+        """Compute the change of a sensor's predicted values by a change of the unknowns, not weighted."""
         moved = values.geometry @ change[: self.active]
         if not self.features or not len(values.row):
             return moved
@@ -80,16 +82,16 @@ class Design:
         return moved
 
     def columns(self, values: SensorValues, rows: slice) -> Float64[Tensor, "values components unknowns"]:
-        """Derivative of a sensor's values by all unknowns, not weighted."""
+        """Compute the derivative of a sensor's values by all unknowns, not weighted."""
         state = self.problem.state
         blocks = [values.geometry[rows]]
         blocks += [values.feature_columns(chosen, state, rows) for chosen in self.features]
         return torch.cat(blocks, -1)
 
     def prior(self, prior_scale: Sequence[float]) -> GaussianPrior:
-        """Prior of all unknowns, the classes' factors as the geometric calibration left them.
+        """Make the prior of all unknowns, with the prior scales of the geometric calibration.
 
-        A prismatic joint's weights are lengths; their sizes count in radians times the reach.
+        The weights of a prismatic joint are lengths; their prior sizes are in radians times the reach.
         """
         problem, robot = self.problem, self.problem.space.robot
         base, group = [problem.precision[problem.active]], [problem.prior_group]
@@ -107,13 +109,13 @@ class Design:
         return GaussianPrior(torch.cat(base), torch.cat(group), torch.cat(sizes), classes)
 
     def usual_prior(self, prior_scale: Sequence[float]) -> GaussianPrior:
-        """The prior of all unknowns with the weights' `usual_sizes`."""
+        """Make the prior of all unknowns with the `usual_sizes` of the weights."""
         prior = self.prior(prior_scale)
         sizes = [size for chosen in self.features for size in chosen.usual_sizes]
         return replace(prior, sizes=torch.cat([prior.sizes[: prior.classes], prior.sizes.new_tensor(sizes)]))
 
     def prior_like(self, other: "Design", prior: GaussianPrior) -> GaussianPrior:
-        """The prior with sizes to start from that another design's fit came to; new bands as its last one."""
+        """Make the prior with the fitted sizes of another design as start; new bands have the size of its last one."""
         prior_here = self.prior(prior.sizes[: prior.classes].tolist())
         sizes = prior_here.sizes.clone()
         others = zip(other.features, other.group_starts(prior.classes), strict=True)
@@ -126,19 +128,19 @@ class Design:
         return replace(prior_here, sizes=sizes)
 
     def group_starts(self, classes: int) -> list[int]:
-        """Number of the first prior size of every choice of features."""
+        """Return the number of the first prior size of every feature."""
         counts = [len(chosen.group_names) for chosen in self.features]
         return [classes + sum(counts[:k]) for k in range(len(counts))]
 
     def indices(self, features: Sequence[AbstractFeature]) -> Int64[Tensor, " chosen"]:
-        """Where the unknowns stand that a design with some of the features has.
+        """Return the indices of the unknowns of a design with some of the features.
 
-        A smaller feature than the one of its name here, such as a series of fewer harmonics, counts as a part of it.
+        A smaller feature of the same name, such as a series with fewer harmonics, is a part of the larger one.
         """
         indices = [torch.arange(self.active)]
         for wanted in features:
             number = next(k for k, chosen in enumerate(self.features) if chosen.name == wanted.name)
-            larger, start = self.features[number], self.stretch(number).start
+            larger, start = self.features[number], self.weights_of(number).start
             index = torch.cumsum(larger.used.flatten(), 0).view(larger.used.shape) - 1 + start
             columns = wanted.columns_in(larger)
             indices.append(index.gather(1, columns)[larger.used.gather(1, columns)])
@@ -147,14 +149,13 @@ class Design:
 
 @dataclass(frozen=True, eq=False)
 class Rows:
-    """Values of all sensors, linearised.
+    """Linearised values of all sensors.
 
     Attributes:
         problem: free parameters and joint values.
-        values: per sensor, weighted, repeats of a pose as one row; residuals are those of the nominal parameters and no
-            correction, as far as the linearised values say.
-        group: number of every row's group; rows of one, such as those of one placement of sockets, are held out
-            together.
+        values: weighted values per sensor, with repeats of a pose as one row; residuals are those of the nominal
+            parameters without a correction, by linearisation.
+        group: number of every row's group; rows of one group, such as one placement of sockets, are held out together.
     """
 
     problem: CalibrationProblem
@@ -163,12 +164,12 @@ class Rows:
 
     @property
     def groups(self) -> int:
-        """How many groups there are."""
+        """Number of groups."""
         return int(self.group.max()) + 1
 
     @property
     def sensors(self) -> tuple[SensorCount, ...]:
-        """How many values there are of every sensor."""
+        """Number of values of every sensor."""
         return tuple(
             SensorCount(
                 sensor.residual.numel() / sensor.repetition, sensor.stated, sensor.certain, sensor.repetition
@@ -177,24 +178,24 @@ class Rows:
         )
 
     def of(self, groups: Int64[Tensor, " chosen"]) -> "Rows":
-        """The rows of some groups."""
+        """Return the rows of some groups."""
         mask = torch.zeros(self.groups, dtype=torch.bool, device=self.group.device)
         mask[groups.to(mask.device)] = True
         kept = tuple(sensor.select(mask[self.group[sensor.row]]) for sensor in self.values)
         return replace(self, values=kept)
 
     def held_out(self, groups: Int64[Tensor, " chosen"]) -> "Rows":
-        """The rows of some groups, without those of sensors that are certain."""
+        """Return the rows of some groups, without those of certain sensors."""
         rows = self.of(groups)
         kept = [sensor.select(slice(0, 0)) if sensor.certain else sensor for sensor in rows.values]
         return replace(rows, values=tuple(kept))
 
     def folds(self, count: int, most_groups: int) -> tuple[Int64[Tensor, " _groups"], ...]:
-        """Numbers of the groups of every fold, drawn at random but always the same.
+        """Draw the groups of every fold with a fixed random seed.
 
         Args:
-            count: how many folds, or one for every group where there are fewer groups.
-            most_groups: only so many groups are held out at all.
+            count: number of folds; one per group if there are fewer groups.
+            most_groups: largest number of groups that are held out.
         """
         order = torch.randperm(self.groups, generator=torch.Generator().manual_seed(0))[:most_groups]
         count = min(count, len(order))
@@ -208,13 +209,13 @@ class Rows:
         weights: Sequence[Float64[Tensor, " _values"]],
         group: Int64[Tensor, " rows"],
     ) -> "Rows":
-        """Weighted values; repeats of a pose become one row.
+        """Make rows from values that were linearised at some unknowns; repeats of a pose become one row.
 
         Args:
-            design: the unknowns that the values were linearised at.
-            x: these unknowns, the parameters counted from nominal.
-            values: of all rows, with residuals there.
-            weights: of the rows of every sensor.
+            design: design of the unknowns.
+            x: the unknowns, with parameters relative to nominal.
+            values: values of all rows, with residuals at these unknowns.
+            weights: weights of the rows of every sensor.
             group: see the attributes.
         """
         problem, rows = design.problem, []
@@ -230,13 +231,13 @@ class Rows:
     def difference(
         self, other: "Rows", x: Float64[Tensor, " unknowns"], design: Design, noise: Sequence[float]
     ) -> float:
-        """Sum of the squared differences between weighted residuals, over the noise; infinite for other rows.
+        """Compute the sum of squared differences of weighted residuals over the noise; infinite for different rows.
 
         Args:
-            other: linearised at another point.
+            other: the same rows, linearised at another point.
             x: unknowns at which the residuals are compared.
-            design: of them.
-            noise: per sensor.
+            design: design of the unknowns.
+            noise: noise per sensor.
         """
         total = 0.0
         for here, there, sigma in zip(self.values, other.values, noise, strict=True):
@@ -249,7 +250,7 @@ class Rows:
 
 
 def chunks(count: int, size: int | None = None) -> list[slice]:
-    """Rows that are worked on together: so many, or `CHUNK`."""
+    """Split rows into chunks of a size, by default `CHUNK`."""
     size = size or CHUNK
     return [slice(start, start + size) for start in range(0, count, size)]
 
@@ -257,12 +258,12 @@ def chunks(count: int, size: int | None = None) -> list[slice]:
 def weigh(
     problem: CalibrationProblem, values: Sequence[SensorValues], effective: float
 ) -> tuple[Float64[Tensor, " values"], ...]:
-    """Weights of all rows of every sensor by the lengths of their residuals.
+    """Compute the robust weights of all rows of every sensor from their residuals.
 
     Args:
-        problem: how far-off rows of a sensor count; the scale is automatic.
-        values: not weighted.
-        effective: number of unknowns that the data determine.
+        problem: the problem with the loss functions; the scale is estimated.
+        values: values that are not weighted.
+        effective: effective number of unknowns.
 
     Raises:
         IdentificationError: a residual is not finite.
@@ -274,8 +275,9 @@ def weigh(
         distance = sensor.residual.norm(dim=1) * sensor.root
         if not bool(torch.isfinite(distance).all()):
             raise IdentificationError(
-                f"the joint correction predicts no finite value of the sensor '{sensor.name}'; calibrate the geometry "
-                "alone, and look for values without limit in the measurements."
+                f"the joint correction predicts values of the sensor '{sensor.name}' that are not finite",
+                value=sensor.name,
+                remedy="calibrate the geometry alone, and look for huge values in the measurements",
             )
         if sensor.certain or isinstance(loss, SquaredLoss):
             weights.append(torch.ones_like(distance))

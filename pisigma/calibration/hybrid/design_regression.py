@@ -24,25 +24,25 @@ class AbstractDesignRegression(AbstractRegression):
 
     @abstractmethod
     def select(self, design: Design) -> "AbstractDesignRegression":
-        """The same for the unknowns of a design that has some of the features, or smaller ones."""
+        """Return the regression for a design with some of the features, or smaller ones."""
 
     @abstractmethod
     def without(self, groups: Int64[Tensor, " groups"]) -> "AbstractDesignRegression":
-        """The same without the values of some groups of rows, see `Rows.group`; values that are certain stay."""
+        """Return the regression without the values of some groups of rows (see `Rows.group`), except certain ones."""
 
     @abstractmethod
     def left_out(self, posterior: Posterior, folds: Sequence[Int64[Tensor, " _groups"]]) -> LeftOut:
-        """Leave out one fold after the other and predict it, with the prior sizes and the noise of a posterior.
+        """Leave out each fold and predict it, with the prior sizes and the noise of a posterior.
 
         Args:
-            posterior: of all values.
+            posterior: posterior by all values.
             folds: groups that are left out together, see `Rows.group`.
         """
 
-    def left_out_anew(
+    def left_out_refitted(
         self, posterior: Posterior, folds: Sequence[Int64[Tensor, " _groups"]], updates: int
     ) -> LeftOut:
-        """The same with so many updates of noise and prior sizes for every fold: few rows leave these uncertain."""
+        """Leave out each fold, with updates of noise and prior sizes, which few rows leave uncertain."""
         parts = []
         for groups in folds:
             rest = self.without(groups).maximise_evidence(posterior.prior, posterior.noise, updates)
@@ -52,14 +52,14 @@ class AbstractDesignRegression(AbstractRegression):
     def first_sizes(
         self, posterior: Posterior, design: Design, features: AbstractFeature
     ) -> tuple[float, Float64[Tensor, " groups"] | None]:
-        """By how much more features raise the log evidence with all other prior sizes and the noise fixed.
+        """Compute the gain of log evidence by additional features, with all other prior sizes and the noise fixed.
 
         Args:
-            posterior: without them.
-            design: without them.
-            features: that are added.
+            posterior: posterior without the features.
+            design: design without the features.
+            features: the additional features.
 
         Returns:
-            The gain, infinite where a fit says it as quickly; and the prior sizes of the features, to start from.
+            The gain, infinite if a fit is as fast; and start values of the prior sizes of the features.
         """
         return math.inf, None

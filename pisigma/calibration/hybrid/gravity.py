@@ -1,4 +1,4 @@
-"""In which direction things fall: as stated, or along an axis of the base by the evidence."""
+"""Direction of gravity, by the evidence for the axes of the base."""
 
 import math
 from collections.abc import Sequence
@@ -15,15 +15,15 @@ from pisigma.robot.description import Robot
 from pisigma.robot.se3 import rotation_from_rpy
 
 USUAL: Direction = (0.0, 0.0, -1.0)
-"""In the base: of a robot that stands on the floor."""
+"""Gravity in the base frame of a robot on the floor."""
 FLOOR_ODDS = 100.0
-"""So many robots stand on the floor for one that hangs elsewhere and whose user does not say so."""
+"""Prior odds of a robot on the floor against one that is mounted otherwise without a statement of the user."""
 HARMONICS = 8
-"""Of a series beside the torques: low harmonics of a joint's gear look like torques of a gravity along other axes."""
+"""Harmonics of a series that is fitted too: low harmonics of a gear look like torques of gravity along other axes."""
 
 
 def in_first_row(robot: Robot, direction: Direction) -> Direction:
-    """A direction in the robot's base frame, in the frame of its first row."""
+    """Transform a direction from the robot's base frame to the frame of its first row."""
     turned = rotation_from_rpy(torch.tensor(robot.base[3:])).mT @ torch.tensor(direction).double()
     x, y, z = (turned + 0.0).tolist()
     return x, y, z
@@ -32,18 +32,18 @@ def in_first_row(robot: Robot, direction: Direction) -> Direction:
 def gravity_by_evidence(
     robot: Robot, rows: Rows, noise: tuple[float, ...], prior_scale: Sequence[float]
 ) -> Direction:
-    """Find the axis of the base that gravity acts along, for robots on walls, rails and ceilings.
+    """Find the axis of the base along which gravity acts, for robots on walls, rails and ceilings.
 
     Geometry, a short series and the `GravityTorques` of each axis are fitted to the rows. Torques are linear in masses
-    of either sign, so the evidence and all predictions are the same for both ends of an axis; the end is the one for
-    which the masses add up to more than 0. Another direction than down has to raise the log evidence above that of the
-    other axes by `CLEARLY`, and by the odds against it before anything was measured.
+    of either sign, so the evidence and all predictions are the same for both directions of an axis; the direction is
+    the one with a positive sum of masses. Directions other than down must have a log evidence above that of the other
+    axes by `CLEARLY` plus the log prior odds against them.
 
     Args:
-        robot: the nominal one.
-        rows: linearised at the geometric calibration.
-        noise: of that, per sensor.
-        prior_scale: its prior sizes.
+        robot: the nominal robot.
+        rows: rows linearised at the geometric calibration.
+        noise: noise of the geometric calibration per sensor.
+        prior_scale: its prior scales.
 
     Returns:
         The direction in the robot's base frame.
@@ -55,21 +55,30 @@ def gravity_by_evidence(
         fit = regression(design, rows)
         posterior = fit.maximise_evidence(design.prior(prior_scale), noise, tolerance=ROUGHLY)
         weight = torch.zeros(torques.used.shape).to(posterior.x)
-        masses = weight.masked_scatter(torques.used, posterior.x[design.stretch(0)])[:, ::4]
+        masses = weight.masked_scatter(torques.used, posterior.x[design.weights_of(0)])[:, ::4]
         x, y, z = (value if masses.sum() > 0 else 0.0 - value for value in direction)
         tried.append((posterior.log_evidence, (x, y, z)))
     (second, _), (first, best) = sorted(tried)[1:]
     return best if first - second > CLEARLY + math.log(FLOOR_ODDS) else USUAL
 
 
-def gravity_sentence(robot: Robot, features: Sequence[AbstractFeature]) -> str:
-    """Say along which axis of the base gravity acts, if any of the features depends on it."""
+def gravity_in_base(robot: Robot, features: Sequence[AbstractFeature]) -> Direction | None:
+    """Return the direction of gravity in the base frame that the features assume; None if none depends on it."""
     directions = [chosen.gravity for chosen in features if isinstance(chosen, GravityTorques)]
     if not directions:
-        return ""
+        return None
     turned = rotation_from_rpy(torch.tensor(robot.base[3:])) @ torch.tensor(directions[0]).double()
-    axis = int(turned.abs().argmax())
-    along = f"{'-' if turned[axis] < 0 else '+'}{'xyz'[axis]}"
-    if float(turned[axis].abs()) < 1 - 1e-9:
-        along = "({:.3g}, {:.3g}, {:.3g})".format(*turned.tolist())
+    x, y, z = turned.tolist()
+    return x, y, z
+
+
+def gravity_sentence(robot: Robot, features: Sequence[AbstractFeature]) -> str:
+    """Write along which axis of the base gravity acts; empty if no feature depends on it."""
+    direction = gravity_in_base(robot, features)
+    if direction is None:
+        return ""
+    axis = max(range(3), key=lambda k: abs(direction[k]))
+    along = f"{'-' if direction[axis] < 0 else '+'}{'xyz'[axis]}"
+    if abs(direction[axis]) < 1 - 1e-9:
+        along = "({:.3g}, {:.3g}, {:.3g})".format(*direction)
     return f"Gravity acts along {along} of the base."

@@ -1,4 +1,4 @@
-"""Solve the chosen model on all rows: linearisation and posterior in turn until they agree."""
+"""Fit of the selected model to all rows: linearisation and posterior alternate until they agree."""
 
 from dataclasses import dataclass, replace
 
@@ -23,26 +23,27 @@ from pisigma.joint_correction.joint_correction import JointCorrection
 from pisigma.measurement.dataset import Measurements
 from pisigma.robot.se3 import transform
 
-MOST_ROUNDS = 5
-SETTLED = 0.05
-"""Rounds end when linearised and true residuals, weighted, differ by less variance for every determined unknown."""
+MAX_LINEARISATIONS = 5
+CONVERGENCE_TOLERANCE = 0.05
+"""Difference of linearised and true weighted residuals [variances], per effective unknown, at convergence."""
 ARM = 0.1
-"""Points of the tool at this share of the reach from its origin are met as well, so that rotations count."""
+"""Distance from the tool's origin, as a share of the reach, of further points that are fitted, so that rotations
+count."""
 
 
 @dataclass(frozen=True, eq=False)
 class Refined:
-    """A solved hybrid.
+    """A hybrid model fitted to all rows.
 
     Attributes:
-        rows: as last linearised and weighted.
+        rows: the rows, as last linearised and weighted.
         design: all unknowns.
-        posterior: of them.
-        regression: of the rows on them.
+        posterior: their posterior.
+        regression: regression of the rows on the unknowns.
         point: all parameters of the problem.
         correction: the network.
-        rounds: linearisations made.
-        left_out: values of the folds of the search, predicted without them; None where another fit followed.
+        rounds: number of linearisations.
+        left_out: leave-out predictions of the folds of the search; None if the model was fitted again after it.
     """
 
     rows: Rows
@@ -56,21 +57,21 @@ class Refined:
 
 
 def refine(problem: CalibrationProblem, group: Int64[Tensor, " rows"], choice: Choice) -> Refined:
-    """Fit the chosen features to all rows.
+    """Fit the selected features to all rows.
 
     Args:
-        problem: of all rows.
+        problem: problem of all rows.
         group: see `Rows.group`.
-        choice: of the features, as fitted to some of the rows or all.
+        choice: the selected features, fitted to some or all of the rows.
     """
     design, posterior = Design(problem, choice.best.design.features), choice.best.posterior
     rows, fit, rounds = choice.rows, choice.regression, 1
-    while rounds < MOST_ROUNDS:
+    while rounds < MAX_LINEARISATIONS:
         there = linearised(design, posterior.x, posterior.effective, group)
         differs = there.difference(rows, posterior.x, design, posterior.noise)
-        if differs < SETTLED * posterior.effective:
+        if differs < CONVERGENCE_TOLERANCE * posterior.effective:
             break
-        rows, fit = there, None  # one system of equations at a time: they are large
+        rows, fit = there, None  # only one system of equations in memory at a time, because they are large
         fit = regression(design, there)
         posterior = fit.maximise_evidence(posterior.prior, posterior.noise)
         rounds += 1
@@ -87,11 +88,11 @@ def _refined(
 
 
 def network(design: Design, x: Float64[Tensor, " unknowns"]) -> JointCorrection:
-    """The network with the weights of some unknowns; products of inputs as product units."""
+    """Make the network with the weights of some unknowns; products of inputs become product units."""
     features = [chosen for chosen in design.features if not isinstance(chosen, InputProducts)]
     factors, linear = None, []
     for number, chosen in enumerate(design.features):
-        weights = x[design.stretch(number)].cpu()
+        weights = x[design.weights_of(number)].cpu()
         if isinstance(chosen, InputProducts):
             factors = chosen.factors(weights)
         else:
@@ -108,19 +109,19 @@ def network(design: Design, x: Float64[Tensor, " unknowns"]) -> JointCorrection:
 
 
 def in_chunks(correction: JointCorrection) -> Shift:
-    """The correction of many rows, with the features of some of them in memory at a time."""
+    """Return a function that evaluates the correction for many rows in chunks, to limit the memory."""
     return lambda state: torch.cat([correction(state[rows]) for rows in chunks(len(state.q))])
 
 
 def linearised(
     design: Design, x: Float64[Tensor, " unknowns"], effective: float, group: Int64[Tensor, " rows"]
 ) -> Rows:
-    """All rows linearised at some unknowns, weighted by their distance from what these predict.
+    """Linearise all rows at some unknowns, with robust weights from their residuals.
 
     Args:
-        design: of the unknowns.
-        x: the unknowns, parameters counted from nominal.
-        effective: how many of them the data determine.
+        design: design of the unknowns.
+        x: the unknowns, with parameters relative to nominal.
+        effective: effective number of unknowns.
         group: see `Rows.group`.
     """
     problem = design.problem
@@ -130,11 +131,11 @@ def linearised(
 
 
 def with_frames_of(solved: SolvedCalibration, refined: Refined) -> IdentifiedGeometry:
-    """The hybrid's geometry; frames that nothing determines are moved onto those of the geometric calibration.
+    """Return the geometry of the hybrid, with floating frames moved onto those of the geometric calibration.
 
-    Sockets, and distances from anchors at unknown points, are met as well after any motion of the whole frame.
-    Nominal joint values and predictions of both calibrations belong to one base, however; so every such frame gets the
-    motion that takes the hybrid's poses nearest to the geometric ones.
+    Residuals of sockets, and of distances from anchors at unknown points, do not change by any motion of the whole
+    frame. But nominal joint values and predictions of both calibrations must refer to the same base. Therefore every
+    such frame is moved so that the poses of the hybrid are nearest to the geometric ones.
 
     Args:
         solved: the geometric calibration.
@@ -160,17 +161,17 @@ def with_frames_of(solved: SolvedCalibration, refined: Refined) -> IdentifiedGeo
 def nearest_motion(
     points: Float64[Tensor, "points 3"], onto: Float64[Tensor, "points 3"]
 ) -> Float64[Tensor, "4 4"]:
-    """The rigid motion T that minimises `Σ |T p - p'|²` (Kabsch 1976, Acta Crystallographica A32, 922-923)."""
+    """Compute the rigid motion T that minimises `Σ |T p - p'|²` (Kabsch 1976, Acta Crystallographica A32, 922-923)."""
     middle, middle_onto = points.mean(0), onto.mean(0)
     U, _, V = torch.linalg.svd((onto - middle_onto).t() @ (points - middle))
     turned = torch.ones(3, dtype=points.dtype, device=points.device)
-    turned[2] = torch.linalg.det(U @ V)
+    turned[2] = torch.linalg.det(U @ V)  # -1 would be a reflection
     R = U @ (turned[:, None] * V)
     return transform(R, middle_onto - R @ middle)
 
 
 def _points(geometry: IdentifiedGeometry, rows: Measurements) -> Float64[Tensor, "rows 4 3"]:
-    """The tool's origin and a point along each of its axes, in the frame of the row."""
+    """Compute the tool's origin and a point along each of its axes, in the frame of the row."""
     T = predicted_poses(geometry.robot, geometry.bases, geometry.tools, rows)
     origin = T[:, None, :3, 3]
     return torch.cat([origin, origin + ARM * geometry.robot.reach * T[:, :3, :3].mT], 1)

@@ -20,12 +20,12 @@ from pisigma.estimation.regression import Posterior, SensorCount
 from pisigma.joint_correction.feature import AbstractFeature
 
 NARROW = 64
-"""Rows of which all columns are in memory at a time where only products with some of them are made."""
+"""Rows whose columns are all in memory at a time, where only products with some of them are needed."""
 
 
 @dataclass(frozen=True, eq=False)
 class NormalEquations(PrimalRegression, AbstractDesignRegression):
-    """The normal equations of linearised rows for the unknowns of a design.
+    """Normal equations of linearised rows for the unknowns of a design.
 
     Attributes:
         design: the unknowns.
@@ -37,10 +37,10 @@ class NormalEquations(PrimalRegression, AbstractDesignRegression):
 
     @staticmethod
     def of(design: Design, rows: Rows) -> "NormalEquations":
-        """Sum up the rows, chunk by chunk.
+        """Sum the rows, chunk by chunk.
 
-        The columns of a joint's weights are its features times the derivative by its value, `J_j f_jm`. So for two
-        joints `X_j^T X_i = f_j^T diag(J_j^T J_i) f_i`: the components of a value are summed before the products.
+        The columns of a joint's weights are its features times the derivative by its value, `J_j f_jm`. Therefore, for
+        two joints, `X_j^T X_i = f_j^T diag(J_j^T J_i) f_i`: the components of a value are summed before the products.
         """
         size = design.unknowns
         return_free_memory(size)
@@ -62,9 +62,9 @@ class NormalEquations(PrimalRegression, AbstractDesignRegression):
         return replace(self, design=design, normal=normal, descent=self.descent[:, columns])
 
     def extended(self, design: Design) -> "NormalEquations":
-        """The same rows for the unknowns of a design that has some of the features, and a new one as its last.
+        """Return the equations for a design with some of the features and a new one as its last.
 
-        Sums that are there already are copied.
+        Existing sums are copied.
         """
         self.latest.clear()
         return_free_memory(design.unknowns)
@@ -128,8 +128,8 @@ class NormalEquations(PrimalRegression, AbstractDesignRegression):
     ) -> tuple[float, Tensor | None]:
         """See `AbstractDesignRegression.first_sizes`.
 
-        The other unknowns are taken out of the normal equations (Schur complement), so that only the weights of the
-        features are left.
+        The other unknowns are eliminated from the normal equations (Schur complement), so that only the weights of the
+        features remain.
         """
         columns = self.design.indices((*design.features, features))
         old, new = columns[: design.unknowns], columns[design.unknowns :]
@@ -156,7 +156,7 @@ class NormalEquations(PrimalRegression, AbstractDesignRegression):
 
 
 def _add_sums(design: Design, sensor: SensorValues, N: Tensor, b: Tensor) -> float:
-    """Fill in normal matrix and right side of one sensor's values; their square is returned."""
+    """Add normal matrix and right-hand side of one sensor's values in place; return the sum of their squares."""
     active, dof = design.active, sensor.joints.shape[-1]
     count = sum(chosen.count for chosen in design.features)
     size = active + dof * count
@@ -174,7 +174,7 @@ def _add_sums(design: Design, sensor: SensorValues, N: Tensor, b: Tensor) -> flo
             along, pull = Jw.mT @ G, torch.einsum("rcj,rc->rj", Jw, y)
             for g, other in sides:
                 shared = Jw.mT @ other
-                for j in range(dof):
+                for j in range(dof):  # blocks from the diagonal on; the matrix is symmetric
                     first = active + j * count
                     right = (g[:, j:] * shared[:, j, j:, None]).flatten(1)
                     normal[first : first + count, first:].addmm_(f[:, j].t(), right)
@@ -193,19 +193,19 @@ def _add_sums(design: Design, sensor: SensorValues, N: Tensor, b: Tensor) -> flo
 
 
 def _copy_chosen(matrix: Tensor, chosen: Int64[Tensor, " chosen"], to: Tensor) -> None:
-    """Copy some rows and columns of a matrix, without another one beside the two."""
+    """Copy some rows and columns of a matrix, without a third matrix in memory."""
     for rows in chunks(len(chosen)):
         torch.index_select(matrix[chosen[rows]], 1, chosen, out=to[rows])
 
 
 def _feature_columns(design: Design, row: Tensor) -> Float64[Tensor, "rows dof columns"]:
-    """Columns of all features at some rows of the problem, those that a joint does not have as well."""
+    """Compute the columns of all features at some rows of the problem, including those that a joint does not use."""
     state = design.problem.state[row]
     return torch.cat([chosen.columns(state) for chosen in design.features], -1)
 
 
 def _places(design: Design, dof: int, count: int) -> Int64[Tensor, " weights"]:
-    """Where the weights stand, joint by joint and all columns of all features in turn."""
+    """Return the positions of the used weights in an order by joint, feature and column."""
     first, places = 0, [torch.zeros(0, dtype=torch.int64)]
     for chosen in design.features:
         own = torch.arange(dof)[:, None] * count + first + torch.arange(chosen.count)
@@ -214,18 +214,18 @@ def _places(design: Design, dof: int, count: int) -> Int64[Tensor, " weights"]:
     return torch.cat(places)
 
 
-MOST_VALUES = 1_000
-"""The covariance of the values is used up to so many, whose matrices of all groups then take up to 200 MB."""
+MAX_VALUES = 1_000
+"""Values up to which their covariance is used; the matrices of all groups then take up to 200 MB."""
 
 
 @dataclass(frozen=True, eq=False)
 class ValueCovariance(DualRegression, AbstractDesignRegression):
-    """The covariance of linearised rows' values under the prior of the weights of a design.
+    """Covariance of the values of linearised rows under the prior of the weights of a design.
 
     Attributes:
         design: the unknowns.
         rows: linearised values.
-        group: of the rows that are held out together; -1 of values that are certain.
+        group: group of the row of every value, see `Rows.group`; -1 for certain values.
     """
 
     design: Design
@@ -305,7 +305,7 @@ class ValueCovariance(DualRegression, AbstractDesignRegression):
 
     @cached_property
     def primal(self) -> NormalEquations:
-        """The same values as normal equations."""
+        """Normal equations of the same values."""
         return NormalEquations(*self.sums, self.sensors, self.design, self.rows)
 
     @cached_property
@@ -318,12 +318,12 @@ class ValueCovariance(DualRegression, AbstractDesignRegression):
 
 
 def regression(design: Design, rows: Rows) -> AbstractDesignRegression:
-    """Normal equations, or the covariance of the values where there are few values and more unknowns."""
+    """Make normal equations, or the covariance of the values if there are few values and more unknowns."""
     values = sum(sensor.residual.numel() for sensor in rows.values)
-    few = values <= min(MOST_VALUES, design.unknowns)
+    few = values <= min(MAX_VALUES, design.unknowns)
     return ValueCovariance.of(design, rows) if few else NormalEquations.of(design, rows)
 
 
 def extended(before: AbstractDesignRegression, design: Design, rows: Rows) -> AbstractDesignRegression:
-    """The regression of the same rows on a design that has some of the features, and a new one as its last."""
+    """Return the regression of the same rows on a design with some of the features and a new one as its last."""
     return before.extended(design) if isinstance(before, NormalEquations) else regression(design, rows)

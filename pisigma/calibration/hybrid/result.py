@@ -1,4 +1,4 @@
-"""What a hybrid calibration comes to."""
+"""Result of a hybrid calibration."""
 
 from dataclasses import dataclass, replace
 
@@ -23,14 +23,14 @@ class LearnedPart:
     """A joint correction and the geometry that was fitted together with it.
 
     Attributes:
-        geometry: differs from that of the geometric calibration, which has to make up for the correction.
-        correction: Δ.
-        coverage: joint values that were measured; beyond them the correction is an extrapolation.
-        noise: per sensor, its standard deviation [m or rad], or a factor where the rows state it.
+        geometry: geometry fitted together with the correction, which differs from that of the geometric calibration.
+        correction: the joint correction Δ.
+        coverage: measured ranges of joint values; outside them the correction is an extrapolation.
+        noise: standard deviation per sensor [m or rad], or a factor on those that the rows state.
         unknowns: number of parameters and weights.
-        effective: how many of them the data determine (the rest the prior holds).
-        rounds: linearisations made.
-        outliers: rows that counted for less than half, the worst first.
+        effective: effective number of parameters and weights; the others are determined by the prior.
+        rounds: number of linearisations.
+        outliers: rows with less than half of the full weight, the worst first.
     """
 
     geometry: IdentifiedGeometry
@@ -45,14 +45,14 @@ class LearnedPart:
 
 @dataclass(frozen=True, eq=False)
 class HybridResult:
-    """A hybrid calibration: the geometric one, and what was learned beyond it.
+    """A hybrid calibration: the geometric one, and a learned joint correction.
 
     Attributes:
         geometric: the calibration without a correction.
-        learned: the correction; None where there is nothing to learn, and then the geometric calibration holds.
-        uncertainty: of predicted positions.
-        trials: what was tried, in order.
-        verdict: what was kept and why, in a sentence.
+        learned: the correction; None if none was kept, so that the geometric calibration is the result.
+        uncertainty: uncertainty of predicted positions.
+        trials: the trials, in order.
+        verdict: what was kept and why, as a sentence.
     """
 
     geometric: CalibrationResult
@@ -63,18 +63,18 @@ class HybridResult:
 
     @property
     def outliers(self) -> tuple[Outlier, ...]:
-        """Rows that counted for less than half in the calibration that holds, the worst first."""
+        """Rows with less than half of the full weight in the resulting calibration, the worst first."""
         return self.geometric.outliers if self.learned is None else self.learned.outliers
 
     def arm(self) -> HybridArm | None:
-        """The arm with the correction, base of the first frame and tool of the first target; None without one."""
+        """Return the corrected arm with the base of the first frame and the tool of the first target; None without."""
         if self.learned is None:
             return None
         learned = self.learned
         return HybridArm(learned.geometry.robot, learned.correction, learned.coverage)
 
     def predicted_poses(self, measurements: Measurements) -> Float64[Tensor, "rows 4 4"]:
-        """Where the targets were, each in the frame of its row.
+        """Predict the poses of the targets, each in the frame of its row.
 
         Raises:
             IdentificationError: a row has a frame or a target that was not calibrated.
@@ -87,16 +87,16 @@ class HybridResult:
         return predicted_poses(geometry.robot, geometry.bases, geometry.tools, moved)
 
     def errors_of(self, measurements: Measurements) -> dict[str, Float64[Tensor, "rows components"]]:
-        """Measured - predicted of any measurements; see `CalibrationResult.errors_of`."""
+        """Compute measured minus predicted of any measurements; see `CalibrationResult.errors_of`."""
         if self.learned is None:
             return self.geometric.errors_of(measurements)
         T = self.predicted_poses(measurements)
         return measured_errors(T, measurements, self.learned.geometry.unknowns)
 
     def deviation(self, measurements: Measurements) -> Float64[Tensor, "rows 3"]:
-        """Standard deviation of the predicted positions along the axes of the row's frame [m], without noise.
+        """Compute the standard deviation of predicted positions along the axes of the row's frame [m], without noise.
 
-        It is that of the posterior, at measured joint values and beyond them.
+        It is that of the posterior, inside the measured joint ranges and outside.
 
         Raises:
             IdentificationError: nothing was measured in metres.
@@ -104,7 +104,7 @@ class HybridResult:
         return self.uncertainty.deviation(measurements, self._moved_joints(measurements))
 
     def _moved_joints(self, measurements: Measurements) -> Float64[Tensor, "rows dof"]:
-        """Joint values of measured rows with their corrections [rad or m]."""
+        """Compute the joint values of rows with their corrections [rad or m]."""
         if self.learned is None:
             return measurements.q
         with torch.no_grad():

@@ -1,4 +1,4 @@
-"""Which features: kept where the evidence and left-out rows say so."""
+"""Selection of features by evidence and by held-out rows."""
 
 import math
 import time
@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from pisigma.calibration.hybrid.design import FOLDS, FOLDS_OF_FEW, MOST_GROUPS, Design, Rows
+from pisigma.calibration.hybrid.design import FOLDS, FOLDS_OF_FEW, MAX_GROUPS, Design, Rows
 from pisigma.calibration.hybrid.design_regression import AbstractDesignRegression
 from pisigma.calibration.hybrid.regression import extended, regression
 from pisigma.estimation.left_out import LeftOut
@@ -16,52 +16,52 @@ from pisigma.estimation.regression import Posterior
 from pisigma.joint_correction.feature import AbstractFeature
 
 LEVEL = 1.03
-"""Features that the evidence is for are kept unless the left-out RMS rises above so many times the least so far."""
+"""Held-out RMS error over the least so far above which features are rejected despite the evidence."""
 CLEARLY = 5.0
-"""The log evidence has to rise by so much (a Bayes factor of 150: very strong, Kass and Raftery 1995).
+"""Increase of the log evidence needed to keep features (a Bayes factor of 150: very strong, Kass and Raftery 1995).
 
-A threshold of 3 gains nothing where joints err: on 16 to 30 positions of the measured UR5 and UR10 the errors are 0.998
-and 1.001 times those at 5 in the mean of 80 fits each, on 20 to 30 of simulated arms 0.997 and 1.004 (120 fits each).
-On simulated arms of which the geometry alone errs it costs 1.7 %."""
+A threshold of 3 gains nothing for arms with joint errors: on 16 to 30 positions of the measured UR5 and UR10 the errors
+are 0.998 and 1.001 times those at 5 in the mean of 80 fits each, on 20 to 30 of simulated arms 0.997 and 1.004 (120
+fits each). On simulated arms with errors of the geometry alone it costs 1.7 %."""
 CLEAR_GAIN = 1.0
-"""Standard errors by which left-out squares have to be smaller."""
+"""[standard errors] Decrease of the held-out squares that counts as better."""
 STRONGLY = 3.0
-"""A rise of the log evidence that is strong: a Bayes factor of 20, same source."""
-LARGEST_EFFECTIVE_SHARE = 0.75
-"""Unknowns may use up so much of the values, or the noise cannot be separated from them."""
-LARGEST_USUAL_SHARE = 0.97
-"""The same where the sizes of the weights start with the usual ones, which hold what few values do not determine."""
-LEAST_USUAL_SCALE = 0.4
-"""Prior sizes of the geometry, as shares of the stated ones, that are tried where the estimated ones are smaller:
-without features a geometric calibration of few rows takes what they do for noise, and small errors of the geometry for
-none."""
+"""Increase of the log evidence that is strong: a Bayes factor of 20, same source."""
+MAX_EFFECTIVE_SHARE = 0.75
+"""Largest effective number of unknowns per value; with more, they cannot be separated from the noise."""
+MAX_USUAL_SHARE = 0.97
+"""The same if the prior sizes of the weights start with the usual ones, which regularise what few values do not
+determine."""
+MIN_USUAL_SCALE = 0.4
+"""Prior scale of the geometry that is tried too if the estimated one is smaller: without features, a geometric
+calibration of few rows takes their effect for noise, and underestimates small errors of the geometry."""
 USUAL_UPDATES = 5
-"""Updates of the usual sizes: more are not worth their time, as few values say little of them."""
+"""Updates of the usual sizes; few values hardly determine them, so more updates are not useful."""
 ROUGHLY = 1.0
-"""While features are chosen, a log evidence that rises by less has settled."""
+"""Increase of the log evidence per update at convergence during the selection of features."""
 FEW_GROUPS = 200
-"""Up to so many there are more folds."""
+"""Groups up to which there are more folds."""
 FEW_TOGETHER = 60
-"""Up to so many groups all features are tried together as well, from the usual sizes of their weights."""
+"""Groups up to which all features are also tried together, starting with the usual sizes of their weights."""
 FIRST_MODEL_SIZES = 3
-"""A model with all features has one that comes in several sizes in the last of so many."""
-FAILURES = 3
-"""Sizes that do not help before no larger ones are tried."""
+"""Number of the size of a growing feature in a model with all features."""
+MAX_FAILURES = 3
+"""Successive sizes without improvement after which no larger ones are tried."""
 
 Progress = Callable[[str], None]
 
 
 @dataclass(frozen=True)
 class Trial:
-    """One line of the table of what was tried.
+    """One line of the table of trials.
 
     Attributes:
-        name: such as "gravity + series 56 + products".
-        unknowns: how many.
-        log_evidence: up to a constant of the data.
-        left_out: RMS of values left out with their group of rows, in units of the geometric calibration's.
-        seconds: time it took.
-        kept: whether it was better than what was kept before it.
+        name: features, such as "gravity + series 56 + products".
+        unknowns: number of unknowns.
+        log_evidence: log evidence up to a constant of the data.
+        left_out: leave-out RMS error over that of the geometric calibration [1].
+        seconds: duration [s].
+        kept: whether it was better than the best trial before it.
     """
 
     name: str
@@ -74,27 +74,27 @@ class Trial:
 
 @dataclass(frozen=True, eq=False)
 class Fitted:
-    """Some features beside the geometry, fitted.
+    """Fit of the geometry and some features.
 
     Attributes:
         design: the unknowns.
-        posterior: of them.
-        largest_share: of the values that the unknowns may use up.
-        left_out: values of the folds, predicted without them; None where they were not.
+        posterior: their posterior.
+        largest_share: largest allowed effective number of unknowns per value.
+        left_out: leave-out predictions of the folds; None if they were not computed.
     """
 
     design: Design
     posterior: Posterior
-    largest_share: float = LARGEST_EFFECTIVE_SHARE
+    largest_share: float = MAX_EFFECTIVE_SHARE
     left_out: LeftOut | None = None
 
     @property
     def name(self) -> str:
-        """What it has, in a table."""
+        """Labels of its features, for tables."""
         return " + ".join(chosen.label for chosen in self.design.features) or "geometry"
 
     def gain(self, before: "Fitted") -> float:
-        """By how many standard errors left-out squares are smaller than another fit's; 0 where none were left out."""
+        """Compute by how many standard errors the leave-out squares are smaller than another fit's; 0 without any."""
         if self.left_out is None or before.left_out is None:
             return 0.0
         return self.left_out.gain(self.posterior.noise, before.left_out, before.posterior.noise)
@@ -102,14 +102,14 @@ class Fitted:
 
 @dataclass(frozen=True, eq=False)
 class Choice:
-    """What a search came to.
+    """Result of a search.
 
     Attributes:
-        rows: on which features were chosen.
-        geometry: without features.
-        best: with the features that were kept.
-        trials: what was tried, in order.
-        regression: of the rows on the best, where it is at hand.
+        rows: rows used for the selection.
+        geometry: fit without features.
+        best: fit with the features that were kept.
+        trials: the trials, in order.
+        regression: regression of the rows on the best design, if available.
     """
 
     rows: Rows
@@ -120,7 +120,7 @@ class Choice:
 
 
 class Search:
-    """Tries one choice of features after the other on the same rows."""
+    """Tries features one after the other on the same rows."""
 
     def __init__(
         self,
@@ -133,11 +133,11 @@ class Search:
         """Make the regression on all features.
 
         Args:
-            rows: to fit to.
-            noise: of the geometric calibration, per sensor.
-            prior_scale: prior sizes of the geometric calibration.
-            largest: all features that `best` may try, those that are tried in several sizes in the largest.
-            progress: called with what is being tried.
+            rows: the rows.
+            noise: noise of the geometric calibration per sensor.
+            prior_scale: prior scales of the geometric calibration.
+            largest: all features that `best` may try; growing ones in their largest size.
+            progress: called with the current trial.
         """
         self.noise, self.prior_scale = noise, prior_scale
         self.trials: list[Trial] = []
@@ -145,7 +145,7 @@ class Search:
         self.rows = rows
         self._regression = regression(Design(rows.problem, tuple(largest)), rows)
         self._order = [one.name for one in largest]
-        self._folds = rows.folds(FOLDS if rows.groups > FEW_GROUPS else FOLDS_OF_FEW, MOST_GROUPS)
+        self._folds = rows.folds(FOLDS if rows.groups > FEW_GROUPS else FOLDS_OF_FEW, MAX_GROUPS)
         began = time.monotonic()
         self.geometry, self._unit = self.fitted(())
         self._least = self._unit
@@ -154,10 +154,15 @@ class Search:
     def fitted(
         self, features: Sequence[AbstractFeature], near: Fitted | None = None, sizes: Tensor | None = None
     ) -> tuple[Fitted, float]:
-        """Fit geometry and features, from the noise and the prior sizes of another fit; the last sizes may be given.
+        """Fit geometry and features, starting with the noise and prior sizes of another fit.
+
+        Args:
+            features: the features.
+            near: another fit; None to start with those of the geometric calibration.
+            sizes: start values of the last prior sizes.
 
         Returns:
-            The fit, and the root mean square of left-out values over the noise of the geometric calibration.
+            The fit, and the leave-out RMS error over the noise of the geometric calibration.
         """
         design = Design(self.rows.problem, tuple(features))
         noise, prior = self.noise, design.prior(self.prior_scale)
@@ -171,7 +176,7 @@ class Search:
         return Fitted(design, posterior, left_out=errors), errors.rms(posterior.noise, self.noise)
 
     def _note(self, tried: Fitted, share: float, began: float, kept: bool) -> None:
-        """Add a line to the table."""
+        """Add a trial to the table."""
         seconds, evidence = time.monotonic() - began, tried.posterior.log_evidence
         self.trials.append(Trial(tried.name, tried.design.unknowns, evidence, share, seconds, kept))
 
@@ -181,15 +186,15 @@ class Search:
         others: Sequence[AbstractFeature],
         last: Sequence[AbstractFeature] = (),
     ) -> Fitted:
-        """Geometry alone, then other features, then ever larger ones, as long as it gets better.
+        """Select features greedily: other features first, then growing ones as long as they improve the fit.
 
-        One after the other, features of few rows do not stand out from the noise that the others leave; so these are
-        tried all together as well.
+        With few rows, single features cannot be distinguished from the noise that the others cause; so all features are
+        also tried together.
 
         Args:
-            growing: of one name, ever larger.
-            others: tried before them, and those that did not help once more after them.
-            last: tried when everything else is chosen; left-out rows have to be predicted better beyond the scatter.
+            growing: features of one name with increasing sizes.
+            others: features that are tried before these, and again after them if they did not help.
+            last: features that are tried at the end; they must clearly reduce the leave-out errors.
         """
         best = self.geometry
         for chosen in others:
@@ -199,14 +204,14 @@ class Search:
             tried = self._tried([*before, chosen], best)
             failures, grown = (failures + 1, grown) if tried is best else (0, True)
             best = tried
-            if failures == FAILURES:
+            if failures == MAX_FAILURES:
                 break
         for chosen in others if grown else ():
             if chosen not in before:
                 best = self._tried([*best.design.features, chosen], best)
         together = [*others, *growing[:FIRST_MODEL_SIZES][-1:]]
         if len(together) > 1 and self.rows.groups <= FEW_TOGETHER:
-            usual = tuple(max(scale, LEAST_USUAL_SCALE) for scale in self.prior_scale)
+            usual = tuple(max(scale, MIN_USUAL_SCALE) for scale in self.prior_scale)
             for scale in dict.fromkeys((tuple(self.prior_scale), usual)):
                 best = self._from_usual_sizes(together, scale, best)
         for chosen in last:
@@ -216,12 +221,12 @@ class Search:
         return best
 
     def extended(self, best: Fitted, feature: AbstractFeature | None, odds: float = 0.0) -> Choice:
-        """The best so far, or that with a feature that comes out of it.
+        """Finish the search, after trying a feature that was derived from its result.
 
         Args:
-            best: so far.
-            feature: chosen by its gain on the same rows; None for none.
-            odds: logarithm of the prior odds against it, which the evidence has to outweigh.
+            best: the best fit so far.
+            feature: feature that was chosen by its gain on the same rows; None for none.
+            odds: logarithm of the prior odds against it, which the evidence must exceed.
         """
         if feature is not None:
             largest = [*best.design.features, feature]
@@ -240,8 +245,8 @@ class Search:
         odds: float = 0.0,
         least_gain: float = -math.inf,
     ) -> Fitted:
-        """The better of new features and the best so far, by evidence and by left-out rows."""
-        # in the order of the largest design, whose equations then need no copy for all of its features
+        """Return the better of new features and the best fit so far, by evidence and leave-out errors."""
+        # In the order of the largest design: its equations need no copy if all of its features are tried.
         features = sorted(features, key=lambda one: self._order.index(one.name))
         self.progress(" + ".join(chosen.label for chosen in features))
         began = time.monotonic()
@@ -250,7 +255,7 @@ class Search:
             tried.posterior.log_evidence - best.posterior.log_evidence > CLEARLY + odds
             and left_out < self._least * LEVEL
             and tried.gain(best) > least_gain
-            and self._regression.effective_share(tried.posterior) < LARGEST_EFFECTIVE_SHARE
+            and self._regression.effective_share(tried.posterior) < MAX_EFFECTIVE_SHARE
         )
         self._note(tried, left_out / self._unit, began, better)
         if better:
@@ -260,10 +265,10 @@ class Search:
     def _from_usual_sizes(
         self, features: Sequence[AbstractFeature], prior_scale: Sequence[float], best: Fitted
     ) -> Fitted:
-        """The better of all features with weights of about the usual sizes and the best so far.
+        """Return the better of all features with about the usual sizes of the weights and the best fit so far.
 
-        Where something was kept already, strong evidence is enough, as few rows show no more. That there is anything
-        beyond the geometry needs the usual evidence.
+        If features were kept before, strong evidence suffices, because few rows cannot give more. Without any, very
+        strong evidence is needed.
         """
         self.progress(" + ".join(chosen.label for chosen in features))
         began = time.monotonic()
@@ -276,9 +281,9 @@ class Search:
             posterior.log_evidence - best.posterior.log_evidence
             > (STRONGLY if best.design.features else CLEARLY)
             and left_out < self._least * LEVEL
-            and fit.effective_share(posterior) < LARGEST_USUAL_SHARE
+            and fit.effective_share(posterior) < MAX_USUAL_SHARE
         )
-        tried = Fitted(design, posterior, LARGEST_USUAL_SHARE, errors)
+        tried = Fitted(design, posterior, MAX_USUAL_SHARE, errors)
         self._note(tried, left_out / self._unit, began, better)
         if better:
             self._least = min(self._least, left_out)

@@ -1,4 +1,4 @@
-"""All measured values linearised at one point: residuals and their derivatives by geometry and by joint values."""
+"""Linearisation of all measured values at one point: residuals and derivatives by geometry and by joint values."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -14,26 +14,26 @@ from pisigma.joint_correction.feature import AbstractFeature
 from pisigma.measurement.conditions import JointState
 
 Shift = Callable[[JointState], Tensor]
-"""Joint corrections [rad or m] as a function of joint values and what is stated beside them."""
+"""Joint corrections [rad or m] as a function of joint values and stated conditions."""
 
 
 @dataclass(frozen=True, eq=False)
 class SensorValues:
-    """The rows in which one sensor saw something.
+    """The rows with values of one sensor.
 
     Attributes:
-        name: of the sensor.
+        name: name of the sensor.
         row: number of every row in the problem.
         geometry: derivative of the predicted values by the free parameters.
-        joints: the same by the joint values.
+        joints: derivative of the predicted values by the joint values.
         residual: measured minus predicted.
-        root: 1 / standard deviation where the rows state their own, else 1.
-        stated: whether the rows state their own standard deviation.
-        certain: whether the values are certain rather than measured.
-        other_row: of distances between the targets of two rows, the number of the other one; else None.
+        root: 1 / standard deviation if the rows state it, else 1.
+        stated: whether the rows state their standard deviations.
+        certain: whether the values are certain (stated), not measured.
+        other_row: number of the other row for distances between the targets of two rows; else None.
         other_joints: derivative by the joint values of that row.
-        repetition: 1 or more: so many values of one configuration say no more than one, because what the model gets
-            wrong there is the same for several targets (the design effect, Kish 1965).
+        repetition: factor >= 1 on the variance, because values of several targets in one configuration share the
+            errors of the model (design effect, Kish 1965).
     """
 
     name: str
@@ -50,7 +50,7 @@ class SensorValues:
 
     @property
     def sides(self) -> list[tuple[Tensor, Tensor]]:
-        """Rows of the problem, and the derivative by their joint values; two of distances between two rows."""
+        """Rows of the problem and derivatives by their joint values; two for distances between two rows."""
         sides = [(self.row, self.joints)]
         if self.other_row is not None and self.other_joints is not None:
             sides.append((self.other_row, self.other_joints))
@@ -59,23 +59,23 @@ class SensorValues:
     def feature_columns(
         self, chosen: AbstractFeature, state: JointState, rows: slice
     ) -> Float64[Tensor, "values components weights"]:
-        """Derivative of the predicted values by the weights of the used columns of some features.
+        """Compute the derivative of the predicted values by the weights of the used columns of a feature.
 
         Args:
-            chosen: the features.
-            state: of all rows of the problem.
-            rows: which of the rows of this sensor.
+            chosen: the feature.
+            state: joint state of all rows of the problem.
+            rows: the rows of this sensor to use.
         """
         blocks = [weight_columns(joints[rows], chosen, state[row[rows]]) for row, joints in self.sides]
         return blocks[0] if len(blocks) == 1 else blocks[0] + blocks[1]
 
     @property
     def components(self) -> int:
-        """Values a row."""
+        """Number of values per row."""
         return self.residual.shape[1]
 
     def select(self, chosen: Tensor | slice) -> "SensorValues":
-        """Some of the rows, by index or mask."""
+        """Select some of the rows, by index or mask."""
         return replace(
             self,
             row=self.row[chosen],
@@ -88,16 +88,16 @@ class SensorValues:
         )
 
     def weighted(self, weight: Float64[Tensor, " values"]) -> "SensorValues":
-        """The same with rows that count more or less; those that do not count at all are left out."""
+        """Multiply the weights of the rows; rows with weight 0 are removed."""
         kept = weight > 0
         return replace(self.select(kept), root=(self.root * weight.sqrt())[kept])
 
     def collapsed(self, pose: Int64[Tensor, " rows"]) -> "SensorValues":
-        """Repeats of a pose as one row that counts for all of them.
+        """Join repeats of a pose to one row with the sum of their weights.
 
-        What a model gets wrong at a pose is the same in all its repeats; counted one by one they would say
-        more than they do. Rows of a pose that see something else of it, such as touches along another axis or
-        distances from another anchor, have other derivatives and stay apart.
+        Repeats of a pose share the errors of the model, so they are not independent. Rows of a pose that measure
+        something different, such as touches along another axis or distances from another anchor, have other derivatives
+        and remain separate.
         """
         if not len(self.row) or self.other_row is not None:
             return self
@@ -125,7 +125,7 @@ class SensorValues:
         )
 
     def shared(self, configuration: Int64[Tensor, " rows"]) -> "SensorValues":
-        """The same with rows that count less where the residuals of several targets of a configuration are alike."""
+        """Reduce the weights if the residuals of several targets in a configuration are correlated."""
         if not len(self.row) or self.certain or self.other_row is not None:
             return self
         key = renumbered(configuration[self.row])
@@ -141,7 +141,8 @@ class SensorValues:
         return replace(self, repetition=repetition, root=self.root * repetition**-0.5)
 
     def _sights(self) -> Int64[Tensor, " values"]:
-        """Number of every row's derivatives among the different ones."""
+        """Number the rows by their derivatives, equal for equal ones."""
+        # A fixed generic linear combination distinguishes derivatives, up to rounding.
         key = self.geometry.new_zeros(len(self.row))
         for J in (self.geometry.flatten(1), self.joints.flatten(1)):
             key = key + J @ torch.arange(1, J.shape[1] + 1).to(J).sin()
@@ -151,12 +152,12 @@ class SensorValues:
 def weight_columns(
     joints: Float64[Tensor, "values components dof"], chosen: AbstractFeature, state: JointState
 ) -> Float64[Tensor, "values components _weights"]:
-    """Derivative by the weights of the used columns of some features, side by side for all joints.
+    """Compute the derivative by the weights of the used columns of a feature, concatenated for all joints.
 
     Args:
         joints: derivative by the joint values.
-        chosen: the features.
-        state: of every row.
+        chosen: the feature.
+        state: joint state of every row.
     """
     used = chosen.used.flatten()
     block = (joints[..., None] * chosen.columns(state)[:, None]).flatten(2)
@@ -171,7 +172,7 @@ def sensor_values(
     Args:
         problem: rows, sensors and free parameters.
         point: values of all parameters.
-        shift: joint corrections that are in force already; None for none.
+        shift: joint corrections at the point; None for none.
     """
     robot = problem.space.robot
     moved = problem if shift is None else replace(problem, q=problem.q + shift(problem.state))
@@ -210,7 +211,7 @@ def sensor_values(
 
 
 def joint_columns(space: ParameterSpace) -> Int64[Tensor, " dof"]:
-    """Which parameter moves like the value of every joint: theta of turning, d of sliding ones."""
+    """Return the parameter that acts like every joint value: theta of revolute, d of prismatic joints."""
     robot = space.robot
     return torch.tensor(
         [5 * row + (0 if turns else 1) for row, turns in zip(robot.joint_rows, robot.revolute, strict=True)]

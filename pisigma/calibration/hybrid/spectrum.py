@@ -1,4 +1,4 @@
-"""Lines in the spectrum of the joints' errors: fast harmonics that stand out of what a first model leaves."""
+"""Lines in the spectrum of joint errors: high harmonics in the residuals of a first model."""
 
 import math
 
@@ -11,34 +11,34 @@ from pisigma.estimation.regression import Posterior
 from pisigma.joint_correction.feature import turning_rate
 
 HIGHEST = 3_000
-"""[cycles a turn] Motors of 10 pairs of poles behind gears of 1:101 cog with 2,020; 0.1 mrad shift the phase of the
-highest order by 0.3 rad."""
-MOST_LINES = 8
-"""Of a joint."""
+"""[1/turn] Motors with 10 pole pairs and gears of 1:101 have cogging at 2,020; an error of 0.1 mrad shifts the phase of
+the highest order by 0.3 rad."""
+MAX_LINES = 8
+"""Lines per joint."""
 ALIKE = 0.9
-"""Harmonics whose sines have this correlation at the measured joint values cannot be told apart."""
+"""Correlation of two harmonics at the measured joint values above which they cannot be distinguished."""
 BLOCK = 64
-"""Powers of `exp(i angle)` that are made one by one; the others are their products."""
+"""Powers of `exp(i angle)` that are computed directly; the others are products of these."""
 
 
 def lines(design: Design, rows: Rows, posterior: Posterior, lowest: int) -> tuple[tuple[int, ...], ...]:
-    """Orders of the lines of every joint, the strongest first.
+    """Find the orders of the lines of every joint, the strongest first.
 
-    The periodogram of unevenly sampled values (Scargle 1982, The Astrophysical Journal 263, 835-853) of what the joints
-    would have to turn for the rest to vanish: by how much sine and cosine of an order raise the log likelihood.
-    Of pure noise the gain is exponential with mean 1; the mean is taken from the median, as noise that the joints
-    themselves make is larger than what the sensors' noise says. Orders whose gain outweighs the odds against them are
-    lines more likely than not, and these predict best (the median probability model: Barbieri and Berger 2004, The
-    Annals of Statistics 32(3), 870-897). Whether there are lines at all the evidence for all of them together says.
+    The periodogram of unevenly sampled values (Scargle 1982, The Astrophysical Journal 263, 835-853) of the joint
+    motions that would cancel the residuals gives the increase of the log likelihood by sine and cosine of each order.
+    For pure noise, this gain has an exponential distribution with mean 1. The mean is estimated from the median,
+    because joints cause noise in addition to that of the sensors. Orders whose gain exceeds the prior odds against them
+    are lines with a probability above 1/2, and these predict best (median probability model: Barbieri and Berger 2004,
+    The Annals of Statistics 32(3), 870-897). The evidence for all of them together decides whether there are lines.
 
     Args:
-        design: of a first model.
-        rows: linearised.
-        posterior: of the first model.
-        lowest: [cycles a turn] Harmonics from here on.
+        design: design of a first model.
+        rows: linearised rows.
+        posterior: posterior of the first model.
+        lowest: lowest order [1/turn].
 
     Returns:
-        Per joint, in cycles a turn (of a prismatic joint, in twice its travel).
+        Orders per joint [1/turn] (for a prismatic joint per twice its travel).
     """
     slope, curvature = _slope_and_curvature(design, rows, posterior)
     angle = design.problem.q * torch.from_numpy(turning_rate(design.problem.space.robot)).to(slope)
@@ -48,14 +48,14 @@ def lines(design: Design, rows: Rows, posterior: Posterior, lowest: int) -> tupl
 
 
 def odds_against_a_line(joints: int) -> float:
-    """Logarithm of the number of orders of all joints, any of which may be a line."""
+    """Return the logarithm of the number of orders of all joints, any of which may be a line."""
     return math.log(joints * HIGHEST)
 
 
 def _slope_and_curvature(
     design: Design, rows: Rows, posterior: Posterior
 ) -> tuple[Float64[Tensor, "rows dof"], Float64[Tensor, "rows dof"]]:
-    """First and minus second derivative of the log likelihood of every row by its joint values."""
+    """Compute the first and minus the second derivative of every row's log likelihood by its joint values."""
     slope, curvature = torch.zeros_like(design.problem.q), torch.zeros_like(design.problem.q)
     for sensor, sigma in zip(rows.values, posterior.noise, strict=True):
         if not sensor.certain:
@@ -74,16 +74,17 @@ def _lines_of_joint(
     lowest: int,
     least: float,
 ) -> tuple[int, ...]:
-    """Orders whose gain is the largest and beyond `least`, one after the other."""
+    """Find the orders with the largest gains above `least` one by one, subtracting each from the residuals."""
     G = _sums(angle, curvature, 2 * HIGHEST + 1)
-    candidates = _told_apart(G, lowest)
+    candidates = _distinguishable(G, lowest)
     if not bool(candidates.any()):
         return ()
     total, G2 = G[0].real, G[: 2 * HIGHEST + 1 : 2]
+    # Weighted sums of sin², cos² and sin·cos of every order k, from `exp(2ik angle)`.
     ss, cc, sc = (total - G2.real) / 2, (total + G2.real) / 2, G2.imag / 2
     determinant = ss * cc - sc.square()
     orders: list[int] = []
-    while len(orders) < MOST_LINES:
+    while len(orders) < MAX_LINES:
         P = _sums(angle, slope, HIGHEST + 1)
         sine, cosine = (
             (cc * P.imag - sc * P.real) / determinant,
@@ -91,7 +92,9 @@ def _lines_of_joint(
         )
         gain = torch.where(candidates, (sine * P.imag + cosine * P.real) / 2, 0.0)
         order = int(gain.argmax())
-        chance = max(float(gain[candidates].median()) / math.log(2), 1.0)
+        chance = max(
+            float(gain[candidates].median()) / math.log(2), 1.0
+        )  # mean of an exponential distribution
         if float(gain[order]) < least * chance:
             break
         orders.append(order)
@@ -100,12 +103,12 @@ def _lines_of_joint(
     return tuple(orders)
 
 
-def _told_apart(G: Complex128[Tensor, " _orders"], lowest: int) -> Bool[Tensor, " _orders"]:
-    """Which orders are judged: where joint values stand on a grid, up to half of the harmonic that is constant there.
+def _distinguishable(G: Complex128[Tensor, " _orders"], lowest: int) -> Bool[Tensor, " _orders"]:
+    """Say which orders can be distinguished: on a grid of joint values, up to half of the harmonic that is constant.
 
     Args:
-        G: sums of the curvature times powers of `exp(i angle)`; near G_0 where powers are the same at all values.
-        lowest: the first order; a joint whose values are too near to each other to tell its powers apart has none.
+        G: sums of the curvature times powers of `exp(i angle)`, near G_0 for powers that are equal at all values.
+        lowest: lowest order; a joint whose values are too near to each other has no distinguishable orders.
     """
     orders = torch.arange(HIGHEST + 1)
     constant = (G.abs() > ALIKE * G[0].real).nonzero()[:, 0]
@@ -117,7 +120,7 @@ def _told_apart(G: Complex128[Tensor, " _orders"], lowest: int) -> Bool[Tensor, 
 def _sums(
     angle: Float64[Tensor, " rows"], values: Float64[Tensor, " rows"], count: int
 ) -> Complex128[Tensor, " count"]:
-    """`Σ values · exp(i k angle)` for k = 0 … count - 1, as products of powers up to `BLOCK` and of multiples of it."""
+    """Compute `Σ values · exp(i k angle)` for k = 0 … count - 1 from powers up to `BLOCK` and of its multiples."""
     few = torch.exp(1j * angle[:, None] * torch.arange(BLOCK))
     steps = torch.exp(1j * BLOCK * angle * torch.arange(-(-count // BLOCK))[:, None])
     return ((steps * values) @ few).flatten()[:count]

@@ -1,4 +1,4 @@
-"""Standard deviations of predicted positions, from the posterior of parameters and weights."""
+"""Standard deviations of predicted positions from the posterior of parameters and weights."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -9,7 +9,7 @@ from torch import Tensor
 
 from pisigma.calibration.geometric.problem.parameters import ParameterSpace
 from pisigma.calibration.geometric.problem.setup import IdentifiedGeometry
-from pisigma.calibration.hybrid.design import FOLDS, FOLDS_OF_FEW, MOST_GROUPS, Design, Rows
+from pisigma.calibration.hybrid.design import FOLDS, FOLDS_OF_FEW, MAX_GROUPS, Design, Rows
 from pisigma.calibration.hybrid.design_regression import AbstractDesignRegression
 from pisigma.calibration.hybrid.sensor_values import joint_columns, weight_columns
 from pisigma.estimation.covariance_root import CovarianceRoot
@@ -24,28 +24,29 @@ from pisigma.robot.kinematics.parameter_jacobian import identification_jacobian
 CHUNK = 128
 """Rows whose columns are in memory at a time."""
 FEW_GROUPS = 600
-"""Up to so many, noise and prior sizes are estimated anew for every fold that is left out."""
+"""Groups up to which noise and prior sizes are estimated again for every fold that is left out."""
 VERY_FEW_GROUPS = 60
-"""Up to so many, `FOLDS_OF_FEW` folds are left out: without a quarter of so few rows a calibration is much worse than
-with all of them, so that its errors say little of theirs."""
+"""Groups up to which `FOLDS_OF_FEW` folds are left out: without a quarter of so few rows a calibration is much worse
+than with all of them, so its errors are not representative."""
 FOLD_UPDATES, FEWER_UPDATES, SOME_GROUPS = 3, 1, 150
-"""Updates of noise and prior sizes then, and of more than so many groups: with one update 0.9 % fewer of 30 rows lie in
-the predicted 95 %, 0.4 % of 100 rows and 0.3 % of 300 rows; a fit of these takes four fifths of the time with it."""
+"""Updates of noise and prior sizes for every fold, the same for more groups, and the number of groups between both.
+With one update, 0.9 % fewer of 30 rows are in the predicted 95 % intervals, 0.4 % of 100 rows and 0.3 % of 300 rows;
+fitting these then takes four fifths of the time."""
 
 
 @dataclass(frozen=True, eq=False)
 class PositionUncertainty:
-    """Standard deviations of positions: `sqrt(x C x^T)` with x the derivative of a coordinate by all unknowns.
+    """Standard deviations of positions: `sqrt(x C x^T)` with the derivative x of a coordinate by all unknowns.
 
     Attributes:
         space: the parameters.
-        geometry: where the derivative is taken.
-        features: what the weights belong to.
-        covariance_root: `R` with `C = R R^T`, of all parameters of the space (0 for those that were not free) and then
-            all weights, scaled so that left-out rows are missed by as much as it says.
-        prior_scale: factor on the variances that this took.
-        noise: per sensor, its standard deviation [m or rad], or a factor where the rows state it; empty in folders from
-            before it was kept.
+        geometry: geometry at which the derivative is taken.
+        features: features of the weights.
+        covariance_root: `R` with `C = R R^T` for all parameters of the space (0 for those that were not free), followed
+            by all weights, scaled so that predicted and observed leave-out errors agree.
+        prior_scale: factor on the variances by this scaling.
+        noise: standard deviation per sensor [m or rad], or a factor on those that the rows state; empty in folders of
+            earlier versions.
     """
 
     space: ParameterSpace
@@ -57,17 +58,17 @@ class PositionUncertainty:
 
     @property
     def root(self) -> Float64[Tensor, "unknowns directions"]:
-        """R as a matrix."""
+        """Root `R` as a dense matrix."""
         return self.covariance_root.dense
 
     def deviation(
         self, measurements: Measurements, q_moved: Float64[Tensor, "rows dof"]
     ) -> Float64[Tensor, "rows 3"]:
-        """Standard deviation of every row's position along the axes of its frame [m].
+        """Compute the standard deviation of every row's position along the axes of its frame [m].
 
         Args:
             measurements: joint values, frames and targets.
-            q_moved: the joint values with their corrections.
+            q_moved: joint values with their corrections [rad or m].
         """
         state = JointState.of(measurements)
         frame = numbers_of(measurements.frame, self.space.frames, measurements.rows)
@@ -89,11 +90,11 @@ class PositionUncertainty:
     def columns(
         self, state: JointState, q_moved: Float64[Tensor, "rows dof"], frame: int = 0, target: int = 0
     ) -> Float64[Tensor, "rows 6 unknowns"]:
-        """Derivative of position [m] and rotation vector [rad] of a target in a frame by all unknowns.
+        """Compute the derivative of position [m] and rotation vector [rad] of a target in a frame by all unknowns.
 
         Args:
-            state: commanded joint values, and what is stated beside them.
-            q_moved: the joint values with their corrections.
+            state: commanded joint values and stated conditions.
+            q_moved: joint values with their corrections [rad or m].
             frame: number of the frame.
             target: number of the target.
         """
@@ -123,20 +124,21 @@ def position_uncertainty(
     geometry: IdentifiedGeometry,
     left_out: LeftOut | None = None,
 ) -> PositionUncertainty:
-    """Of the positions that a posterior predicts, scaled by what left-out rows show.
+    """Compute the uncertainty of positions predicted by a posterior, scaled by leave-out errors.
 
     Args:
         rows: linearised values.
         design: the unknowns.
-        fit: regression of the rows on them.
-        posterior: of them.
-        geometry: in the user's coordinates.
-        left_out: values left out of this fit, where they are at hand; used where their sizes need no estimate anew.
+        fit: regression of the rows on the unknowns.
+        posterior: posterior of the unknowns.
+        geometry: geometry in the user's coordinates.
+        left_out: leave-out predictions of this fit, if available; used if there are too many groups to estimate noise
+            and prior sizes again for every fold.
     """
-    folds = rows.folds(FOLDS if rows.groups > VERY_FEW_GROUPS else FOLDS_OF_FEW, MOST_GROUPS)
+    folds = rows.folds(FOLDS if rows.groups > VERY_FEW_GROUPS else FOLDS_OF_FEW, MAX_GROUPS)
     if rows.groups <= FEW_GROUPS:
         updates = FOLD_UPDATES if rows.groups <= SOME_GROUPS else FEWER_UPDATES
-        missed = fit.left_out_anew(posterior, folds, updates)
+        missed = fit.left_out_refitted(posterior, folds, updates)
     else:
         missed = left_out or fit.left_out(posterior, folds)
     prior_scale = left_out_scale(missed)

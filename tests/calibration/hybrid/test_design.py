@@ -53,7 +53,7 @@ def test_the_correction_is_the_weighted_sum_of_the_used_columns(arm: LinearisedA
     q = drawn_joints(robot, 6, 4)
     made = JointCorrection(robot, design.features).requires_grad_(False)
     for number, chosen in enumerate(design.features):
-        made.linear[number][chosen.used] = x[design.stretch(number)]
+        made.linear[number][chosen.used] = x[design.weights_of(number)]
     assert_close(design.correction(x, JointState(q)), made(q), atol=1e-13)
 
 
@@ -95,7 +95,7 @@ def test_columns_that_a_joint_does_not_have_get_no_unknown(arm: LinearisedArm) -
     weight = torch.randn(gravity.used.shape, generator=torch.Generator().manual_seed(0)).double()
     delta = (gravity.columns(JointState(q)) * weight * gravity.used).sum(-1)
     expected = (arm.rows.values[0].joints[:5] @ delta[..., None])[..., 0]
-    assert_close(columns[..., design.stretch(0)] @ weight[gravity.used], expected, atol=1e-13)
+    assert_close(columns[..., design.weights_of(0)] @ weight[gravity.used], expected, atol=1e-13)
 
 
 def test_prior_has_a_size_for_every_class_and_every_group_of_weights(arm: LinearisedArm) -> None:
@@ -107,15 +107,15 @@ def test_prior_has_a_size_for_every_class_and_every_group_of_weights(arm: Linear
     active = slice(0, design.active)
     expected = problem.precision[problem.active] / prior.sizes[problem.prior_group].square()
     assert_close(prior.precision[active], expected, rtol=1e-14)
-    assert prior.group[design.stretch(0)].unique().tolist() == [4]
-    assert prior.group[design.stretch(1)].unique().tolist() == [5]
-    assert prior.group[design.stretch(2)].view(4, 6).tolist() == [[6, 7, 8] * 2] * 4
+    assert prior.group[design.weights_of(0)].unique().tolist() == [4]
+    assert prior.group[design.weights_of(1)].unique().tolist() == [5]
+    assert prior.group[design.weights_of(2)].view(4, 6).tolist() == [[6, 7, 8] * 2] * 4
 
 
 def test_weights_of_a_sliding_joint_count_in_radians_times_the_reach(arm: LinearisedArm) -> None:
     robot = arm.rows.problem.space.robot
     design = Design(arm.rows.problem, (FourierSeries(robot, 1),))
-    base = design.prior((1.0,) * 4).base[design.stretch(0)].view(4, 2)
+    base = design.prior((1.0,) * 4).base[design.weights_of(0)].view(4, 2)
     turning = torch.tensor(robot.revolute)
     assert_close(base[turning], torch.ones(3, 2))
     assert_close(base[~turning], torch.full((1, 2), robot.reach**-2), rtol=1e-6)

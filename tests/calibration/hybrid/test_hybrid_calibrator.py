@@ -12,6 +12,7 @@ from testing.closeness import assert_close
 from testing.linearised import drawn_joints, tracker_data
 from testing.models import no_type_checker
 from testing.rb5_with_all_errors import NOISE, SimulatedTracker, simulated_tracker
+from testing.refusals import refused
 from testing.sensors import pair_data, socket_data, touch_data, true_robot
 
 from pisigma.calibration.geometric.calibrator import GeometricCalibrator
@@ -61,7 +62,8 @@ def test_all_errors_of_a_simulated_robot_are_learned_from_150_positions() -> Non
     assert 0.5 * NOISE < result.learned.noise["position"] < 1.5 * NOISE
     assert 0 < result.learned.effective < result.learned.unknowns
     assert result.learned.rounds >= 1
-    assert "A joint correction was kept (gravity" in result.verdict
+    assert any(trial.kept for trial in result.trials[1:])
+    assert "gravity" in [feature.name for feature in result.learned.correction.features]
 
 
 def test_95_percent_intervals_cover_about_as_many_new_poses() -> None:
@@ -79,7 +81,7 @@ def test_errors_of_geometry_alone_leave_the_geometric_calibration_as_it_is() -> 
     simulated, result = fitted(geometry_only=True)
     assert result.learned is None
     assert result.arm() is None
-    assert "geometric calibration stands" in result.verdict
+
     alone = GeometricCalibrator(simulated.robot).fit(simulated.train)
     assert_close(result.geometric.robot.dh, alone.robot.dh, atol=1e-12)
     assert_close(
@@ -245,17 +247,12 @@ def test_gravity_may_point_elsewhere() -> None:
 
 
 @pytest.mark.parametrize(
-    ("options", "sentence"),
-    [
-        ({"features": ("serie",)}, "'serie' is no choice; did you mean 'series'"),
-        ({"harmonics": ()}, "whole numbers of at least 1 were wanted"),
-        ({"harmonics": (0, 8)}, "whole numbers of at least 1 were wanted"),
-    ],
+    ("option", "given", "value"),
+    [("features", ("serie",), "serie"), ("harmonics", (), ()), ("harmonics", (0, 8), (0, 8))],
 )
-def test_choices_that_do_not_exist_are_refused(options: dict[str, object], sentence: str) -> None:
-    with pytest.raises(IdentificationError) as refused:
-        calibrator(Robot.load("rb5"), **options)
-    assert sentence.lower() in str(refused.value).lower()
+def test_invalid_settings_are_refused(option: str, given: tuple[object, ...], value: object) -> None:
+    with refused(IdentificationError, option=option, value=value):
+        calibrator(Robot.load("rb5"), **{option: given})
 
 
 def test_harmonics_do_not_matter_without_a_series() -> None:

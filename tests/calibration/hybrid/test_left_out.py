@@ -47,8 +47,8 @@ def test_sizes_and_noise_can_be_estimated_anew_for_every_fold(form: str) -> None
     case = poses()
     folds = case.rows.folds(3, 1000)
     fit: AbstractDesignRegression = FORMS[form].of(case.design, case.rows)
-    found = fit.left_out_anew(fit.solve(case.prior, case.noise), folds, 3)
-    expected = case.dense.left_out_anew(case.dense.solve(case.prior, case.noise), folds, 3)
+    found = fit.left_out_refitted(fit.solve(case.prior, case.noise), folds, 3)
+    expected = case.dense.left_out_refitted(case.dense.solve(case.prior, case.noise), folds, 3)
     assert_close(found.error, expected.error, atol=1e-4)
     assert_close(found.spread, expected.spread, rtol=1e-4)
     held = fit.left_out(fit.solve(case.prior, case.noise), folds)
@@ -66,7 +66,7 @@ def test_the_noise_of_a_sensor_stands_of_which_a_fold_takes_all_values(form: str
     posterior = fit.solve(case.prior, case.noise)
     rest = fit.without(wire).maximise_evidence(posterior.prior, posterior.noise, 2)
     assert rest.noise[number] == case.noise[number]
-    errors = fit.left_out_anew(posterior, [wire], 2)
+    errors = fit.left_out_refitted(posterior, [wire], 2)
     assert float(errors.error.square().mean()) < 4.0
 
 

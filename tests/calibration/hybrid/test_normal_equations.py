@@ -127,7 +127,7 @@ def test_equal_columns_without_a_prior_are_still_solved() -> None:
 def test_values_that_are_not_finite_are_refused() -> None:
     sums = NormalEquations.of(poses().design, poses().rows)
     broken = replace(sums, normal=sums.normal * float("nan"))
-    with pytest.raises(IdentificationError, match="not finite"):
+    with pytest.raises(IdentificationError):
         broken.solve(poses().prior, poses().noise)
 
 

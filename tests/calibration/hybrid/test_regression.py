@@ -26,7 +26,7 @@ def test_very_many_values_have_no_covariance(monkeypatch: pytest.MonkeyPatch) ->
     """It would be too large; the posterior is the same."""
     case = few_values()
     small = regression(case.design, case.rows)
-    monkeypatch.setattr("pisigma.calibration.hybrid.regression.MOST_VALUES", 10)
+    monkeypatch.setattr("pisigma.calibration.hybrid.regression.MAX_VALUES", 10)
     large = regression(case.design, case.rows)
     assert isinstance(large, NormalEquations)
     x, other = (fit.maximise_evidence(case.prior, case.noise).x for fit in (small, large))

@@ -8,7 +8,7 @@ import torch
 from testing.closeness import assert_close
 from testing.linearised import LinearisedArm, drawn_joints, linearised, tracker_data
 
-from pisigma.calibration.hybrid.search import CLEAR_GAIN, CLEARLY, LARGEST_USUAL_SHARE, Search
+from pisigma.calibration.hybrid.search import CLEAR_GAIN, CLEARLY, MAX_USUAL_SHARE, Search
 from pisigma.joint_correction.fourier_series import FourierSeries
 from pisigma.joint_correction.gravity_torques import GravityTorques
 from pisigma.joint_correction.input_products import InputProducts
@@ -112,7 +112,7 @@ def test_few_rows_are_fitted_with_all_features_from_usual_sizes() -> None:
     search = search_of(rows_of(gravity + gears, q))
     best = search.best(SERIES, [SMALL])
     assert best.name == "gravity + series 6"
-    assert best.largest_share == LARGEST_USUAL_SHARE
+    assert best.largest_share == MAX_USUAL_SHARE
     *before, together, wider = search.trials
     assert not wider.kept  # the geometry is as drawn here
     assert together.log_evidence > max(line.log_evidence for line in before) + CLEARLY

@@ -111,7 +111,7 @@ def uncertainty(arm: LinearisedArm) -> tuple[PositionUncertainty, Fitted, JointC
     )
     correction = JointCorrection(robot, fitted.design.features).requires_grad_(False)
     for k, chosen in enumerate(fitted.design.features):
-        correction.linear[k][chosen.used] = fitted.posterior.x[fitted.design.stretch(k)]
+        correction.linear[k][chosen.used] = fitted.posterior.x[fitted.design.weights_of(k)]
     return found, fitted, correction
 
 

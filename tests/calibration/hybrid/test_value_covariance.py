@@ -78,7 +78,7 @@ def test_values_that_are_not_finite_are_refused() -> None:
     case = few_values()
     found = ValueCovariance.of(case.design, case.rows)
     found.X[3] = torch.nan
-    with pytest.raises(IdentificationError, match="not finite"):
+    with pytest.raises(IdentificationError):
         found.solve(case.prior, case.noise)
 
 
