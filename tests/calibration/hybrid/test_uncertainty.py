@@ -17,7 +17,7 @@ from pisigma.calibration.geometric.problem.setup import identified_geometry
 from pisigma.calibration.hybrid.regression import NormalEquations
 from pisigma.calibration.hybrid.search import Fitted
 from pisigma.calibration.hybrid.uncertainty import PositionUncertainty, position_uncertainty
-from pisigma.estimation.left_out import LARGEST_SCALE, LeftOut, left_out_scale
+from pisigma.estimation.left_out import MAX_SCALE, LeftOut, left_out_scale
 from pisigma.estimation.prior import GaussianPrior
 from pisigma.estimation.regression import MIN_EFFECTIVE, root_of_sizes
 from pisigma.joint_correction.fourier_series import FourierSeries
@@ -89,7 +89,7 @@ def test_errors_as_small_as_predicted_widen_nothing_and_there_is_a_limit() -> No
     spread = 1 + normal(500, seed=0).abs()
     assert left_out_scale(missed(0.9 * normal(500, seed=1), spread)) == 1.0
     hopeless = left_out_scale(missed(100 + spread, torch.ones_like(spread)))
-    assert_close(hopeless, LARGEST_SCALE, rtol=1e-9)
+    assert_close(hopeless, MAX_SCALE, rtol=1e-9)
 
 
 @pytest.fixture(scope="module")
