@@ -1,4 +1,4 @@
-"""Arguments and options that several commands share, and what shells complete in them."""
+"""Arguments and options that several commands share, and their completion in shells."""
 
 from pathlib import Path
 from typing import Annotated
@@ -14,7 +14,7 @@ def complete_robot(incomplete: str) -> list[str]:
 
 
 def complete_model(incomplete: str) -> list[str]:
-    """Model folders, and folders on the way to them."""
+    """Model folders, and folders that lead to them."""
     written = Path(incomplete)
     parent = written if incomplete.endswith("/") else written.parent
     folders = [path for path in parent.glob("*/") if str(path).startswith(incomplete.removesuffix("/"))]
@@ -33,25 +33,31 @@ def complete_export(incomplete: str) -> list[str]:
 ModelFolder = Annotated[Path, typer.Argument(help="Model folder.", autocompletion=complete_model)]
 """The argument of commands that read one model."""
 
-AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
-"""The option of all commands that programs call."""
+Verbose = Annotated[bool, typer.Option("--verbose", help="Print all tables and remarks.")]
+"""The option of commands that print many figures."""
 
-Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace the model that the folder holds.")]
+AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
+"""The option of all commands that other programs call."""
+
+Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace the model in the folder.")]
 """The option of commands that write a model folder."""
 
 PayloadKg = Annotated[
     float | None,
-    typer.Option(help="Payload of the robot [kg], if the model learned what that does. [default: the usual]"),
+    typer.Option(help="Payload of the robot [kg], for models that learned its effect. [default: the usual]"),
 ]
 TemperatureC = Annotated[
-    float | None, typer.Option(help="Temperature of the robot [deg C], likewise. [default: the usual]")
+    float | None,
+    typer.Option(
+        help="Temperature of the robot [deg C], for models that learned its effect. [default: the usual]"
+    ),
 ]
 
 AcceptImplausible = Annotated[
     bool,
     typer.Option(
         "--accept-implausible",
-        help="Write the model also where the result must not be trusted; its card says why.",
+        help="Write the model even if the result must not be trusted.",
     ),
 ]
 """The option of commands that check a model before they write it."""

@@ -1,5 +1,6 @@
 """`pisigma calibrate`: geometric or hybrid calibration of measured data."""
 
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -9,6 +10,7 @@ from pisigma.cli.arguments import (
     AcceptImplausible,
     AsJson,
     Overwrite,
+    Verbose,
     complete_model,
     complete_robot,
 )
@@ -16,12 +18,10 @@ from pisigma.cli.lifetime.recalibrate import recalibrate_into
 from pisigma.cli.output import (
     command_line,
     print_json,
-    print_line,
-    print_lines,
-    print_table,
-    progress_of,
     saved,
 )
+from pisigma.cli.progress import progress_of
+from pisigma.cli.screen import Block, print_screen, sentences, table
 from pisigma.cli.settings_options import takes_settings
 from pisigma.workflow.settings.calibration import CalibrationSettings
 from pisigma.workflow.settings.recalibration import RecalibrationSettings
@@ -35,23 +35,17 @@ RobotName = Annotated[
         metavar="ROBOT", help="Catalogue name or robot file (YAML or URDF).", autocompletion=complete_robot
     ),
 ]
-Data = Annotated[
-    list[Path], typer.Argument(metavar="DATA...", help="Measurements (CSV), in one file or several.")
-]
+Data = Annotated[list[Path], typer.Argument(metavar="DATA...", help="Measurements (CSV), one or more files.")]
 Out = Annotated[Path, typer.Option(help="Model folder to write.")]
-Base = Annotated[str | None, typer.Option(help="Of a URDF file: link that is the base. [default: its root]")]
-Tip = Annotated[
-    str | None, typer.Option(help="Of a URDF file: link that is the tool. [default: its only leaf]")
-]
+Base = Annotated[str | None, typer.Option(help="Base link of a URDF file. [default: its root]")]
+Tip = Annotated[str | None, typer.Option(help="Tool link of a URDF file. [default: its only leaf]")]
 Prior = Annotated[
     Path | None,
     typer.Option(
-        help="Model folder of `pisigma fleet prior` to begin with; left-out rows decide whether it helps. "
-        "Options that say how to calibrate or to validate do not go with it.",
+        help="Start from this model folder of `pisigma fleet prior` where that predicts held-out rows better.",
         autocompletion=complete_model,
     ),
 ]
-Verbose = Annotated[bool, typer.Option("--verbose", help="Print all parameters.")]
 
 
 @takes_settings
@@ -69,10 +63,10 @@ def calibrate(
     verbose: Verbose = False,
     as_json: AsJson = False,
 ) -> None:
-    """Calibrate a robot from measurements and write it as a model folder with card and figures.
+    """Calibrate a robot from measurements and write a model folder with card and figures.
 
-    Geometry, base and tool, and with them a correction of the joints where it predicts left-out rows better. Exit
-    status 3, and no folder, where the result must not be trusted.
+    Estimates geometry, base, tool and, where it predicts held-out rows better, a joint correction. Exits with status 3
+    and writes no folder where the result must not be trusted.
     """
     from pisigma.files.output_folder import check_folder
     from pisigma.robot.description import Robot
@@ -86,7 +80,7 @@ def calibrate(
         settings.check_unused()
         again = RecalibrationSettings(cameras=settings.cameras)
         return recalibrate_into(
-            context, prior, data, again, out, accept_implausible, overwrite, as_json, drawn=nominal
+            context, prior, data, again, out, accept_implausible, overwrite, as_json, verbose, drawn=nominal
         )
     with progress_of("calibrate") as progress:
         calibration = workflow.calibrate(nominal, data, settings, progress)
@@ -98,66 +92,97 @@ def calibrate(
 
 
 def print_calibration(
-    summary: "CalibrationSummary", folder: Path | None, seconds: float, verbose: bool = False
+    summary: "CalibrationSummary",
+    folder: Path | None,
+    seconds: float,
+    verbose: bool = False,
+    also: Sequence[Block] = (),
 ) -> None:
-    """Print for people what a calibration gave: accuracy and verdict first, then parameters.
+    """Print a calibration for people: the verdict, warnings, and errors of held-out rows.
 
     Args:
         summary: its figures.
         folder: where the model was written; None where it was not.
         seconds: time it took [s].
-        verbose: print all parameters, not only those that were estimated.
+        verbose: print all tables and all parameters.
+        also: what a command prints in addition.
     """
     from pisigma.reporting import calibration_tables as tables
+    from pisigma.reporting.calibration_verdict import (
+        POSSIBLE_SCALE,
+        calibration_verdict,
+        scale_error,
+        scale_matters,
+        scale_text,
+    )
 
-    print_lines(f"Implausible: {line}" for line in tables.implausible_lines(summary))
-    _print_accuracy(summary)
+    warnings = [*tables.implausible_lines(summary)[1:], *tables.warning_lines(summary)]
+    found = [one.sentence for one in summary.diagnostics if one.kind == "scale"]
+    remarks = []
+    if summary.scale is not None and found:
+        warnings = [f"{one} {scale_error(summary.scale)}" if one in found else one for one in warnings]
+    elif summary.scale is not None and scale_matters(summary):
+        warnings = [scale_text(summary.scale), *warnings]
+    elif summary.scale is not None and scale_matters(summary, POSSIBLE_SCALE):
+        remarks = [scale_text(summary.scale)]
+    written = f"Model written to {folder} in {seconds:.1f} s; its README.md has all figures."
+    print_screen(
+        calibration_verdict(summary, folder, len(warnings)),
+        warnings,
+        [*also, *_accuracy(summary), sentences("scale of the sensor", remarks)],
+        [*_learned(summary), *_fit(summary), *_parameters(summary)],
+        [] if folder is None else [written],
+        verbose,
+    )
+
+
+def _accuracy(summary: "CalibrationSummary") -> Iterator[Block]:
+    """Lay out the errors of rows that were held out, and what is to be said of them."""
+    from pisigma.reporting import calibration_tables as tables
+    from pisigma.reporting.calibration_verdict import error_table, how_held_out, of_what
+    from pisigma.reporting.tables import distance_table
+
+    judged = [one for one in (summary.cross_validation, summary.held_out, summary.test) if one is not None]
+    for figures in judged:
+        title = f"errors of {of_what(summary)}, {how_held_out(figures, summary)}"
+        yield table(title, *error_table(figures), "errors of held-out rows")
+        if figures.socket_distance is not None:
+            what = "stated distances of sockets, under calibrations without them"
+            yield table(what, *distance_table(figures.socket_distance), "distances of sockets")
+        yield sentences("remarks on the held-out rows", tables.held_out_lines(figures))
+
+
+def _learned(summary: "CalibrationSummary") -> Iterator[Block]:
+    """Lay out the joint correction, and what else was tried."""
+    from pisigma.reporting import calibration_tables as tables
+
     if summary.hybrid is not None:
-        print_lines(tables.learned_lines(summary.hybrid))
-    print_lines(f"Warning: {line}" for line in tables.warning_lines(summary))
+        yield sentences("joint correction", tables.learned_lines(summary.hybrid))
+        yield table("joint corrections that were tried", *tables.trial_table(summary.hybrid), "trials")
+    if summary.judged is not None and (coverage := tables.coverage_line(summary.judged)):
+        yield sentences("predicted intervals", [coverage])
     if summary.learning_curve is not None:
-        print_table(
-            "errors of held-out rows by number of training rows", *tables.curve_table(summary.learning_curve)
-        )
-    if summary.hybrid is not None:
-        print_table("what was tried beyond the geometry", *tables.trial_table(summary.hybrid))
-    _print_parameters(summary, verbose)
+        what = "errors of held-out rows by number of training rows"
+        yield table(what, *tables.curve_table(summary.learning_curve), "learning curve")
+
+
+def _fit(summary: "CalibrationSummary") -> Iterator[Block]:
+    """Lay out the errors of the rows that were calibrated with, and how the search ended."""
+    from pisigma.reporting.calibration_verdict import error_table, how_held_out
+
+    if summary.calibrated is not None:
+        what = f"errors of the rows used in the calibration, {how_held_out(summary.calibrated, summary)}"
+        yield table(what, *error_table(summary.calibrated), "errors of the fit")
     count = len(summary.outliers)
     worst = f"; the worst is {summary.outliers[0].place}" if count else ""
-    print_lines([f"Rank {summary.rank}, {summary.iterations} iterations, {count} outliers{worst}."])
-    if folder is not None:
-        print_lines([f"Model written to {folder} in {seconds:.1f} s; read its README.md."])
+    line = f"Rank {summary.rank}, {summary.iterations} iterations, {count} outliers{worst}."
+    yield sentences("outliers", [line])
 
 
-def _print_accuracy(summary: "CalibrationSummary") -> None:
-    """Print the errors of held-out rows, and then of those that were calibrated with."""
-    from pisigma.reporting import calibration_tables as tables
-    from pisigma.reporting.tables import distance_table, pose_rows
-
-    if summary.predicted_rms_mm is not None:
-        print_lines([tables.predicted_line(summary.predicted_rms_mm)])
-    for figures, title in (
-        (summary.held_out, "pose errors of {rows} other simulated rows"),
-        (summary.cross_validation, "pose errors of {rows} held-out rows ({how})"),
-        (summary.test, "pose errors of the {rows} rows of the set 'test', which were kept apart"),
-        (summary.calibrated, "pose errors of the {rows} rows that were calibrated with"),
-    ):
-        if figures is not None:
-            title = title.format(rows=figures.rows, how=tables.folds_text(figures))
-            print_table(title, *pose_rows(figures.models))
-            print_lines([*tables.held_out_lines(figures), *filter(None, [tables.coverage_line(figures)])])
-            if figures.socket_distance is not None:
-                what = "stated distances of sockets, under calibrations without them"
-                print_table(what, *distance_table(figures.socket_distance))
-
-
-def _print_parameters(summary: "CalibrationSummary", verbose: bool) -> None:
-    """Print the parameters that were estimated, or all, and what the data cannot determine."""
+def _parameters(summary: "CalibrationSummary") -> Iterator[Block]:
+    """Lay out all parameters, and what the data cannot determine."""
     from pisigma.reporting.calibration_tables import parameter_table, undetermined_lines
 
-    estimated = [row for row in summary.parameters if verbose or row.standard_error is not None]
-    rest = len(summary.parameters) - len(estimated)
-    title = f"estimated parameters ({rest} others are nominal: --verbose)" if rest else "parameters"
-    print_table(title, *parameter_table(estimated))
-    print_line("What these data cannot determine:")
-    print_lines((f"- {line}" for line in undetermined_lines(summary)), indent="  ")
+    yield table("parameters", *parameter_table(summary.parameters), f"{len(summary.parameters)} parameters")
+    lines = ["What these data cannot determine:", *(f"- {one}" for one in undetermined_lines(summary))]
+    yield sentences("undetermined parameters", lines, "  ")

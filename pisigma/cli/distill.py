@@ -7,10 +7,13 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from pisigma.cli.arguments import AsJson, ModelFolder, Overwrite
-from pisigma.cli.output import command_line, print_json, print_lines, print_table, progress_of
+from pisigma.cli.arguments import AsJson, ModelFolder, Overwrite, Verbose
+from pisigma.cli.output import command_line, print_json
+from pisigma.cli.progress import progress_of
+from pisigma.cli.screen import print_screen, sentences, table
 from pisigma.cli.settings_options import takes_settings
 from pisigma.files.errors import PoseError, RecipeError
+from pisigma.reporting.verdict import Verdict, counted, rms_text
 from pisigma.workflow.settings.distillation import DistillationSettings
 
 if TYPE_CHECKING:
@@ -24,25 +27,22 @@ Out = Annotated[Path, typer.Option(help="Model folder to write.")]
 RegionMm = Annotated[
     Box | None,
     typer.Option(
-        help="X_MIN X_MAX Y_MIN Y_MAX Z_MIN Z_MAX of the tool in the base frame [mm], with the orientations of the "
-        "measured poses. [default: where the model was measured]"
+        help="Region of the tool in the base frame, X_MIN X_MAX Y_MIN Y_MAX Z_MIN Z_MAX [mm]. [default: where the "
+        "model was measured]"
     ),
 ]
 Joints = Annotated[
     Path | None,
-    typer.Option(
-        help="CSV file with q1_deg and so on: the region lies between each of these rows and the rows near it, "
-        "so that the rows have to fill it."
-    ),
+    typer.Option(help="CSV file of joint values (q1_deg and so on) that fill the region."),
 ]
 Orders = Annotated[
     str | None,
-    typer.Option(help="Orders of the product units, such as 1,2,3. [default: several sizes are tried]"),
+    typer.Option(help="Orders of the product units, such as 1,2,3. [default: the best of several]"),
 ]
 Harmonics = Annotated[
     int | None,
     typer.Option(
-        help="With --orders: cycles a turn up to which the value of a joint is an input. [default: 1]"
+        help="With --orders, number of harmonics of every joint value that are inputs. [default: 1]"
     ),
 ]
 
@@ -58,11 +58,12 @@ def distill(
     orders: Orders = None,
     harmonics: Harmonics = None,
     overwrite: Overwrite = False,
+    verbose: Verbose = False,
     as_json: AsJson = False,
 ) -> None:
     """Distil a calibrated model into a small network for controllers that can only add an offset.
 
-    Its error against the full solution, on poses that were not fitted to, is printed and on its card.
+    Prints its error against the full solution at held-out poses.
     """
     from pisigma.files.output_folder import check_folder
     from pisigma.workflow import distill as workflow
@@ -73,27 +74,29 @@ def distill(
     with progress_of("distillation") as progress:
         distillation = workflow.distill(model, settings, progress)
     distillation.save(out, command=command_line(context, ("out", "joints")), overwrite=overwrite)
-    _print(distillation, out, as_json)
+    _print(distillation, out, as_json, verbose)
 
 
 def _size(orders: str | None, harmonics: int | None) -> "Size | None":
-    """The one size that was asked for."""
+    """Return the size of the network that the options state, None for the best of several."""
     from pisigma.workflow.distilled_network import Size
 
     if orders is None:
         if harmonics is not None:
-            raise RecipeError("--harmonics goes with --orders; give both or none.")
+            raise RecipeError("needs --orders", option="--harmonics", remedy="give both or neither")
         return None
     numbers = orders.split(",")
     if not all(number.strip().isdecimal() and 1 <= int(number) <= 20 for number in numbers):
-        raise RecipeError(f"--orders '{orders}': whole numbers from 1 to 20 were wanted, such as 1,2,3.")
+        raise RecipeError(
+            expected="whole numbers from 1 to 20, such as 1,2,3", value=orders, option="--orders"
+        )
     if harmonics is not None and not 1 <= harmonics <= 500:
-        raise RecipeError(f"--harmonics {harmonics}: a whole number from 1 to 500 was wanted.")
+        raise RecipeError(expected="a whole number from 1 to 500", value=harmonics, option="--harmonics")
     return Size(tuple(int(number) for number in numbers), harmonics or 1)
 
 
 def _region(model: Path, box: Box | None, joints: Path | None) -> "Region | None":
-    """Where poses are to be drawn; None: where the model was measured."""
+    """Return where poses are drawn, None for where the model was measured."""
     from pisigma.measurement.csv.reading import read_joints
     from pisigma.model.folder.model_folder import load_model
     from pisigma.workflow.solved_poses import Region
@@ -106,14 +109,15 @@ def _region(model: Path, box: Box | None, joints: Path | None) -> "Region | None
         return Region(q)
     if not all(math.isfinite(value) for value in box) or any(box[i] > box[i + 1] for i in (0, 2, 4)):
         raise PoseError(
-            f"--region {' '.join(f'{value:g}' for value in box)}: x_min x_max y_min y_max z_min z_max [mm] were "
-            "wanted, each minimum not above its maximum."
+            expected="x_min x_max y_min y_max z_min z_max [mm] with no minimum above its maximum",
+            value=" ".join(f"{value:g}" for value in box),
+            option="--region",
         )
     x_min, x_max, y_min, y_max, z_min, z_max = (value / 1e3 for value in box)
     return Region(q, (x_min, x_max, y_min, y_max, z_min, z_max))
 
 
-def _print(distillation: "Distillation", out: Path, as_json: bool) -> None:
+def _print(distillation: "Distillation", out: Path, as_json: bool, verbose: bool) -> None:
     """Print how well the model follows the full solution."""
     from pisigma.reporting.distilled_card import correction_table, size_table
     from pisigma.reporting.tables import pose_rows
@@ -122,10 +126,20 @@ def _print(distillation: "Distillation", out: Path, as_json: bool) -> None:
         print_json({"model": str(out), **distillation.to_json()})
         return
     summary = distillation.summary
-    title = f"tool under the full model, {summary.poses.held_out} held-out poses"
-    print_table(title, *pose_rows(summary.held_out.models))
-    print_lines(f"Warning: {sentence}" for sentence in summary.warnings)
-    print_table("absolute joint corrections, and errors of the distilled ones", *correction_table(summary))
-    print_table("sizes tried", *size_table(summary))
-    print_lines(summary.limitations)
-    print_lines([f"Model written to {out} in {distillation.seconds:.1f} s; read its README.md."])
+    errors, count = summary.held_out, summary.poses.held_out
+    cautions = f"with caution ({counted(len(summary.warnings), 'warning')})" if summary.warnings else "yes"
+    verdict = Verdict(
+        f"{rms_text(errors.distilled, count)} RMS from the full model at {count} held-out poses; nominal "
+        f"{rms_text(errors.nominal, count)}.",
+        f"{cautions}, in the region of the poses only; errors of {summary.parent.name} come in addition.",
+        f"export it: `pisigma export {out} --format onnx --out MODEL.onnx`.",
+    )
+    head, rows = pose_rows(errors.models)
+    blocks = [table(f"errors of the tool against the full model, {count} held-out poses", head, rows)]
+    details = [
+        table("absolute joint corrections, and errors of the distilled ones", *correction_table(summary)),
+        table("sizes tried", *size_table(summary)),
+        sentences("limitations", summary.limitations),
+    ]
+    closing = [f"Model written to {out} in {distillation.seconds:.1f} s; its README.md has all figures."]
+    print_screen(verdict, summary.warnings, blocks, details, closing, verbose)

@@ -1,11 +1,13 @@
-"""How a command ends: its exit status, and one line on stderr for a problem."""
+"""How a command ends: its exit status, and a message on stderr for a problem."""
 
 import contextlib
 import errno
 import functools
 import inspect
 import os
+import shutil
 import sys
+import textwrap
 import traceback
 from collections.abc import Callable
 from pathlib import Path
@@ -13,22 +15,23 @@ from typing import Annotated, Any, NoReturn
 
 import typer
 
+from pisigma.cli.help import HelpAll
 from pisigma.cli.output import print_json
 from pisigma.files.errors import AcceptanceError, PisigmaError, missing_extra, printable
 from pisigma.files.plugins import load_files, load_installed
 
 REFUSED = 2
-"""Exit status where the user's input is at fault."""
+"""Exit status if the user's input is at fault."""
 NOT_ACCEPTED = 3
-"""Exit status of a model that does not meet its limits, or must not be trusted."""
+"""Exit status if a model does not meet its limits, or must not be trusted."""
 DEFECT = 1
-"""Exit status of a defect of ours."""
+"""Exit status of a defect of pisigma."""
 TRACEBACK = "PISIGMA_TRACEBACK"
-"""Environment variable: where it is set, a defect ends with Python's traceback."""
+"""Environment variable: if it is set, a defect ends with Python's traceback."""
 
 _INTERRUPTED = 130
 _NO_READER = 141
-"""As the shell reports a program that SIGPIPE ended, which `pisigma robots | head -1` does."""
+"""As shells report a program that SIGPIPE ended, such as `pisigma robots | head -1`."""
 
 
 PluginFiles = Annotated[
@@ -36,49 +39,50 @@ PluginFiles = Annotated[
     typer.Option(
         "--plugin",
         metavar="FILE",
-        help="Python file that registers sensors, features, exports or others before the command begins; it runs with "
-        "your rights. May be repeated.",
+        help="Python file that registers sensors, features or other plug-ins and runs with your rights. May be "
+        "repeated.",
     ),
 ]
 
 
 def tell_problems(command: Callable[..., None]) -> Callable[..., None]:
-    """Make a command load plug-ins, and end with one line on stderr and a status that says whose fault it is.
+    """Make a command load plug-ins, show its whole help, and end problems with a message and an exit status.
 
-    It gets the option `--plugin`. See `end_with` for the status.
+    It gets the options `--plugin` and `--help-all`. See `end_with` for the status.
     """
 
     @functools.wraps(command)
-    def guarded(*, plugin: PluginFiles = None, **values: Any) -> None:
+    def guarded(*, plugin: PluginFiles = None, help_all: HelpAll = False, **values: Any) -> None:
         try:
             load_installed()
             load_files(plugin or ())
             command(**values)
         except (typer.BadParameter, typer.Exit):
-            raise  # the command line itself says these
+            raise  # the command line itself reports these
         except (Exception, KeyboardInterrupt) as problem:
             end_with(problem, as_json=bool(values.get("as_json")))
 
-    own = [*inspect.signature(command).parameters.values(), _PLUGIN]
     keyword = inspect.Parameter.KEYWORD_ONLY
-    vars(guarded)["__signature__"] = inspect.Signature([one.replace(kind=keyword) for one in own])
-    guarded.__annotations__ = {one.name: one.annotation for one in own}
+    parameters = [
+        *inspect.signature(command).parameters.values(),
+        inspect.Parameter("plugin", keyword, default=None, annotation=PluginFiles),
+        inspect.Parameter("help_all", keyword, default=False, annotation=HelpAll),
+    ]
+    vars(guarded)["__signature__"] = inspect.Signature([one.replace(kind=keyword) for one in parameters])
+    guarded.__annotations__ = {one.name: one.annotation for one in parameters}
     return guarded
 
 
-_PLUGIN = inspect.Parameter("plugin", inspect.Parameter.KEYWORD_ONLY, default=None, annotation=PluginFiles)
-
-
 def end_with(problem: BaseException, as_json: bool = False) -> None:
-    """Say in one line what is wrong and end with the exit status that says whose fault it is.
+    """Say what is wrong and end with an exit status.
 
-    The status is 2 where the user's input is at fault, 3 where a model does not meet its limits, 130 after an
-    interruption, 141 where nobody reads what is printed, and 1 for everything else.
+    The status is 2 if the user's input is at fault, 3 if a model does not meet its limits, 130 after an interruption,
+    141 if the reader of the output has gone, and 1 for everything else.
 
     Args:
         problem: what ended the command.
-        as_json: also print the fields of a refused input as a JSON object with the key `error` on stdout. A model that
-            does not meet its limits has its whole result there already.
+        as_json: also print the fields of a refused input on stdout, as a JSON object with the key `error`. The whole
+            result of a model that does not meet its limits is there already.
     """
     if isinstance(problem, AcceptanceError):
         fail(str(problem), NOT_ACCEPTED)
@@ -98,21 +102,27 @@ def end_with(problem: BaseException, as_json: bool = False) -> None:
             raise typer.Exit(_NO_READER)
         fail(f"the standard output cannot be written ({problem.strerror}); print to another file.")
     if isinstance(problem, MemoryError):
-        fail("there is not enough memory for this; give fewer or smaller inputs.")
+        fail("there is not enough memory; give fewer or smaller inputs.")
     if os.environ.get(TRACEBACK):
         raise problem
     fail(_defect(problem), DEFECT)
 
 
 def fail(sentence: str, status: int = REFUSED) -> NoReturn:
-    """Say what is wrong in one line on stderr and end with an exit status."""
-    with contextlib.suppress(OSError):  # nobody can be told
-        typer.echo(f"pisigma: {printable(' '.join(sentence.split()))}", err=True)
+    """Say what is wrong on stderr and end with an exit status: in one line, which a terminal shows wrapped."""
+    line = f"pisigma: {printable(' '.join(sentence.split()))}"
+    if sys.stderr.isatty():
+        width = shutil.get_terminal_size().columns
+        line = textwrap.fill(
+            line, width, subsequent_indent="  ", break_long_words=False, break_on_hyphens=False
+        )
+    with contextlib.suppress(OSError):  # nobody can read it
+        typer.echo(line, err=True)
     raise typer.Exit(status) from None
 
 
 def _defect(problem: BaseException) -> str:
-    """What to say of a problem that nobody thought of."""
+    """Describe an unexpected problem."""
     frame = traceback.extract_tb(problem.__traceback__)[-1]
     return (
         f"a defect of pisigma ended the command ({type(problem).__name__}: {problem}; {Path(frame.filename).name}, "
@@ -122,6 +132,6 @@ def _defect(problem: BaseException) -> str:
 
 
 def _print_no_more() -> None:
-    """Let the rest of what was printed go nowhere: Python would complain once more when it ends."""
+    """Discard what is left to print: Python would complain once more when it ends."""
     with contextlib.suppress(OSError, ValueError, AttributeError):
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -4,10 +4,12 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from pisigma.cli.arguments import AsJson
-from pisigma.cli.output import print_json, print_lines
+from pisigma.cli.arguments import AsJson, Verbose
+from pisigma.cli.output import print_json
+from pisigma.cli.progress import progress_of
+from pisigma.cli.screen import print_screen
 from pisigma.cli.settings_options import takes_settings
-from pisigma.cli.verify import print_comparison
+from pisigma.cli.verify import comparison_blocks, model_rms
 from pisigma.files.errors import AcceptanceError
 from pisigma.workflow.settings.evaluation import EvaluationSettings
 
@@ -18,17 +20,15 @@ Paths = Annotated[
     list[str],
     typer.Argument(
         metavar="MODEL... DATA",
-        help="Model folders, and 'nominal' (the robot as drawn, base and tool fitted) or 'geometric' (what a hybrid "
-        "builds upon) of the first that has it; last, measurements (CSV) in the frames that they were fitted in. A "
-        "single model is compared with nominal.",
+        help="Model folders, 'nominal' (base and tool fitted) or 'geometric' (without the joint correction), and last "
+        "the measurements (CSV) in the models' frames.",
     ),
 ]
 Hashes = Annotated[
     list[str] | None,
     typer.Option(
         "--sha256",
-        help="SHA-256 of a model folder's model.yaml, as sha256sum prints it; another model is refused. Once for every "
-        "folder, in their order.",
+        help="Refuse other models than those with these SHA-256 of model.yaml, one per folder in their order.",
     ),
 ]
 
@@ -38,44 +38,73 @@ def evaluate(
     paths: Paths,
     settings: EvaluationSettings,
     sha256: Hashes = None,
+    verbose: Verbose = False,
     as_json: AsJson = False,
 ) -> None:
     """Compare models on measurements, with confidence intervals, and accept them or not.
 
-    Rows of the set "train" are left out where the file has a column "set". With a limit, every model folder has to
-    meet it, else the exit status is 3; so it is where the base or the tool has moved, and where errors of positions or
-    orientations are too large to be those of a calibrated robot: the usual setup faults that explain them are named.
-    Balls in sockets, wires and pairs are judged by how well the rows of each agree, and by stated distances.
+    Compares a single model with the nominal robot. Leaves out rows of the set "train". Exits with status 3 where a
+    model misses a limit, the base or the tool has moved, or the errors are too large for a calibrated robot.
     """
     from pisigma.files.model_files import check_model_hash
     from pisigma.workflow import evaluate as workflow
 
     if len(paths) < 2:
-        raise typer.BadParameter("a model folder and, last, a file of measurements were wanted.")
+        raise typer.BadParameter("expected a model folder and, last, a file of measurements")
     folders = [path for path in paths[:-1] if path not in workflow.REFERENCES]
     if sha256 and len(sha256) != len(folders):
         raise typer.BadParameter(
-            f"one for each of the {len(folders)} model folders was wanted, got {len(sha256)}.",
+            f"expected one for each of the {len(folders)} model folders, got {len(sha256)}",
             param_hint="'--sha256'",
         )
-    for folder, wanted in zip(folders, sha256 or (), strict=False):
-        check_model_hash(folder, wanted)
-    evaluation = workflow.evaluate(paths[:-1], paths[-1], settings)
+    for folder, stated in zip(folders, sha256 or (), strict=False):
+        check_model_hash(folder, stated)
+    with progress_of("evaluate") as progress:
+        progress("comparing the models")
+        evaluation = workflow.evaluate(paths[:-1], paths[-1], settings)
     if as_json:
         print_json(evaluation.to_json())
     else:
-        _print(evaluation)
+        _print(evaluation, verbose)
     if not evaluation.accepted:
         missed = [f"not accepted: {'; '.join(evaluation.missed)}."] if evaluation.missed else []
         raise AcceptanceError(" ".join([*missed, *(one.sentence for one in evaluation.diagnostics)]))
 
 
-def _print(evaluation: "Evaluation") -> None:
-    stated = evaluation.settings.limits.stated
-    if stated and evaluation.accepted:
-        limits = ", ".join(f"{name} {limit:g}" for name, limit in stated.items())
-        print_lines([f"Accepted: every model stays within {limits}."])
-    elif evaluation.missed:
-        print_lines([f"Not accepted: {'; '.join(evaluation.missed)}."])
-    print_comparison(evaluation.comparison, evaluation.data)
-    print_lines([*(one.sentence for one in evaluation.diagnostics), *evaluation.warnings])
+def _print(evaluation: "Evaluation", verbose: bool) -> None:
+    """Print the verdict, warnings, and the errors of all models."""
+    from pisigma.reporting.verdict import Verdict
+
+    rows = evaluation.rows
+    errors = ", ".join(f"{one.name} {model_rms(one, rows)}" for one in evaluation.models)
+    fitted = [name for name, one in evaluation.evaluated.items() if one.trained_on]
+    kind = f"; fit of {' and '.join(fitted)}, which these rows calibrated" if fitted else ""
+    verdict = Verdict(
+        f"RMS of {rows} rows: {errors}{kind}.",
+        _trust(evaluation),
+        "correct what is named above, and evaluate again."
+        if evaluation.diagnostics
+        else "recalibrate with these rows (`pisigma recalibrate`), or calibrate with more."
+        if evaluation.missed
+        else "see the intervals below for what differs by more than chance.",
+    )
+    warnings = [*(one.sentence for one in evaluation.diagnostics[1:]), *evaluation.warnings]
+    print_screen(
+        verdict, warnings, *comparison_blocks(evaluation.comparison, evaluation.data), verbose=verbose
+    )
+
+
+def _trust(evaluation: "Evaluation") -> str:
+    """Say whether the models were accepted."""
+    from pisigma.reporting.verdict import counted
+
+    stated, warnings = evaluation.settings.limits.stated, evaluation.warnings
+    cautions = f" ({counted(len(warnings), 'warning')})" if warnings else ""
+    if evaluation.missed:
+        return f"not accepted: {'; '.join(evaluation.missed)}."
+    if evaluation.diagnostics:
+        return f"no: {evaluation.diagnostics[0].sentence}"
+    if not stated:
+        return f"not decided{cautions}, as no limit was stated (--max-p95-mm and others)."
+    limits = ", ".join(f"{name} {limit:g}" for name, limit in stated.items())
+    return f"accepted{cautions}: every model stays within {limits}."

@@ -1,4 +1,4 @@
-"""`pisigma export`: a model in the forms that other programs read."""
+"""`pisigma export`: a model in the formats of other programs."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -16,9 +16,8 @@ if TYPE_CHECKING:
 Out = Annotated[
     Path,
     typer.Option(
-        help="File to write: .urdf; .csv or .yaml for dh and offsets; .conf, .yaml, .cfx, .xacro or .csv for "
-        "controllers' own files; for targets .csv, .script (URScript), .src (KUKA), .mod (ABB) or .ls (FANUC); .onnx; "
-        "for library a folder."
+        help="File to write, whose ending goes with the format: .urdf, .csv, .yaml, .conf, .cfx, .xacro, .onnx, "
+        ".script (URScript), .src (KUKA), .mod (ABB) or .ls (FANUC); for library a folder."
     ),
 ]
 Form = Annotated[
@@ -32,66 +31,65 @@ Form = Annotated[
 Like = Annotated[
     Path | None,
     typer.Option(
-        help="File whose other content stays: with urdf and xacro a URDF file (default: the one that the robot was "
-        "loaded from), with ur-calibration and staubli the controller's own file."
+        help="File to update: a URDF file for urdf and xacro (default: that of the robot), the controller's file for "
+        "ur-calibration and staubli."
     ),
 ]
 Tip = Annotated[
-    str | None, typer.Option(help="With --like: link that is the tool, as it was stated when it was loaded.")
+    str | None, typer.Option(help="With --like, tool link that was stated when the robot was loaded.")
 ]
 Geometry = Annotated[
     str | None,
     typer.Option(
-        help="With urdf and dh: geometric, the geometric fit that is used alone (default), or hybrid, the geometry "
-        "that goes with the correction of --format onnx."
+        help="With urdf and dh, the geometry alone (geometric, default), or that which goes with the joint correction "
+        "of --format onnx (hybrid)."
     ),
 ]
 Poses = Annotated[
     Path | None,
     typer.Option(
-        help="With targets: CSV file of poses, x_mm,y_mm,z_mm,roll_deg,pitch_deg,yaw_deg or qx,qy,qz,qw."
+        help="With targets, CSV file of poses: x_mm,y_mm,z_mm,roll_deg,pitch_deg,yaw_deg or qx,qy,qz,qw."
     ),
 ]
 TargetKind = Annotated[
     str | None,
     typer.Option(
-        help="What a program of targets tells the controller: joints (default), or cartesian, for a controller "
-        "that computes with the robot as drawn. A .csv file holds both."
+        help="Targets of a program: joints (default), or cartesian for a controller that computes with the nominal "
+        "robot."
     ),
 ]
-Branch = Annotated[str | None, typer.Option(help="With targets: branch to take instead of the trained one.")]
+Branch = Annotated[str | None, typer.Option(help="With targets, branch instead of the trained one.")]
 Config = Annotated[
     str | None,
-    typer.Option(help="With .ls and --targets cartesian: the arm's configuration, such as 'N U T, 0, 0, 0'."),
+    typer.Option(
+        help="With .ls and --targets cartesian, configuration of the arm, such as 'N U T, 0, 0, 0'."
+    ),
 ]
 Program = Annotated[
     Path | None,
     typer.Option(
-        help="With targets: existing program (.script, .src or .dat, .mod, .ls) whose pose targets are "
-        "rewritten into --out; all else stays."
+        help="With targets, existing program (.script, .src or .dat, .mod, .ls) whose pose targets are corrected."
     ),
 ]
 Frames = Annotated[
     Path | None,
-    typer.Option(
-        help="With --program: YAML file of the frames and tools that it names without stating them."
-    ),
+    typer.Option(help="With --program, YAML file of the frames and tools that it does not define."),
 ]
 ToleranceMm = Annotated[
     float | None,
     typer.Option(
-        help="With --program: how far the tool may leave a straight line between way points [mm]. [default: 0.1]"
+        help="With --program, largest distance of the tool from a straight line between way points [mm]. [default: 0.1]"
     ),
 ]
 CountsPerTurn = Annotated[
     str | None,
     typer.Option(
-        help="With epson and fanuc-mastering: encoder counts for a turn of every joint, with the gear, or for 1 mm "
-        "where it slides, such as 8388608,8388608,524288,1048576."
+        help="With epson and fanuc-mastering, encoder counts per turn of every joint with its gear, or per mm of a "
+        "prismatic joint, such as 8388608,8388608,524288,1048576."
     ),
 ]
 PresentCounts = Annotated[
-    str | None, typer.Option(help="With epson and fanuc-mastering: the counts that the controller has now.")
+    str | None, typer.Option(help="With epson and fanuc-mastering, present counts of the controller.")
 ]
 
 
@@ -115,11 +113,11 @@ def export(
     temperature_c: TemperatureC = None,
     as_json: AsJson = False,
 ) -> None:
-    """Write a model for other programs, whole or not at all.
+    """Export a model for other programs.
 
-    Exit status 2 when a pose of --poses has no target, being unreachable, singular or outside the joint limits: its
-    values are empty in a .csv file, and no program is written. Every program is slow and has to be tested. With
-    --program, poses that cannot be reached keep their line, and the exit status is 3.
+    Exits with status 2 if a pose of --poses is unreachable, singular or outside the joint limits: its values are empty
+    in a .csv file, and no program is written. With --program, such poses keep their line and the status is 3. Test
+    every program at low speed.
     """
     from pisigma.deployment.export.export_format import ExportRequest
     from pisigma.deployment.export.registry import export_format, export_model
@@ -147,7 +145,7 @@ def export(
 
 
 def _print(exported: "Exported", form: str, out: Path, contents: str, as_json: bool) -> None:
-    """Say what was written, with what is in doubt on stderr."""
+    """Print what was written, and warnings on stderr."""
     for sentence in exported.warnings:
         print_line(f"pisigma: {sentence}", to_stderr=True)
     if as_json:

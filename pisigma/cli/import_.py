@@ -1,4 +1,4 @@
-"""`pisigma import`: what instruments and controllers export, as a measurement file."""
+"""`pisigma import`: exports of instruments and controllers as a measurement file."""
 
 import sys
 from pathlib import Path
@@ -15,9 +15,9 @@ from pisigma.workflow.settings.importing import ImportSettings
 if TYPE_CHECKING:
     from pisigma.workflow.import_rows import ImportProposal
 
-Files = Annotated[list[Path], typer.Argument(help="Exports: tables as text, in any encoding.")]
-Yes = Annotated[bool, typer.Option("--yes", "-y", help="Take the proposed mapping without asking.")]
-SaveMap = Annotated[Path | None, typer.Option(help="File to write the mapping to, for --map the next time.")]
+Files = Annotated[list[Path], typer.Argument(help="Exports (tables as text, in any encoding).")]
+Yes = Annotated[bool, typer.Option("--yes", "-y", help="Accept the proposed mapping without asking.")]
+SaveMap = Annotated[Path | None, typer.Option(help="Write the mapping to this file, for --map.")]
 
 
 @takes_settings
@@ -29,10 +29,10 @@ def import_(
     save_map: SaveMap = None,
     as_json: AsJson = False,
 ) -> None:
-    """Import what instruments and controllers export.
+    """Import exports of instruments and controllers.
 
-    Encoding, separator, decimal sign, headings and units are recognised; the mapping of the columns is shown, and asked
-    about on a terminal. Without one, exit status 2 unless --yes is there or --map says what every column is.
+    Recognises encoding, separator, decimal sign, headings and units, shows the mapping of the columns and asks for
+    confirmation. Without a terminal, exits with status 2 unless --yes or a complete --map is given.
     """
     from pisigma.files.output_file import check_output
     from pisigma.workflow import import_rows as workflow
@@ -53,7 +53,7 @@ def import_(
 
 
 def _confirm(proposal: "ImportProposal", yes: bool, as_json: bool) -> None:
-    """Show the mapping and ask, unless it is stated or accepted; end with 2 where nobody can be asked."""
+    """Show the mapping and ask for confirmation unless it was given; end with status 2 without a terminal."""
     if not as_json:
         for file in proposal.mappings:
             cells = [
@@ -71,5 +71,5 @@ def _confirm(proposal: "ImportProposal", yes: bool, as_json: bool) -> None:
 
 
 def _is_asked() -> bool:
-    """Whether somebody can be asked."""
+    """Whether there is a terminal to ask on."""
     return sys.stdin.isatty()

@@ -14,6 +14,7 @@ from pisigma.cli.endings import end_with, tell_problems
 from pisigma.cli.evaluate import evaluate
 from pisigma.cli.export import export
 from pisigma.cli.fleet.commands import fleet
+from pisigma.cli.help import ShortHelpCommand
 from pisigma.cli.ik.command import ik
 from pisigma.cli.images.camera import camera
 from pisigma.cli.images.detect import detect
@@ -33,7 +34,7 @@ from pisigma.cli.verify import verify
 
 app = typer.Typer(
     name="pisigma",
-    help="Learn a robot's errors from measurements and command joints that really reach the pose.",
+    help="Calibrate robots from measurements and compute joint values that reach the pose.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
@@ -60,12 +61,12 @@ for command in (
     verify,
     upgrade,
 ):
-    app.command(command.__name__.rstrip("_"))(tell_problems(command))
+    app.command(command.__name__.rstrip("_"), cls=ShortHelpCommand)(tell_problems(command))
 app.add_typer(fleet)
 
 
-def _show_version(wanted: bool) -> None:
-    if wanted:
+def _show_version(value: bool) -> None:
+    if value:
         typer.echo(f"pisigma {__version__}")
         raise typer.Exit
 
@@ -80,11 +81,14 @@ def _options(
 
 
 def run() -> None:
-    """Run the command line: exit status 0 done, 2 the user's input is at fault, 3 limits not met, 1 our defect."""
+    """Run the command line.
+
+    Exits with status 0 on success, 2 if the input is at fault, 3 if limits are not met, and 1 for a defect of pisigma.
+    """
     for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, io.TextIOWrapper):  # whatever letters a terminal knows, nothing fails for them
+        if isinstance(stream, io.TextIOWrapper):  # characters that a terminal lacks must not fail
             stream.reconfigure(errors="backslashreplace")
-    # Threads that wait for work soon sleep: while they spin, what runs beside them makes both many times slower.
+    # Waiting threads sleep soon: while they spin, other processes make both many times slower.
     os.environ.setdefault("GOMP_SPINCOUNT", "2000")
     try:
         try:

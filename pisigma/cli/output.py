@@ -1,12 +1,12 @@
-"""What the commands print: tables and sentences for people on stdout, or one JSON object.
+"""What commands print: tables and sentences for people on stdout, or one JSON object.
 
-What files hold reaches a terminal as text only: see `pisigma.files.errors.printable`.
+The contents of files reach a terminal as text only: see `pisigma.files.errors.printable`.
 """
 
 import json
 import shlex
 import textwrap
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -17,41 +17,54 @@ from pisigma.files.errors import AcceptanceError, printable
 
 if TYPE_CHECKING:
     from rich.table import Table
-    from rich.text import Text
 
     from pisigma.workflow.result import AbstractModelResult
 
 WIDTH_WITHOUT_TERMINAL = 80
 
-_ONLY_FOR_PRINTING = ("as_json", "verbose")
+_ONLY_FOR_PRINTING = ("as_json", "verbose", "help_all")
 
 
 def print_json(result: Any) -> None:
-    """Print one JSON object on stdout; what is no number has to be None, as JSON has no NaN."""
+    """Print one JSON object on stdout; unknown numbers have to be None, as JSON has no NaN."""
     typer.echo(json.dumps(result, allow_nan=False))
 
 
 def print_line(line: str, to_stderr: bool = False) -> None:
-    """Print a line as it is, but for what would act on a terminal."""
+    """Print a line without wrapping it; control characters are made visible."""
     typer.echo(printable(line, cut=False), err=to_stderr)
 
 
 def print_lines(lines: Iterable[str], indent: str = "") -> None:
     """Print sentences, each wrapped to the width of the screen; further lines of one are indented."""
+    for line in wrapped(lines, indent):
+        typer.echo(line)
+
+
+def wrapped(lines: Iterable[str], indent: str = "") -> list[str]:
+    """Wrap sentences to the width of the screen; further lines of one are indented."""
     width = screen_width()
-    for line in lines:
-        filled = textwrap.fill(
+    return [
+        part
+        for line in lines
+        for part in textwrap.wrap(
             printable(line, cut=False),
             width,
             subsequent_indent=indent,
             break_long_words=False,
             break_on_hyphens=False,  # names of files stay whole
         )
-        typer.echo(filled)
+    ]
 
 
 def print_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
-    """Print a table; columns of numbers are set right, and where the screen is narrow, headings and texts are wrapped.
+    """Print a table; see `table_lines`."""
+    for line in table_lines(title, columns, rows):
+        typer.echo(line)
+
+
+def table_lines(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
+    """Lay out a table: numbers are aligned right, and headings and texts are wrapped where the screen is narrow.
 
     Numbers and words are never cut: a table of too long ones is wider than the screen.
     """
@@ -75,46 +88,24 @@ def print_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]
         narrowest += longest
     for row in rows:
         table.add_row(*(Text(cell) for cell in row))
-    _print_rich(Text(printable(title, cut=False)), table, max(width, narrowest))
-
-
-@contextmanager
-def progress_of(title: str) -> Iterator[Callable[[str], None]]:
-    """Show a line that changes; gives what to call with what is being done now."""
-    from rich.console import Console
-    from rich.text import Text
-
-    console = Console(stderr=True)
-    if not console.is_terminal:  # nobody watches
-        yield lambda what: None
-        return
-    status = console.status(Text(title))
-
-    def tell(what: str) -> None:
-        status.update(Text(printable(f"{title}: {what}")))
-        status.start()  # not before there is something to say: another bar may be drawn until then
-
-    try:
-        yield tell
-    finally:
-        status.stop()
+    return [*wrapped([title]), *_rich_lines(table, max(width, narrowest)), ""]
 
 
 @contextmanager
 def saved(
     result: "AbstractModelResult", folder: Path, accept_implausible: bool, overwrite: bool, **texts: str
 ) -> Iterator[Path | None]:
-    """Write a result as a model folder; while it is printed, give where it was written, None where it was not.
+    """Write a result as a model folder, and yield the folder for printing; None if it was not written.
 
     Args:
         result: with its diagnostics.
         folder: to write.
-        accept_implausible: write it also where it must not be trusted.
-        overwrite: replace the model that the folder holds.
+        accept_implausible: write it even if it must not be trusted.
+        overwrite: replace the model in the folder.
         texts: name and command, see `AbstractModelResult.save`.
 
     Raises:
-        AcceptanceError: at the end, where it must not be trusted.
+        AcceptanceError: at the end, if it must not be trusted.
     """
     try:
         result.save(folder, accept_implausible=accept_implausible, overwrite=overwrite, **texts)
@@ -125,7 +116,7 @@ def saved(
 
 
 def screen_width() -> int:
-    """Give the width of the terminal, or 80 without one."""
+    """Return the width of the terminal, or 80 without one."""
     from rich.console import Console
 
     console = Console()
@@ -133,11 +124,11 @@ def screen_width() -> int:
 
 
 def command_line(context: typer.Context, files: Collection[str] = ("out",)) -> str:
-    """Give the command that is running, for cards: without folders of files, and options at their defaults.
+    """Return the running command for cards, without the folders of files and options at their defaults.
 
     Args:
         context: of the command.
-        files: names of the options whose values are files or folders; arguments may all be.
+        files: names of the options whose values are files or folders; all arguments may be.
     """
     above: Any = context.parent
     groups = [] if above is None or above.parent is None else [str(above.info_name)]
@@ -160,17 +151,15 @@ def command_line(context: typer.Context, files: Collection[str] = ("out",)) -> s
     return printable(shlex.join(words), cut=False)
 
 
-def _print_rich(title: "Text", table: "Table", width: int) -> None:
-    """Print by way of a text: rich's own printing ends the process where nobody reads."""
+def _rich_lines(table: "Table", width: int) -> list[str]:
+    """Lay out a table as text: rich's own printing ends the process where nobody reads."""
     from rich.console import Console
 
     console = Console(highlight=False)
     console.width = width
     with console.capture() as printed:
-        console.print(title, soft_wrap=True)
         console.print(table)
-        console.print()
-    typer.echo(printed.get(), nl=False)
+    return [line.rstrip() for line in printed.get().splitlines()]
 
 
 def _is_number(cell: str) -> bool:

@@ -1,18 +1,24 @@
-"""`pisigma plan`: which poses to measure, and the accuracy that they are expected to give."""
+"""`pisigma plan`: choose poses to measure, with the accuracy to expect."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from pisigma.cli.arguments import AsJson, complete_robot
+from pisigma.cli.arguments import AsJson, Verbose, complete_robot
 from pisigma.cli.calibrate import Base, Tip
-from pisigma.cli.output import print_json, print_line, print_lines, print_table, progress_of
+from pisigma.cli.output import print_json
+from pisigma.cli.progress import progress_of
+from pisigma.cli.screen import print_screen, sentences, table
 from pisigma.cli.settings_options import takes_settings
 from pisigma.planning.plan_settings import PlanSettings
+from pisigma.reporting.verdict import Verdict, counted, rounded
 
 if TYPE_CHECKING:
     from pisigma.workflow.plan import Plan
+
+MAX_POINTS = 8
+"""Rows of the table of expected errors without `--verbose`."""
 
 Subject = Annotated[
     str,
@@ -22,15 +28,13 @@ Subject = Annotated[
         autocompletion=complete_robot,
     ),
 ]
-Out = Annotated[Path, typer.Option(help="CSV file of poses to write; its .plan.yaml is written beside it.")]
-CellFile = Annotated[
-    Path | None, typer.Option("--cell", help="What stands around the robot (YAML): see the documentation.")
-]
+Out = Annotated[Path, typer.Option(help="CSV file of poses to write, with a .plan.yaml next to it.")]
+CellFile = Annotated[Path | None, typer.Option("--cell", help="Obstacles around the robot (YAML).")]
 Programs = Annotated[
     list[Path] | None,
     typer.Option(
         "--program",
-        help="Program to write too: .script (URScript), .src (KUKA), .mod (ABB) or .ls (FANUC); may be repeated.",
+        help="Also write a robot program: .script (URScript), .src (KUKA), .mod (ABB) or .ls (FANUC).",
     ),
 ]
 
@@ -44,63 +48,85 @@ def plan(
     program: Programs = None,
     base: Base = None,
     tip: Tip = None,
+    verbose: Verbose = False,
     as_json: AsJson = False,
 ) -> None:
-    """Plan which poses to measure so that the calibration gets accurate with few of them.
+    """Plan which poses to measure for an accurate calibration with few of them.
 
-    Prints the accuracy to expect against the number of poses, and writes the poses in the order in which they are
-    measured: add the measured columns, and the file goes to `pisigma calibrate`.
+    Prints the expected accuracy against the number of poses, and writes the poses in the order of measurement. Add the
+    measured columns and give the file to `pisigma calibrate`.
     """
     from pisigma.planning.plan_file import yaml_of
     from pisigma.planning.subject import Subject as PlanningSubject
     from pisigma.workflow import plan as workflow
 
-    wanted, programs = PlanningSubject.of(subject, base, tip), program or []
-    workflow.check_files(out, programs, settings, wanted.robot, (subject, cell))
+    planned_for, programs = PlanningSubject.of(subject, base, tip), program or []
+    workflow.check_files(out, programs, settings, planned_for.robot, (subject, cell))
     with progress_of("plan") as progress:
-        planned = workflow.plan(wanted, settings, cell, progress)
+        planned = workflow.plan(planned_for, settings, cell, progress)
     planned.save(out, programs)
     if as_json:
         print_json({"file": str(out), **planned.to_json()})
     else:
-        _print(planned, [out, yaml_of(out), *programs])
+        _print(planned, [out, yaml_of(out), *programs], verbose)
 
 
-def _print(planned: "Plan", files: list[Path]) -> None:
-    """Print for people what is expected of the poses, and what remains uncertain."""
+def _print(planned: "Plan", files: list[Path], verbose: bool) -> None:
+    """Print what is expected of the poses, and what remains uncertain."""
     columns = ("poses", "RMS [mm]", "95 % [mm]", "RMS of random poses [mm]")
     rows = [
-        (str(point.poses), *(f"{error * 1e3:.3f}" for error in (point.rms, point.p95, point.random_rms)))
+        (str(point.poses), *(rounded(error * 1e3) for error in (point.rms, point.p95, point.random_rms)))
         for point in planned.curve
     ]
-    print_table("expected errors of the tool's position by number of poses", columns, rows)
-    print_lines(_curve_lines(planned))
-    print_line("What the expected error will mostly come from:")
-    print_lines((f"- {line}" for line in planned.weak), indent="  ")
-    points, settings = sum(map(len, planned.stored.way_points)), planned.stored.settings
-    print_lines(
+    title = "expected errors of the tool's position by number of poses"
+    short = rows if len(rows) <= MAX_POINTS else [*rows[:: -(-len(rows) // MAX_POINTS)], rows[-1]]
+    weak = ["What the expected error will mostly come from:", *(f"- {line}" for line in planned.weak)]
+    points = sum(map(len, planned.stored.way_points))
+    lines = [planned.candidates.sentence, f"The poses are joined with {counted(points, 'way point')}."]
+    print_screen(
+        _verdict(planned, files[0]),
+        planned.warnings,
         [
-            planned.candidates.sentence,
-            f"{planned.poses} poses and {planned.checks} to check with take about {planned.travel / 60:.0f} min at "
-            f"{settings.speed_deg_s:g} deg/s and {settings.settling_s:g} s a pose, with {points} way points.",
-            *(() if planned.camera is None else planned.camera.sentences),
-            *(f"Warning: {sentence}" for sentence in planned.warnings),
-            f"Written to {', '.join(map(str, files))}.",
-        ]
+            sentences("criterion and limit", _curve_lines(planned)),
+            table(title, columns, list(dict.fromkeys(short))),
+            sentences("what remains uncertain", weak, "  "),
+            sentences("what limits a camera", () if planned.camera is None else planned.camera.sentences),
+        ],
+        [
+            *([table(f"{title}, all", columns, rows)] if len(short) < len(rows) else []),
+            sentences("candidates and way points", lines),
+        ],
+        [f"Written to {', '.join(map(str, files))}."],
+        verbose,
+    )
+
+
+def _verdict(planned: "Plan", file: Path) -> Verdict:
+    """Say how accurate a calibration with the poses is expected to be."""
+    last, settings, warnings = planned.curve[-1], planned.stored.settings, planned.warnings
+    cautions = f"with caution ({counted(len(warnings), 'warning')})" if warnings else "yes"
+    return Verdict(
+        f"{rounded(last.rms * 1e3)} mm RMS and {rounded(last.p95 * 1e3)} mm for 95 % expected of the tool's position "
+        f"with {planned.poses} poses; {rounded(last.random_rms * 1e3)} mm RMS with random poses.",
+        f"{cautions}, if the sensor scatters as stated; {counted(planned.checks, 'pose')} will check it.",
+        f"measure the poses, about {planned.travel / 60:.0f} min at {settings.speed_deg_s:g} deg/s and "
+        f"{settings.settling_s:g} s a pose, with `pisigma measure {file} --rows ROWS.csv`.",
     )
 
 
 def _curve_lines(planned: "Plan") -> list[str]:
-    """What the curve does not show, and how many poses the limit needs, where there is one."""
+    """Say what the curve does not show, and how many poses the limit needs, if there is one."""
     lines, last, settings = [], planned.curve[-1], planned.stored.settings
     limit = settings.limit_mm
     if settings.criterion == "D" and last.rms > last.random_rms:
         lines.append(
-            "Poses chosen by criterion D determine all unknowns of the robot, and need not lower the error of the "
-            "tool's position; choose by criterion I for that."
+            "Criterion D determines all unknowns of the robot and need not lower the error of the tool's position; use "
+            "criterion I for that."
         )
     if limit is not None and planned.needed is None:
-        lines.append(f"To keep 95 % of the errors below {limit:g} mm needs more than {planned.poses} poses.")
+        lines.append(
+            f"More than {planned.poses} poses are needed to keep 95 % of the errors below {limit:g} mm."
+        )
     elif limit is not None:
         needed = f"with {planned.needed} poses" if planned.needed else "already, without more poses"
         lines.append(f"95 % of the errors are expected below {limit:g} mm {needed}.")

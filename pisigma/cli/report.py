@@ -1,15 +1,21 @@
 """`pisigma report`: one page by which a calibration is accepted."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from pisigma.cli.arguments import AsJson, ModelFolder
-from pisigma.cli.output import print_json, print_lines, progress_of
+from pisigma.cli.output import print_json
+from pisigma.cli.progress import progress_of
+from pisigma.cli.screen import print_screen, sentences
 from pisigma.cli.settings_options import takes_settings
 from pisigma.files.errors import AcceptanceError
 from pisigma.measurement.camera.camera_files import CameraFiles
+from pisigma.reporting.verdict import Verdict, uncapitalised
+
+if TYPE_CHECKING:
+    from pisigma.workflow.report import Report
 
 
 @takes_settings
@@ -18,19 +24,17 @@ def report(
     data: Annotated[
         Path | None,
         typer.Argument(
-            help="Measurements (CSV), in the frame that the model was fitted in. [default: what the folder keeps]"
+            help="Measurements (CSV) in the model's frame. [default: held-out rows in the folder]"
         ),
     ] = None,
     out: Annotated[Path, typer.Option(help="Page to write (.html).")] = Path("report.html"),
-    figures: Annotated[
-        Path | None, typer.Option(help="Folder for the figures as PNG and SVG files; made where missing.")
-    ] = None,
+    figures: Annotated[Path | None, typer.Option(help="Folder for the figures as PNG and SVG files.")] = None,
     cameras: CameraFiles | None = None,
     as_json: AsJson = False,
 ) -> None:
-    """Write a report as one HTML page: how accurate, where worst, what limits it, what to measure next.
+    """Write a report as one HTML page: accuracy, where it is worst, what limits it, what to measure next.
 
-    Exit status 3 where the rows are not to be trusted: the page says why.
+    Exits with status 3 if the rows must not be trusted; the page says why.
     """
     from pisigma.workflow import report as workflow
 
@@ -42,6 +46,20 @@ def report(
         print_json({"report": str(out), "figures": [str(path) for path in written]} | result.to_json())
     else:
         also = f", {len(written)} figures to {figures}" if written else ""
-        print_lines([result.verdict, f"Report written to {out}{also}."])
+        _print(result, [f"Report written to {out}{also}."])
     if result.diagnostics:
         raise AcceptanceError(" ".join(one.sentence for one in result.diagnostics))
+
+
+def _print(result: "Report", closing: list[str]) -> None:
+    """Print the verdict of the page, and what it advises to measure."""
+    content, wrong = result.content, result.diagnostics
+    trust = "yes: these rows were held out."
+    if wrong:
+        trust = f"no: {wrong[0].sentence}"
+    elif not content.verdict.held_out:
+        trust = "with caution: no held-out rows were judged."
+    first, *others = content.advice or ("read the page.",)
+    verdict = Verdict(result.verdict, trust, uncapitalised(first))
+    blocks = [sentences("further advice", (f"- {one}" for one in others), "  ")]
+    print_screen(verdict, [one.sentence for one in wrong[1:]], blocks, closing=closing)

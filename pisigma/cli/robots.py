@@ -17,32 +17,32 @@ if TYPE_CHECKING:
 Read = Annotated[
     Path | None,
     typer.Option(
-        help="File of a controller that holds a calibration: calibration.conf or the kinematics YAML of Universal "
-        "Robots, a Staubli arm.cfx, or a table of joint offsets or counts."
+        help="Read a controller's calibration: calibration.conf or kinematics YAML of Universal Robots, Staubli "
+        "arm.cfx, or a table of joint offsets or counts."
     ),
 ]
 Like = Annotated[
     str | None,
     typer.Option(
-        help="With --read: the robot as the controller has it without the file.",
+        help="With --read, the nominal robot of the controller.",
         autocompletion=complete_robot,
     ),
 ]
-Out = Annotated[Path | None, typer.Option(help="With --read: the robot file (.yaml) to write.")]
+Out = Annotated[Path | None, typer.Option(help="With --read, robot file (.yaml) to write.")]
 
 MaxChange = Annotated[
     float | None,
     typer.Option(
         "--max-change-mm",
-        help="With --read: mean distance [mm] from the nominal robot above which the file is refused (default: 5).",
+        help="With --read, refuse a file that moves the tool by more in the mean [mm]. [default: 5]",
         min=0.0,
     ),
 ]
 Check = Annotated[
     str | None,
     typer.Option(
-        help="Robot (name, YAML or URDF) whose tool to print with all axes at 0 and with each at 90 deg, to be "
-        "compared at the teach pendant.",
+        help="Print the tool of a robot (name, YAML or URDF) with all axes at 0 and each at 90 deg, to compare with "
+        "the teach pendant.",
         autocompletion=complete_robot,
     ),
 ]
@@ -54,8 +54,8 @@ def robots(
     out: Out = None,
     max_change_mm: MaxChange = None,
     check: Check = None,
-    base: Annotated[str | None, typer.Option(help="Of a URDF file: link of poses.")] = None,
-    tip: Annotated[str | None, typer.Option(help="Of a URDF file: link that is the tool.")] = None,
+    base: Annotated[str | None, typer.Option(help="Base link of a URDF file.")] = None,
+    tip: Annotated[str | None, typer.Option(help="Tool link of a URDF file.")] = None,
     as_json: AsJson = False,
 ) -> None:
     """List the robots that come with pisigma, read a controller's own file, or check a robot description."""
@@ -65,7 +65,8 @@ def robots(
         _list(as_json)
     elif read is None or like is None or out is None:
         raise OutputError(
-            "--read, --like and --out go together: the file, the nominal robot, and what to write."
+            expected="--read (the file), --like (the nominal robot) and --out (what to write) together",
+            option="--read",
         )
     else:
         from pisigma.robot import Robot
@@ -76,7 +77,7 @@ def robots(
 def _convert(
     read: Path, like: str, nominal: "Robot", out: Path, max_change_mm: float | None, as_json: bool
 ) -> None:
-    """Write the robot that a controller's file makes of the nominal one, which `like` names."""
+    """Write the robot of a controller's file; `like` names the nominal one."""
     from pisigma.deployment.export.controllers.reading import MAX_CHANGE, read_controller_file
     from pisigma.deployment.export.dh_table import dh_yaml
     from pisigma.files.output_file import check_output, write_whole
@@ -101,8 +102,8 @@ def _convert(
     print_line(f"Robot file written to {out}.")
     print_lines(
         [
-            f"Its tool is {change.mean_mm:.3g} mm and {change.mean_mrad:.3g} mrad from that of the nominal robot "
-            f"in the mean, {change.max_mm:.3g} mm at most.",
+            f"Its tool differs from that of the nominal robot by {change.mean_mm:.3g} mm and {change.mean_mrad:.3g} "
+            f"mrad on average, by {change.max_mm:.3g} mm at most.",
             *reading.remarks,
         ]
     )
@@ -141,7 +142,7 @@ def _list(as_json: bool) -> None:
 
 
 def _check(robot: str, base: str | None, tip: str | None, as_json: bool) -> None:
-    """Print where a description has the tool."""
+    """Print the pose of the tool by a description."""
     from pisigma.robot.description import Robot
     from pisigma.robot.kinematics.closed_form import closed_form_solver
     from pisigma.robot.pendant_poses import pendant_poses
@@ -160,8 +161,8 @@ def _check(robot: str, base: str | None, tip: str | None, as_json: bool) -> None
     print_lines(
         [
             "Move the robot to these values, with the tool and frame of the description, and compare what the teach "
-            "pendant shows; the rotation is RotZ(roll) RotY(pitch) RotX(yaw). Where the first difference comes with an "
-            "axis, look at the rows from there on, its direction and its coupling.",
+            "pendant shows; the rotation is RotZ(roll) RotY(pitch) RotX(yaw). If the first difference comes with an "
+            "axis, check its row and the following ones, its direction and its coupling.",
             "Nominal inverse kinematics are solved numerically."
             if form is None
             else f"Nominal inverse kinematics have the closed form {form.name} with {len(form.branches)} branches.",

@@ -1,4 +1,4 @@
-"""Options of commands, from the settings that the commands take."""
+"""Options of commands, made from the settings that the commands take."""
 
 import functools
 import inspect
@@ -14,9 +14,9 @@ from pisigma.files.setting import Setting, settings_of
 
 
 def takes_settings(command: Callable[..., None]) -> Callable[..., None]:
-    """Give a command the options of its settings, in the place of every parameter whose type is such a class.
+    """Replace every parameter of a command whose type is a class of settings by the options of that class.
 
-    The command gets what is built of them; where the parameter may be None, it is None where nothing is stated.
+    The command is called with the settings; a parameter that may be None is None if none of its options is given.
     """
     parameters: list[inspect.Parameter] = []
     groups: dict[str, tuple[type, bool]] = {}
@@ -41,7 +41,7 @@ def takes_settings(command: Callable[..., None]) -> Callable[..., None]:
 
 
 def _options(group: type) -> Iterator[Setting]:
-    """All options of a class of settings, those of the groups in it too."""
+    """Yield all options of a class of settings, including those of the groups in it."""
     for setting in settings_of(group):
         if setting.is_group:
             yield from _options(setting.kind)
@@ -50,7 +50,7 @@ def _options(group: type) -> Iterator[Setting]:
 
 
 def _parameter(setting: Setting) -> inspect.Parameter:
-    """The parameter of a command for an option."""
+    """Return the parameter of a command for an option."""
     option, name, default = setting.option, setting.name, setting.default
     kind = setting.kind
     if kind is bool and default:
@@ -66,17 +66,17 @@ def _parameter(setting: Setting) -> inspect.Parameter:
 
 
 def _name(setting: Setting) -> str:
-    """Name of the parameter of a command for an option."""
+    """Return the name of the parameter of a command for an option."""
     name = setting.name[2:].replace("-", "_")
     return f"{name}_" if keyword.iskeyword(name) else name
 
 
 def _built(group: type, is_optional: bool, stated: Mapping[str, Any]) -> Any:
-    """Settings by what is stated of them.
+    """Build settings from the values of their options.
 
     Raises:
-        BadParameter: only what says nothing by itself is stated.
-        PisigmaError: a part is stated of what belongs together.
+        BadParameter: only options that need others are given.
+        PisigmaError: only some of the options that are needed together are given.
     """
     values, needed = {}, []
     for setting in settings_of(group):
@@ -92,7 +92,7 @@ def _built(group: type, is_optional: bool, stated: Mapping[str, Any]) -> Any:
     missing = [one for one in needed if one.field not in values]
     if needed and missing == needed:
         unused = ", ".join(one.name for one in _options(group) if stated[_name(one)] != one.default)
-        raise typer.BadParameter(f"{unused}: only with {names}.")
+        raise typer.BadParameter(f"needs {names}", param_hint=unused)
     if missing:
-        raise PisigmaError(f"{names} belong together; give both.")
+        raise PisigmaError(expected=f"{names} together", option=missing[0].name, remedy="give both")
     return group(**values)

@@ -18,8 +18,7 @@ def simulate(
     images: Annotated[
         Path | None,
         typer.Option(
-            help="Folder to write instead, for a recipe with a camera: rendered images, joints.csv, camera.yaml and "
-            "board.yaml."
+            help="Folder for rendered images with joints.csv, camera.yaml and board.yaml, for a recipe with a camera."
         ),
     ] = None,
     held_out: Annotated[
@@ -36,7 +35,9 @@ def simulate(
 
     read = read_recipe(recipe)
     if (out is None) == (images is None):
-        raise RecipeError("state either --out, a CSV file of measurements, or --images, a folder of images.")
+        raise RecipeError(
+            "expected either --out, a CSV file of measurements, or --images, a folder", option="--out"
+        )
     if images is not None:
         _write_images(read, images, as_json)
         return

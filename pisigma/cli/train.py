@@ -3,18 +3,21 @@
 import shlex
 import shutil
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from pisigma.cli.arguments import AcceptImplausible, AsJson, Overwrite
+from pisigma.cli.arguments import AcceptImplausible, AsJson, Overwrite, Verbose
 from pisigma.cli.calibrate import print_calibration
-from pisigma.cli.output import print_json, print_line, print_lines, print_table, progress_of, saved
+from pisigma.cli.output import print_json, saved
+from pisigma.cli.progress import progress_of
+from pisigma.cli.screen import Block, print_screen, table
 from pisigma.cli.settings_options import takes_settings
 from pisigma.files.errors import printable
+from pisigma.reporting.verdict import Verdict, rms_text, rounded, uncapitalised
 from pisigma.workflow.settings.training import TrainSettings
 
 if TYPE_CHECKING:
@@ -27,18 +30,19 @@ def train(
     recipe: Annotated[Path, typer.Argument(help="Recipe (YAML), such as training/kiro3.yaml.")],
     settings: TrainSettings,
     data: Annotated[
-        Path | None, typer.Option(help="Measured data (CSV), for recipes that ask for them.")
+        Path | None, typer.Option(help="Measured data (CSV), for recipes that need them.")
     ] = None,
     out: Annotated[
         Path | None, typer.Option(help="Model folder to write. [default: runs/NAME, or the next free name]")
     ] = None,
     accept_implausible: AcceptImplausible = False,
     overwrite: Overwrite = False,
+    verbose: Verbose = False,
     as_json: AsJson = False,
 ) -> None:
     """Train the model of a recipe and write it as a model folder with card and figures.
 
-    Exit status 3, and no folder, where a calibration must not be trusted.
+    Exits with status 3 and writes no folder if a calibration must not be trusted.
     """
     started = time.perf_counter()
     from pisigma.files.conflicts import check_conflicts
@@ -66,41 +70,68 @@ def train(
         if as_json:
             print_json({"model": written and str(written), **training.to_json(), "command": texts["command"]})
         elif isinstance(training, InverseTraining):
-            _print_training(training.summary)
-            print_line(f"Model written to {folder} in {training.seconds:.1f} s; read its README.md.")
+            _print_training(training.summary, folder, training.seconds, verbose)
         else:
-            _print_redundancy(training.summary)
-            print_calibration(training.summary, written, training.seconds)
+            also = list(_redundancy(training.summary))
+            print_calibration(training.summary, written, training.seconds, verbose, also)
 
 
 def _next_free(name: str) -> Path:
-    """`runs/NAME`, or with a number behind it the first that is not there."""
+    """Return `runs/NAME`, or the first of `runs/NAME-2` and so on that does not exist."""
     names = (name, *(f"{name}-{number}" for number in range(2, 1_000)))
     return next(path for path in (Path("runs") / free for free in names) if not path.exists())
 
 
-def _print_training(summary: "TrainingSummary") -> None:
-    """Print the errors of joints and of held-out poses."""
+def _print_training(summary: "TrainingSummary", folder: Path, seconds: float, verbose: bool) -> None:
+    """Print the errors of held-out poses and of joints."""
     from pisigma.reporting.tables import joint_rows, pose_rows
 
     columns = [
         f"{when}\n{name}" for when in ("before", "after") for name in ("average", "deviat.", "maximum")
     ]
-    print_table("absolute joint errors", ("joint", "unit", "rows", *columns), joint_rows(summary.joints))
-    if summary.cross_validation is not None:
-        title = f"pose errors of held-out rows, {summary.cross_validation.folds}-fold cross-validation"
-        print_table(title, *pose_rows(summary.cross_validation.models))
-        print_lines([summary.verdict or ""])
-    if summary.test is not None:
-        title = f"pose errors of the {summary.test.rows} rows of the set 'test', which were kept aside"
-        print_table(title, *pose_rows(summary.test.models))
-    rows = summary.rows
+    rows, blocks, held_out = summary.rows, list[Block](), ""
+    for figures, which in (
+        (summary.test, "{rows} rows of the set 'test'"),
+        (summary.cross_validation, "held out in {folds}-fold cross-validation"),
+    ):
+        if figures is not None:
+            which = which.format(rows=figures.rows, folds=figures.folds)
+            *_, best = figures.models.values()
+            held_out = (
+                f"{rms_text(best, rows.used)} RMS, {which}; nominal {rms_text(figures.nominal, rows.used)}"
+            )
+            blocks.insert(0, table(f"errors of poses, {which}", *pose_rows(figures.models)))
+    blocks.append(
+        table("absolute joint errors", ("joint", "unit", "rows", *columns), joint_rows(summary.joints))
+    )
     reason = f" ({rows.rule})" if rows.left_out else ""
-    print_lines([f"{rows.used} rows used, {rows.left_out} left out{reason}."])
+    verdict = Verdict(
+        f"{held_out or _worst_joint(summary)}.",
+        uncapitalised(summary.verdict or "not known for a measured robot: the rows are simulated."),
+        f"verify with other poses: `pisigma verify {folder} ROWS.csv`.",
+    )
+    closing = [
+        f"{rows.used} rows used, {rows.left_out} left out{reason}.",
+        f"Model written to {folder} in {seconds:.1f} s; its README.md has all figures.",
+    ]
+    print_screen(verdict, blocks=blocks, closing=closing, verbose=verbose)
 
 
-def _print_redundancy(summary: "CalibrationSummary") -> None:
-    """Print what is redundant beside the paper's, and how the calibration converged."""
+def _worst_joint(summary: "TrainingSummary") -> str:
+    """Say how large the error of the worst joint is on average, before and after the correction."""
+    errors = {one.name: (one.held_out or one.training, one.held_out is None) for one in summary.joints}
+    known = {name: one for name, one in errors.items() if one[0] is not None}
+    if not known:
+        return "not known, as no row was judged"
+    name, (worst, is_fit) = max(known.items(), key=lambda one: one[1][0].after.values[0])  # type: ignore[union-attr]
+    assert worst is not None
+    after, before = (rounded(one.values[0]) for one in (worst.after, worst.before))
+    kind = "fit to the training rows" if is_fit else "held-out simulated rows"
+    return f"{after} {worst.after.unit} mean error of the worst joint, {name}, {kind}; {before} before the correction"
+
+
+def _redundancy(summary: "CalibrationSummary") -> Iterator[Block]:
+    """Lay out redundant parameters and convergence next to those of the paper."""
     if summary.redundant_sets is None:
         return
     paper = summary.paper or {}
@@ -113,13 +144,13 @@ def _print_redundancy(summary: "CalibrationSummary") -> None:
         ("RMSE after [mm]", summary.rmse_mm[-1], "rmse_after_mm", "{:.2e}"),
     ):
         rows.append((label, form.format(value), form.format(paper[key]) if key in paper else ""))
-    print_table("redundancy and convergence", ("what", "pisigma", "paper"), rows)
+    yield table("redundancy and convergence", ("what", "pisigma", "paper"), rows)
 
 
 def _sets_side_by_side(
     ours: Sequence[Sequence[str]], papers: Sequence[Sequence[str]]
 ) -> list[tuple[str, str, str]]:
-    """A row per set, equal sets on one."""
+    """Return a row per set, with equal sets in one."""
     pairs = [(members, next((one for one in papers if set(one) == set(members)), ())) for members in ours]
     pairs += [((), one) for one in papers if set(one) not in [set(members) for members in ours]]
     return [

@@ -1,30 +1,39 @@
-"""`pisigma verify`: whether a correction is active and right, judged from new measurements."""
+"""`pisigma verify`: check with new measurements that a correction is active and right."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from pisigma.cli.arguments import AsJson, ModelFolder
-from pisigma.cli.output import print_json, print_line, print_lines, print_table, progress_of, screen_width
+from pisigma.cli.arguments import AsJson, ModelFolder, Verbose
+from pisigma.cli.output import print_json, screen_width
+from pisigma.cli.progress import progress_of
+from pisigma.cli.screen import Block, print_screen, table
 from pisigma.cli.settings_options import takes_settings
 from pisigma.files.errors import AcceptanceError
 from pisigma.workflow.settings.verification import VerificationSettings
 
 if TYPE_CHECKING:
-    from pisigma.validation.held_out.model_comparison import ModelComparison
+    from pisigma.validation.held_out.model_comparison import ModelComparison, ModelFigures
     from pisigma.workflow.verify import Verification
 
 Hash = Annotated[
     str | None,
     typer.Option(
         "--sha256",
-        help="SHA-256 of the model folder's model.yaml, as sha256sum prints it; another model is refused.",
+        help="Refuse another model than that with this SHA-256 of model.yaml.",
     ),
 ]
-Data = Annotated[
-    Path, typer.Argument(help="New measurements (CSV) at the joint values that the robot was commanded to.")
-]
+Data = Annotated[Path, typer.Argument(help="New measurements (CSV) at commanded joint values.")]
+
+NEXT_STEPS = {
+    "better": "use the model, and verify again after a change of tool, base or arm.",
+    "not_better": "check that the controller applies the correction once, then measure again or recalibrate.",
+    "undecided": "measure more poses that differ, and verify again.",
+    "moved": "recalibrate the model with these rows.",
+    "setup_fault": "correct what is named above and measure again.",
+    "implausible": "correct what is named above and measure again.",
+}
 
 
 @takes_settings
@@ -33,46 +42,74 @@ def verify(
     data: Data,
     settings: VerificationSettings,
     sha256: Hash = None,
+    verbose: Verbose = False,
     as_json: AsJson = False,
 ) -> None:
-    """Say whether new measurements are explained better by the corrected model than by the nominal robot.
+    """Check with new measurements that a correction is active and right.
 
-    Where a joint, a length, the base or the tool has moved since the model was made, it says by how much, and prints
-    the line that recalibrates. Where errors are large, the usual setup faults that explain them are named: units,
-    order, signs or zeros of the joints, a correction that was applied twice or not at all. Balls in sockets, wires and
-    pairs are judged by how well the rows of each agree, and by stated distances. Rows of the set "train" are left out.
-    Exit status 3 where the corrected model does not explain the measurements better, or the arm has moved.
+    Compares the corrected model with the nominal robot. Also says what has moved since the model was made and how to
+    recalibrate, and names setup faults (units, order, signs or zeros of joints, a correction applied twice or not at
+    all) that explain large errors. Leaves out rows of the set "train". Exits with status 3 where the corrected model
+    does not explain the measurements better, or the arm has moved.
     """
     from pisigma.files.model_files import check_model_hash
     from pisigma.workflow import verify as workflow
 
     if sha256 is not None:
         check_model_hash(model, sha256)
-    with progress_of(f"verifying {model}"):
+    with progress_of("verify") as progress:
+        progress("comparing the models and looking for setup faults")
         verification = workflow.verify(model, data, settings)
     if as_json:
         print_json(verification.to_json())
     else:
-        _print(verification)
+        _print(verification, verbose)
     if not verification.accepted:
         raise AcceptanceError(verification.sentence)
 
 
-def _print(verification: "Verification") -> None:
-    """Print the verdict and what to run, the errors, and what else is wrong."""
-    print_lines([verification.sentence])
-    if verification.recalibration:
-        print_line(f"Run {verification.recalibration}")
-    print_comparison(verification.comparison, verification.data)
-    print_lines([*(fault.sentence for fault in verification.setup_faults), *verification.warnings])
+def _print(verification: "Verification", verbose: bool) -> None:
+    """Print the verdict, warnings, and the errors with and without the correction."""
+    from pisigma.reporting.verdict import Verdict, uncapitalised
+
+    trust = {"better": "yes", "undecided": "not known"}.get(verification.verdict, "no")
+    figures, rows = verification.comparison.models, verification.rows
+    errors = f"{model_rms(figures[-1], rows)} RMS with the correction, {model_rms(figures[0], rows)} without"
+    command = f"run `{verification.recalibration}`."
+    verdict = Verdict(
+        f"{errors} ({rows} rows of {Path(verification.data).name}).",
+        f"{trust}: {uncapitalised(verification.sentence)}",
+        command if verification.recalibration else NEXT_STEPS[verification.verdict],
+    )
+    warnings = [*(fault.sentence for fault in verification.setup_faults), *verification.warnings]
+    print_screen(
+        verdict, warnings, *comparison_blocks(verification.comparison, verification.data), verbose=verbose
+    )
 
 
-def print_comparison(comparison: "ModelComparison", data: str) -> None:
-    """Print the tables of models that were compared on the rows of a file."""
+def model_rms(figures: "ModelFigures", rows: int) -> str:
+    """Write the RMS errors of a model."""
+    from pisigma.reporting.verdict import rounded
+
+    errors = (figures.position, figures.orientation)
+    return " and ".join(
+        f"{rounded(one.statistics['rms'], rows)} {one.unit}" for one in errors if one is not None
+    )
+
+
+def comparison_blocks(comparison: "ModelComparison", data: str) -> tuple[list[Block], list[Block]]:
+    """Lay out the errors of models on the rows of a file: in short, and in detail."""
     from pisigma.reporting.comparison_tables import comparison_tables
     from pisigma.reporting.tables import distance_table
 
-    for title, table in comparison_tables(comparison, Path(data).name, screen_width()):
-        print_table(title, *table)
+    def blocks(whole: bool) -> list[Block]:
+        tables = comparison_tables(comparison, Path(data).name, screen_width(), whole)
+        return [
+            table(title, *cells, "all statistics" if whole else title.split()[0].lower())
+            for title, cells in tables
+        ]
+
+    short = blocks(whole=False)
     if comparison.socket_distance is not None:
-        print_table("stated distances of sockets", *distance_table(comparison.socket_distance))
+        short.append(table("stated distances of sockets", *distance_table(comparison.socket_distance)))
+    return short, blocks(whole=True)

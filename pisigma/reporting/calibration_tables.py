@@ -24,19 +24,35 @@ from pisigma.validation.held_out.validation_figures import (
 
 PARAMETER_COLUMNS = ("parameter", "unit", "nominal", "estimated", "change", "std. error", "remark")
 TRIAL_COLUMNS = ("tried", "unknowns", "log evidence", "left-out error", "seconds", "kept")
+SIGNIFICANT = 2.0
+"""Standard errors below which a change cannot be distinguished from 0."""
+UNCERTAIN = "not distinguishable from 0"
 _FIGURES = ("nominal", "estimated", "change", "standard_error")
 
 _say = functools.partial(sentences, "calibration.txt.j2")
 
 
 def parameter_table(parameters: Sequence[ParameterFigures]) -> Table:
-    """Make a table of parameters: figures, and the remark in a few words."""
-    rows = []
-    for parameter in parameters:
-        figures = (parameter.nominal, parameter.estimated, parameter.change, parameter.standard_error)
-        texts = ("" if value is None else figure_text(value + 0.0) for value in figures)
-        rows.append((parameter.name, parameter.unit, *texts, parameter.label))
-    return Table(PARAMETER_COLUMNS, tuple(rows))
+    """Make a table with one row per parameter: its figures, and the remark in a few words.
+
+    Figures have as many digits as their standard error deserves. A change of less than two standard errors cannot be
+    distinguished from 0.
+    """
+    return Table(PARAMETER_COLUMNS, tuple(_parameter_row(one) for one in parameters))
+
+
+def _parameter_row(parameter: ParameterFigures) -> tuple[str, ...]:
+    error = parameter.standard_error
+    digits = 4 if not error else min(max(1 - math.floor(math.log10(error)), 1), 6)
+    figures = (parameter.nominal, parameter.estimated, parameter.change, error)
+    texts = ("" if value is None else f"{round(value, digits) + 0.0:.{digits}f}" for value in figures)
+    small = error is not None and parameter.change is not None and abs(parameter.change) < SIGNIFICANT * error
+    label = (
+        ", ".join([*(() if parameter.label == "identified" else (parameter.label,)), UNCERTAIN])
+        if small
+        else parameter.label
+    )
+    return (parameter.name, parameter.unit, *texts, label)
 
 
 def undetermined_lines(summary: CalibrationSummary) -> list[str]:
@@ -55,19 +71,10 @@ def undetermined_lines(summary: CalibrationSummary) -> list[str]:
 def _scale(scale: ScaleFigures) -> str:
     """Say what a wrong scale of the sensor would explain, and the resulting error of positions."""
     return (
-        f"whether links are {scale.factor:.5f} times as long as drawn (standard deviation {scale.sigma:.2g}) or the "
-        "scale of the sensor is wrong by that factor: both give the same errors of held-out rows. The scale is "
-        f"{scale.odds:.2g} times as probable as independent errors of the links; if it is the scale, true positions "
-        f"deviate by {scale.rms_mm:.2g} mm RMS in addition to all errors shown"
-    )
-
-
-def predicted_line(rms_mm: float) -> str:
-    """Say which errors a calibration without held-out rows predicts, and what to do."""
-    return (
-        f"Predicted position error at other poses: {rms_mm:.3g} mm RMS, by the posterior of the calibration. No row "
-        "was held out to test it, and residuals of the calibration rows are smaller than errors at other poses; "
-        "measure more poses, or use a fleet prior of this robot type (--prior, made by `pisigma fleet prior`)."
+        f"links that are {scale.factor:.5f} times as long as nominal (standard deviation {scale.sigma:.2g}) cannot "
+        "be distinguished from a sensor whose scale is off by that factor, as both give the same held-out errors. The "
+        f"odds are {scale.odds:.2g} to 1 for one common factor rather than an error of each link; if the scale "
+        f"is off, true positions are off by {scale.rms_mm:.2g} mm RMS in addition to all errors shown"
     )
 
 

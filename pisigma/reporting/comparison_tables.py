@@ -2,10 +2,11 @@
 
 from collections.abc import Mapping, Sequence
 
-from pisigma.reporting.tables import Table, figure_text
+from pisigma.reporting.tables import Table
+from pisigma.reporting.verdict import rounded
 from pisigma.validation.held_out.model_comparison import Difference, Interval, ModelComparison, QuantityErrors
 
-_SHOWN = {"rms": "RMS", "mean": "mean", "p95": "95 %", "max": "maximum"}
+_SHOWN = {"rms": "RMS", "mean": "mean", "p95": "95 %", "max": "largest"}
 _NONE = "-"
 
 
@@ -13,7 +14,9 @@ _Lines = list[tuple[str, Sequence[str]]]
 """Label of each line of a table, and one cell per model."""
 
 
-def comparison_tables(comparison: ModelComparison, data: str, width: int) -> list[tuple[str, Table]]:
+def comparison_tables(
+    comparison: ModelComparison, data: str, width: int, whole: bool = True
+) -> list[tuple[str, Table]]:
     """Make titled tables of the errors of every model, and of their differences to the first.
 
     They have one column per model. Models that do not fit the width are divided among several tables.
@@ -22,13 +25,14 @@ def comparison_tables(comparison: ModelComparison, data: str, width: int) -> lis
         comparison: comparison of one model or more.
         data: name of the rows.
         width: width of the screen [characters].
+        whole: show everything; otherwise only RMS, 95 % quantile and maximum, and the mean difference.
     """
     names = [model.name for model in comparison.models]
     rows = f"{comparison.rows} rows ({comparison.configurations} configurations) of {data}"
-    tables = [(f"Errors of {rows}", names, _error_lines(comparison))]
+    tables = [(f"Errors of {rows}", names, _error_lines(comparison, whole))]
     if len(names) > 1:
-        title = f"Differences to {names[0]} on the same rows (negative is better)"
-        tables.append((title, names[1:], _difference_lines(comparison)))
+        title = f"Differences from {names[0]} on the same rows, negative is better"
+        tables.append((title, names[1:], _difference_lines(comparison, whole)))
     return [(title, table) for title, heads, lines in tables for table in _fitting(heads, lines, width)]
 
 
@@ -50,16 +54,17 @@ def _fitting(heads: Sequence[str], lines: _Lines, width: int) -> list[Table]:
     ]
 
 
-def _error_lines(comparison: ModelComparison) -> _Lines:
+def _error_lines(comparison: ModelComparison, whole: bool) -> _Lines:
     """Return errors with confidence intervals, per axis, and inside and outside the domain."""
+    shown = _SHOWN if whole else {key: text for key, text in _SHOWN.items() if key != "mean"}
     models = comparison.models
     lines: _Lines = []
     for quantity, first in models[0].quantities.items():
         errors = [model.quantities[quantity] for model in models]
-        lines += _statistic_lines(comparison, f"{quantity}, {{}} [{first.unit}]", _SHOWN, errors)
+        lines += _statistic_lines(comparison, f"{quantity}, {{}} [{first.unit}]", shown, errors)
         word = "along" if quantity == "position" else "about"
-        for axis in first.axes:
-            values = [figure_text(one.axes[axis]["rms"]) for one in errors]
+        for axis in first.axes if whole else ():
+            values = [rounded(one.axes[axis]["rms"], comparison.rows) for one in errors]
             lines.append((f"{quantity}, RMS {word} {axis} [{first.unit}]", values))
     if any(model.rows_outside for model in models):
         for quantity, first in models[0].quantities.items():
@@ -81,21 +86,26 @@ def _statistic_lines(
     """Return statistics of every model, each followed by its confidence intervals where there are any."""
     lines: _Lines = []
     for key, statistic in shown.items():
-        lines.append((label.format(statistic), [figure_text(one.statistics[key]) for one in errors]))
+        lines.append(
+            (label.format(statistic), [rounded(one.statistics[key], comparison.rows) for one in errors])
+        )
         if errors[0].intervals.get(key) is not None:
             confidence = f"  {100 * comparison.bootstrap.confidence:.0f} % confidence"
             lines.append((confidence, [_interval(one.intervals[key]) for one in errors]))
     return lines
 
 
-def _difference_lines(comparison: ModelComparison) -> _Lines:
+def _difference_lines(comparison: ModelComparison, whole: bool) -> _Lines:
     """Return the differences of the other models to the first, with intervals and Wilcoxon's p."""
     first, *others = comparison.models
     lines: _Lines = []
     for quantity, errors in first.quantities.items():
         differences = [_difference(model.quantities[quantity]) for model in others]
         label = f"{quantity}, {{}} [{errors.unit}]"
-        lines += _statistic_lines(comparison, label, {"mean": "mean", "rms": "RMS"}, differences)
+        statistics = {"mean": "mean", "rms": "RMS"} if whole else {"mean": "mean"}
+        lines += _statistic_lines(comparison, label, statistics, differences)
+        if not whole:
+            continue
         shares = [f"{100 * one.better_share:.0f} %" for one in differences]
         lines.append((f"{quantity}, better in", shares))
         lines.append((f"{quantity}, Wilcoxon's p", [_p(one.test.p) for one in differences]))
@@ -108,14 +118,13 @@ def _difference(errors: QuantityErrors) -> Difference:
 
 
 def _domain(statistics: Mapping[str, float], rows: int | None) -> str:
-    return f"{figure_text(statistics['rms'])} ({rows} rows)" if statistics else _NONE
+    return f"{rounded(statistics['rms'], rows or 0)} ({rows} rows)" if statistics else _NONE
 
 
 def _interval(interval: Interval | None) -> str:
     if interval is None:
         return _NONE
-    ends = (f"{end:.3g}" if abs(end) < 1e3 else f"{end:.0f}" for end in interval)
-    return f"[{', '.join(ends)}]"
+    return f"[{', '.join(rounded(end, 0) for end in interval)}]"
 
 
 def _p(value: float) -> str:

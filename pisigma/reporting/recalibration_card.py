@@ -29,9 +29,14 @@ def write_recalibration_card(model: CalibratedModel, summary: RecalibrationSumma
     )
 
 
+def candidate_names(summary: RecalibrationSummary) -> dict[str, str]:
+    """Name the candidates, by their keys in the figures."""
+    return OF_FLEET if summary.parent.kind == FLEET_PRIOR else CANDIDATES
+
+
 def candidate_table(summary: RecalibrationSummary) -> Table:
     """Make a table of the candidates: RMS error of held-out rows, and which was kept."""
-    names = OF_FLEET if summary.parent.kind == FLEET_PRIOR else CANDIDATES
+    names = candidate_names(summary)
     rows = (
         (
             names[name],

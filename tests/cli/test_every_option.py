@@ -19,6 +19,8 @@ from pisigma.cli.main import app
 REPOSITORY = Path(__file__).parents[2]
 ELSEWHERE = {("train", "--resume"): "tests/cli/test_train_interruption.py"}
 """Options that need a test of their own, and where it is."""
+OF_ALL_COMMANDS = ("--plugin", "--help-all")
+"""Options that one command is enough to test."""
 QUICK = ("robots --json", "import", "simulate rb5")
 """How calls begin that the suite runs too, in this process, so none with a plug-in."""
 QUICK_CALLS = [
@@ -80,8 +82,8 @@ def documented() -> Iterable[tuple[str, tuple[str, ...]]]:
 
 def test_every_option_is_run(ran):
     seen = {(name, option) for name, used in ran for option in used}
-    # --plugin is one option of all commands: one mechanism loads what it names, before any command begins
-    missing = {one for one in options() if one[1] != "--plugin"} - seen - set(ELSEWHERE)
+    # --plugin and --help-all are options of all commands, which one mechanism each handles before the command starts
+    missing = {one for one in options() if one[1] not in OF_ALL_COMMANDS} - seen - set(ELSEWHERE)
     assert not missing, f"add calls with them to tests/gate/options.txt: {sorted(missing)}"
     assert any("--plugin" in used for _, used in ran)
     for (name, option), file in ELSEWHERE.items():

@@ -8,7 +8,9 @@ import typer
 
 from pisigma.cli.arguments import AsJson, ModelFolder, PayloadKg, TemperatureC
 from pisigma.cli.endings import fail
-from pisigma.cli.output import print_json, print_line, print_lines, progress_of
+from pisigma.cli.output import print_json, print_lines
+from pisigma.cli.progress import progress_of
+from pisigma.cli.screen import together
 
 if TYPE_CHECKING:
     import numpy as np
@@ -20,15 +22,15 @@ Pose = tuple[float, float, float, float, float, float]
 IgnoreAxes = Annotated[
     str | None,
     typer.Option(
-        help="Axes of the tool that do not count, such as roll,pitch: of x, y, z (along them) and roll, pitch, yaw "
-        "(about the tool's x, y, z); or none. [default: by the number of joints]"
+        help="Axes of the tool that do not count: x, y, z, roll, pitch, yaw (about the tool's x, y, z) or none, with "
+        "commas. [default: by the number of joints]"
     ),
 ]
 ToleranceMm = Annotated[
-    str | None, typer.Option(help="How far the tool may be off along its axes [mm]: one number or three.")
+    str | None, typer.Option(help="Tolerance along the axes of the tool [mm], one number or three.")
 ]
 ToleranceDeg = Annotated[
-    str | None, typer.Option(help="How far it may be off about its axes [deg]: one number or three.")
+    str | None, typer.Option(help="Tolerance about the axes of the tool [deg], one number or three.")
 ]
 ElbowDeg = Annotated[float | None, typer.Option(help="Elbow angle of an arm with seven joints [deg].")]
 
@@ -50,14 +52,14 @@ def ik(
     accuracy: Annotated[
         bool,
         typer.Option(
-            "--accuracy", help="With --poses: predict the tool's standard deviation too; slow with a hybrid."
+            "--accuracy", help="With --poses, also predict the tool's standard deviation; slow with a hybrid."
         ),
     ] = False,
     path: Annotated[
         bool,
         typer.Option(
             "--path",
-            help="The rows of --poses are a path: stay on one branch as long as possible and say where that ends.",
+            help="Treat the rows of --poses as a path and stay on one branch as long as possible.",
         ),
     ] = False,
     ignore_axes: IgnoreAxes = None,
@@ -68,15 +70,15 @@ def ik(
     temperature_c: TemperatureC = None,
     as_json: AsJson = False,
 ) -> None:
-    """Print the joint values that really reach a pose, or write those of a file of poses.
+    """Compute the corrected joint values that reach a pose, or those of a file of poses.
 
-    Exit status 2 when a pose is unreachable, singular or outside the joint limits, or a row of the file is no
-    pose; what was found is given all the same. A file may be of any length.
+    Exits with status 2 if a pose is unreachable, singular or outside the joint limits, or a row of the file is not a
+    pose; the other solutions are printed or written nevertheless.
     """
     _check_options(pose, poses, out, branch, all_branches)
     for name, given in (("--accuracy", accuracy), ("--path", path)):
         if given and poses is None:
-            raise typer.BadParameter("it goes with --poses", param_hint=f"'{name}'")
+            raise typer.BadParameter("use it with --poses", param_hint=f"'{name}'")
     from pisigma.files.output_file import check_output
     from pisigma.model.inverse.corrected_ik import load
 
@@ -96,7 +98,7 @@ def ik(
 def _for_task(
     solver: "CorrectedIK", ignore: str | None, mm: str | None, deg: str | None, elbow_deg: float | None
 ) -> "CorrectedIK":
-    """The same where the options say which axes of the tool count."""
+    """Return the solver for the axes of the tool that count, by the options."""
     return solver.for_task(
         None if ignore is None else [name for name in _words(ignore) if name != "none"],
         _numbers("--tolerance-mm", mm),
@@ -110,12 +112,12 @@ def _words(text: str) -> list[str]:
 
 
 def _numbers(option: str, text: str | None) -> list[float] | None:
-    """The numbers of an option, None where it is not given."""
+    """Return the numbers of an option, None if it is not given."""
     try:
         return None if text is None else [float(word) for word in _words(text)]
     except ValueError:
         raise typer.BadParameter(
-            f"'{text}' is no number, nor three with commas", param_hint=f"'{option}'"
+            f"expected one number or three with commas, got '{text}'", param_hint=f"'{option}'"
         ) from None
 
 
@@ -140,7 +142,6 @@ def _print_pose(
         print_json({"solutions": solution_records(solution, solver), "warnings": solver.warnings})
     else:
         print_solutions(solution, solver)
-        print_lines(f"Warning: {sentence}" for sentence in solver.warnings)
     if problem := failure(solution, places, any_will_do=all_branches):
         fail(problem)
 
@@ -157,16 +158,15 @@ def _write_file(
     """Write the joint values of a file of poses, of any length."""
     from pisigma.cli.ik.joint_file import write_joint_file
 
-    with progress_of(f"solving {poses}") as tell:
+    with progress_of("ik") as tell:
         outcome = write_joint_file(solver, poses, out, branch, tell, accuracy, path)
     if as_json:
         print_json({"file": str(out), **outcome.to_json(path), "warnings": solver.warnings})
     else:
-        for line, switch in outcome.switches:
-            print_line(f"{poses}, line {line}: {switch.sentence}")
+        switches = [f"{poses}, line {line}: {switch.sentence}" for line, switch in outcome.switches]
         counts = ", ".join(f"{count} {status}" for status, count in outcome.statuses.most_common())
-        print_line(f"{outcome.rows} rows written to {out}: {counts}.")
-        print_lines(f"Warning: {sentence}" for sentence in solver.warnings)
+        warnings = (f"Warning: {sentence}" for sentence in solver.warnings)
+        print_lines([*together(switches), *warnings, f"{outcome.rows} rows written to {out}: {counts}."])
     if problem := outcome.problem(poses):
         fail(problem)
 
@@ -174,17 +174,17 @@ def _write_file(
 def _check_options(
     pose: Pose | None, poses: Path | None, out: Path | None, branch: str | None, all_branches: bool
 ) -> None:
-    """Refuse options that do not go together."""
+    """Refuse options that exclude each other."""
     if (pose is None) == (poses is None):
-        raise typer.BadParameter("give either --pose or --poses", param_hint="'--pose' / '--poses'")
+        raise typer.BadParameter("expected either --pose or --poses", param_hint="'--pose' / '--poses'")
     if (poses is None) != (out is None):
-        raise typer.BadParameter("--poses and --out go together", param_hint="'--out'")
+        raise typer.BadParameter("expected --poses and --out together", param_hint="'--out'")
     if all_branches and (pose is None or branch is not None):
-        raise typer.BadParameter("it goes with --pose and without --branch", param_hint="'--all-branches'")
+        raise typer.BadParameter("use it with --pose and without --branch", param_hint="'--all-branches'")
 
 
 def _transform(pose: Pose) -> "np.ndarray":
-    """The wanted pose T_base_tool as a batch of one; values that no pose has are refused."""
+    """Return the pose T_base_tool as a batch of one; refuse values that a pose cannot have."""
     from pisigma.files.errors import PoseError
     from pisigma.robot.kernels.array_kinematics import transform_of
     from pisigma.robot.row import FRAME_COLUMNS, MAX_MAGNITUDE
@@ -192,7 +192,10 @@ def _transform(pose: Pose) -> "np.ndarray":
     for name, value in zip(FRAME_COLUMNS, pose, strict=True):
         if not abs(value) <= MAX_MAGNITUDE:
             raise PoseError(
-                f"--pose: {name} {value:g} is no length [mm] or angle [deg] that a pose has; give X Y Z ROLL PITCH YAW."
+                expected=f"a length [mm] or angle [deg] of a pose for {name}",
+                value=value,
+                option="--pose",
+                remedy="give X Y Z ROLL PITCH YAW",
             )
 
     return transform_of([*(value / 1e3 for value in pose[:3]), *map(math.radians, pose[3:])])[None]

@@ -24,13 +24,13 @@ from pisigma.robot.description import Robot
 from pisigma.robot.kinematics.status import Status
 
 BAD_ROW = "bad_row"
-"""Status of a row that is no pose."""
+"""Status of a row that is not a pose."""
 
 FAR = 50.0
-"""A position this many times the reach away is no pose of the robot; metres taken for millimetres are off by 1000."""
+"""A position farther away than this many times the reach is refused; metres taken for millimetres are off by 1000."""
 
 LISTED = 10
-"""Rows that failed are told one by one, up to so many."""
+"""Largest number of failed rows that are named."""
 
 _MEASURES = ("position_residual_mm", "rotation_residual_deg", "domain_measure")
 _ACCURACY = "accuracy_mm"
@@ -38,7 +38,7 @@ _ACCURACY = "accuracy_mm"
 
 @dataclass(frozen=True)
 class FailedRow:
-    """A row without joint values that can be used as they are.
+    """A row without joint values that can be commanded.
 
     Attributes:
         line: in the file of poses.
@@ -60,7 +60,7 @@ class Outcome:
         statuses: how many have which status.
         first_failed: the first `LISTED` rows that failed, in the order of the file.
         failed: how many failed.
-        switches: of a path, the line of every place where the joints do not simply go on, and that place.
+        switches: of a path, the lines where it changes its branch or stops, with what happens there.
     """
 
     rows: int = 0
@@ -81,7 +81,7 @@ class Outcome:
         return values | ({"switches": switches} if path else {})
 
     def problem(self, source: Path) -> str | None:
-        """Say which rows failed and why; None where none did."""
+        """Say which rows failed and why; None if none did."""
         if not self.failed:
             return None
         first, *others = self.first_failed
@@ -106,18 +106,17 @@ def write_joint_file(
 ) -> Outcome:
     """Write one row per pose of a file, whole or not at all, however long the file is.
 
-    A row holds the line of the pose, status, branch, corrected and nominal joint values, the residuals of the
-    calibrated model, the domain measure and, where asked for, the predicted standard deviation of the tool's
-    position. What is not known is empty. A row that is no pose gets the status `bad_row` and does not stop the
-    others.
+    A row contains the line of the pose, status, branch, corrected and nominal joint values, the residuals of the
+    calibrated model, the domain measure and, with `accuracy`, the predicted standard deviation of the tool's position.
+    Unknown values are empty. A row that is not a pose gets the status `bad_row` and does not stop the others.
 
     Args:
         solver: the corrected inverse kinematics.
         poses: the file of poses.
         out: the file of joint values.
-        branch: to take instead of the trained one.
-        tell: gets what was done, such as "40,000 rows, 4%, 9,000 rows/s".
-        accuracy: whether to predict the standard deviations, which with a hybrid takes longer than all the rest.
+        branch: branch instead of the trained one.
+        tell: called with progress, such as "40,000 rows, 4%, 9,000 rows/s".
+        accuracy: whether to predict the standard deviations, which takes most of the time with a hybrid.
         path: whether the poses are a path, which is solved as a whole and in memory; see `CorrectedIK.path`.
 
     Raises:
@@ -149,7 +148,7 @@ def _header(solver: CorrectedIK, accuracy: bool) -> list[str]:
 def _solved_rows(
     solver: CorrectedIK, chunk: PoseChunk, branch: str | None, accuracy: bool, outcome: Outcome, path: bool
 ) -> Iterator[list[str]]:
-    """The first cells of the rows to write for a chunk, in the order of the file; counts them in the outcome."""
+    """Return the first cells of the rows of a chunk, in the order of the file, and count them in the outcome."""
     too_far = _too_far(chunk, solver.model.robot)
     near = [line for line, far in zip(chunk.line, too_far, strict=True) if not far]
     bad = [*chunk.bad, *(LeftOut(line, far) for line, far in zip(chunk.line, too_far, strict=True) if far)]
@@ -178,7 +177,7 @@ def _solved_rows(
 def _solve(
     solver: CorrectedIK, T: Tensor, branch: str | None, path: bool
 ) -> tuple[Solution, Sequence[PathSwitch]]:
-    """The one place where poses of a file meet the solver."""
+    """Solve poses of a file, one by one or as a path."""
     if path:
         followed = solver.path(T.numpy(), branch=branch)
         return followed.solution, followed.switches
@@ -186,7 +185,7 @@ def _solve(
 
 
 def _too_far(chunk: PoseChunk, robot: Robot) -> list[str]:
-    """For every pose why it cannot be one of the robot; "" where it can."""
+    """Say why each pose cannot be one of the robot; "" if it can."""
     distance = (chunk.T[:, :3, 3] - torch.from_numpy(robot.base[:3].copy())).norm(dim=-1)
     reasons = [""] * len(chunk.line)
     for row in (distance > FAR * robot.reach).nonzero()[:, 0].tolist() if robot.reach > 0 else []:
@@ -201,7 +200,7 @@ def _too_far(chunk: PoseChunk, robot: Robot) -> list[str]:
 def _cells(
     solution: Solution, lines: Sequence[int], solver: CorrectedIK, accuracy: bool
 ) -> Iterator[list[str]]:
-    """The cells of solved poses; empty where a value is not known."""
+    """Return the cells of solved poses; unknown values are empty."""
     per_file_unit = np.array([180 / math.pi if revolute else 1e3 for revolute in solver.revolute])
     joints = np.concatenate([np.asarray(q) * per_file_unit for q in (solution.q, solution.q_nominal)], -1)
     measures = [

@@ -4,9 +4,10 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
-from pisigma.cli.output import print_line, print_table
+from pisigma.cli.screen import Block, print_screen, sentences, table
 from pisigma.model.inverse.corrected_ik import CorrectedIK
 from pisigma.model.inverse.solution import Solution
+from pisigma.reporting.verdict import Verdict
 from pisigma.robot.kinematics.status import Status
 
 _QUANTITIES = ("q", "q_nominal", "correction")
@@ -45,27 +46,56 @@ def solution_records(solution: Solution, solver: CorrectedIK) -> list[dict[str, 
 
 
 def print_solutions(solution: Solution, solver: CorrectedIK) -> None:
-    """Print a table per solution."""
-    for row, status in enumerate(_statuses(solution)):
-        values = [_in_file_units(getattr(solution, name)[row].tolist(), solver) for name in _QUANTITIES]
-        lines = [
-            (joint, *(f"{value:.6f}" for value in figures), unit)
-            for joint, unit, *figures in zip(solver.joints, file_units(solver), *values, strict=True)
-        ]
-        title = f"{status.name.lower()}, branch {solution.branches[int(solution.branch[row])]}"
-        print_table(title, ("joint", "corrected", "nominal", "correction", "unit"), lines)
-        print_line(status.sentence)
-    if solution.ignored_axes:
-        print_line(f"Axes of the tool that do not count: {', '.join(solution.ignored_axes)}.")
+    """Print what the statuses mean, warnings, and the joint values; one table where there are several solutions."""
+    statuses = _statuses(solution)
+    names = [solution.branches[int(branch)] for branch in solution.branch.tolist()]
+    reached = sum(status not in FAILURES for status in statuses)
+    found = (
+        f"{reached} of {len(statuses)} solutions reach" if len(statuses) > 1 else f"branch {names[0]} reaches"
+    )
+    meanings = [f"{status.name.lower()}: {status.sentence}" for status in dict.fromkeys(statuses)]
+    verdict = Verdict(
+        f"{found} the pose." if reached else "the pose is not reached.",
+        " ".join(meanings),
+        "command the corrected values, not the nominal ones." if reached else "",
+        "Solution",
+    )
+    axes = ", ".join(solution.ignored_axes)
+    remarks = sentences("ignored axes", [f"Axes of the tool that do not count: {axes}."] if axes else [])
+    tables = _one(solution, solver, names[0]) if len(statuses) == 1 else _several(solution, solver, names)
+    print_screen(verdict, solver.warnings, [remarks, tables] if reached else [])
+
+
+def _one(solution: Solution, solver: CorrectedIK, branch: str) -> Block:
+    """Lay out the joint values of a solution."""
+    values = [_in_file_units(getattr(solution, name)[0].tolist(), solver) for name in _QUANTITIES]
+    rows = [
+        (joint, unit, *(f"{value:.4f}" for value in figures))
+        for joint, unit, *figures in zip(solver.joints, file_units(solver), *values, strict=True)
+    ]
+    return table(
+        f"joint values, branch {branch}", ("joint", "unit", "corrected", "nominal", "correction"), rows
+    )
+
+
+def _several(solution: Solution, solver: CorrectedIK, branches: Sequence[str]) -> Block:
+    """Lay out the corrected joint values of several solutions."""
+    units = dict.fromkeys(file_units(solver))
+    rows = [
+        (name, *(f"{value:.3f}" for value in _in_file_units(q, solver)))
+        for name, q in zip(branches, solution.q.tolist(), strict=True)
+    ]
+    title = f"corrected joint values [{' or '.join(units)}]; --json has nominal values and corrections too"
+    return table(title, ("branch", *solver.joints), rows)
 
 
 def failure(solution: Solution, places: Sequence[str], any_will_do: bool) -> str | None:
-    """Say which poses the robot cannot take as asked; None where it can take all.
+    """Say which poses the robot cannot take as asked; None if it can take all.
 
     Args:
         solution: the solutions.
-        places: what to call each of them.
-        any_will_do: one that reaches is enough (all branches of one pose).
+        places: name of each of them.
+        any_will_do: whether one that reaches is enough (all branches of one pose).
     """
     statuses = _statuses(solution)
     failed = [row for row, status in enumerate(statuses) if status in FAILURES]

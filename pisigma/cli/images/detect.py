@@ -1,16 +1,20 @@
 """`pisigma detect`: corners of a board in images, as a file for `pisigma calibrate`."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from pisigma.cli.arguments import AsJson
-from pisigma.cli.endings import fail
-from pisigma.cli.images.result import Page, check_outputs, write_result
-from pisigma.cli.output import print_json, print_lines, progress_of
+from pisigma.cli.arguments import AsJson, Verbose
+from pisigma.cli.images.result import Page, check_outputs, trust_text, write_result
+from pisigma.cli.output import print_json, print_lines
+from pisigma.cli.progress import progress_of
 from pisigma.cli.settings_options import takes_settings
+from pisigma.reporting.verdict import Verdict, rounded
 from pisigma.workflow.settings.images import DetectionSettings
+
+if TYPE_CHECKING:
+    from pisigma.workflow.images.detect import DetectedCorners
 
 Images = Annotated[list[Path] | None, typer.Argument(help="Image files, or folders of them.")]
 BoardFile = Annotated[Path, typer.Option(help="Board (YAML) that the images show.")]
@@ -18,12 +22,12 @@ CameraFile = Annotated[Path | None, typer.Option(help="Camera (YAML) that took t
 Out = Annotated[Path | None, typer.Option(help="File of corners to write (.csv).")]
 Print = Annotated[
     Path | None,
-    typer.Option("--print", help="Draw the board at its true size instead, to be printed (.pdf)."),
+    typer.Option("--print", help="Only draw the board at its true size, to be printed (.pdf)."),
 ]
 Joints = Annotated[
     Path | None,
     typer.Option(
-        help="Joint values (CSV) with a column 'image', or 'time' where images are named by their time."
+        help="Joint values (CSV) with a column 'image', or 'time' if images are named by their time."
     ),
 ]
 
@@ -38,23 +42,37 @@ def detect(
     joints: Joints = None,
     page: Page = None,
     sheet: Print = None,
+    verbose: Verbose = False,
     as_json: AsJson = False,
 ) -> None:
-    """Find the corners of a board in images, to sub-pixel.
+    """Detect the corners of a board in images, to a fraction of a pixel.
 
-    Images without a whole board and blurred ones are named and left out.
+    Leaves out images without a whole board and blurred ones, and names them.
     """
     if sheet is not None:
         _print_board(board, sheet, as_json)
         return
     if not images or camera is None or out is None:
-        fail("IMAGES, --camera, and --out were wanted; state them, or --print to draw the board.")
+        raise typer.BadParameter("expected IMAGES, --camera and --out, or --print to draw the board")
     check_outputs(out, (".csv",), "a file of corners", page, [*images, board, camera, joints])
     from pisigma.workflow.images import detect as workflow
 
     with progress_of("detect") as progress:
         detected = workflow.detect(images, board, camera, joints, settings, progress)
-    write_result(detected, out, page, as_json)
+    write_result(detected, _verdict(detected, out, camera, board), out, page, as_json, verbose)
+
+
+def _verdict(detected: "DetectedCorners", out: Path, camera: Path, board: Path) -> Verdict:
+    """Judge the corners of a board."""
+    detection = detected.detection
+    warnings = len(detected.warnings) + len(detection.left_out)
+    joints = "" if detected.joints else "add the joint values, then "
+    return Verdict(
+        f"corners fit to {rounded(detection.rms)} px RMS of u and v in {len(detection.boards)} of "
+        f"{len(detection.images)} images.",
+        trust_text(warnings, "yes: every image shows the board."),
+        f"{joints}run `pisigma calibrate ROBOT {out} --camera {camera} --board {board} --out DIR`.",
+    )
 
 
 def _print_board(board: Path, sheet: Path, as_json: bool) -> None:

@@ -6,15 +6,15 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from pisigma.cli.output import print_json, print_lines, print_table
+from pisigma.cli.output import print_json
+from pisigma.cli.screen import print_screen, sentences, table
+from pisigma.reporting.verdict import Verdict, counted
 
 if TYPE_CHECKING:
     from pisigma.workflow.images.calibrate_camera import CameraCalibration
     from pisigma.workflow.images.detect import DetectedCorners
 
-Page = Annotated[
-    Path | None, typer.Option(help="HTML page to write: every image with the residuals of its corners.")
-]
+Page = Annotated[Path | None, typer.Option(help="HTML page to write, with the residuals of every image.")]
 
 
 def check_outputs(
@@ -29,16 +29,32 @@ def check_outputs(
 
 
 def write_result(
-    result: "CameraCalibration | DetectedCorners", out: Path, page: Path | None, as_json: bool
+    result: "CameraCalibration | DetectedCorners",
+    verdict: Verdict,
+    out: Path,
+    page: Path | None,
+    as_json: bool,
+    verbose: bool,
 ) -> None:
-    """Write a result and its page, and print what they hold."""
+    """Write a result and its page, and print them."""
     if page is not None:
         result.save_page(page)
     result.save(out)
     if as_json:
         print_json({"file": str(out)} | result.to_json())
         return
-    for title, table in result.tables:
-        print_table(title, *table)
-    print_lines([*result.sentences, *(f"Warning: {one}" for one in result.warnings)])
-    print_lines(f"{file} is written." for file in (out, page) if file is not None)
+    left_out = [f"image {name} is left out: {reason}." for name, reason in result.detection.left_out.items()]
+    written = " and ".join(str(file) for file in (out, page) if file is not None)
+    print_screen(
+        verdict,
+        [*result.warnings, *left_out],
+        [table(title, *cells) for title, cells in result.tables],
+        [sentences("remarks on the images", result.sentences)],
+        [f"Written to {written}."],
+        verbose,
+    )
+
+
+def trust_text(warnings: int, otherwise: str) -> str:
+    """Say whether to trust a result with as many warnings."""
+    return f"with caution ({counted(warnings, 'warning')})." if warnings else otherwise

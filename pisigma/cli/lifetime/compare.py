@@ -1,14 +1,18 @@
-"""`pisigma compare`: in what two models of one robot differ, and what that means for the tool."""
+"""`pisigma compare`: how two models of one robot differ, and what that means for the tool."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from pisigma.cli.arguments import AsJson, complete_model
-from pisigma.cli.output import print_json, print_lines, print_table, progress_of, screen_width
+from pisigma.cli.arguments import AsJson, Verbose, complete_model
+from pisigma.cli.output import print_json
+from pisigma.cli.progress import progress_of
+from pisigma.cli.screen import print_screen, sentences, table
 from pisigma.cli.settings_options import takes_settings
+from pisigma.cli.verify import comparison_blocks
 from pisigma.files.errors import AcceptanceError
+from pisigma.reporting.verdict import Verdict, counted, rounded
 from pisigma.workflow.settings.comparison import ComparisonSettings
 
 if TYPE_CHECKING:
@@ -17,18 +21,18 @@ if TYPE_CHECKING:
 First = Annotated[
     str,
     typer.Argument(
-        metavar="A", help="Model folder, or 'nominal' or 'geometric'.", autocompletion=complete_model
+        metavar="A", help="Model folder, 'nominal' or 'geometric'.", autocompletion=complete_model
     ),
 ]
 Second = Annotated[
     str,
-    typer.Argument(metavar="B", help="What it is compared with, likewise.", autocompletion=complete_model),
+    typer.Argument(metavar="B", help="Second model, given in the same way.", autocompletion=complete_model),
 ]
 Rows = Annotated[Path | None, typer.Option(help="Measurements (CSV) that both models predict.")]
 Program = Annotated[
     Path | None,
     typer.Option(
-        help="Joint values or poses (CSV) of a program that was taught with A: what it misses under B."
+        help="Joint values or poses (CSV) of a program taught with A, to see what it misses under B."
     ),
 ]
 Page = Annotated[Path | None, typer.Option(help="HTML page to write, with a map of the workspace.")]
@@ -42,12 +46,12 @@ def compare(
     rows: Rows = None,
     program: Program = None,
     page: Page = None,
+    verbose: Verbose = False,
     as_json: AsJson = False,
 ) -> None:
-    """Say in what two models of one robot differ: parameters, positions of the tool, rows and programs.
+    """Compare two models of one robot: parameters, positions of the tool, rows and programs.
 
-    The significance of differences is from the posteriors of both models. Exit status 3 where the rows are not to be
-    trusted.
+    Tests differences with the posteriors of both models. Exits with status 3 where the rows must not be trusted.
     """
     from pisigma.files.output_file import check_page
     from pisigma.workflow import compare as workflow
@@ -56,34 +60,64 @@ def compare(
         stated = settings.cameras.files if settings.cameras else ()
         check_page(page, (Path(first), Path(second), rows, program, *stated))
     with progress_of("compare") as progress:
-        progress("both models")
+        progress("parameters, workspace and rows of both models")
         compared = workflow.compare(first, second, rows, program, settings)
         if page is not None:
             compared.save_page(page)
     if as_json:
         print_json(compared.to_json())
     else:
-        _print(compared, page)
+        _print(compared, page, verbose)
     if compared.diagnostics:
         raise AcceptanceError(" ".join(one.sentence for one in compared.diagnostics))
 
 
-def _print(compared: "ComparedModels", page: Path | None) -> None:
-    """Print what differs, the parameters side by side, and distances of the tool."""
-    from pisigma.reporting.comparison_tables import comparison_tables
+def _print(compared: "ComparedModels", page: Path | None, verbose: bool) -> None:
+    """Print what differs, distances of the tool, and the parameters of both models."""
     from pisigma.reporting.difference_tables import difference_table
     from pisigma.reporting.tables import pose_rows
 
     first, second = compared.models
-    print_lines(compared.sentences)
-    print_table(
-        f"parameters of {first} (A) and {second} (B)", *difference_table(compared.parameters, ("A", "B"))
-    )
+    parameters = difference_table(compared.parameters, ("A", "B"))
     distances = {what: one.errors.figures for what, one in compared.displacements.items()}
-    print_table("distances of the tool", *pose_rows(distances))
-    if compared.rows is not None:
-        for title, table in comparison_tables(compared.rows, "the rows", screen_width()):
-            print_table(title, *table)
-    print_lines(f"Warning: {one}" for one in compared.warnings)
-    if page is not None:
-        print_lines([f"Page written to {page}."])
+    short, whole = ([], []) if compared.rows is None else comparison_blocks(compared.rows, "the rows")
+    head, rows = pose_rows(distances)
+    blocks = [
+        sentences("what differs", compared.sentences),
+        *short,
+        table("distances of the tool", head, [row for row in rows if "mean" not in row[0]]),
+        table(f"parameters of {first} (A) and {second} (B)", *parameters),
+    ]
+    closing = [] if page is None else [f"Page written to {page}."]
+    print_screen(_verdict(compared), compared.warnings, blocks, whole, closing, verbose)
+
+
+def _verdict(compared: "ComparedModels") -> Verdict:
+    """Say how far two models differ, and which is better."""
+    first, second = compared.models
+    errors = compared.workspace.errors.figures.by_name
+    count, better = len(compared.parameters.differing), compared.better
+    which = (
+        f"the arms differ in {counted(count, 'parameter')}"
+        if count
+        else "the arms do not differ beyond uncertainty"
+    )
+    if compared.diagnostics:
+        trust = f"no: {compared.diagnostics[0].sentence}"
+    elif compared.rows is None:
+        trust = f"{which}; which model is better is not known without --rows."
+    else:
+        trust = f"{which}; {f'{better} predicts' if better else 'neither clearly predicts'} the rows better."
+    return Verdict(
+        f"{second} has the tool {rounded(errors['rms_mm'])} mm RMS from where {first} has it over the workspace, "
+        f"{rounded(errors['max_mm'])} mm at most.",
+        trust,
+        "measure rows and compare again with --rows."
+        if compared.rows is None
+        else "correct what is named above."
+        if compared.diagnostics
+        else f"use {better}."
+        if better
+        else "keep the model in use, or measure more rows.",
+        "Difference",
+    )

@@ -1,14 +1,17 @@
-"""`pisigma monitor`: whether a robot still is as its model says, what moved, and how it drifts over the months."""
+"""`pisigma monitor`: whether a robot has changed since its model was made, and how it drifts over the months."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from pisigma.cli.arguments import AsJson, ModelFolder
+from pisigma.cli.arguments import AsJson, ModelFolder, Verbose
 from pisigma.cli.endings import NOT_ACCEPTED
-from pisigma.cli.output import print_json, print_lines, print_table, progress_of
+from pisigma.cli.output import print_json
+from pisigma.cli.progress import progress_of
+from pisigma.cli.screen import print_screen, sentences, table
 from pisigma.cli.settings_options import takes_settings
+from pisigma.reporting.verdict import Verdict, counted, rounded, uncapitalised
 from pisigma.workflow.settings.monitoring import MonitorSettings
 
 if TYPE_CHECKING:
@@ -17,9 +20,12 @@ if TYPE_CHECKING:
 Sessions = Annotated[
     list[Path],
     typer.Argument(
-        metavar="SESSION...", help="Measurements (CSV), one file a session; five poses or more each."
+        metavar="SESSION...", help="Measurements (CSV), one file per session of five poses or more."
     ),
 ]
+MAX_SESSIONS = 6
+"""Sessions that are printed without `--verbose`, the last ones."""
+
 Page = Annotated[Path | None, typer.Option(help="HTML page to write, with charts of all sessions.")]
 
 
@@ -29,12 +35,13 @@ def monitor(
     sessions: Sessions,
     settings: MonitorSettings,
     page: Page = None,
+    verbose: Verbose = False,
     as_json: AsJson = False,
 ) -> None:
-    """Say of every session whether the robot is unchanged or what moved, and follow it over the months.
+    """Check in every session whether the robot has changed, and follow its drift over the months.
 
-    The sessions are kept in MODEL.history.sqlite beside the model folder, so that each month's call adds one. Exit
-    status 3 where something is to be done: recalibrating pays, a chart is outside its limits, or the error is.
+    Keeps the sessions in MODEL.history.sqlite next to the model folder, so that each call adds to them. Exits with
+    status 3 where recalibrating pays, or a chart or the error is outside its limits.
     """
     from pisigma.files.output_file import check_page
     from pisigma.workflow import monitor as workflow
@@ -45,24 +52,58 @@ def monitor(
         monitoring = workflow.monitor(model, sessions, settings, progress)
         if page is not None:
             monitoring.save_page(page)
-    _print(monitoring, page, as_json)
+    _print(monitoring, page, as_json, verbose)
     if monitoring.action:
         raise typer.Exit(NOT_ACCEPTED)
 
 
-def _print(monitoring: "Monitoring", page: Path | None, as_json: bool) -> None:
-    """Print a line for every session, what each says, and what they say together."""
+def _print(monitoring: "Monitoring", page: Path | None, as_json: bool, verbose: bool) -> None:
+    """Print the verdict, a line for every session, and what the sessions say together."""
     from pisigma.reporting.monitoring_tables import chart_table, session_table
 
     if as_json:
         print_json(monitoring.to_json())
         return
-    print_table(f"sessions of {monitoring.model.name}", *session_table(monitoring.sessions))
-    said = [one for one in monitoring.sessions if one.session.verdict != "unchanged"]
-    print_lines((f"{one.date}: {one.session.sentence}" for one in said), indent="  ")
-    print_lines(dict.fromkeys(line for one in monitoring.sessions for line in one.session.unobservable))
-    if len(monitoring.records) > 1:
-        print_table(f"charts of {len(monitoring.records)} sessions", *chart_table(monitoring.charts))
-    print_lines([*monitoring.sentences, *(f"Warning: {one}" for one in monitoring.warnings)])
-    if page is not None:
-        print_lines([f"Page written to {page}."])
+    sessions = monitoring.sessions
+    said = [f"{one.date}: {one.session.sentence}" for one in sessions if one.session.verdict != "unchanged"]
+    unobservable = dict.fromkeys(line for one in sessions for line in one.session.unobservable)
+    charts = table(f"charts of {len(monitoring.records)} sessions", *chart_table(monitoring.charts))
+    advice = next((line for line in monitoring.sentences if "`pisigma " in line), "")
+    print_screen(
+        _verdict(monitoring, advice),
+        monitoring.warnings,
+        [
+            sentences(
+                "what the sessions say together", (one for one in monitoring.sentences if one != advice)
+            ),
+            sentences("what has changed", [*said[-MAX_SESSIONS:], *unobservable], "  "),
+            table(f"last sessions of {monitoring.model.name}", *session_table(sessions[-MAX_SESSIONS:])),
+            *([charts] if len(monitoring.records) > 1 else []),
+        ],
+        [
+            table(f"sessions of {monitoring.model.name}", *session_table(sessions)),
+            sentences("what has changed in all sessions", said, "  "),
+        ]
+        if len(sessions) > MAX_SESSIONS
+        else [],
+        [] if page is None else [f"Page written to {page}."],
+        verbose,
+    )
+
+
+def _verdict(monitoring: "Monitoring", advice: str) -> Verdict:
+    """Judge a robot by its sessions; `advice` says how to recalibrate it where that pays."""
+    sessions, untrusted = monitoring.sessions, len(monitoring.untrusted)
+    changed = [one for one in sessions if one.session.verdict != "unchanged"]
+    last = f"{sessions[-1].date}, {rounded(sessions[-1].session.rms * 1e3, 0)} mm RMS" if sessions else "none"
+    alarms = [chart.what for chart in monitoring.charts if chart.alarm is not None]
+    doubts = [f"changed in {len(changed)} of {counted(len(sessions), 'session')}"] if changed else []
+    doubts += [f"outside the limits of its chart: {', '.join(alarms)}"] if alarms else []
+    doubts += [f"{counted(untrusted, 'session')} left out"] if untrusted else []
+    trust = f"yes: unchanged in {counted(len(sessions), 'session')}."
+    return Verdict(
+        f"last session {last} under the model, base and tool fitted where they were moved.",
+        f"{'no' if monitoring.action else 'with caution'}: {'; '.join(doubts)}." if doubts else trust,
+        uncapitalised(advice)
+        or ("see what has changed below." if doubts else "measure the next session with the same poses."),
+    )

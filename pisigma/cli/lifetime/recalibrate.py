@@ -6,10 +6,13 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from pisigma.cli.arguments import AcceptImplausible, AsJson, ModelFolder, Overwrite
-from pisigma.cli.output import command_line, print_json, print_lines, print_table, progress_of, saved
+from pisigma.cli.arguments import AcceptImplausible, AsJson, ModelFolder, Overwrite, Verbose
+from pisigma.cli.output import command_line, print_json, saved
+from pisigma.cli.progress import progress_of
+from pisigma.cli.screen import print_screen, sentences, table
 from pisigma.cli.settings_options import takes_settings
 from pisigma.files.errors import AcceptanceError
+from pisigma.reporting.verdict import Verdict, counted, rounded, uncapitalised
 from pisigma.workflow.settings.recalibration import RecalibrationSettings
 
 if TYPE_CHECKING:
@@ -18,10 +21,10 @@ if TYPE_CHECKING:
 
 Data = Annotated[
     list[Path],
-    typer.Argument(metavar="ROWS...", help="New measurements (CSV), ten poses or more, of any sensors."),
+    typer.Argument(metavar="ROWS...", help="New measurements (CSV) of ten poses or more."),
 ]
-Out = Annotated[Path | None, typer.Option(help="Model folder to write; needed without --dry-run.")]
-DryRun = Annotated[bool, typer.Option("--dry-run", help="Say what would be kept, and write nothing.")]
+Out = Annotated[Path | None, typer.Option(help="Model folder to write, unless --dry-run.")]
+DryRun = Annotated[bool, typer.Option("--dry-run", help="Say what would be kept without writing it.")]
 
 
 @takes_settings
@@ -34,21 +37,22 @@ def recalibrate(
     dry_run: DryRun = False,
     accept_implausible: AcceptImplausible = False,
     overwrite: Overwrite = False,
+    verbose: Verbose = False,
     as_json: AsJson = False,
 ) -> None:
     """Bring a model up to date with new rows, and say what has moved since it was made.
 
-    Left-out rows decide between the old model with the frames of these rows, the recalibrated one, and a calibration
-    from scratch; the folder holds the winner. Exit status 3, and no folder, where the result must not be trusted.
+    Keeps the model that predicts held-out rows best: the old one with the frames of these rows, the recalibrated one,
+    or a calibration from scratch. Exits with status 3 and writes no folder where the result must not be trusted.
     """
     from pisigma.files.output_folder import check_folder
 
     if (out is None) is not dry_run:
-        raise typer.BadParameter("either --out DIR or --dry-run was wanted.", param_hint="'--out'")
+        raise typer.BadParameter("expected either --out DIR or --dry-run", param_hint="'--out'")
     if out is not None:
         stated = settings.cameras.files if settings.cameras else ()
         check_folder(out, overwrite, inputs=(model, *data, *stated))
-    recalibrate_into(context, model, data, settings, out, accept_implausible, overwrite, as_json)
+    recalibrate_into(context, model, data, settings, out, accept_implausible, overwrite, as_json, verbose)
 
 
 def recalibrate_into(
@@ -60,9 +64,10 @@ def recalibrate_into(
     accept_implausible: bool,
     overwrite: bool,
     as_json: bool,
+    verbose: bool = False,
     drawn: "Robot | None" = None,
 ) -> None:
-    """Add rows to a model, write what was kept where a folder is stated, and print it.
+    """Add rows to a model, write the model that was kept if a folder is stated, and print it.
 
     Args:
         context: of the command, for the card.
@@ -70,40 +75,72 @@ def recalibrate_into(
         data: files of the rows.
         settings: how.
         out: folder to write; None for none.
-        accept_implausible: write also what must not be trusted.
-        overwrite: replace the model that the folder holds.
+        accept_implausible: write the model even if it must not be trusted.
+        overwrite: replace the model in the folder.
         as_json: print one JSON object.
+        verbose: print all tables.
         drawn: the robot whose fleet the model has to be the prior of; None for any model.
 
     Raises:
-        ModelError: the model is of another robot, or no fleet prior.
+        ModelError: the model belongs to another robot, or is not a fleet prior.
     """
     from pisigma.workflow import recalibrate as workflow
 
     with progress_of("recalibration") as progress:
         recalibration = workflow.recalibrate(model, data, settings, progress, drawn)
     if out is None:
-        _print(recalibration, None, as_json)
+        _print(recalibration, None, as_json, verbose)
         if not (recalibration.trusted or accept_implausible):
             raise AcceptanceError(
                 "the result must not be trusted, for the reasons above; nothing would be written."
             )
         return
     with saved(recalibration, out, accept_implausible, overwrite, command=command_line(context)) as folder:
-        _print(recalibration, folder, as_json)
+        _print(recalibration, folder, as_json, verbose)
 
 
-def _print(recalibration: "Recalibration", folder: Path | None, as_json: bool) -> None:
-    """Print what has moved and which model was kept."""
+def _print(recalibration: "Recalibration", folder: Path | None, as_json: bool, verbose: bool) -> None:
+    """Print the verdict, what has moved, and the models that were candidates."""
     from pisigma.reporting.recalibration_card import candidate_table
 
     if as_json:
         print_json({"model": folder and str(folder), **recalibration.to_json()})
         return
     summary = recalibration.summary
-    print_lines([*(one.sentence for one in summary.outliers), summary.changed, summary.verdict])
-    print_table(f"errors of {summary.left_out} left-out rows", *candidate_table(summary))
-    print_lines(f"Implausible: {one.sentence}" for one in summary.diagnostics)
-    print_lines(f"Warning: {sentence}" for sentence in summary.warnings)
-    if folder is not None:
-        print_lines([f"Model written to {folder} in {recalibration.seconds:.1f} s; read its README.md."])
+    warnings = [*(one.sentence for one in summary.diagnostics[1:]), *summary.warnings]
+    print_screen(
+        _verdict(recalibration, folder),
+        [*warnings, *(one.sentence for one in summary.outliers)],
+        [
+            sentences("which model is kept", [summary.verdict]),
+            table(f"errors of {summary.left_out} held-out rows", *candidate_table(summary)),
+        ],
+        closing=[]
+        if folder is None
+        else [f"Model written to {folder} in {recalibration.seconds:.1f} s; its README.md has all figures."],
+        verbose=verbose,
+    )
+
+
+def _verdict(recalibration: "Recalibration", folder: Path | None) -> Verdict:
+    """Judge a recalibration."""
+    from pisigma.reporting.recalibration_card import candidate_names
+
+    summary, names = recalibration.summary, candidate_names(recalibration.summary)
+    errors = {name: one.rms_mm for name, one in summary.cross_validation.items() if one.rms_mm is not None}
+    texts = {name: f"{names[name]} {rounded(error, summary.left_out)} mm" for name, error in errors.items()}
+    first = texts.pop(summary.kept, "not known: too few rows")
+    others = f"; {', '.join(texts.values())}" if texts else ""
+    count = len(summary.warnings) + len(summary.outliers)
+    cautions = f"with caution ({counted(count, 'warning')})" if count else "yes"
+    return Verdict(
+        f"{first} RMS, held out in cross-validation of {summary.left_out} new rows{others}.",
+        f"no: {summary.diagnostics[0].sentence}"
+        if summary.diagnostics
+        else f"{cautions}: {uncapitalised(summary.changed)}",
+        f"verify with other poses: `pisigma verify {folder} ROWS.csv`."
+        if folder is not None
+        else "run it with --out DIR instead of --dry-run to write this model."
+        if recalibration.trusted
+        else "correct what is named above and recalibrate again; no model was written.",
+    )

@@ -12,7 +12,8 @@ import typer
 
 from pisigma.cli.arguments import AsJson
 from pisigma.cli.endings import NOT_ACCEPTED
-from pisigma.cli.output import print_json, print_line, print_lines
+from pisigma.cli.output import print_json, print_line
+from pisigma.cli.screen import print_screen
 from pisigma.cli.settings_options import takes_settings
 from pisigma.files.setting import Option
 from pisigma.workflow.settings.measuring import MeasureSettings
@@ -27,27 +28,22 @@ if TYPE_CHECKING:
     from pisigma.workflow.measure import MeasuringSession
 
 PlanFile = Annotated[
-    Path, typer.Argument(metavar="PLAN", help="Poses that `pisigma plan` wrote (CSV, or the YAML beside it).")
+    Path, typer.Argument(metavar="PLAN", help="Plan of `pisigma plan` (CSV, or the YAML next to it).")
 ]
 RowsFile = Annotated[Path, typer.Option("--rows", help="Measurements (CSV) that grow row by row.")]
 Programs = Annotated[
     list[Path] | None,
     typer.Option(
         "--program",
-        help="Program to write again with the poses that are left, whenever they are planned again; several times for "
-        "several controllers.",
+        help="Robot program to rewrite whenever the remaining poses are planned again.",
     ),
 ]
 RestFile = Annotated[
     Path | None,
-    typer.Option(
-        "--rest", help="CSV file of the poses that are left. [default: PLAN.rest.csv beside the plan]"
-    ),
+    typer.Option("--rest", help="CSV file of the remaining poses. [default: PLAN.rest.csv next to the plan]"),
 ]
-Once = Annotated[bool, typer.Option("--once", help="Judge the rows that are there, and end.")]
-View = Annotated[
-    bool, typer.Option("--view", help="Show robot, rows and errors on a page in the browser too.")
-]
+Once = Annotated[bool, typer.Option("--once", help="Judge the present rows and exit.")]
+View = Annotated[bool, typer.Option("--view", help="Also show robot, rows and errors in the browser.")]
 
 
 @dataclass(frozen=True)
@@ -65,7 +61,7 @@ class PageOptions:
     urdf: Annotated[Path | None, Option("--view-urdf")] = None
 
     def body(self, robot: "Robot") -> "MeshBody | None":
-        """Load the meshes of a robot; None where capsules are shown.
+        """Load the meshes of a robot; None to show capsules.
 
         Raises:
             RobotError: the meshes cannot be shown.
@@ -79,17 +75,17 @@ class PageOptions:
 def shown_in_browser(
     arm: "ArmInCell", limit_mm: float | None, page: PageOptions | None, camera: "CameraSettings | None" = None
 ) -> Iterator[Callable[["SessionState"], None]]:
-    """Serve the page of a session, and give what shows a state on it; on a terminal it then stays until Ctrl-C.
+    """Serve the page of a session, and yield what shows a state on it; on a terminal the page stays until Ctrl-C.
 
     Args:
         arm: the robot in its cell.
-        limit_mm: what 95 % of the errors are to stay below [mm]; None for no limit.
+        limit_mm: limit for 95 % of the errors [mm]; None for no limit.
         page: how it is shown; None for no page.
-        camera: that measures; None for another sensor.
+        camera: the camera that measures; None for another sensor.
 
     Raises:
         ImportError: viser is not installed.
-        OutputError: the host is no address of this machine.
+        OutputError: the host is not an address of this machine.
         RobotError: the meshes cannot be shown.
     """
     if page is None:
@@ -120,11 +116,11 @@ def measure(
     view: View = False,
     as_json: AsJson = False,
 ) -> None:
-    """Follow the rows that are measured with a plan: wrong rows, the next pose, the accuracy so far, and when to stop.
+    """Follow the rows measured with a plan: wrong rows, the next pose, the accuracy so far, and when to stop.
 
-    Ends when more poses would not help, or with Ctrl-C. The poses of the plan are never overwritten: where the rest is
-    planned again, it is written beside them. With --json, sentences go to stderr, and one JSON object to stdout at the
-    end. Exit status 3 while all rows are wrong alike.
+    Ends when more poses would not help, or with Ctrl-C. Never overwrites the plan: remaining poses that are planned
+    again are written to --rest. With --json, progress goes to stderr and one JSON object to stdout at the end. Exits
+    with status 3 while all rows have the same fault.
     """
     from pisigma.planning.session.growing_images import growing_file
     from pisigma.workflow.follow import check_programs, follow, rest_file
@@ -157,7 +153,7 @@ def measure(
 def _printer(
     session: "MeasuringSession", title: str, as_json: bool
 ) -> Iterator[Callable[["SessionStep"], None]]:
-    """Give what prints a step: on a page that changes where there is a terminal, else in lines."""
+    """Yield what prints a step: on a changing page on a terminal, otherwise in lines."""
     from rich.console import Console
     from rich.live import Live
 
@@ -177,14 +173,13 @@ def _printer(
 
 
 def _print_summary(session: "MeasuringSession", rest: Path, as_json: bool) -> None:
-    """Print what the session has come to."""
-    from pisigma.cli.measure.session_lines import summary_lines
+    """Print the verdict on the session."""
+    from pisigma.cli.measure.session_lines import coverage_lines, summary_verdict
 
     state = session.state
     written = str(rest) if session.replanned else None
     if as_json:
         print_json({"rest": written, **state.to_json()})
         return
-    print_lines(summary_lines(state))
-    if written is not None:
-        print_lines([f"The poses that are left were planned again: {written}."])
+    again = [] if written is None else [f"The remaining poses were planned again: {written}."]
+    print_screen(summary_verdict(state), coverage_lines(state), closing=again)

@@ -1,49 +1,78 @@
-"""A measuring session as it is printed: a line a row, or a page that changes."""
+"""A measuring session as text: lines, or a page that changes."""
 
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
+import numpy as np
+
+from pisigma.cli.screen import MAX_ALIKE, ranges, together
 from pisigma.files.errors import printable
 from pisigma.planning.session.state import AccuracyPoint, SessionState
+from pisigma.reporting.verdict import Verdict, counted, rounded, uncapitalised
 from pisigma.workflow.follow import SessionStep
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
 
 SHOWN_ROWS, SHOWN_ALARMS, SHOWN_POINTS = 8, 4, 8
-"""On the page: the last of them."""
+"""Largest numbers of rows, alarms and points on the page, the last ones."""
 
 
 def step_lines(step: SessionStep) -> Iterator[str]:
-    """Say what is new, in a line each."""
+    """Say what is new, in a line each; many rows or alarms of one kind in one line."""
     yield from step.growth.notices
     if step.growth.waiting and not step.state.rows.line:
         yield f"Waiting: {step.growth.waiting}"
     state = step.state
     lines = [] if step.growth.rows is None else step.growth.rows.line
     alarms = {alarm.line for alarm in step.alarms if not alarm.counts}
-    for line in lines:
-        if line not in alarms:
-            yield f"line {line}: {row_text(state, state.rows.line.index(line))}"
-    for alarm in step.alarms:
-        yield f"{'Remark' if alarm.counts else 'ALARM'}: {alarm.sentence}"
+    yield from _row_lines(state, [line for line in lines if line not in alarms])
+    yield from together(f"{'Remark' if alarm.counts else 'ALARM'}: {alarm.sentence}" for alarm in step.alarms)
     for point in step.points:
-        yield accuracy_text(point)
+        yield f"Accuracy {accuracy_text(point)}"
     if lines or step.points:
         yield next_text(state)
 
 
-def summary_lines(state: SessionState) -> Iterator[str]:
-    """Say what the session has come to."""
+def _row_lines(state: SessionState, lines: Sequence[int]) -> Iterator[str]:
+    """Say how far new rows are from what the others predict: each row, or all of many."""
+    rows = [state.rows.line.index(line) for line in lines]
+    if len(lines) <= MAX_ALIKE:
+        yield from (f"line {line}: {row_text(state, row)}" for line, row in zip(lines, rows, strict=True))
+        return
+    errors = np.linalg.norm(state.rows.error[rows], axis=1) * 1e3
+    known = errors[~np.isnan(errors)]
+    if not len(known):
+        yield f"lines {ranges(lines)}: cannot be judged yet"
+        return
+    worst = lines[int(np.nanargmax(errors))]
+    yield (
+        f"lines {ranges(lines)}: {rounded(float(np.sqrt((known**2).mean())), len(known))} mm RMS from what the other "
+        f"rows predict, at most {rounded(float(known.max()), len(known))} mm (line {worst})"
+    )
+
+
+def summary_verdict(state: SessionState) -> Verdict:
+    """Judge a session: the accuracy so far, the rows that count, and whether to measure more."""
     counting = int((~state.rows.alarmed).sum())
-    yield f"{len(state.rows.line)} rows were read, {counting} of them count, {len(state.remaining)} poses are left."
-    if state.accuracy is not None:
-        yield accuracy_text(state.accuracy)
+    reached = "not known yet." if state.accuracy is None else accuracy_text(state.accuracy)
+    alarmed = len(state.rows.line) - counting
+    trust = (
+        f"{counted(counting, 'row')} counted, {alarmed} left out" if alarmed else f"all {counting} rows count"
+    )
+    if state.advice.action == "correct":
+        trust = "no: all rows have the same fault"
+    left = counted(len(state.remaining), "pose")
+    return Verdict(
+        reached, f"{trust}; {left} of the plan not measured.", uncapitalised(state.advice.sentence)
+    )
+
+
+def coverage_lines(state: SessionState) -> list[str]:
+    """Say which joints were measured over less than half of the planned range."""
     narrow = [span for span in state.coverage if span.planned < 0.5]
-    if narrow:
-        names = ", ".join(f"{span.name} ({100 * span.planned:.0f} %)" for span in narrow)
-        yield f"Less than half of the planned range was measured of: {names}."
-    yield state.advice.sentence
+    names = ", ".join(f"{span.name} ({100 * span.planned:.0f} %)" for span in narrow)
+    return [f"less than half of the planned range was measured of: {names}."] if narrow else []
 
 
 def row_text(state: SessionState, row: int) -> str:
@@ -57,10 +86,10 @@ def row_text(state: SessionState, row: int) -> str:
 
 def accuracy_text(point: AccuracyPoint) -> str:
     """Say how accurate a calibration is."""
-    texts = [_errors("expected", point.predicted_rms, point.predicted_p95)]
-    texts += [_errors("left-out rows", point.cross_validated_rms, point.cross_validated_p95)]
+    texts = [_errors("predicted", point.predicted_rms, point.predicted_p95)]
+    texts += [_errors("held-out rows", point.cross_validated_rms, point.cross_validated_p95)]
     texts += [_errors("check poses", point.checked_rms, point.checked_p95)]
-    return f"With {point.poses} poses, RMS and 95 % of the errors: {'; '.join(filter(None, texts))}."
+    return f"with {point.poses} poses, RMS and 95 % of the errors: {'; '.join(filter(None, texts))}."
 
 
 def next_text(state: SessionState) -> str:
@@ -102,8 +131,8 @@ def page(step: SessionStep | None, state: SessionState, title: str) -> "Renderab
         *([Text(f"Waiting: {printable(waiting, cut=False)}", style="dim")] if waiting else []),
         *(Text(alarm, style="red") for alarm in alarms),
         table("Rows", ("line", "error"), rows),
-        table("Accuracy [mm]", ("poses", "expected RMS", "95 %", "left-out RMS", "95 %"), _points(points)),
-        table("Joints", ("joint", "measured", "of the planned range"), _coverage(state)),
+        table("Accuracy [mm]", ("poses", "predicted RMS", "95 %", "held-out RMS", "95 %"), _points(points)),
+        table("Joints", ("joint", "measured", "share of the planned range"), _coverage(state)),
     )
 
 
@@ -139,4 +168,4 @@ def _coverage(state: SessionState) -> list[tuple[str, ...]]:
 
 
 def _errors(name: str, rms: float, p95: float) -> str:
-    return "" if rms != rms else f"{name} {rms * 1e3:.3f} and {p95 * 1e3:.3f} mm"
+    return "" if rms != rms else f"{name} {rounded(rms * 1e3)} and {rounded(p95 * 1e3)} mm"

@@ -15,9 +15,7 @@ if TYPE_CHECKING:
     from pisigma.deployment.serve.models import ServedModels
 
 Model = Annotated[Path | None, typer.Argument(help="Model folder.", autocompletion=complete_model)]
-Models = Annotated[
-    Path | None, typer.Option("--models", help="Folder of model folders, which are all served, by name.")
-]
+Models = Annotated[Path | None, typer.Option("--models", help="Folder of model folders to serve by name.")]
 
 
 @takes_settings
@@ -28,7 +26,7 @@ def serve(
 ) -> None:
     """Answer requests for corrected joint values, paths and poses, until SIGTERM or Ctrl-C.
 
-    When it is ready, it prints one JSON line with its ports. SIGHUP loads models again whose folders have changed.
+    Prints one JSON line with its ports when it is ready. SIGHUP reloads models whose folders have changed.
     """
     from pisigma.deployment.serve.server import Server
 
@@ -51,5 +49,7 @@ def _load(model: Path | None, models: Path | None) -> "ServedModels":
     if model is not None and models is None:
         return ServedModels([model])
     if models is None or model is not None:
-        raise typer.BadParameter("give either a model folder or --models", param_hint="'MODEL' / '--models'")
+        raise typer.BadParameter(
+            "expected either a model folder or --models", param_hint="'MODEL' / '--models'"
+        )
     return ServedModels(model_folders(models), within=models)

@@ -1,0 +1,70 @@
+"""A verdict on a result in three sentences, and numbers with as many digits as they deserve."""
+
+import math
+import re
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from pisigma.validation.held_out.validation_figures import ErrorFigures
+
+MANY_ROWS = 100
+"""Number of rows from which on errors deserve three digits, as their RMS is known to a few percent."""
+SMALLEST = 1e-4
+"""Errors [mm or deg] below which their size does not matter."""
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What a user needs to know of a result.
+
+    Attributes:
+        accuracy: how accurate it is, with the kind of the figures.
+        trust: whether to trust it, and why not.
+        next_step: what to do next.
+        heading: what the first sentence is about.
+    """
+
+    accuracy: str
+    trust: str
+    next_step: str
+    heading: str = "Accuracy"
+
+    @property
+    def short(self) -> str:
+        """The accuracy and whether to trust it, in a line."""
+        accuracy = self.accuracy.partition("; ")[0].partition(". ")[0].rstrip(".")
+        trust = re.split(r"[:,;.] ?", self.trust)[0]
+        return f"Verdict: {accuracy}. Trust: {trust}."
+
+    @property
+    def lines(self) -> tuple[tuple[str, str], ...]:
+        """Each sentence after what it is about."""
+        return ((self.heading, self.accuracy), ("Trust", self.trust), ("Next", self.next_step))
+
+
+def rounded(value: float, rows: int = MANY_ROWS) -> str:
+    """Write an error with three digits, or two where few rows were judged."""
+    digits = 3 if rows >= MANY_ROWS else 2
+    if value == 0 or not math.isfinite(value):
+        return f"{value:g}"
+    if abs(value) < SMALLEST:
+        return f"< {SMALLEST:g}" if value > 0 else f"> -{SMALLEST:g}"
+    return f"{value:.{max(0, digits - 1 - math.floor(math.log10(abs(value))))}f}"
+
+
+def uncapitalised(sentence: str) -> str:
+    """Return a sentence that continues another one."""
+    return sentence if sentence[1:2].isupper() else f"{sentence[:1].lower()}{sentence[1:]}"
+
+
+def counted(count: int, what: str) -> str:
+    """Write a number with a noun, such as "1 warning" or "2 warnings"."""
+    return f"{count} {what}{'' if count == 1 else 's'}"
+
+
+def rms_text(errors: "ErrorFigures", rows: int) -> str:
+    """Write the RMS of positions and of orientations, as far as they are known."""
+    figures = ((errors.rms_mm, "mm"), (errors.rms_deg, "deg"))
+    known = [f"{rounded(value, rows)} {unit}" for value, unit in figures if value is not None]
+    return " and ".join(known) or "unknown"
