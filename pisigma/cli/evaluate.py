@@ -90,7 +90,10 @@ def _print(evaluation: "Evaluation", verbose: bool) -> None:
     )
     warnings = [*(one.sentence for one in evaluation.diagnostics[1:]), *evaluation.warnings]
     print_screen(
-        verdict, warnings, *comparison_blocks(evaluation.comparison, evaluation.data), verbose=verbose
+        verdict,
+        warnings,
+        *comparison_blocks(evaluation.comparison, evaluation.data, verbose),
+        verbose=verbose,
     )
 
 

@@ -94,7 +94,7 @@ def _in_a_sentence(parameter: Any) -> Any:
     return short
 
 
-def _show_all(ctx: typer.Context, value: bool) -> bool:
+def _show_all(ctx: Any, value: bool) -> bool:
     if value and not ctx.resilient_parsing:
         ctx.meta[_SHOWS_ALL] = True
         typer.echo(ctx.get_help())

@@ -83,7 +83,10 @@ def _print(verification: "Verification", verbose: bool) -> None:
     )
     warnings = [*(fault.sentence for fault in verification.setup_faults), *verification.warnings]
     print_screen(
-        verdict, warnings, *comparison_blocks(verification.comparison, verification.data), verbose=verbose
+        verdict,
+        warnings,
+        *comparison_blocks(verification.comparison, verification.data, verbose),
+        verbose=verbose,
     )
 
 
@@ -97,8 +100,10 @@ def model_rms(figures: "ModelFigures", rows: int) -> str:
     )
 
 
-def comparison_blocks(comparison: "ModelComparison", data: str) -> tuple[list[Block], list[Block]]:
-    """Lay out the errors of models on the rows of a file: in short, and in detail."""
+def comparison_blocks(
+    comparison: "ModelComparison", data: str, verbose: bool
+) -> tuple[list[Block], list[Block]]:
+    """Lay out the errors of models on the rows of a file, and what is left out of them without `verbose`."""
     from pisigma.reporting.comparison_tables import comparison_tables
     from pisigma.reporting.tables import distance_table
 
@@ -109,7 +114,7 @@ def comparison_blocks(comparison: "ModelComparison", data: str) -> tuple[list[Bl
             for title, cells in tables
         ]
 
-    short = blocks(whole=False)
+    shown = blocks(whole=verbose)
     if comparison.socket_distance is not None:
-        short.append(table("stated distances of sockets", *distance_table(comparison.socket_distance)))
-    return short, blocks(whole=True)
+        shown.append(table("stated distances of sockets", *distance_table(comparison.socket_distance)))
+    return shown, [] if verbose else blocks(whole=True)

@@ -1,7 +1,7 @@
 """Fixtures for commands: run them in this process, and models to run them on."""
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +11,7 @@ from testing.models import hand_made_model, no_type_checker, small_recipe_text
 from testing.refusals import assert_fields, problem_of
 from typer.main import get_command
 
+from pisigma.cli import progress
 from pisigma.cli.main import app
 from pisigma.files.errors import PisigmaError
 from pisigma.model.folder.model_folder import save_model
@@ -33,9 +34,17 @@ def without_pictures(blank_pictures: None) -> None:
     """Commands write blank figures; those of `trained`, made before, are drawn."""
 
 
+@pytest.fixture(scope="session", autouse=True)
+def without_progress() -> Iterator[None]:
+    """Say nothing of progress, however slow the machine is."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(progress, "QUIET_S", 1e9)
+        yield
+
+
 @pytest.fixture(scope="session")
 def run() -> Run:
-    """Run a command; gives exit code, stdout and stderr."""
+    """Run a command in this process and return its exit code, stdout and stderr."""
     return _run
 
 
@@ -61,9 +70,9 @@ def models(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def refuses(run: Run) -> Callable[..., str]:
-    """Run a command that must end with status 2 and one line on stderr; gives that line.
+    """Run a command that must end with status 2 and one line on stderr, and return that line.
 
-    With `error` and fields, as of `testing.refusals.refused`, also the exception that ended it is checked.
+    `error` and fields are those of `testing.refusals.refused`.
     """
 
     def check(

@@ -5,9 +5,18 @@ import json
 import pytest
 from testing.identified import geometric_model
 from testing.models import hand_made_model
+from testing.screens import assert_screen
 
 import pisigma
 from pisigma.deployment.export.onnx_model import INVERSE
+from pisigma.files.errors import (
+    IdentificationError,
+    MeasurementError,
+    ModelError,
+    OutputError,
+    PoseError,
+    RecipeError,
+)
 from pisigma.model.folder.model_folder import save_model
 
 SMALL = ("--poses", 200, "--orders", "1,2")
@@ -67,7 +76,7 @@ def test_without_json_there_are_tables(run, parents, tmp_path):
     out = tmp_path / "tables"
     result = run("distill", parents / "geometric", "--out", out, "--joints", joints, *SMALL)
     assert result.exit_code == 0, result.output
-    assert "tool under the full model, 80 held-out poses" in result.stdout
+    assert_screen(result.stdout, "80 held-out poses", "nominal", "distilled", "full")
     assert "--joints q.csv" in (out / "README.md").read_text()
 
 
@@ -82,31 +91,40 @@ def test_it_can_be_exported(run, distilled, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("options", "complaint"),
+    ("options", "error", "fields"),
     [
-        (("--orders", "1,x"), "--orders '1,x': whole numbers from 1 to 20"),
-        (("--orders", "0"), "--orders '0'"),
-        (("--harmonics", 4), "--harmonics goes with --orders"),
-        (("--orders", "1", "--harmonics", 0), "--harmonics 0"),
-        (("--seed", -1), "--seed -1"),
-        (("--poses", 5), "5 poses are too few"),
-        (("--region", 1, 0, 0, 1, 0, 1), "each minimum not above its maximum"),
-        (("--region", 0, "nan", 0, 1, 0, 1), "x_min x_max"),
-        (("--region", 4000, 4100, 0, 100, 0, 100, *SMALL), "takes only 0"),
-        (("--joints", "missing.csv"), "missing.csv: cannot be read"),
+        (("--orders", "1,x"), RecipeError, {"option": "--orders", "value": "1,x"}),
+        (("--orders", "0"), RecipeError, {"option": "--orders", "value": "0"}),
+        (("--harmonics", 4), RecipeError, {"option": "--harmonics", "value": None}),
+        (("--orders", "1", "--harmonics", 0), RecipeError, {"option": "--harmonics", "value": 0}),
+        (("--seed", -1), RecipeError, {"value": -1}),
+        (("--poses", 5), IdentificationError, {"value": 5}),
+        (("--region", 1, 0, 0, 1, 0, 1), PoseError, {"option": "--region", "value": "1 0 0 1 0 1"}),
+        (("--region", 0, "nan", 0, 1, 0, 1), PoseError, {"option": "--region", "value": "0 nan 0 1 0 1"}),
+        (("--region", 4000, 4100, 0, 100, 0, 100, *SMALL), IdentificationError, {}),
+        (("--joints", "missing.csv"), MeasurementError, {"file": "missing.csv"}),
     ],
 )
-def test_bad_options_are_told(refuses, parents, tmp_path, options, complaint):
+def test_bad_options_are_refused(refuses, parents, tmp_path, options, error, fields):
     out = tmp_path / "out"
-    assert complaint in refuses("distill", parents / "geometric", "--out", out, *options)
+    refuses("distill", parents / "geometric", "--out", out, *options, error=error, **fields)
     assert not out.exists()
 
 
 def test_a_model_of_a_network_only_is_refused(refuses, parents, tmp_path):
-    assert "nothing to distil" in refuses("distill", parents / "network", "--out", tmp_path / "out")
+    refuses(
+        "distill", parents / "network", "--out", tmp_path / "out", error=ModelError, value="hand_made_kiro3"
+    )
 
 
 def test_another_folder_is_not_touched(refuses, parents, tmp_path):
     (tmp_path / "letter.txt").write_text("dear reader")
-    assert "is no model folder" in refuses("distill", parents / "geometric", "--out", tmp_path)
+    refuses(
+        "distill",
+        parents / "geometric",
+        "--out",
+        tmp_path,
+        error=OutputError,
+        file="test_another_folder_is_not_tou0",
+    )
     assert (tmp_path / "letter.txt").read_text() == "dear reader"

@@ -13,6 +13,7 @@ from testing.refusals import problem_of
 import pisigma
 from pisigma.cli.endings import TRACEBACK
 from pisigma.cli.output import print_lines, print_table
+from pisigma.files.errors import OutputError
 from pisigma.robot import Robot, catalogue
 from pisigma.robot.writing import robot_to_yaml
 
@@ -75,10 +76,9 @@ def test_problem_in_a_process_of_its_own(tmp_path):
     done = command("evaluate", tmp_path / "nothing", "data.csv")
     assert done.returncode == 2
     assert done.stdout == ""
-    assert done.stderr == (
-        f"pisigma: {tmp_path}/nothing: there is no such model folder; give a folder that `pisigma calibrate` or "
-        "`pisigma train` wrote.\n"
-    )
+    (line,) = done.stderr.splitlines()
+    assert line.startswith("pisigma: ")
+    assert f"{tmp_path}/nothing" in line
 
 
 DEFECT = (
@@ -102,10 +102,8 @@ def test_a_defect_of_ours_exits_1_with_one_line():
     done = with_a_defect(traceback="")
     assert (done.returncode, done.stdout) == (1, "")
     (line,) = done.stderr.splitlines()
-    assert line.startswith(
-        "pisigma: a defect of pisigma ended the command (ZeroDivisionError: division by zero; "
-    )
-    assert "Please report it" in line
+    assert line.startswith("pisigma: ")
+    assert "ZeroDivisionError: division by zero" in line
     assert f"{TRACEBACK}=1" in line
 
 
@@ -194,9 +192,9 @@ def test_paths_that_no_file_can_have(refuses, models, tmp_path, monkeypatch, pat
         ("export", path, "--format", "dh", "--out", "x.csv"),
         ("upgrade", path),
     ):
-        sentence = refuses(*arguments)
-        assert sentence.isprintable()
-        assert len(sentence) < 1000
+        message = refuses(*arguments)
+        assert message.isprintable()
+        assert len(message) < 1000
     assert list(tmp_path.iterdir()) == []
 
 
@@ -281,43 +279,28 @@ def test_a_missing_extra_is_named_in_one_sentence(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "complaint"),
+    ("arguments", "file"),
     [
-        (("simulate", "r.yaml", "--out", "r.yaml"), "r.yaml: is an input of this command"),
-        (("simulate", "r.yaml", "--out", "arm.yaml"), "arm.yaml: is an input of this command"),
-        (("simulate", "r.yaml", "--out", "m/rows.csv"), "m/rows.csv: lies in the model folder"),
-        (("train", "r.yaml", "--out", "m"), "m: holds a model already; replace it with --overwrite"),
-        (("train", "r.yaml", "--out", ".", "--overwrite"), ".: is the working directory"),
-        (("train", "r.yaml", "--out", "new", "--logs", "m"), "m/metrics.csv: lies in the model folder"),
-        (
-            ("calibrate", "arm.yaml", "poses.csv", "--out", "arm.yaml"),
-            "arm.yaml: is an input of this command",
-        ),
-        (
-            ("calibrate", "ur5", "poses.csv", "--out", "m"),
-            "m: holds a model already; replace it with --overwrite",
-        ),
-        (("distill", "m", "--out", "m", "--overwrite"), "m: is an input of this command"),
-        (("distill", "m", "--out", "m/small"), "m/small: lies in m, an input of this command"),
-        (("report", "m", "x.html", "--out", "x.html"), "x.html: is an input of this command"),
-        (
-            ("report", "m", "--out", "x.html", "--figures", "m"),
-            "m/figure.png: lies in m, an input of this command",
-        ),
-        (("ik", "m", "--poses", "poses.csv", "--out", "m/model.yaml"), "m/model.yaml: lies in m, an input"),
-        (("ik", "m", "--poses", "poses.csv", "--out", "link.csv"), "link.csv: is an input of this command"),
-        (("ik", "m", "--poses", "poses.csv", "--out", "pipe.csv"), "pipe.csv: is no regular file"),
-        (
-            ("export", "m", "--format", "dh", "--out", "m/dh.csv"),
-            "m/dh.csv: lies in m, an input of this command",
-        ),
-        (
-            ("export", "m", "--format", "urdf", "--like", "arm.urdf", "--out", "arm.urdf"),
-            "arm.urdf: is an input of this command",
-        ),
+        (("simulate", "r.yaml", "--out", "r.yaml"), "r.yaml"),
+        (("simulate", "r.yaml", "--out", "arm.yaml"), "arm.yaml"),
+        (("simulate", "r.yaml", "--out", "m/rows.csv"), "m/rows.csv"),
+        (("train", "r.yaml", "--out", "m"), "m"),
+        (("train", "r.yaml", "--out", ".", "--overwrite"), "."),
+        (("train", "r.yaml", "--out", "new", "--logs", "m"), "m/metrics.csv"),
+        (("calibrate", "arm.yaml", "poses.csv", "--out", "arm.yaml"), "arm.yaml"),
+        (("calibrate", "ur5", "poses.csv", "--out", "m"), "m"),
+        (("distill", "m", "--out", "m", "--overwrite"), "m"),
+        (("distill", "m", "--out", "m/small"), "m/small"),
+        (("report", "m", "x.html", "--out", "x.html"), "x.html"),
+        (("report", "m", "--out", "x.html", "--figures", "m"), "m/figure.png"),
+        (("ik", "m", "--poses", "poses.csv", "--out", "m/model.yaml"), "m/model.yaml"),
+        (("ik", "m", "--poses", "poses.csv", "--out", "link.csv"), "link.csv"),
+        (("ik", "m", "--poses", "poses.csv", "--out", "pipe.csv"), "pipe.csv"),
+        (("export", "m", "--format", "dh", "--out", "m/dh.csv"), "m/dh.csv"),
+        (("export", "m", "--format", "urdf", "--like", "arm.urdf", "--out", "arm.urdf"), "arm.urdf"),
     ],
 )
-def test_no_command_writes_over_what_it_reads(refuses, models, tmp_path, monkeypatch, arguments, complaint):
+def test_no_command_writes_over_what_it_reads(refuses, models, tmp_path, monkeypatch, arguments, file):
     shutil.copytree(models / "kiro3", tmp_path / "m")
     (tmp_path / "arm.yaml").write_text(robot_to_yaml(Robot.load("kiro3")))
     (tmp_path / "r.yaml").write_text(small_recipe_text("kiro3").replace("robot: kiro3", "robot: arm.yaml"))
@@ -327,7 +310,7 @@ def test_no_command_writes_over_what_it_reads(refuses, models, tmp_path, monkeyp
     os.mkfifo(tmp_path / "pipe.csv")
     before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
     monkeypatch.chdir(tmp_path)
-    assert refuses(*arguments).startswith(complaint)
+    refuses(*arguments, error=OutputError, file=file)
     assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
 
 

@@ -31,7 +31,8 @@ def test_the_command_writes_it(run, models, tmp_path):
     out = tmp_path / "limits.txt"
     result = run("export", models / "ur10", "--format", "limits", "--out", out, "--branch", "up")
     assert (result.exit_code, result.stderr) == (0, "")
-    assert result.stdout == f"Nothing is corrected.\nA list of limits written to {out}.\n"
+    assert result.stdout.startswith("Nothing is corrected.\n")
+    assert str(out) in result.stdout
     assert out.read_text().splitlines()[0] == "up"
     assert len(out.read_text().splitlines()) == 7
     told = json.loads(run("export", models / "ur10", "--format", "limits", "--out", out, "--json").stdout)
@@ -41,31 +42,26 @@ def test_the_command_writes_it(run, models, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "complaint"),
+    ("arguments", "words"),
     [
-        (("limts", "--out", "x.txt"), "--format 'limts' is unknown; did you mean 'limits'?"),
-        (("limits", "--out", "x.csv"), "x.csv: a list of limits goes into a .txt file"),
-        (
-            ("limits", "--out", "x.txt", "--poses", "p.csv"),
-            "--poses goes with --format targets, not with limits",
-        ),
-        (
-            ("dh", "--out", "x.csv", "--branch", "up"),
-            "--branch goes with --format targets or limits, not with dh",
-        ),
+        (("limts", "--out", "x.txt"), ("--format", "'limts'", "'limits'")),
+        (("limits", "--out", "x.csv"), ("x.csv", ".txt")),
+        (("limits", "--out", "x.txt", "--poses", "p.csv"), ("--poses", "targets", "limits")),
+        (("dh", "--out", "x.csv", "--branch", "up"), ("--branch", "targets", "limits", "dh")),
     ],
 )
-def test_options_and_files_are_checked_as_those_of_others(refuses, models, arguments, complaint):
-    assert refuses("export", models / "ur10", "--format", *arguments).startswith(complaint)
+def test_options_and_files_are_checked_as_those_of_others(refuses, models, arguments, words):
+    message = refuses("export", models / "ur10", "--format", *arguments, error=OutputError)
+    assert all(word in message for word in words)
 
 
 def test_names_and_options_are_checked_when_registering():
     assert register_export(LIMITS) is LIMITS
-    with pytest.raises(OutputError, match="there is an export 'urdf' already"):
+    with pytest.raises(OutputError, match="'urdf'"):
         register_export(ExportFormat("urdf", "a", (), write_limits))
-    with pytest.raises(OutputError, match="there is an export 'limits' already"):
+    with pytest.raises(OutputError, match="'limits'"):
         register_export(ExportFormat("limits", "a", (), write_limits))
-    with pytest.raises(OutputError, match="export 'other': pose: did you mean 'poses'"):
+    with pytest.raises(OutputError, match="'poses'"):
         register_export(ExportFormat("other", "a", (), write_limits, frozenset(["pose"])))
     assert export_names() == (*registry.BUILT_IN, "limits")
 

@@ -7,6 +7,7 @@ from testing.closeness import assert_close
 from testing.coupled import COUPLED, coupled_robot
 from testing.identified import geometric_model
 
+from pisigma.files.errors import RobotError, UnknownRobotError
 from pisigma.model.folder.model_folder import save_model
 from pisigma.robot import Robot
 from pisigma.robot.kinematics.forward import forward_kinematics
@@ -28,7 +29,7 @@ def test_a_calibration_goes_to_the_controller_and_comes_back(run, refuses, tmp_p
     assert any("forum.universal-robots.com" in remark for remark in stated["remarks"])
     read = run("robots", "--read", conf, "--like", "ur10", "--out", out)
     assert (read.exit_code, read.stdout.count("Warning")) == (0, 0)
-    assert read.stdout.startswith(f"Robot file written to {out}.\nIts tool is ")
+    assert str(out) in read.stdout
     q = torch.rand((50, 6), generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     assert model.calibrated is not None
     assert_close(forward_kinematics(Robot.load(out), q), forward_kinematics(model.calibrated, q), atol=1e-9)
@@ -40,7 +41,7 @@ def test_a_calibration_goes_to_the_controller_and_comes_back(run, refuses, tmp_p
     assert 0.1 < change["mean_mm"] < change["max_mm"] < 20
     conf.write_text(conf.read_text().replace("delta_a = [", "delta_a = [0.02, 0, 0, 0, 0, 0] # ["))
     written = out.read_bytes()
-    assert "--max-change-mm" in refuses("robots", "--read", conf, "--like", "ur10", "--out", out)
+    refuses("robots", "--read", conf, "--like", "ur10", "--out", out, error=RobotError)
     assert out.read_bytes() == written
     wide = ("--max-change-mm", "1e5", "--json")
     farther = json.loads(run("robots", "--read", conf, "--like", "ur10", "--out", out, *wide).stdout)
@@ -48,10 +49,10 @@ def test_a_calibration_goes_to_the_controller_and_comes_back(run, refuses, tmp_p
     drawn = robot_to_urdf(Robot.load("ur10")).replace("</robot>", TWO_ENDS)
     (tmp_path / "arm.urdf").write_text(drawn)
     arguments = ("robots", "--read", conf, "--like", tmp_path / "arm.urdf", "--out", out, *wide)
-    assert "say with tip" in refuses(*arguments)
+    refuses(*arguments, stdout=None, error=RobotError)
     assert json.loads(run(*arguments, "--base", "base_link", "--tip", "tool0").stdout)["joints"] == 6
-    assert "--read, --like and --out go together" in refuses("robots", "--read", conf)
-    assert "is an input of this command" in refuses("robots", "--read", out, "--like", "ur10", "--out", out)
+    refuses("robots", "--read", conf)
+    refuses("robots", "--read", out, "--like", "ur10", "--out", out)
 
 
 def test_a_description_is_checked_at_the_pendant(run, refuses, tmp_path):
@@ -71,4 +72,4 @@ def test_a_description_is_checked_at_the_pendant(run, refuses, tmp_path):
     assert "-817.25" in shown
     assert "inside" in shown
     assert all(len(line) <= 80 for line in run("robots", "--check", "ur10").stdout.splitlines())
-    assert "no robot of the catalogue" in refuses("robots", "--check", "nothing")
+    refuses("robots", "--check", "nothing", error=UnknownRobotError)

@@ -53,7 +53,7 @@ def heed_ctrl_c() -> None:
 
 def start_and_wait_for_a_checkpoint(cwd: Path, recipe: Path) -> subprocess.Popen[bytes]:
     process = subprocess.Popen(
-        command(0.1, "train", str(recipe), "--out", "model"),
+        command(0.02, "train", str(recipe), "--out", "model"),
         cwd=cwd,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
@@ -61,7 +61,7 @@ def start_and_wait_for_a_checkpoint(cwd: Path, recipe: Path) -> subprocess.Popen
         preexec_fn=heed_ctrl_c,
     )
     checkpoint = cwd / ".model.training" / "last.ckpt"
-    for _ in range(600):
+    for _ in range(2400):
         if checkpoint.is_file() or process.poll() is not None:
             break
         time.sleep(0.05)

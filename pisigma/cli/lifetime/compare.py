@@ -80,7 +80,9 @@ def _print(compared: "ComparedModels", page: Path | None, verbose: bool) -> None
     first, second = compared.models
     parameters = difference_table(compared.parameters, ("A", "B"))
     distances = {what: one.errors.figures for what, one in compared.displacements.items()}
-    short, whole = ([], []) if compared.rows is None else comparison_blocks(compared.rows, "the rows")
+    short, whole = (
+        ([], []) if compared.rows is None else comparison_blocks(compared.rows, "the rows", verbose)
+    )
     head, rows = pose_rows(distances)
     blocks = [
         sentences("what differs", compared.sentences),

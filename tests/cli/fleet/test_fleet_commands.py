@@ -4,6 +4,9 @@ import json
 
 import pytest
 from testing.aged import model_before, rows_later
+from testing.screens import assert_screen
+
+from pisigma.files.errors import FleetError
 
 pytest.importorskip("pyarrow", reason="Parquet comes with the extra fleet")
 
@@ -35,9 +38,7 @@ def test_status_prints_and_writes_a_page(plant, run):
     page = folder / "page.html"
     shown = run("fleet", "status", folder / "out", "--page", page, "--today", "2027-10-01")
     assert shown.exit_code == 3, shown.output
-    assert "Overdue: cell1 (365 days)." in shown.stdout
-    assert "Refused: cell2, 2026-10-02" in shown.stdout
-    assert all(len(line) <= 80 for line in shown.stdout.splitlines())
+    assert_screen(shown.stdout, "overdue: cell1 (365 days)", "refused: cell2, 2026-10-02")
     text = page.read_text(encoding="utf-8")
     assert '<tr data-state="overdue">' in text
     assert "<b>" not in text
@@ -45,13 +46,16 @@ def test_status_prints_and_writes_a_page(plant, run):
     assert 'src="http' not in text
 
 
-def test_what_is_no_fleet_is_refused(run, tmp_path):
-    for arguments, complaint in (
-        (("status", tmp_path), "not the folder of a fleet"),
-        (("run", tmp_path, "--out", tmp_path / "out"), "got 'no robot'"),
-        (("run", tmp_path, "--out", tmp_path / "out", "--task", "calibrat"), "did you mean 'calibrate'"),
-        (("run", tmp_path, "--out", tmp_path / "out", "--jobs", "0"), "jobs: 1 or more were wanted"),
+def test_what_is_not_a_fleet_is_refused(refuses, tmp_path):
+    for arguments, fields in (
+        (("status", tmp_path), {}),
+        (("run", tmp_path, "--out", tmp_path / "out"), {}),
+        (("run", tmp_path, "--out", tmp_path / "out", "--task", "calibrat"), {"value": "calibrat"}),
+        (("run", tmp_path, "--out", tmp_path / "out", "--jobs", "0"), {"value": 0}),
     ):
-        done = run("fleet", *arguments)
-        assert done.exit_code == 2, done.output
-        assert complaint in " ".join(done.output.split())
+        refuses("fleet", *arguments, error=FleetError, **fields)
+
+
+def test_a_day_that_is_none_is_refused(plant, refuses):
+    command = ("fleet", "status", plant[0] / "out", "--today", "today")
+    refuses(*command, error=FleetError, option="--today", value="today")

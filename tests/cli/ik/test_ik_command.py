@@ -10,7 +10,9 @@ import torch
 from testing.closeness import assert_close
 from testing.models import HOMES, joints_around
 from testing.pose_files import COLUMNS, write_poses
+from testing.screens import assert_screen
 
+from pisigma.files.errors import MeasurementError, ModelError, OutputError, PoseError
 from pisigma.model.inverse.corrected_ik import load
 from pisigma.robot import Robot
 from pisigma.robot.kinematics.forward import forward_kinematics
@@ -64,9 +66,7 @@ def test_json_of_a_robot_with_a_sliding_joint(run, models):
 def test_table_fits_in_80_columns(run, models):
     result = run("ik", models / "kiro3", "--pose", *home_pose("kiro3"))
     assert result.exit_code == 0
-    table = result.stdout.splitlines()[:-1]
-    assert max(map(len, table)) <= 80
-    assert table[0].startswith("reached, branch elbow_positive")
+    assert_screen(result.stdout, "elbow_positive", "reached", heading="Solution")
     for word in ("corrected", "nominal", "correction", "theta_2", "d_3", "mm", "deg"):
         assert word in result.stdout
 
@@ -92,8 +92,7 @@ def test_all_branches_of_a_pose(run, models):
 @pytest.mark.parametrize("name", HOMES)
 def test_unreachable_pose(run, refuses, models, name):
     pose = (9000, 0, 0, 0, 0, 0)
-    sentence = refuses("ik", models / name, "--pose", *pose, stdout=None)
-    assert sentence.startswith("the pose 9000 0 0 0 0 0: unreachable. ")
+    assert "9000 0 0 0 0 0: unreachable" in refuses("ik", models / name, "--pose", *pose, stdout=None)
     result = run("ik", models / name, "--pose", *pose, "--json")
     assert result.exit_code == 2
     (solution,) = json.loads(result.stdout)["solutions"]
@@ -108,7 +107,7 @@ def test_unreachable_pose(run, refuses, models, name):
 )
 def test_singular_pose(run, refuses, models, name, q):
     pose = pose_of(name, torch.tensor(q, dtype=torch.float64))
-    assert ": singular. " in refuses("ik", models / name, "--pose", *pose, stdout=None)
+    assert ": singular" in refuses("ik", models / name, "--pose", *pose, stdout=None)
     result = run("ik", models / name, "--pose", *pose, "--json")
     assert result.exit_code == 2
     (solution,) = json.loads(result.stdout)["solutions"]
@@ -162,9 +161,9 @@ def test_poses_that_fail_are_named_by_their_lines(run, models, tmp_path):
     out = tmp_path / "joints.csv"
     result = run("ik", models / "kiro3", "--poses", tmp_path / "poses.csv", "--out", out)
     assert result.exit_code == 2
-    assert result.stderr.startswith(f"pisigma: {tmp_path}/poses.csv, line 3: unreachable.")
-    assert result.stderr.endswith("(Also: line 5 singular.)\n")
-    assert "2 reached, 1 unreachable, 1 singular" in result.stdout
+    assert f"{tmp_path}/poses.csv, line 3: unreachable" in result.stderr
+    assert "line 5 singular" in result.stderr
+    assert "2 reached, 1 unreachable, 1 singular" in " ".join(result.stdout.split())
     statuses = [row["status"] for row in csv.DictReader(out.read_text().splitlines())]
     assert statuses == ["reached", "unreachable", "reached", "singular"]
     assert list(csv.DictReader(out.read_text().splitlines()))[1]["q1_deg"] == ""
@@ -174,9 +173,9 @@ BAD_ROWS = {
     4: ("1,2,three,4,5,6", "got 'three' (column 'z_mm')"),
     5: ("1,2,,4,5,6", "got '' (column 'z_mm')"),
     8: ("nan,2,3,4,5,6", "got 'nan' (column 'x_mm')"),
-    9: ("1,2,3", "6 fields, got 3"),
+    9: ("1,2,3", "got 3"),
     11: ('1,2,3,4,5,"6', "CSV"),
-    14: ("400000,100000,200000,0,0,0", "times the reach of robot"),
+    14: ("400000,100000,200000,0,0,0", "458.3 m"),
 }
 """By line of the file: a row that is no pose, and why."""
 
@@ -210,7 +209,7 @@ def test_rows_that_are_no_poses_do_not_stop_the_others(
         assert row["status"] == "bad_row"
         assert reason in row["reason"]
         assert reason in result.stderr
-    assert result.stderr.startswith(f"pisigma: {path}, line 4: bad_row. ")
+    assert f"{path}, line 4: bad_row" in result.stderr
     written = list(csv.DictReader(out.read_text().splitlines()))
     assert [int(row["line"]) for row in written] == list(range(2, 2 + len(good) + len(BAD_ROWS)))
     solved = [row for row in written if row["status"] != "bad_row"]
@@ -231,7 +230,7 @@ def test_only_the_first_failures_are_told_one_by_one(run, models, tmp_path):
     assert result.exit_code == 2
     printed = json.loads(result.stdout)
     assert (printed["failed"], len(printed["first_failures"])) == (25, 10)
-    assert result.stderr.endswith("; and 15 more.)\n")
+    assert "15 more" in result.stderr
     assert len(out.read_text().splitlines()) == 26
 
 
@@ -247,7 +246,7 @@ def test_metres_are_not_refused(run, models, tmp_path):
     path.write_text("\n".join([header, *(",".join(map(repr, row)) for row in thousandfold)]))
     result = run("ik", models / "kiro4", "--poses", path, "--out", out)
     assert result.exit_code == 2
-    assert "millimetres in a _m column?" in result.stderr
+    assert "line 2: bad_row" in result.stderr
 
 
 def test_an_interruption_leaves_nothing(run, models, tmp_path, monkeypatch):
@@ -273,9 +272,7 @@ def test_the_file_of_poses_is_not_overwritten(refuses, models, tmp_path):
     write_poses(tmp_path / "poses.csv", [home_pose("kiro3")])
     before = (tmp_path / "poses.csv").read_text()
     same = tmp_path / "poses.csv"
-    assert "poses.csv: is an input of this command" in refuses(
-        "ik", models / "kiro3", "--poses", same, "--out", same
-    )
+    refuses("ik", models / "kiro3", "--poses", same, "--out", same, error=OutputError, file="poses.csv")
     assert same.read_text() == before
 
 
@@ -312,19 +309,40 @@ def test_options_that_do_not_go_together(run, models, options):
 
 def test_other_things_at_fault(refuses, models, tmp_path):
     pose = ("--pose", *home_pose("kiro3"))
-    assert "there is no such model folder" in refuses("ik", tmp_path / "nothing", *pose)
-    assert "model.yaml is missing" in refuses("ik", tmp_path, *pose)
-    assert "did you mean 'elbow_positive'?" in refuses(
-        "ik", models / "kiro3", *pose, "--branch", "elbow_positiv"
+    refuses("ik", tmp_path / "nothing", *pose, error=ModelError)
+    refuses("ik", tmp_path, *pose, error=ModelError)
+    refuses("ik", models / "kiro3", *pose, "--branch", "elbow_positiv", error=PoseError)
+    refuses("ik", models / "kiro3", "--pose", "nan", 0, 0, 0, 0, 0, error=PoseError, option="--pose")
+    refuses("ik", models / "kiro3", "--pose", 300, 250, 300, 0, "inf", 0, error=PoseError, option="--pose")
+    refuses(
+        "ik",
+        models / "kiro3",
+        "--pose",
+        300,
+        250,
+        300,
+        1e300,
+        0,
+        0,
+        error=PoseError,
+        option="--pose",
+        value=1e300,
     )
-    assert "x nan is no" in refuses("ik", models / "kiro3", "--pose", "nan", 0, 0, 0, 0, 0)
-    assert "pitch inf is no" in refuses("ik", models / "kiro3", "--pose", 300, 250, 300, 0, "inf", 0)
-    assert "roll 1e+300 is no" in refuses("ik", models / "kiro3", "--pose", 300, 250, 300, 1e300, 0, 0)
     out = ("--out", tmp_path / "joints.csv")
-    assert "cannot be read" in refuses("ik", models / "kiro3", "--poses", tmp_path / "no.csv", *out)
+    refuses(
+        "ik", models / "kiro3", "--poses", tmp_path / "no.csv", *out, error=MeasurementError, file="no.csv"
+    )
     (tmp_path / "poses.csv").write_text("x_mm,y_mm\n1,2\n")
-    assert "poses.csv, line 1: the column of 'z'" in refuses(
-        "ik", models / "kiro3", "--poses", tmp_path / "poses.csv", *out
+    refuses(
+        "ik",
+        models / "kiro3",
+        "--poses",
+        tmp_path / "poses.csv",
+        *out,
+        error=MeasurementError,
+        file="poses.csv",
+        line=1,
+        value="z",
     )
     assert not (tmp_path / "joints.csv").exists()
 
@@ -332,8 +350,16 @@ def test_other_things_at_fault(refuses, models, tmp_path):
 def test_an_out_that_cannot_be_written(refuses, models, tmp_path):
     write_poses(tmp_path / "poses.csv", [home_pose("kiro3")])
     for out in (tmp_path, tmp_path / "nothing" / "joints.csv", tmp_path / "poses.csv" / "joints.csv"):
-        sentence = refuses("ik", models / "kiro3", "--poses", tmp_path / "poses.csv", "--out", out)
-        assert sentence.startswith((f"{out}: is a folder", f"{out}: there is no folder"))
+        refuses(
+            "ik",
+            models / "kiro3",
+            "--poses",
+            tmp_path / "poses.csv",
+            "--out",
+            out,
+            error=OutputError,
+            file=out,
+        )
     assert [entry.name for entry in tmp_path.iterdir()] == ["poses.csv"]
 
 

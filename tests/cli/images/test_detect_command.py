@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 from testing.board_images import CAMERA, cv2, draw_board, view
 from testing.closeness import assert_close
+from testing.screens import assert_screen
 
+from pisigma.files.errors import MeasurementError, OutputError
 from pisigma.measurement.camera.board import Board
 
 BOARD = Board("board", 4, 5, 0.03)
@@ -59,10 +61,9 @@ def test_corners_with_joint_values_are_written(run, files, tmp_path):
 
 def test_what_is_left_out_is_named(run, files, tmp_path):
     result = run("detect", *options(files), "--out", tmp_path / "corners.csv")
-    text = " ".join(result.stdout.split())
-    assert "2 of 4 images" in text
-    assert "02 is left out: " in text
-    assert "03 is left out: " in text
+    assert_screen(result.stdout, "2 of 4 images", "image 02", "image 03", "2 warnings")
+    whole = run("detect", *options(files), "--out", tmp_path / "corners.csv", "--verbose")
+    assert_screen(whole.stdout, "40 corners", verbose=True)
 
 
 def test_truncated_images_are_named_and_the_others_used(run, files, tmp_path):
@@ -91,18 +92,18 @@ def test_what_is_refused(refuses, files, tmp_path):
     (files / "even.yaml").write_text("rows: 4\ncolumns: 6\nsquare_mm: 30\n")
     (files / "other.yaml").write_text("rows: 6\ncolumns: 7\nsquare_mm: 30\n")
     (files / "large.yaml").write_text(CAMERA_YAML.replace("640", "1280"))
-    assert "looks the same turned by 180 deg" in refuses("detect", *options(files, board="even.yaml"), *out)
+    refuses("detect", *options(files, board="even.yaml"), *out, error=MeasurementError, file="even.yaml")
     refuses("detect", *options(files, board="other.yaml"), *out, error=MeasurementError, value=4)
-    refuses("detect", *options(files, camera="large.yaml"), *out, value="640 x 400 px")
+    refuses(
+        "detect", *options(files, camera="large.yaml"), *out, error=MeasurementError, value="640 x 400 px"
+    )
     no_image = ("detect", files / "board.yaml", *options(files)[1:])
-    assert "is no image that OpenCV reads" in refuses(*no_image, *out)
+    refuses(*no_image, *out, error=MeasurementError)
     (files / "00.txt").write_text("notes")
     beside = ("detect", files / "00.txt", *options(files))
-    assert "00.txt: is no image that OpenCV reads" in refuses(*beside, *out)
+    refuses(*beside, *out, error=MeasurementError)
     (files / "empty.png").touch()
-    assert "is no image that OpenCV reads" in refuses(
-        "detect", files / "empty.png", *options(files)[1:], *out
-    )
+    refuses("detect", files / "empty.png", *options(files)[1:], *out, error=MeasurementError)
     assert not (tmp_path / "corners.csv").exists()
 
 
@@ -110,10 +111,10 @@ def test_a_board_is_drawn_to_be_printed(run, refuses, files, tmp_path):
     command = ("detect", "--board", files / "board.yaml", "--print")
     result = run(*command, tmp_path / "board.pdf")
     assert result.exit_code == 0, result.output
-    assert "print it on A3 at 100 %" in " ".join(result.stdout.split())
+    assert "A3" in result.stdout
     assert (tmp_path / "board.pdf").read_bytes().startswith(b"%PDF")
-    assert "goes into a .pdf file" in refuses(*command, tmp_path / "board.png")
-    assert "--print to draw the board" in refuses(*command[:-1])
+    refuses(*command, tmp_path / "board.png", error=OutputError, file="board.png", value=".png")
+    assert run(*command[:-1]).exit_code == 2
 
 
 def test_a_page_shows_every_image(run, files, tmp_path):
@@ -122,7 +123,8 @@ def test_a_page_shows_every_image(run, files, tmp_path):
     assert result.exit_code == 0, result.output
     text = page.read_text()
     assert text.count("<figure>") == 4
-    assert "Left out: its edges are blurred by 3.8 px" in text
+    assert "Left out: " in text
+    assert "3.8 px" in text
 
 
 def test_without_opencv_the_extra_is_named(refuses, files, tmp_path, monkeypatch):
@@ -131,5 +133,4 @@ def test_without_opencv_the_extra_is_named(refuses, files, tmp_path, monkeypatch
         if name.startswith(("pisigma.measurement.camera.detection", "pisigma.workflow.images")):
             monkeypatch.delitem(sys.modules, name)
     message = refuses("detect", *options(files), "--out", tmp_path / "corners.csv")
-    assert message.startswith("this needs the package opencv-python-headless, which is not installed")
     assert 'pip install "pisigma[camera]"' in message

@@ -5,7 +5,9 @@ import json
 import pytest
 from testing.aged import rows_later
 from testing.compared import COLLISION, model_of
+from testing.screens import assert_screen
 
+from pisigma.files.errors import IdentificationError, ModelError, OutputError
 from pisigma.model.folder.model_folder import save_model
 
 
@@ -29,9 +31,7 @@ def test_differences_are_printed_and_shown_on_a_page(run, folder):
         *("--program", folder / "poses.csv", "--page", page),
     )
     assert done.exit_code == 0, done.output
-    assert "after differs from before in joint 3 by 0." in done.stdout
-    assert "before predicts them better" in " ".join(done.stdout.split())
-    assert all(len(line) <= 80 for line in done.stdout.splitlines())
+    assert_screen(done.stdout, "joint 3 by 0.", "before predicts", heading="Difference")
     text = page.read_text(encoding="utf-8")
     assert "joint 3 by 0." in text
     assert "along poses.csv" in text
@@ -47,11 +47,8 @@ def test_a_model_is_compared_with_the_robot_as_drawn(run, folder):
     assert report["differs"]
 
 
-def test_inputs_at_fault_are_refused(run, folder):
-    assert run("compare", folder / "before", folder / "before").exit_code == 2
-    done = run("compare", folder / "before", folder / "after", "--page", folder / "page.pdf")
-    assert done.exit_code == 2
-    assert ".html" in done.stderr
-    done = run("compare", folder / "before", folder / "after", "--level", "2")
-    assert done.exit_code == 2
-    assert "between 0 and 1" in done.stderr
+def test_inputs_at_fault_are_refused(refuses, folder):
+    both = ("compare", folder / "before", folder / "after")
+    refuses("compare", folder / "before", folder / "before", error=ModelError)
+    refuses(*both, "--page", folder / "page.pdf", error=OutputError, file="page.pdf", value=".pdf")
+    refuses(*both, "--level", "2", error=IdentificationError, value=2.0)

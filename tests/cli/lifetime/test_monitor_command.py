@@ -7,7 +7,9 @@ from contextlib import closing
 
 import pytest
 from testing.aged import model_before, rows_later
+from testing.screens import assert_screen
 
+from pisigma.files.errors import OutputError
 from pisigma.model.folder.model_folder import save_model
 
 
@@ -42,18 +44,15 @@ def test_a_collision_is_said_and_ends_with_3(run, folder):
         *("--no-history", "--page", page, "--dates", "2026-05-01,2026-04-01", "--limit-mm", "0.2"),
     )
     assert done.exit_code == 3, done.output
-    assert "2026-05-01: joint 3 moved by 0.2" in done.stdout
-    assert "Recalibrating pays" in done.stdout
-    assert all(len(line) <= 80 for line in done.stdout.splitlines())
+    assert_screen(done.stdout, "2026-05-01: joint 3 moved by 0.2", "pisigma recalibrate rb5")
     text = page.read_text(encoding="utf-8")
     assert "joint 3 moved by 0.2" in text
     assert 'src="http' not in text
 
 
-def test_a_page_has_to_be_html(run, folder):
-    done = run("monitor", folder / "model", folder / "2026-01-01.csv", "--page", folder / "page.pdf")
-    assert done.exit_code == 2
-    assert ".html" in done.stderr
+def test_a_page_has_to_be_html(refuses, folder):
+    command = ("monitor", folder / "model", folder / "2026-01-01.csv", "--page", folder / "page.pdf")
+    refuses(*command, error=OutputError, file="page.pdf", value=".pdf")
 
 
 def test_a_year_mistyped_long_ago_is_named_left_out_and_corrected(run, folder):

@@ -7,6 +7,8 @@ import sys
 
 from testing.serving import client
 
+from pisigma.files.errors import ModelError, OutputError
+
 POSE = [800.0, 200.0, 600.0, 10.0, -80.0, 170.0]
 
 
@@ -27,9 +29,9 @@ def test_it_says_its_ports_answers_and_ends_with_sigterm(repository):
 
 def test_what_cannot_be_served_is_refused(refuses, run, repository, tmp_path):
     model = repository / "models" / "kiro4"
-    assert "there is no such model folder" in refuses("serve", tmp_path / "none")
-    assert "holds no model folders" in refuses("serve", "--models", tmp_path)
-    assert "clients have to send a token" in refuses("serve", model, "--host", "0.0.0.0")
+    refuses("serve", tmp_path / "none", error=ModelError)
+    refuses("serve", "--models", tmp_path, error=ModelError)
+    refuses("serve", model, "--host", "0.0.0.0", error=OutputError)
     (tmp_path / "token").write_text("\n")
-    assert "the token is empty" in refuses("serve", model, "--token-file", tmp_path / "token")
+    refuses("serve", model, "--token-file", tmp_path / "token", error=OutputError)
     assert run("serve").exit_code == run("serve", model, "--models", tmp_path).exit_code == 2
