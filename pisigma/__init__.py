@@ -1,6 +1,6 @@
 """pisigma: robot calibration and corrected inverse kinematics.
 
-Names are loaded on first use (PEP 562), so that `import pisigma` costs next to nothing.
+Names are loaded on first use (PEP 562), so that `import pisigma` is fast.
 """
 
 from importlib import import_module
@@ -48,8 +48,8 @@ _NAMES = {
     "workflow.settings.importing": "ImportSettings",
     "workflow.verify": "verify",
 }
-"""Public names by the modules that hold them; `__init__.pyi` tells them to type checkers. `Measurements` comes from the
-registry of sensors, and not from its own module, so that files have the columns of all sensors."""
+"""Public names by the modules that define them; `__init__.pyi` declares them to type checkers. `Measurements` comes
+from the registry of sensors, so that files may have the columns of all sensors."""
 
 _HOMES = {name: f"pisigma.{module}" for module, names in _NAMES.items() for name in names.split()}
 
@@ -57,7 +57,7 @@ __all__ = sorted(_HOMES)
 
 
 def __getattr__(name: str) -> Any:
-    """Import a public name when it is first asked for."""
+    """Import a public name at its first use."""
     if name not in _HOMES:
         raise AttributeError(f"module 'pisigma' has no attribute '{name}'")
     value = getattr(import_module(_HOMES[name]), name)

@@ -82,7 +82,7 @@ def test_the_evidence_finds_its_weights():
     arm = model().hybrid
     assert arm is not None
     assert [feature.name for feature in arm.correction.features] == ["coupling"]
-    # The last joint turns the tool about itself, and constants of the first ones are base and offsets.
+    # The last joint rotates the tool about itself, and constants of the first joints are base and offsets.
     assert_close(arm.correction.linear[0][1:5, 0], torch.full((4,), SIZE).double(), atol=5e-5)
 
 

@@ -1,8 +1,8 @@
 """The kernels' intermediate code in the package, compiled by numba and tied to the sources by a hash.
 
-`python -m pisigma.joint_correction.registry` makes it, with all features and closed forms. The code is that of no
-processor in particular, and without vectors: 64-bit machines lay out the kernels' structs alike, and the machine that
-loads it says which processor it has and makes the vectors.
+`python -m pisigma.joint_correction.registry` builds it with all features and closed forms. The code is for a generic
+processor and not vectorised: all 64-bit machines have the same layout of the kernels' structs, and the machine that
+loads the code compiles and vectorises it for its processor.
 """
 
 import dataclasses

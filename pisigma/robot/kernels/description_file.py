@@ -30,7 +30,7 @@ def write_description(
 ) -> None:
     """Write a description, and the names that go with it, as `.npz`; see `CompiledIK` for these.
 
-    All numbers stand in two rows, because every array in the file costs a new process time to read.
+    All numbers are in two arrays, because reading every array of a file takes time in a new process.
     """
     shapes: dict[str, tuple[str, tuple[int, ...]]] = {}
     rows: dict[str, list[Any]] = {"floats": [], "integers": []}

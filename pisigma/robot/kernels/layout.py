@@ -89,9 +89,9 @@ DESCRIPTION = np.dtype([(part, np.dtype(fields)) for part, fields in zip(PARTS, 
 MEMORY = np.dtype(
     _floats(
         pose=(4, 4),  # the wanted pose
-        near=(DOF,),  # joint values to stay near to
-        approach=(DOF,),  # from which side every joint comes: +1 or -1, 0 where that is not stated
-        rounding=(),  # relative size of what counts as rounding of the wanted poses
+        near=(DOF,),  # reference joint values
+        approach=(DOF,),  # approach direction of every joint: +1 or -1, 0 if not stated
+        rounding=(),  # relative size of rounding errors of the wanted poses
         solution=(DOF,),  # joint values found
         nominal=(DOF,),  # those of the nominal arm
         axes=(DOF, 6),  # of the joints: direction and origin
@@ -108,20 +108,20 @@ MEMORY = np.dtype(
         step=(DOF,),
         turning=(2, DOF),  # sines and cosines
         phi=(INPUTS,),  # inputs of product units
-        frames=(DOF, 18),  # on which gravity acts
+        frames=(DOF, 18),  # frames for gravity torques
         scaled=(7, DOF),  # dimensionless Jacobian, normal equations and their right side
         square=(7, 7),
         right=(7,),
         scale=(
             DOF,
-        ),  # of the columns of the Jacobian: [rad or m] that count as one; 0 for a joint that is held
+        ),  # joint motion [rad or m] per unit of the columns of the scaled Jacobian; 0 for a joint that is fixed now
         branches=(BRANCHES, DOF),  # closed-form joint values of all branches
-        others=(BRANCHES, DOF),  # the same of other poses, or as near to the pose as branches come
+        others=(BRANCHES, DOF),  # the same for other poses, or the nearest values of branches
         wanted=(4, 4),  # a pose in the frames of the closed form
         q=(DOF,),  # joint values of a candidate
         start=(DOF,),  # joint values to start from
-        kept=(DOF,),  # joint values outside their limits, in case there are no others
-        checked=(DOF,),  # joint values that T, J and error belong to, NaN where they belong to none
+        kept=(DOF,),  # joint values outside their limits, used if there are no others
+        checked=(DOF,),  # joint values of T, J and error, NaN if these are not valid
         lanes=(12, LANES),  # frames of many poses, entry by entry
         lane_turns=(2, LANES),  # cosines and sines of a joint
         lane_axes=(DOF, 6, LANES),  # directions and origins of the joints
@@ -130,27 +130,27 @@ MEMORY = np.dtype(
         tolerance=(6,),  # of the axes of the tool, see `kinematics.task_axes.TaskAxes.row`
         weight=(6,),  # of these axes in least squares
         turned=(6,),  # an error in these axes
-        elbow=(),  # elbow angle wanted, NaN where any will do, and on the way there
+        elbow=(),  # requested elbow angle, NaN if it is free, and intermediate one
         elbow_now=(),
-        line=(3,),  # from shoulder to wrist; upright, bend and beside go with it
+        line=(3,),  # from shoulder to wrist, with the vectors upright, bend and beside
         upright=(3,),
         bend=(3,),
         beside=(3,),
-        level=(4, 4),  # the wanted pose as the nominal arm can take it
-        candidates=(CANDIDATES, DOF),  # joint values to search from, the most promising first
+        level=(4, 4),  # the wanted pose, modified for the nominal arm
+        candidates=(CANDIDATES, DOF),  # starts, the most promising first
         rank=(CANDIDATES,),
-        preferred=(DOF,),  # joint values that a redundant arm is to come near to
+        preferred=(DOF,),  # preferred joint values of a redundant arm
         chosen=(DOF,),  # the best of several solutions
-        first=(DOF,),  # joint values that a search began at
+        first=(DOF,),  # initial joint values of a search
         distance=(SAMPLES,),  # squared, of scaled inputs from rows of a domain, or of poses from stored ones
     )
     + _integers(
         nearest=(128,),  # stored starts
-        whole=(),  # 1 where all six axes count exactly, else 0
-        loose=(),  # 1 where the arm has too few joints for all axes that count, so that tolerances weigh them
+        whole=(),  # 1 if all six axes are exact, else 0
+        loose=(),  # 1 if the arm has too few joints for all axes, which are then weighted by tolerances
         pivot=(),  # the axis about which rotations are split into twist and swing, or -1
-        rows=(),  # how many axes count now
-        height=(),  # 6, or 7 where the elbow angle counts too
+        rows=(),  # number of axes in use
+        height=(),  # 6, or 7 with the elbow angle
     )
 )
 """Working memory of the kernels; nothing in it is kept from one pose to the next."""

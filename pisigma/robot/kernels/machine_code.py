@@ -1,7 +1,7 @@
 """Kernels as machine code for this processor, compiled by llvmlite from intermediate code and cached in a file.
 
-numba is not needed where the intermediate code comes with the package. The kernels call nothing but the mathematical
-functions of the C library, so their object code can be loaded by llvmlite alone.
+numba is not needed if the package contains the intermediate code. The kernels call only mathematical functions of the C
+library, so their object code can be loaded by llvmlite alone.
 """
 
 import ctypes
@@ -133,7 +133,7 @@ def library_object(wanted: KernelForms) -> bytes:
 
 
 def _key(forms: KernelForms) -> str:
-    """What the machine code depends on: sources, options, the versions of the compiler, and the processor."""
+    """Return the cache key of the machine code: sources, options, compiler versions and processor."""
     digest = hashlib.sha256()
     for word in (
         source_hash(),
@@ -165,7 +165,7 @@ def _intermediate_code(forms: KernelForms) -> str:
 
 
 def _native_machine() -> Any:
-    """The processor that this process runs on, without its registers of 512 bits.
+    """Return the processor of this process, without 512-bit registers.
 
     Sums over six joints do not fill them, and after a millisecond without any the processor takes its time to switch
     them on: a pose of a UR10 hybrid took 15.3 us then, 12.3 us in a row, and without them 12.5 and 11.2 us.
@@ -177,7 +177,7 @@ def _native_machine() -> Any:
 
 
 def target_machine(triple: str, cpu: str = "", features: str = "") -> Any:
-    """LLVM's description of a processor."""
+    """Return LLVM's target machine of a processor."""
     target = llvm.Target.from_triple(triple)
     return target.create_target_machine(
         opt=3, jit=True, cpu=cpu, features=features, reloc="default", codemodel="jitdefault"
@@ -185,7 +185,7 @@ def target_machine(triple: str, cpu: str = "", features: str = "") -> Any:
 
 
 def optimised_object(code: str, machine: Any) -> bytes:
-    """Object code of intermediate code: what is called, optimised as one program, with vectors."""
+    """Compile intermediate code to object code: only reachable functions, optimised together and vectorised."""
     module = llvm.parse_assembly(code)
     module.triple, module.data_layout = machine.triple, str(machine.target_data)
     for item in [*module.functions, *module.global_variables]:
@@ -204,7 +204,7 @@ def optimised_object(code: str, machine: Any) -> bytes:
 
 
 def cache_folders() -> list[Path]:
-    """Where machine code is kept: beside the package, or with the user's other caches where that is not possible.
+    """Return the cache folders of machine code: next to the package, or else in the user's cache folder.
 
     `XDG_CACHE_HOME` counts where it is an absolute path, as its specification says; without a home there is no cache
     of the user.
@@ -219,7 +219,7 @@ def cache_folders() -> list[Path]:
 
 
 def read_code(path: Path) -> bytes | None:
-    """The code in a file; None where there is none, it is damaged, or somebody else could have written it."""
+    """Read code from a file; return None if it is missing or damaged, or other users could have written it."""
     try:
         if not _trusted(os.stat(path.parent)):
             return None
@@ -233,7 +233,7 @@ def read_code(path: Path) -> bytes | None:
 
 
 def write_code(path: Path, code: bytes) -> bool:
-    """Write a file whole or not at all, in folders that only the user can enter; whether that succeeded."""
+    """Write a file completely or not at all, in folders that only the user can access; return success."""
     try:
         _make_private(path.parent)
         if not _trusted(os.stat(path.parent)):
@@ -248,7 +248,7 @@ def write_code(path: Path, code: bytes) -> bool:
 
 
 def _make_private(folder: Path) -> None:
-    """Make a folder, and those above it that are missing, which only the user can enter."""
+    """Create a folder and its missing parents, accessible by the user only."""
     if not folder.is_dir():
         if folder.parent != folder:
             _make_private(folder.parent)
@@ -256,7 +256,7 @@ def _make_private(folder: Path) -> None:
 
 
 def _trusted(status: os.stat_result) -> bool:
-    """Whether a file or folder belongs to the user or root, and nobody else can write it."""
-    if not hasattr(os, "geteuid"):  # Windows, where the folders of a user are closed to others
+    """Return whether a file or folder belongs to the user or root, and nobody else can write to it."""
+    if not hasattr(os, "geteuid"):  # Windows, where a user's folders are not accessible to others
         return True
     return status.st_uid in (0, os.geteuid()) and not status.st_mode & (stat.S_IWGRP | stat.S_IWOTH)

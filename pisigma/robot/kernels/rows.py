@@ -27,7 +27,7 @@ def contracted_kernel(function: Function) -> Function:
     return njit(error_model="numpy", fastmath={"contract"})(inspect.unwrap(function))  # type: ignore[return-value]
 
 
-# Loops, because numba brings half its text handling along for the complaints of a slice assignment.
+# Loops, because the error messages of slice assignments would add much of numba's string code.
 
 
 @kernel

@@ -1,4 +1,4 @@
-"""Calibrated arms for the compiled kernels: random errors, and a correction of every kind that has a compiled form."""
+"""Calibrated arms for tests of kernels: random errors, and all corrections with a compiled form."""
 
 import functools
 import math
@@ -25,7 +25,7 @@ ERRORS = np.array([1e-3, 5e-4, 5e-4, 1e-3, 1e-3])
 
 
 def draw_joints(robot: Robot, rows: int, seed: int = 1, share: float = 1.0) -> torch.Tensor:
-    """Joint values [rad or m] over a share of the limits, at most a turn."""
+    """Draw joint values [rad or m] within a share of the limits, at most a turn."""
     limits = np.clip(robot.limits, -math.pi, math.pi) * share
     return torch.from_numpy(
         np.random.default_rng(seed).uniform(limits[:, 0], limits[:, 1], (rows, robot.dof))
@@ -33,7 +33,7 @@ def draw_joints(robot: Robot, rows: int, seed: int = 1, share: float = 1.0) -> t
 
 
 def draw_correction(robot: Robot, joints: bool, seed: int = 0) -> JointCorrection:
-    """A correction of about 1e-3 rad with all features and product units."""
+    """Draw a correction of about 1e-3 rad with all features and product units."""
     features = [
         FourierSeries(robot, 12),
         GravityTorques(robot, (0.1, -0.2, -1.0)),
@@ -54,10 +54,10 @@ def draw_correction(robot: Robot, joints: bool, seed: int = 0) -> JointCorrectio
 
 @functools.cache
 def calibrated(name: str, hybrid: bool = True, covered: float = 1.0, joints: bool = False) -> CalibratedModel:
-    """A calibrated robot of the catalogue.
+    """Return a calibrated robot of the catalogue.
 
     Args:
-        name: of the robot.
+        name: name of the robot.
         hybrid: whether it has a joint correction.
         covered: share of the joint range that was measured.
         joints: whether the correction has features that change from turn to turn.

@@ -1,4 +1,4 @@
-"""Forward kinematics and Jacobians of arrays: those of torch, for every robot, batch and joint value, without torch."""
+"""Forward kinematics and Jacobians of arrays agree with torch for every robot, batch and joint value."""
 
 import subprocess
 import sys
@@ -23,7 +23,7 @@ pytestmark = pytest.mark.usefixtures("without_type_checker")
 
 
 @pytest.mark.parametrize("name", sorted(catalogue()))
-def test_arrays_go_where_tensors_go(name):
+def test_arrays_agree_with_tensors(name):
     robot = Robot.load(name)
     rng = np.random.default_rng(0)
     moved = robot.with_geometry(
@@ -61,7 +61,7 @@ def test_angles_of_any_size_and_none():
     assert np.isnan(T[3, :3, :2]).all()
 
 
-def test_tensors_go_through_torch_with_gradients():
+def test_tensors_have_gradients():
     robot = Robot.load("kiro4")
     q = joints_of(robot, 3).requires_grad_()
     pisigma.forward_kinematics(robot, q).sum().backward()
@@ -76,7 +76,7 @@ def test_wrong_numbers_of_joint_values_are_rejected():
             pisigma.forward_kinematics(robot, q)
 
 
-def test_without_kernels_arrays_go_through_torch(monkeypatch):
+def test_arrays_use_torch_without_kernels(monkeypatch):
     def missing() -> None:
         raise ModelError("there are none.")
 

@@ -1,4 +1,4 @@
-"""The compiled kernels against the torch ones: poses, Jacobians, corrections, and what lies beyond measured joints."""
+"""Compiled kernels compared with torch: poses, Jacobians, corrections, and excess over measured joint values."""
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ NAMES = ["kiro3", "kiro4", "ur5", "rb5", "panda"]
 
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("arm", [NOMINAL, IDENTIFIED, DRAWN])
-def test_poses_and_jacobians_are_those_of_torch(name, arm, arms):
+def test_poses_and_jacobians_agree_with_torch(name, arm, arms):
     model, q = arms.calibrated(name), arms.draw_joints(arms.calibrated(name).robot, 200, seed=4, share=1.5)
     robot = {NOMINAL: model.robot, IDENTIFIED: model.hybrid.robot, DRAWN: model.drawn}[arm]
     T, J = joint_jacobian(robot, q)
@@ -25,7 +25,7 @@ def test_poses_and_jacobians_are_those_of_torch(name, arm, arms):
 
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("joints", [False, True])
-def test_corrections_are_those_of_torch(name, joints, arms):
+def test_corrections_agree_with_torch(name, joints, arms):
     model = arms.calibrated(name, joints=joints)
     q = arms.draw_joints(model.robot, 200, seed=4, share=1.5)
     _, _, delta, _ = arms.compiled(name, joints=joints).forward(q.numpy())
@@ -34,7 +34,7 @@ def test_corrections_are_those_of_torch(name, joints, arms):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_hybrid_arms_move_as_in_torch_where_joints_were_measured_and_beyond(name, arms):
+def test_hybrid_arms_agree_with_torch_inside_and_beyond_measured_joint_values(name, arms):
     model = arms.calibrated(name, covered=0.5)
     q = arms.draw_joints(model.robot, 400, seed=4, share=0.6)
     T, J, _, beyond = arms.compiled(name, covered=0.5).forward(q.numpy())

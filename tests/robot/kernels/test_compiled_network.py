@@ -1,4 +1,4 @@
-"""Compiled inverse kinematics of models whose network corrects nominal joint values: all that torch gives."""
+"""Compiled inverse kinematics of models whose network corrects nominal joint values agrees with torch."""
 
 import functools
 import math
@@ -28,7 +28,7 @@ POSE = ("x", "roll", "y", "pitch", "z", "yaw", "theta_1")
 
 @functools.cache
 def grouped():
-    """A model of two groups that see different inputs, with joints that are not corrected between them."""
+    """A model of two groups with different inputs, with uncorrected joints between them."""
     model = hand_made_model("ur10")
     robot, groups, networks = model.robot, [], []
     turned = forward_kinematics(robot, joints_around("ur10"))[:3, :3].numpy()
@@ -53,7 +53,7 @@ def grouped():
 
 @functools.cache
 def numeric():
-    """A model of a robot that has no closed form."""
+    """A model of a robot without a closed form."""
     robot = Robot.load("ur10")
     dh = robot.dh.copy()
     dh[:, 3] += 0.01 * np.arange(1, 7)
@@ -87,7 +87,7 @@ def _poses(name, rows=80, spread=0.6):
 
 
 def _assert_same(found, expected, residuals=True):
-    """Every field of a compiled solution is that of the torch one."""
+    """Assert that all fields of a compiled solution agree with those of torch."""
     solved = np.isfinite(expected.q.numpy()).all(-1)
     assert np.array_equal(np.isfinite(found.q).all(-1), solved)
     assert np.array_equal(found.status, expected.status.numpy())
@@ -105,7 +105,7 @@ def _assert_same(found, expected, residuals=True):
 
 
 @pytest.mark.parametrize("name", MODELS)
-def test_solutions_near_to_joint_values_are_those_of_torch(name):
+def test_solutions_near_joint_values_agree_with_torch(name):
     model, (q, T) = _model(name), _poses(name)
     near = q + 0.1 * torch.sin(17 * q)
     near[::2, 0] += 2 * math.pi
@@ -118,7 +118,7 @@ def test_solutions_near_to_joint_values_are_those_of_torch(name):
 
 
 @pytest.mark.parametrize("name", [name for name in MODELS if name != "numeric"])
-def test_every_branch_is_that_of_torch(name):
+def test_every_branch_agrees_with_torch(name):
     _, T = _poses(name)
     with no_type_checker():
         expected = NumericIK(_model(name)).all_branches(T)
@@ -141,7 +141,7 @@ def test_without_branches_stored_joint_values_are_the_start():
     assert_close(every.q[:, 0], found.q, atol=1e-12)
 
 
-def test_poses_at_ninety_degrees_of_pitch_are_seen_as_in_torch():
+def test_poses_at_ninety_degrees_of_pitch_agree_with_torch():
     model = grouped()
     T = torch.eye(4, dtype=torch.float64)
     T[:3, :3] = torch.tensor([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]], dtype=torch.float64)

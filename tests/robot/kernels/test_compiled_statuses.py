@@ -1,4 +1,4 @@
-"""Which branch is taken where none is asked for, and what becomes of matrices that are no poses."""
+"""Choice of the branch if none is requested, and statuses of invalid poses."""
 
 from dataclasses import replace
 
@@ -17,7 +17,7 @@ FINE = (Status.REACHED, Status.SINGULAR, Status.OUTSIDE_DOMAIN)
 
 
 def _first(every, order):
-    """Index of the branch to take for every pose, by the rule, from solutions on every branch."""
+    """Return the index of the branch to select for every pose from solutions on all branches."""
     chosen = []
     for status in every.status:
         fine = [branch for branch in order if status[branch] in FINE]
@@ -27,7 +27,7 @@ def _first(every, order):
 
 
 def _narrow(model):
-    """The model with limits that many solutions lie outside of."""
+    """Return the model with limits that many solutions exceed."""
     robots = [model.robot, model.calibrated]
     for joint, bounds in ((1, (-2.0, 0.5)), (2, (-1.0, 2.5)), (5, (-2.0, 2.0))):
         robots = [robot and with_limits(robot, joint, *bounds) for robot in robots]

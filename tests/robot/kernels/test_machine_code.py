@@ -1,4 +1,4 @@
-"""Machine code: it comes with the package and fits its sources, and is kept only where nobody else can write."""
+"""Machine code belongs to its sources, and is cached only where other users cannot write."""
 
 import os
 import shutil
@@ -84,7 +84,7 @@ def test_code_is_read_as_it_was_written_and_damaged_code_is_not(tmp_path):
     assert machine_code.read_code(tmp_path / "missing.o") is None
 
 
-def test_code_that_somebody_else_could_have_written_is_not_read(tmp_path, monkeypatch):
+def test_code_that_other_users_could_have_written_is_not_read(tmp_path, monkeypatch):
     folder, file = tmp_path / "cache", tmp_path / "cache" / "kernels.o"
     assert machine_code.write_code(file, b"code")
     for path, mode in ((file, 0o664), (file, 0o646), (folder, 0o770), (folder, 0o707)):
@@ -102,13 +102,13 @@ def test_code_that_somebody_else_could_have_written_is_not_read(tmp_path, monkey
     assert not machine_code._trusted(os.stat_result((0o100644, 0, 0, 1, owner + 2, 0, 0, 0, 0, 0)))
 
 
-def test_a_folder_that_cannot_be_written_is_no_failure(tmp_path):
+def test_an_unwritable_cache_folder_is_skipped(tmp_path):
     (tmp_path / "file").write_text("here is no folder", encoding="utf-8")
     assert not machine_code.write_code(tmp_path / "file" / "kernels.o", b"code")
 
 
 @pytest.mark.parametrize("stated", ["relative/cache", "", None])
-def test_a_relative_cache_is_ignored_and_a_missing_home_survived(stated, tmp_path, monkeypatch):
+def test_a_relative_cache_and_a_missing_home_are_ignored(stated, tmp_path, monkeypatch):
     monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
     if stated is not None:
         monkeypatch.setenv("XDG_CACHE_HOME", stated)
@@ -124,7 +124,7 @@ def test_a_relative_cache_is_ignored_and_a_missing_home_survived(stated, tmp_pat
     assert machine_code.cache_folders()[1:] == [tmp_path / "cache" / "pisigma"]
 
 
-def test_the_key_holds_what_the_code_depends_on(monkeypatch):
+def test_the_key_depends_on_everything_that_the_code_depends_on(monkeypatch):
     key = machine_code._key(KernelForms())
     assert key == machine_code._key(KernelForms())
     for owner, name, other in (
@@ -141,7 +141,7 @@ def test_the_key_holds_what_the_code_depends_on(monkeypatch):
 
 
 def test_loading_kernels_on_a_fresh_cache_needs_no_compiler(tmp_path):
-    """As on a new machine without numba, from a copy of the package that has no machine code beside it."""
+    """As on a new machine without numba, from a copy of the package without machine code."""
     package = Path(build.__file__).parents[2]
     shutil.copytree(package, tmp_path / "pisigma", ignore=shutil.ignore_patterns("__pycache__", "catalogue"))
     script = (

@@ -1,4 +1,4 @@
-"""Closed-form inverses: all branches reach the pose, and the status says what else is the case."""
+"""Closed-form inverses: all branches reach the pose, and the status reports singularities and limits."""
 
 import math
 from dataclasses import replace
