@@ -75,7 +75,7 @@ def test_json_has_the_agreed_shape(calibrated):
     assert validation["hybrid"]["rms_mm"] < 0.6 * validation["geometric"]["rms_mm"]
     assert 0.88 <= validation["coverage"] <= 1.0
     hybrid = printed["hybrid"]
-    assert [feature["kind"] for feature in hybrid["learned"]["features"]][:2] == ["gravity", "series"]
+    assert [feature["name"] for feature in hybrid["learned"]["features"]][:2] == ["gravity", "series"]
     assert all(set(trial) == TRIAL for trial in hybrid["trials"])
     assert hybrid["trials"][0]["name"] == "geometry"
     assert hybrid["learned"]["orders"] == []

@@ -74,8 +74,7 @@ def test_rows_of_another_target_are_found(name, size, severity):
 
 
 @pytest.mark.parametrize("name", ARMS)
-@pytest.mark.parametrize("rows", [30, 100])
-@pytest.mark.parametrize("seed", range(5, 8))
+@pytest.mark.parametrize(("rows", "seed"), [(30, 5), (30, 6), (100, 7)])
 def test_an_arm_with_gears_and_sag_is_one_population(name, rows, seed):
     arm = OutsideArm(name, seed, rows, seed)
     assert populations(arm.robot, arm.measured()) == []
