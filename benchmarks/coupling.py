@@ -85,7 +85,7 @@ class Case:
         """Return the nominal arm."""
         values = {"name": "arm", "maker": "made up", "source": "benchmark", "tool": {"x_mm": 60, "z_mm": 150}}
         values |= {"rows": yaml.safe_load(self.rows), "coupling": yaml.safe_load(self.coupling)}
-        return Robot(*parse_yaml(yaml.safe_dump(values), RobotDocument, RobotError, "arm.yaml").drawing())
+        return Robot(*parse_yaml(yaml.safe_dump(values), RobotDocument, RobotError, "arm.yaml").to_fields())
 
     def true(self, seed: int) -> TrueRobot:
         """Return the arm with all errors."""

@@ -6,7 +6,7 @@ import numpy as np
 
 from pisigma.robot.description import Robot
 from pisigma.robot.urdf_chain import Chain, ChainJoint
-from pisigma.robot.urdf_frames import Frame, frame_of, row_frame, shift, turn, xyzrpy_of
+from pisigma.robot.urdf_frames import Frame, frame_of, rotation, row_frame, translation, xyzrpy_of
 from pisigma.robot.urdf_rows import NEARLY_PARALLEL, rows_of_chain
 
 
@@ -18,7 +18,7 @@ def joint_origins(robot: Robot) -> tuple[list[Frame], Frame]:
     """
     origins, behind = [], np.eye(4)
     for row, (theta, d, a, alpha, beta) in zip(robot.rows, robot.dh.tolist(), strict=True):
-        behind = behind @ turn(2, theta) @ shift(0.0, 0.0, d)
+        behind = behind @ rotation(2, theta) @ translation(0.0, 0.0, d)
         if row.type != "fixed":
             origins.append(behind)
             behind = np.eye(4)
@@ -51,9 +51,9 @@ def robot_of_origins(
         )
         for row, origin in zip(like.joints, origins, strict=True)
     )
-    drawing = rows_of_chain(Chain(like.name, "", "", joints, end, ""), nearly_parallel).drawing
-    moved = replace(like, rows=like.joints, dh=drawing.dh, urdf=None)
-    base, tool = frame_of(like.base) @ frame_of(drawing.base), frame_of(drawing.tool) @ frame_of(like.tool)
+    fields = rows_of_chain(Chain(like.name, "", "", joints, end, ""), nearly_parallel).fields
+    moved = replace(like, rows=like.joints, dh=fields.dh, urdf=None)
+    base, tool = frame_of(like.base) @ frame_of(fields.base), frame_of(fields.tool) @ frame_of(like.tool)
     return moved.with_geometry(base=xyzrpy_of(base), tool=xyzrpy_of(tool))
 
 

@@ -13,7 +13,7 @@ from pisigma.files.errors import PoseError, RobotError, nearest_choice
 from pisigma.robot.coupling import Coupling
 from pisigma.robot.robot_file import read_robot
 from pisigma.robot.row import MAX_MAGNITUDE, MAX_ROWS, JointType, Row
-from pisigma.robot.urdf_frames import Frame, frame_of, row_frame, shift, turn
+from pisigma.robot.urdf_frames import Frame, frame_of, rotation, row_frame, translation
 
 if TYPE_CHECKING:
     import pytorch_kinematics
@@ -251,7 +251,7 @@ def serial_chain(robot: Robot) -> "pytorch_kinematics.SerialChain":
         last = attach(
             last,
             f"{row.name}_link",
-            behind @ turn(2, theta) @ shift(0.0, 0.0, d),
+            behind @ rotation(2, theta) @ translation(0.0, 0.0, d),
             row.name,
             joint_type=row.type,
             axis=(0.0, 0.0, float(row.direction)),

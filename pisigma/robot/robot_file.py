@@ -12,9 +12,9 @@ from pydantic import Field, model_validator
 from pisigma.files.errors import RobotError, UnknownRobotError, nearest_choice
 from pisigma.files.yaml_file import Section, parse_yaml, read_yaml
 from pisigma.robot.coupling_section import CoupledJointSection, coupled
-from pisigma.robot.drawing import Drawing
+from pisigma.robot.robot_fields import RobotFields
 from pisigma.robot.row import MAX_ROWS, Bounded, JointType, Row
-from pisigma.robot.urdf_frames import frame_of, shift, turn, xyzrpy_of
+from pisigma.robot.urdf_frames import frame_of, rotation, translation, xyzrpy_of
 
 Limits = Annotated[tuple[Bounded, Bounded], Field(description="lower and upper")]
 
@@ -120,10 +120,10 @@ class RobotDocument(Section):
         if all(row.type == "fixed" for row in self.rows):
             remedy = "add a revolute or prismatic joint"
             raise RobotError("the robot has no joint", expected="a joint", remedy=remedy)
-        self.drawing()
+        self.to_fields()
         return self
 
-    def drawing(self) -> Drawing:
+    def to_fields(self) -> RobotFields:
         """Convert the robot to SI units.
 
         Raises:
@@ -133,7 +133,7 @@ class RobotDocument(Section):
         dh, base = np.array([row.to_si() for row in self.rows]), self.base.to_si()
         if self.convention == "modified":
             dh, base = from_modified(dh, base)
-        return Drawing(self.name, self.maker, self.source, rows, dh, base, self.tool.to_si(), coupling)
+        return RobotFields(self.name, self.maker, self.source, rows, dh, base, self.tool.to_si(), coupling)
 
 
 def catalogue() -> tuple[str, ...]:
@@ -148,7 +148,7 @@ def robot_file(robot: str) -> Path | None:
     return None if robot in catalogue() else Path(robot)
 
 
-def read_robot(robot: str | os.PathLike[str], base: str | None, tip: str | None) -> Drawing:
+def read_robot(robot: str | os.PathLike[str], base: str | None, tip: str | None) -> RobotFields:
     """Read a robot by catalogue name, or from a YAML or URDF file; see `Robot.load`."""
     name = os.fspath(robot)
     suffix = Path(name).suffix.lower()
@@ -156,7 +156,7 @@ def read_robot(robot: str | os.PathLike[str], base: str | None, tip: str | None)
         from pisigma.robot.urdf_chain import read_chain
         from pisigma.robot.urdf_rows import rows_of_chain
 
-        return rows_of_chain(read_chain(name, base, tip)).drawing
+        return rows_of_chain(read_chain(name, base, tip)).fields
     for option, link in (("base", base), ("tip", tip)):
         if link is not None:
             raise RobotError(
@@ -167,9 +167,9 @@ def read_robot(robot: str | os.PathLike[str], base: str | None, tip: str | None)
             )
     if name in catalogue():
         text = (resources.files("pisigma.robot") / "catalogue" / f"{name}.yaml").read_text(encoding="utf-8")
-        return parse_yaml(text, RobotDocument, RobotError, source=f"catalogue/{name}.yaml").drawing()
+        return parse_yaml(text, RobotDocument, RobotError, source=f"catalogue/{name}.yaml").to_fields()
     if suffix in (".yaml", ".yml"):
-        return read_yaml(name, RobotDocument, RobotError).drawing()
+        return read_yaml(name, RobotDocument, RobotError).to_fields()
     raise UnknownRobotError(
         f"'{name}' is neither a robot of the catalogue nor a .yaml or .urdf file",
         value=name,
@@ -205,5 +205,5 @@ def from_modified(
     standard[:, 2:4] = np.roll(dh[:, 2:4], -1, axis=0)
     standard[-1, 2:4] = 0.0
     if dh[0, 2:4].any():
-        base = xyzrpy_of(frame_of(base) @ turn(0, dh[0, 3]) @ shift(dh[0, 2], 0.0, 0.0))
+        base = xyzrpy_of(frame_of(base) @ rotation(0, dh[0, 3]) @ translation(dh[0, 2], 0.0, 0.0))
     return standard, base

@@ -16,7 +16,7 @@ ROUNDING = 2e-14
 """Deviations of lengths from 0 [m] and of angles from multiples of 90 deg [rad] up to this are rounding errors."""
 
 
-def turn(axis: int, angle: float) -> Frame:
+def rotation(axis: int, angle: float) -> Frame:
     """Return the rotation by an angle [rad] about the x (0), y (1) or z (2) axis."""
     cosine, sine = _cosine_sine(angle)
     T = np.eye(4)
@@ -26,7 +26,7 @@ def turn(axis: int, angle: float) -> Frame:
     return T
 
 
-def shift(x: float, y: float, z: float) -> Frame:
+def translation(x: float, y: float, z: float) -> Frame:
     """Return a translation [m]."""
     T = np.eye(4)
     T[:3, 3] = x, y, z
@@ -35,14 +35,14 @@ def shift(x: float, y: float, z: float) -> Frame:
 
 def row_frame(theta: float, d: float, a: float, alpha: float, beta: float) -> Frame:
     """Return `RotZ(theta) · Trans(a, 0, d) · RotX(alpha) · RotY(beta)`."""
-    T: Frame = turn(2, theta) @ shift(a, 0.0, d) @ turn(0, alpha) @ turn(1, beta)
+    T: Frame = rotation(2, theta) @ translation(a, 0.0, d) @ rotation(0, alpha) @ rotation(1, beta)
     return T
 
 
 def frame_of(xyzrpy: Sequence[float] | Float64[np.ndarray, " 6"]) -> Frame:
     """Return `Trans(x, y, z) · RotZ(roll) · RotY(pitch) · RotX(yaw)`, the form of base and tool."""
     x, y, z, roll, pitch, yaw = (float(value) for value in xyzrpy)
-    T: Frame = shift(x, y, z) @ turn(2, roll) @ turn(1, pitch) @ turn(0, yaw)
+    T: Frame = translation(x, y, z) @ rotation(2, roll) @ rotation(1, pitch) @ rotation(0, yaw)
     return T
 
 
@@ -54,7 +54,7 @@ def xyzrpy_of(T: Frame) -> Float64[np.ndarray, " 6"]:
     R = T[:3, :3]
     lying = math.hypot(R[0, 0], R[1, 0]) > ROUNDING
     roll = math.atan2(R[1, 0], R[0, 0]) if lying else 0.0
-    left = turn(2, -roll)[:3, :3] @ R
+    left = rotation(2, -roll)[:3, :3] @ R
     pitch = math.atan2(-left[2, 0], left[0, 0])
     yaw = math.atan2(-left[1, 2], left[1, 1])
     return np.array([*(clean_length(v) for v in T[:3, 3]), *(clean_angle(v) for v in (roll, pitch, yaw))])

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from pisigma.robot.coupling_section import CoupledJointSection, coupled
-from pisigma.robot.drawing import Drawing
+from pisigma.robot.robot_fields import RobotFields
 from pisigma.robot.row import Row
 from pisigma.robot.urdf_chain import Chain, ChainJoint
 from pisigma.robot.urdf_frames import (
@@ -23,8 +23,8 @@ from pisigma.robot.urdf_frames import (
     clean_angle,
     clean_length,
     inverse,
+    rotation,
     row_frame,
-    turn,
     xyzrpy_of,
 )
 
@@ -41,11 +41,11 @@ class ChainRows:
     """A chain as rows, with the frames of the rows in its joints.
 
     Attributes:
-        drawing: rows, base and tool.
+        fields: rows, base, tool and names.
         frames: for every joint, the frame of its row in the joint's frame; both share the axis and move together.
     """
 
-    drawing: Drawing
+    fields: RobotFields
     frames: tuple[Frame, ...]
 
 
@@ -80,7 +80,7 @@ def rows_of_chain(chain: Chain, nearly_parallel: float = NEARLY_PARALLEL) -> Cha
         for j, frame in zip(joints, frames, strict=True)
     ]
     coupled_rows, coupling = coupled(rows, _mimics(joints, rows))
-    drawing = Drawing(
+    fields = RobotFields(
         name=chain.name,
         maker="not stated",
         source=f"{URDF_SOURCE}{Path(chain.source).name}, from link '{chain.base}' to link '{chain.tip}'",
@@ -91,7 +91,7 @@ def rows_of_chain(chain: Chain, nearly_parallel: float = NEARLY_PARALLEL) -> Cha
         coupling=coupling,
         urdf=chain.content,
     )
-    return ChainRows(drawing, tuple(frames))
+    return ChainRows(fields, tuple(frames))
 
 
 def _mimics(joints: tuple[ChainJoint, ...], rows: list[Row]) -> list[CoupledJointSection]:
@@ -124,7 +124,7 @@ def _first_frame(joint: ChainJoint, axis: Vector) -> Frame:
     z, point = joint.origin[:3, :3] @ axis, joint.origin[:3, 3]
     upright = math.hypot(z[0], z[1]) <= ROUNDING
     if upright and (joint.type == "prismatic" or math.hypot(point[0], point[1]) <= ROUNDING):
-        return np.eye(4) if z[2] > 0 else turn(0, math.pi)
+        return np.eye(4) if z[2] > 0 else rotation(0, math.pi)
     T: Frame = joint.origin @ _turned_to(axis)
     return T
 
@@ -133,7 +133,7 @@ def _turned_to(axis: Vector) -> Frame:
     """Return a rotation about y and then x that maps the z axis to a given one."""
     x, y, z = (float(value) for value in axis)
     about_x, about_y = math.atan2(-y, z), math.atan2(x, math.hypot(y, z))
-    T: Frame = turn(0, clean_angle(about_x)) @ turn(1, clean_angle(about_y))
+    T: Frame = rotation(0, clean_angle(about_x)) @ rotation(1, clean_angle(about_y))
     return T
 
 
@@ -176,7 +176,7 @@ def _row_to(z: Vector, point: Vector, nearly_parallel: float) -> Parameters:
         theta = math.atan2(normal[1], normal[0])
         d = clean_length(point[2] - (z[0] * point[0] + z[1] * point[1]) / sine**2 * z[2])
     theta = clean_angle(theta)
-    x, y, up = turn(2, -theta)[:3, :3] @ z
+    x, y, up = rotation(2, -theta)[:3, :3] @ z
     beta = clean_angle(math.atan2(x, math.hypot(y, up))) if sine < nearly_parallel else 0.0
     return theta, d, a, clean_angle(math.atan2(-y, up)), beta
 

@@ -13,7 +13,7 @@ from pisigma.files.yaml_file import yaml_text
 from pisigma.robot.coupling_section import coupling_document
 from pisigma.robot.description import Robot
 from pisigma.robot.row import DH_COLUMNS, FRAME_COLUMNS, Row, in_file_units
-from pisigma.robot.urdf_frames import Frame, frame_of, row_frame, shift, turn, xyzrpy_of
+from pisigma.robot.urdf_frames import Frame, frame_of, rotation, row_frame, translation, xyzrpy_of
 
 
 def robot_to_yaml(robot: Robot) -> str:
@@ -97,7 +97,7 @@ def robot_to_urdf(robot: Robot, comments: tuple[str, ...] = ()) -> str:
     _joint(root, unused_name("base_joint", names), "fixed", (BASE_LINK, link), frame_of(robot.base))
     behind, number = np.eye(4), 0
     for row, (theta, d, a, alpha, beta) in zip(robot.rows, _at_rest(robot).tolist(), strict=True):
-        behind = behind @ turn(2, theta) @ shift(0.0, 0.0, d)
+        behind = behind @ rotation(2, theta) @ translation(0.0, 0.0, d)
         for moving, mimic in _movers(robot, row):
             number += 1
             links = link, f"link_{number}"

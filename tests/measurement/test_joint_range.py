@@ -51,7 +51,7 @@ def test_limits_are_widened_to_the_rows_and_no_farther(robot):
     assert change[2, 0] == pytest.approx(-0.02)
     assert np.count_nonzero(change) == 2
     assert joint_ranges(wide, rows) == ()
-    read = Robot(*parse_yaml(robot_to_yaml(wide), RobotDocument, RobotError, "file").drawing())
+    read = Robot(*parse_yaml(robot_to_yaml(wide), RobotDocument, RobotError, "file").to_fields())
     assert np.abs(read.limits - wide.limits).max() < 1e-12
 
 

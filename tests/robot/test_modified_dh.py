@@ -7,7 +7,7 @@ from testing.refusals import refused
 
 import pisigma
 from pisigma.files.errors import RobotError
-from pisigma.robot.urdf_frames import frame_of, shift, turn
+from pisigma.robot.urdf_frames import frame_of, rotation, translation
 
 MODIFIED = """\
 name: modified
@@ -33,7 +33,13 @@ def test_rows_are_converted_exactly():
         (30, 0.4, np.deg2rad(20), 0.05 + q[2]),
         (-40, 0.003, 0.0, 0.007),
     ):
-        T = T @ turn(0, np.deg2rad(alpha)) @ shift(a, 0.0, 0.0) @ turn(2, theta) @ shift(0.0, 0.0, d)
+        T = (
+            T
+            @ rotation(0, np.deg2rad(alpha))
+            @ translation(a, 0.0, 0.0)
+            @ rotation(2, theta)
+            @ translation(0.0, 0.0, d)
+        )
     T = T @ frame_of(np.array([0, 0, 0.05, 0, 0, np.deg2rad(5)]))
     assert_close(pisigma.forward_kinematics(robot, q), T, atol=1e-15)
 

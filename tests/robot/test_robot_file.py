@@ -26,7 +26,7 @@ tool: {z_mm: 250, yaw_deg: -180}
 
 
 def read(text: str) -> Robot:
-    return Robot(*parse_yaml(text, RobotDocument, RobotError, "arm.yaml").drawing())
+    return Robot(*parse_yaml(text, RobotDocument, RobotError, "arm.yaml").to_fields())
 
 
 def test_units_and_columns():

@@ -12,7 +12,7 @@ from testing.refusals import refused
 
 from pisigma.files.errors import OutputError
 from pisigma.robot import Robot, Row
-from pisigma.robot.urdf_frames import frame_of, inverse, row_frame, turn, xyzrpy_of
+from pisigma.robot.urdf_frames import frame_of, inverse, rotation, row_frame, xyzrpy_of
 from pisigma.robot.writing import robot_to_urdf
 
 ROWS = (
@@ -81,7 +81,7 @@ def test_a_calibrated_robot_has_no_far_frames():
 @pytest.mark.parametrize("tilt", [0.0, 1e-16, 1e-14, 1e-12, 1e-9, 1e-7, 1e-3])
 @pytest.mark.parametrize("side", [1, -1])
 def test_rotations_near_the_singular_pitch_are_exact(tilt, side):
-    R = turn(2, 0.3) @ turn(1, side * math.pi / 2 + tilt) @ turn(0, 1.1) @ turn(2, 1e-9)
+    R = rotation(2, 0.3) @ rotation(1, side * math.pi / 2 + tilt) @ rotation(0, 1.1) @ rotation(2, 1e-9)
     assert_close(frame_of(xyzrpy_of(R)), R, atol=5e-15)
 
 

@@ -42,4 +42,4 @@ coupling:
 
 def coupled_robot(text: str = COUPLED) -> Robot:
     """Load one of the robots."""
-    return Robot(*parse_yaml(text, RobotDocument, RobotError, "robot.yaml").drawing())
+    return Robot(*parse_yaml(text, RobotDocument, RobotError, "robot.yaml").to_fields())

@@ -11,7 +11,7 @@ from pisigma.deployment.export.geometry import check_geometry, chosen_geometry
 from pisigma.files.errors import OutputError, Place, RobotError
 from pisigma.files.model_files import DRAWING
 from pisigma.robot.description import Robot
-from pisigma.robot.drawing import Drawing
+from pisigma.robot.robot_fields import RobotFields
 from pisigma.robot.urdf_chain import Chain, origin_of, read_chain
 from pisigma.robot.urdf_file import parse_xml, read_urdf
 from pisigma.robot.urdf_frames import Frame, frame_of, inverse, row_frame
@@ -131,7 +131,7 @@ def robot_into_urdf(
 
     chain = read_chain(path, base, tip)
     rows = rows_of_chain(chain)
-    _check_same(rows.drawing, nominal, str(path))
+    _check_same(rows.fields, nominal, str(path))
     urdf, _ = read_urdf(path)
     root = parse_xml(path, everything=True)
     elements = {element.get("name"): element for element in root.iterchildren("{*}joint")}
@@ -140,7 +140,7 @@ def robot_into_urdf(
     _widen_limits(elements, nominal)
     if filled := _fill_in(root):
         comments = (*comments, MISSING.format(links=", ".join(filled)))
-    T_frame_base = frame_of(calibrated.base) @ inverse(frame_of(rows.drawing.base))
+    T_frame_base = frame_of(calibrated.base) @ inverse(frame_of(rows.fields.base))
     last = row_frame(*calibrated.dh[-1].tolist()) @ frame_of(calibrated.tool)
     mount = None
     if chain.base in urdf.parent_map:
@@ -155,7 +155,7 @@ def robot_into_urdf(
     return f'<?xml version="1.0"?>\n{etree.tostring(root, encoding="unicode")}\n'
 
 
-def _check_same(drawn: Drawing, nominal: Robot, path: str) -> None:
+def _check_same(drawn: RobotFields, nominal: Robot, path: str) -> None:
     """Raise an error if a file describes another robot."""
     kinds, wanted = ([(row.name, row.type, row.direction) for row in r.rows] for r in (drawn, nominal))
     if kinds != wanted:

@@ -212,7 +212,7 @@ def _build_model(
     Raises:
         ValueError: a tensor is missing, unknown or of another shape or type; or a name or count is wrong.
     """
-    robot = Robot(*document.robot.drawing()._replace(urdf=drawing))
+    robot = Robot(*document.robot.to_fields()._replace(urdf=drawing))
     check_size(document, robot, sum(value.numel() for value in tensors.values()))
     _check_branches(robot, document.branches)
     network = _empty_network(document, robot)
@@ -262,7 +262,7 @@ def _made_of(robot: Robot, numbers: Tensor, measured: Tensor, steps: Tensor) -> 
 def _calibrated_robot(document: ModelDocument, robot: Robot) -> Robot | None:
     if document.calibrated is None:
         return None
-    calibrated = Robot(*document.calibrated.drawing()._replace(urdf=robot.urdf))
+    calibrated = Robot(*document.calibrated.to_fields()._replace(urdf=robot.urdf))
     if [(row.name, row.type) for row in calibrated.rows] != [(row.name, row.type) for row in robot.rows]:
         raise MisfitError("the calibrated robot has other rows than the nominal one", column="calibrated")
     if not (np.array_equal(calibrated.base, robot.base) and np.array_equal(calibrated.tool, robot.tool)):

@@ -20,7 +20,7 @@ from pisigma.reporting.viewing.surface import Surface, capsule, joined
 from pisigma.robot.description import Robot
 from pisigma.robot.urdf_chain import origin_of, read_chain
 from pisigma.robot.urdf_file import parse_xml, read_urdf
-from pisigma.robot.urdf_frames import Frame, frame_of, shift
+from pisigma.robot.urdf_frames import Frame, frame_of, translation
 
 if TYPE_CHECKING:  # names in full, which type checkers at run time find without these imports
     import trimesh
@@ -155,7 +155,7 @@ class MeshBody(AbstractBody):
 
 def _motion(joint: Any, value: float) -> Frame:
     axis = np.array(joint.axis or (1.0, 0.0, 0.0))
-    T: Frame = shift(*(value * axis)) if joint.type == "prismatic" else np.eye(4)
+    T: Frame = translation(*(value * axis)) if joint.type == "prismatic" else np.eye(4)
     if joint.type in ("revolute", "continuous"):
         T[:3, :3] = Rotation.from_rotvec(value * axis).as_matrix()
     return T

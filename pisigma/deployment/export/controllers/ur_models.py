@@ -12,7 +12,7 @@ from pisigma.files.errors import RobotError
 from pisigma.robot.chains import joint_origins
 from pisigma.robot.description import Robot
 from pisigma.robot.kinematics.forward import forward_kinematics
-from pisigma.robot.urdf_frames import Frame, frame_of, inverse, shift, turn, xyzrpy_of
+from pisigma.robot.urdf_frames import Frame, frame_of, inverse, rotation, translation, xyzrpy_of
 
 JOINTS = 6
 SOURCE = "universal-robots.com, DH parameters for calculations of kinematics and dynamics"
@@ -124,7 +124,7 @@ class OwnGeometry:
 def _screw(T: Frame) -> Frame:
     """Return the part of a transform along and about the z axis."""
     angle = float(np.arctan2(T[1, 0] - T[0, 1], T[0, 0] + T[1, 1]))
-    screw: Frame = turn(2, angle) @ shift(0.0, 0.0, float(T[2, 3]))
+    screw: Frame = rotation(2, angle) @ translation(0.0, 0.0, float(T[2, 3]))
     return screw
 
 

@@ -18,7 +18,7 @@ from pisigma.files.yaml_file import Section, parse_yaml, yaml_text
 from pisigma.robot.chains import robot_of_origins
 from pisigma.robot.description import Robot
 from pisigma.robot.row import Bounded
-from pisigma.robot.urdf_frames import Frame, frame_of, shift, turn, xyzrpy_of
+from pisigma.robot.urdf_frames import Frame, frame_of, rotation, translation, xyzrpy_of
 
 COLUMNS = ("x", "y", "z", "yaw", "pitch", "roll")
 """In the order of `frame_of`: the driver's roll is about x, that of pisigma about z."""
@@ -44,7 +44,10 @@ class LinkSection(Section):
         if as_urdf:
             return frame_of([getattr(self, column) for column in COLUMNS])
         T: Frame = (
-            shift(self.x, self.y, self.z) @ turn(0, self.roll) @ turn(1, self.pitch) @ turn(2, self.yaw)
+            translation(self.x, self.y, self.z)
+            @ rotation(0, self.roll)
+            @ rotation(1, self.pitch)
+            @ rotation(2, self.yaw)
         )
         return T
 

@@ -9,7 +9,7 @@ from pisigma.robot.coupling import Coupling
 from pisigma.robot.row import Row
 
 
-class Drawing(NamedTuple):
+class RobotFields(NamedTuple):
     """Contents of a robot file, not yet checked as a whole; see `Robot`, which has the same attributes.
 
     Attributes:
