@@ -1,1 +1,1 @@
-"""What has changed since a calibration: recalibration, monitoring, comparison, fleets."""
+"""Changes since a calibration: recalibration, monitoring, comparison, fleets."""

@@ -62,16 +62,16 @@ class Candidates:
             f" ({reasons})." if reasons else "."
         )
 
-    def check_count(self, wanted: int) -> None:
+    def check_count(self, count: int) -> None:
         """Refuse to select more poses than there are.
 
         Raises:
             PlanningError: there are fewer candidates; the message says why poses were refused.
         """
-        if len(self.q) < wanted:
+        if len(self.q) < count:
             raise PlanningError(
-                f"expected {wanted:,} candidates or more, but {self.sentence.removesuffix('.')}",
-                expected=f"{wanted:,} candidates or more",
+                f"expected {count:,} candidates or more, but {self.sentence.removesuffix('.')}",
+                expected=f"{count:,} candidates or more",
                 value=len(self.q),
                 remedy="plan fewer poses, give more candidates or enlarge the cell",
             )

@@ -104,8 +104,8 @@ def tour(
     first = int(start is not None)
     order = np.arange(first)
     ends = [*(end for end in stages if end < len(q)), len(q)]
-    for begin, end in pairwise([0, *ends]):
-        stage = np.concatenate([order[-1:], np.arange(begin, end) + first])
+    for start_of_stage, end in pairwise([0, *ends]):
+        stage = np.concatenate([order[-1:], np.arange(start_of_stage, end) + first])
         order = np.concatenate([order[:-1], _ordered(motions, poses, seconds, stage, len(order) > 0)])
     return _with_way_points(motions, poses, order, pace, start is not None)
 

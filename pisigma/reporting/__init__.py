@@ -1,1 +1,1 @@
-"""Metrics, tables, figures and cards."""
+"""Tables, figures, cards and pages."""

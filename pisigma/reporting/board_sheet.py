@@ -60,9 +60,9 @@ def draw_board_sheet(board: Board) -> tuple[str, Figure]:
     corner = np.array([(width - across) / 2, MARGIN]) - 1e3 * pattern.sheet[:2]
     axes.add_patch(PathPatch(_outline(pattern, corner), facecolor="black", edgecolor="none"))
     top = MARGIN + down + 4
-    begin, end = (width - RULER) / 2, (width + RULER) / 2
+    start, end = (width - RULER) / 2, (width + RULER) / 2
     axes.plot(
-        [begin, begin, begin, end, end, end], [top, top + 4, top + 2, top + 2, top, top + 4], "k", lw=0.5
+        [start, start, start, end, end, end], [top, top + 4, top + 2, top + 2, top, top + 4], "k", lw=0.5
     )
     texts = (
         f"This line is {RULER:g} mm long; if not, print again at 100 %, or state the measured lengths of the board.",

@@ -154,7 +154,9 @@ def noise_text(noise: NoiseFigures) -> str:
 
 
 def _sentence(line: str) -> str:
-    return f"{line.rstrip('.')}."
+    """Capitalise a line that starts with a plain word, not a name such as "theta_1" or "a.csv", and end it."""
+    is_word = line.partition(" ")[0].isalpha()
+    return f"{line[:1].upper() if is_word else line[:1]}{line[1:].rstrip('.')}."
 
 
 def write_parameters(parameters: Sequence[ParameterFigures], path: Path) -> None:

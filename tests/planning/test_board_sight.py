@@ -14,7 +14,7 @@ from pisigma.robot.kinematics.forward import forward_kinematics
 
 
 @pytest.mark.parametrize("is_fixed", [False, True])
-def test_a_pose_has_the_weight_of_its_image(is_fixed: bool):
+def test_the_weight_of_a_pose_is_that_of_its_image(is_fixed: bool):
     cell = camera_cell(6, is_fixed=is_fixed)
     rows = image_measurements(cell.images, CAMERA, BOARD, is_fixed, NOISE.repeatability)
     texts = rows.readings[WEIGHT_COLUMN]

@@ -42,7 +42,7 @@ def test_every_candidate_sees_the_board(settings: PlanSettings, drawn: Candidate
     assert bool(arm.faults(drawn.q).allowed.all())
 
 
-def test_views_are_of_all_angles_distances_and_branches(settings: PlanSettings, drawn: Candidates):
+def test_views_cover_all_angles_distances_and_branches(settings: PlanSettings, drawn: Candidates):
     arm = arm_before_board()
     views = views_of(settings, arm)
     assert views is not None

@@ -48,7 +48,7 @@ def test_candidates_of_a_file_keep_their_row(tmp_path: Path):
     assert_close(candidates.q, drawn.q, atol=1e-12)
 
 
-def test_poses_that_stand_in_a_file_twice_are_candidates_once(tmp_path: Path):
+def test_repeated_poses_of_a_file_are_candidates_once(tmp_path: Path):
     drawn = draw_candidates(ARM, 4, 0)
     q = torch.cat([drawn.q, drawn.q + 1e-8, drawn.q[1:3]])
     path = tmp_path / "repeated.csv"
@@ -90,7 +90,7 @@ def test_spread_poses_are_farther_apart_than_random_ones():
     assert len(spread(ARM, q, 0, q[:3])) == 0
 
 
-def test_a_joint_that_is_seldom_free_at_some_angles_is_unwrapped_around_them():
+def test_joints_are_unwrapped_away_from_angles_that_are_rarely_free():
     arm = ArmInCell.of(Robot.load("ur5"))  # its wrist cannot fold against the forearm: joint 4 at 90 deg
     q = draw_candidates(arm, 400, 0).q[:, 3].rad2deg()
     assert float(q.min()) < -220

@@ -37,7 +37,7 @@ def stored(tmp_path: Path) -> StoredPlan:
 
 
 @pytest.mark.parametrize("name", ["poses.csv", "poses.plan.yaml"])
-def test_a_plan_comes_back(stored: StoredPlan, tmp_path: Path, name: str):
+def test_a_plan_is_the_same_after_writing_and_reading(stored: StoredPlan, tmp_path: Path, name: str):
     read = read_plan(tmp_path / name)
     assert read.settings == stored.settings
     assert read.arm.cell == stored.arm.cell

@@ -60,7 +60,7 @@ def test_gains_and_exchange_are_those_of_the_criterion(
 
 
 @pytest.mark.parametrize("hybrid", [False, True])
-def test_the_goal_holds_what_is_left_of_the_variance_when_poses_are_measured(hybrid: bool) -> None:
+def test_condensed_rows_keep_the_variance_after_measuring(hybrid: bool) -> None:
     # before it is all where base and tool are, metres against tenths of a millimetre
     posterior, task = RobotPosterior.of_robot(Robot.load("ur5"), hybrid=hybrid), random_joints(50, 1)
     q, goal = random_joints(60, 0), condensed(posterior.tool(task))
@@ -85,7 +85,7 @@ def test_criterion_i_leaves_less_error_of_the_tool_than_criterion_d_and_random_p
         assert left < 0.9 * min(others)
 
 
-def test_the_first_of_a_choice_are_the_greedy_choice_among_it(posterior: RobotPosterior) -> None:
+def test_selected_poses_are_sorted_greedily(posterior: RobotPosterior) -> None:
     q, task = random_joints(60, 2), random_joints(40, 3)
     chosen = select_poses(posterior.measured(q), posterior.tool(task), 12, "I")
     assert len(set(chosen.tolist())) == 12
@@ -113,7 +113,7 @@ def test_quantiles_are_those_of_one_normal_coordinate() -> None:
     assert_close(p95_of(D), 1.96e-3, rtol=0.03)
 
 
-def test_what_remains_is_named(posterior: RobotPosterior) -> None:
+def test_remaining_errors_are_attributed_to_groups(posterior: RobotPosterior) -> None:
     task = random_joints(40, 6)
     errors = remaining_errors(posterior, task)
     assert {"base", "tool", "joint offsets"} <= {error.name for error in errors}
@@ -122,7 +122,7 @@ def test_what_remains_is_named(posterior: RobotPosterior) -> None:
     assert any(error.name.startswith("correction of joint") for error in remaining_errors(hybrid, task))
 
 
-def test_impossible_choices_are_refused(posterior: RobotPosterior) -> None:
+def test_impossible_selections_are_refused(posterior: RobotPosterior) -> None:
     q = random_joints(5, 0)
     with refused(PlanningError, option="count", value=6):
         select_poses(posterior.measured(q), posterior.tool(q), 6)

@@ -25,7 +25,7 @@ def robot() -> Robot:
 
 
 @pytest.mark.parametrize("kind", ["position", "pose", "distance"])
-def test_columns_are_the_derivative_of_what_is_measured(robot: Robot, kind: str) -> None:
+def test_columns_are_the_derivative_of_the_measured_values(robot: Robot, kind: str) -> None:
     instrument = Instrument(kind, 1e-4, 2e-4, (1.0, 2.0, 0.5))
     posterior = RobotPosterior.of_robot(robot, instrument)
     q = random_joints(robot, 4, 0)
@@ -44,7 +44,7 @@ def test_columns_are_the_derivative_of_what_is_measured(robot: Robot, kind: str)
     assert_close(B[:, :3, index], moved * size / 1e-4, atol=1e-4)
 
 
-def test_conditioning_is_that_of_a_normal_distribution(robot: Robot) -> None:
+def test_conditioning_agrees_with_a_normal_distribution(robot: Robot) -> None:
     posterior = RobotPosterior.of_robot(robot, hybrid=False)
     q, task = random_joints(robot, 20, 1), random_joints(robot, 30, 2)
     A = posterior.columns(q)[:, :3].flatten(0, 1)
@@ -65,7 +65,7 @@ def test_few_rows_are_conditioned_on_without_a_fit(robot: Robot) -> None:
     assert_close(posterior.after(rows).deviation(task), posterior.informed(q).deviation(task), rtol=1e-9)
 
 
-def test_rows_surprise_as_chi_squared_and_wrong_ones_more(robot: Robot) -> None:
+def test_surprise_is_chi_square_distributed_and_larger_for_wrong_rows(robot: Robot) -> None:
     posterior = RobotPosterior.of_robot(robot, Instrument("pose", 1e-4, 2e-4)).informed(
         random_joints(robot, 60, 5)
     )
@@ -97,7 +97,7 @@ def test_distances_do_not_determine_the_pose_of_the_base(robot: Robot) -> None:
     assert float(after.max()) < 5e-3
 
 
-def test_an_arm_seen_anew_is_known_as_one_never_measured_there(robot: Robot) -> None:
+def test_unknown_base_and_tool_have_a_wide_prior(robot: Robot) -> None:
     """In another frame, at another target, with nothing known of either."""
     base, tool = (np.array([0.3, -0.2, 0.1, *angles]) for angles in ((0.1, 0.2, 3.0), (0.5, -0.3, 0.2)))
     q = torch.linspace(-1, 1, 5 * robot.dof, dtype=torch.float64).view(5, robot.dof)

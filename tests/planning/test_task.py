@@ -51,7 +51,7 @@ def test_a_task_may_be_joint_values_or_poses(tmp_path: Path, wanted: str):
     ("header", "value", "stated"),
     [("q3_deg", "400", "400 deg"), ("q3_rad", "10", "572.958 deg")],
 )
-def test_joint_values_of_a_task_are_ones_that_the_robot_can_have(
+def test_joint_values_of_a_task_outside_the_limits_are_refused(
     tmp_path: Path, header: str, value: str, stated: str
 ):
     columns = ["q1_deg", "q2_deg", header, "q4_deg", "q5_deg", "q6_deg"]
@@ -63,7 +63,7 @@ def test_joint_values_of_a_task_are_ones_that_the_robot_can_have(
     assert stated in str(caught.value)
 
 
-def test_without_a_task_it_is_wherever_the_robot_can_be_measured():
+def test_without_a_task_the_whole_workspace_counts():
     q = torch.arange(4000.0, dtype=torch.float64).reshape(1000, 4)
     some = task_poses(ArmInCell.of(Robot.load("kiro3")), PlanSettings(), q)
     assert len(some) == TASK_POSES

@@ -36,7 +36,7 @@ def test_few_poses_are_in_the_best_order():
     assert best - 1e-9 <= way.seconds <= 1.05 * best
 
 
-def test_a_tour_goes_on_from_where_the_robot_stands():
+def test_a_tour_starts_at_the_present_joint_values():
     q = torch.from_numpy(np.random.default_rng(3).uniform(-0.4, 0.4, (7, 6)))
     arm = ArmInCell.of(Robot.load("fanuc_r2000"))
     start = q[4] + 0.01
@@ -45,7 +45,7 @@ def test_a_tour_goes_on_from_where_the_robot_stands():
     assert sorted(way.order.tolist()) == list(range(7))
 
 
-def test_what_is_most_useful_comes_first_in_stages():
+def test_the_most_useful_poses_come_in_the_first_stage():
     q = torch.from_numpy(np.random.default_rng(4).uniform(-0.4, 0.4, (9, 6)))
     arm = ArmInCell.of(Robot.load("fanuc_r2000"))
     order = tour(Motions(arm, q), q, PACE, q[0], stages=(2, 5, 20)).order.tolist()
@@ -54,12 +54,12 @@ def test_what_is_most_useful_comes_first_in_stages():
     assert stages_of(81) == (20, 40, 80)
 
 
-def test_poses_to_check_with_stand_evenly_between_the_others():
+def test_test_poses_are_distributed_evenly():
     assert order_of_use(6, 2).tolist() == [0, 1, 6, 2, 3, 4, 7, 5]
     assert order_of_use(2, 0).tolist() == [0, 1]
 
 
-def test_every_motion_touches_nothing():
+def test_every_motion_is_collision_free():
     arm = ArmInCell.of(ARM.drawn, CELL.model_copy(update={"tracker": None, "reflector": None}))
     pool = draw_candidates(arm, 60, 0).q
     way = tour(Motions(arm, pool), pool[:5], PACE)
@@ -72,7 +72,7 @@ def test_every_motion_touches_nothing():
     assert bool(is_free(arm, path[:-1], path[1:]).all())
 
 
-def test_a_pose_that_no_motion_leads_to_is_left_out():
+def test_an_unreachable_pose_is_left_out():
     wall = {"name": "wall", "center_mm": (-3200.0, 0.0, 1500.0), "size_mm": (6000.0, 40.0, 3000.0)}
     robot = Robot.load("kiro3")
     q = torch.tensor([[1.5, 0.3, -0.1, 0], [1.2, 0.1, -0.2, 1], [-1.5, -0.3, -0.1, 0]], dtype=torch.float64)

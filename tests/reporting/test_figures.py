@@ -49,7 +49,7 @@ def test_workspace_grows_with_the_joints(tmp_path, generator, rows, joints):
     assert height > 200 * joints
 
 
-def test_drawing_chooses_no_backend_for_others():
+def test_drawing_does_not_set_the_global_backend():
     """Neither pyplot nor a backend is chosen for a program that draws on the screen."""
     script = (
         "import sys\nimport pisigma.reporting.figures\nimport matplotlib\n"

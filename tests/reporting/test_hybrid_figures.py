@@ -36,7 +36,7 @@ def arm():
     return hybrid_of("rb5", 240)
 
 
-def test_the_line_is_the_correction_with_the_other_joints_at_their_middle(arm):
+def test_the_line_has_the_other_joints_at_their_medians(arm):
     correction, q = arm.result.learned.correction, arm.measurements.q
     own, line = _over_own_value(correction, q, 2)
     assert_close(own[[0, -1]], [float(q[:, 2].min()), float(q[:, 2].max())], atol=1e-12)
@@ -86,7 +86,7 @@ def test_a_curve_for_every_model(tmp_path, rows):
     assert ink(tmp_path / "curve.png") > 0.01
 
 
-def test_what_was_tried_is_listed_in_order(arm):
+def test_trials_are_listed_in_order(arm):
     hybrid = summarise(arm.result).hybrid
     columns, rows = trial_table(hybrid)
     assert columns == TRIAL_COLUMNS

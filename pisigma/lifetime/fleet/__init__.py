@@ -1,1 +1,1 @@
-"""Many robots at once: which there are, what is worked out for each and where, and what came of it."""
+"""Fleets: robots and their sessions, results, status and fleet priors."""

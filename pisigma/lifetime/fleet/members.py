@@ -116,8 +116,8 @@ def _in_manifest(path: Path, robot: str | None) -> list[Member]:
         if name not in COLUMNS:
             at, remedy = Place(path, table.header_line, name), nearest_choice(name, COLUMNS)
             raise FleetError("unknown column", value=name, at=at, remedy=remedy)
-    wanted = COLUMNS[:3] if robot is None else ("id", "data")
-    if missing := [name for name in wanted if name not in table.header]:
+    required = COLUMNS[:3] if robot is None else ("id", "data")
+    if missing := [name for name in required if name not in table.header]:
         at = Place(path, table.header_line, missing[0])
         raise FleetError("the column is missing", at=at, remedy="add it")
     rows: dict[str, list[tuple[int, dict[str, str]]]] = {}

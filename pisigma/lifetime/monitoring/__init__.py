@@ -1,1 +1,1 @@
-"""Whether a calibrated robot still is as its model says: session after session, and over the months."""
+"""Monitoring of a calibrated robot against its model, per session and over months."""

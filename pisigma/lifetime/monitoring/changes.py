@@ -76,10 +76,10 @@ class Series:
             steady: columns of every fit.
             drift: columns of a drift.
         """
-        still, left = self._added(steady)
-        beside, left_beside = self._added(torch.cat([steady, drift], 1))
-        drifts = left_beside + drift.shape[1] * math.log(len(self.values)) < left
-        return (beside, True) if drifts else (still, False)
+        steady_events, left = self._added(steady)
+        drift_events, left_with_drift = self._added(torch.cat([steady, drift], 1))
+        drifts = left_with_drift + drift.shape[1] * math.log(len(self.values)) < left
+        return (drift_events, True) if drifts else (steady_events, False)
 
     def _added(self, columns: Tensor) -> tuple[tuple[Event, ...], float]:
         """Add events to columns; return them, and the remaining square sum plus penalty."""

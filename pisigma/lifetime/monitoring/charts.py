@@ -182,9 +182,9 @@ def cusum_sessions(limit: float) -> float:
     return (math.exp(b) - b - 1) / (2 * ALLOWANCE**2)
 
 
-def _solved(sessions_of: Callable[[float], float], wanted: float, low: float, high: float) -> float:
+def _solved(sessions_of: Callable[[float], float], target: float, low: float, high: float) -> float:
     """Find the limit with a given mean number of sessions by bisection."""
     for _ in range(40):
         middle = (low + high) / 2
-        low, high = (middle, high) if sessions_of(middle) < wanted else (low, middle)
+        low, high = (middle, high) if sessions_of(middle) < target else (low, middle)
     return high

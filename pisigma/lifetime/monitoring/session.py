@@ -175,11 +175,11 @@ def judge_session(
     solved = _solve(model, posterior, rows, stated or frozenset())
     probabilities = dict.fromkeys(stated or (), 1.0)
     if stated is None and solved.frame_moved:
-        solved, probabilities = _elsewhere(model, posterior, rows, solved)
+        solved, probabilities = _with_relocated(model, posterior, rows, solved)
     return _judged(solved, probabilities), _zeros(solved)
 
 
-def _elsewhere(
+def _with_relocated(
     model: CalibratedModel, posterior: ModelPosterior, rows: Measurements, still: "_Solved"
 ) -> tuple["_Solved", dict[FrameKey, float]]:
     """Find which bases and tools were moved: the base, the tool, or both where neither alone explains the rows."""
@@ -248,10 +248,10 @@ class _Solved:
 
 
 def _solve(
-    model: CalibratedModel, posterior: ModelPosterior, rows: Measurements, elsewhere: Set[FrameKey]
+    model: CalibratedModel, posterior: ModelPosterior, rows: Measurements, relocated: Set[FrameKey]
 ) -> _Solved:
     """Linearise and explain repeatedly until the linearisation converges."""
-    problem = recalibration_problem(model, posterior, rows, elsewhere)
+    problem = recalibration_problem(model, posterior, rows, relocated)
     noise = noise_of_sensors(problem, posterior.noise)
     group = held_out_groups(problem.setup.measurements)
     x = problem.mean
@@ -264,7 +264,7 @@ def _solve(
         step = values.X @ (there - x) / values.deviation(noise)
         x = there
         if float(step.square().mean().sqrt()) < CONVERGENCE_TOLERANCE or (
-            solved.frame_moved and not elsewhere
+            solved.frame_moved and not relocated
         ):
             break
     return solved
@@ -297,7 +297,7 @@ def _freed(motion: Motion) -> DriftGroup:
     return replace(motion.group, size=max(motion.size, ZERO_PRIOR))
 
 
-def _judged(solved: _Solved, elsewhere: dict[FrameKey, float]) -> Session:
+def _judged(solved: _Solved, relocated: dict[FrameKey, float]) -> Session:
     """Compute the result of a session."""
     every, wrong = solved.problem.setup.measurements, solved.problem.wrong_rows(solved.values)
     rows = every.select((~wrong).nonzero()[:, 0])
@@ -315,7 +315,7 @@ def _judged(solved: _Solved, elsewhere: dict[FrameKey, float]) -> Session:
     return Session(
         rows=every.rows,
         unchanged=explanation.unchanged,
-        moved=_moved(solved, elsewhere),
+        moved=_moved(solved, relocated),
         candidates=tuple((one.group.what, one.probability) for one in explanation.candidates),
         rms=rms,
         rms_after=rms_after * optimism,
@@ -323,7 +323,7 @@ def _judged(solved: _Solved, elsewhere: dict[FrameKey, float]) -> Session:
         score_ratio=solved.score_ratio(frames, motions) / optimism if "corner" in every.kinds else 1.0,
         error_score=evidence.with_moved(solved.moved_frames).error_score(),
         values=len(solved.values.y),
-        standing=tuple(" ".join(owner).strip() for owner in elsewhere),
+        standing=tuple(" ".join(owner).strip() for owner in relocated),
         observable=tuple(
             float(evidence.shift([group], explanation.noise_factor)[1].sqrt())
             < UNOBSERVABLE * float(group.scale)
@@ -333,11 +333,11 @@ def _judged(solved: _Solved, elsewhere: dict[FrameKey, float]) -> Session:
     )
 
 
-def _moved(solved: _Solved, elsewhere: dict[FrameKey, float]) -> tuple[Movement, ...]:
+def _moved(solved: _Solved, relocated: dict[FrameKey, float]) -> tuple[Movement, ...]:
     """Estimate all movements together, those of the arm first."""
     problem, explanation = solved.problem, solved.explanation
     found = [(_freed(one), one.probability) for one in explanation.motions]
-    for (kind, name), probability in elsewhere.items():
+    for (kind, name), probability in relocated.items():
         whats = (kind, f"{kind} {name}")
         found += [(one, probability) for one in problem.groups if one.fixed_size and one.what in whats]
     if not found:

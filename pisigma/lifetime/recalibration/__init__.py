@@ -1,1 +1,1 @@
-"""A calibrated model and few new rows: what has moved since, and the model that holds again."""
+"""Recalibration of a model with few new rows, and what moved since it was made."""

@@ -86,7 +86,7 @@ class CandidateChoice:
 def choose_candidate(
     model: CalibratedModel,
     whole: Adaptation,
-    elsewhere: Set[FrameKey],
+    relocated: Set[FrameKey],
     rows: Measurements,
     calibrator: Calibrator,
     progress: Progress,
@@ -96,7 +96,7 @@ def choose_candidate(
     Args:
         model: the model that is recalibrated.
         whole: adaptation of it to all rows.
-        elsewhere: bases and tools that were moved since the model was made.
+        relocated: bases and tools that were moved since the model was made.
         rows: new rows, frames and targets by the names of the model.
         calibrator: calibrator for the calibration from scratch.
         progress: called with the fold that is being predicted.
@@ -109,7 +109,7 @@ def choose_candidate(
         progress(f"fold {number} of {folds}")
         training = rows.select(train)
         test = test[_predictable(rows, test, training)]
-        problem = recalibration_problem(model, posterior, training, elsewhere)
+        problem = recalibration_problem(model, posterior, training, relocated)
         candidates: dict[Kept, Callable[[], PredictsErrors]] = {
             "recalibrated": partial(adapt, problem, noise, whole.drift),
             "old": partial(adapt, problem.without_arm(), noise),

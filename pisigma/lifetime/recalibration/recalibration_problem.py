@@ -84,12 +84,12 @@ class RecalibrationProblem:
 
     def without_arm(self) -> "RecalibrationProblem":
         """Return the problem with the arm held fixed: only moved bases and tools are unknown."""
-        elsewhere = tuple(group for group in self.groups if group.fixed_size)
-        return replace(self, root=self.standing, groups=elsewhere, standing=self.root)
+        relocated = tuple(group for group in self.groups if group.fixed_size)
+        return replace(self, root=self.standing, groups=relocated, standing=self.root)
 
 
 def recalibration_problem(
-    model: CalibratedModel, posterior: ModelPosterior, rows: Measurements, elsewhere: Set[FrameKey]
+    model: CalibratedModel, posterior: ModelPosterior, rows: Measurements, relocated: Set[FrameKey]
 ) -> RecalibrationProblem:
     """Set up the problem.
 
@@ -97,7 +97,7 @@ def recalibration_problem(
         model: the model.
         posterior: posterior of the model.
         rows: new rows, frames and targets by the names of the model.
-        elsewhere: bases and tools that were moved since the model was made; those that the model does not have need not
+        relocated: bases and tools that were moved since the model was made; those that the model does not have need not
             be named.
 
     Raises:
@@ -110,7 +110,7 @@ def recalibration_problem(
     known = {("base", name) for name in posterior.geometry.bases}
     known |= {("tool", name) for name in posterior.geometry.tools}
     new = {("base", name) for name in rows.frame} | {("tool", name) for name in rows.target}
-    new = (new - known) | set(elsewhere)
+    new = (new - known) | set(relocated)
     guessed = _guess(model, posterior, space, rows, new)
     setup = setup_around(space, guessed, (usable, rows), SetupOptions(True, True), None, HampelLoss())
     start = setup.start.clone()
@@ -142,10 +142,10 @@ def _joined_space(space: ParameterSpace, rows: Measurements) -> ParameterSpace:
     groups = []
     for name, own in (of_rows | before).items():
         there = of_rows.get(name, UnknownGroup(name, own.columns, ()))
-        stands = dict(zip(there.owners, there.frames, strict=True))
-        stood = dict(zip(own.owners, own.frames or frames[:1] * len(own.owners), strict=True))
-        stands |= {owner: frame for owner, frame in stood.items() if owner not in stands}
-        groups.append(replace(own, owners=tuple(stands), frames=tuple(stands.values())))
+        frame_of = dict(zip(there.owners, there.frames, strict=True))
+        earlier = dict(zip(own.owners, own.frames or frames[:1] * len(own.owners), strict=True))
+        frame_of |= {owner: frame for owner, frame in earlier.items() if owner not in frame_of}
+        groups.append(replace(own, owners=tuple(frame_of), frames=tuple(frame_of.values())))
     targets = tuple(dict.fromkeys((*space.targets, *rows.target)))
     return ParameterSpace(space.robot, frames, targets, tuple(groups))
 
@@ -236,7 +236,7 @@ def _groups(
             stretch = frame_slice(space, kind, name)
             index = torch.arange(stretch.start, stretch.stop)
             if (kind, name) in new:
-                groups.append(_elsewhere(space, what, index))
+                groups.append(_relocated_group(space, what, index))
             elif name in measured:
                 turn = 1 / space.robot.reach
                 scale = torch.tensor([1.0, 1.0, 1.0, turn, turn, turn], dtype=torch.float64)
@@ -246,7 +246,7 @@ def _groups(
             if owner not in posterior.geometry.unknowns.get(own.name, {}):
                 first = space.of(own.name).start + len(own.columns) * number
                 index = torch.tensor([k for k in free_unknowns if first <= k < first + len(own.columns)])
-                groups.append(_elsewhere(space, f"{own.name} {owner}", index))
+                groups.append(_relocated_group(space, f"{own.name} {owner}", index))
     if len(posterior.weights):
         index = torch.arange(parameters, len(root))
         scale = CORRECTION_SCALE * posterior.usual_weights
@@ -256,7 +256,7 @@ def _groups(
     return tuple(group for group in groups if len(group.index))
 
 
-def _elsewhere(space: ParameterSpace, what: str, index: Tensor) -> DriftGroup:
+def _relocated_group(space: ParameterSpace, what: str, index: Tensor) -> DriftGroup:
     """Return the group of a moved base or tool, with a wide prior around its guess."""
     scale = [RELOCATION_PRIOR[space.parameters[number].unit] for number in index.tolist()]
     return DriftGroup(what, index, torch.tensor(scale, dtype=torch.float64), 1.0, fixed_size=True)

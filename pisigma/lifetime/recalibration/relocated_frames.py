@@ -45,14 +45,14 @@ def relocated_frames(
         for kind, names, frames in _kinds(rows, posterior)
     )
 
-    def evidence(elsewhere: Set[FrameKey]) -> float:
-        problem = recalibration_problem(model, posterior, rows, elsewhere)
-        return adapt(problem, noise).drift.log_evidence - LOG_PRIOR_PENALTY * len(elsewhere)
+    def evidence(relocated: Set[FrameKey]) -> float:
+        problem = recalibration_problem(model, posterior, rows, relocated)
+        return adapt(problem, noise).drift.log_evidence - LOG_PRIOR_PENALTY * len(relocated)
 
-    still = adapt(recalibration_problem(model, posterior, rows, frozenset()), noise).drift
-    if all(group.size < MIN_MOVE for group in still.groups if group.what.startswith(("base", "tool"))):
+    unmoved = adapt(recalibration_problem(model, posterior, rows, frozenset()), noise).drift
+    if all(group.size < MIN_MOVE for group in unmoved.groups if group.what.startswith(("base", "tool"))):
         return frozenset()
-    tried = {frozenset[FrameKey](): still.log_evidence}
+    tried = {frozenset[FrameKey](): unmoved.log_evidence}
     with suppress(IdentificationError):  # too few rows to determine these
         tried |= {owners: evidence(owners) for owners in (bases, tools, bases | tools) if owners}
     return max(tried, key=lambda owners: tried[owners])

@@ -94,7 +94,7 @@ class ArmInCell:
         )
 
     def with_measured(self, q: Float64[Tensor, "poses dof"]) -> "ArmInCell":
-        """Return the arm such that measured poses are free of self-collision, whatever the radii of the links.
+        """Return the arm such that measured poses are free of self-collision, for any radii of the links.
 
         Args:
             q: joint values of measured poses [rad or m].
@@ -249,8 +249,8 @@ def _beam_blockers(capsules: Capsules, clearance: float) -> Int64[Tensor, " piec
     q = capsules.random_joints()
     reflector = forward_kinematics(capsules.robot, q)[:, None, None, :3, 3].expand(-1, 1, 2, 3)
     touches = segment_distance(reflector, capsules.segments(q)) < capsules.radius + clearance
-    wanted = (capsules.link < capsules.link.max()) & (touches.double().mean(0) < 0.5)
-    return wanted.nonzero()[:, 0]
+    blocking = (capsules.link < capsules.link.max()) & (touches.double().mean(0) < 0.5)
+    return blocking.nonzero()[:, 0]
 
 
 def _least(gaps: Float64[Tensor, "poses things"], infinite: Float64[Tensor, "poses 1"]) -> Tensor:

@@ -119,8 +119,8 @@ class Capsules:
         distance = segment_distance(segments[:, first], segments[:, second])
         touches = distance < self.radius[first] + self.radius[second] + clearance
         changes = distance.amax(0) - distance.amin(0) > MIN_LENGTH
-        wanted = ((self.link[second] - self.link[first]) > 1) & (touches.double().mean(0) < 0.5) & changes
-        return torch.stack([first, second], -1)[wanted]
+        checked = ((self.link[second] - self.link[first]) > 1) & (touches.double().mean(0) < 0.5) & changes
+        return torch.stack([first, second], -1)[checked]
 
     def random_joints(self) -> Float64[Tensor, "poses dof"]:
         """Draw joint values within the limits [rad or m], the same at every call."""

@@ -53,7 +53,7 @@ def advice_for(
     unsure = _unsure(summary)
     return _once(
         *causes,
-        *(line[:1].upper() + line[1:] for line in warning_lines(summary)),
+        *warning_lines(summary),
         *of_rows,
         *say("weak_parameters", summary.weak_directions, unsure, f"{SIGNIFICANT_ERRORS:.0f}"),
         *_more_rows(model, summary, limit),

@@ -57,9 +57,9 @@ def arrow_scale(detection: DetectedBoards) -> float:
     """Compute the magnification of residuals in all pictures: 1, 2 or 5 times a power of ten."""
     lengths = np.linalg.norm(np.concatenate(list(detection.residuals.values())), axis=1)
     width = next(one.size[0] for one in detection.images if one.is_read)
-    wanted = ARROW * width / max(float(np.quantile(lengths, 0.95)), 1e-6)
-    power = 10.0 ** np.floor(np.log10(wanted))
-    return float(power * max(step for step in (1, 2, 5) if step * power <= wanted))
+    largest = ARROW * width / max(float(np.quantile(lengths, 0.95)), 1e-6)
+    power = 10.0 ** np.floor(np.log10(largest))
+    return float(power * max(step for step in (1, 2, 5) if step * power <= largest))
 
 
 def draw_image(one: BoardImage, detection: DetectedBoards, scale: float) -> Drawing:

@@ -1,1 +1,1 @@
-"""A measuring session in the browser: robot, cell, rows, errors and accuracy in three dimensions, through viser."""
+"""Three-dimensional view of a measuring session in the browser: robot, cell, rows, errors and accuracy (viser)."""

@@ -45,8 +45,8 @@ def revolve(radii: Float64[np.ndarray, " rings"], heights: Float64[np.ndarray, "
     points = radii[:, None, None] * circle + heights[:, None, None] * np.array([0.0, 0.0, 1.0])
     index = np.arange(points.shape[0] * AROUND).reshape(-1, AROUND)
     low, high = index[:-1], index[1:]
-    beside, above = np.roll(low, -1, axis=1), np.roll(high, -1, axis=1)
-    faces = np.concatenate([np.stack([low, beside, above], -1), np.stack([low, above, high], -1)])
+    right, above = np.roll(low, -1, axis=1), np.roll(high, -1, axis=1)
+    faces = np.concatenate([np.stack([low, right, above], -1), np.stack([low, above, high], -1)])
     return Surface(points.reshape(-1, 3), faces.reshape(-1, 3))
 
 

@@ -177,8 +177,8 @@ class AccuracyLimit:
         error: RMS length of the position error [mm]; 0 where no position was judged.
         residual_sigma: standard deviation of the residuals of the geometric calibration per coordinate [mm]; None
             without one.
-        of_parent: whether the model stands for another one, whose errors add to its own.
-        limitations: limitations that such a model states, one sentence each.
+        of_parent: whether the model approximates another one, whose errors add to its own.
+        limitations: limitations that the model states in that case, one sentence each.
     """
 
     noise: float | None = None

@@ -16,7 +16,7 @@ from pisigma.lifetime.comparison.model_pair import ModelPair
 from pisigma.robot.kinematics.forward import forward_kinematics
 
 
-def test_a_base_and_a_tool_that_were_moved_make_no_difference_to_fitted_frames():
+def test_moved_base_and_tool_do_not_matter_with_fitted_frames():
     model = hand_made_model("ur10", scale=0.0)
     base, tool = np.array([[0.4, -0.3, 0.2, 0.5, 0.1, -0.2], [0.1, 0.0, 0.2, 0.3, 0.0, 0.1]])
     moved = replace(model, name="moved", robot=model.robot.with_geometry(base=base, tool=tool))

@@ -15,7 +15,7 @@ from pisigma.validation.held_out.reference_models import nominal_model
 
 
 @pytest.mark.parametrize("forth", [True, False])
-def test_exactly_the_joint_that_moved_differs_beside_a_base_that_moved(forth):
+def test_only_the_moved_joint_differs_when_the_base_moved_as_well(forth):
     models = model_of(50), after_collision()
     differences = parameter_differences(ModelPair.of(*models[:: 1 if forth else -1], "fitted"))
     (joint,) = (one.shift for one in differences.differing)
@@ -54,7 +54,7 @@ def test_models_of_disjoint_rows_differ_by_chance_only():
     assert outside <= 0.08 * tested
 
 
-def test_what_moves_the_tool_as_base_and_tool_do_has_no_shift():
+def test_parameters_equivalent_to_base_and_tool_have_no_shift():
     parameters = parameter_differences(ModelPair.of(model_of(50), model_of(51), "fitted")).parameters
     by_name = {one.name: one for one in parameters}
     for name in ("theta_1", "d_1", "theta_6", "d_6", "a_6", "alpha_6"):
@@ -62,14 +62,14 @@ def test_what_moves_the_tool_as_base_and_tool_do_has_no_shift():
     assert by_name["d_2"].alike == ("d_3", "d_4")  # along parallel axes
 
 
-def test_a_robot_as_drawn_is_exactly_known():
+def test_a_nominal_robot_has_no_uncertainty():
     model = model_of(50)
     differences = parameter_differences(ModelPair.of(model, nominal_model(model, True), "fitted"))
     assert differences.differing
     assert all(one.deviations[1] == 0.0 for one in differences.parameters)
 
 
-def test_a_model_without_posterior_is_put_beside_without_a_test():
+def test_a_model_without_posterior_is_compared_without_tests():
     first = model_of(50)
     differences = parameter_differences(
         ModelPair.of(first, replace(model_of(51), uncertainty=None), "fitted")

@@ -82,7 +82,7 @@ def test_expectation_maximisation_finds_a_population():
     assert (found.covariance.diagonal().sqrt() / deviation - 1).abs().max() < 0.05
 
 
-def test_what_few_robots_say_of_another_one_allows_for_their_number():
+def test_the_prior_of_few_robots_is_wider():
     """One more than five is beyond their 95 % point in 19 %, as their scatter is uncertain, too; else in 31 %."""
     g = torch.Generator().manual_seed(0)
     beyond = []
@@ -111,7 +111,7 @@ def test_a_robot_without_information_does_not_count():
 
 
 @pytest.mark.parametrize("odd", [0, 1, 6])
-def test_odd_robots_that_are_alike_do_not_hide_each_other(odd):
+def test_similar_inconsistent_robots_do_not_mask_each_other(odd):
     g = torch.Generator().manual_seed(odd)
     x = torch.tensor([1.0, -2.0, 0.5]).double() + 0.2 * torch.randn(20, 3, generator=g, dtype=torch.float64)
     x[20 - odd :] += 3.0

@@ -29,7 +29,7 @@ def test_mean_run_lengths_are_those_of_the_literature():
     assert_close(cusum_sessions(5.0), 938.2, rtol=0.01)
 
 
-def test_false_alarms_are_as_rare_as_stated():
+def test_the_rate_of_false_alarms_is_as_stated():
     scores = torch.randn(60_000, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     limits, runs = limits_of(7), []
     average = rise = fall = 0.0
@@ -58,7 +58,7 @@ def test_sessions_without_the_quantity_change_nothing():
     assert_close(with_gap.cusum[[0, 2]], without.cusum, rtol=1e-12)
 
 
-def test_a_common_error_is_no_drift():
+def test_a_common_error_is_not_a_drift():
     # the same error of the model in all sessions, far larger than their own noise
     covariance = 4.0 * torch.ones(20, 20, dtype=torch.float64) + 0.01 * torch.eye(20, dtype=torch.float64)
     drawn = torch.randn(20, generator=torch.Generator().manual_seed(3), dtype=torch.float64)

@@ -31,7 +31,7 @@ def record(number, date="2026-01-01"):
     return Record(f"rows_{number}.csv", date, f"hash {number}", 21.5 if number % 2 else None, session, zeros)
 
 
-def test_sessions_are_added_once_and_come_back_by_date(tmp_path):
+def test_sessions_are_stored_once_and_sorted_by_date(tmp_path):
     path = tmp_path / "model.history.sqlite"
     store_sessions(path, "model", [record(1, "2026-03-01"), record(2, "2026-02-01")])
     records = store_sessions(path, "model", [record(3, "2026-04-01"), record(1, "2026-03-01")])

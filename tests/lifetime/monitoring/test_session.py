@@ -42,7 +42,7 @@ def test_false_alarms_are_rare():
     assert not any(one.recalibrate for one in sessions)
 
 
-def test_recalibrating_pays_after_a_collision():
+def test_a_recalibration_is_recommended_after_a_collision():
     session, _ = judged(rows_later(10, 3, moved_joint(3, 0.25)))
     assert session.recalibrate
     assert session.rms_after < 0.2 * session.rms
@@ -51,7 +51,7 @@ def test_recalibrating_pays_after_a_collision():
 
 
 @pytest.mark.parametrize("joint", [0, 3])
-def test_a_wrong_row_is_named_and_not_taken_for_a_motion(joint):
+def test_a_wrong_row_is_not_mistaken_for_a_movement(joint):
     rows = rows_later(10, 3, moved_joint(joint, 0.25))
     wrong = rows.position.clone()
     wrong[4, 1] += 0.005
@@ -68,7 +68,7 @@ def test_two_joints_that_moved_are_both_named():
 
 
 @pytest.mark.parametrize("joint", [0, 3])
-def test_an_instrument_elsewhere_is_distinguished_from_a_joint(joint):
+def test_a_moved_instrument_is_distinguished_from_a_joint(joint):
     session, _ = judged(rows_later(12, 5, moved_joint(joint, 0.1), ELSEWHERE))
     expected = ["joint 3"] if joint else []
     assert [one.what for one in session.moved] == [*expected, "base", "base"]
@@ -79,13 +79,13 @@ def test_an_instrument_elsewhere_is_distinguished_from_a_joint(joint):
     assert "base" in session.unobservable[0]
 
 
-def test_a_small_motion_of_the_base_is_not_taken_for_a_joint():
+def test_a_small_motion_of_the_base_is_not_mistaken_for_a_joint():
     session, _ = judged(rows_later(10, 6, base=(3e-4, -2e-4, 4e-4, 0.0, 0.0, 0.0)))
     assert {one.what for one in session.moved} == {"base"}
     assert not session.recalibrate
 
 
-def test_what_stands_elsewhere_can_be_stated():
+def test_moved_frames_can_be_stated():
     session, _ = judged(rows_later(12, 5), frozenset({("base", "")}))
     assert session.standing == ("base",)
     assert all(one.what == "base" for one in session.moved)

@@ -48,7 +48,7 @@ def test_a_drift_is_charted_and_measured():
     assert low < 0.01 < high
 
 
-def test_a_jump_is_no_drift():
+def test_a_jump_is_not_a_drift():
     made = records(10)
     for record in made[6:]:
         record.zeros.shift[0] += math.radians(0.05)
@@ -73,7 +73,7 @@ def test_a_jump_is_no_drift():
     ids=["one session", "last session", "three sessions", "twice"],
 )
 @pytest.mark.parametrize("per_month", [0.0, 0.01])
-def test_changes_of_any_kind_are_told_from_a_drift(off, changes, per_month):
+def test_jumps_and_outliers_are_distinguished_from_a_drift(off, changes, per_month):
     made = records(10, per_month=per_month)
     for month, size in off.items():
         made[month].zeros.shift[0] += math.radians(size)
@@ -85,19 +85,19 @@ def test_changes_of_any_kind_are_told_from_a_drift(off, changes, per_month):
     assert len(clear) == (per_month > 0)
 
 
-def test_a_jump_of_the_error_passes_no_limit_by_itself():
+def test_a_jump_of_the_error_is_not_extrapolated():
     made = records(10, rms=lambda month: 1e-4 * (1 + 0.1 * math.sin(9 * month)) + 4e-4 * (month >= 7))
     assert forecast_of(made, 1.0).date is None
 
 
-def test_warming_is_no_drift_in_time():
+def test_warming_is_not_a_drift_with_time():
     warmed = records(10, per_kelvin=0.002, warm=lambda month: 20.0 + 8.0 * math.sin(month))
     clear = [one for one in trends_of(REVOLUTE, warmed) if one.clear]
     assert [(one.what, one.over) for one in clear] == [("joint 1", "kelvin")]
     assert_close(clear[0].slope, 0.002, rtol=0.3)
 
 
-def test_few_sessions_say_nothing_of_a_drift():
+def test_few_sessions_do_not_determine_a_drift():
     assert trends_of(REVOLUTE, records(3, per_month=0.1)) == ()
 
 

@@ -59,13 +59,13 @@ def test_a_collision_is_found_and_repaired():
     assert_close(turned.shift, -moved[0].shift)
 
 
-def test_nothing_moved_is_said_where_nothing_moved():
+def test_an_unchanged_robot_has_no_movements():
     adaptation = adapted(model_before(), rows_later(10, 2))
     assert significant_movements(adaptation) == ()
 
 
 @pytest.mark.parametrize("moved", [(0.0,) * 6, COLLISION])
-def test_an_instrument_elsewhere_is_found(moved):
+def test_a_moved_instrument_is_found(moved):
     model, rows = model_before(), rows_later(12, 2, moved, SHIFTED)
     posterior = ModelPosterior.of(model)
     assert relocated_frames(model, posterior, rows, posterior.noise) == {("base", "")}
@@ -77,7 +77,7 @@ def test_an_instrument_elsewhere_is_found(moved):
     assert whats == [*(["joint 3"] if any(moved) else []), "base", "base"]
 
 
-def test_row_after_row_is_as_all_at_once():
+def test_adapting_row_by_row_agrees_with_all_rows_at_once():
     model = chain = model_before()
     everything = rows_later(30, 11)
     for k in range(3):

@@ -35,7 +35,7 @@ def test_the_recalibrated_model_is_kept_where_it_is_about_as_good():
     assert judged.rms["scratch"] < judged.rms["recalibrated"]
 
 
-def test_a_row_that_is_off_by_far_does_not_save_a_candidate_that_is_worse_everywhere():
+def test_one_outlier_does_not_favour_a_worse_candidate():
     hopeless = [30.0] * 9 + [5_000.0]
     assert decided(recalibrated=hopeless, old=[31.0] * 10, scratch=[0.9, 1.1] * 5).kept == "scratch"
 
@@ -65,7 +65,7 @@ def test_without_held_out_rows_the_recalibrated_model_is_kept():
 
 
 @pytest.mark.parametrize("count", [5, 10])
-def test_left_out_rows_decide(count):
+def test_held_out_rows_decide(count):
     model, rows = model_before(), rows_later(count, 2, (0.0, 0.0, math.radians(0.25), 0.0, 0.0, 0.0))
     posterior = ModelPosterior.of(model)
     problem = recalibration_problem(model, posterior, rows, frozenset())

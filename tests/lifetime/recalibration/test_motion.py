@@ -16,7 +16,7 @@ ELSEWHERE = (0.3, -0.2, 0.1, 0.5, 0.2, -0.3)
 COLLISION = (0.0, 0.0, math.radians(0.25), 0.0, 0.0, 0.0)
 
 
-def test_a_joint_that_moved_is_named_with_what_to_run():
+def test_a_moved_joint_is_named_with_the_command_to_run():
     verification = verify(model_before(), rows_later(10, 3, COLLISION))
     assert verification.verdict == "moved"
     assert not verification.accepted
@@ -47,5 +47,5 @@ def test_a_small_motion_of_the_base_is_a_warning():
     assert {one.what for one in verification.motion.moved} == {"base"}
 
 
-def test_a_model_without_a_posterior_does_not_say():
+def test_a_model_without_a_posterior_gives_no_session():
     assert judged_motion(hand_made_model("kiro3"), rows_later(6, 1)) is None

@@ -30,7 +30,7 @@ def frame(values) -> torch.Tensor:
     return transform_from_xyzrpy(torch.tensor(list(values)).double())
 
 
-def test_it_is_the_same_after_writing_and_reading(tmp_path):
+def test_the_model_is_the_same_after_writing_and_reading(tmp_path):
     rows, test = rows_later(10, 2, (0.0, 0.0, math.radians(0.25), 0.0, 0.0, 0.0)), rows_later(20, 50)
     model, adaptation = recalibrated(rows)
     save_model(model, tmp_path)
@@ -46,7 +46,7 @@ def test_it_is_the_same_after_writing_and_reading(tmp_path):
     assert_close(loaded.calibrated.dh - model_before().calibrated.dh, at, atol=1e-12)
 
 
-def test_frames_elsewhere_take_the_geometric_calibration_along():
+def test_moved_frames_move_the_geometric_calibration_as_well():
     rows = rows_later(12, 2, base=ELSEWHERE)
     model, _ = recalibrated(rows, {("base", "")}, arm=False)
     before = model_before()
@@ -67,7 +67,7 @@ def test_frames_elsewhere_take_the_geometric_calibration_along():
 
 
 @pytest.mark.parametrize("name", ["hall", ""])
-def test_a_new_frame_stands_beside_the_old_ones(name):
+def test_a_new_frame_is_added_to_the_old_ones(name):
     rows = rows_later(12, 2)
     two = type(rows)(q=rows.q, position=rows.position, frame=(name,) * 6 + ("wall",) * 6)
     model, _ = recalibrated(two)

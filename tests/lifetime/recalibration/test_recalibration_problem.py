@@ -13,7 +13,7 @@ from pisigma.model.model_posterior import ModelPosterior
 from pisigma.robot import Robot
 
 
-def test_owners_stand_in_the_order_of_the_rows():
+def test_owners_are_in_the_order_of_the_rows():
     robot = Robot.load("kiro3")
     before = ParameterSpace(
         robot, ("wall",), ("",), (UnknownGroup("socket", SOCKET_COLUMNS, ("a", "b"), ("wall",) * 2),)

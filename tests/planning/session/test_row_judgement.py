@@ -24,12 +24,12 @@ def swapped(rows: Measurements, one: int, other: int) -> Measurements:
     return Measurements(q=rows.q, position=rows.position[order], line=rows.line)
 
 
-def test_right_rows_count():
+def test_correct_rows_count():
     for count in (2, 14):
         assert counting(PLAN.rows(count), count - 1) == list(range(count))
 
 
-def test_rows_of_a_robot_that_does_not_repeat_well_count():
+def test_rows_of_a_robot_with_poor_repeatability_count():
     rows = PLAN.rows(16)
     assert rows.position is not None
     noise = torch.from_numpy(np.random.default_rng(1).normal(size=(16, 3))) * 2e-4
@@ -42,17 +42,17 @@ def test_a_new_row_that_is_5_mm_off_does_not_count():
     assert counting(rows, 14) == list(range(14))
 
 
-def test_a_swapped_point_among_the_first_is_told_from_the_right_ones():
+def test_a_swapped_point_among_the_first_rows_is_found():
     rows = swapped(PLAN.rows(20), 1, 19).select(torch.arange(6))
     assert counting(rows, 5) == [0, 2, 3, 4, 5]
 
 
-def test_a_row_that_was_taken_for_wrong_counts_again():
+def test_a_row_that_was_called_wrong_can_count_again():
     rows = PLAN.rows(15)
     mask = (torch.arange(15) < 14) & (torch.arange(15) != 4)
     assert judge_rows(ROBOT, rows, NOISE, mask).counts.all()
 
 
-def test_a_trusted_row_that_others_contradict_counts_no_more():
+def test_a_trusted_row_that_later_rows_contradict_stops_counting():
     rows = with_offset(PLAN.rows(16), 3, (0.0, 0.004, 0.003))
     assert counting(rows, 15) == [row for row in range(16) if row != 3]

@@ -24,7 +24,7 @@ def of_right_rows():
     return left_out(ROWS)
 
 
-def test_right_rows_are_no_surprise(of_right_rows):
+def test_correct_rows_have_usual_probabilities(of_right_rows):
     assert float(of_right_rows.chance.min()) > 5e-3
     assert 1.0 <= of_right_rows.scale < 1.5
     assert float(of_right_rows.length.max()) < 3e-3
@@ -32,7 +32,7 @@ def test_right_rows_are_no_surprise(of_right_rows):
     assert_close(of_right_rows.position.norm(dim=1), of_right_rows.length, rtol=1e-12)
 
 
-def test_a_row_is_predicted_alike_whether_it_is_left_out_or_was_never_there(of_right_rows):
+def test_a_left_out_row_is_predicted_as_if_it_had_not_been_measured(of_right_rows):
     kept = torch.arange(14) != 6
     without = left_out(ROWS, kept)
     assert_close(without.position[6], of_right_rows.position[6], atol=2e-5)
@@ -47,7 +47,7 @@ def test_the_prediction_does_not_depend_on_a_row_that_is_not_kept():
     assert float(there.chance[6]) < 1e-12
 
 
-def test_three_positions_say_nothing_of_each_other():
+def test_three_positions_cannot_be_predicted_from_each_other():
     assert bool(left_out(ROWS.select(torch.arange(3)), EVERY[:3]).chance.isnan().all())
 
 
@@ -56,7 +56,7 @@ def test_two_positions_are_too_few():
         left_out(ROWS.select(torch.arange(2)), EVERY[:2])
 
 
-def test_a_robot_that_errs_more_than_its_class_has_its_scale():
+def test_the_scale_of_a_robot_with_larger_errors_than_its_class():
     assert ROWS.position is not None
     noise = torch.from_numpy(np.random.default_rng(0).normal(size=(14, 3))) * 5e-3
     assert left_out(Measurements(q=ROWS.q, position=ROWS.position + noise)).scale > 3

@@ -30,7 +30,7 @@ def test_every_allowed_pose_is_free_and_visible():
     assert all(is_visible(ARM.robot, CELL, q, RADIUS) for q in allowed)
 
 
-def test_what_is_refused_is_refused_for_a_reason():
+def test_every_refused_pose_has_a_reason():
     """Points lie a little farther apart than the lines they stand on, hence the few that only lines refuse."""
     refused = Q[~FAULTS.allowed][:60].numpy()
     wrongly = [
@@ -58,7 +58,7 @@ def test_every_reason_is_named():
         ({"radii_mm": {"theta_4": 1700.0}}, "link theta_1 and link theta_4"),
     ],
 )
-def test_links_that_are_too_thick_to_be_kept_apart_are_named(links: dict[str, object], named: str | None):
+def test_links_too_thick_to_be_separated_are_named(links: dict[str, object], named: str | None):
     arm = ArmInCell.of(Robot.load("ur10"), Cell(links=LinkSection.model_validate(links)))
     assert len(arm.unseparated_links) == (named is not None)
     assert named is None or named in arm.unseparated_links[0]
@@ -75,7 +75,7 @@ def test_a_motion_is_free_where_all_poses_on_it_are():
     assert bool((least[~free] < 0).all())
 
 
-def test_way_points_lead_round_what_blocks_a_motion():
+def test_way_points_avoid_obstacles():
     q = Q[ARM.gap(Q) >= 0]
     blocked = (~is_free(ARM, q[:20], q[20:40])).nonzero()[:, 0].tolist()
     start, end = q[blocked[0]], q[20 + blocked[0]]
@@ -86,7 +86,7 @@ def test_way_points_lead_round_what_blocks_a_motion():
     assert way_points(ARM, start, end, q[:0]) is None
 
 
-def test_motions_that_were_looked_at_are_known_both_ways():
+def test_checked_motions_are_kept_in_both_directions():
     q = Q[ARM.gap(Q) >= 0]
     motions, free = Motions(ARM, q), is_free(ARM, q[:20], q[20:40])
     assert motions.are_free(q[:20], q[20:40]).tolist() == free.tolist()

@@ -22,7 +22,7 @@ SCARA = """<robot name="scara">
 <joint name="end" type="fixed"><parent link="quill"/><child link="tip"/><origin xyz="0 0 -0.05"/></joint></robot>"""
 
 
-def test_links_of_a_urdf_file_lie_between_its_joints(tmp_path: Path):
+def test_links_of_a_urdf_file_lead_from_joint_to_joint(tmp_path: Path):
     (tmp_path / "scara.urdf").write_text(SCARA)
     robot = Robot.load(tmp_path / "scara.urdf")
     capsules = Capsules.of(robot, robot.tool[:3], radius=0.04, radii={"J2": 0.03})
@@ -35,7 +35,7 @@ def test_links_of_a_urdf_file_lie_between_its_joints(tmp_path: Path):
     assert_close(capsules.radius, [0.04, 0.04, 0.03, 0.04, 0.04])
 
 
-def test_links_of_a_table_lie_along_d_and_a():
+def test_links_of_a_dh_table_lead_along_d_and_a():
     capsules = Capsules.of(Robot.load("kiro3").with_geometry(tool=np.array([0.0, 0.05, 0.0, 0, 0, 0])))
     q = torch.zeros(2, 4, dtype=torch.float64)
     q[:, 2] = -0.1

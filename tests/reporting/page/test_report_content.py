@@ -321,7 +321,7 @@ def test_a_report_names_one_first_cause(hybrid, tmp_path):
     assert len(content.verdict.sentence) < len(plain.verdict.sentence)
 
 
-def test_warnings_about_the_rows_are_no_causes():
+def test_warnings_about_the_rows_are_not_causes():
     few = Diagnostic(kind="few_rows", severity="warning", sentence="Measure more poses.")
     lag = Diagnostic(kind="lag", severity="warning", sentence="Joint values were logged late.")
     assert causes_of(None, (few, lag)) == (lag.sentence,)

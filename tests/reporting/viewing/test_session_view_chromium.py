@@ -85,7 +85,7 @@ def test_rows_appear_as_they_come(browser, view):
         assert "</script><script>alert(1)</script>" in page.inner_text("[data-action=repeat]")
 
 
-def test_nothing_is_printed_where_results_stand(capfd):
+def test_nothing_is_printed_to_stdout(capfd):
     with no_type_checker(), SessionView(arm_beside_tracker(), port=0) as view:
         assert view.url.startswith("http://127.0.0.1:")
     assert capfd.readouterr().out == ""
@@ -97,14 +97,14 @@ def test_an_address_of_another_machine_is_refused(host):
         SessionView(arm_beside_tracker(), host=host)
 
 
-def test_a_page_beside_another_takes_the_next_port():
+def test_a_second_page_takes_the_next_port():
     with no_type_checker(), SessionView(arm_beside_tracker(), port=0) as first:
         port = int(first.url.rpartition(":")[2])
         with SessionView(arm_beside_tracker(), port=port) as second:
             assert int(second.url.rpartition(":")[2]) > port
 
 
-def test_scales_end_beyond_the_rows_that_count():
+def test_the_colour_scale_covers_the_rows_that_count():
     state = session_state(arm_beside_tracker(), 20, wrong=19)
     assert_close(top_of_scale(state.rows), 5e-4, rtol=1e-12)
     assert_close(top_of_scale(session_state(arm_beside_tracker(), 3).rows), 1e-3)

@@ -19,7 +19,7 @@ def distance_to_segment(points, start, end):
 
 
 @pytest.mark.parametrize("end", [(0.1, -0.2, 0.9), (0.4, 0.2, -0.3), (0.0, 0.0, 0.0), (0.0, 0.0, -1.0)])
-def test_a_capsule_lies_its_radius_around_its_segment(end):
+def test_points_of_a_capsule_are_its_radius_from_the_segment(end):
     start, end = np.array([0.0, 0.0, 0.0]), np.array(end)
     surface = capsule(start, end, 0.1)
     assert_close(distance_to_segment(surface.points, start, end), 0.1, atol=1e-12)

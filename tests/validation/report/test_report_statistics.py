@@ -25,7 +25,7 @@ def test_a_planted_region_is_found():
     assert_close(region.ratio, region.rms / np.sqrt((errors**2).mean()), rtol=1e-12)
 
 
-def test_chance_plants_no_region():
+def test_chance_gives_no_significant_region():
     found = [
         worst_region(rng.uniform(0, 1, (800, 3)), rng.normal(size=800) ** 2)
         for rng in map(np.random.default_rng, range(20))
