@@ -1,4 +1,4 @@
-"""What an image says of a pose before it is taken, against what a taken one says."""
+"""Weight of a pose from an image before it is taken, compared with that of a taken one."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Views of a board: every drawn one shows it whole, sharp and not too obliquely, by a check of its own."""
+"""Random views of a board show it completely, sharply and not too obliquely, by an independent check."""
 
 from pathlib import Path
 

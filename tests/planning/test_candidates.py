@@ -1,4 +1,4 @@
-"""Candidates: drawn or read, allowed by the cell, and poses that are spread over them."""
+"""Candidate poses: drawn or read, allowed by the cell, and spread over the workspace."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""Plans come back from their files, and foreign files are refused with file and line."""
+"""Plan files: writing, reading, and faults with file and line."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""The choice of poses: greedy choice, exchange, order, and the accuracy that is predicted for it."""
+"""Selection of poses: greedy selection, exchange, order, and the predicted accuracy."""
 
 import pytest
 import torch

@@ -1,4 +1,4 @@
-"""RobotPosterior: conditioning on poses, predictions, and what measured rows say."""
+"""Distribution of a robot's unknowns: conditioning on poses, predictions, and improbable rows."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Where a robot is to be accurate, from files of joint values and of poses."""
+"""Tasks from files of joint values and of poses."""
 
 from pathlib import Path
 

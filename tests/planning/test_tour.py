@@ -1,4 +1,4 @@
-"""The order of poses: short, and by motions that touch nothing."""
+"""Order of poses: short, with collision-free motions."""
 
 import itertools
 import math

@@ -1,4 +1,4 @@
-"""Boards to print: paper, true size, and corners that a detector finds where the board has them."""
+"""Boards to print: paper, true size, and corners found by a detector."""
 
 import re
 

@@ -1,4 +1,4 @@
-"""Figures of a geometric calibration, whatever was measured and held out."""
+"""Figures of a geometric calibration for all kinds of measured and held-out rows."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""The card of a model: all its sections, and the figures that were measured."""
+"""Model cards: sections and figures."""
 
 import pytest
 from PIL import Image

@@ -1,4 +1,4 @@
-"""Figures are written as PNG without a screen, and the energy as CSV."""
+"""Figures as PNG without a display, and the energy as CSV."""
 
 import csv
 import os

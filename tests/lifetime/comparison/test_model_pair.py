@@ -1,4 +1,4 @@
-"""Models of one robot, brought together; models of different robots, refused."""
+"""Pairs of models of one robot, and refusal of models of different robots."""
 
 from dataclasses import replace
 

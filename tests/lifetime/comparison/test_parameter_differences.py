@@ -1,4 +1,4 @@
-"""Which parameters of two models differ: right ones, and no others by chance."""
+"""Significant parameter differences between two models."""
 
 import itertools
 import math

@@ -1,4 +1,4 @@
-"""Control charts: limits from the literature, steps and drifts, sessions that err together."""
+"""Control charts: limits from the literature, steps, drifts, and correlated sessions."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""The history of a model: sessions once each, by date, whole after a kill, and no other file taken for one."""
+"""History of a model: each session once, sorted by date, consistent after a kill; other files are refused."""
 
 import os
 import signal

@@ -1,4 +1,4 @@
-"""One session against a model: the joint that moved, an instrument elsewhere, and what cannot be observed."""
+"""Comparison of a session with a model: moved joints, moved instruments, and unobservable joints."""
 
 import math
 from dataclasses import replace

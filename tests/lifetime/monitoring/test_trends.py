@@ -1,4 +1,4 @@
-"""Sessions over the months: drifts with time and temperature, and when a limit is passed."""
+"""Sessions over months: drift with time and temperature, and forecasts."""
 
 import math
 

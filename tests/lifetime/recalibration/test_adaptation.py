@@ -1,4 +1,4 @@
-"""A model adapted to new rows: after a collision, with a moved instrument, and row after row as with all at once."""
+"""Adaptation of a model to new rows: after a collision, with a moved instrument, and row by row."""
 
 import math
 from dataclasses import replace

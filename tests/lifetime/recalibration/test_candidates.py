@@ -1,4 +1,4 @@
-"""Which candidate is kept: by the errors of left-out rows."""
+"""Choice of the candidate of a recalibration by the errors of held-out rows."""
 
 import math
 

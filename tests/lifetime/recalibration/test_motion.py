@@ -1,4 +1,4 @@
-"""What has moved is said by `verify`, with its interval and the command that recalibrates."""
+"""Movements found by `verify`, with the command that recalibrates."""
 
 import math
 import re

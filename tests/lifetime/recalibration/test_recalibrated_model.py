@@ -1,4 +1,4 @@
-"""The model after new rows: it is the same after it was written and read, and knows more than before."""
+"""Recalibrated models: writing and reading, and a smaller uncertainty than before."""
 
 import math
 

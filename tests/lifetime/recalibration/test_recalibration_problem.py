@@ -1,4 +1,4 @@
-"""The unknowns of a recalibration: those of the model and of the rows, in the order in which sensors number them."""
+"""Unknowns of a recalibration: those of the model and of the rows, in the order of the sensors."""
 
 import torch
 from testing.aged import model_before, rows_later

@@ -1,4 +1,4 @@
-"""Corners that come to a file image by image, and the session that follows them."""
+"""Corners in a growing file, and the session that reads them."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""Which rows count."""
+"""Judgement of rows: which of them count."""
 
 import numpy as np
 import torch

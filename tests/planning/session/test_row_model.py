@@ -1,4 +1,4 @@
-"""Rows that are each predicted from the others."""
+"""Prediction of every row from the others."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Capsules lie where the drawing has the links."""
+"""Positions of capsules along the links."""
 
 import itertools
 from pathlib import Path

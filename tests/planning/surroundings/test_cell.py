@@ -1,4 +1,4 @@
-"""Files of cells: read, and refused with file, line and key."""
+"""Cell files, and their faults with file, line and key."""
 
 from pathlib import Path
 

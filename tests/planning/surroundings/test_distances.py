@@ -1,4 +1,4 @@
-"""Distances of segments from each other and from boxes, against points on them."""
+"""Distances of segments from each other and from boxes, compared with points on them."""
 
 import torch
 from testing.closeness import assert_close

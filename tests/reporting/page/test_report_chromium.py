@@ -1,4 +1,4 @@
-"""The page of a report in headless Chromium: no errors, nothing loaded, a map that turns, no sideways scrolling."""
+"""Report page in headless Chromium: no errors, nothing loaded, a rotating map, no horizontal scrolling."""
 
 from contextlib import contextmanager
 

@@ -1,4 +1,4 @@
-"""The page of a report: whole in itself, the same for the same input, and safe from what a file holds."""
+"""Report page: self-contained, reproducible, and with hostile names escaped."""
 
 import base64
 import json

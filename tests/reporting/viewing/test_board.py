@@ -1,4 +1,4 @@
-"""The board of a camera on the page of a session."""
+"""Board of a camera on the page of a session."""
 
 import numpy as np
 import pytest

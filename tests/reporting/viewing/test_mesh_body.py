@@ -1,4 +1,4 @@
-"""Robots as the meshes of their URDF files."""
+"""Robots drawn by the meshes of their URDF files."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""The page of a measuring session in headless Chromium: it shows every row, without errors, from this machine only."""
+"""Page of a measuring session in headless Chromium: all rows, no errors, nothing loaded from elsewhere."""
 
 import re
 from contextlib import contextmanager
