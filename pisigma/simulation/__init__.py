@@ -1,4 +1,4 @@
-"""Simulation: error sources of a true robot, and what sensors would measure on it."""
+"""Simulation: error sources of a true robot, and measurements of sensors on it."""
 
 from pisigma.simulation.distances import SimulatedDistances, SimulatedPairs, SimulatedSockets
 from pisigma.simulation.measure import SimulatedMeasurements, SimulatedSensors, simulate

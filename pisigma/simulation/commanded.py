@@ -1,11 +1,11 @@
-"""Which joint values are commanded: drawn as such, or those that take the true robot to wanted poses."""
+"""Commanded joint values: drawn at random, or those with which the true robot reaches desired poses."""
 
 import torch
 from jaxtyping import Bool, Float64
 from pydantic import Field, model_validator
 from torch import Tensor
 
-from pisigma.files.errors import RecipeError, UnreachablePoseError, nearest_choice
+from pisigma.files.errors import RecipeError, UnreachablePoseError, check_choice
 from pisigma.files.yaml_file import Section
 from pisigma.robot.description import Robot
 from pisigma.robot.kinematics.closed_form import AbstractClosedForm, InverseSolutions, closed_form_solver
@@ -18,13 +18,12 @@ from pisigma.simulation.true_robot import TrueRobot
 
 
 class BranchSection(Section):
-    """Which of several solutions of the inverse kinematics is taken, the same for all poses of a simulation.
+    """The branch of the inverse kinematics, the same for all poses of a simulation.
 
     Attributes:
-        name: a branch of the nominal robot's closed form, by name; or
-        near_deg: joint values to be near to, by name of a revolute joint [deg], 0 where not stated; with a
-            closed form its nearest reachable solution is taken, without one the search for the true solution
-            starts here.
+        name: name of a branch of the nominal robot's closed form; or
+        near_deg: joint values by name of a revolute joint [deg], 0 by default. With a closed form, its nearest
+            reachable solution is used; without one, they are the start of the numeric solution.
         near_mm: the same for prismatic joints [mm].
     """
 
@@ -35,20 +34,20 @@ class BranchSection(Section):
     @model_validator(mode="after")
     def _one_way(self) -> "BranchSection":
         if (self.name is None) == (self.near_deg is None):
-            raise ValueError("state either the name of the branch or near_deg (with near_mm)")
+            raise ValueError("expected either the name of the branch or near_deg (with near_mm)")
         if self.name is not None and self.near_mm:
-            raise ValueError("near_mm goes with near_deg, not with name; remove it")
+            raise ValueError("near_mm is only for near_deg, not for name; remove it")
         return self
 
     def start(self, robot: Robot, T: Float64[Tensor, "poses 4 4"]) -> Float64[Tensor, "poses dof"]:
-        """Joint values [rad or m] near which the true robot reaches the poses.
+        """Return joint values [rad or m] near which the true robot reaches the poses.
 
         Args:
             robot: the nominal robot.
-            T: T_base_tool wanted.
+            T: desired T_base_tool.
 
         Raises:
-            RecipeError: no such branch or joint, or the robot has no closed form whose branch could be named.
+            RecipeError: there is no such branch or joint, or the robot has no closed form with named branches.
             UnreachablePoseError: the nominal robot does not reach a pose on this branch.
         """
         near = self._near(robot).to(T.device)
@@ -60,28 +59,31 @@ class BranchSection(Section):
         if not reached.any(-1).all():
             unreachable = ~reached.any(-1)
             where = f"branch '{self.name}'" if self.name else "any branch"
+            first = int(unreachable.nonzero()[0])
             raise UnreachablePoseError(
-                f"wanted pose {int(unreachable.nonzero()[0])} (counted from 0; {int(unreachable.sum())} of "
-                f"{len(unreachable)} poses) cannot be reached by the nominal robot on {where}; "
-                "change the region of the poses or the branch."
+                f"the nominal robot cannot reach {int(unreachable.sum())} of {len(unreachable)} poses on {where}, the "
+                f"first one is pose {first} (from 0)",
+                option="poses",
+                value=first,
+                remedy="change the region of the poses or the branch",
             )
         return _nearest(solutions, robot, near, reached)
 
     def find(
         self, robot: Robot, T: Float64[Tensor, "poses 4 4"]
     ) -> tuple[Float64[Tensor, "poses dof"], Bool[Tensor, " poses"]]:
-        """Joint values [rad or m] of the nominal robot at poses of which not all need be reachable.
+        """Return joint values [rad or m] of the nominal robot at poses, of which some may be unreachable.
 
         Args:
             robot: the nominal robot.
-            T: T_base_tool wanted.
+            T: desired T_base_tool.
 
         Returns:
             Joint values, and whether they reach the pose on this branch, within the limits and away from
-            singularities; where they do not, the values mean nothing.
+            singularities; the values of other poses are meaningless.
 
         Raises:
-            RecipeError: no such branch or joint, or the robot has no closed form whose branch could be named.
+            RecipeError: there is no such branch or joint, or the robot has no closed form with named branches.
         """
         near = self._near(robot).to(T.device)
         solver = closed_form_solver(robot)
@@ -93,7 +95,7 @@ class BranchSection(Section):
         return _nearest(solutions, robot, near, reached).nan_to_num(), reached.any(-1)
 
     def _near(self, robot: Robot) -> Float64[Tensor, " dof"]:
-        """The joint values to be near to [rad or m], which are stated as the controller counts."""
+        """Return the joint values of `near_deg` and `near_mm` [rad or m], which are the controller's values."""
         fields = ("near_deg", "near_mm")
         stated = stated_joints(robot, self.near_deg or {}, self.near_mm, fields, "branch", axes=True)
         values = [axis.from_file_unit(stated.get(index, 0.0)) for index, axis in enumerate(robot.axes)]
@@ -103,19 +105,17 @@ class BranchSection(Section):
     def _solutions(
         self, solver: AbstractClosedForm | None, robot: Robot, T: Float64[Tensor, "poses 4 4"]
     ) -> InverseSolutions:
-        """All solutions, or those on the branch that is named alone."""
+        """Return all solutions, or only those of the named branch."""
         if solver is None:
             raise RecipeError(
-                f"branch: robot '{robot.name}' has no closed form and so no branch '{self.name}'; "
-                "state near_deg instead."
+                f"robot '{robot.name}' has no closed form and therefore no branch '{self.name}'",
+                option="branch",
+                value=self.name,
+                remedy="give near_deg instead",
             )
         if self.name is None:
             return solver.solve(T)
-        if self.name not in solver.branches:
-            raise RecipeError(
-                f"branch: robot '{robot.name}' has no branch '{self.name}'; "
-                f"{nearest_choice(self.name, solver.branches)}"
-            )
+        check_choice(RecipeError, "branch", self.name, solver.branches)
         index = solver.branches.index(self.name)
         solutions = solver.solve(T)
         return InverseSolutions(solutions.q[:, index, None], solutions.status[:, index, None], (self.name,))
@@ -127,18 +127,18 @@ def _nearest(
     near: Float64[Tensor, " dof"],
     allowed: Bool[Tensor, "poses branches"],
 ) -> Float64[Tensor, "poses dof"]:
-    """The nearest of the solutions that are allowed."""
+    """Return the nearest of the allowed solutions."""
     difference = wrapped_difference(robot, solutions.q, near)
     distance = torch.where(allowed, (difference * difference).sum(-1), torch.inf)
     return torch.take_along_dim(solutions.q, distance.argmin(-1)[:, None, None], 1)[:, 0]
 
 
 class AbstractCommanded(Section):
-    """What sections share that measure at poses.
+    """Base of sections that measure at poses.
 
     Attributes:
-        poses: wanted poses, or joint values to command.
-        branch: on which branch wanted poses are reached; not for joint values.
+        poses: desired poses, or joint values to command.
+        branch: branch of the inverse kinematics for desired poses; not for joint values.
     """
 
     poses: WhereToMeasure
@@ -148,17 +148,17 @@ class AbstractCommanded(Section):
     def _branch_for_poses(self) -> "AbstractCommanded":
         if isinstance(self.poses, JointsRandom) != (self.branch is None):
             raise ValueError(
-                "wanted poses need a branch, but none is stated"
+                "desired poses need a branch; add one"
                 if self.branch is None
-                else "joints_random commands joint values and has no branch; remove it"
+                else "joints_random commands joint values and needs no branch; remove it"
             )
         return self
 
     def commanded(self, robot: TrueRobot) -> Float64[Tensor, "rows dof"]:
-        """Joint values to command [rad or m], the same at every call. See `joints_for_poses`."""
+        """Return the joint values to command [rad or m], the same at every call. See `joints_for_poses`."""
         if isinstance(self.poses, JointsRandom):
             return self.poses.joints(robot.nominal)
-        assert self.branch is not None  # the section's validator sees to it
+        assert self.branch is not None  # checked by the validator
         T = self.poses.transforms()
         return joints_for_poses(robot, T, self.branch.start(robot.nominal, T))
 
@@ -166,26 +166,28 @@ class AbstractCommanded(Section):
 def joints_for_poses(
     robot: TrueRobot, T: Float64[Tensor, "poses 4 4"], start: Float64[Tensor, "poses dof"]
 ) -> Float64[Tensor, "poses dof"]:
-    """Joint values to command so that the true robot takes wanted poses.
+    """Return joint values with which the true robot reaches desired poses.
 
-    Encoder steps are left out here: the joint values are those that would reach the poses exactly, and with
-    an encoder the robot stops at the nearest pulse, so what is measured there is a little off the wanted
-    pose.
+    Encoder steps are ignored: the joint values would reach the poses exactly without an encoder; with one, the robot
+    stops at the nearest pulse, so that measured poses differ slightly from desired ones.
 
     Args:
         robot: the true robot.
-        T: T_base_tool wanted.
+        T: desired T_base_tool.
         start: joint values [rad or m] near the solution.
 
     Raises:
         UnreachablePoseError: the true robot does not reach a pose near its start.
-        RecipeError: joint values would have to leave the limits of the robot.
+        RecipeError: joint values are outside the limits of the robot.
     """
     q, inside = wrap_into_limits(robot.nominal, robot.without_encoder().inverse(T, start))
     if not inside.all():
         outside = (~inside).nonzero()
         raise RecipeError(
-            f"simulation: wanted pose {int(outside[0])} (counted from 0; {len(outside)} of {len(T)} poses) needs joint "
-            f"values outside the limits of robot '{robot.nominal.name}'; change the region of the poses or the branch."
+            f"{len(outside)} of {len(T)} poses need joint values outside the limits of robot '{robot.nominal.name}', "
+            f"the first one is pose {int(outside[0])} (from 0)",
+            option="poses",
+            value=int(outside[0]),
+            remedy="change the region of the poses or the branch",
         )
     return q

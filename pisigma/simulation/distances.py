@@ -1,4 +1,4 @@
-"""Distances and sockets: a draw wire from an anchor, a ball bar between two poses, a ball in fixed points."""
+"""Simulated distances and sockets: a draw wire from an anchor, a ball bar between two poses, a ball in sockets."""
 
 from typing import Literal
 
@@ -21,8 +21,8 @@ class SocketSection(Section):
     """A fixed point that holds the ball.
 
     Attributes:
-        name: of the socket.
-        point_mm: where it is, in the base frame [mm]; the measurements do not tell it.
+        name: name of the socket.
+        point_mm: its position in the base frame [mm], which measurements do not state.
     """
 
     name: str = Field(min_length=1)
@@ -30,16 +30,16 @@ class SocketSection(Section):
 
 
 class SimulatedSockets(Section):
-    """The part of a recipe that states which sockets the ball sits in, and how the tool is turned there.
+    """Recipe section of sockets in which the ball sits, and of the tool's orientations there.
 
     Attributes:
         kind: "sockets".
-        sockets: the fixed points.
-        poses_per_socket: how many orientations of the tool in every one.
-        orientation: of the tool; all are drawn from one generator, those of the first socket first.
-        seed: of the generator of the orientations.
-        branch: on which branch the nominal robot would reach them.
-        noise: `sensor_mm` is the play of the ball per axis; left out, there is none.
+        sockets: the sockets.
+        poses_per_socket: number of orientations of the tool in every socket.
+        orientation: orientations of the tool, drawn from one generator in the order of the sockets.
+        seed: random seed of the orientations.
+        branch: branch of the nominal robot's inverse kinematics.
+        noise: noise, with `sensor_mm` the play of the ball per axis; none by default.
     """
 
     kind: Literal["sockets"]
@@ -55,17 +55,17 @@ class SimulatedSockets(Section):
     def _names_differ(cls, sockets: tuple[SocketSection, ...]) -> tuple[SocketSection, ...]:
         names = [socket.name for socket in sockets]
         if twice := [name for name in names if names.count(name) > 1]:
-            raise ValueError(f"the socket '{twice[0]}' stands twice; names must differ")
+            raise ValueError(f"the socket '{twice[0]}' appears twice; rename one")
         return sockets
 
     def measure(self, robot: TrueRobot) -> Measurements:
-        """Joint values to command such that the true tool point is in the socket, the same at every call.
+        """Return joint values with which the true tool point is in the sockets, the same at every call.
 
-        The tool point is at the socket but for the noise: `FK_true(q) + n_robot = socket + n_sensor`.
+        With noise, `FK_true(q) + n_robot = socket + n_sensor`.
 
         Raises:
             UnreachablePoseError: the robot does not reach a socket with an orientation.
-            RecipeError: joint values would have to leave the limits of the robot.
+            RecipeError: joint values are outside the limits of the robot.
         """
         points = torch.tensor([socket.point_mm for socket in self.sockets], dtype=torch.float64) / 1e3
         points = points.repeat_interleave(self.poses_per_socket, 0)
@@ -86,10 +86,10 @@ class AnchorSection(Section):
     """A fixed point from which a wire is drawn.
 
     Attributes:
-        name: of the anchor.
-        point_mm: where it is, in the base frame [mm].
-        zero_mm: what the sensor shows at no distance [mm].
-        known: whether the measurements tell its place.
+        name: name of the anchor.
+        point_mm: its position in the base frame [mm].
+        zero_mm: zero offset of the sensor [mm].
+        known: whether measurements state its position.
     """
 
     name: str = Field(min_length=1)
@@ -99,12 +99,12 @@ class AnchorSection(Section):
 
 
 class SimulatedDistances(AbstractCommanded):
-    """The part of a recipe that states distances from an anchor.
+    """Recipe section of distances from an anchor.
 
     Attributes:
         kind: "distances".
-        anchor: where they are measured from.
-        noise: of the sensor and of the robot; left out, both are exact.
+        anchor: the anchor.
+        noise: noise of sensor and robot; none by default.
     """
 
     kind: Literal["distances"]
@@ -112,20 +112,20 @@ class SimulatedDistances(AbstractCommanded):
     noise: SensorNoise | None = None
 
     def measure(self, robot: TrueRobot) -> Measurements:
-        """The distances `|FK_true(q) + n_robot - anchor| + zero + n_sensor`, the same at every call.
+        """Return the distances `|FK_true(q) + n_robot - anchor| + zero + n_sensor`, the same at every call.
 
         Raises:
-            RecipeError: a distance is below 0.
+            RecipeError: a distance is negative.
         """
         q = self.commanded(robot)
         draws = draw_noise(self.noise, len(q))
         anchor = torch.tensor(self.anchor.point_mm, dtype=torch.float64) / 1e3
         approach = robot.draw_approach(q)
-        away = robot.forward(q, approach)[:, :3, 3] + draws.robot - anchor
-        shown = away.norm(dim=-1) + self.anchor.zero_mm / 1e3 + draws.sensor[:, 0]
+        vector = robot.forward(q, approach)[:, :3, 3] + draws.robot - anchor
+        shown = vector.norm(dim=-1) + self.anchor.zero_mm / 1e3 + draws.sensor[:, 0]
         return Measurements(
             q=q,
-            distance=_not_below_zero(shown),
+            distance=_not_negative(shown),
             anchor=(self.anchor.name,) * len(q),
             anchor_place=anchor.expand(len(q), 3).clone() if self.anchor.known else None,
             sigma_position=row_sigma(self.noise, len(q)),
@@ -135,12 +135,12 @@ class SimulatedDistances(AbstractCommanded):
 
 
 class SimulatedPairs(AbstractCommanded):
-    """The part of a recipe that states distances between two poses each: the first and the second, and so on.
+    """Recipe section of distances between pairs of poses: the first and the second, and so on.
 
     Attributes:
         kind: "pairs".
-        name: of the pairs, which are numbered from 0 behind it.
-        noise: of the sensor and of the robot, whose two poses both deviate; left out, both are exact.
+        name: name of the pairs, followed by their number from 0.
+        noise: noise of the sensor and of the robot in both poses; none by default.
     """
 
     kind: Literal["pairs"]
@@ -150,25 +150,27 @@ class SimulatedPairs(AbstractCommanded):
     @model_validator(mode="after")
     def _even(self) -> "SimulatedPairs":
         if getattr(self.poses, "count", 0) % 2:
-            raise ValueError("poses are taken two at a time; ask for an even number of them")
+            raise ValueError("expected an even number of poses, as they form pairs")
         return self
 
     def measure(self, robot: TrueRobot) -> Measurements:
-        """The distances `|p_1 - p_2| + n_sensor` of `p = FK_true(q) + n_robot`, the same at every call.
+        """Return the distances `|p_1 - p_2| + n_sensor` of `p = FK_true(q) + n_robot`, the same at every call.
 
         Raises:
-            RecipeError: the number of poses is odd, or a distance is below 0.
+            RecipeError: the number of poses is odd, or a distance is negative.
         """
         q = self.commanded(robot)
         if len(q) % 2:
-            raise RecipeError(f"pairs: an even number of poses was wanted, got {len(q)}; add or remove one.")
+            raise RecipeError(
+                option="pairs", expected="an even number of poses", value=len(q), remedy="add or remove one"
+            )
         draws = draw_noise(self.noise, len(q))
         approach = robot.draw_approach(q)
         position = (robot.forward(q, approach)[:, :3, 3] + draws.robot).reshape(-1, 2, 3)
         shown = (position[:, 0] - position[:, 1]).norm(dim=-1) + draws.sensor[::2, 0]
         return Measurements(
             q=q,
-            distance=_not_below_zero(shown).repeat_interleave(2),
+            distance=_not_negative(shown).repeat_interleave(2),
             pair=tuple(f"{self.name} {row // 2}" for row in range(len(q))),
             sigma_position=row_sigma(self.noise, len(q), points=2),
             approach=approach,
@@ -176,11 +178,13 @@ class SimulatedPairs(AbstractCommanded):
         )
 
 
-def _not_below_zero(shown: Float64[Tensor, " rows"]) -> Float64[Tensor, " rows"]:
+def _not_negative(shown: Float64[Tensor, " rows"]) -> Float64[Tensor, " rows"]:
     if (shown < 0).any():
         row = int(shown.argmin())
         raise RecipeError(
-            f"distances: the sensor would show {float(shown[row]) * 1e3:.6g} mm at pose {row} (counted from 0); "
-            "state poses farther away, less noise, or a larger zero_mm."
+            option="distances",
+            expected=f"a distance of 0 mm or more at pose {row} (from 0)",
+            value=float(f"{float(shown[row]) * 1e3:.6g}"),
+            remedy="choose poses farther away, less noise, or a larger zero_mm",
         )
     return shown

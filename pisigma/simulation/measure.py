@@ -1,4 +1,4 @@
-"""Measurements that sensors would make on the true robot: of a tracker, or of several sensors together."""
+"""Simulated measurements of the true robot: of a tracker, or of several sensors."""
 
 from dataclasses import replace
 from typing import Annotated, Literal
@@ -19,14 +19,14 @@ from pisigma.simulation.true_robot import TrueRobot
 
 
 class SimulatedMeasurements(AbstractCommanded):
-    """The part of a recipe that states what a tracker measures on the true robot.
+    """Recipe section of a tracker that measures the true robot.
 
     Attributes:
-        kind: "tracker"; need not be stated where nothing else can stand.
+        kind: "tracker", the default.
         sensor: "pose" (position and orientation) or "position".
-        noise: of the sensor; left out, it measures exactly.
+        noise: noise of the sensor; none by default.
         frame: name of the tracker's frame, which is the robot's base frame.
-        target: name of what is measured on the robot.
+        target: name of the measured target on the robot.
     """
 
     kind: Literal["tracker"] = "tracker"
@@ -48,17 +48,17 @@ def simulate(
     sensor: Literal["pose", "position"] = "pose",
     noise: MeasurementNoise | None = None,
 ) -> Measurements:
-    """Command joint values and measure where the true robot takes its tool.
+    """Command joint values and measure the tool poses of the true robot.
 
     Args:
         robot: the true robot.
-        q: commanded joint values [rad or m], as the controller counts.
-        sensor: whether the orientation is measured too. The sensor's frame is the robot's base frame.
-        noise: of the sensor; None measures exactly.
+        q: commanded joint values [rad or m], as the controller counts them.
+        sensor: "pose" to measure orientations in addition to positions. The sensor's frame is the robot's base frame.
+        noise: noise of the sensor; None for exact measurements.
 
     Returns:
-        One row per commanded joint vector, with the standard deviations of the noise where there is any, and with
-        the sides from which the joints come, drawn at random, where they have play.
+        One row per commanded joint vector, with the standard deviations of the noise if there is any, and with random
+        directions of approach if joints have backlash.
 
     Raises:
         PoseError: q has another number of columns than the robot has joints.
@@ -83,7 +83,7 @@ def _sigma(q: Float64[Tensor, "rows dof"], sigma: float) -> Float64[Tensor, " ro
 
 
 def kind(section: object) -> object:
-    """Tell a section by its kind, which a tracker need not state."""
+    """Return the kind of a section, by default that of a tracker."""
     return section.get("kind", "tracker") if isinstance(section, dict) else getattr(section, "kind", None)
 
 
@@ -91,24 +91,24 @@ SimulatedPoses = Annotated[
     Annotated[SimulatedMeasurements, Tag("tracker")] | Annotated[SimulatedImages, Tag("images")],
     Discriminator(kind),
 ]
-"""What measures poses: a tracker, unless the kind images is stated."""
+"""Sections of sensors that measure poses: a tracker (default) or images."""
 
 SimulatedSensor = Annotated[
     SimulatedMeasurements | SimulatedTouches | SimulatedSockets | SimulatedDistances | SimulatedPairs,
     Field(discriminator="kind"),
 ]
-"""What one sensor measures, told apart by `kind`: tracker, touches, sockets, distances or pairs."""
+"""Sections of sensors, distinguished by `kind`: tracker, touches, sockets, distances or pairs."""
 
 
 class SimulatedSensors(Section):
-    """The part of a recipe that states what several sensors measure on the same true robot.
+    """Recipe section of several sensors that measure the same true robot.
 
     Attributes:
-        sensors: one or more; their rows follow each other.
+        sensors: one or more sensors, whose rows are concatenated.
     """
 
     sensors: tuple[SimulatedSensor, ...] = Field(min_length=1)
 
     def measure(self, robot: TrueRobot) -> Measurements:
-        """Simulate all sensors and join their rows, the same at every call. See `pisigma.measurement.join`."""
+        """Simulate all sensors and concatenate their rows, the same at every call. See `pisigma.measurement.join`."""
         return join([sensor.measure(robot) for sensor in self.sensors])

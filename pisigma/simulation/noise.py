@@ -1,4 +1,4 @@
-"""Noise of sensors, and of a robot that does not quite repeat."""
+"""Noise of sensors, and repeatability of a robot."""
 
 from dataclasses import dataclass
 
@@ -12,7 +12,7 @@ from pisigma.robot.se3 import rotation_from_vector, transform
 
 
 class MeasurementNoise(Section):
-    """Normal noise on every measured coordinate and about every axis.
+    """Normal noise of every measured coordinate and about every axis.
 
     `p_measured = p + s_p · n_p` and `R_measured = Exp(s_r · n_r) · R` with n_p and n_r three standard normal
     numbers each and Exp the rotation of a rotation vector, in the frame of measurement. From one generator
@@ -24,7 +24,7 @@ class MeasurementNoise(Section):
     Attributes:
         position_mm: standard deviation per axis [mm].
         orientation_deg: standard deviation per axis [deg].
-        seed: of the generator.
+        seed: random seed.
     """
 
     position_mm: float = Field(default=0.0, ge=0)
@@ -42,7 +42,7 @@ class MeasurementNoise(Section):
         return float(torch.deg2rad(torch.tensor(self.orientation_deg, dtype=torch.float64)))
 
     def apply(self, T: Float64[Tensor, "rows 4 4"]) -> Float64[Tensor, "rows 4 4"]:
-        """The poses as they are measured; the same at every call.
+        """Return measured poses, the same at every call.
 
         Args:
             T: true poses in the frame of measurement.
@@ -56,11 +56,11 @@ class MeasurementNoise(Section):
 
 @dataclass(frozen=True, eq=False)
 class NoiseDraws:
-    """Drawn deviations.
+    """Random deviations.
 
     Attributes:
-        sensor: of the sensor, as many numbers as it has axes [m].
-        robot: by which the tool point misses where the commanded joints would take it, in the base frame [m].
+        sensor: deviations of the sensor [m]; sensors of one value use the first column.
+        robot: deviations of the tool point from the commanded one, in the base frame [m].
     """
 
     sensor: Float64[Tensor, "rows 3"]
@@ -75,9 +75,9 @@ class SensorNoise(Section):
 
     Attributes:
         sensor_mm: standard deviation of a measured length, or of every axis of a ball in its socket [mm].
-        repeatability_mm: standard deviation of the tool point per axis of the base frame, from one approach
-            of the same joint values to another [mm].
-        seed: of the generator.
+        repeatability_mm: standard deviation of the tool point per axis of the base frame, between repeats of the same
+            joint values [mm].
+        seed: random seed.
     """
 
     sensor_mm: float = Field(default=0.0, ge=0)
@@ -85,22 +85,22 @@ class SensorNoise(Section):
     seed: Seed
 
     def draw(self, rows: int) -> NoiseDraws:
-        """The deviations of so many rows; the same at every call."""
+        """Return the deviations of `rows` rows, the same at every call."""
         generator = torch.Generator().manual_seed(self.seed)
         draws = torch.randn(2, rows, 3, generator=generator, dtype=torch.float64)
         return NoiseDraws(self.sensor_mm / 1e3 * draws[0], self.repeatability_mm / 1e3 * draws[1])
 
     def sigma(self, points: int = 1) -> float:
-        """Standard deviation of a measured length in which so many tool points take part [m]."""
+        """Return the standard deviation of a length that depends on `points` tool points [m]."""
         return float((self.sensor_mm**2 + points * self.repeatability_mm**2) ** 0.5) / 1e3
 
 
 def draw_noise(noise: SensorNoise | None, rows: int) -> NoiseDraws:
-    """The deviations of so many rows; all 0 without noise."""
+    """Return the deviations of `rows` rows; 0 without noise."""
     return (noise or SensorNoise(seed=0)).draw(rows)
 
 
 def row_sigma(noise: SensorNoise | None, rows: int, points: int = 1) -> Float64[Tensor, " rows"] | None:
-    """What is told of the noise: its standard deviation in every row [m], None where there is no noise."""
+    """Return the standard deviation of the noise in every row [m], or None without noise."""
     sigma = 0.0 if noise is None else noise.sigma(points)
     return torch.full((rows,), sigma, dtype=torch.float64) if sigma else None

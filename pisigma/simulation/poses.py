@@ -1,4 +1,4 @@
-"""Where to measure: wanted poses on grids or at random, or random joint values."""
+"""Poses to measure at: desired poses on grids or at random, or random joint values."""
 
 import math
 from abc import ABC, abstractmethod
@@ -26,8 +26,8 @@ class OrientationSection(Section):
 
     Attributes:
         home_rpy_deg: R_home as roll, pitch, yaw [deg].
-        home_rotation: R_home as three rows, instead.
-        spread_deg: half the range of roll, pitch and yaw [deg]; 0 for the home orientation everywhere.
+        home_rotation: R_home as the three rows of a rotation matrix, instead.
+        spread_deg: half the range of roll, pitch and yaw [deg]; 0 for the home orientation at all poses.
     """
 
     home_rpy_deg: Triple | None = None
@@ -41,22 +41,21 @@ class OrientationSection(Section):
             R = torch.tensor(rows, dtype=torch.float64)
             deviation = (R.mT @ R - torch.eye(3, dtype=torch.float64)).abs().max()
             if deviation > 1e-9 or torch.linalg.det(R) < 0:
-                raise ValueError("three orthonormal, right-handed rows of a rotation are wanted")
+                raise ValueError("expected the three rows of an orthonormal, right-handed rotation matrix")
         return rows
 
     @model_validator(mode="after")
     def _one_home(self) -> "OrientationSection":
         if self.home_rpy_deg is not None and self.home_rotation is not None:
-            raise ValueError("state home_rpy_deg or home_rotation, not both")
+            raise ValueError("expected either home_rpy_deg or home_rotation, got both")
         return self
 
     def rotations(self, count: int, generator: torch.Generator | None) -> Float64[Tensor, "count 3 3"]:
-        """One orientation per pose.
+        """Return one orientation per pose.
 
         Args:
-            count: how many.
-            generator: where roll, pitch, yaw are drawn from, as one (count, 3) block; not used without a
-                spread.
+            count: number of orientations.
+            generator: source of roll, pitch, yaw, drawn as one (count, 3) block; not used without a spread.
         """
         if self.home_rotation is not None:
             home = torch.tensor(self.home_rotation, dtype=torch.float64)
@@ -69,8 +68,8 @@ class OrientationSection(Section):
         return home @ rotation_from_rpy(torch.deg2rad(self.spread_deg * draws))
 
 
-MORE_DRAWS = 9
-"""For each joint vector where coupled joints have stops, which refuse some."""
+EXTRA_DRAWS = 9
+"""Number of additional draws per joint vector for coupled joints with stops, which exclude some."""
 
 Range = tuple[float, float]
 """Smallest and largest value."""
@@ -81,12 +80,11 @@ class JointsRandom(Section):
 
     Attributes:
         kind: "joints_random".
-        count: how many.
-        seed: of the generator.
-        share: share of the range between the joint limits, about its middle, that is used.
-        range_deg: by name of a revolute joint, smallest and largest value [deg]; takes the place of the
-            share.
-        range_mm: by name of a prismatic joint, smallest and largest value [mm].
+        count: number of joint vectors.
+        seed: random seed.
+        share: fraction of the range between the joint limits, about its centre, that is used.
+        range_deg: by name of a revolute joint, smallest and largest value [deg], instead of the share.
+        range_mm: by name of a prismatic joint, smallest and largest value [mm], instead of the share.
     """
 
     kind: Literal["joints_random"]
@@ -97,11 +95,12 @@ class JointsRandom(Section):
     range_mm: dict[str, Range] = Field(default_factory=dict)
 
     def joints(self, robot: Robot) -> Float64[Tensor, "count dof"]:
-        """Joint values to command [rad or m], drawn as the controller counts; the same at every call.
+        """Return joint values to command [rad or m], the same at every call.
+
+        They are drawn as the controller's values and converted to joint values.
 
         Raises:
-            RecipeError: an unknown joint, a range in the wrong unit or outside the limits, or no limits at
-                all.
+            RecipeError: a joint is unknown, has a range in the wrong unit or outside its limits, or has no limits.
         """
         bounds = torch.from_numpy(self._bounds(robot))
         generator = torch.Generator().manual_seed(self.seed)
@@ -114,49 +113,55 @@ class JointsRandom(Section):
         q = drawn()
         if robot.coupling is None or not robot.coupling.stops:
             return q
-        many = torch.cat([q] + [drawn() for _ in range(MORE_DRAWS)])
+        many = torch.cat([q] + [drawn() for _ in range(EXTRA_DRAWS)])
         kept = many[torch.from_numpy(robot.coupling.is_inside(many.numpy()))]
         if len(kept) < self.count:
             raise RecipeError(
-                f"joints_random: of {len(many)} draws only {len(kept)} keep the stops of robot '{robot.name}'; narrow "
-                "the ranges."
+                option="joints_random",
+                expected=f"{self.count} of {len(many)} draws within the stops of robot '{robot.name}'",
+                value=len(kept),
+                remedy="narrow the ranges",
             )
         return kept[: self.count]
 
     def _bounds(self, robot: Robot) -> Float64[np.ndarray, "axes 2"]:
         limits = robot.axis_limits
-        with np.errstate(invalid="ignore"):  # joints without limits are complained of below
+        with np.errstate(invalid="ignore"):  # joints without limits are refused below
             middle, half = limits.mean(1, keepdims=True), np.diff(limits) / 2
             bounds: np.ndarray = middle + self.share * half * np.array([-1.0, 1.0])
         fields = ("range_deg", "range_mm")
         ranges = stated_joints(robot, self.range_deg, self.range_mm, fields, "joints_random", axes=True)
         for index, stated in ranges.items():
-            turns = robot.axes[index].type == "revolute"
-            bounds[index] = np.deg2rad(stated) if turns else np.array(stated) / 1e3
+            is_revolute = robot.axes[index].type == "revolute"
+            bounds[index] = np.deg2rad(stated) if is_revolute else np.array(stated) / 1e3
         for joint, (lower, upper) in zip(robot.axes, bounds, strict=True):
             if not np.isfinite([lower, upper]).all():
                 raise RecipeError(
-                    f"joints_random: joint '{joint.name}' of robot '{robot.name}' has no limits; "
-                    "state its range in range_deg or range_mm."
+                    f"joint '{joint.name}' of robot '{robot.name}' has no limits",
+                    option="joints_random",
+                    value=joint.name,
+                    remedy="give its range in range_deg or range_mm",
                 )
             if not joint.lower - 1e-12 <= lower <= upper <= joint.upper + 1e-12:
                 raise RecipeError(
-                    f"joints_random: the range of joint '{joint.name}' is empty or leaves its limits "
-                    f"({joint.lower:g} to {joint.upper:g} in rad or m); correct it."
+                    option="joints_random",
+                    expected=f"a range of joint '{joint.name}' within its limits {joint.lower:g} to {joint.upper:g} "
+                    f"{'rad' if joint.type == 'revolute' else 'm'}",
+                    value=f"{lower:g} to {upper:g}",
                 )
         return bounds
 
 
 def _check_count(count: int) -> None:
     if count > MAX_POSES:
-        raise ValueError(f"the grid has {count:,} poses, {MAX_POSES:,} at most were wanted; take fewer steps")
+        raise ValueError(f"expected a grid of at most {MAX_POSES:,} poses, got {count:,}; choose fewer steps")
 
 
 class AbstractPoses(Section, ABC):
-    """Wanted tool poses.
+    """Desired tool poses.
 
-    Whatever is random comes from one generator with the section's seed, positions before orientations. Grids need a
-    seed for a spread of orientations only.
+    Random values come from one generator with the section's seed, positions before orientations. Grids need a seed only
+    for a spread of orientations.
     """
 
     orientation: OrientationSection = OrientationSection()
@@ -165,34 +170,34 @@ class AbstractPoses(Section, ABC):
     @model_validator(mode="after")
     def _seed_for_spread(self) -> "AbstractPoses":
         if self.orientation.spread_deg and self.seed is None:
-            raise ValueError("a spread of orientations is drawn at random; state the seed")
+            raise ValueError("a spread of orientations is random and needs a seed; add it")
         return self
 
     def transforms(self) -> Float64[Tensor, "count 4 4"]:
-        """The wanted T_base_tool [m], the same at every call."""
+        """Return the desired T_base_tool [m], the same at every call."""
         generator = None if self.seed is None else torch.Generator().manual_seed(self.seed)
         positions = self._positions(generator)
         return transform(self.orientation.rotations(len(positions), generator), positions)
 
     @abstractmethod
     def _positions(self, generator: torch.Generator | None) -> Float64[Tensor, "count 3"]:
-        """The wanted positions [m]."""
+        """Return the desired positions [m]."""
 
 
 class PolarGrid(AbstractPoses):
-    """Equal steps of radius and angle at one height: `x = r cos(phi)`, `y = r sin(phi)`; phi runs fastest.
+    """Equal steps of radius and angle at one height: `x = r cos(phi)`, `y = r sin(phi)`; phi varies fastest.
 
     Source: Jeong, Kim and Kwak 1998, section 4.1.1 and Fig. 4.
 
     Attributes:
         kind: "polar_grid".
         r_mm: first and last radius [mm].
-        r_steps: how many radii.
+        r_steps: number of radii.
         phi_deg: first and last angle [deg].
-        phi_steps: how many angles.
+        phi_steps: number of angles.
         z_mm: height [mm].
-        orientation: of the tool.
-        seed: for the spread of the orientation, if it has one.
+        orientation: orientations of the tool.
+        seed: random seed of the orientations, if they have a spread.
     """
 
     kind: Literal["polar_grid"]
@@ -215,7 +220,7 @@ class PolarGrid(AbstractPoses):
 
 
 class CubeGrid(AbstractPoses):
-    """Equal steps along x, y and z; z runs fastest.
+    """Equal steps along x, y and z; z varies fastest.
 
     Source: Jeong, Kim and Kwak 1998, section 4.2.1, after ISO 9283.
 
@@ -224,9 +229,9 @@ class CubeGrid(AbstractPoses):
         x_mm: first and last x [mm].
         y_mm: first and last y [mm].
         z_mm: first and last z [mm].
-        steps: how many values of x, y and z.
-        orientation: of the tool.
-        seed: for the spread of the orientation, if it has one.
+        steps: numbers of values of x, y and z.
+        orientation: orientations of the tool.
+        seed: random seed of the orientations, if they have a spread.
     """
 
     kind: Literal["cube_grid"]
@@ -246,18 +251,18 @@ class CubeGrid(AbstractPoses):
 
 
 class PolarRandom(AbstractPoses):
-    """Random poses of a polar region, uniform in radius and angle (so denser towards the centre).
+    """Random poses in a polar region, uniform in radius and angle (so denser towards the centre).
 
     Drawn as a (count, 2) block for r and phi, then the orientations.
 
     Attributes:
         kind: "polar_random".
-        count: how many poses.
-        seed: of the generator.
+        count: number of poses.
+        seed: random seed.
         r_mm: smallest and largest radius [mm].
         phi_deg: smallest and largest angle [deg].
         z_mm: height [mm].
-        orientation: of the tool.
+        orientation: orientations of the tool.
     """
 
     kind: Literal["polar_random"]
@@ -273,18 +278,18 @@ class PolarRandom(AbstractPoses):
 
 
 class CubeRandom(AbstractPoses):
-    """Random poses of a cuboid, uniform in x, y and z.
+    """Random poses in a cuboid, uniform in x, y and z.
 
     Drawn as a (count, 3) block for x, y and z, then the orientations.
 
     Attributes:
         kind: "cube_random".
-        count: how many poses.
-        seed: of the generator.
+        count: number of poses.
+        seed: random seed.
         x_mm: smallest and largest x [mm].
         y_mm: smallest and largest y [mm].
         z_mm: smallest and largest z [mm].
-        orientation: of the tool.
+        orientation: orientations of the tool.
     """
 
     kind: Literal["cube_random"]
@@ -301,7 +306,7 @@ class CubeRandom(AbstractPoses):
 WhereToMeasure = Annotated[
     PolarGrid | CubeGrid | PolarRandom | CubeRandom | JointsRandom, Field(discriminator="kind")
 ]
-"""Wanted poses or joint values to command, told apart by `kind`."""
+"""Sections of desired poses or joint values to command, distinguished by `kind`."""
 
 
 def _linspace(bounds: Range, steps: int) -> Float64[Tensor, " steps"]:

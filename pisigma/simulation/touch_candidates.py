@@ -1,4 +1,4 @@
-"""Where jigs stand, and which touches are possible there: a face, a point on it and a tilt of the torch."""
+"""Placements of jigs, and possible touches there: a face, a point on it and a tilt of the torch."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -22,16 +22,16 @@ from pisigma.simulation.commanded import BranchSection
 
 
 class JigPlacement(Section):
-    """A jig that stands somewhere, as the operator believes and as it really does.
+    """The placement of a jig, nominal and true.
 
-    `T_jig_base = Trans(x, y, z) · RotZ(roll) · RotY(pitch) · RotX(yaw)` says where the robot's base is, seen
-    from the jig (Lim et al., eq. 1). A jig on the floor that is turned about the vertical has a roll.
+    `T_jig_base = Trans(x, y, z) · RotZ(roll) · RotY(pitch) · RotX(yaw)` is the pose of the robot's base in the frame of
+    the jig (Lim et al., eq. 1). A jig on the floor that is rotated about the vertical has a roll.
 
     Attributes:
-        name: of the placement, and of the frame of its touches.
-        jig: name of a jig that comes with pisigma, or its YAML file.
-        base: T_jig_base as the operator believes.
-        true_base: T_jig_base as it really is; left out, as the operator believes.
+        name: name of the placement, and of the frame of its touches.
+        jig: name of a jig that comes with pisigma, or a YAML file.
+        base: nominal T_jig_base.
+        true_base: true T_jig_base; the nominal one by default.
     """
 
     name: str = Field(min_length=1)
@@ -40,7 +40,7 @@ class JigPlacement(Section):
     true_base: FrameSection | None = None
 
     def load_jig(self) -> Jig:
-        """The jig.
+        """Return the jig.
 
         Raises:
             MeasurementError: there is no such jig.
@@ -49,54 +49,57 @@ class JigPlacement(Section):
 
     @property
     def T_jig_base(self) -> Float64[Tensor, "4 4"]:
-        """Where the operator believes that it stands [m]."""
+        """Nominal pose of the base in the frame of the jig [m]."""
         return transform_from_xyzrpy(torch.from_numpy(self.base.to_si()))
 
     @property
     def true_T_jig_base(self) -> Float64[Tensor, "4 4"]:
-        """Where it really stands [m]."""
+        """True pose of the base in the frame of the jig [m]."""
         return transform_from_xyzrpy(torch.from_numpy((self.true_base or self.base).to_si()))
 
 
 def check_names(placements: Sequence[JigPlacement]) -> None:
-    """Refuse two placements of one name.
+    """Refuse two placements with the same name.
 
     Raises:
-        RecipeError: a name stands twice, or there is no placement.
+        RecipeError: a name appears twice, or there is no placement.
     """
     names = [placement.name for placement in placements]
     if not names:
-        raise RecipeError("touches: no jig is placed; state at least one placement.")
+        raise RecipeError(option="touches", expected="one or more placements of jigs", value="none")
     if twice := [name for name in names if names.count(name) > 1]:
         raise RecipeError(
-            f"touches: the placement '{twice[0]}' stands twice; a jig that was moved has a new frame, so name it anew."
+            f"the placement '{twice[0]}' appears twice",
+            option="touches",
+            value=twice[0],
+            remedy="rename one, as a jig that was moved has a new frame",
         )
 
 
-ROUNDS = 20
-"""Draws after which the search for candidates is given up."""
+MAX_DRAWS = 20
+"""Number of draws after which the search for candidates fails."""
 DRAWN = 8192
-"""Candidates drawn at a time."""
-MOST_ITERATIONS = 10
-"""Steps of the numeric inverse to an end of the travel; it needs some five."""
+"""Number of candidates per draw."""
+MAX_ITERATIONS = 10
+"""Iterations of the numeric inverse kinematics to an end of the travel; it needs about five."""
 END_TOLERANCE = 1e-8
-"""[m and rad] How nearly the ends of the travel are solved for."""
-LARGEST_MOVE = 1.5
-"""[rad or m] A joint that moves farther within the travel has changed its branch."""
+"""[m and rad] Tolerance of the inverse kinematics at the ends of the travel."""
+MAX_JOINT_MOTION = 1.5
+"""[rad or m] Motion of a joint within the travel above which it has changed its branch."""
 
 
 @dataclass(frozen=True, eq=False)
 class TouchCandidates:
-    """Touches that the nominal robot can make, by where the operator believes that the jigs stand.
+    """Touches that the nominal robot can make at the nominal placements of the jigs.
 
     Attributes:
         placements: names of the placements, which are the frames.
         placement: index of every candidate's placement.
         face: index of its face on the jig of that placement.
         axis: index of the axis along which it touches.
-        sign: +1 or -1: outward direction of the face along that axis.
-        coordinate: of the face along that axis [m], in the frame of the jig.
-        T_jig_tool: pose of the tool at the touch, in the frame of the jig.
+        sign: +1 or -1, outward direction of the face along that axis.
+        coordinate: coordinate of the face along that axis in the frame of the jig [m].
+        T_jig_tool: pose of the tool at the touch in the frame of the jig.
         q: joint values [rad or m] of the nominal robot there.
     """
 
@@ -125,17 +128,17 @@ class TouchCandidates:
         return tuple("xyz"[axis] for axis in self.axis.tolist())
 
     def select(self, index: Int64[Tensor, " chosen"] | Bool[Tensor, " candidates"]) -> "TouchCandidates":
-        """The candidates of an index, in its order, or of a mask."""
+        """Return the candidates of an index, in the order of the index, or of a mask."""
         return replace(self, **{name: getattr(self, name)[index] for name in _ARRAYS})
 
     @staticmethod
     def joined(parts: Sequence["TouchCandidates"]) -> "TouchCandidates":
-        """Candidates one after the other, with the placements of the first."""
+        """Concatenate candidates, with the placements of the first ones."""
         arrays = {name: torch.cat([getattr(part, name) for part in parts]) for name in _ARRAYS}
         return TouchCandidates(parts[0].placements, **arrays)
 
     def as_measurements(self) -> Measurements:
-        """What the nominal robot would measure if it and the placements were as believed, for planning."""
+        """Return the measurements of the nominal robot at the nominal placements, for planning."""
         return Measurements(
             q=self.q,
             frame=self.frame,
@@ -149,23 +152,23 @@ _ARRAYS = ("placement", "face", "axis", "sign", "coordinate", "T_jig_tool", "q")
 
 
 class TouchCandidatesSection(Section):
-    """How candidates of touches are drawn; the axes x, y and z get equally many of them.
+    """Random candidates of touches, the same number for each of the axes x, y and z.
 
-    A face of its axis and a point on it are drawn uniformly. The tool's z axis, along which the wire leaves
-    the torch, points down the jig's z axis but for a tilt; tilt and azimuth are drawn uniformly over the
-    cone, the turn about the wire uniformly. What the nominal robot cannot do is drawn again.
+    A face of the axis and a point on it are drawn uniformly. The tool's z axis, along which the wire leaves the torch,
+    points down the jig's z axis except for a tilt; tilt and azimuth are drawn uniformly over the cone, and so is the
+    rotation about the wire. Candidates that the nominal robot cannot reach are drawn again.
 
     Attributes:
-        count: candidates per placement.
-        seed: of the generator.
-        tilt_deg: largest tilt of the torch from straight down [deg].
+        count: number of candidates per placement.
+        seed: random seed.
+        tilt_deg: largest tilt of the torch from vertical [deg].
         least_lean_deg: smallest angle between the torch and the face [deg], so that its tip touches first.
-        margin_mm: smallest distance of the point from edges of the face and from what stands on it [mm].
-        travel_mm: how far before and behind the face the tip must be able to go along its normal, as neither
-            robot nor placement are quite where they are believed to be [mm].
+        margin_mm: smallest distance of the point from edges of the face and from blocks on it [mm].
+        travel_mm: distance before and behind the face that the tip must be able to move along its normal, as true robot
+            and placement differ from the nominal ones [mm].
         shaft_mm: length of the torch behind its tip, as a straight line, that must be clear of the jig [mm].
-        least_singular_value: how far from singularities the robot stays; see `singularity_measure`.
-        branch: on which branch of the inverse kinematics the robot touches.
+        least_singular_value: smallest singularity measure of the robot; see `singularity_measure`.
+        branch: branch of the inverse kinematics.
     """
 
     count: Count
@@ -183,7 +186,7 @@ class TouchCandidatesSection(Section):
 
         Args:
             robot: the nominal robot.
-            placements: of the jigs.
+            placements: placements of the jigs.
 
         Raises:
             RecipeError: the robot cannot make as many touches, or the sections do not fit together.
@@ -199,12 +202,12 @@ class TouchCandidatesSection(Section):
     def _of_placement(
         self, robot: Robot, placement: JigPlacement, generator: torch.Generator
     ) -> TouchCandidates:
-        """Candidates on one placement: every axis has its share."""
+        """Return candidates on one placement, with the same number for every axis."""
         jig = placement.load_jig()
         axes = sorted(set(jig.axis.tolist()))
         share = {axis: (self.count + len(axes) - 1 - place) // len(axes) for place, axis in enumerate(axes)}
         parts: list[TouchCandidates] = []
-        for _ in range(ROUNDS):
+        for _ in range(MAX_DRAWS):
             drawn = self._draw(jig, placement.name, robot.dof, generator)
             parts.append(self._reachable(robot, jig, placement, drawn))
             reachable = TouchCandidates.joined(parts)
@@ -215,23 +218,25 @@ class TouchCandidatesSection(Section):
                 )
         lacking = next(axis for axis in axes if len(of_axis[axis]) < share[axis])
         raise RecipeError(
-            f"touches: robot '{robot.name}' can make {len(of_axis[lacking])} of {share[lacking]} touches along "
-            f"{'xyz'[lacking]} of jig '{placement.name}' ({ROUNDS * DRAWN} drawn); place the jig nearer, allow more "
-            "tilt, ask for less margin, travel or shaft, or state another branch."
+            option="touches",
+            expected=f"{share[lacking]} touches of robot '{robot.name}' along {'xyz'[lacking]} of jig "
+            f"'{placement.name}' (of {MAX_DRAWS * DRAWN} drawn)",
+            value=len(of_axis[lacking]),
+            remedy="place the jig nearer, allow more tilt, choose a smaller margin, travel or shaft, or another branch",
         )
 
     def _draw(self, jig: Jig, name: str, dof: int, generator: torch.Generator) -> TouchCandidates:
-        """Faces, points and torches that are clear of the jig and may or may not be reached."""
+        """Draw faces, points and torches that are clear of the jig, reachable or not."""
         u = torch.rand(DRAWN, 7, generator=generator, dtype=torch.float64)
         face = _draw_faces(jig, u[:, 0])
         lower, upper = (bound[face] for bound in jig.extent)
         point = lower + (upper - lower) * u[:, 1:4]
         tilt = torch.deg2rad(torch.tensor(self.tilt_deg, dtype=torch.float64))
         tilt = torch.arccos(1 - (1 - torch.cos(tilt)) * u[:, 4])
-        azimuth, turn = (2 * torch.pi * u[:, 5], 2 * torch.pi * u[:, 6])
+        azimuth, about_wire = (2 * torch.pi * u[:, 5], 2 * torch.pi * u[:, 6])
         zero = torch.zeros_like(tilt)
         R = rotation_from_rpy(torch.stack([azimuth, tilt, zero], -1))
-        R = R @ rotation_from_rpy(torch.stack([turn, zero, zero + torch.pi], -1))
+        R = R @ rotation_from_rpy(torch.stack([about_wire, zero, zero + torch.pi], -1))
         drawn = TouchCandidates(
             placements=(name,),
             placement=torch.zeros_like(face),
@@ -245,7 +250,7 @@ class TouchCandidatesSection(Section):
         return drawn.select(self._is_clear(jig, drawn))
 
     def _is_clear(self, jig: Jig, drawn: TouchCandidates) -> Bool[Tensor, " candidates"]:
-        """Whether the tip touches the face first, at the touch and where it comes from."""
+        """Return whether the tip touches the face first, at the touch and during the approach."""
         point, shaft = drawn.T_jig_tool[:, :3, 3], -drawn.T_jig_tool[:, :3, 2]
         outward = jig.outward[drawn.face]
         lean = torch.arcsin((shaft * outward).sum(-1).clamp(-1, 1))
@@ -259,7 +264,7 @@ class TouchCandidatesSection(Section):
     def _reachable(
         self, robot: Robot, jig: Jig, placement: JigPlacement, drawn: TouchCandidates
     ) -> TouchCandidates:
-        """Those that the nominal robot can make, with their joint values."""
+        """Return the candidates that the nominal robot can reach, with their joint values."""
         T_base_jig = invert(placement.T_jig_base)
         T = T_base_jig @ drawn.T_jig_tool
         q, reached = self.branch.find(robot, T)
@@ -268,15 +273,15 @@ class TouchCandidatesSection(Section):
         T, outward = T[reached], (T_base_jig[:3, :3] @ jig.outward[drawn.face].mT).mT
         shift = self.travel_mm / 1e3 * torch.stack([outward, -outward])
         Ts_end = transform(T[:, :3, :3].expand(2, -1, 3, 3), T[:, :3, 3] + shift)
-        ends = solve_numeric(robot, Ts_end, drawn.q, tolerance=END_TOLERANCE, max_iterations=MOST_ITERATIONS)
+        ends = solve_numeric(robot, Ts_end, drawn.q, tolerance=END_TOLERANCE, max_iterations=MAX_ITERATIONS)
         ends_reached = ends.status == Status.REACHED
-        ends_reached &= (ends.q - drawn.q).abs().amax(-1) < LARGEST_MOVE
+        ends_reached &= (ends.q - drawn.q).abs().amax(-1) < MAX_JOINT_MOTION
         ends_reached &= singularity_measure(robot, ends.q) >= self.least_singular_value
         return drawn.select(ends_reached.all(0))
 
 
 def _draw_faces(jig: Jig, u: Float64[Tensor, " candidates"]) -> Int64[Tensor, " candidates"]:
-    """Faces by numbers in [0, 1): every axis with the same chance, and every face of an axis."""
+    """Return faces by numbers in [0, 1): all axes are equally likely, and all faces of an axis."""
     per_axis = torch.bincount(jig.axis, minlength=3)
     weight = 1.0 / per_axis[jig.axis].to(u.dtype)
     bounds = weight.cumsum(0) / weight.sum()

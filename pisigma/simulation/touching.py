@@ -1,4 +1,4 @@
-"""Touches: the robot moves along a face's normal until the tip really meets the face."""
+"""Simulated touches: the robot moves along a face's normal until the true tip meets the face."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -9,9 +9,10 @@ from jaxtyping import Bool, Float64
 from pydantic import Field
 from torch import Tensor
 
-from pisigma.files.errors import UnreachablePoseError
+from pisigma.files.errors import Place, UnreachablePoseError
 from pisigma.files.yaml_file import Section
 from pisigma.measurement.dataset import Measurements
+from pisigma.measurement.faults import Fault
 from pisigma.measurement.fields import LeftOut
 from pisigma.robot.kinematics.joint_limits import wrap_into_limits
 from pisigma.robot.kinematics.numeric import solve_numeric
@@ -23,21 +24,21 @@ from pisigma.simulation.true_robot import TrueRobot
 
 OnMiss = Literal["error", "leave_out"]
 
-CONTACT = 1e-13
-"""[m] How near the tip comes to the coordinate at which it touches."""
-STEPS = 50
-"""Steps after which the approach is given up; it needs some ten."""
+CONTACT_TOLERANCE = 1e-13
+"""[m] Distance of the tip from the coordinate of the touch at which the approach ends."""
+MAX_ITERATIONS = 50
+"""Iterations after which the approach fails; it needs about ten."""
 
 
 class SimulatedTouches(Section):
-    """The part of a recipe that states which faces of which jigs are touched.
+    """Recipe section of touches on faces of jigs.
 
     Attributes:
         kind: "touches".
-        placements: of the jigs; each is a frame.
-        candidates: which touches are made on each of them.
-        noise: of touching and of the robot; left out, both are exact.
-        on_miss: "error", or "leave_out" to go on without touches that miss their face and to report them.
+        placements: placements of the jigs; each is a frame.
+        candidates: touches on every placement.
+        noise: noise of the touches and of the robot; none by default.
+        on_miss: "error", or "leave_out" to continue without touches that miss their face and to report them.
     """
 
     kind: Literal["touches"]
@@ -63,23 +64,22 @@ def simulate_touches(
 ) -> Measurements:
     """Touch faces with the true robot.
 
-    The controller moves the tool along the normal of the face, keeping its orientation, by the nominal
-    inverse kinematics and where the jig is believed to stand. It stops when the true tip is at the coordinate
-    of the face, in the frame of the jig as it really stands: `e_axis · T_jig_base · FK_true(q) = coordinate +
-    n`. The row holds the joint values commanded there and the coordinate of the face, which is known from the
-    jig; n is the noise of touching, and the robot's repeatability shifts its tip during the whole approach.
-    Encoder steps are left out.
+    The controller moves the tool along the normal of the face with constant orientation, by the nominal inverse
+    kinematics and the nominal placement of the jig. It stops when the true tip is at the coordinate of the face in the
+    frame of the jig at its true placement: `e_axis · T_jig_base · FK_true(q) = coordinate + n`. The row contains the
+    joint values commanded there and the coordinate of the face, which is known from the jig; n is the noise of the
+    touch, and the robot's repeatability shifts its tip during the whole approach. Encoder steps are ignored.
 
     Args:
         robot: the true robot.
-        placements: of the jigs, in the order of `candidates.placements`.
-        candidates: what to touch.
-        noise: of touching and of the robot; None is exact.
-        travel: how far [m] before and behind the place where it is expected the face is looked for.
-        on_miss: what happens with touches that do not meet their face within the travel or beyond its edges.
+        placements: placements of the jigs, in the order of `candidates.placements`.
+        candidates: the touches.
+        noise: noise of the touches and of the robot; None for exact ones.
+        travel: distance [m] before and behind the expected position of the face within which it is searched for.
+        on_miss: "error" or "leave_out" for touches that do not meet their face within the travel or miss its edges.
 
     Returns:
-        One row per touch, its frame the placement's name, with the standard deviation of the noise where
+        One row per touch, with the placement's name as its frame, and with the standard deviation of the noise if
         there is any.
 
     Raises:
@@ -91,11 +91,15 @@ def simulate_touches(
     _, inside = wrap_into_limits(robot.nominal, contact.q)
     met = met & inside
     source = f"simulation of {robot.nominal.name}"
-    left_out = tuple(LeftOut(0, _miss(candidates, row, contact)) for row in (~met).nonzero()[:, 0].tolist())
+    missed = (~met).nonzero()[:, 0].tolist()
+    left_out = tuple(LeftOut.because(0, _miss(candidates, row, contact)) for row in missed)
     if left_out and on_miss == "error":
         raise UnreachablePoseError(
-            f"{source}: {left_out[0].reason} ({len(left_out)} of {candidates.count} touches "
-            "miss); correct the placement, ask for more margin or travel, or leave such touches out with on_miss."
+            f"{len(left_out)} of {candidates.count} touches miss: {left_out[0].reason}",
+            at=Place(source),
+            option="touches",
+            value=missed[0],
+            remedy="correct the placement, choose more margin or travel, or leave out such touches with on_miss",
         )
     touched = replace(candidates.select(met), q=contact.q[met])
     sigma = row_sigma(noise, touched.count)
@@ -104,13 +108,13 @@ def simulate_touches(
 
 @dataclass(frozen=True, eq=False)
 class _Contact:
-    """Where the approaches ended.
+    """The ends of the approaches.
 
     Attributes:
         q: joint values commanded there [rad or m].
-        tip: true tip in the frame of the jig as it stands [m].
-        moved: how far inward of the expected contact the controller went [m].
-        met: whether the tip came to the face within the travel.
+        tip: true tip in the frame of the jig at its true placement [m].
+        moved: distance by which the controller moved inward of the expected contact [m].
+        met: whether the tip reached the coordinate of the face within the travel.
     """
 
     q: Float64[Tensor, "touches dof"]
@@ -126,37 +130,44 @@ def _approach(
     draws: NoiseDraws,
     travel: float,
 ) -> _Contact:
-    """Move all touches on by their gaps until these are closed.
+    """Move the commanded tips by the gaps of the true tips until these are closed.
 
-    The true tip moves as far as the commanded one but for the errors' share, so each step leaves a few
-    percent.
+    The true tip moves almost as far as the commanded one, so that every iteration leaves a few percent of the gap.
     """
     Ts_jig_base = torch.stack([p.T_jig_base for p in placements])[candidates.placement]
     true_Ts_jig_base = torch.stack([p.true_T_jig_base for p in placements])[candidates.placement]
     T = invert(Ts_jig_base) @ candidates.T_jig_tool
     along = torch.nn.functional.one_hot(candidates.axis, 3).to(T)
     inward = -(Ts_jig_base[:, :3, :3].mT @ (along * candidates.sign[:, None])[..., None])[..., 0]
-    wanted = candidates.coordinate + draws.sensor[:, 0]
-    moved, q = torch.zeros_like(wanted), candidates.q
-    for _ in range(STEPS):
+    coordinate = candidates.coordinate + draws.sensor[:, 0]
+    moved, q = torch.zeros_like(coordinate), candidates.q
+    for _ in range(MAX_ITERATIONS):
         here = transform(T[:, :3, :3], T[:, :3, 3] + moved[:, None] * inward)
         solution = solve_numeric(robot.nominal, here, q)
         q = solution.q
         position = robot.forward(q)[:, :3, 3] + draws.robot
         tip = (true_Ts_jig_base[:, :3, :3] @ position[..., None])[..., 0] + true_Ts_jig_base[:, :3, 3]
-        gap = candidates.sign * ((tip * along).sum(-1) - wanted)
-        open_ = (gap.abs() > CONTACT) & (moved.abs() <= travel) & (solution.status != Status.NOT_CONVERGED)
+        gap = candidates.sign * ((tip * along).sum(-1) - coordinate)
+        open_ = (
+            (gap.abs() > CONTACT_TOLERANCE)
+            & (moved.abs() <= travel)
+            & (solution.status != Status.NOT_CONVERGED)
+        )
         if not open_.any():
             break
         moved = torch.where(open_, moved + gap, moved)
-    met = (gap.abs() <= 10 * CONTACT) & (moved.abs() <= travel) & (solution.status != Status.NOT_CONVERGED)
+    met = (
+        (gap.abs() <= 10 * CONTACT_TOLERANCE)
+        & (moved.abs() <= travel)
+        & (solution.status != Status.NOT_CONVERGED)
+    )
     return _Contact(q, tip, moved, met)
 
 
 def _on_faces(
     placements: Sequence[JigPlacement], candidates: TouchCandidates, tip: Float64[Tensor, "touches 3"]
 ) -> Bool[Tensor, " touches"]:
-    """Whether the tips meet their faces and not the air beside them."""
+    """Return whether the tips meet their faces within the edges."""
     on = torch.zeros(candidates.count, dtype=torch.bool)
     for number, placement in enumerate(placements):
         rows = candidates.placement == number
@@ -164,10 +175,10 @@ def _on_faces(
     return on
 
 
-def _miss(candidates: TouchCandidates, row: int, contact: _Contact) -> str:
-    """Say what became of a touch that misses."""
-    name = f"touch {row} (counted from 0) along {candidates.touch_axis[row]} of jig '{candidates.frame[row]}'"
+def _miss(candidates: TouchCandidates, row: int, contact: _Contact) -> Fault:
+    """Return what is wrong with a touch that misses; the value is its tip [mm] if it reached the coordinate."""
+    name = f"touch {row} (from 0) along {candidates.touch_axis[row]} of jig '{candidates.frame[row]}'"
     if bool(contact.met[row]):
-        x, y, z = (1e3 * contact.tip[row]).tolist()
-        return f"{name} comes beside its face or leaves the joint limits, at {x:.1f}, {y:.1f}, {z:.1f} mm"
-    return f"{name} does not find its face within the travel"
+        tip = ", ".join(f"{value:.1f}" for value in (1e3 * contact.tip[row]).tolist())
+        return Fault(f"{name} misses the edges of its face or the joint limits, at {tip} mm", value=tip)
+    return Fault(f"{name} does not reach its face within the travel")

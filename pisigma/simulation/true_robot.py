@@ -1,4 +1,4 @@
-"""The true robot of a simulation: a nominal robot with error sources that add up."""
+"""The true robot of a simulation: a nominal robot with the sum of several error sources."""
 
 import zlib
 from collections.abc import Sequence
@@ -42,54 +42,58 @@ ERROR_SOURCES: dict[str, type[AbstractErrorSource]] = {
     "coupling": CouplingDeviation,
     "guide": Guide,
 }
-"""The registry: every error source by its kind."""
+"""All error sources by kind."""
 
 ErrorSource = Annotated[AbstractErrorSource, OneOf(ERROR_SOURCES)]
-"""A section of a recipe that is one of the registered error sources, told apart by `kind`."""
+"""A recipe section of any registered error source, distinguished by `kind`."""
 
 Source = TypeVar("Source", bound=AbstractErrorSource)
 
-ITERATIONS = 200
-"""Steps after which solving for the commanded joints is given up; errors of a real robot need about ten."""
+MAX_ITERATIONS = 200
+"""Iterations after which solving for the commanded joints fails; errors of a real robot need about ten."""
 
 
 def register_error_source(source: type[Source]) -> type[Source]:
-    """Make recipes know an error source by its kind; to be called once, or used as a decorator.
+    """Register an error source for recipes by its kind; also a class decorator.
 
     Args:
         source: subclass of `AbstractJointSource`, `AbstractGeometrySource` or `AbstractPlaySource` whose `kind` is a
             `Literal`.
 
     Raises:
-        RecipeError: the class states no kind, or another source has it.
+        RecipeError: the class has no kind, or another source has the same one.
     """
     kinds = get_args(source.model_fields["kind"].annotation)
     if len(kinds) != 1:
         raise RecipeError(
-            f"{source.__name__}: a Literal of one kind was wanted; declare it such as "
-            'kind: Literal["backlash"] = "backlash".'
+            option=source.__name__,
+            expected="a Literal of one kind",
+            value=len(kinds),
+            remedy='declare it, such as kind: Literal["backlash"] = "backlash"',
         )
     if ERROR_SOURCES.setdefault(kinds[0], source) is not source:
         raise RecipeError(
-            f"{source.__name__}: the kind '{kinds[0]}' is that of {ERROR_SOURCES[kinds[0]].__name__}; name yours "
-            "otherwise."
+            f"the kind '{kinds[0]}' is that of {ERROR_SOURCES[kinds[0]].__name__}",
+            option=source.__name__,
+            value=kinds[0],
+            remedy="choose another name",
         )
     return source
 
 
 class TrueRobotSection(Section):
-    """The part of a recipe that states the true robot, completely.
+    """Recipe section of the true robot.
 
     Attributes:
         robot: catalogue name or robot file of the nominal robot.
-        errors: what is wrong with the true one; they add up.
+        errors: error sources of the true robot, which are added.
     """
 
     robot: str
     errors: tuple[ErrorSource, ...] = ()
 
     def true_robot(self) -> "TrueRobot":
-        """The true robot.
+        """Return the true robot.
 
         Raises:
             RobotError: there is no such robot.
@@ -100,20 +104,20 @@ class TrueRobotSection(Section):
 
 @dataclass(frozen=True, eq=False)
 class TrueRobot:
-    """A robot as it really is: `T_base_tool = FK(q + Σ e_i(q) - half_play · approach; nominal geometry + Σ changes)`.
+    """A true robot: `T_base_tool = FK(q + Σ e_i(q) - half_play · approach; nominal geometry + Σ changes)`.
 
-    The approach of a joint is +1 where its value grew before it stopped, -1 where it fell, and 0, the middle of its
-    play, where that is not stated.
+    The approach of a joint is +1 if its value increased before it stopped, -1 if it decreased, and 0, the middle of its
+    play, if it is not given.
 
-    Every joint error e_i, the rounding of the encoder among them, is evaluated at the commanded joints q and
-    on the nominal geometry, and then all are added. So their order does not matter, and the effect of one
-    source does not depend on the others.
+    Every joint error e_i, including the rounding of the encoder, is evaluated at the commanded joints q and on the
+    nominal geometry, and all are added. Their order therefore does not matter, and the effect of one source does not
+    depend on the others.
 
     Attributes:
-        nominal: the robot as drawn.
+        nominal: the nominal robot.
         errors: the error sources.
-        geometry: the robot with the true geometric parameters; takes actual joint values.
-        half_play: `(dof,)`, how far every joint stops short of the commanded value [rad or m].
+        geometry: the robot with the true geometric parameters, for actual joint values.
+        half_play: `(dof,)`, distance by which every joint stops short of the commanded value [rad or m].
     """
 
     nominal: Robot
@@ -123,7 +127,7 @@ class TrueRobot:
     _joint_errors: tuple[JointErrorFunction, ...] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        """Add the geometric errors up and bind the joint errors to the robot."""
+        """Add up the geometric errors and bind the joint errors to the robot."""
         dh, base, tool = self.nominal.dh.copy(), self.nominal.base.copy(), self.nominal.tool.copy()
         joint_errors: list[JointErrorFunction] = []
         half_play = torch.zeros(self.nominal.dof, dtype=torch.float64)
@@ -141,7 +145,10 @@ class TrueRobot:
             joint_errors.append(source.bind(self.nominal, place))
             if twice := sorted(stepped & source.stepped_joints):
                 raise RecipeError(
-                    f"{place}: joint '{twice[0]}' has an encoder already; state one of the two."
+                    f"joint '{twice[0]}' already has an encoder",
+                    option=place,
+                    value=twice[0],
+                    remedy="keep one of them",
                 )
             stepped |= source.stepped_joints
         object.__setattr__(self, "errors", tuple(self.errors))
@@ -151,17 +158,17 @@ class TrueRobot:
 
     @property
     def has_encoder(self) -> bool:
-        """Whether a joint moves in steps."""
+        """Whether a joint has encoder steps."""
         return any(_steps(source) for source in self.errors)
 
     def without_encoder(self) -> "TrueRobot":
-        """The same robot, its joints moving continuously."""
+        """Return the same robot without encoder steps."""
         return replace(self, errors=[source for source in self.errors if not _steps(source)])
 
     def draw_approach(self, q: Float64[Tensor, "rows dof"]) -> Float64[Tensor, "rows dof"] | None:
-        """From which side every joint comes, +1 or -1 at random; None where no joint has play.
+        """Return random directions of approach of every joint, +1 or -1; None if no joint has play.
 
-        It is the same at every call: drawn with the seeds of the sources and the joint values.
+        They are the same at every call, as the seed depends only on the sources' seeds and the joint values.
         """
         if not bool(self.half_play.any()):
             return None
@@ -173,11 +180,11 @@ class TrueRobot:
     def joint_error(
         self, q: Float[Tensor, "*batch dof"], approach: Float[Tensor, "*batch dof"] | None = None
     ) -> Float[Tensor, "*batch dof"]:
-        """How far the joints end up from where they are commanded: actual minus commanded [rad or m].
+        """Return actual minus commanded joint values [rad or m].
 
         Args:
-            q: commanded joint values [rad or m], as the controller counts.
-            approach: from which side every joint comes; None for the middle of all play.
+            q: commanded joint values [rad or m], as the controller counts them.
+            approach: direction of approach of every joint; None for the middle of all play.
 
         Raises:
             PoseError: q has another number of columns than the robot has joints.
@@ -191,81 +198,86 @@ class TrueRobot:
     def actual_joints(
         self, q: Float[Tensor, "*batch dof"], approach: Float[Tensor, "*batch dof"] | None = None
     ) -> Float[Tensor, "*batch dof"]:
-        """Where the joints end up [rad or m] when commanded to q: `q + joint_error(q, approach)`."""
+        """Return the actual joint values [rad or m] when commanded to q: `q + joint_error(q, approach)`."""
         return q + self.joint_error(q, approach)
 
     def forward(
         self, q: Float[Tensor, "*batch dof"], approach: Float[Tensor, "*batch dof"] | None = None
     ) -> Float[Tensor, "*batch 4 4"]:
-        """T_base_tool that the robot really takes when commanded to q [rad or m]; no measurement noise.
+        """Return the true T_base_tool when commanded to q [rad or m], without measurement noise.
 
         Args:
             q: commanded joint values [rad or m].
-            approach: from which side every joint comes; None for the middle of all play.
+            approach: direction of approach of every joint; None for the middle of all play.
         """
         return forward_kinematics(self.geometry, self.actual_joints(q, approach))
 
     def commanded_joints(self, actual: Float[Tensor, "*batch dof"]) -> Float[Tensor, "*batch dof"]:
-        """What to command [rad or m] so that the joints end up at `actual`.
+        """Return the joint values to command [rad or m] such that the actual ones are `actual`.
 
-        Solves `q + joint_error(q) = actual` by `q <- actual - joint_error(q)` until q moves less than 1e-14
-        (16 machine epsilons in lower precision). This contracts by the slope of the joint errors, a few
-        percent.
+        Solves `q + joint_error(q) = actual` by the fixed-point iteration `q <- actual - joint_error(q)` until q changes
+        by less than 1e-14 (16 machine epsilons in lower precision). Its rate of convergence is the slope of the joint
+        errors, a few percent.
 
         Raises:
             PoseError: `actual` has another number of columns than the robot has joints.
-            UnreachablePoseError: the robot has encoder steps, or the errors are too steep to be undone.
+            UnreachablePoseError: the robot has encoder steps, or the errors are too steep to be inverted.
         """
         if self.has_encoder:
             raise UnreachablePoseError(
-                "the true robot has encoder steps and cannot end up just anywhere; take the encoder out of "
-                "its errors or use without_encoder()."
+                "the true robot has encoder steps and cannot reach arbitrary joint values",
+                option="errors",
+                value="encoder",
+                remedy="remove the encoder from its errors or use without_encoder()",
             )
         tolerance = max(1e-14, 16 * torch.finfo(actual.dtype).eps)
         q, moved = actual, torch.zeros_like(actual)
-        for _ in range(ITERATIONS):
+        for _ in range(MAX_ITERATIONS):
             following = actual - self.joint_error(q)
             moved, q = (following - q).abs(), following
             if bool((moved < tolerance).all()):
                 return q
         worst = self.nominal.joints[int(moved.reshape(-1, self.nominal.dof).amax(0).argmax())].name
         raise UnreachablePoseError(
-            f"no commanded joints found for the true robot in {ITERATIONS} iterations: joint '{worst}' still "
-            f"moves by {float(moved.max()):.1e}; its error changes faster than the joint itself, so reduce "
-            "amplitudes or compliances, and check that the joint values are finite."
+            f"joint '{worst}' of the true robot still moves by {float(moved.max()):.1e} rad or m after "
+            f"{MAX_ITERATIONS} iterations, as its error changes faster than the joint itself",
+            option="errors",
+            value=worst,
+            remedy="reduce amplitudes or compliances, and check that the joint values are finite",
         )
 
     def inverse(
         self, T: Float[Tensor, "*batch 4 4"], start: Float[Tensor, "*starts dof"]
     ) -> Float[Tensor, "*batch dof"]:
-        """Joint values [rad or m] to command so that the true robot takes the poses T.
+        """Return the joint values [rad or m] to command such that the true robot reaches the poses T.
 
-        First the actual joints on the true geometry, by Newton steps from `start` (so on its branch), then
-        the commanded ones. See `commanded_joints`.
+        The actual joint values are computed on the true geometry by Newton steps from `start` (on its branch), and
+        then the commanded ones, see `commanded_joints`.
 
         Args:
-            T: T_base_tool wanted.
+            T: desired T_base_tool.
             start: joint values near the solution, for example of the nominal inverse kinematics; broadcasts.
 
         Raises:
-            PoseError: T is no rigid transform, or `start` has another number of columns than the robot has
-                joints.
-            UnreachablePoseError: the true robot cannot take a pose, or not on this branch; or it has encoder
-                steps.
+            PoseError: T is not a rigid transform, or `start` has another number of columns than the robot has joints.
+            UnreachablePoseError: the true robot cannot reach a pose, or not on this branch; or it has encoder steps.
         """
         solution = solve_numeric(self.geometry, T, start)
         missed = solution.status == Status.NOT_CONVERGED
         if missed.any():
             index = tuple(missed.nonzero()[0].tolist())
+            number = index if len(index) != 1 else index[0]
             raise UnreachablePoseError(
-                f"the true robot does not reach the wanted pose at index {index if len(index) != 1 else index[0]}: "
+                f"the true robot does not reach pose {number} (from 0), with residuals of "
                 f"{float(solution.position_residual[index]) * 1e3:.3g} mm and "
-                f"{float(torch.rad2deg(solution.rotation_residual[index])):.3g} deg are left; "
-                f"{Status.NOT_CONVERGED.sentence}"
+                f"{float(torch.rad2deg(solution.rotation_residual[index])):.3g} deg",
+                option="T",
+                value=number,
+                remedy=Status.NOT_CONVERGED.sentence,
             )
         return self.commanded_joints(solution.q)
 
 
 def _steps(source: AbstractErrorSource) -> bool:
-    """Whether a joint moves in steps by this source."""
+    """Return whether a joint has encoder steps by this source."""
     return isinstance(source, AbstractJointSource) and bool(source.stepped_joints)

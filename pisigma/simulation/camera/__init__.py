@@ -1,1 +1,1 @@
-"""Cameras as error-prone sensors: which images they take of a board."""
+"""Simulated cameras: images of a board on a true robot."""

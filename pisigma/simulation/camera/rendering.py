@@ -1,4 +1,4 @@
-"""Images of a board, drawn pixel by pixel through the model of the camera."""
+"""Render images of a board pixel by pixel with the camera model."""
 
 from dataclasses import dataclass
 
@@ -11,40 +11,39 @@ from pisigma.measurement.camera.pattern import Pattern
 from pisigma.simulation.camera.true_board import TrueBoard
 
 NODE_STEP = 16
-"""[px] Rays are undistorted so far apart and splined between; a cubic errs by less than 1e-4 px."""
-SURFACE_STEPS = 4
-"""Fixed-point steps from the plane to a bowed surface, each of which shrinks the error to a few percent."""
+"""[px] Distance of the nodes at which rays are undistorted; the cubic spline between them is accurate to 1e-4 px."""
+SURFACE_ITERATIONS = 4
+"""Fixed-point iterations from the plane to a bowed surface, each of which reduces the error to a few percent."""
 SUBPIXELS = 4
-"""Of a pixel across an edge, each way."""
+"""Number of subpixels of a pixel across an edge, in each direction."""
 BLUR_LEVELS = 4
-"""Blurs between the sharpest and the least sharp part of an image, between which pixels interpolate."""
-SMALLEST_BLUR_STEP = 1e-3
-"""[px] Between the levels, for images of one blur."""
-SMALLEST_COSINE = 1e-9
-"""Between a ray and the board's normal; rays along the board meet it far away."""
+"""Number of blurred images from the sharpest to the most blurred part, between which pixels are interpolated."""
+MIN_BLUR_STEP = 1e-3
+"""[px] Smallest difference between the levels, for images of constant blur."""
+MIN_COSINE = 1e-9
+"""Lower bound of the cosine between a ray and the board's normal; rays along the board meet it far away."""
 FAR = 1e6
-"""[m] Where rays are taken to that never meet the board."""
+"""[m] Depth of rays that do not meet the board."""
 OUTLINE = 20
-"""Points of every edge of the sheet whose pixels bound the image of the board."""
+"""Number of points per edge of the sheet, whose pixels bound the image of the board."""
 
 
 @dataclass(frozen=True)
 class Exposure:
-    """How an image comes about.
+    """Light and optics of an image.
 
-    A lens of the aperture A that is focused at the distance F draws a point at the distance z as a disc of the
-    diameter `f A |1/z - 1/F|`, with f the focal length [px]; it is blurred here by a normal density of the same
-    variance.
+    A lens with the aperture A, focused at the distance F, images a point at the distance z as a disc with the diameter
+    `f A |1/z - 1/F|`, with f the focal length [px]; here it is a normal density with the same variance.
 
     Attributes:
         black: gray level of print, of 255.
         white: gray level of paper.
-        background: gray level of what is around the board.
-        blur: standard deviation of the blur where the image is in focus [px].
+        background: gray level around the board.
+        blur: standard deviation of the blur in focus [px].
         focus: distance in focus [m].
         aperture: diameter of the lens's opening [m].
-        vignetting: share of the light that the corners of the image lose.
-        gradient: change of the light from the left to the right edge of the image, over its mean.
+        vignetting: relative loss of light in the corners of the image.
+        gradient: change of the light from the left to the right edge of the image, relative to its mean.
         noise: standard deviation of the gray level of a pixel.
     """
 
@@ -66,14 +65,14 @@ def render_image(
     exposure: Exposure,
     rng: np.random.Generator,
 ) -> UInt8[np.ndarray, "height width"]:
-    """Draw the gray image that a camera takes of a board; nothing hides the board.
+    """Render the gray image that a camera takes of a board, without occlusions.
 
     Args:
-        camera: with its true intrinsics.
-        board: as it really is.
-        T_camera_board: where it is [m].
+        camera: the camera with its true intrinsics.
+        board: the true board.
+        T_camera_board: pose of the board [m].
         exposure: light and optics.
-        rng: of the noise.
+        rng: source of the noise.
 
     Returns:
         Gray levels from 0 to 255.
@@ -91,7 +90,7 @@ def render_image(
 
 
 def _blur(camera: Camera, exposure: Exposure, depth: np.ndarray) -> np.ndarray:
-    """Standard deviation of the blur [px] at a depth [m]; a disc's is a quarter of its diameter along each axis."""
+    """Return the standard deviation of the blur [px] at a depth [m]; that of a disc is a quarter of its diameter."""
     disc = camera.fx * exposure.aperture * np.abs(1 / depth - 1 / exposure.focus)
     blur: np.ndarray = np.hypot(exposure.blur, disc / 4)
     return blur
@@ -100,7 +99,7 @@ def _blur(camera: Camera, exposure: Exposure, depth: np.ndarray) -> np.ndarray:
 def _bounds(
     camera: Camera, board: TrueBoard, T_camera_board: np.ndarray, exposure: Exposure
 ) -> tuple[int, int, int, int]:
-    """First and last pixels that the board may touch, blurred; the whole image where its outline leaves the view."""
+    """Return the range of pixels that the blurred board covers; the whole image if its outline leaves the view."""
     left, top, right, bottom = board.pattern.sheet
     along = np.linspace(0, 1, OUTLINE)
     x, y = left + along * (right - left), top + along * (bottom - top)
@@ -113,7 +112,7 @@ def _bounds(
     if (points[:, 2] <= 0).any():
         return 0, 0, camera.width, camera.height
     pixels = camera.project(points)[0]
-    if (np.abs(pixels - size / 2) > size).any():  # so far out distortion may fold back
+    if (np.abs(pixels - size / 2) > size).any():  # far outside, the distortion is not monotonic
         return 0, 0, camera.width, camera.height
     margin = 2 + 4 * float(_blur(camera, exposure, points[:, 2]).max())
     first = np.maximum(np.floor(pixels.min(0) - margin), 0).astype(int)
@@ -133,13 +132,13 @@ def _rays(camera: Camera, u: np.ndarray, v: np.ndarray) -> Float64[np.ndarray, "
 def _on_surface(
     board: TrueBoard, T_camera_board: np.ndarray, rays: np.ndarray
 ) -> tuple[Float64[np.ndarray, "2 v u"], Float64[np.ndarray, "v u"]]:
-    """Where rays meet the board, in its frame [m], and how deep in the camera's [m]; far away where they do not."""
+    """Return where rays meet the board in its frame [m], and their depths [m]; `FAR` for those that do not."""
     R, t = T_camera_board[:3, :3], T_camera_board[:3, 3]
     origin = -R.T @ t
     along = [R[0, axis] * rays[0] + R[1, axis] * rays[1] + R[2, axis] for axis in range(3)]
-    facing = np.copysign(np.maximum(np.abs(along[2]), SMALLEST_COSINE), along[2])
+    facing = np.copysign(np.maximum(np.abs(along[2]), MIN_COSINE), along[2])
     depth = -origin[2] / facing
-    for _ in range(SURFACE_STEPS if board.bow else 0):
+    for _ in range(SURFACE_ITERATIONS if board.bow else 0):
         xy = np.stack([origin[axis] + depth * along[axis] for axis in (0, 1)], -1)
         depth = (board.height(xy) - origin[2]) / facing
     depth[depth <= 0] = FAR
@@ -147,7 +146,7 @@ def _on_surface(
 
 
 def _reflected(surface: "_Surface", xy: Float64[np.ndarray, "2 v u"]) -> Float64[np.ndarray, "v-1 u-1"]:
-    """Gray level of every pixel before the blur, averaged over its area, from what its four vertices show."""
+    """Return the gray level of every pixel before the blur, averaged over its area, by its four vertices."""
     cell = surface.cell(xy)
     gray: np.ndarray = surface.gray.ravel()[cell[:-1, :-1]]
     across = (cell[:-1, :-1] != cell[1:, 1:]) | (cell[:-1, 1:] != cell[1:, :-1])
@@ -174,8 +173,8 @@ class _Surface:
     Attributes:
         x: edges between columns of cells [m].
         y: edges between rows of cells [m].
-        gray: of every cell, those around the sheet among them.
-        integral: of gray less background over all that is left and above of every crossing of edges [m²].
+        gray: gray level of every cell, including those around the sheet.
+        integral: integral of gray minus background over the area left of and above every intersection of edges [m²].
         background: gray level around the sheet.
     """
 
@@ -187,7 +186,7 @@ class _Surface:
 
     @staticmethod
     def of(pattern: Pattern, exposure: Exposure) -> "_Surface":
-        """Paint the sheet, then what is printed on it."""
+        """Build the grid from the sheet and its printed pattern."""
         rectangles = np.concatenate([pattern.sheet[None], pattern.black])
         x, y = np.unique(rectangles[:, [0, 2]]), np.unique(rectangles[:, [1, 3]])
         columns, rows = np.searchsorted(x, rectangles[:, [0, 2]]), np.searchsorted(y, rectangles[:, [1, 3]])
@@ -200,13 +199,13 @@ class _Surface:
         return _Surface(x, y, gray, integral, exposure.background)
 
     def cell(self, xy: np.ndarray) -> np.ndarray:
-        """Number of the cell in which points are."""
+        """Return the number of the cell that contains a point."""
         column, row = np.searchsorted(self.x, xy[0]), np.searchsorted(self.y, xy[1])
         number: np.ndarray = row * self.gray.shape[1] + column
         return number
 
     def mean(self, xy: np.ndarray, half: np.ndarray) -> np.ndarray:
-        """Mean gray level of rectangles about points, half of whose sides are stated."""
+        """Return the mean gray level of rectangles with the centres `xy` and half the sides `half`."""
         (left, top), (right, bottom) = xy - half, xy + half
         total = self._integral(right, bottom) - self._integral(left, bottom)
         total -= self._integral(right, top) - self._integral(left, top)
@@ -214,7 +213,7 @@ class _Surface:
         return gray
 
     def _integral(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """Of gray levels left of x and above of y, bilinear within every cell."""
+        """Return the integral of gray levels left of x and above y, bilinear within every cell."""
         column, a = _cell(self.x, x)
         row, b = _cell(self.y, y)
         upper = (1 - a) * self.integral[row, column] + a * self.integral[row, column + 1]
@@ -224,15 +223,15 @@ class _Surface:
 
 
 def _cell(edges: np.ndarray, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Number of the cell in which a coordinate is, and how far in it, from 0 to 1."""
+    """Return the number of the cell that contains a coordinate, and the relative position in it, from 0 to 1."""
     at = np.clip(at, edges[0], edges[-1])
     index = np.clip(np.searchsorted(edges, at) - 1, 0, len(edges) - 2)
     return index, (at - edges[index]) / (edges[index + 1] - edges[index])
 
 
 def _blurred(sharp: np.ndarray, blur: np.ndarray) -> np.ndarray:
-    """Blur every pixel by its own standard deviation, between a few levels of blur for the whole."""
-    levels = np.linspace(blur.min(), max(blur.max(), blur.min() + SMALLEST_BLUR_STEP), BLUR_LEVELS)
+    """Blur every pixel by its standard deviation, interpolating between a few blurred images."""
+    levels = np.linspace(blur.min(), max(blur.max(), blur.min() + MIN_BLUR_STEP), BLUR_LEVELS)
     weight = (blur - levels[0]) / (levels[1] - levels[0])
     total = np.zeros_like(sharp)
     for number, level in enumerate(levels):
@@ -241,7 +240,7 @@ def _blurred(sharp: np.ndarray, blur: np.ndarray) -> np.ndarray:
 
 
 def _light(camera: Camera, exposure: Exposure) -> Float[np.ndarray, "height width"]:
-    """Light that reaches every pixel, over that of the middle of the image."""
+    """Return the light at every pixel, relative to that at the centre of the image."""
     u = (np.arange(camera.width, dtype=np.float32) + 0.5) / camera.width - 0.5
     v = (np.arange(camera.height, dtype=np.float32) + 0.5) / camera.height - 0.5
     radius = (u**2 * camera.width**2 + v[:, None] ** 2 * camera.height**2) * (

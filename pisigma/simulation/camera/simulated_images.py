@@ -1,4 +1,4 @@
-"""The part of a recipe that states which images a camera takes on the true robot."""
+"""Recipe section of the images that a camera takes on the true robot."""
 
 import os
 from collections.abc import Iterator, Sequence
@@ -30,22 +30,22 @@ from pisigma.simulation.camera.true_board import TrueBoard
 from pisigma.simulation.true_robot import TrueRobot
 
 CANDIDATES = 8
-"""For each view, of which those are taken that are far apart in joint space."""
-ATTEMPTS = 100
-"""For each candidate, of which some cannot be reached."""
-STATED = ("joints.csv", "camera.yaml", "board.yaml")
+"""Number of candidates per view, of which those far apart in joint space are chosen."""
+MAX_ATTEMPTS = 100
+"""Number of draws per candidate, as some cannot be reached."""
+GIVEN_FILES = ("joints.csv", "camera.yaml", "board.yaml")
 
 
 class RandomViews(Section):
-    """Random views of a whole board, by random branches, of which those are taken that are far apart.
+    """Random views of a complete board on random branches, far apart in joint space.
 
-    Of all candidates, each joint vector is the one farthest from those before it, in sines and cosines.
+    Every joint vector is the candidate that is farthest from the previous ones, in sines and cosines.
 
     Attributes:
-        count: how many.
-        seed: of the generator.
-        distance_mm: nearest and farthest distance of the camera from the middle of the board [mm].
-        oblique_deg: largest angle between the camera's axis and the board's [deg].
+        count: number of views.
+        seed: random seed.
+        distance_mm: smallest and largest distance of the camera from the centre of the board [mm].
+        oblique_deg: largest angle between the axes of camera and board [deg].
     """
 
     count: Count
@@ -56,21 +56,21 @@ class RandomViews(Section):
     def joints(
         self, robot: Robot, camera: Camera, board: Board, is_fixed: bool = False
     ) -> Float64[Tensor, "count dof"]:
-        """Joint values to command [rad or m]; the same at every call.
+        """Return joint values to command [rad or m], the same at every call.
 
         Args:
-            robot: whose base and tool lead from the board to the base and from the flange to the camera (of a fixed
-                camera: from the camera to the base, and from the flange to the board).
-            camera: that has the whole board in view, with its squares' rim.
-            board: that is looked at from its printed side, from which its z axis points away.
-            is_fixed: whether the camera is fixed and the board on the flange.
+            robot: the robot, with its base from the board to the base and its tool from the flange to the camera (for
+                a fixed camera: from the camera to the base, and from the flange to the board).
+            camera: the camera, which has the complete board in view with half a square around its corners.
+            board: the board, seen from its printed side, with its z axis pointing away.
+            is_fixed: whether the camera is fixed and the board is on the flange.
 
         Raises:
-            RecipeError: the robot has no closed form, or does not reach so many views.
+            RecipeError: the robot has no closed form, or does not reach as many views.
         """
         solver, rng = self.check(robot), np.random.default_rng(self.seed)
-        chosen, wanted = list[Tensor](), CANDIDATES * self.count
-        for _ in range(ATTEMPTS * wanted):
+        chosen, needed = list[Tensor](), CANDIDATES * self.count
+        for _ in range(MAX_ATTEMPTS * needed):
             T_board_camera = self._view(board, rng)
             T_camera_board = invert(T_board_camera)
             if not _is_whole(camera, board, T_camera_board.numpy()):
@@ -79,15 +79,17 @@ class RandomViews(Section):
             reached = branches.q[branches.status == Status.REACHED]
             if len(reached):
                 chosen.append(reached[rng.integers(len(reached))])
-            if len(chosen) == wanted:
+            if len(chosen) == needed:
                 return far_apart(torch.stack(chosen), self.count)
         raise RecipeError(
-            f"views of a board: robot '{robot.name}' reaches {len(chosen)} of {ATTEMPTS * wanted} drawn views, but "
-            f"{wanted} were wanted; check where board and camera are, and the distances."
+            option="poses",
+            expected=f"{needed} of {MAX_ATTEMPTS * needed} drawn views of the board that robot '{robot.name}' reaches",
+            value=len(chosen),
+            remedy="check the positions of board and camera, and the distances",
         )
 
     def check(self, robot: Robot) -> AbstractClosedForm:
-        """Return the closed form by which views are reached.
+        """Return the closed-form inverse kinematics for the views.
 
         Raises:
             RecipeError: the robot has none.
@@ -95,8 +97,10 @@ class RandomViews(Section):
         solver = closed_form_solver(robot)
         if solver is None:
             raise RecipeError(
-                f"views of a board are for robots with a closed form, which robot '{robot.name}' does not have; "
-                "simulate a tracker with joints_random instead."
+                option="poses",
+                expected="a robot with a closed form, for views of a board",
+                value=robot.name,
+                remedy="simulate a tracker with joints_random instead",
             )
         return solver
 
@@ -111,7 +115,7 @@ class RandomViews(Section):
 
 
 def _is_whole(camera: Camera, board: Board, T_camera_board: Float64[np.ndarray, "4 4"]) -> bool:
-    """Whether all of a board is in view up to half a square beyond its corners."""
+    """Return whether the complete board is in view, with half a square around its corners."""
     corners = board.corners
     out = corners + board.square / 2 * np.sign(corners - corners.mean(0))
     pixels = camera.project(out @ T_camera_board[:3, :3].T + T_camera_board[:3, 3])[0]
@@ -133,9 +137,9 @@ class CornerNoise(Section):
 
     Attributes:
         corner_px: standard deviation of u and v of every corner [px].
-        repeatability_mm: of the robot's position, per axis [mm].
-        repeatability_deg: of its orientation, about each axis [deg].
-        seed: of the generator.
+        repeatability_mm: standard deviation of the robot's position per axis [mm].
+        repeatability_deg: standard deviation of the robot's orientation about each axis [deg].
+        seed: random seed.
     """
 
     corner_px: float = Field(default=0.3, ge=0)
@@ -145,16 +149,16 @@ class CornerNoise(Section):
 
     @property
     def repeatability(self) -> Repeatability:
-        """Of the robot, in SI units."""
+        """Repeatability of the robot in SI units."""
         return Repeatability(self.repeatability_mm / 1e3, float(np.deg2rad(self.repeatability_deg)))
 
 
 class BoardErrors(Section):
-    """By how much a board differs from what is stated of it.
+    """Differences of the true board from the given one.
 
     Attributes:
-        scale_percent: by how much all of its lengths are larger [%].
-        bow_mm: by how much its farthest corners stand out of the plane at its middle [mm].
+        scale_percent: relative error of all of its lengths [%].
+        bow_mm: height of its farthest corners above the plane at its centre [mm].
     """
 
     scale_percent: float = Field(default=0.0, gt=-100)
@@ -165,7 +169,7 @@ class LateJoints(Section):
     """Joint values of a moving arm that are read after the image was taken.
 
     Attributes:
-        delay_ms: from the image to the reading [ms].
+        delay_ms: delay from the image to the reading [ms].
         speed_deg_per_s: standard deviation of the speed of every joint, which is revolute [deg/s].
     """
 
@@ -174,21 +178,21 @@ class LateJoints(Section):
 
 
 class SimulatedImages(Section):
-    """The part of a recipe that states what a camera sees of a board.
+    """Recipe section of a camera that takes images of a board.
 
-    The base of the true robot (an error of the recipe) leads from the board to the robot, and its tool from the flange
-    to the camera; of a fixed camera, from the camera to the robot and from the flange to the board. Joints with play
-    stop in its middle.
+    The base of the true robot (an error source of the recipe) is the transform from the board to the robot, and its
+    tool that from the flange to the camera; for a fixed camera, from the camera to the robot and from the flange to the
+    board. Joints with play stop in its middle.
 
     Attributes:
         kind: "images".
-        poses: from where the camera looks at the board.
-        camera: as its file would state it.
-        board: as its file would state it.
-        noise: of corners and robot.
-        camera_errors: true minus stated intrinsics.
-        board_errors: of size and flatness.
-        late_joints: joint values that are read late; left out, they are those of the image.
+        poses: views of the board.
+        camera: the given camera, as in its file.
+        board: the given board, as in its file.
+        noise: noise of corners and robot.
+        camera_errors: true minus given intrinsics.
+        board_errors: errors of size and flatness.
+        late_joints: joint values that are read after the image; those of the image by default.
     """
 
     kind: Literal["images"]
@@ -202,12 +206,12 @@ class SimulatedImages(Section):
 
     @property
     def frame(self) -> str:
-        """In which the rows are."""
+        """Frame of the rows."""
         return self.camera.name if self.camera.is_fixed else self.board.name
 
     @property
     def target(self) -> str:
-        """Whose poses the rows are."""
+        """Target of the rows."""
         return self.board.name if self.camera.is_fixed else self.camera.name
 
     def measure(self, robot: TrueRobot) -> Measurements:
@@ -221,11 +225,11 @@ class SimulatedImages(Section):
         return image_measurements(images, *stated, is_fixed, self.noise.repeatability)
 
     def joints_read(self, robot: TrueRobot) -> Float64[Tensor, "images dof"]:
-        """Joint values that are read for the images [rad or m]."""
+        """Return the joint values that are read for the images [rad or m]."""
         return self._read(self._joints(robot))
 
     def rendered(self, robot: TrueRobot) -> Iterator[UInt8[np.ndarray, "height width"]]:
-        """Draw the images pixel by pixel, the same at every call; corners have what noise their detection leaves."""
+        """Render the images pixel by pixel, the same at every call; the noise of corners is that of their detection."""
         camera, board = self._true()
         q, rng = robot.actual_joints(self._joints(robot)), np.random.default_rng(self.noise.seed)
         poses = draw_board_poses(
@@ -250,7 +254,7 @@ class SimulatedImages(Section):
         return q + late * torch.randn(q.shape, generator=generator, dtype=torch.float64)
 
     def _true(self) -> tuple[Camera, TrueBoard]:
-        """The camera and the board as they really are."""
+        """Return the true camera and the true board."""
         stated = self.camera.camera()
         camera = stated.with_intrinsics(stated.intrinsics + np.array(self.camera_errors.numbers))
         errors = self.board_errors
@@ -259,11 +263,11 @@ class SimulatedImages(Section):
 
 @dataclass(frozen=True)
 class ImageNoise:
-    """What is uncertain in every image.
+    """Noise of an image.
 
     Attributes:
         corner: standard deviation of u and v of every corner [px].
-        repeatability: of the robot's pose, the same for all corners of an image.
+        repeatability: repeatability of the robot's pose, which is common to all corners of an image.
     """
 
     corner: float = 0.3
@@ -277,27 +281,27 @@ def draw_board_poses(
     generator: torch.Generator,
     is_fixed: bool = False,
 ) -> Float64[Tensor, "images 4 4"]:
-    """Return T_camera_board of images that a true robot stops for.
+    """Return T_camera_board of the images of a true robot, with its repeatability.
 
     Args:
-        robot: true arm; base and tool lead from the board to the base and from the flange to the camera (of a fixed
-            camera: from the camera to the base, and from the flange to the board).
+        robot: the true arm, with its base from the board to the base and its tool from the flange to the camera (for a
+            fixed camera: from the camera to the base, and from the flange to the board).
         q: joint values of the images [rad or m].
-        repeatability: of the robot.
-        generator: of the poses' errors.
-        is_fixed: whether the camera is fixed and the board on the flange.
+        repeatability: repeatability of the robot.
+        generator: source of the pose errors.
+        is_fixed: whether the camera is fixed and the board is on the flange.
     """
     T = forward_kinematics(robot, q)
-    turn, shift = (torch.randn((len(q), 3), generator=generator, dtype=torch.float64) for _ in range(2))
-    turned = rotation_from_vector(repeatability.angle * turn) @ T[:, :3, :3]
-    T = transform(turned, T[:, :3, 3] + repeatability.length * shift)
+    vector, shift = (torch.randn((len(q), 3), generator=generator, dtype=torch.float64) for _ in range(2))
+    R = rotation_from_vector(repeatability.angle * vector) @ T[:, :3, :3]
+    T = transform(R, T[:, :3, 3] + repeatability.length * shift)
     return T if is_fixed else invert(T)
 
 
 def project_corners(
     camera: Camera, board: Board | TrueBoard, T_camera_board: Float64[Tensor, "images 4 4"]
 ) -> tuple[Float64[np.ndarray, "images corners 2"], Bool[np.ndarray, "images corners"]]:
-    """Return where corners appear [px], and which of them are in front of the camera and inside of its images."""
+    """Return the pixels of corners [px], and which of them are in front of the camera and inside its images."""
     corners = torch.from_numpy(board.corners)
     points = (corners @ T_camera_board[:, :3, :3].mT + T_camera_board[:, None, :3, 3]).numpy()
     pixels = camera.project(points)[0]
@@ -317,16 +321,16 @@ def simulate_images(
     """Project the corners of a board into the images of a camera.
 
     Args:
-        robot: true arm; see `draw_board_poses`.
+        robot: the true arm, see `draw_board_poses`.
         q: joint values of the images [rad or m].
-        camera: that takes them.
-        board: that they show.
-        noise: of corners and robot.
-        generator: of the noise.
-        is_fixed: whether the camera is fixed and the board on the flange.
+        camera: the camera.
+        board: the board.
+        noise: noise of corners and robot.
+        generator: source of the noise.
+        is_fixed: whether the camera is fixed and the board is on the flange.
 
     Returns:
-        The corners that are in front of the camera and inside of its images.
+        The corners that are in front of the camera and inside its images.
     """
     T_camera_board = draw_board_poses(robot, q, noise.repeatability, generator, is_fixed)
     pixels, inside = project_corners(camera, board, T_camera_board)
@@ -339,24 +343,24 @@ def simulate_images(
 def images_of(
     q: Float64[Tensor, "images dof"], corners: Sequence[np.ndarray], pixels: Sequence[np.ndarray]
 ) -> Images:
-    """Gather simulated corners, image by image.
+    """Return simulated corners, image by image.
 
     Args:
         q: joint values of every image [rad or m].
-        corners: numbers of the corners that every image shows.
-        pixels: where it shows them [px].
+        corners: numbers of the corners in every image.
+        pixels: their pixels [px].
     """
     names = tuple(f"{number:04d}" for number in range(len(q)))
     return Images("simulated images", names, q, (0,) * len(q), tuple(corners), tuple(pixels))
 
 
 def write_images(images: SimulatedImages, robot: TrueRobot, folder: str | os.PathLike[str]) -> int:
-    """Render images as `0000.png` and so on, beside `joints.csv`, `camera.yaml` and `board.yaml` as stated.
+    """Render images as `0000.png` and so on, with the given `joints.csv`, `camera.yaml` and `board.yaml`.
 
     Args:
-        images: of a recipe.
-        robot: true robot.
-        folder: to write, whole or not at all; it does not exist or is empty.
+        images: section of a recipe.
+        robot: the true robot.
+        folder: folder to write, completely or not at all; it must not exist or be empty.
 
     Returns:
         The number of images.
@@ -369,14 +373,14 @@ def write_images(images: SimulatedImages, robot: TrueRobot, folder: str | os.Pat
     names = [f"q{joint + 1}_{axis.file_unit}" for joint, axis in enumerate(axes)]
     lines = [",".join(("image", *names))]
     files = [f"{number:04d}.png" for number in range(images.poses.count)]
-    with staged_folder(folder, names=(*files, *STATED)) as scratch:
+    with staged_folder(folder, names=(*files, *GIVEN_FILES)) as scratch:
         q = robot.nominal.to_controller(images.joints_read(robot)).numpy()
         for file, joints, image in zip(files, q, images.rendered(robot), strict=True):
             Image.fromarray(image).save(scratch / file)
             shown = (axis.in_file_unit(float(value)) for axis, value in zip(axes, joints, strict=True))
             lines.append(",".join((file, *(f"{value:.9f}" for value in shown))))
-        (scratch / STATED[0]).write_text("\n".join(lines) + "\n", encoding="utf-8")
-        for document, name in zip((images.camera, images.board), STATED[1:], strict=True):
+        (scratch / GIVEN_FILES[0]).write_text("\n".join(lines) + "\n", encoding="utf-8")
+        for document, name in zip((images.camera, images.board), GIVEN_FILES[1:], strict=True):
             stated = document.model_dump(mode="json", exclude_unset=True)
             (scratch / name).write_text(yaml_text(stated), encoding="utf-8")
     return len(q)

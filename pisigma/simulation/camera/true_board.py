@@ -1,4 +1,4 @@
-"""A board as it really is: larger or smaller than stated, and bowed."""
+"""A true board: larger or smaller than given, and bowed."""
 
 from dataclasses import dataclass
 
@@ -11,14 +11,14 @@ from pisigma.measurement.camera.pattern import Pattern, board_pattern
 
 @dataclass(frozen=True)
 class TrueBoard:
-    """A printed board that differs from what is stated of it.
+    """A printed board that differs from the given one.
 
-    Its surface is `z = bow · r² / R²` with r the distance from the middle of the corners and R that of the farthest.
+    Its surface is `z = bow · r² / R²` with r the distance from the centre of the corners and R that of the farthest.
 
     Attributes:
-        stated: the board as its file states it.
-        scale: true over stated lengths.
-        bow: by how much the farthest corners stand out of the plane at the middle [m], along z.
+        stated: the given board.
+        scale: true lengths relative to given ones.
+        bow: height of the farthest corners above the plane at the centre [m], along z.
     """
 
     stated: Board
@@ -27,18 +27,18 @@ class TrueBoard:
 
     @property
     def corners(self) -> Float64[np.ndarray, "corners 3"]:
-        """Where the corners really are in the board's frame [m]."""
+        """True positions of the corners in the board's frame [m]."""
         flat = self.scale * self.stated.corners[:, :2]
         return np.concatenate([flat, self.height(flat)[:, None]], 1)
 
     @property
     def pattern(self) -> Pattern:
-        """What is printed on it, at its true size."""
+        """The printed pattern, at its true size."""
         stated = board_pattern(self.stated)
         return Pattern(self.scale * stated.black, self.scale * stated.sheet)
 
     def height(self, xy: Float64[np.ndarray, "*batch 2"]) -> Float64[np.ndarray, "*batch"]:
-        """Return z of the surface [m] over points of the plane [m]."""
+        """Return z of the surface [m] at points of the plane [m]."""
         corners = self.scale * self.stated.corners[:, :2]
         middle = corners.mean(0)
         farthest = np.square(corners - middle).sum(1).max()

@@ -1,1 +1,1 @@
-"""Error sources: what makes a true robot differ from the nominal one, one file each."""
+"""Error sources: differences of a true robot from the nominal one, one file each."""

@@ -1,4 +1,4 @@
-"""Backlash: joints that lie on the side of their play from which they come."""
+"""Backlash: joints that stop on the side of their play from which they approach."""
 
 from typing import Annotated, Literal
 
@@ -12,20 +12,20 @@ from pisigma.simulation.errors.source import AbstractPlaySource, joint_values
 
 
 class Backlash(AbstractPlaySource):
-    """Every joint stops short by half of its play: `e_j = -play_j / 2 · approach_j`.
+    """Backlash by which every joint stops short by half of its play: `e_j = -play_j / 2 · approach_j`.
 
-    The approach is +1 where the joint's value grew before it stopped and -1 where it fell. Simulated trackers and
+    The approach is +1 if the joint's value increased before it stopped and -1 if it decreased. Simulated trackers and
     distances draw it at random for every row and joint, and state it; touches and sockets, which are approached until
-    they fit, take the middle of the play.
+    they fit, are in the middle of the play.
 
     Source: Whitney, Lozinski and Rourke, "Industrial robot forward calibration method and results", ASME
     Journal of Dynamic Systems, Measurement, and Control 108(1), 1986, 1-8.
 
     Attributes:
         kind: "backlash".
-        play_deg: by name of a revolute joint, its whole play [deg]; an arc minute is 0.0167.
-        play_mm: by name of a prismatic joint [mm].
-        seed: of the approaches.
+        play_deg: full play by name of a revolute joint [deg]; an arc minute is 0.0167.
+        play_mm: full play by name of a prismatic joint [mm].
+        seed: random seed of the directions of approach.
     """
 
     kind: Literal["backlash"]

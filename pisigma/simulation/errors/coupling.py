@@ -1,4 +1,4 @@
-"""A coupling that is not quite what the controller assumes: factors, and lengths of a linkage."""
+"""Errors of a coupling of joints: its factors, and lengths of its linkage."""
 
 from dataclasses import replace
 from typing import Literal
@@ -8,30 +8,35 @@ from jaxtyping import Float
 from pydantic import Field
 from torch import Tensor
 
-from pisigma.files.errors import RecipeError, RobotError
+from pisigma.files.errors import RecipeError, RobotError, nearest_choice
 from pisigma.robot.coupling_section import CoupledJointSection, coupled, coupling_document
 from pisigma.robot.description import Robot
 from pisigma.simulation.errors.source import AbstractJointSource, JointErrorFunction
 
 
 class CouplingDeviation(AbstractJointSource):
-    """Joints follow the controller's values by another coupling than the one in the robot's file.
+    """A true coupling of joints that differs from that of the robot's file.
 
-    `e = f_true(C_true q + b_true) - f(C q + b)` with q the controller's values: gears of another ratio, and the bars of
-    a parallelogram that are not equally long, so that it is a general four-bar linkage.
+    `e = f_true(C_true q + b_true) - f(C q + b)` with q the controller's values: gears with another ratio, or a
+    parallelogram with bars of different lengths, which is a general four-bar linkage.
 
     Attributes:
         kind: "coupling".
-        coupling: entries in the place of those of the robot's file, of the same joints.
+        coupling: entries that replace those of the robot's file for the same joints.
     """
 
     kind: Literal["coupling"]
     coupling: tuple[CoupledJointSection, ...] = Field(min_length=1)
 
     def bind(self, robot: Robot, place: str) -> JointErrorFunction:
-        """The differences as a function of the joint values. See `AbstractJointSource.bind`."""
+        """Return the differences as a function of the joint values. See `AbstractJointSource.bind`."""
         if robot.coupling is None:
-            raise RecipeError(f"{place}: robot '{robot.name}' has no coupled joints; leave the source out.")
+            raise RecipeError(
+                f"robot '{robot.name}' has no coupled joints",
+                option=place,
+                value=robot.name,
+                remedy="leave out the source",
+            )
         stated = {section.joint: section for section in self.coupling}
         nominal = {
             section.joint: section
@@ -41,7 +46,10 @@ class CouplingDeviation(AbstractJointSource):
         }
         if other := sorted(stated.keys() - nominal.keys()):
             raise RecipeError(
-                f"{place}: joint '{other[0]}' of robot '{robot.name}' is not coupled; name one that is."
+                f"joint '{other[0]}' of robot '{robot.name}' is not coupled",
+                option=place,
+                value=other[0],
+                remedy=nearest_choice(other[0], nominal),
             )
         limited = {axis.name: axis for axis in robot.axes}
         rows = [

@@ -1,4 +1,4 @@
-"""Wrong geometry of links, base and tool: every error stated, or drawn at random."""
+"""Errors of the geometry of links, base and tool: given, or random."""
 
 from typing import Literal
 
@@ -14,11 +14,11 @@ from pisigma.simulation.errors.source import AbstractGeometrySource, GeometryCha
 
 
 class GeometricDeviation(AbstractGeometrySource):
-    """Geometric parameters that differ from the drawing.
+    """Given errors of geometric parameters.
 
-    `dh_true = dh_nominal + rows`, `base_true = base_nominal + base`, `tool_true = tool_nominal + tool`: every
+    `dh_true = dh_nominal + rows`, `base_true = base_nominal + base`, `tool_true = tool_nominal + tool`, for every
     parameter of `A_i = RotZ(theta) Trans(a, 0, d) RotX(alpha) RotY(beta)` and of base and tool
-    `Trans(x, y, z) RotZ(roll) RotY(pitch) RotX(yaw)` by itself.
+    `Trans(x, y, z) RotZ(roll) RotY(pitch) RotX(yaw)`.
 
     Source: Hayati and Mirmirani, "Improving the absolute positioning accuracy of robot manipulators",
     Journal of Robotic Systems 2(4), 1985, 397-413, whose extra rotation beta keeps near-parallel axes
@@ -26,9 +26,9 @@ class GeometricDeviation(AbstractGeometrySource):
 
     Attributes:
         kind: "geometric".
-        rows: by row name, what is added to theta, alpha, beta [deg] and d, a [mm].
-        base: what is added to x, y, z [mm], roll, pitch, yaw [deg] of the base.
-        tool: the same for the tool.
+        rows: errors of theta, alpha, beta [deg] and d, a [mm], by row name.
+        base: errors of x, y, z [mm], roll, pitch, yaw [deg] of the base.
+        tool: errors of the tool, as of the base.
     """
 
     kind: Literal["geometric"]
@@ -37,7 +37,7 @@ class GeometricDeviation(AbstractGeometrySource):
     tool: FrameSection = FrameSection()
 
     def change(self, robot: Robot, place: str) -> GeometryChange:
-        """The stated errors in SI. See `AbstractGeometrySource.change`."""
+        """Return the given errors in SI units. See `AbstractGeometrySource.change`."""
         dh = np.zeros_like(robot.dh)
         for name, error in self.rows.items():
             dh[row_index(robot, name, place)] = error.to_si()
@@ -49,12 +49,11 @@ _LENGTH_IN_FRAME = np.array([True, True, True, False, False, False])
 
 
 class RandomGeometricDeviation(AbstractGeometrySource):
-    """Every geometric parameter differs from the drawing by its own random error.
+    """Independent random errors of all geometric parameters.
 
-    `p_true = p_nominal + s · u`, with s the stated size for lengths or angles and u uniform in [-1, 1), or
-    standard normal. From one generator with `seed`, (rows, 5) values are drawn for the DH rows (theta, d, a,
-    alpha, beta), then 6 for the base and 6 for the tool, whatever their sizes, so that a size of 0 leaves the
-    others as they are.
+    `p_true = p_nominal + s · u`, with s the size for lengths or angles and u uniform in [-1, 1), or standard normal.
+    From one generator with `seed`, (rows, 5) values are drawn for the DH rows (theta, d, a, alpha, beta), then 6 for
+    the base and 6 for the tool, also for sizes of 0, so that the errors of other parameters do not depend on them.
 
     Source: the parameters are those of Hayati and Mirmirani, Journal of Robotic Systems 2(4), 1985,
     397-413; random errors on all of them are the usual way to test an identification, for example in
@@ -63,7 +62,7 @@ class RandomGeometricDeviation(AbstractGeometrySource):
     Attributes:
         kind: "geometric_random".
         distribution: "uniform" (sizes are bounds) or "normal" (sizes are standard deviations).
-        seed: of the generator.
+        seed: random seed.
         length_mm: size for d and a [mm].
         angle_deg: size for theta, alpha and beta [deg].
         base_length_mm: size for x, y, z of the base [mm].
@@ -83,7 +82,7 @@ class RandomGeometricDeviation(AbstractGeometrySource):
     tool_angle_deg: float = Field(default=0.0, ge=0)
 
     def change(self, robot: Robot, place: str) -> GeometryChange:
-        """The drawn errors in SI, the same at every call. See `AbstractGeometrySource.change`."""
+        """Return the random errors in SI units, the same at every call. See `AbstractGeometrySource.change`."""
         generator = torch.Generator().manual_seed(self.seed)
         dh = self._draw(generator, len(robot.rows), 5)
         base, tool = self._draw(generator, 6), self._draw(generator, 6)

@@ -1,4 +1,4 @@
-"""Guides that are not straight: joints that err slowly along the travel of an axis."""
+"""Errors of a linear guide: joint errors that vary slowly along the travel of an axis."""
 
 from typing import Literal
 
@@ -18,10 +18,10 @@ class GuideWave(Section):
     """One wave `amplitude · sin(harmonic · pi · q / travel + phase)` of one joint's error.
 
     Attributes:
-        joint: that errs.
-        amplitude_deg: of a joint that turns [deg].
-        amplitude_mm: of a joint that slides [mm].
-        harmonic: half waves along the travel.
+        joint: joint with the error.
+        amplitude_deg: amplitude of a revolute joint [deg].
+        amplitude_mm: amplitude of a prismatic joint [mm].
+        harmonic: number of half waves along the travel.
         phase_deg: phase [deg].
     """
 
@@ -35,23 +35,23 @@ class GuideWave(Section):
     def _one_amplitude(self) -> "GuideWave":
         if (self.amplitude_deg is None) == (self.amplitude_mm is None):
             raise ValueError(
-                "state either amplitude_deg (joint that turns) or amplitude_mm (joint that slides)"
+                "expected either amplitude_deg (revolute joint) or amplitude_mm (prismatic joint)"
             )
         return self
 
 
 class Guide(AbstractJointSource):
-    """Straightness and yaw of a rail along its travel, as errors of joints that follow it.
+    """Straightness and angular errors of a rail along its travel, as errors of joints after it.
 
     `e_j = Σ A · sin(harmonic · pi · q / travel + phase)` with q the controller's value of the axis and its travel
-    between its limits. In the robot's file the joints that err stand behind the rail and follow it with the factor 0.
+    between its limits. In the robot's file, the joints with errors are after the rail and coupled to it with factor 0.
 
     Source: error motions of a linear axis of ISO 230-1:2012, 3.4 (straightness and angular error motions).
 
     Attributes:
         kind: "guide".
-        along: name of the axis, which slides and has limits.
-        waves: the waves.
+        along: name of the axis, which is prismatic and has limits.
+        waves: waves of the joint errors.
     """
 
     kind: Literal["guide"]
@@ -59,17 +59,20 @@ class Guide(AbstractJointSource):
     waves: tuple[GuideWave, ...] = Field(min_length=1)
 
     def bind(self, robot: Robot, place: str) -> JointErrorFunction:
-        """The waves as a function of the joint values. See `AbstractJointSource.bind`."""
+        """Return the waves as a function of the joint values. See `AbstractJointSource.bind`."""
         names = [axis.name for axis in robot.axes]
         if self.along not in names:
             raise RecipeError(
-                f"{place}: robot '{robot.name}' has no axis '{self.along}'; {nearest_choice(self.along, names)}"
+                f"robot '{robot.name}' has no axis '{self.along}'",
+                option=place,
+                value=self.along,
+                remedy=nearest_choice(self.along, names),
             )
         index = names.index(self.along)
         travel = float(np.diff(robot.axis_limits[index])[0])
         if robot.axes[index].type != "prismatic" or not np.isfinite(travel):
             raise RecipeError(
-                f"{place}: the axis '{self.along}' does not slide between limits; name one that does."
+                option=place, expected="the name of a prismatic axis with limits", value=self.along
             )
         amplitudes = [
             amplitude_of(robot, wave.joint, wave.amplitude_deg, wave.amplitude_mm, place)

@@ -1,4 +1,4 @@
-"""Joints that give way under the weight of the arm and its payload."""
+"""Compliance of joints under the weight of the arm and its payload."""
 
 from typing import Annotated, Literal
 
@@ -21,8 +21,8 @@ class LinkMass(Section):
 
     Attributes:
         mass_kg: mass [kg].
-        centre_mm: centre of mass [mm], in the frame of the link's own row (behind its RotY(beta)); for the
-            payload in the tool frame.
+        centre_mm: centre of mass [mm] in the frame of the link's row (after its RotY(beta)), or in the tool frame for
+            the payload.
     """
 
     mass_kg: float = Field(ge=0)
@@ -30,12 +30,12 @@ class LinkMass(Section):
 
 
 class JointCompliance(AbstractJointSource):
-    """Every joint gives way in proportion to the torque that gravity puts on it.
+    """Deflection of every joint in proportion to its gravity torque.
 
     `e_j = c_j · tau_j(q)` with `tau_j = Σ_k z_j · ((r_k - p_j) x m_k g)` over all masses k beyond joint j,
     where z_j and p_j are the joint's axis and origin and r_k the centre of mass; for a prismatic joint the
-    force `tau_j = Σ_k z_j · m_k g`. The torque is taken on the nominal geometry at the commanded joints, not
-    where they give way to: first order in the compliance.
+    force `tau_j = Σ_k z_j · m_k g`. The torque is that of the nominal geometry at the commanded joints, without the
+    deflection: first order in the compliance.
 
     Source: Whitney, Lozinski and Rourke, ASME Journal of Dynamic Systems, Measurement, and Control
     108(1), 1986, 1-8; Judd and Knasinski, IEEE Transactions on Robotics and Automation 6(1), 1990, 20-30.
@@ -44,10 +44,10 @@ class JointCompliance(AbstractJointSource):
 
     Attributes:
         kind: "joint_compliance".
-        compliance_rad_per_Nm: by name of a revolute joint [rad/(N m)]; 1e-6 to 1e-5 for industrial arms.
-        compliance_m_per_N: by name of a prismatic joint [m/N].
-        links: mass and centre of mass by row name.
-        payload: what the tool carries.
+        compliance_rad_per_Nm: compliance by name of a revolute joint [rad/(N m)]; 1e-6 to 1e-5 for industrial arms.
+        compliance_m_per_N: compliance by name of a prismatic joint [m/N].
+        links: masses and centres of mass of links by row name.
+        payload: mass and centre of mass of the payload.
         gravity_m_per_s2: acceleration of free fall [m/s^2] in the frame of the first row (so without `base`).
     """
 
@@ -59,7 +59,7 @@ class JointCompliance(AbstractJointSource):
     gravity_m_per_s2: Triple = (0.0, 0.0, -9.81)
 
     def bind(self, robot: Robot, place: str) -> JointErrorFunction:
-        """The deflection as a function of the joint values. See `AbstractJointSource.bind`."""
+        """Return the deflection as a function of the joint values. See `AbstractJointSource.bind`."""
         fields = ("compliance_rad_per_Nm", "compliance_m_per_N")
         stated = joint_values(robot, self.compliance_rad_per_Nm, self.compliance_m_per_N, fields, place)
         compliance = torch.from_numpy(stated)

@@ -1,4 +1,4 @@
-"""Joints whose zero is not where the drawing has it."""
+"""Offsets of joint zeros."""
 
 from typing import Literal
 
@@ -11,17 +11,17 @@ from pisigma.simulation.errors.source import AbstractJointSource, JointErrorFunc
 
 
 class JointOffset(AbstractJointSource):
-    """A constant error of each joint's zero.
+    """Constant errors of the joints' zeros.
 
-    `e_j = offset_j`, added to the joint value as the controller counts.
+    `e_j = offset_j`, added to the controller's joint value.
 
     Source: Whitney, Lozinski and Rourke, "Industrial robot forward calibration method and results", ASME
     Journal of Dynamic Systems, Measurement, and Control 108(1), 1986, 1-8.
 
     Attributes:
         kind: "joint_offset".
-        offset_deg: by name of a revolute joint [deg].
-        offset_mm: by name of a prismatic joint [mm].
+        offset_deg: offset by name of a revolute joint [deg].
+        offset_mm: offset by name of a prismatic joint [mm].
     """
 
     kind: Literal["joint_offset"]
@@ -29,7 +29,7 @@ class JointOffset(AbstractJointSource):
     offset_mm: dict[str, float] = Field(default_factory=dict)
 
     def bind(self, robot: Robot, place: str) -> JointErrorFunction:
-        """The offsets as a function of the joint values. See `AbstractJointSource.bind`."""
+        """Return the offsets as a function of the joint values. See `AbstractJointSource.bind`."""
         stated = joint_values(robot, self.offset_deg, self.offset_mm, ("offset_deg", "offset_mm"), place)
         offset = torch.from_numpy(np.where(robot.revolute, np.deg2rad(stated), stated / 1e3))
         return lambda q: torch.zeros_like(q) + offset.to(q)

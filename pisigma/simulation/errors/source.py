@@ -1,4 +1,4 @@
-"""What an error source is: a section of a recipe that changes the geometry or the joint values of a robot."""
+"""The interface of error sources: recipe sections that change the geometry or the joint values of a robot."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
@@ -16,17 +16,17 @@ from pisigma.robot.description import Robot
 Value = TypeVar("Value")
 
 JointErrorFunction = Callable[[Tensor], Tensor]
-"""From commanded joint values `(*batch, dof)` to what is added to them [rad or m], of the same shape."""
+"""Maps commanded joint values `(*batch, dof)` to their errors [rad or m], of the same shape."""
 
 
 @dataclass(frozen=True, eq=False)
 class GeometryChange:
-    """What is added to the geometric parameters of a robot; columns as `DH_COLUMNS` and `FRAME_COLUMNS`.
+    """Errors of the geometric parameters of a robot; columns as in `DH_COLUMNS` and `FRAME_COLUMNS`.
 
     Attributes:
-        dh: `(rows, 5)` [rad or m].
-        base: x, y, z [m], roll, pitch, yaw [rad].
-        tool: the same for the tool.
+        dh: errors of the DH rows `(rows, 5)` [rad or m].
+        base: errors of x, y, z [m], roll, pitch, yaw [rad] of the base.
+        tool: errors of the tool, as of the base.
     """
 
     dh: Float64[np.ndarray, "rows 5"]
@@ -38,7 +38,7 @@ class AbstractErrorSource(Section, ABC):
     """An error source; concrete ones are an `AbstractGeometrySource`, `AbstractJointSource` or `AbstractPlaySource`.
 
     Attributes:
-        kind: what recipes call it, a `Literal` of one text.
+        kind: its name in recipes, a `Literal` of one text.
     """
 
     kind: str
@@ -49,11 +49,11 @@ class AbstractGeometrySource(AbstractErrorSource):
 
     @abstractmethod
     def change(self, robot: Robot, place: str) -> GeometryChange:
-        """What this source adds to the parameters of the nominal robot.
+        """Return the errors of the parameters of the nominal robot.
 
         Args:
             robot: the nominal robot.
-            place: where the source stands in its recipe, for complaints.
+            place: position of the source in its recipe, for messages.
 
         Raises:
             RecipeError: the source does not fit the robot.
@@ -61,20 +61,20 @@ class AbstractGeometrySource(AbstractErrorSource):
 
 
 class AbstractJointSource(AbstractErrorSource):
-    """An error source that moves joints away from where they are commanded; several sources are added."""
+    """An error source that changes commanded joint values; several sources are added."""
 
     @property
     def stepped_joints(self) -> frozenset[str]:
-        """Names of the joints that move in steps by this source and so cannot end up just anywhere."""
+        """Names of the joints with encoder steps by this source, which cannot reach arbitrary values."""
         return frozenset()
 
     @abstractmethod
     def bind(self, robot: Robot, place: str) -> JointErrorFunction:
-        """The source as a function of the commanded joint values of one robot.
+        """Return the errors as a function of the commanded joint values of one robot.
 
         Args:
             robot: the nominal robot.
-            place: where the source stands in its recipe, for complaints.
+            place: position of the source in its recipe, for messages.
 
         Raises:
             RecipeError: the source does not fit the robot.
@@ -82,21 +82,21 @@ class AbstractJointSource(AbstractErrorSource):
 
 
 class AbstractPlaySource(AbstractErrorSource):
-    """An error source by which a joint stops on the side that it comes from; several sources are added.
+    """An error source by which joints stop on the side of their approach; several sources are added.
 
     Attributes:
-        seed: of the sides from which simulated rows are approached.
+        seed: random seed of the directions of approach of simulated rows.
     """
 
     seed: int
 
     @abstractmethod
     def half_play(self, robot: Robot, place: str) -> Float64[np.ndarray, " dof"]:
-        """How far every joint stops short of the commanded value [rad or m].
+        """Return the distance by which every joint stops short of the commanded value [rad or m].
 
         Args:
             robot: the nominal robot.
-            place: where the source stands in its recipe, for complaints.
+            place: position of the source in its recipe, for messages.
 
         Raises:
             RecipeError: the source does not fit the robot.
@@ -104,28 +104,31 @@ class AbstractPlaySource(AbstractErrorSource):
 
 
 def row_index(robot: Robot, name: str, place: str) -> int:
-    """Index of the row called `name`.
+    """Return the index of the row `name`.
 
     Args:
         robot: the robot.
-        name: what the recipe says.
-        place: where in the recipe, for the complaint.
+        name: name of the row.
+        place: position in the recipe, for messages.
 
     Raises:
-        RecipeError: the robot has no such row; the message gives the nearest name.
+        RecipeError: the robot has no such row; the message states the nearest name.
     """
     return _index(robot, [row.name for row in robot.rows], name, "row", place)
 
 
 def joint_index(robot: Robot, name: str, place: str) -> int:
-    """Index of the joint called `name`, counted among the rows that move. See `row_index`."""
+    """Return the index of the joint `name` among the rows that are not fixed. See `row_index`."""
     return _index(robot, [joint.name for joint in robot.joints], name, "joint", place)
 
 
 def _index(robot: Robot, names: list[str], name: str, what: str, place: str) -> int:
     if name not in names:
         raise RecipeError(
-            f"{place}: robot '{robot.name}' has no {what} '{name}'; {nearest_choice(name, names)}"
+            f"robot '{robot.name}' has no {what} '{name}'",
+            option=place,
+            value=name,
+            remedy=nearest_choice(name, names),
         )
     return names.index(name)
 
@@ -138,18 +141,18 @@ def stated_joints(
     place: str,
     axes: bool = False,
 ) -> dict[int, Value]:
-    """What the two mappings of a recipe state, by index of the joint.
+    """Return the values of two mappings of a recipe, by index of the joint.
 
     Args:
         robot: the robot.
         for_revolute: values of revolute joints, by name.
         for_prismatic: values of prismatic joints, by name.
-        fields: how the recipe calls the two mappings, revolute first.
-        place: where in the recipe, for complaints.
-        axes: whether the values are of what the controller commands, `robot.axes`, and not of the joints.
+        fields: keys of the two mappings in the recipe, revolute first.
+        place: position in the recipe, for messages.
+        axes: whether the values are of the controller's axes, `robot.axes`, instead of the joints.
 
     Raises:
-        RecipeError: an unknown joint, or one in the mapping of the other type.
+        RecipeError: a joint is unknown, or in the mapping of the other type.
     """
     values: dict[int, Value] = {}
     joints = robot.axes if axes else robot.joints
@@ -160,7 +163,10 @@ def stated_joints(
             actual = joints[index].type
             if actual != kind:
                 raise RecipeError(
-                    f"{place}: joint '{name}' is {actual}, so state it in {other}, not in {field}."
+                    f"joint '{name}' in {field} is {actual}",
+                    option=place,
+                    value=name,
+                    remedy=f"move it to {other}",
                 )
             values[index] = value
     return values
@@ -173,7 +179,7 @@ def joint_values(
     fields: tuple[str, str],
     place: str,
 ) -> Float64[np.ndarray, " dof"]:
-    """One value per joint, 0 where none is stated. See `stated_joints`."""
+    """Return one value per joint, 0 if not given. See `stated_joints`."""
     stated = stated_joints(robot, for_revolute, for_prismatic, fields, place)
     return np.array([stated.get(index, 0.0) for index in range(robot.dof)])
 
@@ -181,14 +187,14 @@ def joint_values(
 def amplitude_of(
     robot: Robot, joint: str, deg: float | None, mm: float | None, place: str
 ) -> Float64[np.ndarray, " dof"]:
-    """The amplitude of a wave [rad or m] in the column of its joint, 0 elsewhere. See `stated_joints`.
+    """Return the amplitude of a wave [rad or m] in the column of its joint, 0 elsewhere. See `stated_joints`.
 
     Args:
         robot: the robot.
-        joint: that errs.
-        deg: amplitude of a joint that turns.
-        mm: amplitude of a joint that slides.
-        place: where in the recipe, for complaints.
+        joint: name of the joint with the error.
+        deg: amplitude of a revolute joint [deg].
+        mm: amplitude of a prismatic joint [mm].
+        place: position in the recipe, for messages.
     """
     stated = joint_values(
         robot,

@@ -1,4 +1,4 @@
-"""Gears that run out of true: errors that repeat with the angles of the joints."""
+"""Transmission errors: periodic functions of the joint angles."""
 
 from typing import Literal
 
@@ -23,13 +23,13 @@ class Harmonic(Section):
     """One sine `amplitude · sin(m · q + phase)` of one joint's error.
 
     Attributes:
-        joint: the joint that errs.
-        amplitude_deg: of a revolute joint [deg].
-        amplitude_mm: of a prismatic joint [mm].
-        harmonic: m as a multiple of the joint's own angle; of a prismatic joint, of the angle of its screw.
-        lead_mm: travel of a prismatic joint per turn of its screw [mm]; goes with `harmonic`.
-        joints: instead of `harmonic`, m as a multiple per revolute joint, by name: the gears of a coupled
-            wrist turn with sums of joint angles.
+        joint: joint with the error.
+        amplitude_deg: amplitude of a revolute joint [deg].
+        amplitude_mm: amplitude of a prismatic joint [mm].
+        harmonic: multiple m of the joint's angle, or of the angle of a prismatic joint's screw.
+        lead_mm: travel of a prismatic joint per revolution of its screw [mm], with `harmonic`.
+        joints: multiples of the angles of revolute joints by name, instead of `harmonic`: gears of a coupled wrist
+            rotate by sums of joint angles.
         phase_deg: phase [deg].
     """
 
@@ -44,22 +44,23 @@ class Harmonic(Section):
     @model_validator(mode="after")
     def _one_of_each(self) -> "Harmonic":
         if (self.amplitude_deg is None) == (self.amplitude_mm is None):
-            raise ValueError("state either amplitude_deg (revolute joint) or amplitude_mm (prismatic joint)")
+            raise ValueError(
+                "expected either amplitude_deg (revolute joint) or amplitude_mm (prismatic joint)"
+            )
         if (self.harmonic is None) == (self.joints is None):
             raise ValueError(
-                "state either harmonic (of the joint's own angle) or joints (a multiple per joint)"
+                "expected either harmonic (of the joint's angle) or joints (a multiple per joint)"
             )
         if self.lead_mm is not None and self.harmonic is None:
-            raise ValueError("lead_mm goes with harmonic; remove it")
+            raise ValueError("lead_mm is only for harmonic; remove it")
         return self
 
 
 class TransmissionHarmonics(AbstractJointSource):
-    """Eccentric or badly cut gears: the joint wobbles once or several times per turn.
+    """Errors of eccentric or inaccurate gears, which repeat one or several times per revolution.
 
-    `e_j = Σ A · sin(Σ_i m_i q_i + phase)` over the terms of joint j, with whole numbers m_i and q_i the
-    commanded joint angles as the controller counts; for a screw with lead L, m · 2 pi q_j / L takes the place
-    of m · q_j.
+    `e_j = Σ A · sin(Σ_i m_i q_i + phase)` over the terms of joint j, with integers m_i and the commanded joint angles
+    q_i of the controller; for a screw with lead L, m · 2 pi q_j / L replaces m · q_j.
 
     Source: Judd and Knasinski, "A technique to calibrate industrial robots with experimental
     verification", IEEE Transactions on Robotics and Automation 6(1), 1990, 20-30 (gear errors as sines of
@@ -68,17 +69,17 @@ class TransmissionHarmonics(AbstractJointSource):
 
     Attributes:
         kind: "transmission".
-        terms: the sines.
+        terms: terms of the joint errors.
     """
 
     kind: Literal["transmission"]
     terms: tuple[Harmonic, ...] = Field(min_length=1)
 
     def bind(self, robot: Robot, place: str) -> JointErrorFunction:
-        """The sines as a function of the joint values. See `AbstractJointSource.bind`."""
+        """Return the sum of the terms as a function of the joint values. See `AbstractJointSource.bind`."""
         places = [f"{place}, terms[{index}]" for index in range(len(self.terms))]
         stated = list(zip(self.terms, places, strict=True))
-        # (terms, dof): which joint errs by how much, and the multiples of the joint values inside the sine.
+        # (terms, dof): amplitudes of the joint errors, and multiples of the joint values inside the sine
         amplitudes = [
             amplitude_of(robot, term.joint, term.amplitude_deg, term.amplitude_mm, where)
             for term, where in stated
@@ -95,22 +96,26 @@ class TransmissionHarmonics(AbstractJointSource):
 
 
 def _multiple(robot: Robot, term: Harmonic, place: str) -> np.ndarray:
-    """What every joint value [rad or m] is multiplied by inside the sine."""
+    """Return the multiples of the joint values [rad or m] inside the sine."""
     multiple = np.zeros(robot.dof)
     if term.joints is not None:
         for name, value in term.joints.items():
             index = joint_index(robot, name, place)
             if not robot.revolute[index]:
                 raise RecipeError(
-                    f"{place}: joint '{name}' is prismatic and has no angle; take it out of joints."
+                    f"joint '{name}' is prismatic and has no angle",
+                    option=place,
+                    value=name,
+                    remedy="remove it from joints",
                 )
             multiple[index] = value
         return multiple
-    assert term.harmonic is not None  # the section's validator sees to it
+    assert term.harmonic is not None  # checked by the validator
     index = joint_index(robot, term.joint, place)
     if robot.revolute[index] != (term.lead_mm is None):
-        remedy = "take lead_mm out" if robot.revolute[index] else "state the lead_mm of its screw"
-        raise RecipeError(f"{place}: joint '{term.joint}' is {robot.joints[index].type}; {remedy}.")
-    per_turn = 1.0 if term.lead_mm is None else 2 * np.pi / (term.lead_mm / 1e3)
-    multiple[index] = term.harmonic * per_turn
+        remedy = "remove lead_mm" if robot.revolute[index] else "add the lead_mm of its screw"
+        kind = robot.joints[index].type
+        raise RecipeError(f"joint '{term.joint}' is {kind}", option=place, value=term.joint, remedy=remedy)
+    angle_per_unit = 1.0 if term.lead_mm is None else 2 * np.pi / (term.lead_mm / 1e3)
+    multiple[index] = term.harmonic * angle_per_unit
     return multiple
