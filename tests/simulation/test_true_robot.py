@@ -5,6 +5,7 @@ import math
 import pytest
 import torch
 from testing.closeness import assert_close
+from testing.refusals import refused
 
 from pisigma.files.errors import PoseError, RecipeError, UnreachablePoseError
 from pisigma.files.yaml_file import parse_yaml
@@ -120,7 +121,7 @@ def test_commanded_joints_undo_the_joint_errors(generator):
 def test_encoder_steps_cannot_be_undone(generator):
     q = joints(generator, 3)
     robot = true_robot(OFFSET, ENCODER)
-    with pytest.raises(UnreachablePoseError, match="without_encoder"):
+    with refused(UnreachablePoseError, option="errors", value="encoder"):
         robot.commanded_joints(q)
     assert robot.has_encoder
     smooth = robot.without_encoder()
@@ -132,25 +133,23 @@ def test_encoder_steps_cannot_be_undone(generator):
 def test_errors_steeper_than_the_joint_are_refused(generator):
     term = {"joint": "theta_1", "amplitude_deg": 30, "harmonic": 7}
     robot = true_robot({"kind": "transmission", "terms": [term]})
-    with pytest.raises(UnreachablePoseError, match="joint 'theta_1' still moves"):
+    with refused(UnreachablePoseError, option="errors", value="theta_1"):
         robot.commanded_joints(joints(generator, 20))
 
 
 def test_joint_values_of_another_robot_are_refused():
-    with pytest.raises(PoseError, match="has 6 joints"):
+    with pytest.raises(PoseError):
         true_robot(OFFSET).forward(torch.zeros(4, dtype=torch.float64))
 
 
 def test_one_joint_with_two_encoders_is_refused():
-    with pytest.raises(RecipeError, match=r"errors\[1\] \(encoder\): joint 'theta_1' has an encoder already"):
+    with refused(RecipeError, option="errors[1] (encoder)", value="theta_1"):
         true_robot(ENCODER, {"kind": "encoder", "pulses_per_revolution": {"theta_1": 2048}})
 
 
 def test_unknown_joint_is_refused_with_place_and_nearest_name():
     wrong = {"kind": "joint_offset", "offset_deg": {"theta_l": 1}}
-    with pytest.raises(
-        RecipeError, match=r"errors\[1\] \(joint_offset\): robot 'ur10' has no joint 'theta_l'; did you"
-    ):
+    with refused(RecipeError, option="errors[1] (joint_offset)", value="theta_l"):
         true_robot(OFFSET, wrong)
 
 
@@ -170,14 +169,14 @@ def test_recipe_is_read_and_misspelt_keys_are_refused():
     assert_close(
         robot.joint_error(torch.zeros(4, dtype=torch.float64)), [0, math.radians(3.7), 0, 0], atol=1e-17
     )
-    with pytest.raises(
-        RecipeError, match=r"recipe.yaml, line 7: unknown key 'ofset_deg'.* did you mean 'offset_deg'"
-    ):
+    with refused(RecipeError, file="recipe.yaml", line=7, column="errors.1.ofset_deg") as caught:
         parse_yaml(RECIPE.replace("offset_deg", "ofset_deg"), TrueRobotSection, RecipeError, "recipe.yaml")
-    with pytest.raises(RecipeError, match=r"recipe.yaml, line 6: .*did you mean 'joint_offset'"):
+    assert "'offset_deg'" in caught.value.remedy
+    with refused(RecipeError, file="recipe.yaml", line=6, value="joint_ofset") as caught:
         parse_yaml(
             RECIPE.replace("joint_offset", "joint_ofset"), TrueRobotSection, RecipeError, "recipe.yaml"
         )
+    assert "'joint_offset'" in caught.value.remedy
 
 
 @pytest.mark.parametrize("name", ["ur10", "kiro4"])
@@ -210,5 +209,5 @@ def test_poses_that_cannot_be_reached_are_refused(generator):
     q = joints(generator, 3)
     T = robot.forward(q)
     T[1, 0, 3] += 5
-    with pytest.raises(UnreachablePoseError, match=r"wanted pose at index 1: .* mm"):
+    with refused(UnreachablePoseError, option="T", value=1):
         robot.inverse(T, q)
