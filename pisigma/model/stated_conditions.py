@@ -119,8 +119,8 @@ def _learned(model: CalibratedModel) -> ConditionFeatures | None:
 def _shifted(robot: Robot, shift: Float64[Tensor, " dof"]) -> Robot:
     """Return the robot with shifted joint offsets: at q it is where the given robot is at `q + shift`."""
     dh = robot.dh.copy()
-    for row, turns, direction, value in zip(
+    for row, is_revolute, direction, value in zip(
         robot.joint_rows, robot.revolute, robot.directions, shift.tolist(), strict=True
     ):
-        dh[row, 0 if turns else 1] += direction * value
+        dh[row, 0 if is_revolute else 1] += direction * value
     return robot.with_geometry(dh=dh)

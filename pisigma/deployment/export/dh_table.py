@@ -83,7 +83,7 @@ def _write(request: ExportRequest) -> Exported:
     chosen = chosen_geometry(model, request.geometry)
     write = dh_csv if request.as_csv else dh_yaml
     return Exported(
-        write(chosen.robot, chosen.said), model_facts(model) | {"geometry": chosen.name}, chosen.said
+        write(chosen.robot, chosen.comments), model_facts(model) | {"geometry": chosen.name}, chosen.comments
     )
 
 

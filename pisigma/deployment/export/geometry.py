@@ -21,12 +21,12 @@ class ChosenGeometry:
     Attributes:
         name: `GEOMETRIC` or `HYBRID`.
         robot: robot with the geometry, base and tool.
-        said: sentences for the head of the file.
+        comments: sentences for the head of the file.
     """
 
     name: str
     robot: Robot
-    said: tuple[str, ...]
+    comments: tuple[str, ...]
 
 
 def check_geometry(request: ExportRequest) -> None:
@@ -110,14 +110,14 @@ def remarks(model: CalibratedModel) -> tuple[str, ...]:
         if model.calibrated is None
         else "Identified geometry"
     )
-    said = [f"{kind} of model {model.name} (robot {model.robot.name}), by pisigma {__version__}."]
+    sentences = [f"{kind} of model {model.name} (robot {model.robot.name}), by pisigma {__version__}."]
     if corrects_joints(model):
-        said.append(
+        sentences.append(
             "The learned joint correction of the model is not in this file: it describes the geometric fit alone, "
             "without the accuracy that the correction adds. Do not combine it with the correction of --format onnx, "
             "which belongs to --geometry hybrid."
         )
-    return (*said, *frame_remarks(model))
+    return (*sentences, *frame_remarks(model))
 
 
 def frame_remarks(model: CalibratedModel) -> tuple[str, ...]:

@@ -108,12 +108,12 @@ def departure_sentence(what: str, lost: Departure, nominal: Departure) -> str:
 
 def offset_sentences(offsets: JointOffsets) -> tuple[str, ...]:
     """Return sentences on the meaning of the offsets and their loss of accuracy."""
-    said = [MEANING, departure_sentence("Offsets alone deviate", offsets.lost, offsets.nominal)]
+    sentences = [MEANING, departure_sentence("Offsets alone deviate", offsets.lost, offsets.nominal)]
     if offsets.unobservable:
-        said.append(
+        sentences.append(
             f"Offsets of {', '.join(offsets.unobservable)} are 0 because base or tool have the same effect."
         )
-    return tuple(said)
+    return tuple(sentences)
 
 
 def offsets_csv(offsets: JointOffsets, comments: tuple[str, ...] = ()) -> str:
@@ -143,9 +143,9 @@ def _joints(offsets: JointOffsets) -> list[dict[str, object]]:
 
 def _write(request: ExportRequest) -> Exported:
     model = request.load()
-    offsets, said = fit_joint_offsets(model), offset_remarks(model)
-    text = (offsets_csv if request.as_csv else offsets_yaml)(offsets, said)
-    return Exported(text, model_facts(model) | offsets.departures(), (*said, *offset_sentences(offsets)))
+    offsets, sentences = fit_joint_offsets(model), offset_remarks(model)
+    text = (offsets_csv if request.as_csv else offsets_yaml)(offsets, sentences)
+    return Exported(text, model_facts(model) | offsets.departures(), (*sentences, *offset_sentences(offsets)))
 
 
 FORMAT = ExportFormat(

@@ -249,7 +249,7 @@ def _metadata(model: CalibratedModel, computes: str, sha256: str) -> dict[str, s
         "computes": computes,
         "robot": model.robot.name,
         "joints": [joint.name for joint in model.robot.joints],
-        "joint_units": ["rad" if turns else "m" for turns in model.robot.revolute],
+        "joint_units": ["rad" if is_revolute else "m" for is_revolute in model.robot.revolute],
         "length_unit": "m",
         "pose_frame": "T_base_tool maps coordinates of the tool into the base frame",
         "geometry": "nominal" if arm is None else HYBRID,
@@ -286,7 +286,7 @@ def _joints(model: CalibratedModel) -> str:
 
 
 def _units(model: CalibratedModel) -> str:
-    return " or ".join(dict.fromkeys("rad" if turns else "m" for turns in model.robot.revolute))
+    return " or ".join(dict.fromkeys("rad" if is_revolute else "m" for is_revolute in model.robot.revolute))
 
 
 def _write(request: ExportRequest) -> Exported:

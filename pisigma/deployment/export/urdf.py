@@ -53,21 +53,21 @@ def _check(request: ExportRequest) -> None:
 def _write(request: ExportRequest) -> Exported:
     model = request.load()
     chosen = chosen_geometry(model, request.geometry)
-    text = drawn_into(request, chosen.robot, model.robot, chosen.said) or robot_to_urdf(
-        chosen.robot, chosen.said
+    text = drawn_into(request, chosen.robot, model.robot, chosen.comments) or robot_to_urdf(
+        chosen.robot, chosen.comments
     )
     facts = model_facts(model) | {"geometry": chosen.name}
-    return Exported(text, facts, chosen.said, warnings=_warnings(request, model.robot, text))
+    return Exported(text, facts, chosen.comments, warnings=_warnings(request, model.robot, text))
 
 
-def drawn_into(request: ExportRequest, robot: Robot, nominal: Robot, said: tuple[str, ...]) -> str | None:
+def drawn_into(request: ExportRequest, robot: Robot, nominal: Robot, comments: tuple[str, ...]) -> str | None:
     """Write a robot into the URDF file of --like, or by default into the one that the model folder includes.
 
     Args:
         request: model and options.
         robot: robot with the geometry to write.
         nominal: robot of the model, whose `source` names the links.
-        said: sentences for the head of the file.
+        comments: sentences for the head of the file.
 
     Returns:
         The text; None without such a file.
@@ -77,7 +77,7 @@ def drawn_into(request: ExportRequest, robot: Robot, nominal: Robot, said: tuple
     if like is None:
         return None
     base, tip = drawn.group("base", "tip") if drawn else (None, None)
-    return robot_into_urdf(robot, nominal, like, request.tip or tip, said, base)
+    return robot_into_urdf(robot, nominal, like, request.tip or tip, comments, base)
 
 
 def _warnings(request: ExportRequest, nominal: Robot, text: str) -> tuple[str, ...]:

@@ -232,8 +232,8 @@ def _solve(model: ServedModel, request: dict[str, Any]) -> tuple[str, dict[str, 
     """Solve one pose."""
     entries, near = _entries(request["pose"], "pose"), _near(model, request)
     if model.direct is not None and request.keys() <= _PLAIN:
-        beside = b"" if near is None else struct.pack(f"<{len(near)}d", *near)
-        row = model.direct.solve_packed(_POSE.pack(*entries), beside)
+        near_bytes = b"" if near is None else struct.pack(f"<{len(near)}d", *near)
+        row = model.direct.solve_packed(_POSE.pack(*entries), near_bytes)
         values = _record(model, row, model.ik.axes.ignored)
     else:
         approach = _numbers(request, "approach", len(model.ik.joints)) if "approach" in request else None
@@ -303,7 +303,7 @@ def _model_record(model: ServedModel) -> dict[str, Any]:
         "name": model.name,
         "sha256": model.sha256,
         "joints": model.ik.joints,
-        "units": ["deg" if turns else "mm" for turns in model.ik.revolute],
+        "units": ["deg" if is_revolute else "mm" for is_revolute in model.ik.revolute],
         "limits": per_unit.round(9).tolist(),
         "branches": model.ik.branches,
     }

@@ -53,7 +53,7 @@ class ServedModel:
     @cached_property
     def per_file_unit(self) -> list[float]:
         """For every joint, degrees per radian or millimetres per metre."""
-        return [180 / math.pi if turns else 1e3 for turns in self.ik.revolute]
+        return [180 / math.pi if is_revolute else 1e3 for is_revolute in self.ik.revolute]
 
     @cached_property
     def joints_key(self) -> str:

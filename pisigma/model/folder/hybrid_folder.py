@@ -252,7 +252,7 @@ def _coverage(robot: Robot, tensors: Mapping[str, Tensor]) -> JointCoverage:
             value="coverage.joint",
         )
     rate = torch.from_numpy(turning_rate(robot))
-    turning = tuple(bool(turns) for turns in robot.revolute)
+    turning = tuple(bool(is_revolute) for is_revolute in robot.revolute)
     return JointCoverage(joint, middle, half, rate, turning)
 
 

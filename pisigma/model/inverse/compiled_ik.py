@@ -130,8 +130,8 @@ class CompiledIK:
             raise fault_error(wrong % 8)
         row = np.frombuffer(memoryview(out))
         position, rotation, measure, status, index = row[2 * dof :].tolist()
-        lies = row[:dof], row[dof : 2 * dof], int(index), self.branches, int(status)
-        return Solution(*lies, position, rotation, measure, owner, task.ignored)
+        joints = row[:dof], row[dof : 2 * dof], int(index), self.branches, int(status)
+        return Solution(*joints, position, rotation, measure, owner, task.ignored)
 
     def solve_packed(self, T_base_tool: bytes, near: bytes) -> list[float]:
         """Find corrected joint values for one pose that is given as bytes, as received from a socket.
@@ -145,13 +145,13 @@ class CompiledIK:
             (INVALID_POSE for an invalid pose) and branch, see `Solution`.
         """
         try:
-            solve, rest, out = self._threads.packed
+            solve, arguments, out = self._threads.packed
         except AttributeError:
             out, axes = self._row(), self.axes.row.tobytes()
             solve = partial(self._kernels, IGNORED, IGNORED, self._address, self._memory(), arrays.SOLVE, 1)
-            rest = b"", 0, axes, bool(axes), arrays.ANY_BRANCH, True, False, out, 1
-            self._threads.packed = solve, rest, out
-        solve(T_base_tool, near, bool(near), *rest)
+            arguments = b"", 0, axes, bool(axes), arrays.ANY_BRANCH, True, False, out, 1
+            self._threads.packed = solve, arguments, out
+        solve(T_base_tool, near, bool(near), *arguments)
         return out[:]  # type: ignore[no-any-return]
 
     def solve_batch(
@@ -251,8 +251,11 @@ class CompiledIK:
         """Make solutions from the rows that the kernels write, `(*batch, 2 · dof + 5)`."""
         dof = len(self.joints)
         position, rotation, measure, status, branch = np.moveaxis(out[..., 2 * dof :], -1, 0)
-        lies, found = (branch.astype(int), self.branches, status.astype(int)), (position, rotation, measure)
-        return Solution(out[..., :dof], out[..., dof : 2 * dof], *lies, *found, ignored_axes=axes.ignored)
+        branches, found = (
+            (branch.astype(int), self.branches, status.astype(int)),
+            (position, rotation, measure),
+        )
+        return Solution(out[..., :dof], out[..., dof : 2 * dof], *branches, *found, ignored_axes=axes.ignored)
 
     def _solve_rows(
         self,

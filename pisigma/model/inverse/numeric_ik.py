@@ -109,7 +109,7 @@ class NumericIK:
         """
         if branch is not None:
             check_choice(PoseError, "branch", branch, self.branches)
-        wanted = self.order if branch is None else (self.branches.index(branch),)
+        requested = self.order if branch is None else (self.branches.index(branch),)
         poses = _Poses.of(T_base_tool, single, throw)
         valid, near_rows = poses.valid, None
         if near is not None:
@@ -118,7 +118,7 @@ class NumericIK:
 
         def solve(ik: "NumericIK", rows: Tensor) -> Solution:
             start = None if near_rows is None else near_rows[rows].nan_to_num()
-            return _best(*ik._candidates(poses.T[rows], poses.single, start, wanted), wanted)
+            return _best(*ik._candidates(poses.T[rows], poses.single, start, requested), requested)
 
         result = self._by_approach(approach, poses, axes, solve)
         return _without(result, ~valid, Status.INVALID_POSE).map(poses.shaped)
@@ -175,12 +175,12 @@ class NumericIK:
         return rows.expand(len(poses.T), -1)
 
     def _candidates(
-        self, T: Tensor, single: bool, near: Tensor | None, wanted: Sequence[int]
+        self, T: Tensor, single: bool, near: Tensor | None, requested: Sequence[int]
     ) -> tuple[Solution, Tensor]:
         """Find solutions `(poses, starts)` from all starts, and their ranks, of which the lowest is the best."""
         starts, branch = self._starts(T, single)
         plausible = torch.isfinite(starts).all(-1).any(1) | (self._solver is None)
-        if near is not None and len(wanted) == len(self.branches):
+        if near is not None and len(requested) == len(self.branches):
             starts = torch.cat([starts, near[:, None]], 1)
         numeric = self._solver is None or self._spare
         if numeric:
@@ -188,7 +188,7 @@ class NumericIK:
             starts = torch.cat([starts, few], 1)
         unknown = branch.new_full((len(T), starts.shape[1] - branch.shape[1]), -1)
         every, rank = self._solved(T, starts, torch.cat([branch, unknown], 1), near)
-        lost = ((_among(every, rank, wanted) >= _OUTSIDE).all(1) & plausible).nonzero()[:, 0]
+        lost = ((_among(every, rank, requested) >= _OUTSIDE).all(1) & plausible).nonzero()[:, 0]
         if not len(lost):
             return every, rank
         attempts = tolerances.MORE_ATTEMPTS if numeric else tolerances.ATTEMPTS
@@ -364,17 +364,17 @@ class _Poses:
         return values.reshape((*self.batch, *values.shape[1:]))
 
 
-def _among(every: Solution, rank: Tensor, wanted: Sequence[int]) -> Tensor:
+def _among(every: Solution, rank: Tensor, branches: Sequence[int]) -> Tensor:
     """Return ranks of solutions, `_LOST` on other branches than the requested ones."""
-    return torch.where(torch.isin(every.branch, torch.tensor(wanted)), rank, _LOST)
+    return torch.where(torch.isin(every.branch, torch.tensor(branches)), rank, _LOST)
 
 
-def _best(every: Solution, rank: Tensor, wanted: Sequence[int]) -> Solution:
+def _best(every: Solution, rank: Tensor, branches: Sequence[int]) -> Solution:
     """Select the best solution of every pose on the requested branches."""
-    least, index = _among(every, rank, wanted).min(1)
+    least, index = _among(every, rank, branches).min(1)
     lost = least >= _LOST
     best = every.map(lambda values: values[torch.arange(len(index)), index])
-    best = replace(best, branch=torch.where(lost, wanted[0], best.branch))
+    best = replace(best, branch=torch.where(lost, branches[0], best.branch))
     return _without(best, lost, Status.UNREACHABLE)
 
 

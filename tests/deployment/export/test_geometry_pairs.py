@@ -93,7 +93,7 @@ def test_the_geometric_fit_is_the_default(form, stated, model, tmp_path):
 
 
 def test_every_file_says_which_geometry_it_holds(model):
-    said = {name: chosen_geometry(model, name).said for name in (GEOMETRIC, HYBRID)}
+    said = {name: chosen_geometry(model, name).comments for name in (GEOMETRIC, HYBRID)}
     assert said[GEOMETRIC] != said[HYBRID]
     assert not np.array_equal(
         chosen_geometry(model, GEOMETRIC).robot.dh, chosen_geometry(model, HYBRID).robot.dh

@@ -1,1 +1,1 @@
-"""Files that controllers keep of their own calibration: writers, and readers that give the robot back."""
+"""Calibration files of controllers: writers, and readers that return a robot."""

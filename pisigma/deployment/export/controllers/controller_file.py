@@ -27,13 +27,13 @@ class FileText:
         robot: robot with the geometry for the file.
         nominal: robot of the controller without the file.
         request: model, file and options.
-        said: sentences for the comments of the file.
+        comments: sentences for the comments of the file.
     """
 
     robot: Robot
     nominal: Robot
     request: ExportRequest
-    said: tuple[str, ...] = ()
+    comments: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,19 +41,19 @@ class Frames:
     """Frames of a controller relative to those of a robot description.
 
     Attributes:
-        said: a sentence that states them.
+        sentence: a sentence that states them.
         base: the controller's base frame in the frame of the description's poses, as `FRAME_COLUMNS`.
         tool: the description's tool relative to the controller's flange.
     """
 
-    said: str
+    sentence: str
     base: Float64[np.ndarray, " 6"]
     tool: Float64[np.ndarray, " 6"]
 
     def to_json(self) -> dict[str, object]:
         """Return plain values for `--json`."""
         parts = {part: in_file_units(FRAME_COLUMNS, getattr(self, part)) for part in ("base", "tool")}
-        return {"said": self.said, **parts}
+        return {"said": self.sentence, **parts}
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,7 +80,7 @@ class Convention:
             else f"No published values were found to test this file for robot '{self.nominal.name}': compare the "
             "controller's position with that of pisigma at several joint values before you use it."
         )
-        return (tried, self.frames.said) if self.frames else (tried,)
+        return (tried, self.frames.sentence) if self.frames else (tried,)
 
 
 @dataclass(frozen=True)
@@ -141,24 +141,24 @@ class ControllerFile:
         lost, drawn = fit.departure(held), fit.departure(nominal)
         title = f"{self.contents[0].upper()}{self.contents[1:]} of model {model.name} (robot {nominal.name})."
         convention = self.convention(model.drawn or nominal)
-        said = [
+        sentences = [
             title,
             self.source,
             *convention.remarks,
             departure_sentence("This file deviates", lost, drawn),
         ]
         if corrects_joints(model):
-            said.append(
+            sentences.append(
                 "It does not include a learned joint correction: its geometry is the nearest approximation of the "
                 "whole model."
             )
-        said += [*self.relies, *condition_remarks(model), *frame_remarks(model)]
+        sentences += [*self.relies, *condition_remarks(model), *frame_remarks(model)]
         facts = {"off_the_whole_model": asdict(lost), "robot_as_drawn": asdict(drawn)}
         facts |= {part: in_file_units(FRAME_COLUMNS, getattr(held, part)) for part in ("base", "tool")}
         if convention.frames:
             facts["frames"] = convention.frames.to_json()
-        text = self.text(replace(draft, said=tuple(said)))
-        return Exported(text, model_facts(model) | facts, tuple(said))
+        text = self.text(replace(draft, comments=tuple(sentences)))
+        return Exported(text, model_facts(model) | facts, tuple(sentences))
 
 
 def untried(source: str) -> str:

@@ -67,7 +67,7 @@ def write_counts(content: FileText) -> str:
         lines.append(entry | {column: f"{value:.17g}" for column, value in zip(COLUMNS, values, strict=True)})
     lines += [{"part": part, **cells(FRAME_COLUMNS, getattr(robot, part))} for part in ("base", "tool")]
     frame = in_file_units(FRAME_COLUMNS, robot.base)
-    return csv_table(("part", "name", "offset_deg", "offset_mm", *COLUMNS, *frame), lines, content.said)
+    return csv_table(("part", "name", "offset_deg", "offset_mm", *COLUMNS, *frame), lines, content.comments)
 
 
 def _numbers(stated: str | None, option: str, robot: Robot) -> Float64[np.ndarray, " axes"]:

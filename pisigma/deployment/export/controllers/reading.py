@@ -97,7 +97,7 @@ def read_controller_file(path: Path, nominal: Robot, max_change: float = MAX_CHA
         )
     frames = convention.frames
     source = f"Read from {path.name} with the nominal robot '{nominal.name}'."
-    source = f"{source} {frames.said}" if frames else source
+    source = f"{source} {frames.sentence}" if frames else source
     remarks = (
         (file.source, *convention.remarks)
         if file

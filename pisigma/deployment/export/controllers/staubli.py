@@ -43,7 +43,7 @@ def write_arm(content: FileText) -> str:
         array.tail = before.tail
         before.getparent().replace(before, array)
         array = root
-    comments = (comment_text(line) for line in (*content.said, *frame_sentences(content.robot)))
+    comments = (comment_text(line) for line in (*content.comments, *frame_sentences(content.robot)))
     lines = ['<?xml version="1.0" encoding="utf-8"?>', *(f"<!--{line}-->" for line in comments)]
     return "\n".join([*lines, etree.tostring(array, encoding="unicode")]) + "\n"
 

@@ -65,7 +65,7 @@ def write_calibration(content: FileText) -> str:
         key: f"{key} = [{', '.join(repr(value) for value in difference[:, column].tolist())}]"
         for key, column in KEYS.items()
     }
-    comments = head((*content.said, *frame_sentences(robot)))
+    comments = head((*content.comments, *frame_sentences(robot)))
     if content.request.like is None:
         return comments + "\n".join(["[mounting]", *lines.values()]) + "\n"
     text = read_text(content.request.like, RobotError, "calibration.conf")

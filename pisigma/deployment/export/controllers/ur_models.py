@@ -107,18 +107,18 @@ class OwnGeometry:
     def frames(self) -> Frames:
         """Return the differences between the description's frames and the controller's."""
         base, tool = xyzrpy_of(self.T_drawn_base), xyzrpy_of(self.T_flange_tool)
-        return Frames(self._said(), base, tool)
+        return Frames(self._sentence(), base, tool)
 
-    def _said(self) -> str:
+    def _sentence(self) -> str:
         base, tool = _frame_words(self.T_drawn_base), _frame_words(self.T_flange_tool)
-        said = f"Poses are those of the {self.model}'s flange in the controller's frame 'base'"
+        poses = f"Poses are those of the {self.model}'s flange in the controller's frame 'base'"
         if not base and not tool:
-            return f"{said}, which are also the frames of robot '{self.drawing.name}'."
+            return f"{poses}, which are also the frames of robot '{self.drawing.name}'."
         differences = [
             f"'base' is at {base} in the frame of its poses" if base else "",
             f"its tool is at {tool} on the flange" if tool else "",
         ]
-        return f"{said}; robot '{self.drawing.name}' has other frames: {' and '.join(filter(None, differences))}."
+        return f"{poses}; robot '{self.drawing.name}' has other frames: {' and '.join(filter(None, differences))}."
 
 
 def _screw(T: Frame) -> Frame:

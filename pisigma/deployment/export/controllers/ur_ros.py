@@ -85,7 +85,7 @@ def write_kinematics(content: FileText) -> str:
         for link, origin in zip(LINKS, origins, strict=True)
     }
     links["hash"] = calibration_hash(without_beta(origins, own))
-    return head((*content.said, *frame_sentences(own))) + yaml_text({"kinematics": links})
+    return head((*content.comments, *frame_sentences(own))) + yaml_text({"kinematics": links})
 
 
 def read_kinematics(text: str, source: str, nominal: Robot) -> Robot:

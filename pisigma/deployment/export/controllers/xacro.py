@@ -34,7 +34,7 @@ def write_overlay(content: FileText) -> str:
     Raises:
         OutputError: there is no such file.
     """
-    urdf = drawn_into(content.request, content.robot, content.nominal, content.said)
+    urdf = drawn_into(content.request, content.robot, content.nominal, content.comments)
     if urdf is None:
         raise OutputError(
             "--format xacro needs the URDF file of the robot",

@@ -26,10 +26,10 @@ typedef struct {
     double lowest[PISIGMA_MOST_JOINTS], highest[PISIGMA_MOST_JOINTS]; /* range of `near_q` */
     uint64_t axes_rows; /* 0 if all axes of the tool are constrained */
     double axes[8];     /* else the constrained axes, see pisigma/robot/kinematics/task_axes.py */
-} head;
+} file_head;
 
 struct pisigma_model {
-    head said;
+    file_head head;
     char *names; /* names of the branches, each terminated by a zero */
     unsigned char *description;
 };
@@ -52,19 +52,19 @@ static int take(FILE *stream, void *target, size_t size, uint32_t *sum) {
 
 static const char *fill(pisigma_model *model, FILE *stream) {
     static const char *const cut = "is truncated or was changed; export the model again";
-    head *said = &model->said;
+    file_head *head = &model->head;
     uint32_t sum = 0, stated;
-    if (!take(stream, said, sizeof *said, &sum) || memcmp(said->magic, "PSIGIK01", 8) != 0)
+    if (!take(stream, head, sizeof *head, &sum) || memcmp(head->magic, "PSIGIK01", 8) != 0)
         return "is not a model file of this library";
-    if (said->layout != PISIGMA_LAYOUT || said->description_size != PISIGMA_DESCRIPTION_SIZE ||
-        said->memory_size != PISIGMA_MEMORY_SIZE)
+    if (head->layout != PISIGMA_LAYOUT || head->description_size != PISIGMA_DESCRIPTION_SIZE ||
+        head->memory_size != PISIGMA_MEMORY_SIZE)
         return "was exported by another version; use the library that was exported together with it";
-    if (said->joints > PISIGMA_MOST_JOINTS || said->names_size > 4096) return cut;
-    model->names = calloc(1, said->names_size + 1);
+    if (head->joints > PISIGMA_MOST_JOINTS || head->names_size > 4096) return cut;
+    model->names = calloc(1, head->names_size + 1);
     model->description = calloc(1, PISIGMA_DESCRIPTION_SIZE);
     if (!model->names || !model->description) return "does not fit into memory";
-    if (!take(stream, model->names, said->names_size, &sum)) return cut;
-    for (uint64_t i = 0; i < said->segments; i++) {
+    if (!take(stream, model->names, head->names_size, &sum)) return cut;
+    for (uint64_t i = 0; i < head->segments; i++) {
         uint64_t at[2]; /* first byte and number of bytes */
         if (!take(stream, at, sizeof at, &sum)) return cut;
         if (at[0] > PISIGMA_DESCRIPTION_SIZE || at[1] > PISIGMA_DESCRIPTION_SIZE - at[0]) return cut;
@@ -92,9 +92,9 @@ void pisigma_free(pisigma_model *model) {
     free(model);
 }
 
-int pisigma_joints(const pisigma_model *model) { return (int)model->said.joints; }
+int pisigma_joints(const pisigma_model *model) { return (int)model->head.joints; }
 
-int pisigma_branches(const pisigma_model *model) { return (int)model->said.branches; }
+int pisigma_branches(const pisigma_model *model) { return (int)model->head.branches; }
 
 const char *pisigma_branch_name(const pisigma_model *model, int branch) {
     const char *name = model->names;
@@ -109,7 +109,7 @@ static int64_t run(const pisigma_model *model, int64_t task, double *pose, const
     int64_t result[2] = {0, 0};
     memset(memory, 0, sizeof memory);
     pisigma_run(&result[0], (void **)&result[1], model->description, memory, task, 1, pose, near_q, near_q != NULL,
-                approach, approach != NULL, model->said.axes, (int64_t)model->said.axes_rows, branch, 1, 0, out, 1);
+                approach, approach != NULL, model->head.axes, (int64_t)model->head.axes_rows, branch, 1, 0, out, 1);
     return result[0];
 }
 
@@ -119,7 +119,7 @@ int pisigma_solve(const pisigma_model *model, const double pose[16], const doubl
     double T[16], beside[PISIGMA_MOST_JOINTS], out[2 * PISIGMA_MOST_JOINTS + 5];
     memcpy(T, pose, sizeof T);
     for (int j = 0; near_q && j < dof; j++) {
-        int possible = near_q[j] >= model->said.lowest[j] && near_q[j] <= model->said.highest[j];
+        int possible = near_q[j] >= model->head.lowest[j] && near_q[j] <= model->head.highest[j];
         beside[j] = possible ? near_q[j] : NAN; /* probably in degrees: INVALID_POSE */
     }
     for (int j = 0; approach && j < dof; j++)
@@ -139,7 +139,7 @@ int pisigma_solve(const pisigma_model *model, const double pose[16], const doubl
 
 int pisigma_forward(const pisigma_model *model, const double *q, const double *approach, double pose[16]) {
     double out[7 * PISIGMA_MOST_JOINTS + 1];
-    if (model->said.arm < 0) return -1;
-    run(model, EVALUATE, pose, q, approach, model->said.arm, out);
+    if (model->head.arm < 0) return -1;
+    run(model, EVALUATE, pose, q, approach, model->head.arm, out);
     return 0;
 }

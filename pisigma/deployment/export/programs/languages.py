@@ -65,16 +65,16 @@ class Program:
     @staticmethod
     def of_targets(targets: Targets, name: str, cartesian: bool, config: str = "") -> "Program":
         """Make the program that moves to targets, none of which may be missing."""
-        said = [targets.title, TEST, COUNTING.format(robot=targets.robot.name)]
-        said += [*CARTESIAN, *targets.remarks] if cartesian else []
-        said += [targets.domain_warning] if targets.domain_warning else []
+        sentences = [targets.title, TEST, COUNTING.format(robot=targets.robot.name)]
+        sentences += [*CARTESIAN, *targets.remarks] if cartesian else []
+        sentences += [targets.domain_warning] if targets.domain_warning else []
         labels = [
             f"line {line}{' OUTSIDE DOMAIN' if status == Status.OUTSIDE_DOMAIN else ''}"
             for line, status in zip(targets.line, targets.status, strict=True)
         ]
         waits = (0.0,) * len(labels)
         shown = targets if cartesian else None
-        return Program(name, targets.robot, said, targets.q, tuple(labels), waits, shown, config)
+        return Program(name, targets.robot, sentences, targets.q, tuple(labels), waits, shown, config)
 
     @property
     def degrees(self) -> list[list[float]]:
@@ -142,8 +142,8 @@ class Language:
         Raises:
             OutputError: it has more lines than the language allows.
         """
-        said = [*self.cautions, *(self.cartesian_cautions if program.cartesian else ())]
-        content = {"program": program, "targets": program.cartesian, "cautions": said}
+        sentences = [*self.cautions, *(self.cartesian_cautions if program.cartesian else ())]
+        content = {"program": program, "targets": program.cartesian, "cautions": sentences}
         text = _templates().get_template(self.template).render(content) + "\n"
         lines = len(_NUMBERED_LINE.findall(text))
         if self.most_lines is not None and lines > self.most_lines:

@@ -147,15 +147,15 @@ def _exported(
 
 def _warnings(corrected: CorrectedProgram, source: str) -> tuple[str, ...]:
     """Return warnings on the branches of the targets, and on all that was left unchanged."""
-    said = [
+    sentences = [
         f"Targets are corrected for the branch {' and '.join(corrected.branches) or 'of the model'}. The program's "
         "configuration was not checked: if the arm is in another configuration, state --branch."
     ]
     if corrected.left:
-        said.append(
+        sentences.append(
             f"Left unchanged in {source}: {'; '.join(f'line {line}: {reason}' for line, reason in corrected.left)}."
         )
-    return tuple(said)
+    return tuple(sentences)
 
 
 def _shortfall(corrected: CorrectedProgram, source: str) -> str | None:
