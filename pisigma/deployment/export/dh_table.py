@@ -53,7 +53,7 @@ def _coupling_sentences(robot: Robot) -> tuple[str, ...]:
         return ()
     stated = json.dumps(coupling_document(robot.coupling, robot.joints))
     return (
-        f"q_i are joint values, which follow from the controller's values by the coupling of a robot file: {stated}",
+        f"q_i are joint values, which follow from the controller's values as in a robot file: coupling: {stated}",
     )
 
 

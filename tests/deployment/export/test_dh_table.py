@@ -68,7 +68,7 @@ def test_the_csv_holds_the_same(name):
             assert_close(found, [row.lower, row.upper], rtol=1e-15, atol=0)
 
 
-def test_the_coupling_of_joints_stands_above_the_table():
+def test_the_coupling_of_joints_is_stated_above_the_table():
     (line,) = [line for line in dh_csv(coupled_robot()).splitlines() if "coupling" in line]
-    stated = yaml.safe_load(line.partition(" says: ")[2])
+    stated = yaml.safe_load("coupling: " + line.partition("coupling: ")[2])
     assert stated == {"coupling": [{"joint": "theta_3", "factors": {"theta_2": 1.0, "theta_3": 1.0}}]}

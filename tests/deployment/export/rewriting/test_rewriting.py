@@ -57,8 +57,9 @@ def test_the_real_tool_comes_where_the_program_says(language, arm, tmp_path):
         i for i, text in enumerate(request.program.read_text().splitlines(), 1) if "9" in text and i > 5
     )
     assert line
-    assert str(exported.shortfall).startswith(f"{request.program}, line ")
-    assert "unreachable, so the line is as it was" in str(exported.shortfall)
+    (unreached,) = exported.facts["unreached"]
+    assert unreached["status"] == "unreachable"
+    assert str(exported.shortfall).startswith(f"{request.program}, line {unreached['line']}: unreachable")
 
 
 @pytest.mark.parametrize("language", LANGUAGES, ids=lambda language: language.suffix)
@@ -153,7 +154,7 @@ def test_a_pose_of_several_tools_stays(arm, tmp_path):
         ({"tolerance_mm": 0.0}, {"option": "--tolerance-mm", "value": 0.0}),
         ({"poses": Path("poses.csv")}, {"option": "--poses", "remedy": "give one of them"}),
         ({"program": None}, {"option": "--poses", "remedy": "give --poses, or a --program with poses"}),
-        ({"program": None, "poses": Path("x.csv")}, {"option": "--frames"}),
+        ({"program": None, "poses": Path("x.csv")}, {"option": "--tolerance-mm"}),
     ],
 )
 def test_invalid_options_are_refused(options, fields, arm, tmp_path):
