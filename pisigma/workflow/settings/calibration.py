@@ -97,7 +97,7 @@ class CalibrationSettings:
         features: features of the joint correction to try, such as gravity,lines,series. None: all that apply, including
             those of plug-ins.
         gravity: direction of gravity in the robot's base frame, such as 0,0,-1. None: the axis that fits the data best.
-        new_frame_at: first line measured after the instrument was moved. Its rows get a frame of their own.
+        new_frame_at: first line measured after the instrument was moved. From there, rows are in a new frame.
         socket_distances: known distance between two sockets [m], such as */0,*/1,50. An asterisk stands for the same
             text in both names, here for every placement.
         cameras: cameras and boards, for files of detected board corners.
