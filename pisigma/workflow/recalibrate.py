@@ -190,7 +190,7 @@ def _adapted(
     right = rows.select(torch.tensor(left)) if far else rows
     adaptation = adapt(recalibration_problem(parent, posterior, right, elsewhere), posterior.noise)
     wrong = [left[row] for row in adaptation.wrong_rows]
-    if wrong:
+    if wrong:  # they have biased the first adaptation
         right = rows.select(torch.tensor([row for row in left if row not in wrong]))
         adaptation = adapt(recalibration_problem(parent, posterior, right, elsewhere), posterior.noise)
     return right, adaptation, _outliers(adaptation, rows, sorted((*far, *wrong)))

@@ -132,6 +132,7 @@ def draw_between(
     order = torch.rand(count, nearby, generator=generator).argsort(-1)[:, : robot.dof]
     others = torch.cat(neighbours)[first].gather(1, order)
     way = wrapped_difference(robot, q[others], q[first][:, None])
+    # normalised exponential variables are uniform over the simplex; squared, they concentrate at its corners (rows)
     weight = torch.rand(count, way.shape[1] + 1, generator=generator, dtype=torch.float64).log().square()
     weight = weight / weight.sum(-1, keepdim=True)
     return q[first] + (weight[:, 1:, None] * way).sum(1)
