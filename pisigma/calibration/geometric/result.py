@@ -174,12 +174,7 @@ class CalibrationResult:
         """All parameters, free or not."""
         solved = self.solved
         return parameter_table(
-            solved.setup,
-            solved.problem,
-            solved.findings,
-            solved.refined,
-            solved.geometry,
-            solved.covariance,
+            solved.setup, solved.problem, solved.findings, solved.refined, solved.geometry, solved.covariance
         )
 
     @property
@@ -262,10 +257,7 @@ class CalibrationResult:
     @cached_property
     def warning_details(self) -> tuple[CalibrationWarning, ...]:
         """What the measurements do not determine, what to measure next, and what does not fit."""
-        return (
-            *what_to_measure(self.solved.setup, self.solved.findings.wanted),
-            *_warnings(self.solved),
-        )
+        return (*what_to_measure(self.solved.setup, self.solved.findings.wanted), *_warnings(self.solved))
 
     @property
     def warnings(self) -> tuple[str, ...]:

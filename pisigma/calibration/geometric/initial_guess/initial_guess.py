@@ -9,9 +9,7 @@ from jaxtyping import Bool, Float64, Int64
 from torch import Tensor
 
 from pisigma.calibration.geometric.initial_guess.base_and_tool import guess_base_and_tool
-from pisigma.calibration.geometric.initial_guess.base_and_tool_closed_form import (
-    base_by_points,
-)
+from pisigma.calibration.geometric.initial_guess.base_and_tool_closed_form import base_by_points
 from pisigma.calibration.geometric.initial_guess.tool_from_distances import (
     base_from_anchors,
     tools_from_distances,
