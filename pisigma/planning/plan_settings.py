@@ -91,7 +91,9 @@ class PlanSettings:
         check_choice(PlanningError, "criterion", self.criterion, get_args(Criterion))
         if (self.sensor == "camera") != (self.camera is not None):
             raise PlanningError(
-                expected="files of a camera and of a board for the sensor camera only",
+                "the sensor camera needs files of a camera and of a board"
+                if self.camera is None
+                else f"files of a camera and of a board are for the sensor camera, got '{self.sensor}'",
                 value=self.sensor,
                 option="sensor",
             )

@@ -145,7 +145,7 @@ class CalibrationSettings:
             )
         if self.hold_out is not None and self.folds is not None:
             raise MeasurementError(
-                f"folds {self.folds} and hold_out {self.hold_out:g} exclude each other",
+                f"{self.hold_out:g} cannot be combined with folds {self.folds}",
                 value=self.hold_out,
                 option="hold_out",
                 remedy="leave one out",

@@ -45,8 +45,9 @@ class Limits:
         """Check that limits are positive and finite."""
         for name, limit in self.stated.items():
             if not (limit > 0 and math.isfinite(limit)):
+                unit = name.split("_")[1]
                 raise MeasurementError(
-                    expected="a finite limit > 0", value=limit, option=f"--{_LIMITED[name][0]}"
+                    expected=f"a finite limit > 0 {unit}", value=limit, option=f"--{_LIMITED[name][0]}"
                 )
 
     @property
