@@ -50,7 +50,7 @@ def _response():
     )
 
 
-def test_a_service_call_gets_corrected_joint_values(messages, repository):
+def test_a_service_call_returns_corrected_joint_values(messages, repository):
     ik, arm = pisigma.load(repository / "models" / "kiro4"), messages.Arm(JOINTS, "base_link")
     near = ik.model.starts[3].double().numpy()
     T = ik.forward(near)
@@ -81,7 +81,7 @@ def test_a_service_call_gets_corrected_joint_values(messages, repository):
     assert messages.answer(_request(T, near), _response(), arm, gone).error_code.val == -25
 
 
-def test_joint_values_outside_the_domain_count_where_that_is_accepted(messages):
+def test_joint_values_outside_the_domain_are_returned_if_accepted(messages):
     q = [0.1] * 6
     for accepts, wanted in ((False, -31), (True, 1)):
         arm = messages.Arm(JOINTS, "base_link", accept_outside_domain=accepts)

@@ -1,1 +1,1 @@
-"""The calibrated model: geometry and network together, its folder, and corrected inverse kinematics."""
+"""Corrected inverse kinematics of a calibrated model."""

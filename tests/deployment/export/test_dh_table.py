@@ -1,4 +1,4 @@
-"""DH tables: the YAML is a robot file, the CSV holds the same numbers."""
+"""DH tables: the YAML is a robot file, and the CSV has the same numbers."""
 
 import csv
 import math
@@ -16,7 +16,7 @@ LENGTHS = ("d", "a", "x", "y", "z")
 
 
 def calibrated(name: str) -> Robot:
-    """A robot of the catalogue with every parameter off its nominal value."""
+    """A catalogue robot with errors in all parameters."""
     nominal, random = Robot.load(name), np.random.default_rng(3)
     return nominal.with_geometry(
         nominal.dh + random.normal(0, 1e-3, nominal.dh.shape),
@@ -48,7 +48,7 @@ def test_the_yaml_is_a_robot_file(name, tmp_path):
 
 
 @pytest.mark.parametrize("name", catalogue())
-def test_the_csv_holds_the_same(name):
+def test_the_csv_has_the_same_numbers(name):
     robot = calibrated(name)
     lines = dh_csv(robot, ("said",)).splitlines()
     assert [line[0] for line in lines[:3]] == ["#", "#", "p"]

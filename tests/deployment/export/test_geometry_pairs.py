@@ -1,4 +1,4 @@
-"""Exports that belong together fit together: a hybrid's geometry and its correction give the model's pose."""
+"""A hybrid's exported geometry and correction together yield the model's pose."""
 
 import json
 from dataclasses import replace
@@ -33,14 +33,14 @@ def model(request, monkeypatch):
 
 
 def exported(form: str, geometry: str | None, folder) -> tuple[Robot, object]:
-    """The robot of an exported file, and what `--json` says of its geometry."""
+    """The robot of an exported file, and its geometry according to `--json`."""
     out = folder / f"{form}{SUFFIXES[form]}"
     done = export_model(form, ExportRequest(folder / "model", out, geometry=geometry))
     return Robot.load(out), done.facts["geometry"]
 
 
 @pytest.mark.parametrize("form", SUFFIXES)
-def test_hybrid_geometry_and_onnx_correction_give_the_pose_of_the_model(form, model, tmp_path):
+def test_hybrid_geometry_and_onnx_correction_yield_the_pose_of_the_model(form, model, tmp_path):
     onnxruntime = pytest.importorskip("onnxruntime")
     pytest.importorskip("onnx")
     robot, named = exported(form, HYBRID, tmp_path)
@@ -55,7 +55,7 @@ def test_hybrid_geometry_and_onnx_correction_give_the_pose_of_the_model(form, mo
     assert float(off[:, :3, 3].norm(dim=-1).max()) > 1e-6
 
 
-def test_base_and_tool_beside_a_correction_are_those_of_its_geometry(model):
+def test_base_and_tool_of_a_correction_are_those_of_its_geometry(model):
     onnxruntime = pytest.importorskip("onnxruntime")
     pytest.importorskip("onnx")
     base, tool = np.array([0.2, -0.1, 0.3, 0.4, 0.1, -0.2]), np.array([0.01, 0.02, 0.1, 0.0, 0.2, 0.5])
@@ -72,7 +72,7 @@ def test_base_and_tool_beside_a_correction_are_those_of_its_geometry(model):
     assert_close(T, own.hybrid.forward(q), atol=1e-12)
 
 
-def test_base_and_tool_beside_a_network_are_those_of_the_nominal_robot():
+def test_base_and_tool_of_a_network_are_those_of_the_nominal_robot():
     onnxruntime = pytest.importorskip("onnxruntime")
     pytest.importorskip("onnx")
     model = hand_made_model("kiro4")
@@ -92,7 +92,7 @@ def test_the_geometric_fit_is_the_default(form, stated, model, tmp_path):
     assert_close(forward_kinematics(robot, q), forward_kinematics(model.calibrated, q), atol=1e-9)
 
 
-def test_every_file_says_which_geometry_it_holds(model):
+def test_every_file_states_its_geometry(model):
     said = {name: chosen_geometry(model, name).comments for name in (GEOMETRIC, HYBRID)}
     assert said[GEOMETRIC] != said[HYBRID]
     assert not np.array_equal(
@@ -107,7 +107,7 @@ def test_models_without_a_correction_of_joints_have_no_hybrid_geometry(made):
 
 
 @pytest.mark.parametrize("form", [name for name in export_names() if name not in SUFFIXES])
-def test_formats_that_hold_no_such_geometry_refuse_it(form, tmp_path):
+def test_other_formats_refuse_the_option_geometry(form, tmp_path):
     out = tmp_path / f"out{''.join(export_format(form).suffixes[:1])}"
     with refused(OutputError, option="--geometry", value=form):
         export_model(form, ExportRequest(tmp_path, out, geometry=HYBRID))
@@ -115,6 +115,6 @@ def test_formats_that_hold_no_such_geometry_refuse_it(form, tmp_path):
 
 
 @pytest.mark.parametrize("form", SUFFIXES)
-def test_a_geometry_that_is_none_is_refused(form, tmp_path):
+def test_an_unknown_geometry_is_refused(form, tmp_path):
     with refused(OutputError, option="--geometry", value="hybird"):
         export_model(form, ExportRequest(tmp_path, tmp_path / f"a{SUFFIXES[form]}", geometry="hybird"))

@@ -6,7 +6,7 @@ from pisigma.deployment.export.geometry import offset_remarks, remarks
 from pisigma.model.geometric_model import model_of_hybrid
 
 
-def test_what_a_hybrid_has_learned_is_said_to_be_missing():
+def test_files_state_that_the_learned_correction_is_missing():
     arm = hybrid_of(name="rb5")
     model = model_of_hybrid("hybrid", arm.true.nominal, arm.result, arm.measurements)
     assert model.hybrid is not None

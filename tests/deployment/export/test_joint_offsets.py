@@ -1,4 +1,4 @@
-"""Joint offsets alone: found where the model is nothing else, and honest where it is more."""
+"""Joint offsets alone are exact for models with only offset errors, and their deviation is stated for others."""
 
 import dataclasses
 
@@ -39,8 +39,8 @@ def with_offsets(robot: Robot, offsets: list[float]) -> Robot:
 
 
 @pytest.mark.parametrize("name", ["kiro4", "ur10"])
-def test_offsets_come_back(name):
-    """Those of the first and the last joint are base and tool."""
+def test_offsets_are_found_again(name):
+    """Offsets of the first and the last joint are part of base and tool."""
     nominal = Robot.load(name)
     flipped = dataclasses.replace(
         nominal,
@@ -61,8 +61,8 @@ def test_offsets_come_back(name):
     assert_close(forward_kinematics(shifted, q + torch.from_numpy(found.values)), T, atol=1e-9)
 
 
-def test_parallel_axes_leave_base_and_tool_open():
-    """On a SCARA the second joint alone is told from base and tool, which share two directions themselves."""
+def test_parallel_axes_have_unobservable_offsets():
+    """On a SCARA only the second joint is distinguishable from base and tool, which share two directions."""
     model = geometric_model("kiro3", with_offsets(Robot.load("kiro3"), [0.0, 0.02, 0.0, 0.0]))
     found = fit_joint_offsets(model)
     assert found.unobservable == ("theta_1", "d_3", "theta_4")
@@ -72,7 +72,7 @@ def test_parallel_axes_leave_base_and_tool_open():
 
 
 @pytest.mark.parametrize("name", ["kiro3", "kiro4", "ur10"])
-def test_a_learned_correction_is_followed_in_part(name):
+def test_a_learned_correction_is_approximated_in_part(name):
     found = fit_joint_offsets(hand_made_model(name))
     assert 0 < found.lost.mean_mm < found.nominal.mean_mm
     assert found.departures()["off_the_whole_model"]["mean_mm"] == found.lost.mean_mm

@@ -1,4 +1,4 @@
-"""The ONNX graph gives what the model gives, and says what its numbers are."""
+"""The ONNX graph has the outputs of the model, and describes its inputs and outputs."""
 
 import json
 import math
@@ -43,7 +43,7 @@ def run(content: bytes, **inputs: torch.Tensor) -> dict[str, np.ndarray]:
 
 
 def everywhere(robot: Robot, rows: int) -> torch.Tensor:
-    """Joint values over two turns and more, 0 and quarter turns among them."""
+    """Joint values over more than two turns, including 0 and quarter turns."""
     generator = torch.Generator().manual_seed(rows)
     q = 14 * torch.rand(rows, robot.dof, generator=generator, dtype=torch.float64) - 7
     if rows > 10:
@@ -73,7 +73,7 @@ def test_corrections_of_nominal_joint_values_are_those_of_the_network(name, inpu
     assert rows == 0 or float(expected.abs().max()) > 1e-3
 
 
-def test_joints_without_correction_stay():
+def test_joints_without_correction_are_unchanged():
     model = hand_made_model("kiro3")
     group, network = model.network.members()[0]
     network = type(network)(network.inputs, 1, (2,))
@@ -86,8 +86,8 @@ def test_joints_without_correction_stay():
 
 
 @pytest.mark.parametrize("pitch", [0.0, 0.3, RIGHT, -RIGHT, RIGHT - 1e-13, RIGHT - 1e-7])
-def test_angles_of_a_pose_at_their_ends(pitch):
-    """Roll and yaw at multiples of a quarter turn and beside them, where the arc functions change their branch."""
+def test_angles_of_a_pose_at_branch_cuts(pitch):
+    """Roll and yaw at and near multiples of a quarter turn, where the arc functions have branch cuts."""
     model = hand_made_model("kiro3", inputs=POSE_INPUTS, scale=0.3)
     quarters = torch.arange(-4, 5, dtype=torch.float64) * math.pi / 4
     near = torch.cat([quarters, quarters + 1e-9, quarters - 1e-9])
@@ -134,7 +134,7 @@ def test_the_correction_of_a_hybrid_is_that_of_the_model(name, names, rows):
     assert rows < 2 or float(beyond.max()) > 0.1
 
 
-def test_joints_that_count_the_other_way_carry_their_masses():
+def test_reversed_joints_carry_their_masses():
     robot = Robot.load("ur10")
     rows = tuple(replace(row, direction=-1) if i in (1, 4) else row for i, row in enumerate(robot.rows))
     robot = replace(robot, rows=rows)
@@ -144,7 +144,7 @@ def test_joints_that_count_the_other_way_carry_their_masses():
 
 
 @pytest.mark.parametrize("kind", [INVERSE, FORWARD])
-def test_the_file_says_what_its_numbers_are(kind):
+def test_the_file_describes_its_numbers(kind):
     forward = kind == FORWARD
     model = (
         hybrid_model("kiro3", features_of(Robot.load("kiro3"), "series conditions"))
@@ -171,16 +171,16 @@ def test_the_file_says_what_its_numbers_are(kind):
     assert {value.shape[0] for value in (*opened.get_inputs(), *opened.get_outputs())} == {"batch"}
 
 
-def test_the_same_model_gives_the_same_file():
+def test_the_file_is_reproducible():
     assert export_onnx(hand_made_model("kiro4")) == export_onnx(hand_made_model("kiro4"))
 
 
-def test_geometry_alone_is_no_network():
+def test_a_model_without_a_network_is_refused():
     with refused(ModelError, value=geometric_model("kiro4").kind):
         export_onnx(geometric_model("kiro4"))
 
 
-def test_without_onnx_it_says_what_to_install(monkeypatch):
+def test_without_onnx_the_message_names_the_extra(monkeypatch):
     monkeypatch.setitem(sys.modules, "onnx", None)
     with pytest.raises(MissingExtraError, match=r'`pip install "pisigma\[onnx\]"`'):
         export_onnx(hand_made_model("kiro4"))

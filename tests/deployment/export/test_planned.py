@@ -1,4 +1,4 @@
-"""Programs of planned poses: they wait at poses, and pass way points."""
+"""Programs of planned poses wait at poses and pass way points."""
 
 from pathlib import Path
 
@@ -34,7 +34,7 @@ STOPS = ["pose 1", "way point", "way point", "pose 2"]
         ("go.ls", "  !", "WAIT 2.50(sec)"),
     ],
 )
-def test_a_program_goes_by_way_points_and_waits_at_poses(name: str, label: str, wait: str):
+def test_a_program_passes_way_points_and_waits_at_poses(name: str, label: str, wait: str):
     lines = planned_program(PLAN, Path(name)).replace("\r\n", "\n").splitlines()
     at = [
         number

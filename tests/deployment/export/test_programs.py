@@ -1,4 +1,4 @@
-"""Programs of targets: grammars read them whole, and the numbers are the targets' in every controller's convention."""
+"""Programs of targets comply with the grammars, and have the targets in every controller's convention."""
 
 import re
 from dataclasses import replace
@@ -27,7 +27,7 @@ TOOL = np.array([0.01, -0.02, 0.15, -1.2, 0.7, 0.4])
 
 
 def targets_at(q: torch.Tensor, T: torch.Tensor | None = None, name: str = "rb5", **others) -> Targets:
-    """Targets of a robot of the catalogue on a base and with a tool that are no identities."""
+    """Targets of a catalogue robot with a base and a tool."""
     robot = Robot.load(name).with_geometry(base=BASE, tool=TOOL)
     plain = Targets(
         model="cell_3",
@@ -54,7 +54,7 @@ def read(targets: Targets, suffix: str, cartesian: bool = False, name: str = "ce
 
 
 def transforms(values: list[list[float]], suffix: str) -> np.ndarray:
-    """Poses as a language writes them, as matrices [m], by scipy's conventions."""
+    """Convert poses of a language to matrices [m], with scipy's conventions."""
     array = np.array(values)
     rotation = {
         ".script": lambda v: Rotation.from_rotvec(v),
@@ -75,7 +75,7 @@ def in_radians(values: list[list[float]], suffix: str) -> torch.Tensor:
 
 @pytest.mark.parametrize("rows", [1, 200])
 @pytest.mark.parametrize("suffix", LANGUAGES)
-def test_joint_targets_come_back(suffix, rows):
+def test_joint_targets_are_read_back(suffix, rows):
     targets = targets_at(some_joints(rows))
     program = read(targets, suffix)
     assert program.name == ("CELL" if suffix == ".ls" else "cell")
@@ -88,8 +88,8 @@ def test_joint_targets_come_back(suffix, rows):
 
 @pytest.mark.parametrize("rows", [1, 200])
 @pytest.mark.parametrize("suffix", LANGUAGES)
-def test_cartesian_targets_come_back(suffix, rows):
-    """The controller's frame, pose and tool bring the flange of the bare arm where the joint values bring it."""
+def test_cartesian_targets_are_read_back(suffix, rows):
+    """The controller's frame, pose and tool determine the same flange pose as the joint values."""
     targets = targets_at(some_joints(rows))
     program = read(targets, suffix, cartesian=True)
     T = transforms(program.poses, suffix)
@@ -109,8 +109,8 @@ def test_cartesian_targets_come_back(suffix, rows):
 
 
 @pytest.mark.parametrize("suffix", LANGUAGES)
-def test_orientations_where_conventions_break(suffix):
-    """No turn, half turns about every axis and between, and the pitch of a quarter turn, exactly and nearly."""
+def test_orientations_at_singularities_of_conventions(suffix):
+    """No rotation, half turns about all axes and between them, and a pitch at and near a quarter turn."""
     half = Rotation.from_rotvec(
         np.pi * np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [0.6, 0.8, 0], [0.6, 0, -0.8], [0, -0.6, 0.8]])
     )
@@ -141,7 +141,7 @@ def test_zeros_and_very_small_numbers_have_neither_sign_nor_exponent(suffix):
 
 
 @pytest.mark.parametrize("suffix", LANGUAGES)
-def test_every_program_says_what_it_relies_on(suffix):
+def test_every_program_states_its_requirements(suffix):
     targets = targets_at(some_joints(3), remarks=("The base is that of the frame 'wall'.",))
     for cartesian in (False, True):
         program = read(targets, suffix, cartesian)
@@ -178,7 +178,7 @@ def test_hostile_names_of_models_stay_in_their_comments(suffix):
 
 
 @pytest.mark.parametrize("suffix", LANGUAGES)
-def test_what_lies_outside_the_domain_is_marked(suffix):
+def test_targets_outside_the_domain_are_marked(suffix):
     status = (Status.REACHED, Status.OUTSIDE_DOMAIN)
     program = read(targets_at(some_joints(2), status=status), suffix)
     assert "line 3 OUTSIDE DOMAIN" in program.remarks
@@ -190,7 +190,7 @@ def test_what_lies_outside_the_domain_is_marked(suffix):
 @pytest.mark.parametrize(
     "status", [status for status in Status if status not in (Status.REACHED, Status.OUTSIDE_DOMAIN)]
 )
-def test_no_program_without_all_its_targets(suffix, status):
+def test_a_missing_target_is_refused(suffix, status):
     targets = targets_at(some_joints(3), status=(Status.REACHED, status, status))
     with pytest.raises(UnreachablePoseError) as refused:
         program_text(targets, Path(f"cell{suffix}"), cartesian=False)
@@ -222,7 +222,7 @@ def test_many_failures_are_counted():
         (f"{'a' * 37}.ls", f"{'A' * 36}.ls"),
     ],
 )
-def test_names_that_controllers_refuse(name, suggested):
+def test_invalid_program_names_are_refused(name, suggested):
     targets = targets_at(some_joints(1))
     with pytest.raises(OutputError) as caught:
         program_text(targets, Path(name), cartesian=False)
@@ -250,7 +250,7 @@ def test_poses_on_several_branches(suffix):
     assert len(read(targets, ".script", cartesian=True).poses) == 3
 
 
-def test_one_configuration_names_one_turn():
+def test_targets_with_several_numbers_of_turns_are_refused():
     q = some_joints(2)
     q[1, 5] += 2 * np.pi
     with refused(OutputError, file="poses.csv", line=3, option="--config"):
@@ -259,7 +259,7 @@ def test_one_configuration_names_one_turn():
 
 
 @pytest.mark.parametrize("config", ["", "N U T", "NUT, 0, 0, 0", "N U T, 0, 0, 0\n", "N U T, 0, 0, 0';"])
-def test_configurations_that_are_none(config):
+def test_invalid_configurations_are_refused(config):
     with refused(OutputError, option="--config", value=config):
         program_text(targets_at(some_joints(1)), Path("a.ls"), True, config)
 
@@ -277,7 +277,7 @@ def test_configurations_that_are_none(config):
         (r"\r?\n", lambda match: "\n" if match.group().startswith("\r") else "\r\n"),
     ],
 )
-def test_the_grammars_refuse_what_is_no_program(suffix, pattern, other):
+def test_the_grammars_refuse_invalid_programs(suffix, pattern, other):
     text = program_text(targets_at(some_joints(2)), Path(f"cell{suffix}"), cartesian=False)
     broken = re.sub(pattern, other, text)
     assert broken != text
@@ -285,6 +285,6 @@ def test_the_grammars_refuse_what_is_no_program(suffix, pattern, other):
         READERS[suffix](broken)
 
 
-def test_a_program_that_no_controller_takes():
+def test_a_program_with_too_many_lines_is_refused():
     with refused(OutputError, expected="at most 9999 lines"):
         program_text(targets_at(some_joints(5000)), Path("a.ls"), False)

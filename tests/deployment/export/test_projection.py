@@ -1,4 +1,4 @@
-"""Models projected on few parameters: the best there are, by least squares."""
+"""Projections of models on few parameters are least-squares solutions."""
 
 import numpy as np
 import pytest
@@ -16,8 +16,8 @@ from pisigma.robot import Robot
 from pisigma.robot.kinematics.forward import forward_kinematics
 
 
-def test_the_fit_is_the_best_there_is():
-    """No small change of the free numbers makes the sum of squares smaller."""
+def test_the_fit_is_a_minimum():
+    """No small change of the free parameters reduces the sum of squares."""
     nominal, random = Robot.load("ur10"), np.random.default_rng(0)
     true = nominal.with_geometry(nominal.dh + random.normal(0, 2e-3, nominal.dh.shape))
     q = joints_around("ur10", 200, spread=0.8)
@@ -32,7 +32,7 @@ def test_the_fit_is_the_best_there_is():
 
 
 @pytest.mark.parametrize("free", [joint_offsets, whole_geometry])
-def test_the_derivative_is_that_of_finite_differences(free):
+def test_the_derivative_agrees_with_finite_differences(free):
     robot, q = Robot.load("kiro3"), joints_around("kiro3", 4)
     problem = ProjectionProblem(robot, q, forward_kinematics(robot, q), free(robot))
     _, J = problem.residual(robot)
@@ -43,7 +43,7 @@ def test_the_derivative_is_that_of_finite_differences(free):
         assert_close((back - there) / 2e-6, J[:, i], atol=1e-8)
 
 
-def test_the_whole_geometry_reaches_any_other():
+def test_all_parameters_reproduce_any_geometry():
     nominal, random = Robot.load("ur10"), np.random.default_rng(0)
     true = nominal.with_geometry(nominal.dh + random.normal(0, 2e-3, nominal.dh.shape))
     q = joints_around("ur10", 200, spread=0.8)

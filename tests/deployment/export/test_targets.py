@@ -84,7 +84,7 @@ def test_rows_without_target_are_empty():
         assert all(values) if there else not any(values)
 
 
-def test_a_pose_out_of_reach_gets_no_target():
+def test_a_pose_out_of_reach_has_no_target():
     model = hand_made_model("kiro4")
     T = forward_kinematics(model.robot, joints_around("kiro4", 2, seed=5, spread=0.1))
     T[1, 0, 3] = 9.0
@@ -99,7 +99,7 @@ def test_a_pose_out_of_reach_gets_no_target():
     assert targets.failure == f"poses.csv, line 5: unreachable. {Status.UNREACHABLE.sentence}"
 
 
-def test_a_hybrid_tells_its_accuracy_and_frames():
+def test_targets_of_a_hybrid_state_accuracy_and_frames():
     arm = hybrid_of(name="rb5", frames=True)
     model = model_of_hybrid("cell", arm.true.nominal, arm.result, arm.measurements)
     T = model.forward(arm.measurements.q[:4])
@@ -118,7 +118,7 @@ def test_a_hybrid_tells_its_accuracy_and_frames():
     assert f"Nominal robot: rb5; base: x_mm {model.robot.base[0] * 1e3:.9g}, " in text
 
 
-def test_what_is_said_of_the_nominal_robot_fits_in_comment_lines():
+def test_the_nominal_robot_is_described_in_comment_lines():
     robot = Robot.load("ur10").with_geometry(base=np.array([0.1, 0, 0, 0, 0, -np.pi / 2]))
     model = CalibratedModel(
         name="two\nlines, ü",

@@ -1,4 +1,4 @@
-"""A calibrated robot in the file that it was drawn in: exact from end to end, all else as it was."""
+"""A calibrated robot in its URDF file: exact forward kinematics, other content unchanged."""
 
 import numpy as np
 import pytest
@@ -138,7 +138,7 @@ def test_files_of_other_robots_are_refused(path):
         robot_into_urdf(drawn, drawn, path)
 
 
-def test_what_simulators_ask_for_is_filled_in_where_it_is_missing(path, tmp_path):
+def test_missing_values_that_simulators_require_are_filled_in(path, tmp_path):
     mass = '<inertial><mass value="3"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>'
     text = TEXT.replace('<link name="bracket"/>', f'<link name="bracket">{mass}</link>')
     path.write_text(text.replace('effort="7"', 'effort="0"'))

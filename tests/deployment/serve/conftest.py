@@ -18,4 +18,4 @@ def served(repository: Path) -> Iterator[Server]:
 
 @pytest.fixture(autouse=True)
 def _as_users_do(without_type_checker: None) -> None:
-    """Servers that end switch the type checker on again, for the one that serves all tests too."""
+    """Keep the type checker off: servers that stop switch it on again for the shared one too."""

@@ -1,4 +1,4 @@
-"""Binary frames: the same numbers as in Python, byte by byte as documented."""
+"""Binary frames have the numbers of Python, byte by byte as documented."""
 
 import math
 import socket
@@ -28,7 +28,7 @@ def _request(name=1, index=0, flags=0, pose=T, near=(math.nan,) * 8, magic=b"PSI
 
 @pytest.fixture
 def raw(served):
-    """Send bytes, give all that is answered."""
+    """Send bytes, and return all answers."""
 
     def exchange(sent):
         with socket.create_connection(("127.0.0.1", served.binary_port), 5) as stream:
@@ -42,7 +42,7 @@ def raw(served):
 
 
 @pytest.mark.parametrize(("index", "name"), [(0, "kiro4"), (1, "kiro3")])
-def test_a_frame_gets_the_numbers_of_python(frames, repository, index, name):
+def test_a_frame_is_answered_with_the_numbers_of_python(frames, repository, index, name):
     ik = pisigma.load(repository / "models" / name)
     near = NEAR[: len(ik.joints)]
     pose = ik.forward(near)
@@ -69,7 +69,7 @@ def test_statuses_without_joint_values(frames):
         assert np.isnan([*q, *residuals]).all()
 
 
-def test_many_frames_are_answered_in_their_order(raw):
+def test_many_frames_are_answered_in_order(raw):
     answers = raw(b"".join(_request(name) for name in range(2**63, 2**63 + 100)))
     assert [answer[2] for answer in answers] == list(range(2**63, 2**63 + 100))
     assert len({answer[3:12] for answer in answers if not answer[3]}) >= 1
@@ -87,7 +87,7 @@ def test_many_frames_are_answered_in_their_order(raw):
         (_request() + _request()[:200], [0]),
     ],
 )
-def test_what_is_no_request_is_never_answered_with_joint_values(raw, sent, statuses):
+def test_invalid_requests_are_never_answered_with_joint_values(raw, sent, statuses):
     answers = raw(sent)
     assert [answer[3] for answer in answers] == statuses
     for answer in answers:

@@ -1,4 +1,4 @@
-"""The clients of the documentation: run where something runs their language here, else parsed."""
+"""The clients of the documentation are run if their language is available here, else parsed."""
 
 import json
 import re
@@ -42,7 +42,7 @@ def ik(repository):
 
 
 @pytest.mark.skipif(shutil.which("gcc") is None, reason="no gcc on the path")
-def test_the_c_client_gives_the_numbers_of_python(ik, repository, tmp_path):
+def test_the_c_client_has_the_numbers_of_python(ik, repository, tmp_path):
     (tmp_path / "client.c").write_text(PROGRAM)
     options = ["-std=gnu11", "-Wall", "-Wextra", "-Werror", "-I", CLIENTS, "-o", tmp_path / "client"]
     subprocess.run(["gcc", *options, tmp_path / "client.c", "-lm"], check=True)
@@ -64,7 +64,7 @@ def test_the_c_client_gives_the_numbers_of_python(ik, repository, tmp_path):
 
 
 def test_urscript_gets_joint_values(ik, repository):
-    """UR turns about z, y and x as pisigma does, and calls the angle about x roll."""
+    """UR rotates about z, y and x like pisigma, but calls the angle about x roll."""
     x, y, z, roll, pitch, yaw = POSE
     turned = Rotation.from_euler("ZYX", [roll, pitch, yaw], degrees=True).as_rotvec().tolist()
     wanted = ik(transform_of([x / 1e3, y / 1e3, z / 1e3, *np.radians(POSE[3:])]), near=NEAR).q
@@ -93,7 +93,7 @@ def test_the_programs_of_controllers_parse(name):
 
 @pytest.mark.parametrize("name", ["pisigma_client.src", "pisigma_client.mod", "pisigma_client.kl"])
 def test_the_lines_that_they_send_are_requests(name, served):
-    """The texts of a request, with numbers in the places of the others."""
+    """The texts of a request, with numbers in place of variables."""
     text = (CLIENTS / name).read_text()
     for pattern in (r"SWRITE\(.*?\"(.*)\"", r"Str:=(.*);", r"WRITE link \((.*)\)"):
         if sent := re.findall(pattern, text):

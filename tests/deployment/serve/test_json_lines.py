@@ -1,4 +1,4 @@
-"""Lines of JSON: the same numbers as in Python, and a sentence for whatever cannot be answered."""
+"""Lines of JSON have the numbers of Python, and an error for invalid requests."""
 
 import json
 import math
@@ -34,7 +34,7 @@ def ik(repository):
 
 @pytest.fixture
 def raw(served):
-    """Send bytes, give the answer to each line."""
+    """Send bytes, and return the answer to each line."""
 
     def exchange(*lines):
         with socket.create_connection(("127.0.0.1", served.json_port), 5) as stream:
@@ -50,7 +50,7 @@ def _matrix(pose):
     return transform_of([*(value / 1e3 for value in pose[:3]), *map(math.radians, pose[3:])])
 
 
-def test_a_pose_gets_the_numbers_of_python(ask, ik):
+def test_a_pose_is_answered_with_the_numbers_of_python(ask, ik):
     answer = ask(pose=POSE, near_deg=NEAR, model="kiro4")
     solution = ik(_matrix(POSE), near=np.radians(NEAR))
     assert_close(answer["q_deg"], np.degrees(solution.q), rtol=1e-15)
@@ -81,7 +81,7 @@ def test_lines_are_read_as_python_reads_them(line):
 @pytest.mark.parametrize(
     "line", [b'{"id" : 1, "i\\u0064":2}', b'{"id": Infinity}', b'{"id": 01}', b"\xef\xbb\xbf{}", b"[" * 9999]
 )
-def test_what_is_no_json_is_refused_with_a_reason(line):
+def test_invalid_json_is_refused_with_a_reason(line):
     with pytest.raises((ValueError, RecursionError)):
         json_lines._decode(line)
 
@@ -133,7 +133,7 @@ def test_ignored_axes_are_those_of_python(repository, tmp_path):
                 client.ask(**asked, **wrong)
 
 
-def test_a_robot_with_a_linear_joint_says_q(ask):
+def test_a_robot_with_a_prismatic_joint_uses_the_key_q(ask):
     (kiro3,) = (model for model in ask(ask="models")["models"] if model["name"] == "kiro3")
     units = kiro3["units"]
     assert set(units) == {"deg", "mm"}
@@ -145,7 +145,7 @@ def test_a_robot_with_a_linear_joint_says_q(ask):
             ask(**request, model="kiro3")
 
 
-def test_health_counts_what_was_answered(ask):
+def test_health_counts_answers(ask):
     before = ask(ask="health")
     ask(pose=POSE, model="kiro4")
     after = ask(ask="health")

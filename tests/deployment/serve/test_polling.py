@@ -1,4 +1,4 @@
-"""When the server stays awake for the next request."""
+"""When the server polls for the next request."""
 
 import pytest
 
@@ -9,7 +9,7 @@ DURATION = 0.02
 
 
 class _Sockets:
-    """A clock, and sockets where a request comes at the stated look; each look takes a while."""
+    """A clock, and sockets at which a request arrives at a stated poll; each poll takes some time."""
 
     def __init__(self):
         self.now, self.look, self.looks, self.request_at = 100.0, MAX_GAP / 5, 0, None
@@ -39,7 +39,7 @@ def _after_two_requests(sockets, apart=0.0, duration=DURATION):
     return polling
 
 
-def test_the_next_of_frequent_requests_finds_the_server_awake(sockets):
+def test_the_next_of_frequent_requests_is_polled_for(sockets):
     sockets.request_at = 3
     assert _after_two_requests(sockets).ready() == ["request"]
     assert sockets.looks == 3
@@ -57,14 +57,14 @@ def test_after_rare_requests_or_without_a_duration_the_server_sleeps_at_once(soc
     assert sockets.looks == 0
 
 
-def test_one_request_alone_keeps_nobody_awake(sockets):
+def test_a_single_request_does_not_start_polling(sockets):
     polling = Polling(sockets, DURATION)
     polling.record_activity()
     assert polling.ready() == []
     assert sockets.looks == 0
 
 
-def test_the_server_rests_where_others_want_the_processor(sockets):
+def test_polling_pauses_when_others_need_the_processor(sockets):
     sockets.look = 2 * MAX_GAP
     busy = _after_two_requests(sockets)
     for looks, pause in ((1, 0.0), (1, 0.6), (2, 0.6)):

@@ -45,7 +45,7 @@ def test_other_machines_are_served_with_a_token_only(kiro4):
         Server(models, ServeSettings("0.0.0.0", token=" "))
 
 
-def test_a_port_that_is_taken_is_refused(served, kiro4):
+def test_a_port_in_use_is_refused(served, kiro4):
     with refused(OutputError, value=served.json_port):
         Server(ServedModels([kiro4]), ServeSettings(json_port=served.json_port))
 
@@ -87,7 +87,7 @@ def _send_for_ever(stream, line):
         stream.sendall(line)
 
 
-def test_a_client_that_takes_no_answers_is_cut_off(kiro4):
+def test_a_client_that_does_not_read_answers_is_cut_off(kiro4):
     with running(kiro4, settings=ServeSettings(client_timeout=0.2)) as server, json_client(server) as other:
         greedy = socket.create_connection(("127.0.0.1", server.json_port), 5)
         line = b'{"ask": "models"}\n' * 1000
@@ -97,7 +97,7 @@ def test_a_client_that_takes_no_answers_is_cut_off(kiro4):
         assert other.ask(ask="health")["cut_off"] == 1
 
 
-def test_a_model_that_is_written_anew_is_loaded_without_a_call_being_dropped(kiro4, repository, tmp_path):
+def test_a_rewritten_model_is_reloaded_without_dropping_a_request(kiro4, repository, tmp_path):
     shutil.copytree(kiro4, tmp_path / "arm")
     with running(tmp_path / "arm", within=tmp_path) as server, json_client(server) as client:
         before = client.ask(ask="models")["models"]
@@ -125,7 +125,7 @@ def test_a_model_that_is_written_anew_is_loaded_without_a_call_being_dropped(kir
         assert client.ask(pose=POSE, model="arm")["status"] == "reached"
 
 
-def test_what_was_begun_is_finished_when_the_server_stops(kiro4, monkeypatch):
+def test_pending_requests_are_finished_when_the_server_stops(kiro4, monkeypatch):
     begun = threading.Event()
     follow = json_lines._follow
 
@@ -145,8 +145,8 @@ def test_what_was_begun_is_finished_when_the_server_stops(kiro4, monkeypatch):
         assert [json.loads(line)["id"] for line in file] == [1, 2]
 
 
-def test_all_that_came_in_whole_is_answered_when_the_server_stops(kiro4):
-    """Many requests of several clients, one of which nobody has accepted yet, and half a request."""
+def test_all_complete_requests_are_answered_when_the_server_stops(kiro4):
+    """Many requests of several clients, one of them not accepted yet, and an incomplete request."""
     with running(kiro4) as server:
         streams = [socket.create_connection(("127.0.0.1", server.json_port), 5) for _ in range(3)]
         lines = [json.dumps({"id": i, "pose": POSE}).encode() + b"\n" for i in range(200)]
@@ -157,7 +157,7 @@ def test_all_that_came_in_whole_is_answered_when_the_server_stops(kiro4):
             assert [json.loads(line)["id"] for line in file] == list(range(200))
 
 
-def test_a_client_that_goes_on_sending_keeps_neither_the_server_nor_the_others(kiro4, monkeypatch):
+def test_a_client_that_keeps_sending_delays_neither_the_server_nor_the_others(kiro4, monkeypatch):
     monkeypatch.setattr(connection, "MAX_DRAIN_BYTES", 20_000)
     line = json.dumps({"id": 1, "pose": POSE}).encode() + b"\n"
     with running(kiro4) as server:
@@ -185,7 +185,7 @@ def test_a_client_that_goes_on_sending_keeps_neither_the_server_nor_the_others(k
     assert not any(thread.is_alive() for thread in threads)
 
 
-def test_the_second_stop_ends_what_takes_its_time(kiro4, monkeypatch):
+def test_the_second_stop_aborts_slow_answers(kiro4, monkeypatch):
     begun, go_on = threading.Event(), threading.Event()
     monkeypatch.setattr(json_lines, "_follow", lambda *arguments: begun.set() or go_on.wait(10))
     with (

@@ -23,7 +23,7 @@ FRAME = client.REQUEST.pack(b"PSI1", 216, 7, 0, 0, *MATRIX, *[math.nan] * 8)
 
 @pytest.fixture
 def asking():
-    """Give a function that connects a socket of a kind to a server and asks it."""
+    """Return a function that connects a socket of a kind to a server and sends requests."""
     context = zmq.Context()
     sockets = []
 
@@ -66,7 +66,7 @@ def test_lines_and_frames_get_the_answers_of_tcp(asking, repository):
             assert ask(LINE) == wanted
 
 
-def test_every_message_holds_the_token(asking, repository):
+def test_every_message_needs_the_token(asking, repository):
     settings = ServeSettings("0.0.0.0", zmq_port=0, token="secret")
     with running(repository / "models" / "kiro4", settings=settings) as server:
         ask = asking(server, zmq.REQ)
@@ -89,7 +89,7 @@ def test_without_pyzmq_the_extra_is_named(monkeypatch, repository):
 
 @pytest.fixture
 def unread():
-    """Give a function that connects a socket to a server and sends it many messages before it reads an answer."""
+    """Return a function that connects a socket to a server and sends many messages before it reads an answer."""
     context = zmq.Context()
     sockets = []
 
@@ -112,8 +112,8 @@ def unread():
     context.term()
 
 
-def test_all_that_came_in_is_answered_when_the_server_stops(unread, repository):
-    """More messages than wait in a queue of ZeroMQ at a time."""
+def test_all_received_messages_are_answered_when_the_server_stops(unread, repository):
+    """More messages than fit into a queue of ZeroMQ."""
     with running(repository / "models" / "kiro4", settings=ServeSettings(zmq_port=0)) as server:
         socket = unread(server, 2000 * [LINE])
         socket.recv()
@@ -121,8 +121,8 @@ def test_all_that_came_in_is_answered_when_the_server_stops(unread, repository):
         socket.recv()
 
 
-def test_a_slow_reader_gets_every_answer_and_one_that_never_reads_holds_nobody_up(unread, repository):
-    """Answers wait for a client that reads late; ROUTER sockets drop them silently where nobody asks for more."""
+def test_a_slow_reader_gets_every_answer_and_one_that_never_reads_delays_nobody(unread, repository):
+    """Answers wait for a client that reads late; by default ROUTER sockets drop them silently."""
     small = {"RCVHWM": 1, "RCVBUF": 4096}
     padded = json.dumps({"id": int(4000 * "1"), "pose": POSE}).encode()
     with running(repository / "models" / "kiro4", settings=ServeSettings(zmq_port=0)) as server:

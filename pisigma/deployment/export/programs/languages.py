@@ -293,17 +293,17 @@ def cautions(path: Path, cartesian: bool) -> tuple[str, ...]:
 
 
 def program_text(targets: Targets, path: Path, cartesian: bool, config: str | None = None) -> str:
-    """The program for a file.
+    """Return the text of a program for a file.
 
     Args:
-        targets: the targets.
-        path: the file; its suffix is one of `LANGUAGES`, its name is the program's.
-        cartesian: write poses instead of joint values.
-        config: configuration of all poses, where the language wants one.
+        targets: targets of the program.
+        path: file to write; its suffix is one of `LANGUAGES`, its stem is the name of the program.
+        cartesian: whether to write poses instead of joint values.
+        config: configuration of all poses, if the language requires one.
 
     Raises:
-        OutputError: the program cannot be written so.
-        UnreachablePoseError: a pose has no target; the message names line and status.
+        OutputError: the program cannot be written to this file.
+        UnreachablePoseError: a pose has no target; the message states line and status.
     """
     check_program(path, targets.robot, cartesian, config)
     targets.check_complete()

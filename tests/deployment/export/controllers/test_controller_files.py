@@ -1,4 +1,4 @@
-"""Controllers' own files: written, read back, and what they cannot hold is stated."""
+"""Files of controllers are written and read back, and their loss of accuracy is stated."""
 
 import dataclasses
 from pathlib import Path
@@ -35,14 +35,14 @@ COUNTS = {"counts_per_turn": "8388608,-8388608,4194304,1e6,2e6,1e6", "present_co
 
 
 def everything_off(name: str = "ur10", scale: float = 1e-3) -> Robot:
-    """A robot of which every parameter is off, with a base and a tool."""
+    """A robot with errors in all parameters, with a base and a tool."""
     nominal, random = Robot.load(name), np.random.default_rng(3)
     dh = nominal.dh + random.normal(0, scale, nominal.dh.shape)
     return nominal.with_geometry(dh, random.normal(0, 0.5, 6), random.normal(0, 0.2, 6))
 
 
 def far_apart(one: Robot, other: Robot) -> float:
-    """Largest distance of the tools [m], over the whole range of the joints."""
+    """Largest distance between the tools [m] over the joint ranges."""
     random = np.random.default_rng(1)
     q = torch.from_numpy(random.uniform(-3, 3, (300, one.dof)))
     T, T_other = forward_kinematics(one, q), forward_kinematics(other, q)
@@ -54,8 +54,8 @@ def far_apart(one: Robot, other: Robot) -> float:
     "file", [universal_robots.FILE, ur_ros.FILE, staubli.FILE], ids=lambda file: file.name
 )
 @pytest.mark.parametrize("scale", [3e-3, 1e-4, 1e-5])
-def test_the_same_robot_comes_back(file, scale):
-    """The maker's rows have no beta: the tilt of nearly parallel axes makes d large, and the tool stays."""
+def test_the_robot_is_read_back(file, scale):
+    """The maker's rows have no beta: a tilt of nearly parallel axes makes d large without moving the tool."""
     robot, nominal = everything_off(scale=scale), Robot.load("ur10")
     text = file.text(FileText(robot, nominal, REQUEST, ("said: a -- b",)))
     assert far_apart(file.read(text, "file", nominal), robot) <= 1e-9
@@ -72,7 +72,7 @@ def test_rows_are_rewritten_without_moving_the_tool(name):
 
 
 def test_a_published_calibration_is_read():
-    """DH parameters of a real UR10e and the correction of huge d, from the driver's documentation."""
+    """DH parameters of a real UR10e and the correction of large d, from the driver's documentation."""
     theta = [-2.4147806894359e-07, 1.60233952386695, -1.68607190752171, 0.0837331147700119]
     a = [
         2.12234865571206e-05,
@@ -125,8 +125,8 @@ def ur10e() -> Robot:
     return nominal.with_geometry(dh)
 
 
-def test_the_hash_is_the_drivers():
-    """That of the default kinematics of the UR10e; see test_universal_robots.py for others."""
+def test_the_hash_equals_that_of_the_driver():
+    """Hash of the default kinematics of the UR10e; see test_universal_robots.py for others."""
     assert ur_ros.calibration_hash(ur10e()) == "calib_5119701370761913513"
 
 
@@ -158,7 +158,7 @@ def test_the_loss_of_accuracy_is_stated(name, model, tmp_path):
         assert float(off.max()) < 1e-9
 
 
-def test_counts_are_whole_and_count_as_stated(model, tmp_path):
+def test_counts_are_integers_with_the_stated_resolution(model, tmp_path):
     out = tmp_path / "counts.csv"
     export_model("epson", ExportRequest(model, out, **COUNTS))
     nominal = Robot.load("ur10")
@@ -261,7 +261,7 @@ def test_counts_that_are_refused(options, option, value, model, tmp_path):
         export_model("fanuc-mastering", ExportRequest(model, tmp_path / "counts.csv", **options))
 
 
-def test_robots_with_other_directions_have_offsets_as_the_controller_counts():
+def test_offsets_of_reversed_joints_are_in_the_controllers_direction():
     nominal = Robot.load("ur10")
     flipped = dataclasses.replace(
         nominal, rows=tuple(dataclasses.replace(row, direction=-1) for row in nominal.rows)

@@ -1,4 +1,4 @@
-"""Files of Universal Robots against the maker's formula, on values that the maker and users published."""
+"""Files of Universal Robots agree with the maker's formula for published values."""
 
 import csv
 import re
@@ -40,7 +40,7 @@ DELTAS = ("delta_theta", "delta_d", "delta_a", "delta_alpha")
 
 
 def makers_formula(q: np.ndarray, theta, d, a, alpha) -> np.ndarray:
-    """Flange in `base` as the maker computes it: the product of RotZ(q + theta) TransZ(d) TransX(a) RotX(alpha)."""
+    """Flange in `base` by the maker's formula: the product of RotZ(q + theta) TransZ(d) TransX(a) RotX(alpha)."""
     T = np.broadcast_to(np.eye(4), (len(q), 4, 4))
     for joint in range(6):
         c, s = np.cos(q[:, joint] + theta[joint]), np.sin(q[:, joint] + theta[joint])
@@ -79,14 +79,14 @@ def conf(deltas) -> str:
 
 
 def everything_off(name: str) -> Robot:
-    """An arm as drawn with every parameter off, another base and another tool."""
+    """A nominal arm with errors in all parameters, another base and another tool."""
     nominal, random = Robot.load(name), np.random.default_rng(3)
     dh = nominal.dh + random.normal(0, 1e-3, nominal.dh.shape)
     return nominal.with_geometry(dh, random.normal(0, 0.5, 6), random.normal(0, 0.2, 6))
 
 
 @pytest.mark.parametrize("case", CALIBRATIONS)
-def test_published_calibrations_are_read_and_written_as_the_maker_computes(case, tmp_path):
+def test_published_calibrations_agree_with_the_makers_formula(case, tmp_path):
     name, deltas = CALIBRATIONS[case]
     path = tmp_path / "calibration.conf"
     path.write_text(conf(deltas))
@@ -100,8 +100,8 @@ def test_published_calibrations_are_read_and_written_as_the_maker_computes(case,
 
 
 @pytest.mark.parametrize("name", NOMINAL)
-def test_what_is_written_is_what_the_maker_computes(name):
-    """With the base and the tool that the file states, without a frame fitted."""
+def test_written_files_agree_with_the_makers_formula(name):
+    """With the base and tool of the file, without fitting a frame."""
     robot, nominal = everything_off(name), Robot.load(name)
     text = universal_robots.FILE.text(FileText(robot, nominal, REQUEST))
     q = joint_values()
@@ -121,8 +121,8 @@ def test_what_is_written_is_what_the_maker_computes(name):
 
 @pytest.mark.parametrize("file", [universal_robots.FILE, ur_ros.FILE], ids=lambda file: file.name)
 @pytest.mark.parametrize("name", NOMINAL)
-def test_drawn_arms_are_the_makers_in_its_frames(name, file):
-    """A file of zeros, or the default kinematics, gives the maker's nominal arm in `base`, however it is drawn."""
+def test_described_arms_agree_with_the_maker_in_its_frames(name, file):
+    """A file of zeros, or the default kinematics, yields the maker's nominal arm in `base` for any description."""
     drawn, own = Robot.load(name), own_geometry(Robot.load(name))
     d, a, calib = NOMINAL[name]
     q = joint_values()
@@ -142,7 +142,7 @@ def test_drawn_arms_are_the_makers_in_its_frames(name, file):
 
 
 def test_the_factory_calibration_meets_the_controllers_poses(shared_data):
-    """Of weijieyong/UR_kinematics_calib: poses rounded to 0.01 mm, which the maker's formula meets to 0.080."""
+    """Poses of weijieyong/UR_kinematics_calib, rounded to 0.01 mm, agree with the maker's formula to 0.080 mm."""
     folder = shared_data / "ur5e_factory"
     robot = read_controller_file(folder / "calibration.conf", Robot.load("ur5e")).robot
     with open(folder / "poses.csv", newline="") as file:
@@ -155,7 +155,7 @@ def test_the_factory_calibration_meets_the_controllers_poses(shared_data):
 
 
 def test_a_calibrated_robot_is_written_against_the_makers_nominal_one():
-    """What was read as a robot of its own is written with all of its differences, not with those that were added."""
+    """A robot read from a file is written with all of its differences from the nominal robot."""
     name, deltas = CALIBRATIONS["ur5 179"]
     read = universal_robots.read_calibration(conf(deltas), "file", Robot.load(name))
     again = universal_robots.FILE.text(FileText(read, read, REQUEST))
@@ -168,8 +168,8 @@ def test_a_calibrated_robot_is_written_against_the_makers_nominal_one():
     assert_close(deltas_of(again)["delta_d"], deltas["delta_d"], atol=1e-6)
 
 
-def test_the_hash_is_the_drivers():
-    """That of the DH parameters which a user's robot sent, and of a user's links brought back to DH parameters."""
+def test_the_hash_equals_that_of_the_driver():
+    """Hash of the DH parameters of a user's robot, and of a user's links converted to DH parameters."""
     robot = Robot.load("ur5")
     dh = np.column_stack([*USERS_DH.values(), np.zeros(6)])
     assert ur_ros.calibration_hash(robot.with_geometry(dh)) == USERS_DH_HASH
@@ -189,7 +189,7 @@ def test_the_hash_is_the_drivers():
 
 
 def test_positions_of_the_simulated_controller():
-    """Two of a UR10 in the driver's tests, ur_calibration/test/calibration_test.cpp."""
+    """Two positions of a UR10 in the driver's tests, ur_calibration/test/calibration_test.cpp."""
     q = [
         [
             -1.6007002035724,
@@ -217,7 +217,7 @@ def test_positions_of_the_simulated_controller():
     assert_close(forward_kinematics(robot, torch.tensor(q).double())[:, :3, 3], wanted, atol=1e-7)
 
 
-def test_what_is_far_from_the_nominal_robot_is_refused(tmp_path):
+def test_a_robot_far_from_the_nominal_one_is_refused(tmp_path):
     name, deltas = CALIBRATIONS["ur3 145"]
     path = tmp_path / "calibration.conf"
     path.write_text(conf(deltas | {"delta_a": [0, 0.02, 0, 0, 0, 0]}))
@@ -230,8 +230,8 @@ def test_what_is_far_from_the_nominal_robot_is_refused(tmp_path):
     ("key", "joint", "by"),
     [("delta_theta", 0, 0.1), ("delta_theta", 5, 0.1), ("delta_d", 0, 0.01), ("delta_a", 5, 0.01)],
 )
-def test_what_another_base_or_tool_would_make_up_for_is_refused_too(key, joint, by, tmp_path):
-    """Poses are those of the flange in the controller's `base`: nothing may be fitted before they are compared."""
+def test_errors_that_a_base_or_tool_could_absorb_are_refused(key, joint, by, tmp_path):
+    """Poses are those of the flange in the controller's `base`: no frame is fitted before they are compared."""
     name, deltas = CALIBRATIONS["ur5 179"]
     path, wrong = tmp_path / "calibration.conf", list(deltas[key])
     wrong[joint] += by
@@ -240,8 +240,8 @@ def test_what_another_base_or_tool_would_make_up_for_is_refused_too(key, joint, 
         read_controller_file(path, Robot.load(name))
 
 
-def test_frames_of_a_models_file_are_those_of_the_drawing(tmp_path):
-    """Not those of the calibration, whose base and tool have lines of their own."""
+def test_frames_of_a_models_file_are_those_of_the_description(tmp_path):
+    """They are not those of the calibration, whose base and tool are stated separately."""
     drawn = Robot.load("ur5e")
     model = hybrid_model("ur10", [FourierSeries(drawn, 8)], robot=drawn)
     base, tool = np.array([1.5, -0.8, 0.2, 0.7, 0.1, 0.2]), np.array([0.03, 0.05, 0.1, 0.3, 0.2, 0.1])

@@ -1,4 +1,4 @@
-"""The xacro overlay: a URDF whose origins are properties, read back to the robot that was written."""
+"""The xacro file, a URDF with origins as properties, is read back as the written robot."""
 
 import pytest
 from testing.closeness import assert_close
@@ -23,7 +23,7 @@ def drawn(tmp_path):
     return path
 
 
-def test_the_same_robot_comes_back(drawn, tmp_path):
+def test_the_robot_is_read_back(drawn, tmp_path):
     nominal = Robot.load(drawn)
     calibrated = off_by(nominal)
     urdf = robot_into_urdf(calibrated, nominal, drawn, comments=("said",))

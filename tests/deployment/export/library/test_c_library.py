@@ -1,4 +1,4 @@
-"""The shared library from C: the numbers of Python to 1e-12, and model files that are not its own."""
+"""The shared library has the numbers of Python to 1e-12 in C, and refuses foreign model files."""
 
 import shutil
 import subprocess
@@ -50,7 +50,7 @@ def _answers(folder, model, rows):
         (hand_made_model, "kiro3", {}),
     ],
 )
-def test_c_gives_the_numbers_of_python(exported, tmp_path, make, name, options):
+def test_c_has_the_numbers_of_python(exported, tmp_path, make, name, options):
     model = make(name, **options)
     ik, dof = CorrectedIK(model), model.robot.dof
     (tmp_path / MODEL).write_bytes(model_file(model))
@@ -80,7 +80,7 @@ def test_c_gives_the_numbers_of_python(exported, tmp_path, make, name, options):
     assert reached > 100
 
 
-def test_a_file_that_is_not_its_own_is_refused(exported, tmp_path):
+def test_a_foreign_file_is_refused(exported, tmp_path):
     content = (exported / MODEL).read_bytes()
     middle = len(content) // 2
     cases = {
@@ -99,7 +99,9 @@ def test_a_file_that_is_not_its_own_is_refused(exported, tmp_path):
         assert sentence in done.stderr
 
 
-def test_a_folder_gets_the_three_files_and_no_compiler_is_said(exported, repository, tmp_path, monkeypatch):
+def test_a_folder_has_three_files_and_a_missing_compiler_is_reported(
+    exported, repository, tmp_path, monkeypatch
+):
     assert {HEADER, LIBRARY, MODEL} <= {path.name for path in exported.iterdir()}
     model = repository / "models" / "kiro4"
     monkeypatch.setenv("CC", "no-such-compiler")

@@ -1,4 +1,4 @@
-"""The arm that programs are rewritten for."""
+"""Arm for which programs are rewritten."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -13,7 +13,7 @@ from pisigma.robot import Robot
 
 @pytest.fixture(scope="session")
 def arm(tmp_path_factory) -> Path:
-    """A geometric model of a UR10 with a base and a tool of its own."""
+    """A geometric model of a UR10 with a base and a tool."""
     nominal = Robot.load("ur10").with_geometry(base=np.full(6, 0.3), tool=np.full(6, 0.1))
     model = geometric_model("ur10")
     folder = tmp_path_factory.mktemp("models") / "arm"

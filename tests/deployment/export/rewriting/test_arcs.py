@@ -27,12 +27,12 @@ from pisigma.deployment.export.rewriting.krl import STATED_ARC
 from pisigma.model.folder.model_folder import load_model
 
 POINTS = torch.tensor([[0.0, 0.0, 0.0], [0.05, 0.09, 0.02], [0.16, 0.1, 0.05]], dtype=torch.float64)
-"""Of the arc, from where it begins [m]."""
+"""Points of the arc relative to its start [m]."""
 
 
 @dataclass(frozen=True)
 class Program:
-    """A program with one arc, and what makes the controller turn the tool in another way along it."""
+    """A program with one arc, and a statement that changes the orientation along it."""
 
     text: str
     turning: tuple[str, str]
@@ -73,7 +73,7 @@ def _poses(arm, points=POINTS):
 
 
 def _request(suffix, text, T, arm, tmp_path):
-    """A program of the three poses, and what it does not state."""
+    """A program of the three poses, and the frames that it does not state."""
     language = next(language for language in LANGUAGES if language.suffix == suffix)
     place = place_of if suffix == ".mod" else language.pose
     poses = {
@@ -95,7 +95,7 @@ def _reasons(exported):
 
 @pytest.mark.parametrize("suffix", PROGRAMS)
 def test_the_real_tool_stays_on_the_arc(suffix, arm, tmp_path):
-    """A controller moves on arcs through the commanded poses; so does the real tool on the arc that was meant."""
+    """A controller moves on arcs through the commanded poses, and the real tool on the intended arc."""
     T = _poses(arm)
     request = _request(suffix, PROGRAMS[suffix].text, T, arm, tmp_path)
     exported = export_model("targets", request)
@@ -118,7 +118,7 @@ def test_the_real_tool_stays_on_the_arc(suffix, arm, tmp_path):
 
 
 @pytest.mark.parametrize("suffix", PROGRAMS)
-def test_an_arc_along_which_the_tool_turns_otherwise_is_not_cut(suffix, arm, tmp_path):
+def test_an_arc_with_another_orientation_is_not_split(suffix, arm, tmp_path):
     text = PROGRAMS[suffix].text.replace(*PROGRAMS[suffix].turning)
     exported = export_model("targets", _request(suffix, text, _poses(arm), arm, tmp_path))
     assert exported.facts["way_points"] == 0
@@ -132,7 +132,7 @@ def test_an_arc_along_which_the_tool_turns_otherwise_is_not_cut(suffix, arm, tmp
         (lambda T: T[1, :3, 3].copy_((T[0, :3, 3] + T[2, :3, 3]) / 2), COLLINEAR),
     ],
 )
-def test_arcs_without_one_meaning_are_named(change, reason, arm, tmp_path):
+def test_ambiguous_arcs_are_reported(change, reason, arm, tmp_path):
     T = _poses(arm)
     change(T)
     exported = export_model("targets", _request(".src", PROGRAMS[".src"].text, T, arm, tmp_path))
@@ -140,20 +140,20 @@ def test_arcs_without_one_meaning_are_named(change, reason, arm, tmp_path):
     assert exported.facts["way_points"] == 0
 
 
-def test_an_arc_behind_a_move_to_joint_values_is_named(arm, tmp_path):
+def test_an_arc_after_a_move_to_joint_values_is_reported(arm, tmp_path):
     text = PROGRAMS[".src"].text.replace("CIRC", "PTP {{A1 0, A2 -90, A3 90, A4 0, A5 0, A6 0}}\nCIRC")
     exported = export_model("targets", _request(".src", text, _poses(arm), arm, tmp_path))
     assert any(why.startswith("the start or via point of the arc") for why in _reasons(exported))
 
 
-def test_an_arc_that_goes_on_beyond_its_end_is_named(arm, tmp_path):
+def test_an_arc_beyond_its_end_point_is_reported(arm, tmp_path):
     text = PROGRAMS[".src"].text.replace("{P2} ;", "{P2}, CA 200 ;")
     exported = export_model("targets", _request(".src", text, _poses(arm), arm, tmp_path))
     assert STATED_ARC in _reasons(exported)
     assert exported.facts["way_points"] == 0
 
 
-def test_arcs_go_through_their_points():
+def test_arcs_pass_through_their_points():
     angles = torch.tensor([[0.3, 1.0, 2.0], [0.3, 5.0, 6.0]], dtype=torch.float64)
     circle = torch.stack([angles.cos(), angles.sin(), torch.zeros_like(angles)], -1) * 0.2
     arcs = Arcs.through(*circle.unbind(1))

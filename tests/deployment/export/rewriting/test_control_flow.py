@@ -1,4 +1,4 @@
-"""A pose is of the frame and the tool that hold when the program comes to it, or it stays."""
+"""A pose is corrected with the frame and tool in force when the program reaches it, or left unchanged."""
 
 import re
 
@@ -40,7 +40,7 @@ def fanuc(*lines: str) -> str:
 
 
 def kept(scan, text, frames=None):
-    """Tools [m] of the poses that are understood, and the reasons for leaving the others."""
+    """Tools [m] of the poses that are understood, and the reasons for leaving the others unchanged."""
     program = scan(text, frames or FrameFile())
     assert len(program.targets) + len(program.left) == text.count("LIN {") + text.count("movel(")
     return [float(target.T_flange_tool[2, 3]) for target in program.targets], [why for _, why in program.left]
@@ -140,7 +140,7 @@ def test_urscript(lines, tools, reason):
     assert bool(reasons) == (reason is not None)
 
 
-def test_displaced_poses_of_a_module_stay():
+def test_displaced_poses_of_a_module_are_unchanged():
     target = "[[600, 0, 400], [0.5, 0.5, 0.5, 0.5], [0, 0, 0, 0], [9E9, 9E9, 9E9, 9E9, 9E9, 9E9]]"
     text = f"MODULE cell\nPROC main()\n{{}}MoveL {target}, v100, fine, tool0;\nENDPROC\nENDMODULE\n"
     assert len(scan_rapid(text.format(""), FrameFile()).targets) == 1
@@ -164,7 +164,7 @@ def test_a_frame_that_a_fanuc_program_sets_is_not_as_stated(line, understood):
     assert understood or program.left == ((4, "the program sets UFRAME 1"),)
 
 
-def test_values_outside_of_routines_hold_from_their_place_on():
+def test_values_outside_routines_apply_after_their_statement():
     frames = FramesInForce([Step("set", "tool"), Step("loop"), Step("end"), Step("end")], {"tool": "unknown"})
     assert frames["tool"] == "unknown"
     frames.advance(0, IDENTITY)
@@ -173,8 +173,8 @@ def test_values_outside_of_routines_hold_from_their_place_on():
         assert isinstance(frames["tool"], torch.Tensor)
 
 
-def test_all_kinds_of_moves_are_seen():
-    """Those of splines as well; straight ones of a process are straight."""
+def test_all_kinds_of_moves_are_found():
+    """Moves of splines are included; straight process moves are straight."""
     pose = "{X 600, Y 0, Z 400, A 0, B 90, C 0}"
     words = ("SPTP", "PTP", "SPL", "SLIN", "LIN", "spl")
     program = scan_krl(krl(FIRST, *(f"{word} {pose}" for word in words)), FrameFile())
@@ -188,7 +188,7 @@ def test_all_kinds_of_moves_are_seen():
     assert [move.line for move in program.moves] == [4, 5]
 
 
-def test_arcs_without_way_points_are_named():
+def test_arcs_without_way_points_are_reported():
     text = fanuc("A P[1] 100mm/sec CNT50")
     assert "no way points" in dict(scan_fanuc(text, FRAMES).left)[3]
 
@@ -205,7 +205,7 @@ def rapid(pose: str, named: bool, tool: str = "[1, 0, 0, 0]") -> str:
 
 
 @pytest.mark.parametrize("named", [True, False])
-def test_external_axes_that_are_in_use_leave_the_pose_and_are_named(named):
+def test_external_axes_in_use_leave_the_pose_unchanged_and_are_reported(named):
     upright = "[0.5, 0.5, 0.5, 0.5]"
     for value, understood in (("9E+09", True), ("0", True), ("250.5", False)):
         found = scan_rapid(rapid(RAPID_POSE.format(q=upright, eax=value), named), FrameFile())
@@ -230,7 +230,7 @@ def test_external_axes_that_are_in_use_leave_the_pose_and_are_named(named):
     "before",
     ["PTP {E1 500}", "PTP {A1 0, A2 0, A3 0, A4 0, A5 0, A6 0, E1 -5}", "ASYPTP {E1 500}", "XQ.E1 = rail"],
 )
-def test_a_pose_without_an_external_axis_stays_where_the_program_moves_that_axis(before):
+def test_a_pose_without_an_external_axis_is_unchanged_if_the_program_moves_that_axis(before):
     stated = LIN.replace("}", ", E1 0}")
     found = scan_krl(krl(FIRST, before, LIN, stated), FrameFile())
     assert [target.line for target in found.targets] == [6]
@@ -238,7 +238,7 @@ def test_a_pose_without_an_external_axis_stays_where_the_program_moves_that_axis
     assert not scan_krl(krl(FIRST, LIN.replace("}", ", E1 rail}")), FrameFile()).targets
 
 
-def test_rapid_and_fanuc_poses_without_an_external_axis_that_is_in_use_stay():
+def test_rapid_and_fanuc_poses_without_an_external_axis_in_use_are_unchanged():
     pose = RAPID_POSE.format(q="[0.5, 0.5, 0.5, 0.5]", eax="9E9")
     text, moved = rapid(pose, False), "[[0, 0, 0, 0, 0, 0], [500, 9E9, 9E9, 9E9, 9E9, 9E9]]"
     for before, understood in (
@@ -258,7 +258,7 @@ def test_rapid_and_fanuc_poses_without_an_external_axis_that_is_in_use_stay():
 
 
 @pytest.mark.parametrize("quaternion", ["[0, 0, 0, 0]", "[0.7, 0, 0.7, 0.1]", "[1, 1, 0, 0]"])
-def test_quaternions_that_are_none_are_named_with_their_lines(quaternion):
+def test_invalid_quaternions_are_reported_with_their_lines(quaternion):
     good = "[0.707107, 0, 0.707107, 0]"
     assert scan_rapid(rapid(RAPID_POSE.format(q=good, eax="9E9"), True), FrameFile()).targets
     for named in (True, False):
@@ -270,8 +270,8 @@ def test_quaternions_that_are_none_are_named_with_their_lines(quaternion):
     assert "(line 2)" in dict(tool.left)[5]
 
 
-def test_a_routine_that_is_called_does_not_find_the_stated_tool():
-    """Where the program sets another one, or a routine of another file may, before it is called."""
+def test_the_tool_of_a_called_routine_is_uncertain():
+    """The program, or a routine of another file, may set another tool before the call."""
     frames = FrameFile.model_validate({"tools": {"tcp": {"z_mm": 50}}})
     text = "def cell():\n{}{}\nend\n"
     sub = f"def sub():\n{MOVE}\nend\n"
@@ -324,8 +324,8 @@ CALLS = [(one, f"elsewhere \\Fast, 3;\n{one}") for one in BEFORE]
 @pytest.mark.parametrize(
     ("line", "call"), [*CALLS, ("own;\nagain", "elsewhere;\nagain"), ("Incr n;", '%"go"%;')]
 )
-def test_a_routine_of_another_module_leaves_all_poses_of_this_one(line, call):
-    """Whose tools and work objects it may change, or displace all that follows."""
+def test_a_call_of_another_module_leaves_all_poses_unchanged(line, call):
+    """The called routine may change tools and work objects, or displace the following poses."""
     text = MODULE.format(pose=RAPID_POSE.format(q="[0.5, 0.5, 0.5, 0.5]", eax="9E9"))
     assert line in text
     assert len(scan_rapid(text, FrameFile()).targets) == 1

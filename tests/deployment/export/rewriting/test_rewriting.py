@@ -1,4 +1,4 @@
-"""Programs whose targets are rewritten: the real tool comes where the program says, along straight lines too."""
+"""In rewritten programs the real tool reaches the programmed poses, along straight lines too."""
 
 import json
 import re
@@ -31,7 +31,7 @@ from pisigma.model.folder.model_folder import load_model
 
 
 @pytest.mark.parametrize("language", LANGUAGES, ids=lambda language: language.suffix)
-def test_the_real_tool_comes_where_the_program_says(language, arm, tmp_path):
+def test_the_real_tool_reaches_the_programmed_poses(language, arm, tmp_path):
     request = program(language, arm, tmp_path)
     exported = export_model("targets", request)
     wanted = wanted_poses(load_model(arm).robot)
@@ -64,7 +64,7 @@ def test_the_real_tool_comes_where_the_program_says(language, arm, tmp_path):
 
 @pytest.mark.parametrize("language", LANGUAGES, ids=lambda language: language.suffix)
 def test_straight_moves_stay_straight(language, arm, tmp_path):
-    """Between way points a controller moves on the line between commanded poses; so does the real tool, nearly."""
+    """Between way points a controller moves on the line between commanded poses, and the real tool nearly so."""
     request = program(language, arm, tmp_path)
     exported = export_model("targets", request)
     after = scanned(request.out, request.frames)
@@ -87,7 +87,7 @@ def test_straight_moves_stay_straight(language, arm, tmp_path):
 
 
 @pytest.mark.parametrize("language", LANGUAGES, ids=lambda language: language.suffix)
-def test_all_else_stays_and_is_named(language, arm, tmp_path):
+def test_other_text_is_unchanged_and_reported(language, arm, tmp_path):
     request = program(language, arm, tmp_path)
     exported = export_model("targets", request)
     text, old = request.out.read_text(), request.program.read_text()
@@ -115,7 +115,7 @@ def test_all_else_stays_and_is_named(language, arm, tmp_path):
 
 
 @pytest.mark.parametrize("language", LANGUAGES, ids=lambda language: language.suffix)
-def test_frames_that_are_not_stated_leave_their_targets(language, arm, tmp_path):
+def test_targets_in_unknown_frames_are_unchanged(language, arm, tmp_path):
     request = program(language, arm, tmp_path)
     pattern = r"(?m)^.*(set_tcp|\$BASE|tooldata).*\n"
     request.program.write_text(re.sub(pattern, "", request.program.read_text(), count=1), newline="")
@@ -124,7 +124,7 @@ def test_frames_that_are_not_stated_leave_their_targets(language, arm, tmp_path)
     assert not request.out.exists()
 
 
-def test_a_pose_within_a_branch_of_the_program_begins_nowhere(arm, tmp_path):
+def test_a_move_after_a_branch_of_the_program_has_no_known_start(arm, tmp_path):
     request = program(LANGUAGES[0], arm, tmp_path)
     text = request.program.read_text().replace("  set_digital_out(1, True)\n", "  if x > 1:\n  end\n")
     request.program.write_text(text)
@@ -133,7 +133,7 @@ def test_a_pose_within_a_branch_of_the_program_begins_nowhere(arm, tmp_path):
     assert sum(reason.startswith("the start of the straight move") for reason in reasons) == 1
 
 
-def test_a_pose_of_several_tools_stays(arm, tmp_path):
+def test_a_pose_of_several_tools_is_unchanged(arm, tmp_path):
     request = program(LANGUAGES[0], arm, tmp_path)
     other = "end\n".join(request.program.read_text().rsplit("end\n", 1)).replace(
         "  movel(pose_add",
@@ -169,7 +169,7 @@ def test_a_missing_program_is_refused(arm, tmp_path):
         export_model("targets", request)
 
 
-def test_the_facts_are_plain(arm, tmp_path):
+def test_the_facts_are_plain_values(arm, tmp_path):
     exported = export_model("targets", program(LANGUAGES[0], arm, tmp_path))
     assert isinstance(exported, Exported)
     assert json.loads(json.dumps(dict(exported.facts)))["unreached"] == [
@@ -178,7 +178,7 @@ def test_the_facts_are_plain(arm, tmp_path):
 
 
 @pytest.mark.parametrize("language", LANGUAGES, ids=lambda language: language.suffix)
-def test_line_ends_stay(language, arm, tmp_path):
+def test_line_endings_are_kept(language, arm, tmp_path):
     request = program(language, arm, tmp_path)
     export_model("targets", request)
     plain = request.out.read_bytes()
