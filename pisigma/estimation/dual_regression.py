@@ -60,6 +60,7 @@ class DualRegression(AbstractRegression):
         alpha = P @ self.y
         x = torch.cat([parameters, (self.X.t() @ alpha)[active:] / precision[active:]])
         square = prior.of_groups(x.square() * prior.base)
+        # A parameter is determined by the data as far as its posterior variance is below the prior variance.
         held = torch.zeros_like(x)
         held[:active] = 1 - precision[:active] * covariance.diagonal()
         determined = prior.of_groups(held)
@@ -167,6 +168,7 @@ def without_nuisance(
     """
     inverse = torch.cholesky_inverse(torch.linalg.cholesky(V))
     along = inverse @ G
+    # Unknowns have different units, so they are scaled before their rank is decided.
     scale = G.square().sum(0).clamp(min=1e-300).rsqrt()
     strength, axes = torch.linalg.eigh(G.t() @ along * scale * scale[:, None])
     certain = strength > DETERMINED * strength[-1:]

@@ -227,9 +227,11 @@ class SessionEvidence:
 
     def _gain(self, groups: Sequence[DriftGroup], noise_factor: float) -> tuple[Tensor, Tensor]:
         """Return the gain matrix from values to an estimate of the groups' unknowns, and its covariance."""
+        # Groups of fixed size are part of K, but those to be estimated must not count as noise too.
         V = self._K + self._noise(noise_factor).square().diag()
         for B in (self.values.X[:, one.index] * one.deviation for one in groups if one.fixed_size):
             V = V - B @ B.t()
+        # Given the other variances, the estimate is a ridge regression with unit prior in units of `deviation`.
         factor = covariance_factor(V)
         index, deviation = (
             torch.cat([getattr(one, name) for one in groups]) for name in ("index", "deviation")

@@ -98,7 +98,7 @@ def left_out_scale(errors: LeftOut) -> float:
     low, high = 0.0, math.log(MAX_SCALE)
     if float((square / (1 + extra)).mean()) <= 1:
         return 1.0
-    for _ in range(60):
+    for _ in range(60):  # bisection in the logarithm
         middle = (low + high) / 2
         if float((square / (1 + math.exp(middle) * extra)).mean()) > 1:
             low = middle

@@ -176,17 +176,20 @@ def _maximised(
     precision = torch.linalg.inv(now.covariance)
     at_mean, x, scatter = precision @ now.mean, [], torch.zeros_like(precision)
     for first in range(0, count, ROBOTS_PER_CHUNK):
+        # Expectation: posterior mean and covariance of every robot under the present population.
         some = evidence[first : first + ROBOTS_PER_CHUNK]
         factors = torch.linalg.cholesky(torch.stack([one.normal for one in some]) + precision)
         inverses = torch.cholesky_inverse(factors)
         right = torch.stack([one.descent for one in some]) + at_mean
         x.append(torch.einsum("rij,rj->ri", inverses, right))
         scatter += inverses.sum(0)
+    # Maximisation: scatter of the posterior means, plus their covariances summed above.
     mean = torch.cat(x).mean(0)
     off = torch.cat(x) - mean
     scatter += off.t() @ off
     diagonal = (of_class + scatter.diagonal()) / robots
     covariance = diagonal.diag()
+    # A full covariance needs more robots than parameters, so correlations are shrunk.
     covariance[:size, :size] = count / (count + size) * scatter[:size, :size] / robots
     covariance.diagonal().copy_(diagonal)
     return Population(mean, covariance, size)

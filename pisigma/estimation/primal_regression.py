@@ -83,7 +83,8 @@ class PrimalRegression(AbstractRegression):
         x, held = solved.x, precision * solved.variance
         pairs = zip(self.normal[1:], noise[1:], strict=True)
         used = [solved.trace(N) / sigma**2 for N, sigma in pairs]
-        used.insert(0, float((1 - held).sum()) - sum(used))  # the prior holds what the values do not
+        # All sensors together determine what the prior does not, which saves the trace of the first one.
+        used.insert(0, float((1 - held).sum()) - sum(used))
         misfit = self._misfits(x)
         log_prior = float(precision[precision > 0].log().sum())
         fit = sum(total / sigma**2 for total, sigma in zip(misfit, noise, strict=True))

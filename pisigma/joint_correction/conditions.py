@@ -161,6 +161,7 @@ def at_conditions(
     slides = ~torch.tensor(robot.revolute)
     series = _weights_of(kept, FourierSeries(robot, 1), lambda other: isinstance(other, FourierSeries))
     harmonics = series.shape[1] // 2
+    # Columns of a series are all sines, then all cosines; the first of each are the first harmonic.
     series[:, 0] += torch.where(slides, 0.0, sine)
     series[:, harmonics] += torch.where(slides, 0.0, cosine)
     if bool(slides.any()):

@@ -7,7 +7,7 @@ from jaxtyping import Float64
 
 from pisigma.measurement.copies import copy_warnings
 from pisigma.measurement.dataset import Measurements
-from pisigma.robot.coupling import hull
+from pisigma.robot.coupling import dh_limits
 from pisigma.robot.description import Robot
 from pisigma.robot.kinematics.joint_limits import beyond_limits, grossly_beyond
 from pisigma.robot.row import Row
@@ -87,7 +87,7 @@ def with_limits_of_rows(robot: Robot, rows: Measurements) -> Robot:
     if robot.coupling is None:
         return replace(robot, rows=tuple(wider.get(row.name, row) for row in robot.rows))
     coupling = replace(robot.coupling, axes=tuple(wider.get(axis.name, axis) for axis in robot.coupling.axes))
-    limits = iter(hull(coupling).tolist())
+    limits = iter(dh_limits(coupling).tolist())
     joints = tuple(
         row
         if row.type == "fixed"

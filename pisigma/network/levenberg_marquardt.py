@@ -193,6 +193,7 @@ class LevenbergMarquardt(nn.Module):
         """Return the Cholesky factor of the damped normal matrix."""
         A = A + torch.diag_embed(pull.flatten(-2))
         diagonal = A.diagonal(dim1=-2, dim2=-1)
+        # Parameters without influence on the outputs have a zero diagonal, which the damping would not change.
         floor = diagonal.amax(-1, keepdim=True) * 1e-12 + torch.finfo(A.dtype).tiny
         damping = self.damping[..., None] * diagonal.clamp_min(floor) + floor * 1e-3
         factor, info = torch.linalg.cholesky_ex(A + torch.diag_embed(damping))

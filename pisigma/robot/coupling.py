@@ -53,9 +53,9 @@ class FourBar:
         """Return the crank rotation [rad] for a joint value u [rad]; the inverse of `follow`."""
         return self._other_end(u, self.rocker, self.crank, -1.0)
 
-    def length_slopes(self, x: Any) -> tuple[Any, Any, Any]:
+    def length_derivatives(self, x: Any) -> tuple[Any, Any, Any]:
         """Return the derivatives of `follow` with respect to crank, coupler and rocker, each times its length [rad]."""
-        step, result = 1e-5, []
+        step, result = 1e-5, []  # central differences, with errors of order step²
         for name in ("crank", "coupler", "rocker"):
             length = getattr(self, name)
             longer, shorter = (replace(self, **{name: length * (1 + h)}) for h in (step, -step))
@@ -201,7 +201,7 @@ class Coupling:
         return _functions(values).stack(columns, -1)
 
 
-def hull(coupling: Coupling) -> Float64[np.ndarray, "dof 2"]:
+def dh_limits(coupling: Coupling) -> Float64[np.ndarray, "dof 2"]:
     """Return the smallest and largest DH value of every joint [rad or m] within the controller's limits.
 
     The limits are infinite for an unlimited joint and for one whose range is empty.

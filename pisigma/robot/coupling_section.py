@@ -8,7 +8,7 @@ from pydantic import Field
 
 from pisigma.files.errors import RobotError, nearest_choice
 from pisigma.files.yaml_file import Section
-from pisigma.robot.coupling import Coupling, FourBar, hull
+from pisigma.robot.coupling import Coupling, FourBar, dh_limits
 from pisigma.robot.row import MAX_MAGNITUDE, Bounded, Row
 
 
@@ -99,7 +99,7 @@ def coupled(
             if (limits := section.limits_deg or section.limits_mm)
         ),
     )
-    limits = iter(hull(coupling).tolist())
+    limits = iter(dh_limits(coupling).tolist())
     return tuple(row if row.type == "fixed" else _within(row, *next(limits)) for row in rows), coupling
 
 

@@ -213,6 +213,7 @@ def _affine_base_and_tool(
     R_tool = torch.eye(3).to(T).expand(*T.shape[:-3], 3, 3)
     if bool(measured.has_rotation.any()):
         K = _rotation_products(T, measured)[..., None, :, :]
+        # The leading singular vectors are the rotations up to a common sign, so both signs are tried.
         leading = torch.linalg.svd(K)[2][..., 0, :]
         Z = _nearest_rotations(torch.cat([leading, -leading], -2)[..., None])
         for _ in range(ALTERNATIONS):
@@ -229,6 +230,7 @@ def _affine_base_and_tool(
     eye = torch.eye(3).to(T).expand(R.shape)
     J = torch.cat([eye, R_base[..., None, :, :] @ R], -1).flatten(-3, -2)
     wanted = (position - p @ R_base.mT).flatten(-2)[..., None]
+    # Base and tool translations are not separable if all orientations are equal.
     ridge = 1e-9 * T.shape[-3] * torch.eye(6).to(T)
     shift = torch.linalg.solve(J.mT @ J + ridge, J.mT @ wanted)[..., 0]
     return transform(R_base, shift[..., :3]), transform(R_tool, shift[..., 3:])
@@ -280,6 +282,7 @@ def base_and_tool_step(
     if free is not None:
         weight = measured.lever * measured.has_rotation.to(T)[..., None]
         along = torch.cat([free[..., :3], weight * free[..., 3:]], -1)[..., None]
+        # Projecting out this direction solves each row's own unknown implicitly.
         along = along / along.norm(dim=-2, keepdim=True).clamp(min=1e-12)
         J, residual = J - along @ (along.mT @ J), residual - along @ (along.mT @ residual)
     J, residual = J.flatten(-3, -2), residual.flatten(-3, -2)

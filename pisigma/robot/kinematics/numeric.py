@@ -243,6 +243,7 @@ def damped_step(
     """
     A = dimensionless_jacobian(robot, J).contiguous()
     small = A.mT @ A if robot.dof < rows else A @ A.mT
+    # Near the solution the damping vanishes, and rounding could make a singular matrix indefinite.
     floor = 4 * torch.finfo(A.dtype).eps * small.diagonal(dim1=-2, dim2=-1).sum(-1)
     weight = damping * scaled_error.square().sum(-1) + floor
     small = small + weight[:, None, None] * torch.eye(small.shape[-1], dtype=A.dtype, device=A.device)
@@ -345,6 +346,7 @@ def approach_preferred(
         factor, _ = torch.linalg.cholesky_ex(small + floor[:, None, None] * torch.eye(6, dtype=A.dtype))
         step = pull + scale * (A.mT @ torch.cholesky_solve(left[..., None], factor))[..., 0]
         moved = step.abs().amax(-1, keepdim=True)
+        # Steps that do not become shorter oscillate, so the pull is reduced.
         share, before = torch.where(moved > 0.7 * before, 0.6 * share, share), moved
         trial = best + step * (tolerances.MAX_STEP / moved).clamp(max=1.0)
         inside = torch.minimum(torch.maximum(trial, limits[:, 0]), limits[:, 1])

@@ -201,6 +201,7 @@ class ThreeParallelArm(AbstractClosedForm):
             return t_6
         a, b = abs(self.rows.a[1]), abs(self.rows.a[2])
         turn = t_234 + math.atan2(across, along) - torch.atan2(y, x)
+        # Law of cosines: distance of axis 4 from axis 2, and the hand angle at which the elbow just reaches it.
         square = far * far + hand * hand - 2 * far * hand * torch.cos(turn)
         nearest, farthest = abs(a - b) + TRIANGLE_MARGIN * (a + b), (a + b) * (1 - TRIANGLE_MARGIN)
         wanted = square.clamp(nearest**2, farthest**2)
