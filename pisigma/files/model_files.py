@@ -82,7 +82,7 @@ def check_model_hash(folder: str | os.PathLike[str], sha256: str) -> None:
             expected=sha256,
             value=actual,
             at=Place(folder),
-            remedy="this is another model, or it was changed",
+            remedy="check that this is the intended model and was not changed",
         )
 
 
