@@ -1,7 +1,7 @@
-"""Data sets of measurements: their CSV form, their splits into training and test rows; jigs.
+"""Data sets of measurements, their CSV files, splits into training and held-out rows, and jigs.
 
-Names are loaded on first use, so that settings of cameras are read without torch; `__init__.pyi` tells them to type
-checkers.
+Names are loaded on first use, so that settings of cameras are read without torch; `__init__.pyi` declares them for
+type checkers.
 """
 
 from pisigma.files.lazy_names import lazily

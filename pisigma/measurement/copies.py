@@ -297,10 +297,10 @@ def _equal_pairs(values: RowValues) -> tuple[Int64[Tensor, " pairs"], Int64[Tens
     last = torch.searchsorted(key, key + 1.1 * float(weight.sum()), right=True)
     ahead = last - torch.arange(len(key)) - 1
     found = [torch.zeros(2, 0, dtype=torch.int64)]
-    for begin, end in _chunks(ahead):
-        own = torch.repeat_interleave(torch.arange(begin, end), ahead[begin:end])
+    for start, end in _chunks(ahead):
+        own = torch.repeat_interleave(torch.arange(start, end), ahead[start:end])
         offset = torch.arange(len(own)) - torch.repeat_interleave(
-            ahead[begin:end].cumsum(0) - ahead[begin:end], ahead[begin:end]
+            ahead[start:end].cumsum(0) - ahead[start:end], ahead[start:end]
         )
         pair = torch.stack([order[own], order[own + 1 + offset]])
         for column in range(numbers.shape[1]):

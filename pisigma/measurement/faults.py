@@ -1,4 +1,4 @@
-"""What is wrong with a row of measurements, and where the row comes from."""
+"""Faults of rows of measurements, and places of rows."""
 
 from dataclasses import dataclass, replace
 from typing import Any
@@ -8,11 +8,11 @@ from pisigma.files.errors import MeasurementError, Place
 
 @dataclass(frozen=True)
 class RowPlace(Place):
-    """Where a row of measurements comes from.
+    """The place of a row of measurements.
 
     Attributes:
-        row: its number, counted from 0, where it comes from no line of a file.
-        image: the image that it was measured in; "" where it was measured in none.
+        row: number of the row, from 0, if it does not come from a line of a file.
+        image: the image from which it was measured; "" if there is none.
     """
 
     row: int | None = None
@@ -29,14 +29,14 @@ class RowPlace(Place):
 
 @dataclass(frozen=True)
 class Fault:
-    """What is wrong with a row; see `PisigmaError` for the fields.
+    """A fault of a row; see `PisigmaError` for the fields.
 
     Attributes:
-        problem: a clause without a full stop; without it the message says ``expected ..., got ...``.
-        column: name of the (first) column at fault, or its number from 1; None where the whole row is meant.
+        problem: what is wrong, a clause without a full stop; without it the message is ``expected ..., got ...``.
+        column: name of the (first) column at fault, or its number from 1; None for the whole row.
         expected: what was expected.
         value: what was given instead.
-        remedy: what to do about it, an imperative clause without a full stop.
+        remedy: what to do, an imperative clause without a full stop.
     """
 
     problem: str = ""

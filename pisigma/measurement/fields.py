@@ -33,7 +33,7 @@ TEXTS = ("target", "frame", "split", "socket", "touch_axis", "anchor", "pair", "
 
 OnBadRow = Literal["error", "leave_out"]
 Kind = str
-"""What a sensor measured in a row: "pose", "position", "rotation", "touch", "socket", "distance", or the name of a
+"""Kind of measurement in a row: "pose", "position", "rotation", "touch", "socket", "distance", or the name of a
 registered sensor. An orientation alone is a "rotation"; with a position it is a "pose"."""
 KINDS = ("pose", "position", "rotation", "touch", "socket", "distance")
 """The built-in kinds."""

@@ -27,7 +27,7 @@ Reader = Callable[[Table, bool], MeasuredFields]
 
 @dataclass(frozen=True, eq=False)
 class Growth:
-    """What was appended to a file since it was last read.
+    """Changes of a file since it was last read.
 
     Attributes:
         rows: new rows in the file's order; None if there are none.

@@ -51,7 +51,7 @@ VARIANTS = {
 
 @pytest.mark.parametrize("variant", VARIANTS)
 @pytest.mark.parametrize("copy_first", [False, True])
-def test_copies_count_once_and_the_row_with_the_most_digits_is_kept(variant, copy_first):
+def test_copies_are_left_out_and_the_row_with_the_most_digits_is_kept(variant, copy_first):
     rows = measured()
     copy = VARIANTS[variant](rows)
     both = join([copy, rows] if copy_first else [rows, copy])

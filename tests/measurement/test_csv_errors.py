@@ -155,7 +155,7 @@ def test_missing_file(tmp_path: Path, name: str):
 
 
 @pytest.mark.usefixtures("without_type_checker")
-def test_unknown_way_with_bad_rows(tmp_path: Path):
+def test_an_unknown_choice_for_bad_rows_is_refused(tmp_path: Path):
     with refused(MeasurementError, option="on_bad_row", value="leaveout") as caught:
         Measurements.read_csv(tmp_path / "data.csv", on_bad_row="leaveout")
     assert "leave_out" in caught.value.remedy

@@ -1,4 +1,4 @@
-"""What a data set of measurements accepts, and what it carries along."""
+"""Data sets of measurements: validation, selection and hash."""
 
 from dataclasses import FrozenInstanceError, replace
 
@@ -43,7 +43,7 @@ def zeros(*shape: int) -> torch.Tensor:
     return torch.zeros(*shape, dtype=torch.float64)
 
 
-def test_fills_in_names_that_are_not_given():
+def test_missing_names_are_filled_in():
     measurements = Measurements(q=zeros(3, 2))
     assert (measurements.rows, measurements.dof, measurements.kinds) == (3, 2, set())
     assert measurements.frame == measurements.target == ("", "", "")
@@ -51,7 +51,7 @@ def test_fills_in_names_that_are_not_given():
     assert measurements.place(1) == "memory, row 1"
 
 
-def test_no_rows_are_measurements_too():
+def test_measurements_may_have_no_rows():
     measurements = Measurements(q=zeros(0, 6), position=zeros(0, 3), rotation=zeros(0, 3, 3))
     assert measurements.T.shape == (0, 4, 4)
     assert measurements.select(torch.zeros(0, dtype=torch.bool)).rows == 0
@@ -62,7 +62,7 @@ def test_is_frozen():
         make_measurements().source = "other"
 
 
-def test_poses_hold_position_and_rotation():
+def test_poses_contain_position_and_rotation():
     measurements = make_measurements()
     assert measurements.kinds == {"pose"}
     assert_close(measurements.T[:, :3, 3], measurements.position)
@@ -71,7 +71,7 @@ def test_poses_hold_position_and_rotation():
 
 
 @pytest.mark.parametrize(("missing", "word"), [("rotation", "orientation"), ("position", "position")])
-def test_no_poses_without_position_and_rotation(missing: str, word: str):
+def test_poses_need_position_and_rotation(missing: str, word: str):
     with refused(MeasurementError, file="tracker.csv", value=f"no {word}"):
         _ = replace(make_measurements(), **{missing: None}).T
 
@@ -122,7 +122,7 @@ def test_refuses_impossible_values_of_a_row(field: str, value: torch.Tensor, col
 @pytest.mark.parametrize(
     "index", [torch.tensor([2, 0]), torch.tensor([True, False, True, False])], ids=["index", "mask"]
 )
-def test_select_carries_everything_along(index: torch.Tensor):
+def test_select_keeps_all_fields(index: torch.Tensor):
     measurements = make_measurements()
     rows = [2, 0] if index.dtype == torch.int64 else [0, 2]
     chosen = measurements.select(index)
@@ -136,7 +136,7 @@ def test_select_carries_everything_along(index: torch.Tensor):
     assert (chosen.source, chosen.left_out) == (measurements.source, measurements.left_out)
 
 
-def test_select_keeps_absent_what_is_absent():
+def test_select_keeps_fields_absent():
     chosen = Measurements(q=zeros(3, 2), position=zeros(3, 3)).select(torch.tensor([1]))
     assert chosen.rotation is None
     assert chosen.split is None
@@ -158,7 +158,7 @@ def test_select_refuses_other_indices(index: torch.Tensor, value: object):
         make_measurements().select(index)
 
 
-def test_hash_depends_on_values_and_on_nothing_else():
+def test_the_hash_depends_on_values_only():
     measurements = make_measurements()
     elsewhere = replace(measurements, source="other.csv", line=(), left_out=())
     assert measurements.content_hash() == elsewhere.content_hash() == make_measurements().content_hash()
@@ -168,7 +168,7 @@ def test_hash_depends_on_values_and_on_nothing_else():
 @pytest.mark.parametrize(
     "name", ["q", "position", "sigma_position", "sigma_rotation", "payload", "temperature"]
 )
-def test_hash_sees_every_digit(name: str):
+def test_the_hash_depends_on_every_digit(name: str):
     measurements = make_measurements()
     values = getattr(measurements, name).clone()
     values.view(-1)[-1] *= 1 + 2e-16
@@ -179,19 +179,19 @@ def test_hash_sees_every_digit(name: str):
 @pytest.mark.parametrize(
     "change", [{"target": ("A", "A", "A", "A")}, {"rotation": None}, {"split": None}, {"approach": None}]
 )
-def test_hash_sees_names_and_what_is_absent(change: dict[str, object]):
+def test_the_hash_depends_on_names_and_absent_fields(change: dict[str, object]):
     measurements = make_measurements()
     assert replace(measurements, **change).content_hash() != measurements.content_hash()
 
 
-def test_joining_leaves_approaches_open_where_a_file_has_none():
+def test_concatenation_without_approaches_fills_nan():
     with_approach, without = make_measurements(), replace(make_measurements(seed=1), approach=None)
     joined = join([with_approach, without])
     assert_close(joined.approach[:4], with_approach.approach)
     assert bool(joined.approach[4:].isnan().all())
 
 
-def test_hash_takes_all_nans_and_all_zeros_as_one():
+def test_the_hash_is_equal_for_all_nans_and_zeros():
     plain = Measurements(q=zeros(1, 1), position=torch.full((1, 3), torch.nan, dtype=torch.float64))
     other = Measurements(q=-zeros(1, 1), position=-torch.full((1, 3), torch.nan, dtype=torch.float64))
     assert plain.content_hash() == other.content_hash()

@@ -1,4 +1,4 @@
-"""Rows that are held out together where models are chosen."""
+"""Rows that are held out together for model selection."""
 
 import torch
 
@@ -7,7 +7,7 @@ from pisigma.measurement.groups import groups_of_equal_joints, held_out_groups
 
 
 def rows(count: int, **columns: object) -> Measurements:
-    """Different joint values and whatever is stated."""
+    """Return rows of different joint values with the given fields."""
     return Measurements(q=torch.arange(2 * count, dtype=torch.float64).view(count, 2), **columns)  # type: ignore[arg-type]
 
 
@@ -16,12 +16,12 @@ def sockets(*names: str) -> Measurements:
 
 
 def test_sockets_of_a_placement_are_held_out_together():
-    """Wherever in the file they are."""
+    """Their order in the file does not matter."""
     measured = sockets("low/0", "high/0", "low/1", "plate/0", "high/1", "low/0", "plate/0")
     assert held_out_groups(measured).tolist() == [0, 1, 0, 2, 1, 0, 2]
 
 
-def test_a_socket_without_a_placement_is_one_of_its_own():
+def test_a_socket_without_a_placement_is_a_placement():
     assert held_out_groups(sockets("a", "b", "b", "c", "a")).tolist() == [0, 1, 1, 2, 0]
 
 
@@ -58,7 +58,7 @@ def test_equal_joints_in_two_sockets_join_these():
     assert held_out_groups(Measurements(q=q, socket=names)).tolist() == [0, 0, 1, 2, 0]
 
 
-def test_rows_of_a_pair_and_rows_without_a_name_are_groups_beside_the_named_ones():
+def test_rows_of_a_pair_and_rows_without_a_name_are_separate_groups():
     names = ("low/0", "", "high/0", "", "", "plate/0", "plate/1", "")
     pair = ("", "p", "", "p", "", "", "", "")
     distance = torch.full((8,), torch.nan, dtype=torch.float64)

@@ -59,7 +59,7 @@ def test_points_on_a_face_are_inside_its_edges_and_uncovered(tmp_path: Path):
     assert jig.on_face(tread[:0], on[:0]).tolist() == []
 
 
-def test_lines_hit_blocks_that_they_run_through(tmp_path: Path):
+def test_lines_intersect_blocks(tmp_path: Path):
     jig = load(tmp_path, STAIRS)
     start = points((50, 50, 60), (50, 50, 51), (50, 50, 51), (50, 50, 51), (50, -10, 25), (50, 50, 50))
     end = points((50, 50, 500), (50, 500, 51), (50, -500, 51), (50, 99, 300), (50, 210, 25), (500, 50, 50))

@@ -1,4 +1,4 @@
-"""Rows beyond the limits of a drawing."""
+"""Rows beyond the nominal joint limits."""
 
 import dataclasses
 
@@ -17,7 +17,7 @@ from pisigma.robot.writing import robot_to_yaml
 
 
 def rows_at(robot: Robot, q: np.ndarray) -> Measurements:
-    """Rows with the controller's values."""
+    """Return rows with the controller's values."""
     return Measurements(
         q=torch.from_numpy(robot.to_dh(q)),
         position=torch.zeros(len(q), 3, dtype=torch.float64),
@@ -28,7 +28,7 @@ def rows_at(robot: Robot, q: np.ndarray) -> Measurements:
 @pytest.mark.parametrize(
     "robot", [Robot.load("kiro3"), Robot.load("panda"), coupled_robot()], ids=lambda r: r.name
 )
-def test_limits_are_widened_to_the_rows_and_no_farther(robot):
+def test_limits_are_widened_exactly_to_the_rows(robot):
     lower, upper = robot.axis_limits.T
     q = np.stack([0.6 * lower + 0.4 * upper, 0.4 * lower + 0.6 * upper, 0.5 * (lower + upper)])
     assert with_limits_of_rows(robot, rows_at(robot, q)) is robot
@@ -55,7 +55,7 @@ def test_limits_are_widened_to_the_rows_and_no_farther(robot):
     assert np.abs(read.limits - wide.limits).max() < 1e-12
 
 
-def test_axes_without_limits_have_no_rows_outside():
+def test_axes_without_limits_have_no_rows_beyond():
     robot = Robot.load("ur10")
     free = dataclasses.replace(
         robot, rows=tuple(dataclasses.replace(row, lower=-np.inf, upper=np.inf) for row in robot.rows)

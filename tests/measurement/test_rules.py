@@ -34,7 +34,7 @@ def make() -> Measurements:
     )
 
 
-def test_kinds_say_what_was_measured():
+def test_kinds_of_measurements():
     data = make()
     assert data.kinds == {"socket", "touch", "distance"}
     assert data.select(torch.tensor([0])).kinds == {"socket"}
@@ -64,7 +64,7 @@ def test_kinds_say_what_was_measured():
         ({"anchor_place": torch.tensor([[NAN, 1.0, NAN]] * 5).double()}, 0, "anchor_place", "1 of them"),
     ],
 )
-def test_refuses_what_contradicts_itself(change: dict[str, object], row: int, column: str, value: object):
+def test_refuses_contradictory_rows(change: dict[str, object], row: int, column: str, value: object):
     with refused(MeasurementError, file="memory", column=column, value=value) as caught:
         replace(make(), **change)
     assert f"row {row}," in str(caught.value)
@@ -80,7 +80,7 @@ def test_refuses_fields_of_other_sizes(change: dict[str, object], option: str, v
         replace(make(), **change)
 
 
-def test_a_pair_is_not_parted():
+def test_a_pair_is_not_split():
     with refused(MeasurementError, column="pair", value="1 row"):
         make().select(torch.tensor([0, 3]))
     chosen = make().select(torch.tensor([4, 2, 3]))
@@ -101,7 +101,7 @@ def test_a_pair_is_not_parted():
         {"distance": column(NAN, NAN, 1.0 + 1e-15, 0.5, 0.5)},
     ],
 )
-def test_the_hash_sees_every_part(change: dict[str, object]):
+def test_the_hash_depends_on_every_field(change: dict[str, object]):
     assert replace(make(), **change).content_hash() != make().content_hash()
     assert make().content_hash() == replace(make(), source="elsewhere").content_hash()
 
@@ -123,7 +123,7 @@ def test_pairs_and_equal_joints_are_one_group():
 
 
 @pytest.mark.parametrize("by", ["joints", "time"])
-def test_folds_never_part_a_pair(by: str):
+def test_folds_never_split_a_pair(by: str):
     data = paired(9)
     for train, test in (*k_folds(data, 3, seed=1, by=by), holdout(data, 0.3, seed=1, by=by)):
         assert sorted([*train.tolist(), *test.tolist()]) == list(range(18))
@@ -131,7 +131,7 @@ def test_folds_never_part_a_pair(by: str):
         assert data.select(test).rows == len(test) > 0
 
 
-def test_joining_fills_what_a_part_lacks():
+def test_concatenation_fills_missing_fields():
     generator = torch.Generator().manual_seed(0)
     position = torch.rand(2, 3, generator=generator, dtype=torch.float64)
     tracker = Measurements(
@@ -149,7 +149,7 @@ def test_joining_fills_what_a_part_lacks():
     assert join([tracker]).content_hash() == tracker.content_hash()
 
 
-def test_refuses_parts_that_do_not_fit():
+def test_refuses_data_sets_that_do_not_fit():
     one = Measurements(q=torch.zeros(1, 3, dtype=torch.float64))
     with refused(MeasurementError, option="data", value="none"):
         join([])

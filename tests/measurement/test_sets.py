@@ -28,6 +28,6 @@ def test_without_test_rows_all_are_trained_on(split):
     assert measurements.split_sets() == (measurements, None)
 
 
-def test_test_rows_alone_are_refused():
+def test_only_test_rows_are_refused():
     with refused(MeasurementError, file="rows.csv", column="set", value="test"):
         rows(*["test"] * 6).split_sets()

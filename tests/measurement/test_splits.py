@@ -17,7 +17,7 @@ WAYS = ("joints", "interleaved", "time", "space")
 
 
 def repeated(labels: list[int]) -> Measurements:
-    """A measurement per label; equal labels have equal joints, and positions along x as the labels."""
+    """Return a measurement per label, with equal joints for equal labels and positions along x by label."""
     label = torch.tensor(labels, dtype=torch.float64)
     noise = torch.linspace(0, 1e-3, len(labels), dtype=torch.float64)
     position = torch.stack([label, noise, -noise], 1)
@@ -46,7 +46,7 @@ def test_groups_of_a_measured_robot(shared_data: Path):
     st.integers(0, 3),
     st.sampled_from(WAYS),
 )
-def test_folds_part_the_rows_and_keep_groups_whole(labels: list[int], folds: int, seed: int, by: str):
+def test_folds_partition_the_rows_and_keep_groups_whole(labels: list[int], folds: int, seed: int, by: str):
     measurements = repeated(labels)
     folds = min(folds, len(set(labels)))
     if folds < 2:
@@ -78,7 +78,7 @@ def test_holdout_keeps_groups_whole_and_meets_the_share(labels: list[int], share
     assert abs(len(test) - share * len(labels)) <= largest
 
 
-def test_the_seed_decides_and_nothing_else():
+def test_the_result_depends_on_the_seed_only():
     measurements = repeated(list(range(40)))
 
     def tests(seed: int | torch.Generator) -> list[list[int]]:
@@ -96,7 +96,7 @@ def test_large_groups_are_balanced_by_many_small_ones(seed: int):
     assert [len(test) for _, test in parts] == [6, 6, 6]
 
 
-def test_interleaved_deals_in_turn():
+def test_interleaved_folds_alternate():
     measurements = repeated([7, 7, 3, 3, 5, 5, 1, 1, 4, 4, 0, 0, 2, 2])
     folds = k_folds(measurements, 3, seed=5, by="interleaved")
     assert [test.tolist() for _, test in folds] == [[0, 1, 6, 7, 12, 13], [2, 3, 8, 9], [4, 5, 10, 11]]
@@ -108,14 +108,14 @@ def test_interleaved_deals_in_turn():
         assert len(test) > 0
 
 
-def test_by_time_gives_blocks_of_the_file():
+def test_folds_by_time_are_blocks_of_the_file():
     parts = k_folds(repeated([5, 5, 3, 3, 9, 9, 1, 5]), 3, seed=0, by="time")
     assert [test.tolist() for _, test in parts] == [[0, 1, 7], [2, 3], [4, 5, 6]]
     train, test = holdout(repeated([5, 5, 3, 3, 9, 9, 1, 1]), 0.25, seed=0, by="time")
     assert (train.tolist(), test.tolist()) == ([0, 1, 2, 3, 4, 5], [6, 7])
 
 
-def test_by_space_gives_boxes_that_do_not_overlap():
+def test_folds_by_space_are_boxes_that_do_not_overlap():
     generator = torch.Generator().manual_seed(0)
     position = (
         torch.rand(200, 3, generator=generator, dtype=torch.float64) * torch.tensor([4.0, 2.0, 0.5]).double()
@@ -170,7 +170,7 @@ def test_refuses_space_without_positions_to_compare():
 
 
 def in_sockets(names: list[str], **more: object) -> Measurements:
-    """A row per socket's name, each with joints of its own."""
+    """Return a row per name of a socket, each with different joints."""
     q = torch.arange(2.0 * len(names), dtype=torch.float64).view(-1, 2)
     return Measurements(q=q, socket=tuple(names), **more)  # type: ignore[arg-type]
 
@@ -187,7 +187,7 @@ def test_placements_are_named_before_the_last_slash():
     assert placements(touches) == ("left", "right", "left")
 
 
-def test_by_placement_one_fold_holds_one_placement():
+def test_folds_by_placement_contain_one_placement():
     names = ["low/0", "low/1", "high/0", "low/0", "high/1", "far/0", "far/0"]
     parts = k_folds(in_sockets(names), None, seed=0, by="placement")
     tests = sorted(test.tolist() for _, test in parts)

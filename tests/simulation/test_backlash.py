@@ -1,4 +1,4 @@
-"""Simulated backlash: joints stop short on the side from which they come."""
+"""Simulated backlash: joints stop short on the side from which they approach."""
 
 import math
 
@@ -35,7 +35,7 @@ def test_joints_stop_short_by_half_of_their_play():
     assert_close(true.forward(Q, approach), robot_at(Q + expected), atol=1e-14)
 
 
-def test_measurements_state_the_sides_that_were_drawn():
+def test_measurements_state_the_directions_of_approach():
     true = TrueRobot(ROBOT, [play(0.2, 0.2)])
     first, again = simulate(true, Q), simulate(true, Q)
     assert first.approach is not None
@@ -47,7 +47,7 @@ def test_measurements_state_the_sides_that_were_drawn():
     assert simulate(TrueRobot(ROBOT, [play()]), Q).approach is None
 
 
-def test_a_recipe_states_it_and_a_wrong_joint_is_refused():
+def test_recipes_accept_backlash_and_refuse_unknown_joints():
     section = {"robot": "rb5", "errors": [{"kind": "backlash", "play_deg": {ROBOT.joints[1].name: 0.1}}]}
     true = TrueRobotSection.model_validate(section).true_robot()
     assert float(true.half_play[1]) == pytest.approx(math.radians(0.05), rel=1e-12)

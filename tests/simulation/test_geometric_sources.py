@@ -1,4 +1,4 @@
-"""Wrong geometry, stated and drawn."""
+"""Errors of geometry, given and random."""
 
 import math
 
@@ -13,7 +13,7 @@ from pisigma.simulation.errors.geometric import GeometricDeviation, RandomGeomet
 UR10 = Robot.load("ur10")
 
 
-def test_stated_errors_land_in_their_columns():
+def test_given_errors_are_in_their_columns():
     source = GeometricDeviation(
         kind="geometric",
         rows={
@@ -44,7 +44,7 @@ def drawn(**fields):
     return RandomGeometricDeviation(kind="geometric_random", **settings).change(UR10, "here")
 
 
-def test_uniform_errors_fill_their_bounds_and_nothing_more():
+def test_uniform_errors_are_within_their_bounds():
     values = np.stack([drawn(seed=seed).dh for seed in range(200)])
     scaled = values / np.array([math.radians(1), 1e-3, 1e-3, math.radians(1), math.radians(1)])
     assert abs(scaled).max() <= 1.0
@@ -65,7 +65,7 @@ def test_seeds_repeat_and_differ():
     assert abs(drawn(seed=7).dh - drawn(seed=8).dh).min() > 0
 
 
-def test_sizes_do_not_change_what_else_is_drawn():
+def test_sizes_do_not_change_other_errors():
     alone, all_of_it = drawn(), drawn(base_length_mm=5, base_angle_deg=2, tool_length_mm=3, tool_angle_deg=4)
     assert_close(alone.dh, all_of_it.dh)
     assert_close(alone.base, 0.0)
@@ -74,7 +74,7 @@ def test_sizes_do_not_change_what_else_is_drawn():
     assert_close(without_base.tool, all_of_it.tool)
 
 
-def test_base_and_tool_have_sizes_of_their_own():
+def test_base_and_tool_have_separate_sizes():
     sizes = {"base_length_mm": 5, "base_angle_deg": 2, "tool_length_mm": 3, "tool_angle_deg": 4}
     changes = [drawn(seed=seed, **sizes) for seed in range(200)]
     for frame, length, angle in (("base", 5e-3, 2), ("tool", 3e-3, 4)):

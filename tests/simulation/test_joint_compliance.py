@@ -1,4 +1,4 @@
-"""Deflection under gravity, against the potential energy and against torques worked out by hand."""
+"""Deflection under gravity, compared with the potential energy and with torques by hand."""
 
 import math
 
@@ -17,7 +17,7 @@ GRAVITY = (1.0, -2.0, -9.0)
 
 
 def arm() -> Robot:
-    """Five rows of every kind, one counted backwards, with a base that must not matter."""
+    """Five rows of every type, one with negative direction, with a base that must not matter."""
     rows = (
         Row("j1", "revolute"),
         Row("j2", "revolute", direction=-1),
@@ -81,7 +81,7 @@ def test_horizontal_beam_by_hand():
     assert_close(source.bind(beam, "here")(q), -1e-5 * torque * torch.cos(q), atol=1e-18)
 
 
-def test_vertical_axis_carries_no_torque_and_the_slide_carries_the_weight(generator):
+def test_a_vertical_axis_has_no_torque_and_the_prismatic_joint_carries_the_weight(generator):
     robot = Robot.load("kiro3")
     source = JointCompliance(
         kind="joint_compliance",

@@ -1,4 +1,4 @@
-"""Every joint error source alone, against its formula written out by hand."""
+"""Every joint error source alone, compared with its formula."""
 
 import math
 
@@ -29,7 +29,7 @@ def test_offset_is_added_to_its_joint_only(generator):
     assert_close(source.bind(KIRO3, "here")(q), expected, atol=1e-16)
 
 
-def test_transmission_of_own_angle(generator):
+def test_transmission_errors_of_one_joint(generator):
     q = joint_values((7,), generator)
     term = {"joint": "theta_1", "amplitude_deg": 0.2, "harmonic": 3, "phase_deg": 40}
     error = TransmissionHarmonics(kind="transmission", terms=[term]).bind(KIRO3, "here")(q)

@@ -1,4 +1,4 @@
-"""Simulated measurements: what is commanded, what is seen, on which branch."""
+"""Simulated measurements: commanded joint values, measured poses, and branches."""
 
 import math
 
@@ -43,7 +43,7 @@ def true_robot(name: str, *errors: dict) -> TrueRobot:
 
 
 @pytest.mark.parametrize("branch", ["elbow_positive", "elbow_negative"])
-def test_wanted_poses_are_reached_by_the_true_robot_on_the_named_branch(branch):
+def test_desired_poses_are_reached_by_the_true_robot_on_the_named_branch(branch):
     robot = true_robot("kiro3", GEOMETRIC, OFFSET)
     section = SimulatedMeasurements(poses=GRID, branch={"name": branch})
     data = section.measure(robot)
@@ -54,7 +54,7 @@ def test_wanted_poses_are_reached_by_the_true_robot_on_the_named_branch(branch):
     assert bool((sign * data.q[:, 1] > 0).all())
 
 
-def test_nearest_branch_is_the_one_that_contains_the_joint_values_stated():
+def test_the_nearest_branch_contains_the_given_joint_values():
     robot = true_robot("kiro4", OFFSET)
     solver = closed_form_solver(robot.nominal)
     for index, name in enumerate(solver.branches[:4]):
@@ -68,7 +68,7 @@ def test_nearest_branch_is_the_one_that_contains_the_joint_values_stated():
         assert_close(nearest.q, named.q, atol=1e-11)
 
 
-def test_robot_without_closed_form_starts_from_the_joint_values_stated():
+def test_a_robot_without_a_closed_form_starts_from_the_given_joint_values():
     robot = true_robot("ur10", OFFSET)
     near = {"theta_1": 10, "theta_2": -60, "theta_3": 80, "theta_4": -110, "theta_5": -90}
     home = torch.deg2rad(torch.tensor([10.0, -60, 80, -110, -90, 0], dtype=torch.float64))
@@ -98,7 +98,7 @@ def test_joint_values_are_commanded_as_drawn():
     assert data.frame == ("",) * 20
 
 
-def test_with_an_encoder_the_robot_stops_beside_the_wanted_pose():
+def test_with_an_encoder_the_robot_stops_near_the_desired_pose():
     robot = true_robot("kiro3", OFFSET, ENCODER)
     section = SimulatedMeasurements(poses=GRID, branch={"name": "elbow_positive"})
     data = section.measure(robot)
@@ -109,7 +109,7 @@ def test_with_an_encoder_the_robot_stops_beside_the_wanted_pose():
     assert_close(data.q, without.q)
 
 
-def test_noise_is_added_and_its_size_is_told(generator):
+def test_noise_is_added_and_its_standard_deviation_is_stated(generator):
     robot = true_robot("ur10", OFFSET)
     q = torch.randn(2000, 6, generator=generator, dtype=torch.float64)
     noise = MeasurementNoise(position_mm=0.05, orientation_deg=0.01, seed=2)

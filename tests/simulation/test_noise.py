@@ -1,4 +1,4 @@
-"""Measurement noise: its size, its independence, its seed."""
+"""Measurement noise: standard deviation, independence and seed."""
 
 import math
 
@@ -37,7 +37,7 @@ def test_seeds_repeat_and_differ(generator):
     assert float((first - other).abs().amax((1, 2)).min()) > 1e-4
 
 
-def test_no_noise_leaves_poses_as_they_are(generator):
+def test_without_noise_poses_are_unchanged(generator):
     T = poses(10, generator)
     assert_close(MeasurementNoise(seed=1).apply(T), T)
 

@@ -1,4 +1,4 @@
-"""One physical KIRO-3, against the paper's table of joint errors before calibration."""
+"""One physical KIRO-3, compared with the paper's table of joint errors before calibration."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""Where to measure: grids against their points written out, random poses against their bounds."""
+"""Poses to measure at: points of grids, and bounds of random poses."""
 
 import math
 
@@ -50,7 +50,7 @@ def test_cube_grid_has_the_papers_points():
     assert_close(T[:, :3, :3], torch.tensor(KIRO4_HOME, dtype=torch.float64).expand(125, 3, 3))
 
 
-def test_spread_turns_the_home_orientation_as_documented():
+def test_spread_rotates_the_home_orientation_as_documented():
     orientation = {"home_rotation": KIRO4_HOME, "spread_deg": 45}
     T = CubeGrid(
         kind="cube_grid", steps=(5, 5, 5), orientation=orientation, seed=4, **KIRO4_CUBE

@@ -1,4 +1,4 @@
-"""An error source from outside the package: recipes take it, and complain about it with file and line."""
+"""An error source from outside the package: recipes accept it, and errors state file and line."""
 
 from typing import Literal
 
@@ -16,14 +16,14 @@ from pisigma.simulation.true_robot import ERROR_SOURCES
 
 
 class Drift(AbstractJointSource):
-    """A joint that goes too far by a share: `e_j = share · q_j`."""
+    """A joint with a relative error: `e_j = share · q_j`."""
 
     kind: Literal["drift"] = "drift"
     joint: str
     share: float
 
     def bind(self, robot: Robot, place: str) -> JointErrorFunction:
-        """The drift as a function of the joint values."""
+        """Return the drift as a function of the joint values."""
         factor = torch.zeros(robot.dof, dtype=torch.float64)
         factor[joint_index(robot, self.joint, place)] = self.share
         return lambda q: factor.to(q) * q
@@ -83,7 +83,7 @@ def test_a_kind_that_is_not_registered_is_refused():
     assert "encoder, geometric," in caught.value.remedy
 
 
-def test_registering_twice_is_allowed_but_no_second_source_of_a_kind(drift):
+def test_registering_twice_is_allowed_but_not_a_second_source_of_a_kind(drift):
     assert register_error_source(drift) is drift
 
     class Other(AbstractJointSource):

@@ -1,4 +1,4 @@
-"""Sockets, draw wires, pairs and several sensors together: the true robot is where the measurements say."""
+"""Simulated sockets, draw wires, pairs and several sensors: the true robot is consistent with the measurements."""
 
 import math
 
@@ -50,7 +50,7 @@ def test_the_true_tool_point_is_in_its_socket(robot):
     assert float((turns[0] - turns[1]).abs().max()) > 0.05
 
 
-def test_balls_have_play_and_robots_do_not_repeat(robot):
+def test_play_of_balls_and_repeatability_of_robots(robot):
     stated = SOCKETS | {"poses_per_socket": 400, "noise": NOISE}
     data = SimulatedSockets(**stated).measure(robot)
     assert_close(data.sigma_position, 0.5e-3, atol=1e-18)
@@ -83,7 +83,7 @@ def test_noise_of_a_wire(robot):
     assert_close(noisy.sigma_position, 0.5e-3, atol=1e-18)
 
 
-def test_pairs_hold_the_distance_of_their_tool_points(robot):
+def test_pairs_have_the_distance_of_their_tool_points(robot):
     data = SimulatedPairs(kind="pairs", poses=JOINTS).measure(robot)
     assert data.pair[:4] == ("pair 0", "pair 0", "pair 1", "pair 1")
     tip = robot.forward(data.q)[:, :3, 3]
@@ -109,7 +109,7 @@ def test_both_poses_of_a_pair_deviate(robot):
     ],
     ids=lambda stated: stated["kind"],
 )
-def test_the_seed_of_the_noise_decides(robot, stated: dict):
+def test_noise_depends_on_its_seed(robot, stated: dict):
     hashes = [
         SimulatedSensors(sensors=(stated | {"noise": NOISE | {"seed": seed}},)).measure(robot).content_hash()
         for seed in (1, 1, 2)
@@ -179,7 +179,7 @@ def test_incomplete_and_contradictory_recipes_are_refused(
     assert name in str(caught.value)
 
 
-def test_a_sensor_shows_no_distance_below_zero(robot):
+def test_negative_distances_and_odd_numbers_of_poses_are_refused(robot):
     anchor = WIRE | {"zero_mm": -5000}
     with refused(RecipeError, option="distances") as caught:
         SimulatedDistances(kind="distances", poses=JOINTS, anchor=anchor).measure(robot)

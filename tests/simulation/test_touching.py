@@ -1,4 +1,4 @@
-"""Touches on placed jigs: what can be touched, and that the true tip is where a touch says."""
+"""Simulated touches on jigs: possible touches, and true tips at the measured coordinates."""
 
 import math
 
@@ -62,7 +62,7 @@ def section(**changes: object) -> SimulatedTouches:
 
 
 def true_coordinates(robot: TrueRobot, data: Measurements, placements: tuple = PLACEMENTS) -> torch.Tensor:
-    """Coordinates of the true tips along the axes of their rows, computed row by row."""
+    """Return the coordinates of the true tips along the axes of their rows, computed row by row."""
     found = []
     for q, frame, axis in zip(data.q, data.frame, data.touch_axis, strict=True):
         T_jig_base = next(p.true_T_jig_base for p in placements if p.name == frame)
@@ -130,7 +130,7 @@ def test_candidates_can_be_touched():
     assert bool(((found.q >= limits[:, 0]) & (found.q <= limits[:, 1])).all())
 
 
-def test_the_seed_decides_and_nothing_else():
+def test_the_result_depends_on_the_seed_only():
     robot = Robot.load("welding")
     first, again = (TouchCandidatesSection(**CANDIDATES).find(robot, PLACEMENTS) for _ in range(2))
     other = TouchCandidatesSection(**CANDIDATES | {"seed": 5}).find(robot, PLACEMENTS)
@@ -145,7 +145,7 @@ def test_the_seed_decides_and_nothing_else():
     assert hashes[0] == hashes[1] != hashes[2]
 
 
-def test_noise_is_of_the_size_that_is_stated():
+def test_noise_has_its_standard_deviation():
     robot = true_robot()
     candidates = TouchCandidatesSection(count=100, seed=0).find(robot.nominal, PLACEMENTS)
     noise = section(noise={"sensor_mm": 0.2, "repeatability_mm": 0.15, "seed": 3}).noise

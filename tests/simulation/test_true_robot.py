@@ -1,4 +1,4 @@
-"""The true robot: error sources add up, and its inverse undoes its forward kinematics."""
+"""The true robot: error sources are added, and inverse kinematics inverts forward kinematics."""
 
 import math
 
@@ -71,7 +71,7 @@ def test_no_errors_give_the_nominal_robot(errors, generator):
     assert_close(robot.forward(q), forward_kinematics(Robot.load("ur10"), q))
 
 
-def test_errors_add_up_in_any_order(generator):
+def test_errors_are_added_in_any_order(generator):
     q = joints(generator, 20)
     sources = [*SMOOTH, ENCODER]
     together, reversed_order = true_robot(*sources), true_robot(*sources[::-1])
@@ -110,7 +110,7 @@ def test_batches_and_dtypes(batch, dtype, generator):
     assert_close(back, q, atol=1e-5 if dtype == torch.float32 else 1e-14)
 
 
-def test_commanded_joints_undo_the_joint_errors(generator):
+def test_commanded_joints_invert_the_joint_errors(generator):
     actual = joints(generator, 1000)
     robot = true_robot(*SMOOTH)
     q = robot.commanded_joints(actual)
@@ -118,7 +118,7 @@ def test_commanded_joints_undo_the_joint_errors(generator):
     assert float((q - actual).abs().max()) > 0.01
 
 
-def test_encoder_steps_cannot_be_undone(generator):
+def test_encoder_steps_cannot_be_inverted(generator):
     q = joints(generator, 3)
     robot = true_robot(OFFSET, ENCODER)
     with refused(UnreachablePoseError, option="errors", value="encoder"):

@@ -35,8 +35,8 @@ class BoardPose:
         by_intrinsics: derivative of the solved pose (shift of t [m], rotation vector of R in the camera's frame [rad])
             by the intrinsics.
         root: information of the corners on the intrinsics k with the pose eliminated, for a noise of 1 px:
-            `root (k - present) = rest`.
-        rest: see `root` [px].
+            `root (k - present) = residual`.
+        residual: see `root` [px].
     """
 
     R: Float64[np.ndarray, "3 3"]
@@ -46,7 +46,7 @@ class BoardPose:
     weight: Float64[np.ndarray, " corners"]
     by_intrinsics: Float64[np.ndarray, "6 9"]
     root: Float64[np.ndarray, "9 9"]
-    rest: Float64[np.ndarray, " 9"]
+    residual: Float64[np.ndarray, " 9"]
 
 
 def solve_board_pose(
@@ -91,7 +91,7 @@ def solve_board_pose(
         weight,
         by_intrinsics=-inverse @ factor[:POSE, POSE:-1],
         root=factor[POSE:-1, POSE:-1],
-        rest=factor[POSE:-1, -1],
+        residual=factor[POSE:-1, -1],
     )
 
 

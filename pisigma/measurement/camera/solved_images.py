@@ -82,7 +82,7 @@ class SolvedImages:
         return ImageIntrinsics(
             np.stack([pose.by_intrinsics for pose in self.poses]),
             np.stack([pose.root for pose in self.poses]) / self.noise,
-            np.stack([pose.rest for pose in self.poses]) / self.noise,
+            np.stack([pose.residual for pose in self.poses]) / self.noise,
             *(np.broadcast_to(values, rows) for values in stated),
         )
 

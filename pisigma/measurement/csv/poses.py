@@ -68,7 +68,7 @@ def read_poses(path: str | os.PathLike[str]) -> PoseChunk:
 def read_pose_chunks(path: str | os.PathLike[str], rows: int = CHUNK_ROWS) -> Iterator[PoseChunk]:
     """Read desired poses in chunks of rows; invalid rows are reported and do not stop the others.
 
-    For the columns see `read_poses`. Blank lines and lines that begin with # are skipped.
+    For the columns see `read_poses`. Blank lines and lines that start with # are skipped.
 
     Args:
         path: the file.

@@ -51,7 +51,7 @@ class Table:
 def read_table(path: str | os.PathLike[str]) -> Table:
     """Read a CSV file: commas between fields, UTF-8 with or without byte order mark.
 
-    Blank lines and lines that begin with # are skipped. A field may be in double quotes, but must not contain a line
+    Blank lines and lines that start with # are skipped. A field may be in double quotes, but must not contain a line
     break.
 
     Raises:
@@ -136,10 +136,10 @@ def split_line(line: str) -> tuple[list[str], str]:
 
 
 class Faults:
-    """What is wrong with which row; the first fault of a row is kept.
+    """Faults of rows, of which the first one of every row is kept.
 
     Attributes:
-        by_row: what is wrong, by number of the row.
+        by_row: faults by number of the row.
     """
 
     def __init__(self, broken: dict[int, str]):

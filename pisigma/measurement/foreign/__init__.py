@@ -1,1 +1,1 @@
-"""What instruments and controllers export, turned into measurement files."""
+"""Conversion of exports of instruments and controllers to measurement files."""

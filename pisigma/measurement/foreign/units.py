@@ -61,12 +61,12 @@ _MAX_COMMENT = 500
 """Number of characters of a comment that are searched for units."""
 
 _SYMBOLS = {name: symbol for symbol, unit in UNITS.items() for name in (symbol, *unit.spellings.split())}
-_SAID = re.compile(
+_STATEMENT = re.compile(
     r"(?i)\b(?:units?|einheit(?:en)?|lengths?|längen?|angles?|winkel|distances?|joints?|gelenke?|coordinates?|positions?|"
     r"values)\b(.*)"
 )
 _BETWEEN = frozenset(("", "in", "and", "und", "are", "is"))
-"""Words that may be between a word of `_SAID` and its unit; in comments, an inch has to be spelt out."""
+"""Words that may be between a word of `_STATEMENT` and its unit; in comments, an inch has to be spelt out."""
 
 
 def unit_symbol(text: str) -> str:
@@ -89,8 +89,8 @@ def stated_units(comments: Sequence[str]) -> dict[UnitKind, str]:
     stated: dict[UnitKind, str] = {}
     for comment in comments:
         text = comment[:_MAX_COMMENT]
-        while said := _SAID.search(text):
-            text = said[1]
+        while match := _STATEMENT.search(text):
+            text = match[1]
             for word in re.split(r"[\s,;:=/()\[\]]+", text):
                 if word.lower() in _BETWEEN:
                     continue

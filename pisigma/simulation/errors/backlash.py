@@ -34,6 +34,6 @@ class Backlash(AbstractPlaySource):
     seed: Seed = 0
 
     def half_play(self, robot: Robot, place: str) -> Float64[np.ndarray, " dof"]:
-        """See `AbstractPlaySource.half_play`."""
+        """Return half the play of every joint [rad or m]. See `AbstractPlaySource.half_play`."""
         stated = joint_values(robot, self.play_deg, self.play_mm, ("play_deg", "play_mm"), place)
         return np.where(robot.revolute, np.deg2rad(stated), stated / 1e3) / 2

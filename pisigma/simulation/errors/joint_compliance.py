@@ -75,13 +75,13 @@ def gravity_load(
     payload: LinkMass,
     gravity: Triple,
 ) -> Float[Tensor, "*batch dof"]:
-    """Torque [N m] or force [N] that gravity puts on every joint, counted as the controller counts.
+    """Return the gravity torque [N m] or force [N] of every joint, with the sign of the controller's joint values.
 
-    It is minus the derivative of the potential energy by the joint values. The sum over the masses beyond a
+    It is the negative derivative of the potential energy by the joint values. The sum over the masses beyond a
     joint is kept as their total M and first moment S = Σ m r: `tau_j = z_j · ((S - M p_j) x g)`.
 
     Args:
-        robot: the robot; its base is left out.
+        robot: the robot, whose base is ignored.
         q: joint values [rad or m].
         links: masses by index of the row.
         payload: mass in the tool frame.
@@ -111,6 +111,6 @@ def gravity_load(
 
 
 def _first_moment(mass: LinkMass, frame: Frame, q: Tensor) -> Float[Tensor, "poses 3"]:
-    """Mass times centre of mass [kg m] in the frame of the first row."""
+    """Return mass times centre of mass [kg m] in the frame of the first row."""
     T = as_transform(frame, q.reshape(-1, q.shape[-1])[:, 0])
     return mass.mass_kg * (T @ q.new_tensor([*(value / 1e3 for value in mass.centre_mm), 1.0]))[:, :3]

@@ -1,4 +1,4 @@
-"""Boards of three kinds: their files, where their corners are, and which of them are symmetric."""
+"""Boards of three kinds: files, positions of corners, and symmetry."""
 
 from pathlib import Path
 

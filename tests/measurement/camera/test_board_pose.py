@@ -1,4 +1,4 @@
-"""Poses of boards by their corners: exact, with wrong corners, and their covariance."""
+"""Poses of boards from their corners: exact, with wrong corners, and their covariance."""
 
 import numpy as np
 import torch
@@ -14,12 +14,12 @@ T = np.array([-0.1, 0.05, 0.5])
 
 
 def pixels() -> np.ndarray:
-    """Where the board appears."""
+    """Return the pixels of the board."""
     return CAMERA.project(BOARD.corners @ R.T + T)[0]
 
 
 def off(measured: np.ndarray) -> np.ndarray:
-    """Shift [m] and turn [rad] by which the pose from some pixels is off."""
+    """Return the errors of position [m] and rotation [rad] of the pose from some pixels."""
     pose = solve_board_pose(CAMERA, BOARD.corners, measured, HampelLoss())
     return np.concatenate([pose.t - T, rotation_vector(torch.from_numpy(pose.R @ R.T)).numpy()])
 
@@ -28,7 +28,7 @@ def test_exact_corners_give_the_pose() -> None:
     assert_close(off(pixels()), np.zeros(6), atol=1e-9)
 
 
-def test_wrong_corners_hardly_count() -> None:
+def test_wrong_corners_have_little_weight() -> None:
     rng = np.random.default_rng(0)
     noisy = pixels() + 0.3 * rng.standard_normal(pixels().shape)
     wrong = noisy.copy()

@@ -40,7 +40,7 @@ distortion_coefficients: !!opencv-matrix
 
 
 def points() -> np.ndarray:
-    """Points in front of a camera [m]."""
+    """Return points in front of a camera [m]."""
     return np.random.default_rng(0).uniform((-0.2, -0.15, 0.4), (0.2, 0.15, 0.9), (5, 4, 3))
 
 

@@ -1,4 +1,4 @@
-"""Files of corners, of several cameras and beside rows of other sensors, as measurements."""
+"""Files of corners of several cameras, also with rows of other sensors, as measurements."""
 
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -40,7 +40,7 @@ def camera_files(
 
 
 def with_columns(lines: list[str], **columns: str) -> list[str]:
-    """Lines with further columns, of which all rows hold the same."""
+    """Return lines with additional columns of constant values."""
     names, cells = ",".join(columns), ",".join(columns.values())
     return [f"{lines[0]},{names}", *(f"{line},{cells}" for line in lines[1:])]
 
@@ -99,7 +99,7 @@ def test_rows_of_several_files_keep_their_names(tmp_path: Path) -> None:
     assert rows.select(rows.measured("position")).place(1) == f"{tracker}, line 3"
 
 
-def test_corners_count_by_their_deviations(tmp_path: Path) -> None:
+def test_corners_are_weighted_by_their_deviations(tmp_path: Path) -> None:
     cell = camera_cell(2, 0, EXACT)
     lines = with_columns(corner_lines(cell.images), sigma_px="0.5")
     worse = lines[10].split(",")

@@ -1,4 +1,4 @@
-"""Boards that are not flat: how they are bent is seen in their images."""
+"""Boards that are not flat: their shape is estimated from images."""
 
 from dataclasses import replace
 
@@ -17,7 +17,7 @@ BENT = np.array([3e-4, -1e-4, 2e-4])
 
 
 def bent_images(cell: CameraCell, noise: float) -> Images:
-    """Images of the same board, bent."""
+    """Return images of the same board, bent."""
     corners, rng = bent_corners(BOARD, BENT), np.random.default_rng(0)
     T = invert(forward_kinematics(cell.true, cell.images.q)).numpy()
     pixels = []
@@ -44,7 +44,7 @@ def test_exact_images_of_a_bent_board_give_exact_poses() -> None:
     assert off[1] < 1e-6
 
 
-def test_noise_is_not_taken_for_a_bend() -> None:
+def test_noise_does_not_bend_the_board() -> None:
     cell = camera_cell(20, 1)
     rows, flat = (
         image_measurements(cell.images, CAMERA, board, False, Repeatability(), "fixed")

@@ -1,4 +1,4 @@
-"""Images as rows, and what a calibration makes of them."""
+"""Images as rows of measurements, and calibrations with them."""
 
 from dataclasses import replace
 
@@ -25,13 +25,13 @@ PRIOR = Prior(theta=5e-3, d=1e-3, a=1e-3, alpha=5e-3, beta=5e-3)
 
 
 def beyond(true: Robot, estimated: Robot) -> float:
-    """Root mean square error of positions at other views of the board [m]."""
+    """Return the RMS position error at other views of the board [m]."""
     q = camera_cell(50, 2).images.q
     return aligned_error(*(forward_kinematics(robot, q)[:, :3, 3] for robot in (true, estimated)))
 
 
 @pytest.mark.parametrize("is_fixed", [False, True], ids=["flange", "fixed"])
-def test_a_calibration_by_images_is_right_beyond_them(is_fixed: bool) -> None:
+def test_a_calibration_with_images_is_accurate_at_other_views(is_fixed: bool) -> None:
     cell = camera_cell(50, 1, is_fixed=is_fixed)
     data = image_measurements(cell.images, CAMERA, BOARD, is_fixed, Repeatability())
     result = GeometricCalibrator(cell.nominal, prior=PRIOR).fit(data)
@@ -57,7 +57,7 @@ def test_wrong_corners_and_swapped_joints_are_found() -> None:
     assert errors[1] < 1.15 * errors[0]
 
 
-def test_a_tracker_beside_the_camera_adds_to_it() -> None:
+def test_a_tracker_adds_information_to_a_camera() -> None:
     cell = camera_cell(20, 1)
     data = image_measurements(cell.images, CAMERA, BOARD, False, Repeatability())
     q = camera_cell(50, 3).images.q[:15]
@@ -91,7 +91,7 @@ def test_two_cameras_calibrate_one_arm() -> None:
     assert beyond(wrist.true, result.robot) < 1e-4
 
 
-def test_the_result_says_that_scale_rests_on_the_board() -> None:
+def test_the_result_warns_that_the_board_sets_the_scale() -> None:
     cell = camera_cell(50, 1)
     data = image_measurements(cell.images, CAMERA, BOARD, False, Repeatability())
     result = GeometricCalibrator(cell.nominal).fit(data)
@@ -117,7 +117,7 @@ def test_corners_of_another_board_are_refused() -> None:
     assert "'0000'" in caught.value.expected
 
 
-def test_mirrored_images_are_named() -> None:
+def test_mirrored_images_are_refused() -> None:
     images = camera_cell(8, 0, EXACT).images
     pixels = list(images.pixels)
     for number in (3, 6):

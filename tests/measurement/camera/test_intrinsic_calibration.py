@@ -1,4 +1,4 @@
-"""Intrinsics by images of a board alone: against OpenCV, their deviations, and images that do not determine them."""
+"""Intrinsics from images of a board alone: compared with OpenCV, their deviations, and insufficient images."""
 
 import numpy as np
 import pytest
@@ -25,7 +25,7 @@ NOISE = 0.2
 
 
 def views(count: int, tilt: float, seed: int = 0, noise: float = NOISE, bow: float = 0.0) -> list[BoardView]:
-    """The whole board from 0.3 to 0.5 m anywhere in the image, at most so oblique [rad]."""
+    """Return views of the complete board from 0.3 to 0.5 m anywhere in the image, up to an angle `oblique` [rad]."""
     rng, chosen = np.random.default_rng(seed), list[BoardView]()
     while len(chosen) < count:
         rpy = np.append(rng.uniform(-np.pi, np.pi), rng.uniform(-tilt, tilt, 2))
@@ -39,7 +39,7 @@ def views(count: int, tilt: float, seed: int = 0, noise: float = NOISE, bow: flo
 
 @pytest.fixture(scope="module")
 def calibration() -> IntrinsicCalibration:
-    """By 12 images of a flat board."""
+    """A calibration with 12 images of a flat board."""
     return calibrate_intrinsics(views(12, 0.6), "wrist", SIZE)
 
 

@@ -1,4 +1,4 @@
-"""Printed patterns: squares meet at the corners that the board states."""
+"""Printed patterns: squares meet at the corners of the board."""
 
 import numpy as np
 from testing.closeness import assert_close

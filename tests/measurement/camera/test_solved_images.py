@@ -1,4 +1,4 @@
-"""Poses of boards and intrinsics together: their derivatives, and intrinsics that are under a prior or free."""
+"""Poses of boards together with intrinsics: derivatives, and intrinsics under a prior or free."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -28,14 +28,14 @@ PRIOR = Prior(theta=5e-3, d=1e-3, a=1e-3, alpha=5e-3, beta=5e-3)
 
 
 def poses_of(images: Images) -> Callable[[Camera], list[BoardPose]]:
-    """What solves the poses of some images."""
+    """Return a function that solves the poses of some images."""
     return lambda camera: [
         solve_board_pose(camera, BOARD.corners[corners], pixels, SquaredLoss())
         for corners, pixels in zip(images.corners, images.pixels, strict=True)
     ]
 
 
-def test_a_pose_follows_the_intrinsics() -> None:
+def test_the_derivative_of_a_pose_by_the_intrinsics() -> None:
     solve = poses_of(camera_cell(2).images)
     here = solve(CAMERA)
     for k, step in enumerate(1e-5 * np.eye(9)):
@@ -47,7 +47,7 @@ def test_a_pose_follows_the_intrinsics() -> None:
             assert_close(pose.by_intrinsics[:, k], change, atol=1e-2 * size, rtol=0.05)
 
 
-def test_what_is_left_for_the_intrinsics_is_that_of_a_whole_least_squares_problem() -> None:
+def test_the_reduced_equations_are_those_of_the_complete_least_squares_problem() -> None:
     (pose,) = poses_of(camera_cell(1).images)(CAMERA)
     points = BOARD.corners @ pose.R.T + pose.t
     B = CAMERA.by_intrinsics(points).reshape(-1, 9)
@@ -69,16 +69,16 @@ def test_images_correct_intrinsics(choice: str) -> None:
     assert np.abs(root @ (mean - solved.present.intrinsics)).max() < 0.1
 
 
-def test_fixed_intrinsics_and_those_of_no_deviation_are_held() -> None:
+def test_intrinsics_with_zero_deviation_are_fixed() -> None:
     assert not prior_deviations(CAMERA, "fixed").any()
     assert_close(prior_deviations(CAMERA, "prior"), np.array(USUAL_DEVIATIONS))
     stated = replace(CAMERA, sigma=(1.0, *[0.0] * 8))
     assert prior_deviations(stated, "free").nonzero()[0].tolist() == [0]
 
 
-def test_intrinsics_that_no_camera_has_are_refused() -> None:
+def test_impossible_intrinsics_are_refused() -> None:
     (pose,) = poses_of(camera_cell(1).images)(CAMERA)
-    pulled = replace(pose, root=np.eye(9), rest=np.full(9, -1e6))
+    pulled = replace(pose, root=np.eye(9), residual=np.full(9, -1e6))
     sigma = prior_deviations(CAMERA, "free")
     with refused(MeasurementError, file="x", value="wrist"):
         solve_images(CAMERA, sigma, lambda camera: [pulled], SquaredLoss(), "x")
@@ -102,7 +102,7 @@ def test_a_calibration_identifies_the_intrinsics() -> None:
     assert_close(held["position"].square().mean().sqrt(), torch.tensor(5e-4).double(), rtol=0.5)
 
 
-def test_one_length_beside_the_images_corrects_the_scale_of_the_board() -> None:
+def test_one_length_in_addition_to_images_corrects_the_scale_of_the_board() -> None:
     cell = camera_cell(50, 1)
     wrong = replace(BOARD, square=BOARD.square * 0.999)  # the true board is 0.1 % too large
     data = image_measurements(cell.images, CAMERA, wrong, False, Repeatability(), "fixed")

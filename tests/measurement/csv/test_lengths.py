@@ -31,7 +31,7 @@ def read(tmp_path: Path, text: str, on_bad_row: str = "error") -> Measurements:
     return Measurements.read_csv(path, on_bad_row=on_bad_row)
 
 
-def test_a_file_mixes_kinds_and_frames(tmp_path: Path):
+def test_a_file_contains_several_kinds_and_frames(tmp_path: Path):
     data = read(tmp_path, MIXED)
     assert data.kinds == {"position", "socket", "touch", "distance"}
     assert data.measured("position").tolist() == [True] + [False] * 7
@@ -53,7 +53,7 @@ def test_a_file_mixes_kinds_and_frames(tmp_path: Path):
 
 
 @pytest.mark.parametrize("rows", [[0, 1, 3], [1, 2], [3], [4, 7], [5, 6], list(range(8))])
-def test_what_is_written_reads_back(tmp_path: Path, rows: list[int]):
+def test_written_files_read_back(tmp_path: Path, rows: list[int]):
     data = read(tmp_path, MIXED).select(torch.tensor(rows))
     data.write_csv(tmp_path / "again.csv")
     again = Measurements.read_csv(tmp_path / "again.csv")

@@ -110,7 +110,7 @@ SOUND, BAD = (2, 4, 8, 10), (5, 7, 9)
 
 
 @pytest.mark.parametrize("rows", [1, 2, 3, 100])
-def test_chunks_hold_every_row_once_and_in_order(tmp_path, rows):
+def test_chunks_contain_every_row_once_and_in_order(tmp_path, rows):
     path = tmp_path / "poses.csv"
     path.write_text("\n".join([QUATERNION, *ROWS]) + "\n")
     chunks = list(read_pose_chunks(path, rows))

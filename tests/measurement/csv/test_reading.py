@@ -70,7 +70,7 @@ def test_reads_directions_of_approach(write):
     assert bool(approach[2, 1].isnan())
 
 
-def test_joints_from_ten_on_are_counted_as_numbers(write):
+def test_joints_from_ten_are_sorted_as_numbers(write):
     names = [f"q{number}_rad" for number in range(11, 0, -1)]
     path = write(",".join([*names, "x_mm,y_mm,z_mm"]) + "\n11,10,9,8,7,6,5,4,3,2,1,0,0,0\n")
     assert_close(Measurements.read_csv(path).q, [np.arange(1.0, 12.0)])
@@ -109,21 +109,21 @@ def test_reads_quaternions_and_normalises_them(write):
         "q1_deg,x_mm,y_mm,z_mm,target\n+1.,2e0,3.0E+0,0x4,A\n".replace("0x4", "004"),
     ],
 )
-def test_tolerates_how_programs_write_csv(write, text: str):
+def test_tolerates_variants_of_csv(write, text: str):
     measurements = Measurements.read_csv(write(text))
     assert_close(measurements.q, np.deg2rad([[1.0]]), rtol=1e-15)
     assert_close(measurements.position, [[2e-3, 3e-3, 4e-3]])
     assert measurements.target == ("A",)
 
 
-def test_lines_are_counted_as_an_editor_counts_them(write):
+def test_lines_are_numbered_as_in_an_editor(write):
     path = write("# tracker\n\nq1_deg,x_mm,y_mm,z_mm\n1,2,3,4\n\n# pause\n2,2,3,4\n")
     measurements = Measurements.read_csv(path)
     assert measurements.line == (4, 7)
     assert measurements.place(1) == f"{path}, line 7"
 
 
-def test_empty_cells_are_what_was_not_measured(write):
+def test_empty_cells_were_not_measured(write):
     path = write(
         "q1_deg,x_mm,y_mm,z_mm,qx,qy,qz,qw,sigma_mm,temperature_c,payload_kg\n"
         "1,,,,0,0,0,1,0.1,,\n"

@@ -1,4 +1,4 @@
-"""Writing measurement files: what is written reads back, and nothing is written in part."""
+"""Writing measurement files: values read back, and files are written completely or not at all."""
 
 import os
 import stat
@@ -34,13 +34,13 @@ def with_gaps(values: torch.Tensor, gaps: list[bool]) -> torch.Tensor:
 
 
 def approaches(dof: int) -> st.SearchStrategy[list[float]]:
-    """Directions of approach of all joints in one row, some of them not stated."""
+    """Directions of approach of all joints in one row, some of them not given."""
     return st.lists(st.sampled_from([1.0, -1.0, float("nan")]), min_size=dof, max_size=dof)
 
 
 @st.composite
 def written_fields(draw: st.DrawFn, rows: int, dof: int) -> dict[str, object]:
-    """Everything that a file can hold; the orientation as quaternions."""
+    """All fields of a file, with orientations as quaternions."""
 
     def each_row(values: st.SearchStrategy[object]) -> list[object]:
         return draw(st.lists(values, min_size=rows, max_size=rows))
@@ -72,7 +72,7 @@ def written_fields(draw: st.DrawFn, rows: int, dof: int) -> dict[str, object]:
 
 
 def assert_same(actual: Measurements, expected: Measurements) -> None:
-    """Equal to 1e-12 in every field that the file holds; a column of nothing but NaN reads back as absent."""
+    """Assert equality to 1e-12 in every field of the file; columns of NaN only are absent when read back."""
     for item in fields(Measurements):
         a, e = getattr(actual, item.name), getattr(expected, item.name)
         if item.name in ("line", "source", "left_out"):
@@ -197,7 +197,7 @@ def test_the_new_file_takes_the_place_of_the_old_one_in_one_step(tmp_path: Path)
     assert Measurements.read_csv(path).rows == 2
 
 
-def test_refuses_a_folder_that_is_not_there(tmp_path: Path):
+def test_refuses_a_missing_folder(tmp_path: Path):
     with pytest.raises(OutputError):
         make().write_csv(tmp_path / "nowhere" / "data.csv")
 

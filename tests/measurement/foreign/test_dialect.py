@@ -1,4 +1,4 @@
-"""Separators and decimal signs are told from the cells."""
+"""Separators and decimal signs are recognised by the cells."""
 
 import pytest
 from testing.refusals import refused
@@ -34,7 +34,7 @@ def test_separator_and_decimal_sign(lines: list[str], separator: str, decimal: s
     assert (dialect.separator, dialect.numbers.decimal) == (separator, decimal)
 
 
-def test_a_stated_sign_counts():
+def test_a_stated_sign_is_used():
     assert sniffed(["1,250;2,125"], ".").numbers.decimal == "."
 
 

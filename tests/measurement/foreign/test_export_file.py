@@ -14,7 +14,7 @@ def read(tmp_path: Path, text: str, encoding: str = "utf-8") -> ExportFile:
     return read_export(path)
 
 
-def test_what_stands_around_the_rows(tmp_path: Path):
+def test_lines_around_the_rows(tmp_path: Path):
     file = read(
         tmp_path,
         "Report of 2 March\n// units mm\n\nname;x;y;;\n;mm;mm;;\n--;--;--;--;--\n"
@@ -33,7 +33,7 @@ def test_first_lines_of_spreadsheets_and_unit_rows_with_dashes(tmp_path: Path):
     assert (file.headings, file.units) == (("Point", "x", "y", "Note"), ("", "mm", "mm", ""))
 
 
-def test_headings_that_come_again_and_blanks_before_units(tmp_path: Path):
+def test_repeated_headings_and_blanks_before_units(tmp_path: Path):
     file = read(tmp_path, "J1 [deg]  J2 [deg]  x [mm]\n1 2 3\n4 5 6\nJ1 [deg]  J2 [deg]  x [mm]\n7 8 9\n")
     assert file.headings == ("J1[deg]", "J2[deg]", "x[mm]")
     assert file.lines == (2, 3, 5)

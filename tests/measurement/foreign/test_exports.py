@@ -1,4 +1,4 @@
-"""Small files as instruments and controllers write them, all of the same six poses."""
+"""Small exports of instruments and controllers, all of the same six poses."""
 
 from pathlib import Path
 
@@ -54,7 +54,7 @@ def test_spreadsheet_with_grouped_thousands_and_decimal_commas():
     check(imported("excel_german.csv"), None)
 
 
-def test_points_joined_by_name_name_those_without_partner():
+def test_points_without_a_partner_are_listed():
     rows = imported("polyworks_log.csv", "polyworks_points.csv", settings=ImportSettings(join="point"))
     check(rows, None)
     assert [(row.point, row.line) for row in rows.left_out if "points" in row.file] == [("P099", 9)]

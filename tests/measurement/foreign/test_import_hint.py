@@ -40,7 +40,7 @@ def test_exports(tmp_path: Path, text: str, command: str):
     "text",
     [f"q1_deg,q2_degg,x_mm,y_mm,z_mm\n{ROWS}", f"q1_deg,q2_deg,x_mm,y_mm,x_mm\n{ROWS}", "", "only words\n"],
 )
-def test_no_command_reads_these(tmp_path: Path, text: str):
+def test_no_command_imports_these(tmp_path: Path, text: str):
     path = tmp_path / "export.csv"
     path.write_text(text)
     with pytest.raises(MeasurementError) as problem:

@@ -1,4 +1,4 @@
-"""Joint logs and lists of measurements: partners by name, order and time, and rows without."""
+"""Joining of joint logs and lists of measurements by name, order and time, and rows without a partner."""
 
 import pytest
 from testing.refusals import refused
@@ -55,7 +55,7 @@ def test_joining_by_order_requires_as_many_rows():
         join_rows(measured, rows("log", q1_deg=("10",)), "order")
 
 
-def test_the_nearest_time_stamp_counts():
+def test_the_nearest_time_stamp_is_joined():
     measured = rows("points", time=("10:00:01.1", "10:00:02.0", "10:00:09"), x_mm=("1", "2", "3"))
     log = rows("log", time=("10:00:02.1", "10:00:01.0", "10:00:05"), q1_deg=("20", "10", "50"))
     joined = join_rows(measured, log, "time", 0.2)
@@ -98,7 +98,7 @@ def test_names_of_points_that_contradict_the_order_or_the_time_are_refused():
         (("10:00:01 AM", "1:00:02 p.m."), ("10:00:01", "13:00:02")),
     ],
 )
-def test_stamps_of_other_countries(ours: tuple[str, str], theirs: tuple[str, str]):
+def test_time_stamps_of_other_countries(ours: tuple[str, str], theirs: tuple[str, str]):
     log = rows("log", time=theirs[::-1], q1_deg=("20", "10"))
     assert join_rows(rows("points", time=ours, x_mm=("1", "2")), log, "time").rows.cells["q1_deg"] == (
         "10",
@@ -133,7 +133,7 @@ def test_no_common_name():
         )
 
 
-def test_where_no_name_is_the_same_the_numbers_are_compared():
+def test_without_common_names_numbers_are_compared():
     def joined(*names: str):
         log = rows("log", point=names, q1_deg=("10", "20", "30"))
         return join_rows(rows("points", point=("P1", "P2", "P3"), x_mm=("1", "2", "3")), log, "order")

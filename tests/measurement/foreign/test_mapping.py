@@ -191,7 +191,7 @@ def test_cells_that_are_not_numbers_are_refused(tmp_path: Path):
     assert_fields(refusal(tmp_path, text), line=4, column="A3", value="30.5.1")
 
 
-def test_doubts_about_units_and_external_axes(tmp_path: Path):
+def test_warnings_of_units_and_external_axes(tmp_path: Path):
     rows = "".join(f"{170 - i},-20,{i}.5,1200.5,{i},400\n" for i in range(8))
     found = doubts(mapped(tmp_path, f"J1 [rad],J2 [rad],E1 [mm],X [m],Y [m],Z [m]\n{rows}"))
     assert len(found) == 3
@@ -217,7 +217,7 @@ def test_different_names_in_all_rows_are_those_of_points(tmp_path: Path, heading
     assert targets(mapped(tmp_path, f"{heading},{','.join(DEGREES_MM)}\n{rows}"))[0] == target
 
 
-def test_a_joint_that_is_stated_leaves_the_others_to_their_maker(tmp_path: Path):
+def test_other_joints_are_named_by_the_maker(tmp_path: Path):
     file = mapped(tmp_path, f"A1,A2,A3,A4,A5,A6,X,Y,Z\n{ROW}", {"A1": "q1_deg", "X": "x_mm"})
     assert targets(file) == DEGREES_MM
 

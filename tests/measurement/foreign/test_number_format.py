@@ -39,6 +39,6 @@ def test_a_group_without_decimals_may_be_a_decimal():
     assert NumberFormat(".").certainty("1,234") < NumberFormat(",").certainty("1,234") == 1
 
 
-def test_what_says_that_nothing_was_measured():
+def test_markers_of_missing_values():
     assert all(map(is_missing, ("", " ", "-", "---", "NaN", "n/a", "null")))
     assert not any(map(is_missing, ("0", "x", "-1")))

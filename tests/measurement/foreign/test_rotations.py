@@ -61,7 +61,7 @@ def test_columns_of_measurement_files_mean_the_same(name: str):
     assert_close(encoding.to_rotation(values), to_rotation(columns), atol=1e-14)
 
 
-def test_left_handed_matrices_are_no_rotations():
+def test_left_handed_matrices_are_not_rotations():
     mirrored = torch.tensor([[1.0, 0, 0, 0, 1, 0, 0, 0, -1], [1, 0, 0, 0, 1, 0, 0, 0, math.nan]]).double()
     assert not bool(ROTATIONS["matrix"].is_rotation(mirrored).any())
 

@@ -1,4 +1,4 @@
-"""Encodings that nobody states."""
+"""Recognition of text encodings."""
 
 import pytest
 from testing.refusals import refused

@@ -26,7 +26,7 @@ def test_time_stamps(text: str, seconds: float):
     assert_close(seconds_of(text), seconds, atol=0.0)
 
 
-def test_what_is_no_time_stamp():
+def test_invalid_time_stamps():
     assert seconds_of("noon") is None
     assert seconds_of("nan") is None
     assert seconds_of("02/03/2026 10:31") is None  # the second of March, or the third of February

@@ -1,4 +1,4 @@
-"""Units: how they are spelt, exact conversion, and values that cannot be in them."""
+"""Units: spellings, exact conversion, and impossible values."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""Derivatives of the poses that images give."""
+"""Derivatives of poses from images."""
 
 from dataclasses import replace
 from pathlib import Path

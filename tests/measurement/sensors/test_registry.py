@@ -294,7 +294,7 @@ def test_names_that_are_taken_are_refused() -> None:
         register_sensor(Other)
 
 
-def test_a_gauge_that_was_not_calibrated_is_named() -> None:
+def test_a_gauge_that_was_not_calibrated_is_refused() -> None:
     robot, data = measured(40)
     names = gauges(data)
     assert names is not None

@@ -20,7 +20,7 @@ SHARP = Exposure(blur=1e-3, aperture=0.0, vignetting=0.0, gradient=0.0, noise=0.
 
 
 def pose(distance: float, rpy: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> np.ndarray:
-    """T_camera_board with the middle of the corners on the camera's axis."""
+    """Return T_camera_board with the centre of the corners on the camera's axis."""
     T = np.eye(4)
     T[:3, :3] = rotation_from_rpy(torch.tensor(rpy, dtype=torch.float64)).numpy()
     T[:3, 3] = [0, 0, distance] - T[:3, :3] @ BOARD.corners.mean(0)
@@ -34,7 +34,7 @@ def rendered(
 
 
 def test_pixels_have_the_mean_gray_of_their_area():
-    """Straight on, 50 px a square with the edges through pixels: 0.3 of each pixel across an edge is black."""
+    """Perpendicular view, 50 px per square, with edges through pixels: 0.3 of each pixel across an edge is black."""
     camera = Camera("straight", 640, 400, 500.0, 500.0, 299.8, 199.8)
     T = np.eye(4)
     T[:3, 3] = [0, 0, 0.3]
@@ -63,7 +63,7 @@ def test_blur_grows_away_from_the_distance_in_focus():
 
 @pytest.mark.parametrize("bow", [0.0, 2e-3])
 def test_corners_are_detected_where_the_camera_projects_them(bow: float):
-    """Of a board that is larger than stated and bowed, through a lens with distortion."""
+    """The board is larger than given and bowed, and the lens has distortion."""
     pytest.importorskip("cv2", reason="opencv-python-headless is not installed")
     from pisigma.measurement.camera.detection.detected_board import DetectedBoard
     from pisigma.measurement.camera.detection.detector import detect_checkerboard

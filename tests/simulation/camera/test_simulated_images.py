@@ -1,4 +1,4 @@
-"""Images of a recipe: views of the whole board, and what errors of camera, board and time do to them."""
+"""Images of a recipe: views of the complete board, and effects of errors of camera, board and time."""
 
 from pathlib import Path
 from typing import Any
@@ -26,12 +26,12 @@ def recipe(repository: Path) -> GeometricRecipe:
 
 @pytest.fixture(scope="module")
 def robot(recipe: GeometricRecipe) -> TrueRobot:
-    """The frames of the recipe, with an arm as drawn."""
+    """The frames of the recipe, with the nominal arm."""
     return TrueRobot(Robot.load(recipe.robot), recipe.errors[1:])
 
 
 def images(recipe: GeometricRecipe, **changed: Any) -> SimulatedImages:
-    """Eight images without noise and other errors, but for what is changed."""
+    """Return eight images without noise and other errors, except for the given changes."""
     exact = {"corner_px": 0.0, "repeatability_mm": 0.0, "repeatability_deg": 0.0, "seed": 0}
     stated = recipe.measurements.model_dump(exclude={"camera_errors", "late_joints"})
     stated |= {"poses": {**stated["poses"], "count": 8}, "noise": exact} | changed
@@ -56,7 +56,7 @@ def test_views_are_near_oblique_and_from_the_printed_side(recipe: GeometricRecip
     assert T[:, 2, 2].min() < 0.95 < T[:, 2, 2].max(), "some are frontal, some are oblique"
 
 
-def test_a_board_that_is_larger_brings_the_camera_nearer(recipe: GeometricRecipe, robot: TrueRobot):
+def test_a_larger_board_brings_the_camera_nearer(recipe: GeometricRecipe, robot: TrueRobot):
     exact, larger = (
         images(recipe, board_errors={"scale_percent": scale}).measure(robot).position for scale in (0.0, 1.0)
     )

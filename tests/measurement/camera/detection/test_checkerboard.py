@@ -1,4 +1,4 @@
-"""Corners of checkerboards in drawn images: where they are, how they are numbered, and why there are none."""
+"""Corners of checkerboards in rendered images: positions, numbering, and missing boards."""
 
 import numpy as np
 import pytest
@@ -13,7 +13,7 @@ BOARD = Board("board", 4, 5, 0.03)
 
 
 @pytest.mark.parametrize("roll", [0.0, 1.5, 3.0, -1.7])
-def test_corners_are_found_and_numbered_however_the_camera_is_turned(roll: float) -> None:
+def test_corners_are_found_and_numbered_at_any_rotation_of_the_camera(roll: float) -> None:
     R, t = view(BOARD, 0.35, (roll, 0.4, -0.3))
     detected = detect_checkerboard(draw_board(BOARD, R, t), BOARD)
     assert isinstance(detected, DetectedBoard)
@@ -32,7 +32,7 @@ def test_a_symmetric_board_is_numbered_from_the_upper_left() -> None:
     assert_close(detected.pixels, true[::-1], atol=0.1)
 
 
-def test_why_there_is_no_board() -> None:
+def test_incomplete_and_missing_boards_are_distinguished() -> None:
     image = draw_board(BOARD, *view(BOARD, 0.35, (0.0, 0.3, 0.0)))
     image[:, :280] = 120
     piece, nothing = detect_checkerboard(image, BOARD), detect_checkerboard(np.zeros_like(image), BOARD)
@@ -41,7 +41,7 @@ def test_why_there_is_no_board() -> None:
     assert (piece.piece, nothing.piece) == ((4, 3), None)
 
 
-def test_edges_without_contrast_have_no_blur_and_stay() -> None:
+def test_edges_without_contrast_have_no_blur_and_are_not_moved() -> None:
     ends = np.array([[[100.0, 100.0], [150.0, 110.0]]])
     profiles = EdgeProfiles.of(np.full((400, 640), 90, dtype=np.uint8), ends, 0.2)
     assert np.isnan(profiles.blur)

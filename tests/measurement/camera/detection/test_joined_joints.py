@@ -1,4 +1,4 @@
-"""Joint values of images by their names and by their times."""
+"""Joining of joint values and images by name and by time."""
 
 from pathlib import Path
 
@@ -14,7 +14,7 @@ def log(folder: Path, text: str) -> Path:
     return folder / "joints.csv"
 
 
-def test_by_name_with_ending_or_without(tmp_path: Path) -> None:
+def test_by_name_with_or_without_extension(tmp_path: Path) -> None:
     path = log(
         tmp_path, "image,q1_deg,q2_deg,payload_kg,note\na/0001.png,1.5,2,3,\n0002,4.25,5,3,\n0009,7,8,3,\n"
     )

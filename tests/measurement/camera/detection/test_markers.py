@@ -1,4 +1,4 @@
-"""ChArUco boards and AprilTags in drawn images, whole and in part."""
+"""ChArUco boards and AprilTags in rendered images, complete and partly visible."""
 
 import numpy as np
 import pytest
@@ -48,7 +48,7 @@ def test_an_image_without_markers(board, detect) -> None:
 
 
 @pytest.mark.parametrize("board", [CHARUCO, TAGS], ids=["charuco", "apriltag"])
-def test_a_mirrored_image_is_named(board, tmp_path) -> None:
+def test_a_mirrored_image_is_recognised(board, tmp_path) -> None:
     image = draw_board(board, *view(board, 0.3, (2.0, 0.4, -0.3)))
     cv2.imwrite(str(tmp_path / "flipped.png"), image[:, ::-1])
     flipped = detect_board(tmp_path / "flipped.png", board, 3.0).board

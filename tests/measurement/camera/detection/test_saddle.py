@@ -1,4 +1,4 @@
-"""Corners fitted to gray values: exact ones are found again whatever the light, and what is no corner stays."""
+"""Corners fitted to gray values: exact under any light, and points that are not corners are not moved."""
 
 import numpy as np
 from scipy.special import erf
@@ -11,7 +11,7 @@ AXES = np.array([[[40.0, 8.0], [6.0, 35.0]], [[30.0, -25.0], [25.0, 30.0]]])
 
 
 def drawn_corners(slope: float) -> np.ndarray:
-    """An image of two corners, each with half of it, that are blurred by 0.9 px under light of a slope [1/px]."""
+    """Return an image of two corners, one per half, blurred by 0.9 px under light with a gradient [1/px]."""
     y, x = np.mgrid[:64, :120].astype(float)
     gray = np.empty_like(x)
     for corner, axes, half in zip(CORNERS, AXES, (x < 60, x >= 60), strict=True):
@@ -36,7 +36,7 @@ def test_noise_moves_corners_by_some_thousandths_of_a_pixel() -> None:
     assert_close(np.sqrt(np.square(off).mean()), 0.004, rtol=0.5)
 
 
-def test_what_is_no_corner_stays() -> None:
+def test_points_that_are_not_corners_are_not_moved() -> None:
     gray = np.random.default_rng(0).uniform(0.0, 255.0, (64, 120))
     moved = np.abs(fit_saddles(gray, CORNERS, AXES, 0.4) - CORNERS)
     assert moved.max() <= 0.5
