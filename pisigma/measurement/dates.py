@@ -5,7 +5,7 @@ import re
 
 from pisigma.files.errors import MeasurementError, Place
 
-WANTED = "a day from 1970-01-01 to today, such as 2026-11-22"
+EXPECTED_DATE = "a day from 1970-01-01 to today, such as 2026-11-22"
 """Expected dates, for messages."""
 
 _FIRST = datetime.date(1970, 1, 1)
@@ -43,7 +43,7 @@ def date_in_name(name: str) -> str:
         return ""
     if not is_date(text):
         raise MeasurementError(
-            expected=f"{WANTED}, in the name of the file",
+            expected=f"{EXPECTED_DATE}, in the name of the file",
             value=text,
             at=Place(name),
             remedy="rename the file, or state the date",

@@ -10,7 +10,7 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from pisigma.files.errors import MeasurementError, Place, nearest_choice
-from pisigma.measurement.dates import WANTED, is_date
+from pisigma.measurement.dates import EXPECTED_DATE, is_date
 from pisigma.measurement.faults import Fault
 from pisigma.measurement.fields import NUMBERS, TEXTS, MeasuredFields
 from pisigma.measurement.readings import READINGS, Unit, from_si, reading_numbers, reading_texts
@@ -218,7 +218,7 @@ def _value_faults(data: MeasuredFields, labels: Labels) -> Iterator[RowAndFault]
             yield row, Fault("", labels("split"), "train or test", split, "write one of them")
     for row, date in enumerate(data.texts.get("date", ())):
         if date and not is_date(date):
-            yield row, Fault("", labels("date"), WANTED, date, _CORRECT)
+            yield row, Fault("", labels("date"), EXPECTED_DATE, date, _CORRECT)
 
 
 _CORRECT = "correct it or leave it empty"

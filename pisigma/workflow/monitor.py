@@ -40,7 +40,7 @@ from pisigma.measurement.camera.camera_files import CameraFiles
 from pisigma.measurement.camera.corner_file import read_rows
 from pisigma.measurement.copies import RowValues
 from pisigma.measurement.dataset import Measurements
-from pisigma.measurement.dates import WANTED, date_in_name, is_date
+from pisigma.measurement.dates import EXPECTED_DATE, date_in_name, is_date
 from pisigma.measurement.joint_range import row_warnings
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.folder.model_folder import load_model
@@ -263,7 +263,7 @@ def monitor(
     if folder is not None:
         records = store_sessions(history_path(folder), model_hash(folder), new)
         warnings += [
-            f"{one.file}: its session in the history was left out: expected {WANTED}, got {one.date}; monitor its rows "
+            f"{one.file}: its session in the history was left out: expected {EXPECTED_DATE}, got {one.date}; monitor its rows "
             "again with --dates to correct the date."
             for one in records
             if not is_date(one.date)
@@ -312,7 +312,7 @@ def _date_of_file(source: str) -> str:
     date = datetime.date.fromtimestamp(moment).isoformat()
     if not is_date(date):
         raise MeasurementError(
-            expected=f"{WANTED} as the file's time of modification",
+            expected=f"{EXPECTED_DATE} as the file's time of modification",
             value=date,
             at=Place(source),
             remedy="give --dates",

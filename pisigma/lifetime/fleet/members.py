@@ -10,7 +10,7 @@ from pisigma.files.errors import FleetError, Place, nearest_choice
 from pisigma.measurement.camera.camera_files import CameraFiles
 from pisigma.measurement.csv.header import check_separators
 from pisigma.measurement.csv.table import Table, read_table
-from pisigma.measurement.dates import WANTED, date_in_name, is_date
+from pisigma.measurement.dates import EXPECTED_DATE, date_in_name, is_date
 
 COLUMNS = ("id", "robot", "data", "date", "model", "options", "camera", "board")
 """Columns of a manifest; the first three are required."""
@@ -167,7 +167,9 @@ def _member(path: Path, name: str, rows: Sequence[tuple[int, dict[str, str]]], r
             at, remedy = Place(path, line, "data"), "name a file of measurements"
             raise FleetError("the field is empty", at=at, remedy=remedy)
         if date and not is_date(date):
-            raise FleetError(expected=WANTED, value=date, at=Place(path, line, "date"), remedy="correct it")
+            raise FleetError(
+                expected=EXPECTED_DATE, value=date, at=Place(path, line, "date"), remedy="correct it"
+            )
         sessions.append(_session(path.parent / data, date))
     stated = {key: {fields.get(key, "") for _, fields in rows} - {""} for key in ("robot", *COLUMNS[4:])}
     for key, values in stated.items():

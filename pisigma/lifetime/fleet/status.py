@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from pisigma.lifetime.fleet.record import RobotRecord, SessionRecord
-from pisigma.measurement.dates import WANTED, is_date
+from pisigma.measurement.dates import EXPECTED_DATE, is_date
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,7 @@ class FleetStatus:
         missing = set(expected) - {one.robot for one in records}
         robots += [RobotStatus(robot, None, None) for robot in missing]
         warnings = tuple(
-            f"robot {record.robot}: expected {WANTED} as the date of session {one.session}, got {one.date}; "
+            f"robot {record.robot}: expected {EXPECTED_DATE} as the date of session {one.session}, got {one.date}; "
             "correct it in the manifest and run the fleet again."
             for record in records
             for one in record.sessions

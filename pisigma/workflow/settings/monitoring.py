@@ -7,7 +7,7 @@ from typing import Annotated
 from pisigma.files.errors import IdentificationError, MeasurementError
 from pisigma.files.setting import Option, names
 from pisigma.measurement.camera.camera_files import CameraFiles
-from pisigma.measurement.dates import WANTED, is_date
+from pisigma.measurement.dates import EXPECTED_DATE, is_date
 from pisigma.workflow.settings.recalibration import Moved, RecalibrationSettings
 
 
@@ -40,6 +40,8 @@ class MonitorSettings:
         RecalibrationSettings(self.moved)
         for date in self.dates:
             if not is_date(date):
-                raise MeasurementError(expected=WANTED, value=date, option="dates", remedy="correct it")
+                raise MeasurementError(
+                    expected=EXPECTED_DATE, value=date, option="dates", remedy="correct it"
+                )
         if self.limit_mm is not None and not self.limit_mm > 0:
             raise IdentificationError(expected="an RMS error > 0 mm", value=self.limit_mm, option="limit_mm")
