@@ -263,8 +263,8 @@ def monitor(
     if folder is not None:
         records = store_sessions(history_path(folder), model_hash(folder), new)
         warnings += [
-            f"{one.file}: its session in the history was left out: expected {EXPECTED_DATE}, got {one.date}; monitor its rows "
-            "again with --dates to correct the date."
+            f"{one.file}: its session in the history was left out: expected {EXPECTED_DATE}, got {one.date}; monitor "
+            "its rows again with --dates to correct the date."
             for one in records
             if not is_date(one.date)
         ]
