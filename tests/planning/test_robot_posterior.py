@@ -101,7 +101,7 @@ def test_unknown_base_and_tool_have_a_wide_prior(robot: Robot) -> None:
     """In another frame, at another target, with nothing known of either."""
     base, tool = (np.array([0.3, -0.2, 0.1, *angles]) for angles in ((0.1, 0.2, 3.0), (0.5, -0.3, 0.2)))
     q = torch.linspace(-1, 1, 5 * robot.dof, dtype=torch.float64).view(5, robot.dof)
-    anew = RobotPosterior.of_robot(robot, hybrid=False).with_unknown_base_and_tool(base, tool)
+    unknown = RobotPosterior.of_robot(robot, hybrid=False).with_unknown_base_and_tool(base, tool)
     expected = RobotPosterior.of_robot(robot.with_geometry(base=base, tool=tool), hybrid=False)
-    for D, wanted in ((anew.tool(q), expected.tool(q)), (anew.measured(q), expected.measured(q))):
-        assert_close(D @ D.mT, wanted @ wanted.mT, rtol=1e-9)
+    for D, reference in ((unknown.tool(q), expected.tool(q)), (unknown.measured(q), expected.measured(q))):
+        assert_close(D @ D.mT, reference @ reference.mT, rtol=1e-9)

@@ -17,14 +17,14 @@ from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.robot.se3 import rpy_from_rotation
 
 
-@pytest.mark.parametrize("wanted", ["joints", "poses"])
-def test_a_task_may_be_joint_values_or_poses(tmp_path: Path, wanted: str):
+@pytest.mark.parametrize("kind", ["joints", "poses"])
+def test_a_task_may_be_joint_values_or_poses(tmp_path: Path, kind: str):
     robot = Robot.load("fanuc_r2000")
     q = torch.deg2rad(
         torch.tensor([[10.0, 20, 5, 30, 40, 50], [-20, 10, 15, 30, -40, 50]], dtype=torch.float64)
     )
     T = forward_kinematics(robot, q)
-    if wanted == "joints":
+    if kind == "joints":
         rows = [
             ",".join(f"q{n}_deg" for n in range(1, 7)),
             *(",".join(map(str, row)) for row in q.rad2deg().tolist()),
@@ -41,7 +41,7 @@ def test_a_task_may_be_joint_values_or_poses(tmp_path: Path, wanted: str):
         read = task_poses(arm, settings, q)
     assert_close(forward_kinematics(robot, read), T, atol=1e-9)
     (tmp_path / "task.csv").write_text(
-        "\n".join(rows).replace(",", ",99", 3) if wanted == "poses" else "q1_deg\n1"
+        "\n".join(rows).replace(",", ",99", 3) if kind == "poses" else "q1_deg\n1"
     )
     with refused(PisigmaError, file="task.csv"), no_type_checker():
         task_poses(arm, settings, q)

@@ -50,6 +50,6 @@ def test_corners_are_printed_at_their_true_distances() -> None:
         detected = DETECTORS[board.kind](np.asarray(canvas.buffer_rgba())[..., 0].copy(), board)
         assert isinstance(detected, DetectedBoard)
         assert len(detected.corners) == len(board.corners)
-        wanted = board.corners[detected.corners, :2] * 1e3 * MM
-        shift = (detected.pixels - wanted).mean(0)
-        assert_close(detected.pixels - shift, wanted, atol=0.5)
+        expected = board.corners[detected.corners, :2] * 1e3 * MM
+        shift = (detected.pixels - expected).mean(0)
+        assert_close(detected.pixels - shift, expected, atol=0.5)

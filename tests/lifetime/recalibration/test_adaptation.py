@@ -24,9 +24,9 @@ COLLISION = (0.0, 0.0, math.radians(0.25), 0.0, 0.0, 0.0)
 SHIFTED = (0.3, -0.2, 0.1, 0.5, 0.2, -0.3)
 
 
-def adapted(model, rows, elsewhere=frozenset()) -> Adaptation:
+def adapted(model, rows, relocated=frozenset()) -> Adaptation:
     posterior = ModelPosterior.of(model)
-    return adapt(recalibration_problem(model, posterior, rows, elsewhere), posterior.noise)
+    return adapt(recalibration_problem(model, posterior, rows, relocated), posterior.noise)
 
 
 def rms(errors: torch.Tensor) -> float:

@@ -18,10 +18,10 @@ from pisigma.robot.se3 import invert, transform_from_xyzrpy
 ELSEWHERE = (0.3, -0.2, 0.1, 0.5, 0.2, -0.3)
 
 
-def recalibrated(rows, elsewhere=frozenset(), arm=True):
+def recalibrated(rows, relocated=frozenset(), arm=True):
     model = model_before()
     posterior = ModelPosterior.of(model)
-    problem = recalibration_problem(model, posterior, rows, elsewhere)
+    problem = recalibration_problem(model, posterior, rows, relocated)
     adaptation = adapt(problem if arm else problem.without_arm(), posterior.noise)
     return recalibrated_model(model, adaptation, rows), adaptation
 

@@ -14,7 +14,7 @@ NAMES = [f"pose {number} of the plan" for number in range(1, 25)]
 
 
 def test_an_unreadable_row_has_to_be_measured_again():
-    alarm = unreadable(LeftOut(7, "column 'x_mm': 'abc' is no finite number; write one such as -12.5"))
+    alarm = unreadable(LeftOut(7, "column 'x_mm': 'abc' is not a finite number; write one such as -12.5"))
     assert alarm.line == 7
     assert "'abc'" in alarm.sentence
     assert (alarm.kind, alarm.repeat, alarm.counts) == ("unreadable", True, False)

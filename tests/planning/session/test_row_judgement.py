@@ -12,7 +12,7 @@ ROBOT = PLAN.stored.arm.robot
 
 
 def counting(rows: Measurements, trusted: int) -> list[int]:
-    """Rows that count after so many were right."""
+    """Rows that count, given the number of trusted ones."""
     mask = torch.arange(rows.rows) < trusted
     return judge_rows(ROBOT, rows, NOISE, mask).counts.nonzero()[:, 0].tolist()
 

@@ -31,7 +31,7 @@ def test_every_allowed_pose_is_free_and_visible():
 
 
 def test_every_refused_pose_has_a_reason():
-    """Points lie a little farther apart than the lines they stand on, hence the few that only lines refuse."""
+    """Points are slightly farther apart than the lines through them, hence the few that only lines refuse."""
     refused = Q[~FAULTS.allowed][:60].numpy()
     wrongly = [
         is_collision_free(ARM.robot, CELL, q, RADIUS) and is_visible(ARM.robot, CELL, q, RADIUS)

@@ -64,7 +64,7 @@ def test_the_page_opens_without_errors_and_fits(browser, page_file, width, schem
         assert page.title().startswith(HOSTILE)
         loaded = "[...document.images].every((image) => image.complete && image.naturalWidth > 0)"
         assert page.evaluate(loaded)
-        if width >= 1280:  # the tables of errors stand side by side and are not cut
+        if width >= 1280:  # the tables of errors are side by side and not cut
             cut = "[...document.querySelectorAll('.accuracy')].map((t) => t.scrollWidth - t.parentElement.clientWidth)"
             cuts = page.evaluate(cut)
             assert len(cuts) == 2

@@ -52,7 +52,7 @@ def opened(browser, view):
 
 
 def text_with(page, rows):
-    """The text of the page once it shows so many rows."""
+    """Return the text of the page once it shows a number of rows."""
     page.wait_for_selector(f"[data-rows='{rows}']")
     return re.sub(r"\s+", " ", page.inner_text("body"))
 
