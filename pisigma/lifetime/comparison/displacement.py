@@ -54,7 +54,7 @@ class Displacement:
                 value=source,
                 remedy="give poses that the robot reaches",
             )
-        base = frames_of(pair.first, pair.owner[0])[0]
+        base = frames_of(pair.first, pair.frame_names[0])[0]
         place = (invert(base) @ pair.poses(q[there])[0])[:, :3, 3]
         errors = PoseErrors(by[there, :3].norm(dim=-1), by[there, 3:].norm(dim=-1))
         number = there.nonzero()[:, 0]

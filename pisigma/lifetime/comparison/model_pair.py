@@ -36,7 +36,7 @@ class ModelPair:
         first: reference model.
         second: model that is compared with it.
         frames: how bases and tools are aligned.
-        owner: names of the frame and the target that each model is compared in.
+        frame_names: names of the frame and the target that each model is compared in.
         T_base: transform from the frame of the second model to that of the first; the identity for fixed frames.
         T_tool: pose of the first model's tool in the tool frame of the second; the identity for fixed frames.
     """
@@ -44,7 +44,7 @@ class ModelPair:
     first: CalibratedModel
     second: CalibratedModel
     frames: FrameChoice
-    owner: tuple[tuple[str, str], tuple[str, str]]
+    frame_names: tuple[tuple[str, str], tuple[str, str]]
     T_base: Float64[Tensor, "4 4"]
     T_tool: Float64[Tensor, "4 4"]
 
@@ -62,9 +62,9 @@ class ModelPair:
                 or keep no joint values at which both predict a pose.
         """
         _check_one_robot(first, second)
-        owner = _owners(first, second, frames)
+        frame_names = _frame_names(first, second, frames)
         eye = torch.eye(4, dtype=torch.float64)
-        pair = ModelPair(first, second, frames, owner, eye, eye)
+        pair = ModelPair(first, second, frames, frame_names, eye, eye)
         T_first, T_second = pair.poses(pair.workspace[:: SAMPLES // FITTED_SAMPLES])
         there = torch.isfinite(T_first + T_second).all(-1).all(-1)
         if not bool(there.any()):
@@ -76,7 +76,7 @@ class ModelPair:
             return pair
         lever = LEVER_SHARE * first.robot.reach
         measured = MeasuredPoses(T_first[there, :3, 3], T_first[there, :3, :3], there[there], lever)
-        return ModelPair(first, second, frames, owner, *best_base_and_tool(T_second[there], measured))
+        return ModelPair(first, second, frames, frame_names, *best_base_and_tool(T_second[there], measured))
 
     @property
     def points(self) -> Float64[Tensor, "points dof"]:
@@ -108,7 +108,7 @@ class ModelPair:
         """Predict the tool poses of both models in the frame of the first [m]; NaN where a model predicts none."""
         first, second = (
             poses_of_rows(model, Measurements(q=q, frame=(frame,) * len(q), target=(target,) * len(q)))
-            for model, (frame, target) in zip((self.first, self.second), self.owner, strict=True)
+            for model, (frame, target) in zip((self.first, self.second), self.frame_names, strict=True)
         )
         return first, self.T_base @ second @ self.T_tool
 
@@ -123,19 +123,19 @@ class ModelPair:
 
     def frames_of_second(self) -> tuple[Float64[Tensor, "4 4"], Float64[Tensor, "4 4"]]:
         """Return base and tool of the second model, aligned with those of the first."""
-        base, tool = frames_of(self.second, self.owner[1])
+        base, tool = frames_of(self.second, self.frame_names[1])
         return self.T_base @ base, tool @ self.T_tool
 
 
 def frames_of(
-    model: CalibratedModel, owner: tuple[str, str]
+    model: CalibratedModel, frame_names: tuple[str, str]
 ) -> tuple[Float64[Tensor, "4 4"], Float64[Tensor, "4 4"]]:
     """Return base and tool of the geometry that a model predicts with, by the names of a frame and a target."""
     robot = model.identified
     bases, tools = (
         (model.bases, model.tools) if model.hybrid is None else (model.hybrid_bases, model.hybrid_tools)
     )
-    base, tool = bases.get(owner[0], robot.base), tools.get(owner[1], robot.tool)
+    base, tool = bases.get(frame_names[0], robot.base), tools.get(frame_names[1], robot.tool)
     T = [transform_from_xyzrpy(torch.from_numpy(np.array(frame))) for frame in (base, tool)]
     return T[0], T[1]
 
@@ -145,11 +145,11 @@ def as_drawn(model: CalibratedModel) -> Robot:
     return model.drawn or model.robot
 
 
-def _owners(
+def _frame_names(
     first: CalibratedModel, second: CalibratedModel, frames: FrameChoice
 ) -> tuple[tuple[str, str], tuple[str, str]]:
     """Return frame and target that each model is compared in: the first common one, else the first of each."""
-    owners: tuple[list[str], list[str]] = ([], [])
+    names_of_models: tuple[list[str], list[str]] = ([], [])
     for what, mine, others in (
         ("frame", first.bases, second.bases),
         ("target", first.tools, second.tools),
@@ -164,9 +164,9 @@ def _owners(
                 value=f"{', '.join(names[0])} and {', '.join(names[1])}",
                 remedy="compare them with fitted frames",
             )
-        for own, chosen in zip(owners, names, strict=True):
+        for own, chosen in zip(names_of_models, names, strict=True):
             own.append(common[0] if common else chosen[0])
-    return (owners[0][0], owners[0][1]), (owners[1][0], owners[1][1])
+    return (names_of_models[0][0], names_of_models[0][1]), (names_of_models[1][0], names_of_models[1][1])
 
 
 def _check_one_robot(first: CalibratedModel, second: CalibratedModel) -> None:

@@ -76,13 +76,15 @@ class ParameterEffects:
         q, d = q[there], d[there]
         lever = LEVER_SHARE * pair.first.robot.reach
         weight = torch.tensor([1.0, 1.0, 1.0, lever, lever, lever], dtype=torch.float64)[:, None]
-        frames = frames_of(pair.first, pair.owner[0]), pair.frames_of_second()
+        frames = frames_of(pair.first, pair.frame_names[0]), pair.frames_of_second()
         base, tool = _geometry(frames[0])
         robot = pair.first.identified.with_geometry(base=base, tool=tool)
         T, J = identification_jacobian(robot, _corrected(pair.first, q))
         spread = [
-            _spread(model, owner, those, q)
-            for model, owner, those in zip((pair.first, pair.second), pair.owner, frames, strict=True)
+            _spread(model, frame_names, those, q)
+            for model, frame_names, those in zip(
+                (pair.first, pair.second), pair.frame_names, frames, strict=True
+            )
         ]
         self._pair, self._arm = pair, J.shape[-1] - 12
         columns = torch.cat([J[..., :-12], _frame_columns(T, frames[0][0][:3, 3])], -1)
@@ -194,7 +196,7 @@ class ParameterEffects:
         self, shift: Float64[Tensor, "12"], covariance: Float64[Tensor, "12 12"]
     ) -> tuple[Movement, ...]:
         """Return how far base and tool of both models differ: the fitted motion plus the linear estimate."""
-        pair, (base, _) = self._pair, frames_of(self._pair.first, self._pair.owner[0])
+        pair, (base, _) = self._pair, frames_of(self._pair.first, self._pair.frame_names[0])
         X, Y, origin = pair.T_base, pair.T_tool, base[:3, 3]
         moved = []
         # X base_2 = exp(step) base_1 and tool_2 Y = tool_1 exp(step)
@@ -242,14 +244,16 @@ def _corrected(model: CalibratedModel, q: Float64[Tensor, "poses dof"]) -> Float
 
 
 def _spread(
-    model: CalibratedModel, owner: tuple[str, str], frames: Frames, q: Float64[Tensor, "poses dof"]
+    model: CalibratedModel, frame_names: tuple[str, str], frames: Frames, q: Float64[Tensor, "poses dof"]
 ) -> Float64[Tensor, "poses 6 directions"]:
     """Return the root of the covariance of predicted poses, for a tool and frame that may have been moved."""
     known = model.uncertainty
     if known is None:
         return torch.zeros((len(q), 6, 0), dtype=torch.float64)
     space, there = known.space, known.geometry
-    number = [names.index(name) for names, name in zip((space.frames, space.targets), owner, strict=True)]
+    number = [
+        names.index(name) for names, name in zip((space.frames, space.targets), frame_names, strict=True)
+    ]
     base, tool = _geometry(frames)
     geometry = replace(
         there,

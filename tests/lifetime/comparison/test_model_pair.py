@@ -58,4 +58,4 @@ def test_fixed_frames_need_a_common_name():
     first, second = (replace(model, bases={name: model.robot.base}) for name in ("wall", "floor"))
     with refused(ModelError, option="frame", value="wall and floor"):
         ModelPair.of(first, second, "fixed")
-    assert ModelPair.of(first, second, "fitted").owner == (("wall", ""), ("floor", ""))
+    assert ModelPair.of(first, second, "fitted").frame_names == (("wall", ""), ("floor", ""))
