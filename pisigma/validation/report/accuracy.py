@@ -209,13 +209,14 @@ def limit_of(
     if accuracy is not None and accuracy.origin == "poses":
         return AccuracyLimit(of_parent=True, limitations=tuple(model.metrics.get("limitations", ())))
     scatter = None if rows is None else rows.scatter
-    noise, source = (scatter, "repeats") if scatter is not None else (_identified_noise(summary), "hybrid")
+    noise = _identified_noise(summary) if scatter is None else scatter
+    source: Literal["repeats", "hybrid"] = "hybrid" if scatter is None else "repeats"
     error = accuracy.figure("rms") if accuracy is not None and accuracy.unit == "mm" else 0.0
     sensors = () if summary is None else summary.noise
     sigma = next((one.sigma_mm for one in sensors if one.sigma_mm is not None), None)
     if noise is None or not error > 0:
         return AccuracyLimit(error=error, residual_sigma=sigma)
-    return AccuracyLimit(noise, "repeats" if source == "repeats" else "hybrid", error, sigma)
+    return AccuracyLimit(noise, source, error, sigma)
 
 
 def _identified_noise(summary: CalibrationSummary | None) -> float | None:
