@@ -1,1 +1,1 @@
-"""From rows to a calibrated robot: the geometric calibrator, and the hybrid that learns joint corrections, too."""
+"""Calibration: the geometric calibrator, and the hybrid one, which also learns joint corrections."""

@@ -1,1 +1,1 @@
-"""Whether a calibration is right: rows left out, faults of the set-up, checks of rows and results, ISO 9283."""
+"""Validation of calibrations: held-out rows, setup faults, checks of rows and results, ISO 9283."""

@@ -23,9 +23,9 @@ from pisigma.validation.held_out.diagnostic import Diagnostic
 from pisigma.validation.held_out.frames.fitted_frames import FrameKind
 from pisigma.validation.setup_faults.cause import length_text
 from pisigma.validation.setup_faults.explanations import position_spread
-from pisigma.validation.setup_faults.faults_as_drawn import MIN_ROWS_AS_DRAWN, largest_group, usual_error
 from pisigma.validation.setup_faults.hypothesis import COLLAPSED
 from pisigma.validation.setup_faults.joint_faults import joint_causes, signs_and_exchanges
+from pisigma.validation.setup_faults.nominal_robot_faults import MIN_ROWS_NOMINAL, largest_group, usual_error
 from pisigma.validation.setup_faults.setup_fault import SetupFault
 
 MIN_ROWS_TO_CALIBRATE = 12
@@ -171,10 +171,10 @@ def size_of_positions(robot: Robot, rows: Measurements) -> Iterator[Diagnostic]:
 def joint_columns(robot: Robot, rows: Measurements) -> Iterator[Diagnostic]:
     """Try a reversed sign of every joint and an exchange of two neighbours, with base and tool fitted each time.
 
-    With at least `MIN_ROWS_AS_DRAWN` rows, `find_faults_as_drawn` tries many more hypotheses instead.
+    With at least `MIN_ROWS_NOMINAL` rows, `find_nominal_robot_faults` tries many more hypotheses instead.
     """
     group = largest_group(rows)
-    if not MIN_ROWS_FOR_JOINTS <= group.rows < MIN_ROWS_AS_DRAWN:
+    if not MIN_ROWS_FOR_JOINTS <= group.rows < MIN_ROWS_NOMINAL:
         return
     here, usual = _errors(robot, group, group.q[None])[0], usual_error(robot, group.q)
     if not here > usual:

@@ -30,7 +30,7 @@ from pisigma.validation.checks.scale import scale_figures
 from pisigma.validation.checks.setup_fault import explained, setup_diagnostics
 from pisigma.validation.held_out.calibration_summary import CalibrationSummary, summarise
 from pisigma.validation.held_out.calibration_validation import CalibrationValidation, joined_repeats, judge
-from pisigma.validation.held_out.few_rows import fit_beside_folds
+from pisigma.validation.held_out.few_rows import fit_with_folds
 from pisigma.validation.held_out.held_out_rows import HeldOutRows
 from pisigma.validation.held_out.pose_statistics import predicted_at_other_poses
 from pisigma.validation.held_out.trained_calibrations import (
@@ -134,7 +134,7 @@ def calibrate(
     if faulty:
         calibrator, splits = geometric_of(calibrator), []
     try:
-        result, judged = fit_beside_folds(calibrator, rows, training, splits, progress, settings.jobs)
+        result, judged = fit_with_folds(calibrator, rows, training, splits, progress, settings.jobs)
     except IdentificationError as refusal:
         raise explained(refusal, nominal, rows) from refusal
     validation = joined_repeats(training, splits, judged) if splits else None

@@ -10,7 +10,7 @@ from hostile.mistakes import POSES, POSITIONS, SETS, Mistake, answer, clean_rows
 
 from pisigma.measurement.dataset import Measurements
 from pisigma.robot import Robot
-from pisigma.validation.setup_faults.faults_as_drawn import find_faults_as_drawn
+from pisigma.validation.setup_faults.nominal_robot_faults import find_nominal_robot_faults
 
 pytestmark = pytest.mark.usefixtures("without_type_checker")
 
@@ -57,11 +57,11 @@ def test_wrong_target_names_are_found(shared_data, tmp_path):
     clean = answer(Mistake("none", unchanged, ""), robot, rows, tmp_path)
     assert clean.status == 0
     assert "target" not in clean.text
-    (one_name,) = find_faults_as_drawn(robot, replace(rows, target=()))
+    (one_name,) = find_nominal_robot_faults(robot, replace(rows, target=()))
     assert (one_name.kinds, one_name.amounts) == (("target",), (3.0,))
     turned = {"A": "B", "B": "C", "C": "A"}
     wrong = tuple(turned[name] if row % 37 == 0 else name for row, name in enumerate(rows.target))
-    (mixed,) = find_faults_as_drawn(robot, replace(rows, target=wrong))
+    (mixed,) = find_nominal_robot_faults(robot, replace(rows, target=wrong))
     assert "20 of 720" in mixed.clause
     assert re.search(r"line 2 .*'A'.*'B'", mixed.advice)
     mislabelled = Mistake("", lambda clean, robot: replace(clean, target=wrong), "")

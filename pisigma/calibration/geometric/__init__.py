@@ -1,1 +1,1 @@
-"""The geometric calibrator: base and tool, parameters, least squares, redundancy, result."""
+"""Geometric calibration: initial guess, parameters, least squares, identifiability, result."""

@@ -1,6 +1,5 @@
 """Result of a geometric calibration: the robot, its parameters with their errors, and what is not identifiable."""
 
-import math
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal
@@ -27,6 +26,7 @@ from pisigma.calibration.geometric.outliers import Outlier, outliers_of
 from pisigma.calibration.geometric.parameter_table import ParameterEstimate, parameter_table
 from pisigma.calibration.geometric.posterior import ParameterPosterior
 from pisigma.calibration.geometric.prediction import predicted_poses
+from pisigma.calibration.geometric.prior_ratio import PriorRatio, prior_ratios_of
 from pisigma.calibration.geometric.problem.least_squares import (
     Linearisation,
     Solution,
@@ -34,7 +34,6 @@ from pisigma.calibration.geometric.problem.least_squares import (
     covariance_of,
 )
 from pisigma.calibration.geometric.problem.noise import values_used, view_of
-from pisigma.calibration.geometric.problem.prior_sizes import LENGTH_GROUPS, PriorGroup, effective_parameters
 from pisigma.calibration.geometric.problem.problem import CalibrationProblem
 from pisigma.calibration.geometric.problem.setup import CalibrationSetup, IdentifiedGeometry
 from pisigma.measurement.dataset import Measurements
@@ -43,36 +42,6 @@ from pisigma.robot.description import Robot
 
 DISAGREEING = 10.0
 """Factor on the variance of angles above which a warning is given."""
-
-
-@dataclass(frozen=True)
-class PriorRatio:
-    """Estimated size of the errors of a group of parameters over their prior standard deviation.
-
-    Attributes:
-        kind: "length" or "angle".
-        group: the group of parameters.
-        prior: smallest prior standard deviation of a parameter of the group [m or rad].
-        value: the estimated ratio [1].
-        at_least: the ratio minus two standard deviations. An estimate from n effective parameters has a relative
-            standard deviation of about `1 / sqrt(2 n)`, so this is `exp(-sqrt(2 / n))` times the estimate.
-    """
-
-    kind: Literal["length", "angle"]
-    group: PriorGroup
-    prior: float
-    value: float
-    at_least: float
-
-    @property
-    def size(self) -> float:
-        """The estimated standard deviation of the errors [m or rad]."""
-        return self.value * self.prior
-
-    @property
-    def size_at_least(self) -> float:
-        """The same minus two standard deviations [m or rad]."""
-        return self.at_least * self.prior
 
 
 @dataclass(frozen=True)
@@ -267,19 +236,7 @@ class CalibrationResult:
     @cached_property
     def prior_ratios(self) -> tuple[PriorRatio, ...]:
         """Estimated errors over their prior standard deviations, by group of parameters with a prior."""
-        problem, view = self.solved.problem, view_of(self.solved.refined)
-        precision, group = problem.precision[problem.active], problem.prior_group
-        covariance = covariance_of(self.solved.refined.normal)
-        effective = effective_parameters(precision, group, view.prior_scale, covariance).tolist()
-        ratios = []
-        for number in sorted(set(group[precision > 0].tolist())):
-            if effective[number] > 0:
-                scale = float(view.prior_scale[number])
-                prior = float(precision[(group == number) & (precision > 0)].max()) ** -0.5
-                at_least = scale * math.exp(-((2 / effective[number]) ** 0.5))
-                kind: Literal["length", "angle"] = "length" if number in LENGTH_GROUPS else "angle"
-                ratios.append(PriorRatio(kind, PriorGroup(number), prior, scale, at_least))
-        return tuple(ratios)
+        return prior_ratios_of(self.solved.problem, self.solved.refined)
 
     @property
     def rank(self) -> int:

@@ -1,1 +1,1 @@
-"""The hybrid calibration: geometry and a Pi-Sigma joint correction, fitted together through the kinematics."""
+"""Hybrid calibration: geometry and a Pi-Sigma joint correction, fitted together through the kinematics."""

@@ -19,7 +19,7 @@ from pisigma.validation.held_out.frames.fitted_frames import FrameKind
 from pisigma.validation.held_out.model_comparison import ModelComparison
 from pisigma.validation.setup_faults.cause import joined, length_text
 from pisigma.validation.setup_faults.explanations import PLAUSIBLE_SHARE
-from pisigma.validation.setup_faults.faults_as_drawn import measured_rows, spread
+from pisigma.validation.setup_faults.nominal_robot_faults import measured_rows, spread
 from pisigma.validation.setup_faults.setup_faults import judged_values
 
 MAX_ROWS = 60

@@ -3,8 +3,8 @@
 import math
 from collections.abc import Iterator, Sequence
 
+from pisigma.calibration.geometric.prior_ratio import PriorRatio
 from pisigma.calibration.geometric.problem.prior_sizes import PriorGroup
-from pisigma.calibration.geometric.result import PriorRatio
 from pisigma.robot.robot_class import CLASSES, RobotClass
 from pisigma.validation.checks.check import AbstractCheck, CheckedCalibration
 from pisigma.validation.held_out.diagnostic import Diagnostic

@@ -16,7 +16,7 @@ from pisigma.robot.robot_class import HOBBY
 from pisigma.validation.checks.check import AbstractCheck, CheckedCalibration
 from pisigma.validation.held_out.diagnostic import Diagnostic, Severity
 from pisigma.validation.setup_faults.cause import length_text
-from pisigma.validation.setup_faults.faults_as_drawn import are_unrelated, find_faults_as_drawn
+from pisigma.validation.setup_faults.nominal_robot_faults import are_unrelated, find_nominal_robot_faults
 from pisigma.validation.setup_faults.setup_fault import either
 
 UNRELATED = (
@@ -34,7 +34,7 @@ MAX_WRONG_SHARE = 0.1
 
 
 class SetupFaultCheck(AbstractCheck):
-    """Looks for setup faults that explain the errors of the nominal robot; see `find_faults_as_drawn`.
+    """Looks for setup faults that explain the errors of the nominal robot; see `find_nominal_robot_faults`.
 
     A fault makes the calibration implausible, because parameters may absorb it and are then wrong at other poses. A
     joint zero is a parameter: a calibration estimates it correctly, so it is a warning up to the size that is possible
@@ -49,7 +49,7 @@ class SetupFaultCheck(AbstractCheck):
 @lru_cache(maxsize=1)  # the same rows are checked before and after a calibration
 def setup_diagnostics(robot: Robot, rows: Measurements) -> tuple[Diagnostic, ...]:
     """Report the setup faults that explain the errors of the nominal robot; see `SetupFaultCheck`."""
-    if faults := find_faults_as_drawn(robot, rows):
+    if faults := find_nominal_robot_faults(robot, rows):
         fault = either(faults)
         severity: Severity = "implausible" if fault.moved > HOBBY.largest.joint_offset else "warning"
         found = Diagnostic(

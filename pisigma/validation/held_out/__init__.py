@@ -1,1 +1,1 @@
-"""How accurate a calibration is on rows that it never saw."""
+"""Errors of calibrations on held-out rows."""

@@ -101,7 +101,7 @@ def _evident(calibrator: GeometricCalibrator, result: CalibrationResult, rows: M
     return more > 0 and bool(fdtrc(more, left, (before - left) / more) < CHANCE)
 
 
-def fit_beside_folds(
+def fit_with_folds(
     calibrator: Calibrator,
     rows: Measurements,
     training: Measurements,

@@ -20,14 +20,14 @@ from pisigma.validation.setup_faults.explanations import (
     largest_explained,
     simplest,
 )
-from pisigma.validation.setup_faults.faults_as_drawn import (
+from pisigma.validation.setup_faults.hypothesis import Hypothesis, PredictingArm
+from pisigma.validation.setup_faults.joint_faults import NOTICED
+from pisigma.validation.setup_faults.nominal_robot_faults import (
     MAX_ROWS,
-    find_faults_as_drawn,
+    find_nominal_robot_faults,
     measured_rows,
     spread,
 )
-from pisigma.validation.setup_faults.hypothesis import Hypothesis, PredictingArm
-from pisigma.validation.setup_faults.joint_faults import NOTICED
 from pisigma.validation.setup_faults.setup_fault import SetupFault, fault_of
 
 CAUSES = {"base": "frame", "tool": "tool"}
@@ -50,7 +50,7 @@ def find_setup_faults(
     deg or one zero moved by any amount, and a correction that was applied once more or once less than logged; each also
     together with another frame and tool, as after a new setup of the sensor. Several faults are returned if they
     explain the errors equally well. If nothing explains the errors, the nominal robot is tried; see
-    `find_faults_as_drawn`.
+    `find_nominal_robot_faults`.
 
     Args:
         model: the model.
@@ -88,7 +88,7 @@ def find_setup_faults(
         if not {cause.kind for cause in other.causes} <= free
     )
     if not faults and not frames_only:
-        faults = find_faults_as_drawn(model.robot, with_names_of(model, judged, fitted))
+        faults = find_nominal_robot_faults(model.robot, with_names_of(model, judged, fitted))
     return faults
 
 

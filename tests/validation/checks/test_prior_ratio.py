@@ -8,7 +8,7 @@ from testing.checked import kinds_of
 from testing.simulated_arm import simulate
 
 from pisigma.calibration.geometric.calibrator import GeometricCalibrator
-from pisigma.validation.setup_faults.faults_as_drawn import find_faults_as_drawn
+from pisigma.validation.setup_faults.nominal_robot_faults import find_nominal_robot_faults
 
 pytestmark = pytest.mark.usefixtures("without_type_checker")
 
@@ -37,7 +37,7 @@ def test_zeros_that_are_far_off_are_believed_within_the_class(zeros):
     )
     assert severities(found, arm.measurements) == severities(stated, arm.measurements) == {"warning"}
     assert severities(narrow, arm.measurements) == {"implausible"}
-    assert find_faults_as_drawn(arm.nominal, arm.measurements) == ()
+    assert find_nominal_robot_faults(arm.nominal, arm.measurements) == ()
 
 
 def test_zeros_that_are_far_off_are_not_believed_where_left_out_rows_are_not_predicted():

@@ -1,1 +1,1 @@
-"""What the data can and cannot determine."""
+"""Identifiability: which parameters the data determine, and whether a fit is plausible."""

@@ -1,1 +1,1 @@
-"""Initial guesses of bases, tools, sockets and anchors: nothing has to be guessed by the user."""
+"""Initial guesses of bases, tools, sockets and anchors, so that the user need not give any."""

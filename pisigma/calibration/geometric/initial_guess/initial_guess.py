@@ -10,6 +10,11 @@ from torch import Tensor
 
 from pisigma.calibration.geometric.initial_guess.base_and_tool import guess_base_and_tool
 from pisigma.calibration.geometric.initial_guess.base_and_tool_closed_form import base_by_points
+from pisigma.calibration.geometric.initial_guess.base_from_touches import (
+    check_touched_base,
+    check_touched_frames,
+    touched_base,
+)
 from pisigma.calibration.geometric.initial_guess.tool_from_distances import (
     base_from_anchors,
     tools_from_distances,
@@ -23,11 +28,7 @@ from pisigma.measurement.sensors.socket import means
 from pisigma.robot.description import Robot
 from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.robot.se3 import (
-    nearest_rotation,
-    rotation_from_rpy,
-    rotation_from_vector,
     rpy_from_rotation,
-    skew,
     transform_from_xyzrpy,
 )
 
@@ -40,15 +41,6 @@ ENOUGH = 5
 MIN_TURN = 0.02
 """Singular value per row below which orientations in sockets do not determine a direction of the tool, which then
 stays nominal."""
-MIN_TOUCHES = 4
-"""Touches along an axis needed to determine its direction."""
-CLEAR = 0.03
-"""Smallest over largest spread of the tips needed to determine a direction."""
-REFINEMENTS = 10
-"""Gauss-Newton steps after the linear solution of a touched frame."""
-NEAR = 0.05
-"""Largest RMS residual of the touches with a guess, as a share of the reach."""
-BASE_UNKNOWNS = 6
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,7 +88,7 @@ def guess(
     """
     _check_frame_names(stated, space.frames, measurements.source)
     if free_base:
-        _check_frame_values(measurements, space.frames)
+        check_touched_frames(measurements, space.frames)
     bases = {name: np.array(base, dtype=np.float64) for name, base in stated.items()}
     bases, tools = _from_positions(space, measurements, free_base, free_tool, bases)
     touched = {} if not free_base else _touched_rows(space, measurements, bases)
@@ -242,7 +234,7 @@ def _from_touches(
     axis = numbers_of(part.touch_axis, ("x", "y", "z"), part.rows)
     assert part.touch is not None
     base, rms = touched_base(tip[rows], axis, part.touch.cpu(), torch.from_numpy(space.robot.base.copy()))
-    _check_touched_base(part, name, rms, space.robot.reach)
+    check_touched_base(part, name, rms, space.robot.reach)
     guessed: np.ndarray = base.numpy()
     return guessed
 
@@ -273,115 +265,6 @@ def tool_from_sockets(
 
 def _centred(values: Tensor, number: Tensor) -> Tensor:
     return values - means(values, number, int(number.max()) + 1)[number]
-
-
-def touched_base(
-    tip: Float64[Tensor, "touches 3"],
-    axis: Int64[Tensor, " touches"],
-    touch: Float64[Tensor, " touches"],
-    guess: Float64[Tensor, " 6"],
-) -> tuple[Float64[Tensor, " 6"], float]:
-    """Compute T_frame_robot from touches, with the tips in the robot's frame.
-
-    `touch = R[axis] · tip + p[axis]` is linear in R and p for every axis separately; the third axis follows from two.
-    Then all six unknowns are refined together. The refinement also starts at the guess, and the better result is used.
-
-    Args:
-        tip: nominal positions of the tip [m].
-        axis: axis of the frame along which each touch was measured.
-        touch: measured coordinates [m].
-        guess: the robot's base, x, y, z [m], roll, pitch, yaw [rad].
-
-    Returns:
-        The base, and the RMS residual of the touches [m].
-    """
-    starts = [(rotation_from_rpy(guess[3:]), guess[:3])]
-    linear = _linear_rotation(tip, axis, touch)
-    if linear is not None:
-        starts.insert(0, (linear, torch.zeros(3).to(tip)))
-    best, miss = guess, float("inf")
-    for R, p in starts:
-        R, p, rms = _refined(tip, axis, touch, R, p)
-        if rms < miss:
-            best, miss = torch.cat([p, rpy_from_rotation(R)]), rms
-    return best, miss
-
-
-def _linear_rotation(tip: Tensor, axis: Tensor, touch: Tensor) -> Tensor | None:
-    rows: list[Tensor | None] = []
-    for k in range(3):
-        points, values = tip[axis == k], touch[axis == k]
-        rows.append(None)
-        if len(points) < MIN_TOUCHES:
-            continue
-        centred = points - points.mean(0)
-        singular = torch.linalg.svdvals(centred)
-        if float(singular[-1]) > CLEAR * float(singular[0]):
-            row = torch.linalg.lstsq(centred, (values - values.mean())[:, None]).solution[:, 0]
-            rows[k] = row / row.norm().clamp(min=1e-12)
-    for k in range(3):
-        following, last = rows[(k + 1) % 3], rows[(k + 2) % 3]
-        if rows[k] is None and following is not None and last is not None:
-            rows[k] = torch.linalg.cross(following, last)
-    directions = [row for row in rows if row is not None]
-    return nearest_rotation(torch.stack(directions)) if len(directions) == 3 else None
-
-
-def _refined(tip: Tensor, axis: Tensor, touch: Tensor, R: Tensor, p: Tensor) -> tuple[Tensor, Tensor, float]:
-    rows = torch.arange(len(tip))
-    eye = torch.eye(3).to(tip)[axis]
-    residual = touch - (tip @ R.mT + p)[rows, axis]
-    for _ in range(REFINEMENTS):
-        turned = tip @ R.mT
-        J = torch.cat([eye, (-skew(turned))[rows, axis]], -1)
-        step = torch.linalg.pinv(J, rtol=1e-6) @ residual
-        R, p = rotation_from_vector(step[3:]) @ R, p + step[:3]
-        residual = touch - (tip @ R.mT + p)[rows, axis]
-    return R, p, float(residual.square().mean().sqrt())
-
-
-def _check_touched_base(measurements: Measurements, name: str, rms: float, reach: float) -> None:
-    """Refuse a guess of a touched frame with large residuals.
-
-    Raises:
-        IdentificationError: see above.
-    """
-    if rms <= NEAR * reach:
-        return
-    counts = ", ".join(f"{(measurements.touch_axis or ()).count(axis)} along {axis}" for axis in "xyz")
-    raise IdentificationError(
-        f"the touches of frame '{name}' ({counts}) do not determine its pose (the best fit has an RMS error of "
-        f"{rms * 1e3:.3g} mm)",
-        value=name,
-        at=Place(measurements.source),
-        remedy="check that all touches belong to this frame, or give the approximate base of the robot in it, "
-        f"frames={{'{name}': (x, y, z, roll, pitch, yaw)}}",
-    )
-
-
-def _check_frame_values(measurements: Measurements, names: tuple[str, ...]) -> None:
-    """Refuse frames with no more touches than the six unknowns of the frame.
-
-    Raises:
-        IdentificationError: see above.
-    """
-    if measurements.touch is None:
-        return
-    touch = measurements.measured("touch").tolist()
-    other = (measurements.measured("position") | measurements.measured("pose")).tolist()
-    for name in names:
-        rows = [row for row, frame in enumerate(measurements.frame) if frame == name]
-        touches = sum(touch[row] for row in rows)
-        if not touches or any(other[row] for row in rows) or touches > BASE_UNKNOWNS:
-            continue
-        raise IdentificationError(
-            f"expected more than {BASE_UNKNOWNS} touches of frame '{name}', which has {BASE_UNKNOWNS} unknowns, got "
-            f"{touches}",
-            expected=f"more than {BASE_UNKNOWNS} touches of frame '{name}'",
-            value=touches,
-            at=Place(measurements.source),
-            remedy=f"touch it about {3 * BASE_UNKNOWNS} times along x, y and z, or leave out its rows",
-        )
 
 
 def _check_frame_names(stated: Mapping[str, object], frames: tuple[str, ...], source: str) -> None:

@@ -1,1 +1,1 @@
-"""The geometric calibration as a least-squares problem, and its solver."""
+"""Geometric calibration as a least-squares problem, and its solver."""

@@ -1,1 +1,1 @@
-"""Frames of measured rows: fitted to them in closed form, and errors under such frames."""
+"""Frames that are fitted to measured rows, and errors of rows in such frames."""

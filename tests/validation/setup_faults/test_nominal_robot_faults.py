@@ -11,7 +11,11 @@ from testing.simulated_arm import simulate
 from pisigma.robot.frame_fits import MeasuredPoses, affine_error, best_base_and_tool
 from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.validation.setup_faults.explanations import other_conventions
-from pisigma.validation.setup_faults.faults_as_drawn import are_unrelated, find_faults_as_drawn, usual_error
+from pisigma.validation.setup_faults.nominal_robot_faults import (
+    are_unrelated,
+    find_nominal_robot_faults,
+    usual_error,
+)
 
 pytestmark = pytest.mark.usefixtures("without_type_checker")
 MISTAKES = {mistake.name: mistake for mistake in (*POSITIONS, *POSES)}
@@ -37,7 +41,7 @@ def arm():
     ],
 )
 def test_faults_are_named(arm, name, kind):
-    (fault,) = find_faults_as_drawn(arm.nominal, MISTAKES[name].change(arm.measurements, arm.nominal))
+    (fault,) = find_nominal_robot_faults(arm.nominal, MISTAKES[name].change(arm.measurements, arm.nominal))
     assert fault.kinds == (kind,)
     assert fault.after < 3 * usual_error(arm.nominal, arm.measurements.q) < fault.before
     assert fault.explains_orientation == (kind not in ("position_unit",))
@@ -45,10 +49,10 @@ def test_faults_are_named(arm, name, kind):
 
 def test_healthy_and_unrelated_rows_have_no_fault(arm):
     rows = arm.measurements
-    assert find_faults_as_drawn(arm.nominal, rows) == ()
+    assert find_nominal_robot_faults(arm.nominal, rows) == ()
     assert not are_unrelated(arm.nominal, rows)
     mixed = MISTAKES["rows in another order"].change(rows, arm.nominal)
-    assert find_faults_as_drawn(arm.nominal, mixed) == ()
+    assert find_nominal_robot_faults(arm.nominal, mixed) == ()
     assert are_unrelated(arm.nominal, mixed)
 
 

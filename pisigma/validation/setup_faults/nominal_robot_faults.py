@@ -43,9 +43,9 @@ from pisigma.validation.setup_faults.setup_fault import SetupFault, fault_of
 
 MAX_ROWS = 1_000
 """Rows that hypotheses are tried on, evenly over all rows."""
-MAX_ROWS_AS_DRAWN = 150
+MAX_ROWS_NOMINAL = 150
 """The same with the nominal robot, where base and tool are fitted under every hypothesis."""
-MIN_ROWS_AS_DRAWN = 24
+MIN_ROWS_NOMINAL = 24
 """With fewer rows, base and tool, as 39 unknowns of an affine fit, leave too few degrees of freedom."""
 MAX_ZERO = 3 * HOBBY.largest.joint_offset
 """[rad] Largest plausible error of the zero of a revolute joint."""
@@ -67,7 +67,7 @@ MAX_CLUSTERINGS = 8
 """Iterations of assigning every row to the nearest target and fitting base and targets again."""
 
 
-def find_faults_as_drawn(robot: Robot, measurements: Measurements) -> tuple[SetupFault, ...]:
+def find_nominal_robot_faults(robot: Robot, measurements: Measurements) -> tuple[SetupFault, ...]:
     """Find setup faults that reduce the errors of the nominal robot to a quarter or less, the simplest first.
 
     Base and tool are fitted to the rows as they are and under every hypothesis: those of `find_setup_faults`, rows
@@ -83,9 +83,9 @@ def find_faults_as_drawn(robot: Robot, measurements: Measurements) -> tuple[Setu
         Empty if the errors are of usual size, or if nothing explains them.
     """
     rows = largest_group(measurements)
-    if rows.rows < MIN_ROWS_AS_DRAWN:
+    if rows.rows < MIN_ROWS_NOMINAL:
         return ()
-    chosen = spread(torch.arange(MARGIN, rows.rows - MARGIN), MAX_ROWS_AS_DRAWN)
+    chosen = spread(torch.arange(MARGIN, rows.rows - MARGIN), MAX_ROWS_NOMINAL)
     some, arm = rows.select(chosen), PredictingArm(robot)
     measured = MeasuredPoses.of(some.position, some.rotation, LEVER_SHARE * robot.reach)
     raw = Hypothesis(some.q, arm.poses(some), measured)
@@ -194,9 +194,9 @@ def _with_joints(
 def are_unrelated(robot: Robot, measurements: Measurements) -> bool:
     """Say whether positions are unrelated to the joint values of their rows, for example because one was sorted."""
     rows = largest_group(measurements)
-    if rows.rows < MIN_ROWS_AS_DRAWN:
+    if rows.rows < MIN_ROWS_NOMINAL:
         return False
-    rows = rows.select(spread(torch.arange(rows.rows), MAX_ROWS_AS_DRAWN))
+    rows = rows.select(spread(torch.arange(rows.rows), MAX_ROWS_NOMINAL))
     assert rows.position is not None
     spread_out = float((rows.position - rows.position.mean(0)).square().sum(1).mean().sqrt())
     return spread_out > usual_error(robot, rows.q) and explains_nothing(
