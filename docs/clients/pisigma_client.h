@@ -40,11 +40,11 @@ _Static_assert(sizeof(pisigma_request) == 216 && sizeof(pisigma_answer) == 104, 
 
 /* Connect; a file descriptor, or -1 with errno. */
 static inline int pisigma_connect(const char *host, int port) {
-    struct addrinfo wanted = {.ai_socktype = SOCK_STREAM}, *list = NULL;
+    struct addrinfo hints = {.ai_socktype = SOCK_STREAM}, *list = NULL;
     char service[8];
     int server = -1, yes = 1;
     snprintf(service, sizeof service, "%d", port);
-    if (getaddrinfo(host, service, &wanted, &list) != 0) return -1;
+    if (getaddrinfo(host, service, &hints, &list) != 0) return -1;
     for (struct addrinfo *one = list; one && server < 0; one = one->ai_next) {
         server = socket(one->ai_family, one->ai_socktype, one->ai_protocol);
         if (server >= 0 && connect(server, one->ai_addr, one->ai_addrlen) != 0) {

@@ -9,15 +9,15 @@ MODULE PisigmaClient
     ENDPROC
 
     ! Joint values for a pose of the tool in the base frame. FALSE if there are none: do not move then.
-    FUNC bool PisigmaJoints(pose wanted, num number, INOUT robjoint target)
+    FUNC bool PisigmaJoints(pose requested, num number, INOUT robjoint target)
         VAR num q{6};
         VAR bool reached;
         VAR bool understood;
         SocketSend pisigma \Str:="{""id"": " + NumToStr(number, 0) + ", ""brief"": true, ""pose"": [";
-        SocketSend pisigma \Str:=NumToStr(wanted.trans.x, 4) + ", " + NumToStr(wanted.trans.y, 4) + ", ";
-        SocketSend pisigma \Str:=NumToStr(wanted.trans.z, 4) + ", " + NumToStr(EulerZYX(\Z, wanted.rot), 5) + ", ";
-        SocketSend pisigma \Str:=NumToStr(EulerZYX(\Y, wanted.rot), 5) + ", ";
-        SocketSend pisigma \Str:=NumToStr(EulerZYX(\X, wanted.rot), 5) + "]}\0A";
+        SocketSend pisigma \Str:=NumToStr(requested.trans.x, 4) + ", " + NumToStr(requested.trans.y, 4) + ", ";
+        SocketSend pisigma \Str:=NumToStr(requested.trans.z, 4) + ", " + NumToStr(EulerZYX(\Z, requested.rot), 5) + ", ";
+        SocketSend pisigma \Str:=NumToStr(EulerZYX(\Y, requested.rot), 5) + ", ";
+        SocketSend pisigma \Str:=NumToStr(EulerZYX(\X, requested.rot), 5) + "]}\0A";
         reached := PisigmaRead(q);
         IF reached THEN
             target := [q{1}, q{2}, q{3}, q{4}, q{5}, q{6}];
@@ -25,42 +25,42 @@ MODULE PisigmaClient
         RETURN reached;
     ENDFUNC
 
-    ! A string has at most 80 letters, so the line is read letter by letter.
+    ! A string has at most 80 characters, so the line is read character by character.
     FUNC bool PisigmaRead(INOUT num q{*})
         VAR rawbytes data;
-        VAR string letter := "";
+        VAR string character := "";
         VAR string word := "";
         VAR string tail := "";
         VAR num position := 1;
         VAR num joint := 0;
         VAR bool reached := FALSE;
         VAR bool understood := TRUE;
-        WHILE letter <> "\0A" DO
+        WHILE character <> "\0A" DO
             IF position > RawBytesLen(data) THEN
                 SocketReceive pisigma \RawData:=data \Time:=5;
                 position := 1;
             ENDIF
-            UnpackRawBytes data, position, letter \ASCII:=1;
+            UnpackRawBytes data, position, character \ASCII:=1;
             position := position + 1;
-            tail := tail + letter;
+            tail := tail + character;
             IF StrLen(tail) > 9 THEN
                 tail := StrPart(tail, 2, 9);
             ENDIF
             IF tail = """reached""" THEN
                 reached := TRUE;
             ENDIF
-            IF letter = "[" THEN
+            IF character = "[" THEN
                 joint := 1;
                 word := "";
-            ELSEIF joint > 0 AND (letter = "," OR letter = "]") THEN
+            ELSEIF joint > 0 AND (character = "," OR character = "]") THEN
                 understood := understood AND StrToVal(word, q{joint});
                 joint := joint + 1;
                 word := "";
-                IF letter = "]" THEN
+                IF character = "]" THEN
                     joint := 0;
                 ENDIF
             ELSEIF joint > 0 THEN
-                word := word + letter;
+                word := word + character;
             ENDIF
         ENDWHILE
         RETURN reached AND understood;
