@@ -99,7 +99,7 @@ def test_urdf_in_calibrated_and_out_again(run, tmp_path):
         tmp_path / "model", overwrite=True
     ) as folder:  # as models were before they kept the file
         save_model(replace(model, robot=replace(model.robot, urdf=None)), folder)
-    assert "with --like FILE" in " ".join(run(*export).stderr.split())
+    assert "--like FILE" in " ".join(run(*export).stderr.split())
     assert_close(peer_poses(out, "tool0", new), forward_kinematics(model.calibrated, new), atol=1e-10)
 
 
