@@ -60,6 +60,7 @@ _LOOPS = ("FOR", "WHILE", "LOOP", "REPEAT")
 _FRAMES_OF_MOVES = ("$BASE", "$TOOL")
 
 
+FIXED_TOOL = "the tool is fixed and the workpiece moves"
 STATED_ARC = "the angle of the arc or its orientation is stated, so it has no way points"
 
 
@@ -126,7 +127,7 @@ class _Reader:
                 where = f" (line {self.scan.line(match.start())})"
                 self.names.add(match[1], pose if isinstance(pose, Pose) else pose + where)
         steps = [(match, step) for match in _STATEMENT.finditer(self.text) for step in self._steps(match)]
-        unknown = "the tool is fixed and the workpiece moves" if _FIXED_TOOL.search(self.text) else ""
+        unknown = FIXED_TOOL if _FIXED_TOOL.search(self.text) else ""
         self.frames = FramesInForce(
             [step for _, step in steps],
             {name: unknown or f"{name} is not stated before the move" for name in _FRAMES_OF_MOVES},
