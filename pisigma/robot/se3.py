@@ -203,20 +203,21 @@ def check_transforms(T: Tensor, name: str, tolerance: float = 1e-6) -> None:
     if T.ndim < 2 or T.shape[-2:] != (4, 4):
         shape = tuple(T.shape)
         expected = "homogeneous transforms of shape (*batch, 4, 4)"
-        raise PoseError(f"{name}: expected {expected}, got {shape}", expected=expected, value=shape)
+        raise PoseError(expected=expected, value=shape, option=name)
     if not T.is_floating_point():
-        problem, remedy = f"{name}: expected float64 or float32, got {T.dtype}", "give lengths in metres"
-        raise PoseError(problem, expected="float64 or float32", value=str(T.dtype), remedy=remedy)
-    for bad, expected, problem, remedy in transform_faults(T, tolerance):
+        expected = "float64 or float32, lengths in metres"
+        raise PoseError(f"expected {expected}, got {T.dtype}", expected=expected, value=T.dtype, option=name)
+    for bad, expected, remedy in transform_faults(T, tolerance):
         if bad.any():
             index = tuple(bad.nonzero()[0].tolist())
             place = f" at index {index if len(index) > 1 else index[0]}" if index else ""
-            raise PoseError(f"{name}{place} {problem}", expected=expected, value=index, remedy=remedy)
+            problem = f"expected {expected}{place}"
+            raise PoseError(problem, expected=expected, value=index, option=name, remedy=remedy)
 
 
 def transform_faults(
     T: Float[Tensor, "*batch 4 4"], tolerance: float
-) -> tuple[tuple[Bool[Tensor, "*batch"], str, str, str], ...]:
+) -> tuple[tuple[Bool[Tensor, "*batch"], str, str], ...]:
     """Return, for every possible fault of a rigid transform, which matrices have it, and texts for an error.
 
     Args:
@@ -224,7 +225,7 @@ def transform_faults(
         tolerance: see `check_transforms`.
 
     Returns:
-        Mask, what was expected, what is wrong (a predicate), and a remedy, for every fault.
+        Mask, what was expected, and a remedy, for every fault.
     """
     eye = torch.eye(4, dtype=T.dtype, device=T.device)
     finite = torch.isfinite(T).all(-1).all(-1)
@@ -232,24 +233,13 @@ def transform_faults(
     skewness = (R.mT @ R - eye[:3, :3]).abs().amax((-1, -2))
     last_row = (T[..., 3, :] - eye[3]).abs().amax(-1)
     return (
-        (~finite, "finite numbers", "has entries that are not finite numbers", "give 16 finite numbers"),
-        (
-            last_row > tolerance,
-            "the last row 0 0 0 1",
-            "does not end with the row 0 0 0 1",
-            "give a homogeneous transform",
-        ),
-        (
-            skewness > tolerance,
-            "an orthonormal rotation",
-            "has a rotation that is not orthonormal",
-            "normalise it or check its source",
-        ),
+        (~finite, "finite entries", "check the source of the pose"),
+        (last_row > tolerance, "the last row 0 0 0 1", "give a homogeneous transform"),
+        (skewness > tolerance, "an orthonormal rotation part", "normalise it or check its source"),
         (
             torch.linalg.det(R) < 0,
-            "a right-handed rotation",
-            "has a left-handed rotation (determinant -1), which is a reflection",
-            "check its axes",
+            "a right-handed rotation part (determinant +1)",
+            "check the direction of its axes",
         ),
     )
 

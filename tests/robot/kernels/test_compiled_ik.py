@@ -202,66 +202,67 @@ def test_a_correction_that_differs_between_turns_is_solved_on_the_given_turn(arm
 
 GOOD = np.eye(4)
 INVALID = {
-    "nan": np.where(np.eye(4) == 0, np.nan, 1.0),
-    "infinite": GOOD + np.inf,
-    "scaled": np.diag([2.0, 2.0, 2.0, 1.0]),
-    "mirrored": np.diag([1.0, 1.0, -1.0, 1.0]),
-    "last row": 2 * np.eye(4),
-    "shape": np.eye(3),
-    "text": [["a"] * 4] * 4,
-    "ragged": [[1.0], [1.0, 2.0]],
+    "nan": (np.where(np.eye(4) == 0, np.nan, 1.0), "finite entries"),
+    "infinite": (GOOD + np.inf, "finite entries"),
+    "scaled": (np.diag([2.0, 2.0, 2.0, 1.0]), "an orthonormal rotation part"),
+    "mirrored": (np.diag([1.0, 1.0, -1.0, 1.0]), "a right-handed rotation part (determinant +1)"),
+    "last row": (2 * np.eye(4), "the last row 0 0 0 1"),
+    "shape": (np.eye(3), "one homogeneous transform of shape (4, 4)"),
+    "text": ([["a"] * 4] * 4, "an array of real numbers, lengths in metres"),
+    "ragged": ([[1.0], [1.0, 2.0]], "an array of real numbers, lengths in metres"),
 }
 
 
 @pytest.mark.parametrize("case", INVALID)
 def test_invalid_poses_are_rejected_on_one_line(case, arms):
-    kernels, T = arms.compiled("ur5"), INVALID[case]
-    with pytest.raises(PoseError) as caught:
+    kernels, (T, expected) = arms.compiled("ur5"), INVALID[case]
+    with refused(PoseError, option="T_base_tool", expected=expected) as caught:
         kernels.solve(T)
     assert "\n" not in str(caught.value)
     if case not in ("text", "ragged", "shape"):
-        with pytest.raises(PoseError, match="index 3 ") as caught:
+        with pytest.raises(PoseError, match="index 3"):
             kernels.solve_batch(np.stack([GOOD, GOOD, GOOD, T, GOOD]))
 
 
 @pytest.mark.parametrize(
-    ("options", "data"),
+    ("options", "expected"),
     [
-        ({"near": np.zeros(5)}, r"near.*\(5,\)"),
-        ({"near": np.full(6, np.nan)}, "near"),
-        ({"near": "here"}, "near"),
-        ({"branch": "front/elbow_up/no_flop"}, "'front/elbow_up/no_flip'"),
+        ({"near": np.zeros(5)}, "6 columns"),
+        ({"near": np.full(6, np.nan)}, "finite joint values"),
+        ({"near": "here"}, "an array of real numbers, lengths in metres"),
+        ({"branch": "front/elbow_up/no_flop"}, ""),
     ],
 )
-def test_invalid_options_are_rejected(options, data, arms):
-    with pytest.raises(PoseError, match=data):
+def test_invalid_options_are_rejected(options, expected, arms):
+    (option,) = options
+    with refused(PoseError, option=option, expected=expected):
         arms.compiled("ur5").solve(GOOD, **options)
-    with pytest.raises(PoseError, match=data):
+    with refused(PoseError, option=option, expected=expected):
         arms.compiled("ur5").solve_batch(GOOD[None], **options)
 
 
 def test_invalid_batches_are_rejected(arms):
     kernels = arms.compiled("ur5")
-    with pytest.raises(PoseError, match=r"\(3, 4\)"):
+    with refused(PoseError, option="T_base_tool", value=(3, 4)):
         kernels.solve_batch(GOOD[:3])
-    with pytest.raises(PoseError, match="threads"):
+    with refused(PoseError, option="threads", value=0):
         kernels.solve_batch(GOOD[None], threads=0)
-    with pytest.raises(PoseError):
+    with refused(PoseError, option="T_base_tool", expected="an array of real numbers, lengths in metres"):
         kernels.solve_batch([["a"] * 4] * 4)
 
 
 def test_models_without_a_compiled_form_are_rejected(arms):
     model = arms.calibrated("ur5")
-    with pytest.raises(ModelError, match="ur10"):
+    with refused(ModelError, value="network"):
         describe(replace(hand_made_model("ur10"), calibrated=model.calibrated))
     correction = JointCorrection(model.robot, [NominalPose(model.robot)])
     arm = HybridArm(model.calibrated, correction, model.hybrid.coverage)
-    with pytest.raises(ModelError, match="'pose'"):
+    with refused(ModelError, value="pose"):
         describe(replace(model, hybrid=arm))
     panda = arms.calibrated("panda")
-    with pytest.raises(ModelError):
+    with refused(ModelError, value="starts"):
         describe(replace(panda, starts=panda.starts[:0]))
-    with pytest.raises(ModelError, match=r"starts\.q"):
+    with refused(ModelError, value=(800, 7)):
         CompiledIK.of(replace(panda, starts=panda.starts.repeat(2, 1)))
 
 

@@ -304,11 +304,15 @@ def test_other_wrists_and_links_without_length_have_no_closed_form(row, column, 
 @pytest.mark.parametrize(
     ("T", "expected", "value"),
     [
-        (torch.full((2, 4, 4), math.nan), "finite numbers", (0,)),
+        (torch.full((2, 4, 4), math.nan), "finite entries", (0,)),
         (torch.stack([torch.eye(4), 2 * torch.eye(4)]), "the last row 0 0 0 1", (1,)),
-        (torch.diag(torch.tensor([1.0, 1.0, -1.0, 1.0])), "a right-handed rotation", ()),
+        (
+            torch.diag(torch.tensor([1.0, 1.0, -1.0, 1.0])),
+            "a right-handed rotation part (determinant +1)",
+            (),
+        ),
         (torch.eye(3), "homogeneous transforms of shape (*batch, 4, 4)", (3, 3)),
-        (torch.eye(4, dtype=torch.int32), "float64 or float32", "torch.int32"),
+        (torch.eye(4, dtype=torch.int32), "float64 or float32, lengths in metres", torch.int32),
     ],
 )
 def test_invalid_poses_are_rejected(name, T, expected, value, robots):

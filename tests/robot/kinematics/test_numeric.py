@@ -162,8 +162,8 @@ def test_joints_outside_their_limits_are_wrapped_or_reported(robots, generator):
         (torch.eye(4).double(), torch.zeros(5).double(), "", 5),
         (torch.eye(4).double(), torch.zeros(6), "start", "torch.float32"),
         (torch.eye(4).double().expand(2, 4, 4), torch.zeros((3, 6)).double(), "start", (3,)),
-        (torch.zeros((4, 4)).double(), torch.zeros(6).double(), "", ()),
-        (torch.eye(3).double(), torch.zeros(6).double(), "", (3, 3)),
+        (torch.zeros((4, 4)).double(), torch.zeros(6).double(), "T_base_tool", ()),
+        (torch.eye(3).double(), torch.zeros(6).double(), "T_base_tool", (3, 3)),
     ],
 )
 def test_invalid_input_is_rejected(T, start, option, value, robots):
