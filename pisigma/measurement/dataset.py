@@ -237,29 +237,19 @@ class Measurements:
             MeasurementError: the index is out of range, the mask has another length, or one row of a pair is missing.
         """
         if index.ndim != 1 or index.dtype not in (torch.int64, torch.bool):
-            raise MeasurementError(
-                option="index",
-                expected="a one-dimensional int64 index or boolean mask",
-                value=f"{index.dtype} of shape {tuple(index.shape)}",
-                at=Place(self.source),
-            )
+            given = f"{index.dtype} of shape {tuple(index.shape)}"
+            raise self._index_error("a one-dimensional int64 index or boolean mask", given)
         if index.dtype == torch.bool:
             if index.shape[0] != self.rows:
-                raise MeasurementError(
-                    option="index",
-                    expected=f"a mask of {self.rows} rows",
-                    value=index.shape[0],
-                    at=Place(self.source),
-                )
+                raise self._index_error(f"a mask of {self.rows} rows", index.shape[0])
             index = index.nonzero()[:, 0]
         if index.numel() and not 0 <= int(index.min()) <= int(index.max()) < self.rows:
-            raise MeasurementError(
-                option="index",
-                expected=f"rows from 0 to {self.rows - 1}",
-                value=f"{int(index.min())} to {int(index.max())}",
-                at=Place(self.source),
-            )
+            given = f"{int(index.min())} to {int(index.max())}"
+            raise self._index_error(f"rows from 0 to {self.rows - 1}", given)
         return Measurements.from_fields(self.as_fields().select(index))
+
+    def _index_error(self, expected: str, value: str | int) -> MeasurementError:
+        return MeasurementError(option="index", expected=expected, value=value, at=Place(self.source))
 
     def content_hash(self) -> str:
         """Return the SHA-256 (hexadecimal) of all values; it does not depend on source and lines."""

@@ -14,15 +14,20 @@ from pydantic_core import from_json
 from pisigma.deployment.serve.metrics import Metrics
 from pisigma.deployment.serve.models import ServedModel, ServedModels, solution_row
 from pisigma.deployment.serve.protocol import STATUS_NAMES, AbstractProtocol, BrokenStreamError, Reply
+from pisigma.deployment.serve.request_values import (
+    pose_entries,
+    read_branch,
+    read_flag,
+    read_numbers,
+    read_tolerance,
+)
 from pisigma.files.errors import PisigmaError, RequestError, check_choice, nearest_choice, printable
 from pisigma.model.inverse.corrected_ik import CorrectedIK
-from pisigma.robot.kernels.array_kinematics import transform_entries, xyzrpy_of
+from pisigma.robot.kernels.array_kinematics import xyzrpy_of
 from pisigma.robot.kinematics.status import Status
 
 MAX_LINE_BYTES = 2**20
 """A path of about 8,000 poses."""
-MAX_NUMBER = 1e9
-"""[mm or deg] Largest accepted value of a pose or joint."""
 MAX_ID_CHARACTERS = 200
 
 _TASKS = ("pose", "path", "q_deg", "q", "ask")
@@ -155,7 +160,7 @@ class JsonLines(AbstractProtocol):
         if task == "ask":
             return self._question(request)
         model = self._models.find(request.get("model"))
-        slow = not model.quick or task == "path" or _flag(request, "accuracy")
+        slow = not model.quick or task == "path" or read_flag(request, "accuracy")
         solve = {"pose": _solve, "path": _follow}.get(task, _forward)
         return (lambda: solve(model, request)), slow
 
@@ -230,19 +235,19 @@ def _read(message: bytes) -> dict[str, Any]:
 
 def _solve(model: ServedModel, request: dict[str, Any]) -> tuple[str, dict[str, Any]]:
     """Solve one pose."""
-    entries, near = _entries(request["pose"], "pose"), _near(model, request)
+    entries, near = pose_entries(request["pose"], "pose"), _near(model, request)
     if model.direct is not None and request.keys() <= _PLAIN:
         near_bytes = b"" if near is None else struct.pack(f"<{len(near)}d", *near)
         row = model.direct.solve_packed(_POSE.pack(*entries), near_bytes)
         values = _record(model, row, model.ik.axes.ignored)
     else:
-        approach = _numbers(request, "approach", len(model.ik.joints)) if "approach" in request else None
+        approach = read_numbers(request, "approach", len(model.ik.joints)) if "approach" in request else None
         ik, T = _for_task(model, request), np.reshape(entries, (4, 4))
-        solution = ik(T, near=near, branch=_branch(request), approach=approach)
+        solution = ik(T, near=near, branch=read_branch(request), approach=approach)
         values = _record(model, solution_row(solution), solution.ignored_axes)
-        if _flag(request, "accuracy"):
+        if read_flag(request, "accuracy"):
             values["accuracy_mm"] = _millimetres(solution.accuracy)
-    return values["status"], _brief(model, values) if _flag(request, "brief") else values
+    return values["status"], _brief(model, values) if read_flag(request, "brief") else values
 
 
 def _record(model: ServedModel, row: list[float], ignored_axes: tuple[str, ...]) -> dict[str, Any]:
@@ -276,8 +281,8 @@ def _follow(model: ServedModel, request: dict[str, Any]) -> tuple[str, dict[str,
         raise RequestError(
             "expected a list of poses [x_mm, y_mm, z_mm, roll_deg, pitch_deg, yaw_deg]", option="path"
         )
-    T = np.reshape([_entries(pose, f"path[{row}]") for row, pose in enumerate(poses)], (-1, 4, 4))
-    path = _for_task(model, request).path(T, near=_near(model, request), branch=_branch(request))
+    T = np.reshape([pose_entries(pose, f"path[{row}]") for row, pose in enumerate(poses)], (-1, 4, 4))
+    path = _for_task(model, request).path(T, near=_near(model, request), branch=read_branch(request))
     q = (np.asarray(path.solution.q) * np.array(model.per_file_unit)).tolist()
     return "path", {
         model.joints_key: [row if math.isfinite(row[0]) else None for row in q],
@@ -289,10 +294,10 @@ def _follow(model: ServedModel, request: dict[str, Any]) -> tuple[str, dict[str,
 def _forward(model: ServedModel, request: dict[str, Any]) -> tuple[str, dict[str, Any]]:
     """Compute the pose of the calibrated arm."""
     q = _joints(model, request, "q_deg", "q")
-    approach = _numbers(request, "approach", len(q)) if "approach" in request else None
+    approach = read_numbers(request, "approach", len(q)) if "approach" in request else None
     x, y, z, *angles = xyzrpy_of(model.ik.forward(q, approach=approach))
     values: dict[str, Any] = {"pose": [x * 1e3, y * 1e3, z * 1e3, *map(math.degrees, angles)]}
-    if _flag(request, "accuracy"):
+    if read_flag(request, "accuracy"):
         values["accuracy_mm"] = _millimetres(model.ik.accuracy(q))
     return "forward", values
 
@@ -307,12 +312,6 @@ def _model_record(model: ServedModel) -> dict[str, Any]:
         "limits": per_unit.round(9).tolist(),
         "branches": model.ik.branches,
     }
-
-
-def _entries(pose: Any, name: str) -> tuple[float, ...]:
-    """Convert x, y, z [mm], roll, pitch, yaw [deg] to the 16 entries of T_base_tool [m], row by row."""
-    x, y, z, *angles = _numbers({name: pose}, name, 6)
-    return transform_entries(x / 1e3, y / 1e3, z / 1e3, *map(math.radians, angles))
 
 
 def _near(model: ServedModel, request: dict[str, Any]) -> list[float] | None:
@@ -339,32 +338,12 @@ def _joints(model: ServedModel, request: dict[str, Any], in_degrees: str, mixed:
             option=other,
             remedy=f"give '{wanted}' in {_units(model)}",
         )
-    values, units = _numbers(request, wanted, len(model.ik.joints)), model.per_file_unit
+    values, units = read_numbers(request, wanted, len(model.ik.joints)), model.per_file_unit
     return [value / unit for value, unit in zip(values, units, strict=True)]
 
 
 def _units(model: ServedModel) -> str:
     return "deg" if model.joints_key == "q_deg" else "deg and mm"
-
-
-def _numbers(request: dict[str, Any], key: str, count: int) -> list[float]:
-    """Read a list of finite numbers.
-
-    Raises:
-        RequestError: the value is anything else.
-    """
-    values = request[key]
-    if not isinstance(values, list) or len(values) != count:
-        length = len(values) if isinstance(values, list) else str(values)[:40]
-        raise RequestError(expected=f"a list of {count} numbers", value=length, option=key)
-    for value in values:
-        if type(value) not in (float, int) or not -MAX_NUMBER <= value <= MAX_NUMBER:
-            raise RequestError(
-                expected=f"{count} numbers [mm or deg] up to {MAX_NUMBER:g}",
-                value=str(value)[:40],
-                option=key,
-            )
-    return values
 
 
 def _for_task(model: ServedModel, request: dict[str, Any]) -> CorrectedIK:
@@ -381,32 +360,10 @@ def _for_task(model: ServedModel, request: dict[str, Any]) -> CorrectedIK:
         raise RequestError(expected="a list of names of axes", value=repr(names)[:40], option="ignore_axes")
     elbow = None
     if "elbow_deg" in request:
-        elbow = math.radians(_numbers({"elbow_deg": [request["elbow_deg"]]}, "elbow_deg", 1)[0])
+        elbow = math.radians(read_numbers({"elbow_deg": [request["elbow_deg"]]}, "elbow_deg", 1)[0])
     return model.ik.for_task(
-        names, _tolerance(request, "tolerance_mm"), _tolerance(request, "tolerance_deg"), elbow
+        names, read_tolerance(request, "tolerance_mm"), read_tolerance(request, "tolerance_deg"), elbow
     )
-
-
-def _tolerance(request: dict[str, Any], key: str) -> list[float] | None:
-    """Read the tolerances of three axes, as a list or one number for all; None if not given."""
-    if key not in request:
-        return None
-    stated = request[key]
-    return _numbers(request if isinstance(stated, list) else {key: [stated] * 3}, key, 3)
-
-
-def _branch(request: dict[str, Any]) -> str | None:
-    branch = request.get("branch")
-    if branch is None or isinstance(branch, str):
-        return branch
-    raise RequestError(expected="the name of a branch", value=repr(branch)[:40], option="branch")
-
-
-def _flag(request: dict[str, Any], key: str) -> bool:
-    value = request.get(key, False)
-    if isinstance(value, bool):
-        return value
-    raise RequestError(expected="true or false", value=repr(value)[:40], option=key)
 
 
 def _millimetres(length: Any) -> float | None:

@@ -40,8 +40,7 @@ class JoinedRows:
         rows: the measurements in their order, with joint values.
         used: file and line of the rows of the log that were joined.
         unmatched: rows of both files that have no partner.
-        unused: rows of the log that need no partner: another row has their point, or nothing was measured at their
-            time.
+        unused: rows of the log that need no partner, as another row has their point or nothing was measured then.
         warnings: warnings, each a sentence.
     """
 
@@ -98,11 +97,8 @@ def join_rows(measured: ConvertedRows, joints: ConvertedRows, by: JoinBy, within
         warnings += _moving(joints, partner[matched], within)
     alone = np.setdiff1d(np.arange(len(joints.lines)), partner)
     known = np.intersect1d(alone, _partners(joints, partner, by))
-    why = (
-        "nothing was measured at its time"
-        if by == "time"
-        else "another row has the same point and joint values"
-    )
+    same_point = "another row has the same point and joint values"
+    why = "nothing was measured at its time" if by == "time" else same_point
     return JoinedRows(
         rows=rows,
         used=tuple(joints.places[row] for row in np.unique(partner[matched])),
@@ -328,19 +324,12 @@ def _no_partner(
     if by == "time":
         times, logged = _times(measured, joints), _times(joints, measured)
         difference = np.abs(times[:1000, None] - logged[None, :1000]).min()
-        return MeasurementError(
-            expected=f"time stamps within {within:g} s of each other",
-            value=f"a smallest difference of {difference:.6g} s",
-            at=at,
-            remedy="check the clocks and their time zones",
-        )
-    first, second = measured.cells["point"][0], joints.cells["point"][0]
-    return MeasurementError(
-        expected="points with the same name in both files",
-        value=f"{first} and {second}",
-        at=at,
-        remedy="check the columns of the names",
-    )
+        expected, remedy = f"time stamps within {within:g} s of each other", "check the clocks and time zones"
+        value = f"a smallest difference of {difference:.6g} s"
+    else:
+        expected, remedy = "points with the same name in both files", "check the columns of the names"
+        value = f"{measured.cells['point'][0]} and {joints.cells['point'][0]}"
+    return MeasurementError(expected=expected, value=value, at=at, remedy=remedy)
 
 
 @dataclass(frozen=True)

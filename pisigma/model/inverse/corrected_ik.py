@@ -43,8 +43,7 @@ class CorrectedIK(AbstractInverse):
         revolute: `(dof,)`: which joints are revolute.
         closed_form: whether the nominal robot has a closed-form inverse, so that all branches are known.
         warnings: warnings of conditions of `under` that are outside the range of the calibration.
-        controller: for coupled joints, conversion between the controller's values, which this class takes and returns,
-            and the joint values; else None.
+        controller: for coupled joints, conversion between joint values and the controller's (used in calls); else None.
     """
 
     controller: "pisigma.model.inverse.controller_values.ControllerValues | None"
@@ -53,8 +52,7 @@ class CorrectedIK(AbstractInverse):
         """Prepare a model for calls.
 
         Raises:
-            ModelError: the model states branches that its robot does not have, or has no initial values for the numeric
-                inverse.
+            ModelError: the model states unknown branches of its robot, or no initial values for the numeric inverse.
         """
         from pisigma.model.inverse.numeric_ik import NUMERIC, NumericIK
         from pisigma.model.stated_conditions import condition_warnings
@@ -214,13 +212,11 @@ class CorrectedIK(AbstractInverse):
         """Compute poses T_base_tool `(*batch, 4, 4)` of the calibrated arm at commanded joint values `(*batch, dof)`.
 
         Args:
-            q: joint values [rad or m]; kernels evaluate arrays without torch, and torch evaluates tensors with
-                gradients.
+            q: joint values [rad or m]; arrays are evaluated by kernels, tensors by torch with gradients.
             approach: see `__call__`; for arrays only.
 
         Raises:
-            PoseError: the number of columns of q is not the robot's number of joints, or `approach` is invalid or given
-                where torch evaluates the arm.
+            PoseError: q does not match the robot's joints, or `approach` is invalid or given where torch is used.
         """
         approach = checked_approach(approach)
         if self.controller is not None:
@@ -239,10 +235,9 @@ class CorrectedIK(AbstractInverse):
         return T.reshape(*values.shape[:-1], 4, 4)
 
     def jacobian(self, q: Any) -> Any:
-        """Compute the geometric Jacobian `(*batch, 6, dof)` of the calibrated arm.
+        """Compute the geometric Jacobian `(*batch, 6, dof)` of the calibrated arm, at the tool origin in the base frame.
 
-        It is in the base frame at the tool's origin. The slope of the correction, about 1e-3, is neglected, and so is a
-        network on nominal joint values. For the arguments see `forward`.
+        The slope of the correction, about 1e-3, and a network on nominal joint values are neglected. See `forward`.
         """
         if self.controller is not None:
             return self.controller.jacobian(q)
@@ -271,11 +266,7 @@ class CorrectedIK(AbstractInverse):
         return CorrectedIK(under_stated_conditions(self.model, payload_kg, temperature_c))
 
     def accuracy(self, q: Any) -> Any:
-        """Predict the standard deviation [m] of the tool's position at joint values `(*batch, dof)`, in float64.
-
-        Returns:
-            A tensor if q is a tensor, else an array.
-        """
+        """Predict the standard deviation [m] of the tool's position at `(*batch, dof)`; a tensor if q is one."""
         from pisigma.model.accuracy import position_accuracy
 
         if self.controller is not None:
@@ -320,8 +311,7 @@ class CorrectedIK(AbstractInverse):
                 for four, and all rotations for three.
             tolerance_mm: accepted deviations along the tool's axes where the pose cannot be reached exactly [mm], one
                 number or three. The deviations, each divided by its tolerance, are then minimised.
-            tolerance_deg: the same about the tool's axes [deg]. Axes without a tolerance are met exactly unless
-                ignored.
+            tolerance_deg: the same about the tool's axes [deg]. Other axes are met exactly unless they are ignored.
             elbow_angle: elbow angle of an arm with seven revolute joints [rad], see `kinematics.task_axes.TaskAxes`.
 
         Raises:
@@ -329,12 +319,10 @@ class CorrectedIK(AbstractInverse):
         """
         if ignore_axes is None and tolerance_mm is None and tolerance_deg is None and elbow_angle is None:
             return self
-        if elbow_angle is not None and not (
-            self.revolute.tolist() == [True] * 7 and np.isfinite(elbow_angle)
-        ):
+        has_elbow = self.revolute.tolist() == [True] * 7
+        if elbow_angle is not None and not (has_elbow and np.isfinite(elbow_angle)):
             raise PoseError(
-                "expected a finite angle [rad] and a robot with seven revolute joints",
-                expected="a finite angle",
+                expected="a finite angle [rad], for a robot with seven revolute joints",
                 value=elbow_angle,
                 option="elbow_angle",
                 remedy="leave it out for other robots",
