@@ -235,7 +235,7 @@ class CorrectedIK(AbstractInverse):
         return T.reshape(*values.shape[:-1], 4, 4)
 
     def jacobian(self, q: Any) -> Any:
-        """Compute the geometric Jacobian `(*batch, 6, dof)` of the calibrated arm, at the tool origin in the base frame.
+        """Compute the geometric Jacobian `(*batch, 6, dof)` of the calibrated arm, at the tool in the base frame.
 
         The slope of the correction, about 1e-3, and a network on nominal joint values are neglected. See `forward`.
         """
