@@ -9,7 +9,6 @@ import typer
 
 from pisigma import __version__
 from pisigma.cli.calibrate import calibrate
-from pisigma.cli.distill import distill
 from pisigma.cli.endings import end_with, tell_problems
 from pisigma.cli.evaluate import evaluate
 from pisigma.cli.export import export
@@ -28,7 +27,8 @@ from pisigma.cli.report import report
 from pisigma.cli.robots import robots
 from pisigma.cli.serve.command import serve
 from pisigma.cli.simulate import simulate
-from pisigma.cli.train import train
+from pisigma.cli.training.distill import distill
+from pisigma.cli.training.train import train
 from pisigma.cli.upgrade import upgrade
 from pisigma.cli.verify import verify
 

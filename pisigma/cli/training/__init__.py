@@ -1,0 +1,1 @@
+"""Training of models from recipes, and distillation of models."""
