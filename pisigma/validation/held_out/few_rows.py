@@ -29,10 +29,10 @@ from pisigma.validation.held_out.trained_calibrations import (
     geometric_result,
 )
 
-FEW = 2.0
+MIN_RATIO = 2.0
 """Measured values per parameter below which rows are few: the noise, and with it the prior scale, is then estimated
 from less than half of them."""
-TOO_FEW = 1.25
+MIN_RATIO_HELD_OUT = 1.25
 """Values per parameter below which held-out rows cannot decide, because a fit without a pose has hardly more values
 than parameters; an F test of the residuals of all rows decides instead."""
 CHANCE = 1e-4
@@ -74,11 +74,11 @@ def _helps(
 ) -> bool:
     """Say whether there are enough values per parameter, or else whether a fit predicts held-out poses better."""
     ratio = distinct_values(result.solved.problem) / max(result.solved.findings.wanted, 1)
-    if ratio >= FEW:
+    if ratio >= MIN_RATIO:
         return True
     if any(noise.used > USED_UP * noise.values for noise in result.noise):
         return False
-    if ratio < TOO_FEW:
+    if ratio < MIN_RATIO_HELD_OUT:
         return distinct_rows(result.solved.problem) >= MIN_POSES and _evident(calibrator, result, rows)
     try:
         errors = validate(calibrator, rows, k_folds(rows, None, seed=0), progress).models

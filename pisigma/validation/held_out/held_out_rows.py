@@ -72,8 +72,8 @@ class HeldOutRows:
             robot: the robot, for the units of revolute (deg) and prismatic (mm) joints.
         """
         columns: dict[str, list[str]] = {}
-        for j, turns in enumerate(robot.revolute):
-            factor, unit = (_DEGREES, "deg") if turns else (1e3, "mm")
+        for j, revolute in enumerate(robot.revolute):
+            factor, unit = (_DEGREES, "deg") if revolute else (1e3, "mm")
             columns[f"q{j + 1}_{unit}"] = [repr(value) for value in (self.q[:, j] * factor).tolist()]
         columns |= {"frame": list(self.frame), "target": list(self.target)}
         for name, errors in self.models.items():

@@ -88,7 +88,7 @@ def _pairs(tables: tuple[Correlations, ...]) -> tuple[tuple[str, str, float], ..
 
 @dataclass(frozen=True, eq=False)
 class CorrectionCurve:
-    """Learned correction of one joint over its own value, the other joints held at those of a measured row.
+    """Learned correction of one joint over its value, the other joints at their values in a measured row.
 
     Attributes:
         joint: name of the joint.

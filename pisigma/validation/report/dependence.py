@@ -19,11 +19,11 @@ NOTABLE_RATIO = 1.25
 ORDERED = 0.3
 """Rank correlation of a joint with the order of the rows above which time and position are hard to separate."""
 MAX_BINS = 12
-"""Bins of a joint's measured values."""
+"""Largest number of bins of a joint's measured values."""
 MIN_ROWS = 8
-"""Rows of a region or a bin."""
+"""Smallest number of rows of a region or a bin."""
 MIN_ROWS_OF_RMS = 3
-"""Rows that the RMS error of a bin is computed from."""
+"""Smallest number of rows that the RMS error of a bin is computed from."""
 _DEGREES = math.degrees(1.0)
 _UNITS = {"kg": "kg", "c": "°C"}
 

@@ -143,7 +143,7 @@ def _map(
     number: Int64[Tensor, " points"],
     about: tuple[int, str, str, int],
 ) -> ErrorMap:
-    factor = [math.degrees(1.0) if turns else 1e3 for turns in model.robot.revolute]
+    factor = [math.degrees(1.0) if revolute else 1e3 for revolute in model.robot.revolute]
     return ErrorMap(
         place_of(model, points.q).numpy() * 1e3,
         tuple(layers),

@@ -76,11 +76,11 @@ def joint_gaps(model: CalibratedModel, rows: JudgedRows | None) -> tuple[JointGa
         return ()
     gaps = []
     for j, (stretches, (low, high)) in enumerate(measured_stretches(model, q)):
-        turns = bool(model.robot.revolute[j])
+        revolute = bool(model.robot.revolute[j])
         share = sum(b - a for a, b in stretches) / (high - low) if high > low else 1.0
         if not math.isfinite(high - low) or share >= COVERED:
             continue
-        factor, unit = (math.degrees(1.0), "deg") if turns else (1e3, "mm")
+        factor, unit = (math.degrees(1.0), "deg") if revolute else (1e3, "mm")
         measured = stretches if share >= NOT_MOVED else [(float(q[0, j]), float(q[0, j]))]
         gaps.append(
             JointGap(
@@ -89,7 +89,7 @@ def joint_gaps(model: CalibratedModel, rows: JudgedRows | None) -> tuple[JointGa
                 measured=tuple((a * factor, b * factor) for a, b in measured),
                 range=(low * factor, high * factor),
                 share=share,
-                whole_turn=turns and high - low > 2 * math.pi - 1e-6,
+                whole_turn=revolute and high - low > 2 * math.pi - 1e-6,
             )
         )
     return tuple(gaps)

@@ -21,8 +21,8 @@ from pisigma.validation.setup_faults.hypothesis import PredictingArm
 QUARTER = math.pi / 2
 GRADIANS = 0.9
 """Degrees in a gradian."""
-ALMOST = math.radians(0.5)
-"""[rad] A zero this near to a multiple of 90 deg is taken to be there."""
+ZERO_TOLERANCE = math.radians(0.5)
+"""[rad] A zero closer than this to a multiple of 90 deg is set to that multiple."""
 MAX_ORDERS = 5040
 """Number of orders of seven joints; with more joints, only pairs are exchanged."""
 MAX_ZEROS = 4**7
@@ -299,7 +299,7 @@ def _best_zeros(robot: Robot, errors_of: Callable[[JointMaps], Float64[Tensor, "
     near = (by / QUARTER).round() * QUARTER
     near = torch.where(near < -1.5 * QUARTER, -near, near)
     turning = torch.tensor(robot.revolute)
-    by = torch.where(turning & (wrap_to_pi(by - near).abs() < ALMOST) & (near != 0), near, by)
+    by = torch.where(turning & (wrap_to_pi(by - near).abs() < ZERO_TOLERANCE) & (near != 0), near, by)
     return moved_zeros(torch.arange(dof), by, dof)
 
 

@@ -16,11 +16,11 @@ from pisigma.robot.se3 import (
 
 MIN_TOUCHES = 4
 """Touches along an axis needed to determine its direction."""
-CLEAR = 0.03
+MIN_SPREAD_RATIO = 0.03
 """Smallest over largest spread of the tips needed to determine a direction."""
 REFINEMENTS = 10
 """Gauss-Newton steps after the linear solution of a touched frame."""
-NEAR = 0.05
+MAX_RMS_SHARE = 0.05
 """Largest RMS residual of the touches with a guess, as a share of the reach."""
 BASE_UNKNOWNS = 6
 
@@ -66,7 +66,7 @@ def _linear_rotation(tip: Tensor, axis: Tensor, touch: Tensor) -> Tensor | None:
             continue
         centred = points - points.mean(0)
         singular = torch.linalg.svdvals(centred)
-        if float(singular[-1]) > CLEAR * float(singular[0]):
+        if float(singular[-1]) > MIN_SPREAD_RATIO * float(singular[0]):
             row = torch.linalg.lstsq(centred, (values - values.mean())[:, None]).solution[:, 0]
             rows[k] = row / row.norm().clamp(min=1e-12)
     for k in range(3):
@@ -96,7 +96,7 @@ def check_touched_base(measurements: Measurements, name: str, rms: float, reach:
     Raises:
         IdentificationError: see above.
     """
-    if rms <= NEAR * reach:
+    if rms <= MAX_RMS_SHARE * reach:
         return
     counts = ", ".join(f"{(measurements.touch_axis or ()).count(axis)} along {axis}" for axis in "xyz")
     raise IdentificationError(

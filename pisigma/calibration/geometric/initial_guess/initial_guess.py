@@ -34,9 +34,9 @@ from pisigma.robot.se3 import (
 
 GUESS_ROWS = 1_024
 """Rows used to guess base and tool."""
-FEW = 9
+MIN_POSITIONS = 9
 """Positions below which a frame's base is guessed with the tools of other frames."""
-ENOUGH = 5
+MIN_POSITIONS_TOUCHED = 5
 """Positions in a touched frame that suffice for base and tool in closed form."""
 MIN_TURN = 0.02
 """Singular value per row below which orientations in sockets do not determine a direction of the tool, which then
@@ -142,7 +142,9 @@ def _from_positions(
     count = [int((positions & (frame == number)).sum()) for number in range(len(space.frames))]
     for number in sorted(range(len(space.frames)), key=lambda number: -count[number]):
         name, rows = space.frames[number], (positions & (frame == number)).nonzero()[:, 0]
-        if len(rows) == 0 or (len(rows) < ENOUGH and bool((touches & (frame == number)).any())):
+        if len(rows) == 0 or (
+            len(rows) < MIN_POSITIONS_TOUCHED and bool((touches & (frame == number)).any())
+        ):
             continue
         robot = space.robot if name not in stated else space.robot.with_geometry(base=stated[name])
         part = measurements
@@ -152,7 +154,7 @@ def _from_positions(
             part = replace(part, pair=None, distance=None)
         find_base = free_base and name not in stated
         turned = bool(part.measured("pose").any())
-        if find_base and 3 <= len(rows) < FEW and not turned and set(part.target) <= set(tools):
+        if find_base and 3 <= len(rows) < MIN_POSITIONS and not turned and set(part.target) <= set(tools):
             bases[name] = _base_by_tools(robot, part, tools)
             continue
         base, guessed = guess_base_and_tool(robot, part, find_base, free_tool)

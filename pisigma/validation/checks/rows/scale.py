@@ -22,8 +22,8 @@ EXPLAINED = 0.6
 """Share of the errors that may remain after correcting the factor."""
 AS_GOOD = 1.3
 """Errors under any other explanation must be larger by this factor."""
-CLEAR = 5.0
-"""[standard deviations] Difference of the factor from 1."""
+MIN_DEVIATIONS = 5.0
+"""[standard deviations] Difference of the factor from 1 above which it is reported."""
 
 
 class ScaleOfRowsCheck(AbstractRowCheck):
@@ -47,7 +47,7 @@ class ScaleOfRowsCheck(AbstractRowCheck):
             _fit(torch.cat([_frames(T), one[:, None]], 1), error)[0] for one in _joints(judged, base, tool)
         )
         if (
-            abs(factor) > max(MIN_CHANGE, CLEAR * deviation)
+            abs(factor) > max(MIN_CHANGE, MIN_DEVIATIONS * deviation)
             and after < EXPLAINED * before
             and min(others) > AS_GOOD * after
         ):

@@ -33,7 +33,8 @@ class UnexplainedRowsCheck(AbstractRowCheck):
         known, robot = judged.known, judged.model.robot
         zeros = torch.zeros(known.dof, dtype=torch.float64)
         largest = (
-            MAX_STEP * torch.tensor([1.0 if turns else robot.reach for turns in robot.revolute]).double()
+            MAX_STEP
+            * torch.tensor([1.0 if revolute else robot.reach for revolute in robot.revolute]).double()
         )
         moves = "joint_zero" in judged.may_move
         least = float("inf")
