@@ -11,6 +11,7 @@ from testing.closeness import assert_close
 from testing.hybrid import hybrid_of
 from testing.models import hand_made_model, joints_around
 
+from pisigma.deployment.export.geometry import frame_remarks
 from pisigma.deployment.export.programs.targets import Targets, targets_of
 from pisigma.deployment.export.targets import targets_csv
 from pisigma.model.calibrated_model import CalibratedModel
@@ -114,8 +115,10 @@ def test_targets_of_a_hybrid_state_accuracy_and_frames():
     for row, q in zip(rows, solution.q, strict=True):
         assert_close(pose_in(row), forward_kinematics(drawn, q), atol=1e-12)
     text = targets_csv(targets)
-    assert "# The base is that of the frame 'wall'; the model has 2 frames (wall, floor)." in text
-    assert f"Nominal robot: rb5; base: x_mm {model.robot.base[0] * 1e3:.9g}, " in text
+    (remark,) = frame_remarks(model)
+    assert "(wall, floor)" in remark
+    assert f"# {remark}\n" in text
+    assert f"rb5; base: x_mm {model.robot.base[0] * 1e3:.9g}, " in text
 
 
 def test_the_nominal_robot_is_described_in_comment_lines():
