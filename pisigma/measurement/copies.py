@@ -178,6 +178,7 @@ def originals(values: RowValues, known: int = 0) -> Int64[Tensor, " rows"]:
     """
     count = len(values.numbers)
     own = torch.arange(count)
+    # known rows rank first, then those with the finest rounding, then those that come first in the file
     keys = (own.numpy(), *values.steps.T[:3].numpy(), (own >= known).numpy())
     order = torch.from_numpy(np.lexsort(keys))
     rank = order.argsort()
@@ -190,6 +191,7 @@ def originals(values: RowValues, known: int = 0) -> Int64[Tensor, " rows"]:
     same_joints = _SameJoints.of(values)
     standing = same_joints.run[better] == same_joints.run[worse]
     best = rank.clone()
+    # consecutive rows at one pose repeat better than returns to it, so each has its own probability of equal readings
     for scope, deviation in ((standing, STANDING), (~standing, RETURNING)):
         equal = torch.zeros(count, dtype=torch.bool)
         equal[worse[scope]] = True

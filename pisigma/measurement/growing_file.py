@@ -123,6 +123,7 @@ class GrowingFile:
 
     def _new_rows(self, data: MeasuredFields) -> list[int]:
         """Return the numbers of the rows that were not read before, and record them as read."""
+        # equal rows are new as often as the file has more of them than were read
         in_file: Counter[str] = Counter()
         new = []
         for row in range(data.rows):

@@ -299,6 +299,7 @@ def _assign(
 
 def _interleaved(sizes: Int64[Tensor, " groups"], share: float) -> Bool[Tensor, " groups"]:
     """Choose held-out groups such that their share of the rows up to any group is as close as possible to `share`."""
+    # error diffusion: a group is held out if that brings the share of the rows so far nearer to `share`
     is_test, passed, held = [], 0, 0
     for size in sizes.tolist():
         passed += size

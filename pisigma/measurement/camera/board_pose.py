@@ -81,6 +81,7 @@ def solve_board_pose(
     weight = _weights(residual, loss)
     by_intrinsics = camera.by_intrinsics(corners @ R.T + t) / sigma[:, None, None]
     columns = np.concatenate([J, by_intrinsics, residual[..., None]], -1)
+    # blocks of the factor: pose, intrinsics with the pose eliminated, and the residual as last column
     factor = triangle((np.sqrt(weight)[:, None, None] * columns).reshape(-1, columns.shape[-1]))
     inverse = np.linalg.inv(factor[:POSE, :POSE])
     return BoardPose(

@@ -223,7 +223,7 @@ def _by_time(measured: ConvertedRows, joints: ConvertedRows, within: float) -> I
         if len(order) > 1
         else np.zeros(len(times), dtype=np.int64)
     )
-    before = np.maximum(after - 1, 0)
+    before = np.maximum(after - 1, 0)  # the nearest stamp is one of the two neighbours in the sorted log
     nearer = np.abs(logged[order][after] - times) < np.abs(logged[order][before] - times)
     partner = order[np.where(nearer, after, before)]
     return np.where(np.abs(logged[partner] - times) <= within, partner, -1)

@@ -166,7 +166,7 @@ def anchor_from_distances(
     Returns:
         x, y, z, zero [m].
     """
-    centre, middle = points.mean(0), distance.mean()
+    centre, middle = points.mean(0), distance.mean()  # centred, for the condition of the linear system
     p, d = points - centre, distance - middle
     A = torch.cat([-2 * p, 2 * d[:, None], torch.ones_like(d)[:, None]], -1)
     solution = torch.linalg.pinv(A, rtol=1e-4) @ (d.square() - p.square().sum(-1))

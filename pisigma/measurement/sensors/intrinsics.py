@@ -98,6 +98,7 @@ def intrinsics_information(
     """
     sigma, at = images.sigma[0], images.at[0]
     free = np.flatnonzero(sigma > 0)
+    # in units of the prior standard deviations, in which the information of the prior is the identity
     scaled = images.root[:, :, free] * sigma[free]
     information = np.eye(len(free)) + np.einsum("nij,nik->jk", scaled, scaled)
     residual = images.residual + np.einsum("nij,nj->ni", images.root, images.at - at)

@@ -106,6 +106,7 @@ def rotation_difference(
     cosine = ((measured * predicted).sum((0, 1)) - 1) / 2
     if bool((cosine < NEARLY_OPPOSITE).any()):
         return rotation_vector(torch.einsum("ijn,kjn->nik", measured, predicted)).t()
+    # the vector part of R - R^T has the norm 2 sin, the trace is 1 + 2 cos; atan2 of both is accurate near 0 as well
     sine_square = twice_sine_axis.square().sum(0) / 4
     sine = sine_square.sqrt()
     # near 0 the quotient is 0 / 0, so its series is used there
