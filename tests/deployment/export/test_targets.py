@@ -115,9 +115,9 @@ def test_targets_of_a_hybrid_state_accuracy_and_frames():
     for row, q in zip(rows, solution.q, strict=True):
         assert_close(pose_in(row), forward_kinematics(drawn, q), atol=1e-12)
     text = targets_csv(targets)
-    (remark,) = frame_remarks(model)
-    assert "(wall, floor)" in remark
-    assert f"# {remark}\n" in text
+    remarks = frame_remarks(model)
+    assert "(wall, floor)" in remarks[0]
+    assert all(f"# {remark}\n" in text for remark in remarks)
     assert f"rb5; base: x_mm {model.robot.base[0] * 1e3:.9g}, " in text
 
 
