@@ -86,7 +86,7 @@ class LevenbergMarquardtSection(Section):
         epochs: largest number of iterations; it stops earlier when nothing moves any more.
         starts: number of starts of every output.
         validation_share: share of the patterns that only choose between starts.
-        ridge: pull of the weights (not the biases) towards 0, beside a mean square of 1.
+        ridge: pull of the weights (not the biases) towards 0, relative to a mean square of 1.
         seed: of starts and validation patterns.
         spread: half width of the uniform start of weights (around 0) and biases (around 1).
     """
