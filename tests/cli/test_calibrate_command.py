@@ -116,10 +116,8 @@ def test_the_card_says_everything(calibrated):
     folder, printed = calibrated
     card = (folder / "README.md").read_text()
     assert card.startswith("# arm\n\nGeometric calibration of robot kiro4 (")
-    assert (
-        "Made by `pisigma calibrate kiro4 poses.csv --out arm --model geometric --folds 3 --class hobby`, "
-        "on 60 rows of `poses.csv`." in card
-    )
+    assert "`pisigma calibrate kiro4 poses.csv --out arm --model geometric --folds 3 --class hobby`" in card
+    assert "60 rows of `poses.csv`." in card
     assert "3-fold cross-validation, 3 repeats: each of 60 rows" in card
     assert f"{printed['cross_validation']['geometric']['rms_mm']:.4f}" in card
     for row in printed["parameters"]:
@@ -183,7 +181,7 @@ def test_a_share_is_held_out_instead(run, data, tmp_path, split):
     )
     validation = json.loads(run(*arguments, "--json").stdout)["cross_validation"]
     assert (validation["folds"], validation["rows"]) == (1, 15)
-    assert "Judged on 15 rows by a calibration on the others" in (tmp_path / "arm" / "README.md").read_text()
+    assert "15 rows held out once" in (tmp_path / "arm" / "README.md").read_text()
 
 
 def test_no_folds_no_cross_validation(run, data, tmp_path):
@@ -391,7 +389,7 @@ def test_the_papers_protocol(run, repository, tmp_path, name):
     assert printed["held_out"]["rows"] == 2000
     assert printed["held_out"]["geometric"]["rms_mm"] < 1e-10
     card = (tmp_path / "model" / "README.md").read_text()
-    assert "2000 other simulated rows." in card
+    assert "2000 further simulated rows." in card
     assert pisigma.load(tmp_path / "model").model.provenance.recipe == name
 
 

@@ -252,7 +252,7 @@ def test_a_simulated_recipe_is_judged_on_true_positions_of_every_repeat(trained_
     assert [point["rows"] for point in printed["learning_curve"]] == [60, 100, 150]
     assert all(point["held_out"] == 400 for point in printed["learning_curve"])
     card = (folder / "model" / "README.md").read_text()
-    assert "400 other simulated rows of 2 simulations that differ in all that is random" in card
+    assert "400 further simulated rows of 2 simulations" in card
     assert "## Learning curve" in card
     assert (folder / "model" / "learning_curve.png").exists()
     assert load_model(folder / "model").provenance.recipe == "rb5_hybrid"
