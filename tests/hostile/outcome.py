@@ -22,6 +22,7 @@ from testing.models import no_type_checker
 from typer.main import get_command
 
 from pisigma.calibration.geometric.initial_guess.base_and_tool import fit_base_and_tool
+from pisigma.cli import progress
 from pisigma.cli.main import app
 from pisigma.measurement.dataset import Measurements
 from pisigma.robot import Robot
@@ -95,6 +96,7 @@ def attempt(case: Case, folder: Path) -> Outcome:
             _at_most(LONGEST),
             no_type_checker(),
             patch.object(Calibration, "_describe", keep),
+            patch.object(progress, "QUIET_S", 1e9),
         ):
             result = CliRunner().invoke(COMMAND, list(case.arguments))
     except _TooLong:
