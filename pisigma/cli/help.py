@@ -22,8 +22,8 @@ RARELY_USED: Mapping[str, tuple[str, ...]] = {
         "--settling-s", "--criterion", "--base", "--tip",
     ),
     "calibrate": (
-        *_IMAGES, "--hold-out", "--repeats", "--seed", "--train-rows", "--free", "--robust", "--gravity",
-        "--prior-mm", "--prior-mrad", "--class", "--features", "--base", "--tip", "--jobs",
+        *_IMAGES, "--hold-out", "--repeats", "--seed", "--train-rows", "--free", "--robust", "--gravity", "--class",
+        "--features", "--base", "--tip", "--jobs",
     ),
     "recalibrate": _IMAGES,
     "monitor": _IMAGES,

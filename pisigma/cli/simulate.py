@@ -1,4 +1,4 @@
-"""`pisigma simulate`: the simulated measurements of a recipe as a file."""
+"""`pisigma simulate`: write the simulated measurements of a recipe."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -26,7 +26,7 @@ def simulate(
     ] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Write the simulated measurements of a recipe as a CSV file, or the images that its camera takes."""
+    """Write the simulated measurements of a recipe as a CSV file, or the images of its camera."""
     from pisigma.files.errors import RecipeError
     from pisigma.files.output_file import check_output
     from pisigma.robot.robot_file import robot_file

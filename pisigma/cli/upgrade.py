@@ -1,4 +1,4 @@
-"""`pisigma upgrade`: a model folder of an earlier version in the form of this one."""
+"""`pisigma upgrade`: convert a model folder of an earlier version."""
 
 from dataclasses import asdict
 
@@ -7,7 +7,7 @@ from pisigma.cli.output import print_json, print_line, print_lines
 
 
 def upgrade(model: ModelFolder, as_json: AsJson = False) -> None:
-    """Rewrite a model folder of an earlier version so that this one reads it, whole or not at all."""
+    """Convert a model folder of an earlier version to the present format."""
     from pisigma.model.folder.upgrade import upgrade_folder
     from pisigma.model.inverse.written_model import check_written
 
@@ -15,6 +15,6 @@ def upgrade(model: ModelFolder, as_json: AsJson = False) -> None:
     if as_json:
         print_json({"model": str(model), **asdict(done)})
     elif done.before == done.after:
-        print_line(f"{model} has the newest format ({done.after}) already.")
+        print_line(f"{model} already has the newest format ({done.after}).")
     else:
         print_lines([f"{model}: format {done.before} was upgraded to {done.after}.", *done.changes])

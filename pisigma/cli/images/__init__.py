@@ -1,1 +1,1 @@
-"""Commands for images of boards: corners for a calibration, and the intrinsics of a camera."""
+"""Commands for images of boards: detect corners, and calibrate a camera."""
