@@ -6,7 +6,8 @@ from pisigma.lifetime.recalibration.summary import RecalibrationSummary
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.model_posterior import FLEET_PRIOR
 from pisigma.reporting.rendering import write_card
-from pisigma.reporting.tables import Table, figure_text
+from pisigma.reporting.tables import Table
+from pisigma.reporting.verdict import rounded
 
 CANDIDATES = {
     "recalibrated": "recalibrated",
@@ -40,7 +41,7 @@ def candidate_table(summary: RecalibrationSummary) -> Table:
     rows = (
         (
             names[name],
-            "too few rows" if errors.rms_mm is None else figure_text(errors.rms_mm),
+            "too few rows" if errors.rms_mm is None else rounded(errors.rms_mm, summary.left_out),
             "yes" if name == summary.kept else "no",
         )
         for name, errors in summary.cross_validation.items()
