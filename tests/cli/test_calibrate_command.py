@@ -164,7 +164,7 @@ def test_a_wrong_scale_of_the_sensor_is_a_warning_where_it_matters(capsys, calib
         assert (f"{odds:g} to 1" in text) == is_said
 
 
-@pytest.mark.parametrize("split", ["joints", "time", "space"])
+@pytest.mark.parametrize("split", ["joints", "time"])
 def test_a_share_is_held_out_instead(run, data, tmp_path, split):
     arguments = (
         "calibrate",
