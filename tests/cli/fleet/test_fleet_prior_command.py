@@ -41,7 +41,7 @@ def test_what_the_robots_have_in_common_is_printed_and_kept(prior):
     assert "| a_2 | mm |" in card
     for name in ("bad", "undrawn", "metres"):
         assert f"Robot '{name}' did not count: " in card
-    assert "Made by `pisigma fleet prior in " in card
+    assert "`pisigma fleet prior in " in card
 
 
 def test_a_calibration_of_ten_poses_begins_with_it(prior, run):
