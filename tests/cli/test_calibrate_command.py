@@ -1,4 +1,4 @@
-"""`pisigma calibrate`, and `train`, `simulate` and `evaluate` with geometric calibrations."""
+"""`pisigma calibrate` with geometric calibrations, and `evaluate` of what it writes."""
 
 import json
 import shutil
@@ -19,13 +19,11 @@ from pisigma.files.errors import (
     AcceptanceError,
     IdentificationError,
     MeasurementError,
-    RecipeError,
     UnknownRobotError,
 )
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.folder.model_folder import load_model
 from pisigma.reporting.verdict import rounded
-from pisigma.robot import Robot
 from pisigma.robot.kinematics.status import Status
 from pisigma.validation.held_out.calibration_summary import CalibrationSummary, ScaleFigures
 
@@ -34,7 +32,6 @@ POSE = POSITION | {name.replace("mm", "deg") for name in POSITION}
 FILES = {"README.md", "compiled.npz", "correlation.png", "model.safetensors", "model.yaml", "parameters.csv"}
 FILES |= {"held_out_errors.png", "residuals.png"}
 FILES |= {"correlation.csv", "held_out.csv"}
-RECIPES = {"rb5_redundancy": (28, 20, 6), "panda_redundancy": (35, 24, 5)}
 
 
 def write(path, measurements, split=None):
@@ -166,19 +163,8 @@ def test_a_wrong_scale_of_the_sensor_is_a_warning_where_it_matters(capsys, calib
 
 @pytest.mark.parametrize("split", ["joints", "time"])
 def test_a_share_is_held_out_instead(run, data, tmp_path, split):
-    arguments = (
-        "calibrate",
-        "kiro4",
-        data,
-        "--out",
-        tmp_path / "arm",
-        "--model",
-        "geometric",
-        "--hold-out",
-        0.25,
-        "--split",
-        split,
-    )
+    command = ("calibrate", "kiro4", data, "--out", tmp_path / "arm", "--model", "geometric")
+    arguments = (*command, "--hold-out", 0.25, "--split", split)
     validation = json.loads(run(*arguments, "--json").stdout)["cross_validation"]
     assert (validation["folds"], validation["rows"]) == (1, 15)
     assert "15 rows" in (tmp_path / "arm" / "README.md").read_text()
@@ -371,53 +357,6 @@ def test_robots_and_files_at_fault(refuses, data, tmp_path):
         column="q6_deg",
         value=6,
     )
-
-
-@pytest.mark.parametrize("name", RECIPES)
-def test_the_papers_protocol(run, repository, tmp_path, name):
-    recipe = repository / "training" / f"{name}.yaml"
-    printed = json.loads(run("train", recipe, "--out", tmp_path / "model", "--json").stdout)
-    left, rank, sets = RECIPES[name]
-    paper = printed["paper"]
-    assert (printed["pairwise_parameters"], printed["rank"]) == (left, rank)
-    assert (paper["pairwise_parameters"], paper["rank"], len(paper["redundant_sets"])) == (left, rank, sets)
-    assert sorted(printed["redundant_sets"]) == sorted(paper["redundant_sets"])
-    assert set(printed["no_effect"]) == set(paper["no_effect"])
-    assert printed["iterations"] <= 10
-    assert 2 < len(printed["rmse_mm"]) <= printed["iterations"] + 1  # steps that were not taken have none
-    assert printed["rmse_mm"][-1] <= 1e-12 < printed["rmse_mm"][0]
-    assert printed["held_out"]["rows"] == 2000
-    assert printed["held_out"]["geometric"]["rms_mm"] < 1e-10
-    card = (tmp_path / "model" / "README.md").read_text()
-    assert "2000" in card
-    assert pisigma.load(tmp_path / "model").model.provenance.recipe == name
-
-
-def test_sets_are_told_apart_in_the_table(run, repository, tmp_path):
-    recipe = repository / "training" / "rb5_redundancy.yaml"
-    text = run("train", recipe, "--out", tmp_path / "model", "--verbose").stdout
-    assert_screen(text, "redundancy and convergence", verbose=True)
-    lines = text.splitlines()
-    for members in ("{a_6, a_EE}", "{d_2, d_3, d_4}", "{theta_4, -beta_4}"):
-        assert sum(line.count(members) == 2 for line in lines) == 1  # ours and the paper's side by side
-
-
-def test_options_that_a_geometric_recipe_has_no_use_for(refuses, repository, data, tmp_path):
-    recipe = repository / "training" / "rb5_redundancy.yaml"
-    for option in (("--data", data), ("--resume",)):
-        refuses("train", recipe, "--out", tmp_path / "model", *option, error=RecipeError, option=option[0])
-
-
-def test_geometric_recipes_write_their_measurements(run, repository, tmp_path):
-    recipe = repository / "training" / "rb5_redundancy.yaml"
-    for option, rows in (((), 40), (("--held-out",), 2000)):
-        printed = json.loads(
-            run("simulate", recipe, "--out", tmp_path / "rows.csv", "--json", *option).stdout
-        )
-        assert printed["rows"] == rows
-        read = Measurements.read_csv(tmp_path / "rows.csv", Robot.load("rb5"))
-        assert read.rows == rows
-        assert read.kinds == {"position"}
 
 
 def test_an_implausible_calibration_is_written_on_demand_only(run, tmp_path):
