@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from testing.closeness import assert_close
 from testing.models import hand_made_model, joints_around, no_type_checker, with_limits
+from testing.refusals import numbers_in, refused
 
 from pisigma.files.errors import PoseError
 from pisigma.model.inverse.compiled_ik import CompiledIK
@@ -108,8 +109,9 @@ def test_control_loops_get_a_status_instead_of_an_exception(case, arms):
         every = kernels.all_branches(T, throw=False)
         assert (every.status[3] == Status.INVALID_POSE).all()
         assert every.branch[3].tolist() == list(range(8))
-        with pytest.raises(PoseError, match="index 3 "):
+        with refused(PoseError, option="T_base_tool") as caught:
             kernels.all_branches(T)
+        assert numbers_in(str(caught.value))[-1] == 3  # the index
 
 
 def test_joint_values_that_are_not_finite_have_a_status(arms):
@@ -121,7 +123,7 @@ def test_joint_values_that_are_not_finite_have_a_status(arms):
     assert np.flatnonzero(found.status == Status.INVALID_POSE).tolist() == [2]
     assert found.sentences[2] == Status.INVALID_POSE.sentence
     assert kernels.solve(T[2], near=q[2], throw=False).status == Status.INVALID_POSE
-    with pytest.raises(PoseError, match=r"near.* index 2 "):
+    with pytest.raises(PoseError, match=r"^near: .* 2; "):
         kernels.solve_batch(T, near=q)
 
 
