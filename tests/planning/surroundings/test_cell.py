@@ -33,7 +33,7 @@ def test_stated_limits_and_margins_narrow_the_range(tmp_path: Path):
         ("boxes:\n- {name: a, size_mm: [1, 2, 3]}", 2, "boxes.0.center_mm", None),
         ("boxes:\n- {name: a, center_mm: [0, 0, 0], size_mm: [1, 2, -3]}", 2, "boxes.0.size_mm.2", -3),
         ("clearance_mm: wide", 1, "clearance_mm", "wide"),
-        ("\n\njoints:\n  limits_deg: {theta_9: [0, 1]}", 3, "joints", None),
+        ("\n\njoints:\n  limits_deg: {theta_9: [0, 1]}", 3, "joints", "theta_9"),
         ("joints: {limits_deg: {theta_1: [0, 1]}, margin_deg: 5}", 1, "joints", "theta_1"),
         ("links:\n  radii_mm: {elbow: 50}", 2, "links.radii_mm.elbow", "elbow"),
         ("reflector: {}", 1, None, None),
