@@ -1,0 +1,1 @@
+"""What is known of one robot on its mount: its sessions, events, models, and which model is in use."""

@@ -1,0 +1,278 @@
+"""The history of a cell in one SQLite file: sessions, events, models, checks, and which model was in use when.
+
+The tables are named after the classes below, and their columns after the attributes, so that DuckDB or pandas read
+them as they are. Every change is one transaction; SQLite's rollback journal and lock make two processes safe.
+"""
+
+import datetime
+import sqlite3
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Any, Literal, TypeVar, get_args
+
+from pisigma.files.errors import ModelError, OutputError, Place, check_choice
+
+HISTORY = "history.sqlite"
+SCHEMA_VERSION = 1
+LOCK_TIMEOUT = 10.0
+"""[s] Wait for another process that writes."""
+
+EventKind = Literal["instrument", "tool", "mastering", "encoder", "collision", "maintenance", "firmware"]
+"""What was changed: the instrument (tracker, camera, board) was set up again, the tool or reflector was changed, or
+something that ends the validity of everything that was measured of the arm."""
+ARM_EVENTS: frozenset[EventKind] = frozenset(("mastering", "encoder", "collision", "maintenance"))
+"""Events after which earlier sessions no longer describe the arm."""
+
+
+@dataclass(frozen=True)
+class SessionEntry:
+    """A session of rows, as it was measured.
+
+    Attributes:
+        name: of the session and, with ".csv", of its file in `sessions/`.
+        sha256: of the file.
+        taken_in: when it was taken in (ISO 8601, UTC).
+        day: first day on which rows were measured (ISO 8601).
+        rows: number of rows.
+        sensor: kinds of readings, with commas between.
+        temperature_c: mean temperature [deg C]; None where rows do not state it.
+        judged_by: what the rows were checked against: "robot" as drawn, or the name of a model.
+        remark: warnings of the check.
+        set_aside: why the session is not used; empty where it is.
+    """
+
+    name: str
+    sha256: str
+    taken_in: str
+    day: str
+    rows: int
+    sensor: str
+    temperature_c: float | None = None
+    judged_by: str = "robot"
+    remark: str = ""
+    set_aside: str = ""
+
+
+@dataclass(frozen=True)
+class Event:
+    """A change of the robot, its tool or its instrument.
+
+    Attributes:
+        day: on which it happened (ISO 8601); sessions of that day were measured after it.
+        kind: see `EventKind`.
+        note: free text.
+        recorded: when it was recorded (ISO 8601, UTC).
+    """
+
+    day: str
+    kind: EventKind
+    note: str
+    recorded: str
+
+
+@dataclass(frozen=True)
+class ModelEntry:
+    """A model of the cell.
+
+    Attributes:
+        name: of its folder in `models/`.
+        sha256: of its `model.yaml`.
+        made: when (ISO 8601, UTC).
+        sessions: names of the sessions that it was made of, with commas between.
+        day: day of the newest of them (ISO 8601).
+        frame_day: day of the instrument event whose frame is the newest one of the model; empty where it has only
+            the first.
+        target_day: the same for the tool.
+        parent: the model that was recalibrated; empty for a calibration.
+        p95_mm: 95 % quantile of the position errors of held-out rows [mm]; None where it was not judged.
+        remark: why it is or is not in use.
+    """
+
+    name: str
+    sha256: str
+    made: str
+    sessions: str
+    day: str
+    frame_day: str = ""
+    target_day: str = ""
+    parent: str = ""
+    p95_mm: float | None = None
+    remark: str = ""
+
+
+@dataclass(frozen=True)
+class Check:
+    """What a command found of a model with a session.
+
+    Attributes:
+        command: `calibrate`, `verify`, `monitor` or `recalibrate`.
+        model: name of the model; empty where none was written.
+        session: name of the session; empty where all valid ones were used.
+        verdict: in one word, see the result of the command.
+        summary: in one sentence.
+        p95_mm: 95 % quantile of the position errors [mm]; None where it is not known.
+        action: whether something has to be done.
+        checked: when (ISO 8601, UTC).
+    """
+
+    command: str
+    model: str
+    session: str
+    verdict: str
+    summary: str
+    p95_mm: float | None
+    action: bool
+    checked: str
+
+
+@dataclass(frozen=True)
+class Use:
+    """Which model was in use from some moment on.
+
+    Attributes:
+        model: its name; empty where none was in use.
+        since: when (ISO 8601, UTC).
+        reason: why.
+    """
+
+    model: str
+    since: str
+    reason: str
+
+
+Entry = TypeVar("Entry", SessionEntry, Event, ModelEntry, Check, Use)
+_TABLES: dict[type, str] = {
+    SessionEntry: "cell_sessions",
+    Event: "events",
+    ModelEntry: "models",
+    Check: "checks",
+    Use: "uses",
+}
+_SQL_TYPES = {str: "TEXT NOT NULL", int: "INTEGER NOT NULL", bool: "INTEGER NOT NULL"}
+
+
+def now() -> str:
+    """The time as the history states it (ISO 8601, UTC, to the second)."""
+    return datetime.datetime.now(datetime.timezone.utc).isoformat(timespec="seconds")
+
+
+class History:
+    """The history of a cell.
+
+    Attributes:
+        path: of its SQLite file, which is made with the first entry.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def sessions(self) -> tuple[SessionEntry, ...]:
+        """All sessions by their days, those that were set aside among them."""
+        return tuple(sorted(self._read(SessionEntry), key=lambda one: (one.day, one.taken_in, one.name)))
+
+    def events(self) -> tuple[Event, ...]:
+        """All events by their days."""
+        return tuple(sorted(self._read(Event), key=lambda one: (one.day, one.recorded)))
+
+    def models(self) -> tuple[ModelEntry, ...]:
+        """All models in the order in which they were made."""
+        return self._read(ModelEntry)
+
+    def checks(self) -> tuple[Check, ...]:
+        """All checks in the order in which they were made."""
+        return self._read(Check)
+
+    def uses(self) -> tuple[Use, ...]:
+        """Which models were in use, the one of today last."""
+        return self._read(Use)
+
+    @property
+    def in_use(self) -> ModelEntry | None:
+        """The model in use; None where there is none."""
+        uses = self.uses()
+        return self.model(uses[-1].model) if uses and uses[-1].model else None
+
+    def model(self, name: str) -> ModelEntry:
+        """The entry of a model.
+
+        Raises:
+            ModelError: the cell has no such model.
+        """
+        models = {one.name: one for one in self.models()}
+        check_choice(ModelError, "model", name, tuple(models), Place(self.path.parent))
+        return models[name]
+
+    def add(self, *entries: SessionEntry | Event | ModelEntry | Check | Use) -> None:
+        """Add entries in one transaction; a session or a model of the same name is replaced.
+
+        Raises:
+            OutputError: the history cannot be written.
+        """
+        with self._opened() as database, database:
+            for entry in entries:
+                values = asdict(entry)
+                marks = ", ".join("?" * len(values))
+                names = ", ".join(values)
+                database.execute(
+                    f"INSERT OR REPLACE INTO {_TABLES[type(entry)]} ({names}) VALUES ({marks})",
+                    tuple(values.values()),
+                )
+
+    def _read(self, kind: type[Entry]) -> tuple[Entry, ...]:
+        if not self.path.exists():
+            return ()
+        names = [one.name for one in fields(kind)]
+        with self._opened() as database:
+            rows = database.execute(
+                f"SELECT {', '.join(names)} FROM {_TABLES[kind]} ORDER BY rowid"
+            ).fetchall()
+        return tuple(_entry(kind, dict(zip(names, row, strict=True))) for row in rows)
+
+    @contextmanager
+    def _opened(self) -> Iterator[sqlite3.Connection]:
+        try:
+            with closing(sqlite3.connect(self.path, timeout=LOCK_TIMEOUT)) as database:
+                (version,) = database.execute("PRAGMA user_version").fetchone()
+                if version > SCHEMA_VERSION:
+                    raise OutputError(
+                        expected=f"a history of schema version {SCHEMA_VERSION} or older",
+                        value=version,
+                        at=Place(self.path),
+                        remedy="update pisigma",
+                    )
+                if version < SCHEMA_VERSION:
+                    with database:
+                        _create_tables(database)
+                yield database
+        except sqlite3.Error as problem:
+            raise OutputError(
+                f"the history of the cell cannot be used: {problem}",
+                at=Place(self.path),
+                remedy="check that the file is one and that the folder can be written to",
+            ) from None
+
+
+def _create_tables(database: sqlite3.Connection) -> None:
+    for kind, table in _TABLES.items():
+        columns = [f"{one.name} {_sql_type(one.type)}" for one in fields(kind)]
+        key = ", PRIMARY KEY (name)" if "name" in {one.name for one in fields(kind)} else ""
+        database.execute(f"CREATE TABLE IF NOT EXISTS {table} ({', '.join(columns)}{key})")
+    database.execute(f"PRAGMA user_version = {SCHEMA_VERSION}")
+
+
+def _sql_type(kind: Any) -> str:
+    if kind == float | None:
+        return "REAL"
+    return _SQL_TYPES.get(kind, "TEXT NOT NULL")
+
+
+def _entry(kind: type[Entry], values: dict[str, Any]) -> Entry:
+    booleans = {one.name: bool(values[one.name]) for one in fields(kind) if one.type is bool}
+    return kind(**(values | booleans))
+
+
+def event_kinds() -> tuple[str, ...]:
+    """The kinds of events."""
+    return get_args(EventKind)

@@ -1,0 +1,266 @@
+"""What to do next with a cell: stated rules over what is known of it, each with its reason and its command."""
+
+import datetime
+import shlex
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from pisigma.lifetime.cell.history import ARM_EVENTS, Check, Event, ModelEntry, SessionEntry
+
+MAX_DAYS_UNVERIFIED = 92
+"""[days] After a quarter without a session the model in use has to be verified again."""
+VERIFICATION_POSES = 10
+"""Poses of a session that verifies or monitors."""
+
+State = Literal[
+    "edited_session",
+    "no_plan",
+    "not_measured",
+    "not_calibrated",
+    "not_trusted",
+    "not_verified",
+    "verification_failed",
+    "session_not_judged",
+    "moved",
+    "outside_limit",
+    "better_model",
+    "verification_due",
+    "up_to_date",
+]
+
+
+@dataclass(frozen=True)
+class Step:
+    """The next step.
+
+    Attributes:
+        state: where the cell stands.
+        reason: why the step is due, in one sentence.
+        command: what to run; empty where nothing is to be done.
+    """
+
+    state: State
+    reason: str
+    command: str = ""
+
+    def to_json(self) -> dict[str, Any]:
+        """The step as plain values."""
+        return {"state": self.state, "reason": self.reason, "command": self.command or None}
+
+
+@dataclass(frozen=True)
+class CellFacts:
+    """What the rules look at.
+
+    Attributes:
+        folder: of the cell, as the user names it.
+        plans: names of the plans.
+        sessions: all sessions by their days.
+        edited: names of sessions whose files have changed since they were taken in.
+        events: all events by their days.
+        models: all models in the order in which they were made.
+        checks: all checks in the order in which they were made.
+        in_use: the model in use; None where there is none.
+        limit_mm: length below which 95 % of the position errors have to stay [mm]; None where none is stated.
+        today: day (ISO 8601).
+    """
+
+    folder: str
+    plans: tuple[str, ...]
+    sessions: tuple[SessionEntry, ...]
+    edited: tuple[str, ...]
+    events: tuple[Event, ...]
+    models: tuple[ModelEntry, ...]
+    checks: tuple[Check, ...]
+    in_use: ModelEntry | None
+    limit_mm: float | None
+    today: str
+
+    @property
+    def valid_sessions(self) -> tuple[SessionEntry, ...]:
+        """Sessions that describe the arm of today: not set aside, and since the last event that changed the arm."""
+        return valid_sessions(self.sessions, self.events)
+
+    @property
+    def newest_model(self) -> ModelEntry | None:
+        """The model that was made last, of valid sessions; None where there is none."""
+        valid = {one.name for one in self.valid_sessions}
+        made = [one for one in self.models if valid.issuperset(one.sessions.split(","))]
+        return made[-1] if made else None
+
+    def command(self, verb: str, *words: str) -> str:
+        """A command of this cell."""
+        return shlex.join(["pisigma", verb, self.folder, *words])
+
+    def checks_of(self, model: str, *commands: str) -> list[Check]:
+        """Checks of a model by some commands, the newest last."""
+        return [one for one in self.checks if one.model == model and one.command in commands]
+
+    def unseen_sessions(self, model: ModelEntry) -> list[SessionEntry]:
+        """Valid sessions that a model was not made of, measured on its newest day or later."""
+        made_of = model.sessions.split(",")
+        return [one for one in self.valid_sessions if one.name not in made_of and one.day >= model.day]
+
+
+def valid_sessions(
+    sessions: tuple[SessionEntry, ...], events: tuple[Event, ...]
+) -> tuple[SessionEntry, ...]:
+    """Sessions that are not set aside and were measured since the last event that changed the arm."""
+    since = max((one.day for one in events if one.kind in ARM_EVENTS), default="")
+    return tuple(one for one in sessions if not one.set_aside and one.day >= since)
+
+
+def next_step(facts: CellFacts) -> Step:
+    """The first rule that applies, in the order of `RULES`."""
+    return next(step for rule in RULES if (step := rule(facts)) is not None)
+
+
+def _edited_session(facts: CellFacts) -> Step | None:
+    if not facts.edited:
+        return None
+    name = facts.edited[0]
+    return Step(
+        "edited_session",
+        f"the file of session '{name}' was changed or removed after it was taken in; put the measured file back, or "
+        "set the session aside",
+        facts.command("session", name, "--set-aside", "edited"),
+    )
+
+
+def _no_session(facts: CellFacts) -> Step | None:
+    if facts.valid_sessions:
+        return None
+    if not facts.plans:
+        return Step("no_plan", "nothing is planned and nothing is measured", facts.command("plan"))
+    ended = [one for one in facts.events if one.kind in ARM_EVENTS] if facts.sessions else []
+    why = f"{ended[-1].kind} of {ended[-1].day} ended the validity of all sessions" if ended else ""
+    words = [why] if why else [f"plan '{facts.plans[-1]}' is not measured"]
+    return Step("not_measured", words[0], facts.command("measure"))
+
+
+def _not_calibrated(facts: CellFacts) -> Step | None:
+    if facts.newest_model is not None:
+        return None
+    rows = sum(one.rows for one in facts.valid_sessions)
+    calibrations = [one for one in facts.checks if one.command == "calibrate"]
+    newest = max(one.taken_in for one in facts.valid_sessions)
+    if calibrations and calibrations[-1].verdict == "not_trusted" and calibrations[-1].checked >= newest:
+        return Step(
+            "not_trusted",
+            f"the calibration must not be trusted: {calibrations[-1].summary}",
+            facts.command("measure"),
+        )
+    return Step("not_calibrated", f"{rows} rows are measured and no model is made", facts.command("calibrate"))
+
+
+def _not_verified(facts: CellFacts) -> Step | None:
+    if facts.in_use is not None:
+        return None
+    model = facts.newest_model
+    assert model is not None  # else an earlier rule applies
+    verdicts = facts.checks_of(model.name, "verify")
+    judged = {one.session for one in verdicts}
+    new = [one for one in facts.unseen_sessions(model) if one.name not in judged]
+    if new:
+        return Step(
+            "not_verified",
+            f"model '{model.name}' is not in use; session '{new[-1].name}', which it was not made of, can verify it",
+            facts.command("verify"),
+        )
+    if verdicts and verdicts[-1].verdict != "better":
+        return Step("verification_failed", verdicts[-1].summary, facts.command("calibrate"))
+    return Step(
+        "not_verified",
+        f"model '{model.name}' is not in use until rows verify it that it was not made of; measure "
+        f"{VERIFICATION_POSES} poses, take them in, and run `{facts.command('verify')}`",
+        facts.command("plan", "--count", str(VERIFICATION_POSES), "--check", "0"),
+    )
+
+
+def _session_not_judged(facts: CellFacts) -> Step | None:
+    model = facts.in_use
+    assert model is not None
+    judged = {one.session for one in facts.checks_of(model.name, "verify", "monitor", "recalibrate")}
+    new = [one for one in facts.unseen_sessions(model) if one.name not in judged]
+    if not new:
+        return None
+    return Step(
+        "session_not_judged",
+        f"session '{new[-1].name}' was not compared with model '{model.name}'",
+        facts.command("monitor"),
+    )
+
+
+def _moved(facts: CellFacts) -> Step | None:
+    model = facts.in_use
+    assert model is not None
+    verdicts = facts.checks_of(model.name, "verify", "monitor")
+    if not verdicts or not verdicts[-1].action:
+        return None
+    return Step("moved", verdicts[-1].summary, facts.command("recalibrate"))
+
+
+def _better_model(facts: CellFacts) -> Step | None:
+    newest, model = facts.newest_model, facts.in_use
+    assert model is not None
+    if newest is None or newest.name == model.name or newest.made <= model.made:
+        return None
+    judged = {one.session for one in facts.checks_of(newest.name, "verify")}
+    new = [one for one in facts.unseen_sessions(newest) if one.name not in judged]
+    if not new:
+        return None
+    return Step(
+        "better_model",
+        f"model '{newest.name}' is not in use; session '{new[-1].name}', which it was not made of, can verify it",
+        facts.command("verify", "--model", newest.name),
+    )
+
+
+def _outside_limit(facts: CellFacts) -> Step | None:
+    model, limit = facts.in_use, facts.limit_mm
+    assert model is not None
+    found = [one.p95_mm for one in facts.checks_of(model.name, "verify") if one.p95_mm is not None]
+    p95 = found[-1] if found else model.p95_mm
+    if limit is None or p95 is None or p95 <= limit:
+        return None
+    return Step(
+        "outside_limit",
+        f"95 % of the position errors are below {p95:.3f} mm, and the limit is {limit:g} mm; more poses help until the "
+        "repeatability of the robot is reached",
+        facts.command("plan"),
+    )
+
+
+def _verification_due(facts: CellFacts) -> Step | None:
+    model = facts.in_use
+    assert model is not None
+    newest = max(one.day for one in facts.sessions)
+    age = (datetime.date.fromisoformat(facts.today) - datetime.date.fromisoformat(newest)).days
+    if age <= MAX_DAYS_UNVERIFIED:
+        return None
+    return Step(
+        "verification_due",
+        f"the last session is {age} days old; measure {VERIFICATION_POSES} poses and run "
+        f"`{facts.command('monitor')}`",
+        facts.command("plan", "--count", str(VERIFICATION_POSES), "--check", "0"),
+    )
+
+
+def _up_to_date(facts: CellFacts) -> Step:
+    assert facts.in_use is not None
+    return Step("up_to_date", f"model '{facts.in_use.name}' is in use and nothing has to be done")
+
+
+RULES: tuple[Callable[[CellFacts], Step | None], ...] = (
+    _edited_session,
+    _no_session,
+    _not_calibrated,
+    _not_verified,
+    _session_not_judged,
+    _moved,
+    _better_model,
+    _outside_limit,
+    _verification_due,
+    _up_to_date,
+)

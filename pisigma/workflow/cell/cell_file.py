@@ -1,0 +1,312 @@
+"""`cell.yaml`: what a cell is, and the settings of every step, with the names and units of the command line."""
+
+import os
+import textwrap
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal, TypeVar, get_args
+
+import yaml
+from pydantic import Field, TypeAdapter, ValidationError
+
+from pisigma.files.errors import Place, PlanningError, nearest_choice
+from pisigma.files.setting import Setting, settings_of
+from pisigma.files.yaml_file import Section, line_of, read_yaml
+from pisigma.planning.plan_settings import PlanSettings
+from pisigma.planning.surroundings.cell import Cell as Surroundings
+from pisigma.robot.row import Bounded
+from pisigma.workflow.settings.calibration import CalibrationSettings
+from pisigma.workflow.settings.comparison import ComparisonSettings
+from pisigma.workflow.settings.evaluation import EvaluationSettings
+from pisigma.workflow.settings.importing import ImportSettings
+from pisigma.workflow.settings.monitoring import MonitorSettings
+from pisigma.workflow.settings.recalibration import RecalibrationSettings
+from pisigma.workflow.settings.verification import VerificationSettings
+
+CELL_FILE = "cell.yaml"
+STEPS: dict[str, type] = {
+    "plan": PlanSettings,
+    "import": ImportSettings,
+    "calibrate": CalibrationSettings,
+    "verify": VerificationSettings,
+    "monitor": MonitorSettings,
+    "recalibrate": RecalibrationSettings,
+    "compare": ComparisonSettings,
+    "evaluate": EvaluationSettings,
+}
+"""By the section of `cell.yaml`, which has the name of the command, the class of its settings."""
+CAMERA_KEYS = ("camera", "board", "fixed_camera", "intrinsics", "repeatability_mm", "repeatability_deg")
+SHARED_KEYS = (*CAMERA_KEYS, "limit_mm")
+"""Keys that are stated once for all steps."""
+MAX_WIDTH = 100
+
+SensorName = Literal["tracker", "camera", "sockets", "draw-wire", "touch"]
+PLANNED_SENSORS: dict[SensorName, str] = {"camera": "camera", "draw-wire": "distance"}
+"""What `plan` calls the sensors that do not measure positions."""
+
+Group = TypeVar("Group")
+_Steps = dict[str, Any] | None
+
+
+class CameraSection(Section):
+    """Which cameras see which boards; paths are inside the cell.
+
+    Attributes:
+        camera: camera files (YAML of pisigma, ROS or OpenCV).
+        board: board files (YAML: rows, columns, square_mm).
+        fixed_camera: the cameras are fixed and the boards are on the flange, not the other way round.
+        intrinsics: fixed, prior or free.
+        repeatability_mm: standard deviation with which a position repeats, per axis [mm].
+        repeatability_deg: standard deviation with which an orientation repeats, per axis [deg].
+    """
+
+    camera: tuple[str, ...]
+    board: tuple[str, ...]
+    fixed_camera: bool = False
+    intrinsics: Literal["fixed", "prior", "free"] = "prior"
+    repeatability_mm: Annotated[Bounded, Field(ge=0)] = 0.02
+    repeatability_deg: Annotated[Bounded, Field(ge=0)] = 0.01
+
+
+class CellDocument(Section):
+    """The content of `cell.yaml`.
+
+    Attributes:
+        robot: catalogue name, or a robot file (YAML or URDF) inside the cell.
+        base: link of a URDF file that poses are given in; None for its root.
+        tip: link of a URDF file that is the tool; None for its only end.
+        sensor: what measures the robot.
+        limit_mm: length below which 95 % of the position errors have to stay [mm]; None where none is stated.
+        camera: cameras and boards; None where no camera measures.
+        surroundings: what is around the robot; None for nothing.
+        plan: settings of `pisigma plan`, by the names of its options.
+        import_: settings of `pisigma import`.
+        calibrate: settings of `pisigma calibrate`.
+        verify: settings of `pisigma verify`.
+        monitor: settings of `pisigma monitor`.
+        recalibrate: settings of `pisigma recalibrate`.
+        compare: settings of `pisigma compare`.
+        evaluate: settings of `pisigma evaluate`.
+    """
+
+    robot: str
+    base: str | None = None
+    tip: str | None = None
+    sensor: SensorName = "tracker"
+    limit_mm: Annotated[Bounded, Field(gt=0)] | None = None
+    camera: CameraSection | None = None
+    surroundings: Surroundings | None = None
+    plan: _Steps = None
+    import_: _Steps = Field(default=None, alias="import")
+    calibrate: _Steps = None
+    verify: _Steps = None
+    monitor: _Steps = None
+    recalibrate: _Steps = None
+    compare: _Steps = None
+    evaluate: _Steps = None
+
+
+@dataclass(frozen=True)
+class CellFile:
+    """`cell.yaml` as it was read.
+
+    Attributes:
+        path: of the file.
+        document: its content.
+    """
+
+    path: Path
+    document: CellDocument
+
+    @staticmethod
+    def read(folder: Path) -> "CellFile":
+        """Read the file of a cell, and check the settings of every step.
+
+        Raises:
+            PlanningError: it is missing or not a `cell.yaml`; the message names file, line and key.
+            PisigmaError: a setting of a step cannot be used.
+        """
+        path = folder / CELL_FILE
+        read = CellFile(path, read_yaml(path, CellDocument, PlanningError))
+        for step in STEPS:
+            if step not in ("plan", "import"):
+                read.settings(step)
+            else:
+                list(_checked(STEPS[step], read.stated(step), read._place(step)))
+        return read
+
+    @property
+    def robot(self) -> str:
+        """The robot as `Robot.load` takes it."""
+        inside = self.path.parent / self.document.robot
+        return str(inside) if inside.is_file() else self.document.robot
+
+    def stated(self, step: str) -> dict[str, Any]:
+        """What the file states for a step, by option names; shared keys count where the step has such an option."""
+        section = dict(getattr(self.document, {"import": "import_"}.get(step, step)) or {})
+        known = {key_of(one) for one in flat_settings(STEPS[step])}
+        shared: dict[str, Any] = {}
+        if self.document.limit_mm is not None:
+            shared["limit_mm"] = self.document.limit_mm
+        if self.document.camera is not None:
+            shared |= self.document.camera.model_dump(exclude_defaults=True)
+        if step == "plan" and self.document.sensor in PLANNED_SENSORS:
+            shared["sensor"] = PLANNED_SENSORS[self.document.sensor]
+        return {key: value for key, value in shared.items() if key in known} | section
+
+    def settings(self, step: str, **changed: Any) -> Any:
+        """The settings of a step.
+
+        Args:
+            step: a key of `STEPS`.
+            **changed: options that are stated otherwise, by the keys of the file.
+
+        Raises:
+            PisigmaError: a setting cannot be used; the message names file, line and key.
+        """
+        return settings_from(
+            STEPS[step], self.stated(step) | changed, self._place(step), self.path.parent
+        )
+
+    def _place(self, step: str) -> "_Places":
+        return _Places(self.path, step)
+
+
+@dataclass(frozen=True)
+class _Places:
+    """Where the keys of a step are in a file."""
+
+    path: Path
+    step: str
+
+    def of(self, key: str) -> Place:
+        keys = (self.step, key)
+        return Place(self.path, line_of(self.path, keys), f"{self.step}.{key}")
+
+
+def key_of(setting: Setting) -> str:
+    """The key of a setting in `cell.yaml`: its option without dashes before it, such as "prior_mm"."""
+    return setting.name.removeprefix("--").replace("-", "_")
+
+
+def flat_settings(group: type) -> Iterator[Setting]:
+    """The settings of a class, with those of the classes that it is made of."""
+    for setting in settings_of(group):
+        if setting.is_group:
+            yield from flat_settings(setting.kind)
+        else:
+            yield setting
+
+
+def settings_from(group: type[Group], stated: Mapping[str, Any], places: _Places, folder: Path) -> Group:
+    """Make settings of what a file states.
+
+    Args:
+        group: their class.
+        stated: values by their keys, in the units of the command line.
+        places: where the keys are.
+        folder: of the cell, which paths are relative to.
+
+    Raises:
+        PisigmaError: a key is unknown, or a value is of another type or not a valid one.
+    """
+    values = dict(_checked(group, stated, places))
+    built = _built(group, values, folder, is_optional=False)
+    assert isinstance(built, group)
+    return built
+
+
+def _checked(group: type, stated: Mapping[str, Any], places: _Places) -> Iterator[tuple[str, Any]]:
+    """Values by their keys, each of the type that its option takes."""
+    known = {key_of(one): one for one in flat_settings(group)}
+    for key, value in stated.items():
+        if key not in known:
+            raise PlanningError(f"unknown key '{key}'", at=places.of(key), remedy=nearest_choice(key, known))
+        kind = known[key].kind
+        try:
+            yield key, TypeAdapter(kind).validate_python(_listed(value, kind))
+        except ValidationError:
+            expected = getattr(kind, "__name__", str(kind)).replace("str", "a text").replace("float", "a number")
+            raise PlanningError(expected=expected, value=value, at=places.of(key)) from None
+
+
+def _listed(value: Any, kind: Any) -> Any:
+    """A single value as a list of one, where the option may be repeated."""
+    is_repeated = getattr(kind, "__origin__", None) is list
+    return [value] if is_repeated and not isinstance(value, list | tuple) else value
+
+
+def _built(group: type, values: Mapping[str, Any], folder: Path, is_optional: bool) -> Any:
+    found: dict[str, Any] = {}
+    for setting in settings_of(group):
+        if setting.is_group:
+            if (built := _built(setting.kind, values, folder, is_optional=True)) is not None:
+                found[setting.field] = built
+        elif key_of(setting) in values:
+            value = values[key_of(setting)]
+            if setting.kind is Path:
+                value = inside(folder, value)
+            elif isinstance(value, list):
+                are_paths = get_args(setting.kind) == (Path,)
+                value = tuple(inside(folder, one) for one in value) if are_paths else tuple(value)
+            found[setting.field] = setting.read(value)
+    return None if is_optional and not found else group(**found)
+
+
+def inside(folder: Path, path: str | os.PathLike[str]) -> Path:
+    """A path that a cell states, which has to be inside the cell.
+
+    Raises:
+        PlanningError: it leads out of the cell.
+    """
+    whole = folder / path
+    if not Path(os.path.realpath(whole)).is_relative_to(os.path.realpath(folder)):
+        raise PlanningError(
+            expected="a path inside the cell", value=str(path), at=Place(folder / CELL_FILE), remedy="copy the file there"
+        )
+    return whole
+
+
+def template(document: Mapping[str, Any]) -> str:
+    """The text of a new `cell.yaml`: what is known, and every setting with its help and default commented out.
+
+    Args:
+        document: what is known, by the keys of `CellDocument`.
+    """
+    lines = ["# A cell: one robot on its mount and what measures it. Lines that begin with # are defaults."]
+    optional = {
+        "base": "link of the URDF file that poses are given in",
+        "tip": "link of the URDF file that is the tool",
+        "limit_mm": "length below which 95 % of the position errors have to stay [mm]",
+    }
+    for key in ("robot", "base", "tip", "sensor", "limit_mm"):
+        if document.get(key) is not None:
+            lines.append(f"{key}: {_yaml(document[key])}")
+        elif key in optional:
+            lines.append(f"# {key}:  # {optional[key]}")
+    if document.get("camera") is not None:
+        lines += ["camera:", *(f"  {key}: {_yaml(value)}" for key, value in document["camera"].items())]
+    lines.append("# surroundings:  # floor, boxes, tracker, joint margins: see the documentation of `pisigma plan`")
+    for step, group in STEPS.items():
+        lines += ["", f"{step}:  # as the options of `pisigma {step}`"]
+        for setting in flat_settings(group):
+            key = key_of(setting)
+            if key in SHARED_KEYS or (step == "plan" and key == "sensor"):
+                continue
+            lines += textwrap.wrap(setting.help, MAX_WIDTH, initial_indent="  # ", subsequent_indent="  # ")
+            lines.append(f"  # {key}: {_yaml(setting.default)}".rstrip())
+    return "\n".join([*lines, ""])
+
+
+def _yaml(value: Any) -> str:
+    if value is None:
+        return ""
+    return yaml.safe_dump(value, default_flow_style=True, width=1000).removesuffix("\n...\n").strip()
+
+
+def is_cell(path: str | os.PathLike[str]) -> bool:
+    """Whether a folder is a cell."""
+    return (Path(path) / CELL_FILE).is_file()
+
+
