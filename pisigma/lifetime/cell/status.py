@@ -103,9 +103,7 @@ class CellFacts:
         return [one for one in self.valid_sessions if one.name not in made_of and one.day >= model.day]
 
 
-def valid_sessions(
-    sessions: tuple[SessionEntry, ...], events: tuple[Event, ...]
-) -> tuple[SessionEntry, ...]:
+def valid_sessions(sessions: tuple[SessionEntry, ...], events: tuple[Event, ...]) -> tuple[SessionEntry, ...]:
     """Sessions that are not set aside and were measured since the last event that changed the arm."""
     since = max((one.day for one in events if one.kind in ARM_EVENTS), default="")
     return tuple(one for one in sessions if not one.set_aside and one.day >= since)
@@ -131,12 +129,11 @@ def _edited_session(facts: CellFacts) -> Step | None:
 def _no_session(facts: CellFacts) -> Step | None:
     if facts.valid_sessions:
         return None
-    if not facts.plans:
-        return Step("no_plan", "nothing is planned and nothing is measured", facts.command("plan"))
     ended = [one for one in facts.events if one.kind in ARM_EVENTS] if facts.sessions else []
-    why = f"{ended[-1].kind} of {ended[-1].day} ended the validity of all sessions" if ended else ""
-    words = [why] if why else [f"plan '{facts.plans[-1]}' is not measured"]
-    return Step("not_measured", words[0], facts.command("measure"))
+    why = f"{ended[-1].kind} on {ended[-1].day} ended the validity of all sessions" if ended else ""
+    if not facts.plans:
+        return Step("no_plan", why or "nothing is planned and nothing is measured", facts.command("plan"))
+    return Step("not_measured", why or f"plan '{facts.plans[-1]}' is not measured", facts.command("measure"))
 
 
 def _not_calibrated(facts: CellFacts) -> Step | None:
@@ -151,7 +148,9 @@ def _not_calibrated(facts: CellFacts) -> Step | None:
             f"the calibration must not be trusted: {calibrations[-1].summary}",
             facts.command("measure"),
         )
-    return Step("not_calibrated", f"{rows} rows are measured and no model is made", facts.command("calibrate"))
+    return Step(
+        "not_calibrated", f"{rows} rows are measured and no model is made", facts.command("calibrate")
+    )
 
 
 def _not_verified(facts: CellFacts) -> Step | None:

@@ -15,7 +15,14 @@ from typing import Any
 
 import torch
 
-from pisigma.files.errors import AcceptanceError, MeasurementError, ModelError, OutputError, Place, check_choice
+from pisigma.files.errors import (
+    AcceptanceError,
+    MeasurementError,
+    ModelError,
+    OutputError,
+    Place,
+    check_choice,
+)
 from pisigma.files.model_files import is_model, model_hash
 from pisigma.files.output_file import write_whole
 from pisigma.files.progress import Progress
@@ -23,7 +30,6 @@ from pisigma.lifetime.cell.history import (
     HISTORY,
     Check,
     Event,
-    EventKind,
     History,
     ModelEntry,
     SessionEntry,
@@ -162,8 +168,16 @@ class Cell:
         target, name = Path(folder), os.fspath(robot)
         Robot.load(name, base, tip)
         if target.exists() and (not target.is_dir() or any(target.iterdir())):
-            raise OutputError("the folder exists and is not empty", at=Place(folder), remedy="choose another --out")
-        known: dict[str, Any] = {"robot": name, "base": base, "tip": tip, "sensor": sensor, "limit_mm": limit_mm}
+            raise OutputError(
+                "the folder exists and is not empty", at=Place(folder), remedy="choose another --out"
+            )
+        known: dict[str, Any] = {
+            "robot": name,
+            "base": base,
+            "tip": tip,
+            "sensor": sensor,
+            "limit_mm": limit_mm,
+        }
         try:
             for part in (PLANS, SESSIONS, MODELS):
                 (target / part).mkdir(parents=True, exist_ok=True)
@@ -207,7 +221,9 @@ class Cell:
         if name is None:
             entry = self.history.in_use
             if entry is None:
-                raise ModelError("no model is in use", at=Place(self.folder), remedy=self.status().step.reason)
+                raise ModelError(
+                    "no model is in use", at=Place(self.folder), remedy=self.status().step.reason
+                )
             name = entry.name
         elif not is_model(self.folder / MODELS / name):
             self.history.model(name)
@@ -225,7 +241,9 @@ class Cell:
         """
         entry = self.history.in_use
         subject = self.robot if entry is None else self.model_folder(entry.name)
-        planned = plan(subject, self.file.settings("plan", **changed), self.file.document.surroundings, progress)
+        planned = plan(
+            subject, self.file.settings("plan", **changed), self.file.document.surroundings, progress
+        )
         path = self._free(PLANS, datetime.date.today().isoformat(), ".csv")
         planned.save(path)
         return planned, path
@@ -251,7 +269,7 @@ class Cell:
         entry = self._judged(rows, day, accept_implausible)
         path = self._free(SESSIONS, day, ".csv")
         if isinstance(file, Measurements):
-            file.write_csv(path, [axis.type == "revolute" for axis in self.robot.axes])
+            file.write_csv(path, self.robot)
         elif Path(file).parent.resolve() == (self.folder / SESSIONS).resolve():
             path = Path(file)
         else:
@@ -268,7 +286,9 @@ class Cell:
             values = RowValues.of(self.rows_of([one]).as_fields(), self.robot)
             again |= copies_of_known(rows.as_fields(), self.robot, values)
         if bool(again.all()):
-            raise MeasurementError("every row was taken in before", at=Place(rows.source), remedy="give new rows")
+            raise MeasurementError(
+                "every row was taken in before", at=Place(rows.source), remedy="give new rows"
+            )
         model = self.history.in_use
         if model is None:
             verdict = check_rows(rows, self.robot)
@@ -344,7 +364,15 @@ class Cell:
                     f"{one.name} --set-aside REASON)",
                 )
             rows = read_rows(path, self.robot, self.cameras)
-            parts.append(_named(rows, _newest_day(events, "instrument", one.day), _newest_day(events, "tool", one.day)))
+            parts.append(
+                _named(rows, _newest_day(events, "instrument", one.day), _newest_day(events, "tool", one.day))
+            )
+        if any(
+            one.split is not None for one in parts
+        ):  # a session without check poses is all for calibration
+            parts = [
+                one if one.split is not None else replace(one, split=("train",) * one.rows) for one in parts
+            ]
         return parts[0] if len(parts) == 1 else read_rows(join(parts), self.robot)
 
     def rows_for(self, model: ModelEntry, rows: Measurements, day: str) -> ModelRows:
@@ -357,12 +385,12 @@ class Cell:
         """
         events = self.history.events()
         changed = {"base": "instrument", "tool": "tool"}
-        moved = tuple(
-            what for what, kind in changed.items() if model.day < _newest_day(events, kind, day)
-        )
+        moved = tuple(what for what, kind in changed.items() if model.day < _newest_day(events, kind, day))
         return ModelRows(_named(rows, model.frame_day, model.target_day), moved)
 
-    def calibrate(self, progress: Progress = lambda what: None, **changed: Any) -> tuple[Calibration, ModelEntry]:
+    def calibrate(
+        self, progress: Progress = lambda what: None, **changed: Any
+    ) -> tuple[Calibration, ModelEntry]:
         """Calibrate with all rows since the last event that changed the arm, and store the model.
 
         The first model goes into use after `verify`. A later one goes into use where rows that neither it nor the one
@@ -392,22 +420,33 @@ class Cell:
         judged = result.summary.cross_validation
         entry = self._entry(path, sessions, remark, _p95(judged))
         summary = next(iter(result.warnings), "")
-        self.history.add(entry, Check("calibrate", entry.name, "", "trusted", summary, entry.p95_mm, False, now()))
+        self.history.add(
+            entry, Check("calibrate", entry.name, "", "trusted", summary, entry.p95_mm, False, now())
+        )
         if better:
             self._use(entry, remark)
         return result, entry
 
     def _is_better(
-        self, robot: Robot, sessions: Sequence[SessionEntry], settings: CalibrationSettings, progress: Progress
+        self,
+        robot: Robot,
+        sessions: Sequence[SessionEntry],
+        settings: CalibrationSettings,
+        progress: Progress,
     ) -> tuple[bool, str]:
         """Whether a new calibration is better than the model in use on rows that neither was made of, and why."""
         in_use = self.history.in_use
         assert in_use is not None
         newest, older = sessions[-1], list(sessions[:-1])
         if newest.name in in_use.sessions.split(",") or newest.rows < MIN_ROWS_TO_COMPARE or not older:
-            return False, f"no session of {MIN_ROWS_TO_COMPARE} rows or more is new to it and to '{in_use.name}'"
+            return (
+                False,
+                f"no session of {MIN_ROWS_TO_COMPARE} rows or more is new to it and to '{in_use.name}'",
+            )
         progress("calibration without the newest session")
-        without = calibrate(robot, self.rows_of(older), replace(settings, cameras=None, folds=0, hold_out=None))
+        without = calibrate(
+            robot, self.rows_of(older), replace(settings, cameras=None, folds=0, hold_out=None)
+        )
         seen = self.rows_for(in_use, self.rows_of([newest]), newest.day)
         fit_frame, fit_tool = "base" in seen.moved, "tool" in seen.moved
         old = load_model(self.model_folder(in_use.name))
@@ -419,7 +458,9 @@ class Cell:
         difference = judged.models[-1].position.difference
         interval = None if difference is None else difference.intervals["mean"]
         better = interval is not None and interval[1] < 0
-        figures = " and ".join(f"{one.position.statistics['mean']:.3f} mm ({one.name})" for one in judged.models)
+        figures = " and ".join(
+            f"{one.position.statistics['mean']:.3f} mm ({one.name})" for one in judged.models
+        )
         return better, f"mean errors of session '{newest.name}', which neither was made of: {figures}"
 
     def verify(
@@ -478,7 +519,9 @@ class Cell:
             words = {key: value for key, value in stated.items() if value is not None}
             settings = self.file.settings("monitor", **words, **({"moved": moved} if moved else {}))
             settings = replace(settings, cameras=None, dates=(one.day,))
-            found = monitor(self.model_folder(entry.name), [replace(seen.rows, date=None)], settings, progress)
+            found = monitor(
+                self.model_folder(entry.name), [replace(seen.rows, date=None)], settings, progress
+            )
             self.history.add(_check_of(found, entry, one))
         assert found is not None  # there is a session
         return found
@@ -529,7 +572,9 @@ class Cell:
         entry = self.history.model(model)
         folder = self.folder / MODELS / model
         if model_hash(folder) != entry.sha256:
-            raise ModelError("the model was changed after it was made", at=Place(folder), remedy="use another one")
+            raise ModelError(
+                "the model was changed after it was made", at=Place(folder), remedy="use another one"
+            )
         self._use(entry, reason or "by hand")
 
     def status(self) -> CellStatus:
@@ -538,7 +583,9 @@ class Cell:
         names = {one.name for one in sessions}
         folder = self.folder / SESSIONS
         edited = tuple(
-            one.name for one in sessions if not one.set_aside and _sha256(folder / f"{one.name}.csv") != one.sha256
+            one.name
+            for one in sessions
+            if not one.set_aside and _sha256(folder / f"{one.name}.csv") != one.sha256
         )
         facts = CellFacts(
             folder=os.fspath(self.folder),
@@ -562,7 +609,9 @@ class Cell:
         sessions = list(valid_sessions(self.history.sessions(), self.history.events()))
         if not sessions:
             raise MeasurementError(
-                "there is no session of the arm as it is", at=Place(self.folder), remedy=self.status().step.reason
+                "there is no session of the arm as it is",
+                at=Place(self.folder),
+                remedy=self.status().step.reason,
             )
         return sessions
 
@@ -574,7 +623,9 @@ class Cell:
         if (entry := self.history.in_use) is not None:
             return entry
         if not models:
-            raise ModelError("there is no model", at=Place(self.folder), remedy="run `pisigma calibrate` of it first")
+            raise ModelError(
+                "there is no model", at=Place(self.folder), remedy="run `pisigma calibrate` of it first"
+            )
         return models[-1]
 
     def _unseen_sessions(self, model: ModelEntry) -> list[SessionEntry]:
@@ -685,5 +736,3 @@ def _copied(cameras: CameraFiles, folder: Path) -> dict[str, Any]:
 def _sha256(path: Path) -> str:
     """Hash of a file; "" where it is missing."""
     return hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else ""
-
-

@@ -149,10 +149,11 @@ class CellFile:
         shared: dict[str, Any] = {}
         if self.document.limit_mm is not None:
             shared["limit_mm"] = self.document.limit_mm
-        if self.document.camera is not None:
+        sensor = PLANNED_SENSORS.get(self.document.sensor, "position")
+        if self.document.camera is not None and (step != "plan" or sensor == "camera"):
             shared |= self.document.camera.model_dump(exclude_defaults=True)
-        if step == "plan" and self.document.sensor in PLANNED_SENSORS:
-            shared["sensor"] = PLANNED_SENSORS[self.document.sensor]
+        if step == "plan":
+            shared["sensor"] = sensor
         return {key: value for key, value in shared.items() if key in known} | section
 
     def settings(self, step: str, **changed: Any) -> Any:
@@ -165,9 +166,7 @@ class CellFile:
         Raises:
             PisigmaError: a setting cannot be used; the message names file, line and key.
         """
-        return settings_from(
-            STEPS[step], self.stated(step) | changed, self._place(step), self.path.parent
-        )
+        return settings_from(STEPS[step], self.stated(step) | changed, self._place(step), self.path.parent)
 
     def _place(self, step: str) -> "_Places":
         return _Places(self.path, step)
@@ -227,14 +226,18 @@ def _checked(group: type, stated: Mapping[str, Any], places: _Places) -> Iterato
         try:
             yield key, TypeAdapter(kind).validate_python(_listed(value, kind))
         except ValidationError:
-            expected = getattr(kind, "__name__", str(kind)).replace("str", "a text").replace("float", "a number")
+            expected = (
+                getattr(kind, "__name__", str(kind)).replace("str", "a text").replace("float", "a number")
+            )
             raise PlanningError(expected=expected, value=value, at=places.of(key)) from None
 
 
 def _listed(value: Any, kind: Any) -> Any:
-    """A single value as a list of one, where the option may be repeated."""
-    is_repeated = getattr(kind, "__origin__", None) is list
-    return [value] if is_repeated and not isinstance(value, list | tuple) else value
+    """A single value as a list of one where the option may be repeated, and a list of one as its value elsewhere."""
+    is_list, is_repeated = isinstance(value, list | tuple), getattr(kind, "__origin__", None) is list
+    if is_list and not is_repeated and len(value) == 1:
+        return value[0]
+    return [value] if is_repeated and not is_list else value
 
 
 def _built(group: type, values: Mapping[str, Any], folder: Path, is_optional: bool) -> Any:
@@ -263,7 +266,10 @@ def inside(folder: Path, path: str | os.PathLike[str]) -> Path:
     whole = folder / path
     if not Path(os.path.realpath(whole)).is_relative_to(os.path.realpath(folder)):
         raise PlanningError(
-            expected="a path inside the cell", value=str(path), at=Place(folder / CELL_FILE), remedy="copy the file there"
+            expected="a path inside the cell",
+            value=str(path),
+            at=Place(folder / CELL_FILE),
+            remedy="copy the file there",
         )
     return whole
 
@@ -287,7 +293,9 @@ def template(document: Mapping[str, Any]) -> str:
             lines.append(f"# {key}:  # {optional[key]}")
     if document.get("camera") is not None:
         lines += ["camera:", *(f"  {key}: {_yaml(value)}" for key, value in document["camera"].items())]
-    lines.append("# surroundings:  # floor, boxes, tracker, joint margins: see the documentation of `pisigma plan`")
+    lines.append(
+        "# surroundings:  # floor, boxes, tracker, joint margins: see the documentation of `pisigma plan`"
+    )
     for step, group in STEPS.items():
         lines += ["", f"{step}:  # as the options of `pisigma {step}`"]
         for setting in flat_settings(group):
@@ -308,5 +316,3 @@ def _yaml(value: Any) -> str:
 def is_cell(path: str | os.PathLike[str]) -> bool:
     """Whether a folder is a cell."""
     return (Path(path) / CELL_FILE).is_file()
-
-

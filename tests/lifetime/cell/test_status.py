@@ -1,0 +1,117 @@
+"""Every state of a cell is reached by stated facts, and its command is the one that changes it."""
+
+from dataclasses import replace
+from typing import get_args
+
+import pytest
+
+from pisigma.lifetime.cell.history import ARM_EVENTS, Check, Event, ModelEntry, SessionEntry
+from pisigma.lifetime.cell.status import MAX_DAYS_UNVERIFIED, CellFacts, State, next_step, valid_sessions
+
+
+def session(name, rows=40, **changed):
+    return SessionEntry(name, "hash", f"{name}T09:00:00+00:00", name[:10], rows, "position", **changed)
+
+
+def model(name, sessions, day="2026-01-10", **changed):
+    return ModelEntry(name, "hash", f"{day}T12:00:00+00:00", sessions, day, **changed)
+
+
+def check(command, of, session="", verdict="better", action=False, p95=0.1, at="2026-02-10T10:00:00+00:00"):
+    return Check(command, of, session, verdict, f"{verdict} was found", p95, action, at)
+
+
+FIRST, SECOND = session("2026-01-10"), session("2026-02-10", rows=10)
+MODEL = model("a", "2026-01-10", p95_mm=0.1)
+EMPTY = CellFacts("cell", (), (), (), (), (), (), None, 0.3, "2026-02-11")
+PLANNED = replace(EMPTY, plans=("2026-01-09",))
+MEASURED = replace(PLANNED, sessions=(FIRST,))
+CALIBRATED = replace(MEASURED, models=(MODEL,), checks=(check("calibrate", "a"),))
+MEASURED_AGAIN = replace(CALIBRATED, sessions=(FIRST, SECOND))
+VERIFIED = replace(
+    MEASURED_AGAIN, checks=(*CALIBRATED.checks, check("verify", "a", "2026-02-10")), in_use=MODEL
+)
+THIRD = session("2026-03-10", rows=10)
+MONITORED = replace(VERIFIED, sessions=(FIRST, SECOND, THIRD), today="2026-03-11")
+NEWER = model("b", "2026-01-10,2026-02-10", day="2026-02-10", p95_mm=0.1)
+
+CASES = {
+    "no_plan": (EMPTY, "plan"),
+    "not_measured": (PLANNED, "measure"),
+    "not_calibrated": (MEASURED, "calibrate"),
+    "not_trusted": (
+        replace(MEASURED, checks=(check("calibrate", "", verdict="not_trusted"),)),
+        "measure",
+    ),
+    "not_verified": (MEASURED_AGAIN, "verify"),
+    "verification_failed": (
+        replace(MEASURED_AGAIN, checks=(check("verify", "a", "2026-02-10", "not_better", True),)),
+        "calibrate",
+    ),
+    "session_not_judged": (MONITORED, "monitor"),
+    "moved": (
+        replace(
+            MONITORED, checks=(*VERIFIED.checks, check("monitor", "a", "2026-03-10", "moved", action=True))
+        ),
+        "recalibrate",
+    ),
+    "better_model": (
+        replace(
+            MONITORED,
+            models=(MODEL, NEWER),
+            checks=(*VERIFIED.checks, check("monitor", "a", "2026-03-10", "unchanged")),
+        ),
+        "verify",
+    ),
+    "outside_limit": (replace(VERIFIED, limit_mm=0.05), "plan"),
+    "verification_due": (replace(VERIFIED, today="2026-09-01"), "plan"),
+    "edited_session": (replace(VERIFIED, edited=("2026-01-10",)), "session"),
+    "up_to_date": (VERIFIED, ""),
+}
+
+
+def test_every_state_is_a_case():
+    assert set(CASES) == set(get_args(State))
+
+
+@pytest.mark.parametrize("state", CASES)
+def test_facts_lead_to_their_state_and_its_command(state):
+    facts, verb = CASES[state]
+    step = next_step(facts)
+    assert step.state == state
+    assert step.command.split()[:3] == (["pisigma", verb, "cell"] if verb else [])
+    assert step.to_json() == {"state": state, "reason": step.reason, "command": step.command or None}
+
+
+@pytest.mark.parametrize("kind", ["instrument", "tool", "firmware", *ARM_EVENTS])
+def test_only_events_of_the_arm_end_the_validity_of_sessions(kind):
+    event = Event("2026-02-01", kind, "", "2026-02-01T08:00:00+00:00")
+    valid = valid_sessions((FIRST, SECOND), (event,))
+    assert valid == ((SECOND,) if kind in ARM_EVENTS else (FIRST, SECOND))
+
+
+def test_a_session_of_the_day_of_an_event_was_measured_after_it():
+    event = Event("2026-02-10", "mastering", "", "2026-02-10T08:00:00+00:00")
+    assert valid_sessions((FIRST, SECOND), (event,)) == (SECOND,)
+    assert next_step(replace(VERIFIED, events=(event,), in_use=None)).state == "not_calibrated"
+
+
+def test_a_session_that_was_set_aside_counts_no_more():
+    aside = replace(SECOND, set_aside="wrong tool")
+    assert next_step(replace(MEASURED_AGAIN, sessions=(FIRST, aside))).state == "not_verified"
+    assert valid_sessions((FIRST, aside), ()) == (FIRST,)
+
+
+def test_a_new_session_after_a_calibration_that_failed_is_calibrated_with():
+    failed = check("calibrate", "", verdict="not_trusted", at="2026-01-11T00:00:00+00:00")
+    assert next_step(replace(MEASURED, checks=(failed,))).state == "not_trusted"
+    later = replace(MEASURED, sessions=(FIRST, SECOND), checks=(failed,))
+    assert next_step(later).state == "not_calibrated"
+
+
+@pytest.mark.parametrize(("days", "state"), [(0, "up_to_date"), (1, "verification_due")])
+def test_verification_is_due_after_a_quarter(days, state):
+    import datetime
+
+    today = datetime.date(2026, 2, 10) + datetime.timedelta(days=MAX_DAYS_UNVERIFIED + days)
+    assert next_step(replace(VERIFIED, today=today.isoformat())).state == state

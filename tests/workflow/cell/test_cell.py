@@ -1,0 +1,218 @@
+"""A cell from its drawing to a recalibrated model: every step finds its rows and settings, and status the next step."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+from testing.closeness import assert_close
+from testing.models import no_type_checker
+from testing.refusals import refused
+from testing.simulated_arm import BASE, TOOL, dh_errors, draw_joints
+
+from pisigma.files.errors import AcceptanceError, MeasurementError, ModelError, OutputError
+from pisigma.measurement.dataset import Measurements
+from pisigma.model.folder.model_folder import load_model
+from pisigma.robot import Robot
+from pisigma.robot.kinematics.forward import forward_kinematics
+from pisigma.workflow.calibrate import calibrate
+from pisigma.workflow.cell.cell import Cell
+from pisigma.workflow.settings.calibration import CalibrationSettings
+
+ROBOT = Robot.load("ur10")
+
+
+def measured(rows, seed, zero=0.0, base=BASE, scale=1.0):
+    """Rows of a UR10 with errors, whose third joint has moved by `zero` [deg]."""
+    dh = ROBOT.dh + dh_errors(ROBOT, 3e-4, 5e-4, np.random.default_rng(0))
+    dh[2, 0] += np.deg2rad(zero)
+    rng = np.random.default_rng([seed, 7])
+    q = draw_joints(ROBOT, rows, rng)
+    T = forward_kinematics(ROBOT.with_geometry(dh=dh, base=base, tool=TOOL), q)
+    noise = 3e-5 * torch.from_numpy(rng.normal(size=(rows, 3)))
+    return Measurements(q=q, position=scale * T[:, :3, 3] + noise)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def quick(blank_pictures):
+    with no_type_checker():
+        yield
+
+
+@pytest.fixture(scope="module")
+def year(tmp_path_factory):
+    """A cell that was calibrated, verified, and recalibrated after a collision; with every state on the way."""
+    cell = Cell.create(tmp_path_factory.mktemp("cells") / "welder7", "ur10", limit_mm=0.5)
+    states = [cell.status().step.state]
+
+    def then(step):
+        result = step()
+        states.append(cell.status().step.state)
+        return result
+
+    then(lambda: cell.plan(candidates=200, count=12, check=2))
+    then(lambda: cell.take_in(measured(60, 1), day="2026-01-10"))
+    calibrated = then(lambda: cell.calibrate(folds=2))
+    then(lambda: cell.take_in(measured(12, 2), day="2026-02-10"))
+    verified = then(cell.verify)
+    then(lambda: cell.take_in(measured(12, 3, zero=0.08), day="2026-11-10"))
+    return cell, states, calibrated, verified
+
+
+def test_status_names_every_step_on_the_way(year):
+    _, states, _, _ = year
+    assert states[:-2] == ["no_plan", "not_measured", "not_calibrated", "not_verified", "not_verified"]
+    assert states[-1] == "session_not_judged"
+
+
+def test_the_model_is_that_of_the_rows_without_a_cell_to_the_bit(year):
+    cell, _, (calibration, entry), _ = year
+    rows = Measurements.read_csv(cell.folder / "sessions" / "2026-01-10.csv", ROBOT)
+    alone = calibrate("ur10", rows, CalibrationSettings(folds=2))
+    assert np.array_equal(alone.model.identified.dh, calibration.model.identified.dh)
+    assert_close(
+        load_model(cell.model_folder(entry.name)).identified.dh, alone.model.identified.dh, atol=1e-14
+    )
+
+
+def test_the_first_model_goes_into_use_when_it_is_verified(year):
+    cell, _, (_, entry), (verification, verified) = year
+    assert verification.verdict == "better"
+    assert (verified, cell.history.in_use) == (entry, entry)
+    assert cell.model.name == entry.name
+
+
+def test_a_move_is_found_and_recalibrated(year):
+    cell, *_ = year
+    found = cell.monitor()
+    assert [one["what"] for one in found.sessions[-1].to_json()["moved"]] == ["joint 3"]
+    assert cell.status().step.state == "moved"
+    result, entry = cell.recalibrate()
+    assert result.trusted
+    assert cell.history.in_use == entry
+    assert entry.parent == cell.history.models()[0].name
+    assert cell.status().step.state == "up_to_date"
+    cell.use(entry.parent, "try")
+    assert cell.history.in_use.name == entry.parent
+    cell.use(entry.name, "back")
+
+
+@pytest.mark.parametrize("again", ["same", "file"])
+def test_rows_that_are_known_are_refused(year, again, tmp_path):
+    cell, *_ = year
+    rows = measured(12, 2)
+    if again == "file":
+        rows.write_csv(tmp_path / "again.csv", ROBOT)
+        rows = tmp_path / "again.csv"
+    with refused(MeasurementError):
+        cell.take_in(rows, day="2026-03-10")
+
+
+def test_rows_in_inches_are_refused_and_not_stored(year):
+    cell, *_ = year
+    before = cell.history.sessions()
+    with refused(AcceptanceError):
+        cell.take_in(measured(12, 5, scale=1 / 25.4), day="2026-03-11")
+    assert cell.history.sessions() == before
+    assert cell.status().not_taken_in == ()
+
+
+def test_a_file_that_was_edited_is_named_and_not_used(year):
+    cell, *_ = year
+    path = cell.folder / "sessions" / "2026-01-10.csv"
+    content = path.read_bytes()
+    path.write_bytes(content.replace(b"0", b"1", 1))
+    try:
+        assert cell.status().step.state == "edited_session"
+        with refused(MeasurementError, file="2026-01-10.csv"):
+            cell.calibrate()
+    finally:
+        path.write_bytes(content)
+    assert cell.status().step.state != "edited_session"
+
+
+def test_a_changed_model_is_not_put_into_use(year):
+    cell, *_ = year
+    entry = cell.history.models()[0]
+    path = cell.folder / "models" / entry.name / "model.yaml"
+    content = path.read_bytes()
+    path.write_bytes(content + b"\n")
+    try:
+        with refused(ModelError):
+            cell.use(entry.name, "")
+    finally:
+        path.write_bytes(content)
+
+
+def test_sessions_before_and_after_an_event_of_the_instrument_are_in_two_frames(tmp_path):
+    cell = Cell.create(tmp_path / "cell", "ur10")
+    moved = np.add(BASE, [0.5, 0.2, 0, 0.3, 0, 0])
+    cell.take_in(measured(30, 1), day="2026-01-10")
+    cell.record("instrument", "2026-01-15")
+    cell.take_in(measured(30, 2, base=moved), day="2026-01-20")
+    rows = cell.rows_of(cell.history.sessions())
+    assert set(rows.frame) == {"", "since 2026-01-15"}
+    calibration, entry = cell.calibrate(model="geometric", folds=0)
+    assert calibration.trusted
+    assert set(calibration.model.bases) == {"", "since 2026-01-15"}
+    assert (entry.frame_day, entry.target_day) == ("2026-01-15", "")
+    cell.take_in(measured(12, 3, base=moved), day="2026-02-01")
+    verification, _ = cell.verify()
+    assert verification.verdict == "better"
+    assert not verification.settings.fit_frame
+    cell.record("instrument", "2026-02-02")
+    cell.take_in(measured(12, 4), day="2026-02-03")
+    again, _ = cell.verify()
+    assert again.settings.fit_frame
+    assert again.verdict == "better"
+    cell.record("mastering", "2026-02-10")
+    assert cell.status().step.state == "no_plan"
+    with refused(MeasurementError):
+        cell.calibrate()
+
+
+def test_a_file_in_the_folder_of_sessions_is_taken_in_by_the_next_step(tmp_path):
+    cell = Cell.create(tmp_path / "cell", "ur10")
+    measured(40, 1).write_csv(cell.folder / "sessions" / "by hand 2026-01-10.csv", ROBOT)
+    assert cell.status().not_taken_in == ("by hand 2026-01-10.csv",)
+    _, entry = cell.calibrate(model="geometric", folds=0)
+    assert entry.sessions == "by hand 2026-01-10"
+    assert cell.status().not_taken_in == ()
+    (one,) = cell.history.sessions()
+    assert dataclasses.replace(one, sha256="", taken_in="", remark="").day == "2026-01-10"
+
+
+def test_a_session_is_set_aside_with_a_reason(tmp_path):
+    cell = Cell.create(tmp_path / "cell", "ur10")
+    cell.take_in(measured(20, 1), day="2026-01-10")
+    with refused(MeasurementError, option="--set-aside"):
+        cell.set_aside("2026-01-10", " ")
+    with refused(MeasurementError, option="session", value="2026-01-1"):
+        cell.set_aside("2026-01-1", "wrong tool")
+    cell.set_aside("2026-01-10", "wrong tool")
+    assert cell.status().step.state == "no_plan"
+    assert (cell.folder / "sessions" / "2026-01-10.csv").exists()
+
+
+def test_a_folder_that_holds_something_is_not_made_a_cell(tmp_path):
+    (tmp_path / "notes.txt").write_text("mine")
+    with refused(OutputError, file=tmp_path):
+        Cell.create(tmp_path, "ur10")
+
+
+def test_a_new_calibration_goes_into_use_only_where_new_rows_show_that_it_is_better(tmp_path):
+    cell = Cell.create(tmp_path / "cell", "ur10")
+    cell.take_in(measured(14, 1), day="2026-01-10")
+    cell.calibrate(model="geometric", folds=0)
+    cell.take_in(measured(8, 2), day="2026-01-11")
+    cell.verify()
+    first = cell.history.in_use
+    cell.take_in(measured(60, 3), day="2026-01-12")
+    cell.take_in(measured(30, 4), day="2026-01-13")
+    _, entry = cell.calibrate(model="geometric", folds=0)
+    assert first is not None
+    assert cell.history.in_use == entry
+    same, again = cell.calibrate(model="geometric", folds=0)
+    assert same.trusted
+    assert cell.history.in_use == entry
+    assert again.name not in {one.model for one in cell.history.uses()}

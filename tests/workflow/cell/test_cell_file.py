@@ -1,0 +1,88 @@
+"""`cell.yaml`: made of the settings, read into the settings, and with file, line and key in every complaint."""
+
+import pytest
+from testing.refusals import refused
+
+from pisigma.files.errors import PlanningError
+from pisigma.workflow.cell.cell_file import (
+    CAMERA_KEYS,
+    CELL_FILE,
+    STEPS,
+    CellFile,
+    flat_settings,
+    key_of,
+    template,
+)
+from pisigma.workflow.settings.calibration import CalibrationSettings
+from pisigma.workflow.settings.recalibration import RecalibrationSettings
+
+
+def cell_file(folder, text):
+    (folder / CELL_FILE).write_text(text)
+    return CellFile.read(folder)
+
+
+def test_a_new_file_states_every_setting_as_a_comment_and_gives_the_defaults(tmp_path):
+    text = template({"robot": "ur10", "sensor": "tracker", "limit_mm": 0.3})
+    file = cell_file(tmp_path, text)
+    assert file.document.robot == "ur10"
+    for step, group in STEPS.items():
+        section = text.partition(f"\n{step}:")[2].partition("\n\n")[0]
+        for setting in flat_settings(group):
+            if key_of(setting) not in (*CAMERA_KEYS, "limit_mm", "sensor"):
+                assert f"\n  # {key_of(setting)}:" in section, (step, key_of(setting))
+    assert file.settings("calibrate") == CalibrationSettings()
+    assert file.settings("recalibrate") == RecalibrationSettings()
+
+
+def test_values_have_the_units_and_forms_of_the_command_line(tmp_path):
+    file = cell_file(
+        tmp_path,
+        "robot: ur10\ncalibrate:\n  prior_mm: 2\n  free: a_2,theta_3\n  socket_distance: A,B,50\n  gravity: 0,0,-1\n",
+    )
+    settings = file.settings("calibrate")
+    assert settings.prior_length == pytest.approx(2e-3)
+    assert settings.free == ("a_2", "theta_3")
+    assert settings.socket_distances == {("A", "B"): 0.05}
+    assert settings.gravity == (0, 0, -1)
+
+
+def test_what_is_stated_once_counts_for_every_step_and_a_step_may_state_another(tmp_path):
+    file = cell_file(tmp_path, "robot: ur10\nlimit_mm: 0.3\nplan:\n  limit_mm: 0.5\n")
+    assert file.settings("monitor").limit_mm == 0.3
+    assert file.settings("plan").limit_mm == 0.5
+    assert file.settings("monitor", limit_mm=0.4).limit_mm == 0.4
+
+
+def test_a_camera_is_stated_once_with_paths_inside_the_cell(tmp_path):
+    for name in ("camera.yaml", "board.yaml"):
+        (tmp_path / name).write_text("")
+    text = "robot: ur10\ncamera:\n  camera: [camera.yaml]\n  board: [board.yaml]\n  fixed_camera: true\n"
+    file = cell_file(tmp_path, text)
+    for step in ("calibrate", "verify", "monitor", "recalibrate", "compare", "evaluate"):
+        cameras = file.settings(step).cameras
+        assert cameras.cameras == (str(tmp_path / "camera.yaml"),)
+        assert cameras.is_fixed
+
+
+@pytest.mark.parametrize(
+    ("text", "fields"),
+    [
+        ("robot: ur10\ncalibrate:\n  fold: 3\n", {"line": 3, "column": "calibrate.fold"}),
+        ("robot: ur10\ncalibrate:\n  folds: x\n", {"line": 3, "column": "calibrate.folds", "value": "x"}),
+        ("robot: ur10\nimport:\n  wuthin: 3\n", {"line": 3, "column": "import.wuthin"}),
+        ("robot: ur10\nplan:\n  count: 1.5\n", {"line": 3, "column": "plan.count", "value": 1.5}),
+        ("robot: ur10\nplan:\n  task: ../secret.csv\n", {"value": "../secret.csv"}),
+    ],
+)
+def test_a_fault_is_refused_with_its_line_and_key(tmp_path, text, fields):
+    with refused(PlanningError, file=CELL_FILE, **fields):
+        cell_file(tmp_path, text).settings("plan")
+
+
+@pytest.mark.parametrize(
+    "text", ["robot: ur10\nsensor: radar\n", "robots: ur10\n", "robot: ur10\nlimit_mm: -1\n"]
+)
+def test_a_document_that_is_not_one_is_refused(tmp_path, text):
+    with pytest.raises(PlanningError):
+        cell_file(tmp_path, text)
