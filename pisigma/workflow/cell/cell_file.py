@@ -316,3 +316,19 @@ def _yaml(value: Any) -> str:
 def is_cell(path: str | os.PathLike[str]) -> bool:
     """Whether a folder is a cell."""
     return (Path(path) / CELL_FILE).is_file()
+
+
+def cells_in(folder: str | os.PathLike[str]) -> tuple[Path, ...]:
+    """The cells in a folder, by their names.
+
+    Raises:
+        PlanningError: there is none.
+    """
+    found = tuple(sorted(path.parent for path in Path(folder).glob(f"*/{CELL_FILE}")))
+    if not found:
+        raise PlanningError(
+            expected=f"a cell (a folder with a {CELL_FILE}) or a folder of cells",
+            value=os.fspath(folder),
+            remedy="make one with `pisigma new`",
+        )
+    return found

@@ -1,0 +1,239 @@
+"""`pisigma new`, `status`, `use`, `session`, `event`, `pack` and `unpack`: a cell, and what to do with it next."""
+
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from pisigma.cli.arguments import AsJson, complete_robot
+from pisigma.cli.endings import NOT_ACCEPTED
+from pisigma.cli.output import print_json, print_line, print_lines, print_table
+
+if TYPE_CHECKING:
+    from pisigma.workflow.cell.cell import CellStatus
+
+CellFolder = Annotated[Path, typer.Argument(metavar="CELL", help="Folder of a cell.")]
+Reason = Annotated[str, typer.Option(help="Reason, which the history keeps.")]
+MAX_LINES = 12
+"""Newest sessions that are shown."""
+
+
+def new(
+    robot: Annotated[
+        str,
+        typer.Argument(
+            metavar="ROBOT",
+            help="Catalogue name or robot file (YAML or URDF).",
+            autocompletion=complete_robot,
+        ),
+    ],
+    out: Annotated[Path, typer.Option(help="Folder to write.")],
+    sensor: Annotated[str, typer.Option(help="tracker, camera, sockets, draw-wire or touch.")] = "tracker",
+    limit_mm: Annotated[
+        float | None, typer.Option(help="Length below which 95 % of the position errors have to stay [mm].")
+    ] = None,
+    base: Annotated[str | None, typer.Option(help="Link of a URDF file that poses are given in.")] = None,
+    tip: Annotated[str | None, typer.Option(help="Link of a URDF file that is the tool.")] = None,
+    camera: Annotated[list[Path] | None, typer.Option(help="Camera file (YAML); may be repeated.")] = None,
+    board: Annotated[list[Path] | None, typer.Option(help="Board file (YAML); may be repeated.")] = None,
+    fixed_camera: Annotated[
+        bool, typer.Option("--fixed-camera", help="The camera is fixed and the board is on the flange.")
+    ] = False,
+    as_json: AsJson = False,
+) -> None:
+    """Make a cell: the folder of one robot on its mount, with its settings, sessions, models and history."""
+    from pisigma.measurement.camera.camera_files import CameraFiles
+    from pisigma.workflow.cell.cell import Cell
+
+    cameras = None
+    if camera or board:
+        cameras = CameraFiles(tuple(map(str, camera or ())), tuple(map(str, board or ())), fixed_camera)
+    cell = Cell.create(out, robot, sensor, limit_mm, base, tip, cameras)
+    if as_json:
+        print_json({"cell": str(out), **cell.status().to_json()})
+        return
+    print_lines([f"Cell written to {out}; its cell.yaml states every setting with its default."])
+    _print_next(cell.status())
+
+
+def status(
+    cell: Annotated[Path, typer.Argument(metavar="CELL|FOLDER", help="A cell, or a folder of cells.")],
+    exit_code: Annotated[
+        bool, typer.Option("--exit-code", help="End with status 3 where something has to be done.")
+    ] = False,
+    watch: Annotated[float | None, typer.Option(min=1, help="Print again every so many seconds [s].")] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Say where a robot stands and what to do next, with the command; of a folder, of every cell in it."""
+    while True:
+        states = _status(cell, as_json)
+        if watch is None:
+            break
+        time.sleep(watch)
+    if exit_code and states != {"up_to_date"}:
+        raise typer.Exit(NOT_ACCEPTED)
+
+
+def _status(path: Path, as_json: bool) -> set[str]:
+    """Print the status of a cell or of a folder of cells; give the states."""
+    from pisigma.workflow.cell.cell import Cell
+    from pisigma.workflow.cell.cell_file import cells_in, is_cell
+
+    if is_cell(path):
+        one = Cell.open(path).status()
+        if as_json:
+            print_json(one.to_json())
+        else:
+            _print_status(one)
+        return {one.step.state}
+    found = [Cell.open(folder).status() for folder in cells_in(path)]
+    if as_json:
+        print_json({"cells": [one.to_json() for one in found]})
+    else:
+        rows = [
+            (
+                Path(one.facts.folder).name,
+                one.facts.in_use.name if one.facts.in_use else "",
+                one.facts.sessions[-1].day if one.facts.sessions else "",
+                one.step.state,
+            )
+            for one in found
+        ]
+        print_table(f"{len(found)} cells in {path}", ("cell", "model in use", "last session", "state"), rows)
+    return {one.step.state for one in found}
+
+
+def _print_status(status: "CellStatus") -> None:
+    """Print where a cell stands on one screen."""
+    facts, model = status.facts, status.facts.in_use
+    limit = "no limit is stated" if facts.limit_mm is None else f"the limit is {facts.limit_mm:g} mm"
+    if model is None:
+        print_lines([f"{facts.folder}: no model is in use; {limit}."])
+    else:
+        accuracy = (
+            "" if model.p95_mm is None else f", 95 % of held-out position errors below {model.p95_mm:.3f} mm"
+        )
+        count = len(model.sessions.split(","))
+        made = f"made of {count} session{'s' if count > 1 else ''} until {model.day}"
+        print_lines([f"{facts.folder}: model '{model.name}' is in use, {made}{accuracy}; {limit}."])
+    verdicts = {one.session: one.verdict for one in facts.checks}
+    rows = [
+        (
+            one.name,
+            str(one.rows),
+            one.sensor,
+            f"set aside: {one.set_aside}" if one.set_aside else verdicts.get(one.name, ""),
+        )
+        for one in facts.sessions[-MAX_LINES:]
+    ]
+    if rows:
+        print_table(f"sessions ({len(facts.sessions)})", ("session", "rows", "sensor", "verdict"), rows)
+    print_lines(f"{one.day}: {one.kind}{f' ({one.note})' if one.note else ''}" for one in facts.events)
+    print_lines(
+        f"sessions/{name} is taken in by the next step that reads rows." for name in status.not_taken_in
+    )
+    _print_next(status)
+
+
+def _print_next(status: "CellStatus") -> None:
+    """Print the next step and, on a line of its own, its command."""
+    reason = status.step.reason.rstrip(".")
+    print_lines([f"Next: {reason}."])
+    if status.step.command:
+        print_line(f"  {status.step.command}")
+
+
+def use(
+    cell: CellFolder,
+    model: Annotated[str, typer.Argument(help="Name of the model.")],
+    reason: Reason = "by hand",
+    as_json: AsJson = False,
+) -> None:
+    """Put a model of a cell into use; the one before stays, so that this can be undone."""
+    from pisigma.workflow.cell.cell import Cell
+
+    opened = Cell.open(cell)
+    before = opened.history.in_use
+    opened.use(model, reason)
+    if as_json:
+        print_json({"model": model, "before": before and before.name})
+    else:
+        undo = f" (undo: pisigma use {cell} {before.name})" if before else ""
+        print_lines([f"Model '{model}' is in use{undo}."])
+
+
+def session(
+    cell: CellFolder,
+    name: Annotated[str, typer.Argument(help="Name of the session.")],
+    set_aside: Annotated[str, typer.Option(help="Leave the session out from now on, for this reason.")],
+    as_json: AsJson = False,
+) -> None:
+    """Set a session of a cell aside; its file is kept."""
+    from pisigma.workflow.cell.cell import Cell
+
+    opened = Cell.open(cell)
+    opened.set_aside(name, set_aside)
+    if as_json:
+        print_json({"session": name, "set_aside": set_aside})
+    else:
+        print_lines([f"Session '{name}' is set aside."])
+        _print_next(opened.status())
+
+
+def event(
+    cell: CellFolder,
+    kind: Annotated[
+        str,
+        typer.Argument(help="instrument, tool, mastering, encoder, collision, maintenance or firmware."),
+    ],
+    date: Annotated[str, typer.Option(help="Day of the event, such as 2026-11-22. [default: today]")] = "",
+    note: Annotated[str, typer.Option(help="Free text.")] = "",
+    as_json: AsJson = False,
+) -> None:
+    """Record that the instrument, the tool or the arm was changed, which decides which sessions still count.
+
+    After an event of the instrument or the tool, rows are in a frame or of a target of their own. Mastering, encoder,
+    collision and maintenance end the validity of all earlier sessions for a calibration.
+    """
+    from pisigma.workflow.cell.cell import Cell
+
+    opened = Cell.open(cell)
+    recorded = opened.record(kind, date, note)
+    if as_json:
+        print_json({"day": recorded.day, "kind": recorded.kind, "note": recorded.note})
+    else:
+        print_lines([f"Recorded: {recorded.kind} on {recorded.day}."])
+        _print_next(opened.status())
+
+
+def pack(
+    cell: CellFolder,
+    out: Annotated[Path, typer.Option(help="File to write (.zip).")],
+    as_json: AsJson = False,
+) -> None:
+    """Write a whole cell into one file that can be sent."""
+    from pisigma.workflow.cell.archive import pack as workflow
+    from pisigma.workflow.cell.cell import Cell
+
+    count = workflow(Cell.open(cell), out)
+    if as_json:
+        print_json({"file": str(out), "files": count})
+    else:
+        print_lines([f"{count} files of {cell} written to {out}."])
+
+
+def unpack(
+    file: Annotated[Path, typer.Argument(help="Packed cell (.zip).")],
+    out: Annotated[Path, typer.Option(help="Folder to write.")],
+    as_json: AsJson = False,
+) -> None:
+    """Make a cell of a file of `pisigma pack`."""
+    from pisigma.workflow.cell.archive import unpack as workflow
+
+    opened = workflow(file, out)
+    if as_json:
+        print_json({"cell": str(out), **opened.status().to_json()})
+    else:
+        print_lines([f"Cell written to {out}."])
+        _print_next(opened.status())

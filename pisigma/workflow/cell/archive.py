@@ -1,0 +1,128 @@
+"""A cell as one ZIP file that can be sent, and back; nothing in it leads out of its folder."""
+
+import os
+import stat
+import zipfile
+from pathlib import Path, PurePosixPath
+
+from pisigma.files.errors import MeasurementError, OutputError, Place, PlanningError
+from pisigma.files.output_file import check_output
+from pisigma.files.scratch import FILE, FOLDER, scratch_beside
+from pisigma.workflow.cell.cell import Cell
+from pisigma.workflow.cell.cell_file import CELL_FILE
+
+MAX_BYTES = 2 * 10**9
+"""Of all files of a cell together."""
+_CHUNK = 2**20
+
+
+def pack(cell: Cell, path: str | os.PathLike[str]) -> int:
+    """Write all files of a cell into a ZIP file, whole or not at all.
+
+    Args:
+        cell: whose sessions have to be as they were taken in.
+        path: the file (.zip).
+
+    Returns:
+        The number of files.
+
+    Raises:
+        MeasurementError: a session was changed or removed.
+        OutputError: the file cannot be written, or the cell holds a link or more than 2 GB.
+    """
+    target = Path(path)
+    check_output(target, (".zip",), "a packed cell", (cell.folder,))
+    if edited := cell.status().facts.edited:
+        raise MeasurementError(f"session '{edited[0]}' was changed or removed", at=Place(cell.folder))
+    files = sorted(one for one in cell.folder.rglob("*") if not one.is_dir() or one.is_symlink())
+    for one in files:
+        if one.is_symlink() or not one.is_file():
+            raise OutputError(expected="regular files in the cell", value="a link or a device", at=Place(one))
+    if (size := sum(one.stat().st_size for one in files)) > MAX_BYTES:
+        raise OutputError(expected=f"at most {MAX_BYTES:,} bytes", value=size, at=Place(cell.folder))
+    try:
+        with scratch_beside(target, FILE) as scratch:
+            with zipfile.ZipFile(scratch, "w", zipfile.ZIP_DEFLATED) as archive:
+                for one in files:
+                    archive.write(one, one.relative_to(cell.folder).as_posix())
+            scratch.chmod(0o644)
+            os.replace(scratch, target)
+    except OSError as problem:
+        raise OutputError(f"the file cannot be written: {problem.strerror}", at=Place(path)) from None
+    return len(files)
+
+
+def unpack(path: str | os.PathLike[str], folder: str | os.PathLike[str]) -> Cell:
+    """Make a cell of a ZIP file that `pack` wrote, whole or not at all.
+
+    Args:
+        path: the file.
+        folder: to write; it must not exist.
+
+    Raises:
+        PlanningError: the file is not a packed cell, is damaged, holds links, paths that lead out of the folder or
+            more than 2 GB.
+        OutputError: the folder exists or cannot be written.
+    """
+    target = Path(folder)
+    if target.exists() or target.is_symlink():
+        raise OutputError("the folder exists", at=Place(folder), remedy="choose another --out")
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        with zipfile.ZipFile(path) as archive, scratch_beside(target, FOLDER) as scratch:
+            _check_members(archive, path)
+            for member in archive.infolist():
+                _extract(archive, member, scratch, path)
+            Cell.open(scratch)
+            scratch.chmod(0o755)
+            os.replace(scratch, target)
+    except (zipfile.BadZipFile, NotImplementedError, EOFError) as problem:
+        raise PlanningError(f"the file is not a packed cell: {problem}", at=Place(path)) from None
+    except FileNotFoundError:
+        raise PlanningError("there is no such file", at=Place(path)) from None
+    except OSError as problem:
+        raise OutputError(f"the cell cannot be written: {problem.strerror}", at=Place(folder)) from None
+    return Cell.open(target)
+
+
+def _check_members(archive: zipfile.ZipFile, path: str | os.PathLike[str]) -> None:
+    """Refuse what no packed cell holds."""
+    names = [one.filename for one in archive.infolist()]
+    if CELL_FILE not in names:
+        raise PlanningError(
+            expected=f"a packed cell with its {CELL_FILE}", value="another archive", at=Place(path)
+        )
+    if len({name.casefold() for name in names}) < len(names):
+        raise PlanningError(expected="different names of files", value="one name twice", at=Place(path))
+    for one in archive.infolist():
+        inside = PurePosixPath(one.filename)
+        leads_out = (
+            inside.is_absolute() or ".." in inside.parts or "\\" in one.filename or ":" in one.filename
+        )
+        mode = one.external_attr >> 16
+        if leads_out or (mode and not (stat.S_ISREG(mode) or stat.S_ISDIR(mode))):
+            raise PlanningError(expected="regular files inside the cell", value=one.filename, at=Place(path))
+    if (size := sum(one.file_size for one in archive.infolist())) > MAX_BYTES:
+        raise PlanningError(expected=f"at most {MAX_BYTES:,} bytes", value=size, at=Place(path))
+
+
+def _extract(
+    archive: zipfile.ZipFile, member: zipfile.ZipInfo, folder: Path, path: str | os.PathLike[str]
+) -> None:
+    """Write one file, and no more of it than the archive states."""
+    target = folder / member.filename
+    if member.is_dir():
+        target.mkdir(parents=True, exist_ok=True)
+        return
+    target.parent.mkdir(parents=True, exist_ok=True)
+    left = member.file_size
+    with archive.open(member) as source, target.open("wb") as file:
+        while chunk := source.read(_CHUNK):
+            left -= len(chunk)
+            if left < 0:
+                raise PlanningError(
+                    expected=f"{member.file_size:,} bytes",
+                    value="more",
+                    at=Place(path, None, member.filename),
+                )
+            file.write(chunk)
