@@ -139,9 +139,11 @@ def _print_status(status: "CellStatus") -> None:
 def _print_next(status: "CellStatus") -> None:
     """Print the next step and, on a line of its own, its command."""
     reason = status.step.reason.rstrip(".")
-    print_lines([f"Next: {reason}."])
     if status.step.command:
+        print_lines([f"Next step, because {reason}:"])
         print_line(f"  {status.step.command}")
+    else:
+        print_lines([f"Nothing to do: {reason}."])
 
 
 def use(

@@ -9,6 +9,7 @@ import typer
 
 from pisigma import __version__
 from pisigma.cli.calibrate import calibrate
+from pisigma.cli.cell import event, new, pack, session, status, unpack, use
 from pisigma.cli.endings import end_with, tell_problems
 from pisigma.cli.evaluate import evaluate
 from pisigma.cli.export import export
@@ -40,6 +41,8 @@ app = typer.Typer(
     rich_markup_mode=None,
 )
 for command in (
+    new,
+    status,
     robots,
     simulate,
     plan,
@@ -60,6 +63,11 @@ for command in (
     export,
     verify,
     upgrade,
+    use,
+    session,
+    event,
+    pack,
+    unpack,
 ):
     app.command(command.__name__.rstrip("_"), cls=ShortHelpCommand)(tell_problems(command))
 app.add_typer(fleet)

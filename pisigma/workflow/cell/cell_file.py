@@ -12,7 +12,7 @@ from pydantic import Field, TypeAdapter, ValidationError
 
 from pisigma.files.errors import Place, PlanningError, nearest_choice
 from pisigma.files.setting import Setting, settings_of
-from pisigma.files.yaml_file import Section, line_of, read_yaml
+from pisigma.files.yaml_file import Section, place_of_key, read_yaml
 from pisigma.planning.plan_settings import PlanSettings
 from pisigma.planning.surroundings.cell import Cell as Surroundings
 from pisigma.robot.row import Bounded
@@ -180,8 +180,7 @@ class _Places:
     step: str
 
     def of(self, key: str) -> Place:
-        keys = (self.step, key)
-        return Place(self.path, line_of(self.path, keys), f"{self.step}.{key}")
+        return place_of_key(self.path, (self.step, key))
 
 
 def key_of(setting: Setting) -> str:

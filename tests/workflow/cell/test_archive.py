@@ -1,0 +1,99 @@
+"""A packed cell is the same cell elsewhere, and an archive that is not one writes nothing."""
+
+import stat
+import zipfile
+
+import pytest
+from testing.refusals import refused
+
+from pisigma.files.errors import MeasurementError, OutputError, PlanningError
+from pisigma.workflow.cell.archive import pack, unpack
+from pisigma.workflow.cell.cell import Cell
+from pisigma.workflow.cell.cell_file import CELL_FILE
+
+
+@pytest.fixture
+def cell(tmp_path, repository):
+    cell = Cell.create(tmp_path / "here" / "welder7", "ur10", limit_mm=0.3)
+    cell.record("maintenance", "2026-01-10", "new gear")
+    (cell.folder / "sessions" / "notes.txt").write_text("by hand")
+    return cell
+
+
+def files(folder):
+    return {path.relative_to(folder): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def test_an_unpacked_cell_has_the_same_files(cell, tmp_path):
+    count = pack(cell, tmp_path / "welder7.zip")
+    other = unpack(tmp_path / "welder7.zip", tmp_path / "there" / "welder8")
+    assert files(other.folder) == files(cell.folder)
+    assert count == len(files(cell.folder))
+    assert other.history.events() == cell.history.events()
+    assert other.status().step.state == cell.status().step.state
+
+
+def archive(path, *members):
+    with zipfile.ZipFile(path, "w") as written:
+        written.writestr(CELL_FILE, "robot: ur10\n")
+        for name, mode in members:
+            info = zipfile.ZipInfo(name)
+            info.external_attr = mode << 16
+            written.writestr(info, "content")
+    return path
+
+
+@pytest.mark.parametrize(
+    "member",
+    [
+        ("../outside.txt", 0),
+        ("/etc/outside.txt", 0),
+        ("sessions/../../outside.txt", 0),
+        ("C:\\outside.txt", 0),
+        ("link", stat.S_IFLNK | 0o777),
+        ("pipe", stat.S_IFIFO | 0o644),
+        ("CELL.yaml", 0),
+    ],
+)
+def test_an_archive_that_leads_out_of_its_folder_is_refused_and_nothing_is_written(tmp_path, member):
+    path = archive(tmp_path / "bad.zip", member)
+    with refused(PlanningError, file="bad.zip"):
+        unpack(path, tmp_path / "cell")
+    assert sorted(tmp_path.iterdir()) == [path]
+
+
+def test_an_archive_that_claims_too_much_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr("pisigma.workflow.cell.archive.MAX_BYTES", 10)
+    with refused(PlanningError, file="big.zip"):
+        unpack(archive(tmp_path / "big.zip"), tmp_path / "cell")
+
+
+@pytest.mark.parametrize("content", [b"", b"no archive", b"PK\x03\x04 broken"])
+def test_a_file_of_another_kind_is_refused(tmp_path, content):
+    (tmp_path / "cell.zip").write_bytes(content)
+    with refused(PlanningError, file="cell.zip"):
+        unpack(tmp_path / "cell.zip", tmp_path / "cell")
+    assert not (tmp_path / "cell").exists()
+
+
+def test_a_missing_file_and_a_folder_that_exists_are_refused(cell, tmp_path):
+    with refused(PlanningError, file="no.zip"):
+        unpack(tmp_path / "no.zip", tmp_path / "cell")
+    pack(cell, tmp_path / "cell.zip")
+    with refused(OutputError, file=cell.folder):
+        unpack(tmp_path / "cell.zip", cell.folder)
+
+
+def test_a_cell_with_a_link_is_not_packed(cell, tmp_path):
+    (cell.folder / "link").symlink_to("/etc/hostname")
+    with refused(OutputError, file=cell.folder / "link"):
+        pack(cell, tmp_path / "cell.zip")
+    assert not (tmp_path / "cell.zip").exists()
+
+
+def test_a_cell_with_an_edited_session_is_not_packed(cell, tmp_path, repository):
+    from pisigma.lifetime.cell.history import SessionEntry
+
+    cell.history.add(SessionEntry("gone", "abc", "2026-01-11T00:00:00+00:00", "2026-01-11", 5, "position"))
+    with refused(MeasurementError):
+        pack(cell, tmp_path / "cell.zip")
