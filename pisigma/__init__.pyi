@@ -7,7 +7,6 @@ from pisigma.joint_correction.registry import register_feature as register_featu
 from pisigma.measurement.dataset import Measurements as Measurements
 from pisigma.measurement.sensors.registry import register_sensor as register_sensor
 from pisigma.model.inverse.corrected_ik import CorrectedIK as CorrectedIK
-from pisigma.model.inverse.corrected_ik import load as load
 from pisigma.model.inverse.solution import Solution as Solution
 from pisigma.network.pi_sigma import PiSigma as PiSigma
 from pisigma.planning.plan_settings import PlanSettings as PlanSettings
@@ -27,6 +26,7 @@ from pisigma.workflow.fleet.prior import estimate_fleet_prior as estimate_fleet_
 from pisigma.workflow.fleet.run import FleetRun as FleetRun
 from pisigma.workflow.fleet.run import run_fleet as run_fleet
 from pisigma.workflow.import_rows import import_rows as import_rows
+from pisigma.workflow.load import load as load
 from pisigma.workflow.monitor import Monitoring as Monitoring
 from pisigma.workflow.monitor import monitor as monitor
 from pisigma.workflow.plan import Plan as Plan

@@ -11,7 +11,7 @@ from pisigma.cli.endings import NOT_ACCEPTED
 from pisigma.cli.output import print_json, print_line, print_lines, print_table
 
 if TYPE_CHECKING:
-    from pisigma.workflow.cell.cell import CellStatus
+    from pisigma.lifetime.cell.status import CellStatus
 
 CellFolder = Annotated[Path, typer.Argument(metavar="CELL", help="Folder of a cell.")]
 Reason = Annotated[str, typer.Option(help="Reason, which the history keeps.")]
@@ -77,8 +77,9 @@ def status(
 
 def _status(path: Path, as_json: bool) -> set[str]:
     """Print the status of a cell or of a folder of cells; give the states."""
+    from pisigma.lifetime.cell.layout import is_cell
     from pisigma.workflow.cell.cell import Cell
-    from pisigma.workflow.cell.cell_file import cells_in, is_cell
+    from pisigma.workflow.cell.cell_file import cells_in
 
     if is_cell(path):
         one = Cell.open(path).status()
@@ -175,7 +176,7 @@ def session(
     from pisigma.workflow.cell.cell import Cell
 
     opened = Cell.open(cell)
-    opened.set_aside(name, set_aside)
+    opened.sessions.set_aside(name, set_aside)
     if as_json:
         print_json({"session": name, "set_aside": set_aside})
     else:

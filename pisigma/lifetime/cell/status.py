@@ -263,3 +263,38 @@ RULES: tuple[Callable[[CellFacts], Step | None], ...] = (
     _verification_due,
     _up_to_date,
 )
+
+
+@dataclass(frozen=True)
+class CellStatus:
+    """Where a cell stands.
+
+    Attributes:
+        facts: all that is known.
+        step: what to do next.
+        not_taken_in: files in `sessions/` that are not in the history yet.
+    """
+
+    facts: CellFacts
+    step: Step
+    not_taken_in: tuple[str, ...]
+
+    def to_json(self) -> dict[str, Any]:
+        """The status as plain values; `next.command` and `next.reason` are the next step."""
+        facts, model = self.facts, self.facts.in_use
+        return {
+            "cell": facts.folder,
+            "model": None if model is None else model.name,
+            "made_of": [] if model is None else model.sessions.split(","),
+            "p95_mm": None if model is None else model.p95_mm,
+            "limit_mm": facts.limit_mm,
+            "plans": list(facts.plans),
+            "sessions": [
+                {"name": one.name, "day": one.day, "rows": one.rows, "set_aside": one.set_aside or None}
+                for one in facts.sessions
+            ],
+            "events": [{"day": one.day, "kind": one.kind, "note": one.note} for one in facts.events],
+            "models": [{"name": one.name, "remark": one.remark} for one in facts.models],
+            "not_taken_in": list(self.not_taken_in),
+            "next": self.step.to_json(),
+        }

@@ -8,8 +8,8 @@ from pathlib import Path, PurePosixPath
 from pisigma.files.errors import MeasurementError, OutputError, Place, PlanningError
 from pisigma.files.output_file import check_output
 from pisigma.files.scratch import FILE, FOLDER, scratch_beside
+from pisigma.lifetime.cell.layout import CELL_FILE
 from pisigma.workflow.cell.cell import Cell
-from pisigma.workflow.cell.cell_file import CELL_FILE
 
 MAX_BYTES = 2 * 10**9
 """Of all files of a cell together."""

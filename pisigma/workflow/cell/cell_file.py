@@ -1,5 +1,7 @@
 """`cell.yaml`: what a cell is, and the settings of every step, with the names and units of the command line."""
 
+import functools
+import itertools
 import os
 import textwrap
 from collections.abc import Iterator, Mapping
@@ -13,6 +15,7 @@ from pydantic import Field, TypeAdapter, ValidationError
 from pisigma.files.errors import Place, PlanningError, nearest_choice
 from pisigma.files.setting import Setting, settings_of
 from pisigma.files.yaml_file import Section, place_of_key, read_yaml
+from pisigma.lifetime.cell.layout import CELL_FILE
 from pisigma.planning.plan_settings import PlanSettings
 from pisigma.planning.surroundings.cell import Cell as Surroundings
 from pisigma.robot.row import Bounded
@@ -24,7 +27,6 @@ from pisigma.workflow.settings.monitoring import MonitorSettings
 from pisigma.workflow.settings.recalibration import RecalibrationSettings
 from pisigma.workflow.settings.verification import VerificationSettings
 
-CELL_FILE = "cell.yaml"
 STEPS: dict[str, type] = {
     "plan": PlanSettings,
     "import": ImportSettings,
@@ -188,13 +190,16 @@ def key_of(setting: Setting) -> str:
     return setting.name.removeprefix("--").replace("-", "_")
 
 
-def flat_settings(group: type) -> Iterator[Setting]:
+@functools.cache
+def _settings(group: type) -> tuple[Setting, ...]:
+    return tuple(settings_of(group))
+
+
+@functools.cache
+def flat_settings(group: type) -> tuple[Setting, ...]:
     """The settings of a class, with those of the classes that it is made of."""
-    for setting in settings_of(group):
-        if setting.is_group:
-            yield from flat_settings(setting.kind)
-        else:
-            yield setting
+    parts = [flat_settings(one.kind) if one.is_group else (one,) for one in _settings(group)]
+    return tuple(itertools.chain.from_iterable(parts))
 
 
 def settings_from(group: type[Group], stated: Mapping[str, Any], places: _Places, folder: Path) -> Group:
@@ -241,7 +246,7 @@ def _listed(value: Any, kind: Any) -> Any:
 
 def _built(group: type, values: Mapping[str, Any], folder: Path, is_optional: bool) -> Any:
     found: dict[str, Any] = {}
-    for setting in settings_of(group):
+    for setting in _settings(group):
         if setting.is_group:
             if (built := _built(setting.kind, values, folder, is_optional=True)) is not None:
                 found[setting.field] = built
@@ -310,11 +315,6 @@ def _yaml(value: Any) -> str:
     if value is None:
         return ""
     return yaml.safe_dump(value, default_flow_style=True, width=1000).removesuffix("\n...\n").strip()
-
-
-def is_cell(path: str | os.PathLike[str]) -> bool:
-    """Whether a folder is a cell."""
-    return (Path(path) / CELL_FILE).is_file()
 
 
 def cells_in(folder: str | os.PathLike[str]) -> tuple[Path, ...]:

@@ -7,9 +7,9 @@ import pytest
 from testing.refusals import refused
 
 from pisigma.files.errors import MeasurementError, OutputError, PlanningError
+from pisigma.lifetime.cell.layout import CELL_FILE
 from pisigma.workflow.cell.archive import pack, unpack
 from pisigma.workflow.cell.cell import Cell
-from pisigma.workflow.cell.cell_file import CELL_FILE
 
 
 @pytest.fixture

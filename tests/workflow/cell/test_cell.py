@@ -10,6 +10,7 @@ from testing.models import no_type_checker
 from testing.refusals import refused
 from testing.simulated_arm import BASE, TOOL, dh_errors, draw_joints
 
+import pisigma
 from pisigma.files.errors import AcceptanceError, MeasurementError, ModelError, OutputError
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.folder.model_folder import load_model
@@ -150,7 +151,7 @@ def test_sessions_before_and_after_an_event_of_the_instrument_are_in_two_frames(
     cell.take_in(measured(30, 1), day="2026-01-10")
     cell.record("instrument", "2026-01-15")
     cell.take_in(measured(30, 2, base=moved), day="2026-01-20")
-    rows = cell.rows_of(cell.history.sessions())
+    rows = cell.sessions.rows_of(cell.history.sessions())
     assert set(rows.frame) == {"", "since 2026-01-15"}
     calibration, entry = cell.calibrate(model="geometric", folds=0)
     assert calibration.trusted
@@ -186,10 +187,10 @@ def test_a_session_is_set_aside_with_a_reason(tmp_path):
     cell = Cell.create(tmp_path / "cell", "ur10")
     cell.take_in(measured(20, 1), day="2026-01-10")
     with refused(MeasurementError, option="--set-aside"):
-        cell.set_aside("2026-01-10", " ")
+        cell.sessions.set_aside("2026-01-10", " ")
     with refused(MeasurementError, option="session", value="2026-01-1"):
-        cell.set_aside("2026-01-1", "wrong tool")
-    cell.set_aside("2026-01-10", "wrong tool")
+        cell.sessions.set_aside("2026-01-1", "wrong tool")
+    cell.sessions.set_aside("2026-01-10", "wrong tool")
     assert cell.status().step.state == "no_plan"
     assert (cell.folder / "sessions" / "2026-01-10.csv").exists()
 
@@ -216,3 +217,12 @@ def test_a_new_calibration_goes_into_use_only_where_new_rows_show_that_it_is_bet
     assert same.trusted
     assert cell.history.in_use == entry
     assert again.name not in {one.model for one in cell.history.uses()}
+
+
+def test_load_takes_the_model_in_use(year, tmp_path):
+    cell, *_ = year
+    ik = pisigma.load(cell.folder)
+    assert ik.model.name == cell.history.in_use.name
+    empty = Cell.create(tmp_path / "empty", "ur10")
+    with refused(ModelError, file=empty.folder):
+        pisigma.load(empty.folder)

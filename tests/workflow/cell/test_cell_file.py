@@ -4,9 +4,9 @@ import pytest
 from testing.refusals import refused
 
 from pisigma.files.errors import PlanningError
+from pisigma.lifetime.cell.layout import CELL_FILE
 from pisigma.workflow.cell.cell_file import (
     CAMERA_KEYS,
-    CELL_FILE,
     STEPS,
     CellFile,
     flat_settings,

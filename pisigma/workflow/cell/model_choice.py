@@ -1,0 +1,108 @@
+"""What new rows say of the models of a cell: which is better, and whether the one in use still holds."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import TypeVar
+
+from pisigma.files.progress import Progress
+from pisigma.lifetime.cell.history import Check, ModelEntry, SessionEntry, now
+from pisigma.lifetime.cell.layout import MODELS
+from pisigma.model.calibrated_model import CalibratedModel
+from pisigma.model.folder.model_folder import load_model
+from pisigma.workflow.calibrate import calibrate
+from pisigma.workflow.cell.sessions import Sessions, newest_day, since
+from pisigma.workflow.evaluate import evaluate
+from pisigma.workflow.monitor import Monitoring
+from pisigma.workflow.settings.calibration import CalibrationSettings
+from pisigma.workflow.settings.evaluation import EvaluationSettings
+
+MIN_ROWS = 10
+"""Of the newest session, which is held out."""
+Value = TypeVar("Value")
+
+
+def is_better(
+    stored: Sessions,
+    in_use: ModelEntry,
+    sessions: Sequence[SessionEntry],
+    settings: CalibrationSettings,
+    progress: Progress,
+) -> tuple[bool, str]:
+    """Say whether a calibration from some sessions is better than the model in use, and why.
+
+    The calibration is repeated without the newest session, on which both are then compared: it is better where the
+    confidence interval of the difference of the mean position errors is below 0.
+
+    Args:
+        stored: the sessions of the cell.
+        in_use: the model in use.
+        sessions: that the new calibration was made of, by their days.
+        settings: of the calibration.
+        progress: called with what is being done.
+    """
+    newest, older = sessions[-1], list(sessions[:-1])
+    if newest.name in in_use.sessions.split(",") or newest.rows < MIN_ROWS or not older:
+        return False, f"no session of {MIN_ROWS} rows or more is new to it and to '{in_use.name}'"
+    progress("calibration without the newest session")
+    alone = replace(settings, cameras=None, folds=0, hold_out=None)
+    without = calibrate(stored.robot, stored.rows_of(older), alone)
+    events, day = stored.history.events(), older[-1].day
+    entry = replace(
+        in_use,
+        day=day,
+        frame_day=newest_day(events, "instrument", day),
+        target_day=newest_day(events, "tool", day),
+    )
+    rows = stored.as_measured(newest)
+    seen = [stored.rows_for(one, rows, newest.day) for one in (in_use, entry)]
+    old = load_model(stored.folder.parent / MODELS / in_use.name)
+    judged = evaluate(
+        [replace(old, name="in use"), replace(with_names_of(without.model, entry, in_use), name="new")],
+        seen[0].rows,
+        EvaluationSettings(
+            fit_frame=any(one.fit_frame for one in seen), fit_tool=any(one.fit_tool for one in seen)
+        ),
+    )
+    difference = judged.models[-1].position.difference
+    interval = None if difference is None else difference.intervals["mean"]
+    means = [f"{one.position.statistics['mean']:.3f} mm ({one.name})" for one in judged.models]
+    figures = f"mean errors of session '{newest.name}', which neither was made of: {' and '.join(means)}"
+    return interval is not None and interval[1] < 0, figures
+
+
+def with_names_of(model: CalibratedModel, entry: ModelEntry, other: ModelEntry) -> CalibratedModel:
+    """A model whose newest frame and tool have the names that those of another model have."""
+
+    def renamed(values: Mapping[str, Value], day: str, other_day: str) -> dict[str, Value]:
+        newest = {since(name, other_day): value for name, value in _of_day(values, day).items()}
+        return newest | {name: value for name, value in values.items() if name not in newest}
+
+    frame, tool = (entry.frame_day, other.frame_day), (entry.target_day, other.target_day)
+    return replace(
+        model,
+        bases=renamed(model.bases, *frame),
+        hybrid_bases=renamed(model.hybrid_bases, *frame),
+        tools=renamed(model.tools, *tool),
+        hybrid_tools=renamed(model.hybrid_tools, *tool),
+    )
+
+
+def _of_day(values: Mapping[str, Value], day: str) -> dict[str, Value]:
+    """What was set up on a day, by the names of the files of rows."""
+    ending = since("", day)
+    if not day:
+        return {name: value for name, value in values.items() if " since " not in f" {name}"}
+    return {
+        name.removesuffix(ending).rstrip(): value for name, value in values.items() if name.endswith(ending)
+    }
+
+
+def check_of(found: Monitoring, entry: ModelEntry, session: SessionEntry) -> Check:
+    """The entry of what monitoring found of a session."""
+    if found.untrusted:
+        summary = found.untrusted[0].sentence
+        return Check("monitor", entry.name, session.name, "implausible", summary, None, True, now())
+    judged = found.sessions[-1].session
+    return Check(
+        "monitor", entry.name, session.name, judged.verdict, judged.sentence, None, judged.recalibrate, now()
+    )
