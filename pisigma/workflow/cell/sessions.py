@@ -3,14 +3,15 @@
 import datetime
 import hashlib
 import os
-from collections.abc import Sequence
+import tempfile
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
 
 from pisigma.files.errors import AcceptanceError, MeasurementError, OutputError, Place, check_choice
-from pisigma.files.output_file import write_whole
+from pisigma.files.scratch import FILE, scratch_beside
 from pisigma.lifetime.cell.history import Event, History, ModelEntry, SessionEntry, now
 from pisigma.lifetime.cell.layout import MODELS, SESSIONS
 from pisigma.lifetime.cell.status import valid_sessions
@@ -88,14 +89,17 @@ class Sessions:
         if not is_date(day):
             raise MeasurementError(expected=WANTED, value=day, option="--date")
         entry = self._judged(rows, day, accept_implausible)
-        path = free_path(self.folder, day, ".csv", {one.name for one in self.history.sessions()})
         if isinstance(file, Measurements):
-            file.write_csv(path, self.robot)
-        elif Path(file).parent.resolve() == self.folder.resolve():
+            with tempfile.TemporaryDirectory() as scratch:
+                file.write_csv(Path(scratch) / "rows.csv", self.robot)
+                content = (Path(scratch) / "rows.csv").read_bytes()
+        else:
+            content = Path(file).read_bytes()
+        if not isinstance(file, Measurements) and Path(file).parent.resolve() == self.folder.resolve():
             path = Path(file)
         else:
-            write_whole(path, Path(file).read_bytes())
-        entry = replace(entry, name=path.stem, sha256=sha256_of(path))
+            path = write_new(self.folder, day, content, {one.name for one in self.history.sessions()})
+        entry = replace(entry, name=path.stem, sha256=hashlib.sha256(content).hexdigest())
         self.history.add(entry)
         return entry
 
@@ -274,7 +278,7 @@ def not_taken_in(folder: Path, sessions: Sequence[SessionEntry]) -> tuple[str, .
     return tuple(sorted(path.name for path in folder.glob("*.csv") if path.stem not in names))
 
 
-def free_path(folder: Path, name: str, suffix: str, taken: set[str] = frozenset()) -> Path:  # type: ignore[assignment]
+def free_path(folder: Path, name: str, suffix: str, taken: Collection[str] = ()) -> Path:
     """A path in a folder that is not taken: NAME, NAME-2, NAME-3 and so on.
 
     Raises:
@@ -286,6 +290,35 @@ def free_path(folder: Path, name: str, suffix: str, taken: set[str] = frozenset(
         if not path.exists() and stem not in taken:
             return path
     raise OutputError(f"there are {MAX_NAMES:,} files of {name} already", at=Place(folder))
+
+
+def write_new(folder: Path, name: str, content: bytes, taken: Collection[str]) -> Path:
+    """Write a session under a name that no file has, whole or not at all, whatever other processes do meanwhile.
+
+    Args:
+        folder: to write to.
+        name: of the file, without ".csv"; see `free_path`.
+        content: of the file.
+        taken: further names that are taken.
+
+    Raises:
+        OutputError: it cannot be written.
+    """
+    while True:
+        path = free_path(folder, name, ".csv", taken)
+        try:
+            with scratch_beside(path, FILE) as scratch:
+                with scratch.open("wb") as file:
+                    file.write(content)
+                    file.flush()
+                    os.fsync(file.fileno())
+                scratch.chmod(0o644)
+                os.link(scratch, path)  # unlike a rename, it never replaces what another process wrote
+            return path
+        except FileExistsError:
+            continue
+        except OSError as problem:
+            raise OutputError(f"the session cannot be written: {problem.strerror}", at=Place(path)) from None
 
 
 def edited_sessions(folder: Path, sessions: Sequence[SessionEntry]) -> tuple[str, ...]:

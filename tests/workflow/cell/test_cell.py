@@ -17,6 +17,7 @@ from pisigma.model.folder.model_folder import load_model
 from pisigma.robot import Robot
 from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.workflow.calibrate import calibrate
+from pisigma.workflow.cell import sessions
 from pisigma.workflow.cell.cell import Cell
 from pisigma.workflow.settings.calibration import CalibrationSettings
 
@@ -226,3 +227,13 @@ def test_load_takes_the_model_in_use(year, tmp_path):
     empty = Cell.create(tmp_path / "empty", "ur10")
     with refused(ModelError, file=empty.folder):
         pisigma.load(empty.folder)
+
+
+def test_a_session_never_replaces_a_file_that_appeared_meanwhile(tmp_path, monkeypatch):
+    (tmp_path / "2026-01-10.csv").write_text("another process")
+    offered = iter([tmp_path / "2026-01-10.csv", tmp_path / "2026-01-10-2.csv"])
+    monkeypatch.setattr(sessions, "free_path", lambda *arguments: next(offered))
+    path = sessions.write_new(tmp_path, "2026-01-10", b"rows", ())
+    assert path.read_bytes() == b"rows"
+    assert (tmp_path / "2026-01-10.csv").read_text() == "another process"
+    assert sorted(one.name for one in tmp_path.iterdir()) == ["2026-01-10-2.csv", "2026-01-10.csv"]
