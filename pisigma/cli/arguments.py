@@ -31,7 +31,12 @@ def complete_export(incomplete: str) -> list[str]:
 
 
 ModelFolder = Annotated[Path, typer.Argument(help="Model folder.", autocompletion=complete_model)]
-"""The argument of commands that read one model."""
+"""The argument of commands that change one model."""
+
+ModelOrCell = Annotated[
+    Path, typer.Argument(metavar="MODEL|CELL", help="Model folder, or a cell.", autocompletion=complete_model)
+]
+"""The argument of commands that read one model, of a cell the one in use."""
 
 Verbose = Annotated[bool, typer.Option("--verbose", help="Print all tables and remarks.")]
 """The option of commands that print many figures."""

@@ -14,6 +14,7 @@ from pisigma.cli.arguments import (
     complete_model,
     complete_robot,
 )
+from pisigma.cli.cell import cell_at, next_lines, refuse_beside_cell, tell_replaced
 from pisigma.cli.lifetime.recalibrate import recalibrate_into
 from pisigma.cli.output import (
     command_line,
@@ -22,21 +23,27 @@ from pisigma.cli.output import (
 )
 from pisigma.cli.progress import progress_of
 from pisigma.cli.screen import Block, print_screen, sentences, table
-from pisigma.cli.settings_options import takes_settings
+from pisigma.cli.settings_options import StatedOptions, takes_settings
+from pisigma.files.errors import AcceptanceError
 from pisigma.workflow.settings.calibration import CalibrationSettings
 from pisigma.workflow.settings.recalibration import RecalibrationSettings
 
 if TYPE_CHECKING:
     from pisigma.validation.held_out.calibration_summary import CalibrationSummary
+    from pisigma.workflow.cell.cell import Cell
 
 RobotName = Annotated[
     str,
     typer.Argument(
-        metavar="ROBOT", help="Catalogue name or robot file (YAML or URDF).", autocompletion=complete_robot
+        metavar="ROBOT|CELL",
+        help="Catalogue name, robot file (YAML or URDF), or a cell.",
+        autocompletion=complete_robot,
     ),
 ]
-Data = Annotated[list[Path], typer.Argument(metavar="DATA...", help="Measurements (CSV), one or more files.")]
-Out = Annotated[Path, typer.Option(help="Model folder to write.")]
+Data = Annotated[
+    list[Path] | None, typer.Argument(metavar="DATA...", help="Measurements (CSV), one or more files.")
+]
+Out = Annotated[Path | None, typer.Option(help="Model folder to write.")]
 Base = Annotated[str | None, typer.Option(help="Base link of a URDF file. [default: its root]")]
 Tip = Annotated[str | None, typer.Option(help="Tool link of a URDF file. [default: its only leaf]")]
 Prior = Annotated[
@@ -52,9 +59,10 @@ Prior = Annotated[
 def calibrate(
     context: typer.Context,
     robot: RobotName,
-    data: Data,
-    out: Out,
     settings: CalibrationSettings,
+    stated: StatedOptions,
+    data: Data = None,
+    out: Out = None,
     base: Base = None,
     tip: Tip = None,
     prior: Prior = None,
@@ -73,6 +81,11 @@ def calibrate(
     from pisigma.robot.robot_file import robot_file
     from pisigma.workflow import calibrate as workflow
 
+    if (cell := cell_at(robot)) is not None:
+        refuse_beside_cell(DATA=data, __out=out, __base=base, __tip=tip, __prior=prior)
+        return _calibrate_cell(cell, stated, accept_implausible, verbose, as_json)
+    if not data or out is None:
+        raise typer.BadParameter(f"expected {'--out DIR' if data else 'DATA'}, or a cell instead of a robot")
     seen_by = settings.cameras.files if settings.cameras else ()
     check_folder(out, overwrite, inputs=(robot_file(robot), prior, *data, *seen_by))
     nominal = Robot.load(robot, base, tip)
@@ -89,6 +102,29 @@ def calibrate(
             print_json({"model": folder and str(folder), **calibration.to_json()})
         else:
             print_calibration(calibration.summary, folder, calibration.seconds, verbose)
+
+
+def _calibrate_cell(
+    cell: "Cell", stated: StatedOptions, accept_implausible: bool, verbose: bool, as_json: bool
+) -> None:
+    """Calibrate with the rows of a cell, store the model there, and print it."""
+    with progress_of("calibrate") as progress:
+        calibration, entry = cell.calibrate(
+            progress, accept_implausible, **tell_replaced(cell, "calibrate", stated)
+        )
+    folder = None if entry is None else cell.model_folder(entry.name)
+    if as_json:
+        print_json(
+            {"model": folder and str(folder), **calibration.to_json(), "next": cell.status().step.to_json()}
+        )
+    else:
+        remark = [f"Model '{entry.name}': {entry.remark}."] if entry is not None else []
+        also = [sentences("the cell", [*remark, *next_lines(cell)])]
+        print_calibration(calibration.summary, folder, calibration.seconds, verbose, also)
+    if entry is None:
+        raise AcceptanceError(
+            "no model was stored, because the result must not be trusted, for the reasons above."
+        )
 
 
 def print_calibration(

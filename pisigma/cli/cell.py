@@ -9,9 +9,11 @@ import typer
 from pisigma.cli.arguments import AsJson, complete_robot
 from pisigma.cli.endings import NOT_ACCEPTED
 from pisigma.cli.output import print_json, print_line, print_lines, print_table
+from pisigma.cli.settings_options import StatedOptions
 
 if TYPE_CHECKING:
     from pisigma.lifetime.cell.status import CellStatus
+    from pisigma.workflow.cell.cell import Cell
 
 CellFolder = Annotated[Path, typer.Argument(metavar="CELL", help="Folder of a cell.")]
 Reason = Annotated[str, typer.Option(help="Reason, which the history keeps.")]
@@ -147,6 +149,43 @@ def _print_next(status: "CellStatus") -> None:
         print_lines([f"Nothing to do: {reason}."])
 
 
+def cell_at(path: str | Path) -> "Cell | None":
+    """Open the cell at a path; None where it is something else."""
+    from pisigma.lifetime.cell.layout import is_cell
+
+    if not is_cell(path):
+        return None
+    from pisigma.workflow.cell.cell import Cell
+
+    return Cell.open(path)
+
+
+def tell_replaced(cell: "Cell", step: str, stated: StatedOptions) -> StatedOptions:
+    """Say on stderr which settings of a step the command line replaces; return what it states."""
+    for key in sorted(stated.keys() & cell.file.stated(step).keys()):
+        print_line(f"--{key.replace('_', '-')} replaces {key} of {cell.file.path}.", to_stderr=True)
+    return stated
+
+
+def refuse_beside_cell(**given: object) -> None:
+    """Refuse what a cell knows already.
+
+    Args:
+        **given: values of options and arguments, by their names.
+    """
+    for name, value in given.items():
+        if value:
+            raise typer.BadParameter(
+                f"leave out {name.replace('_', '-')}: a cell uses its own robot, rows and models"
+            )
+
+
+def next_lines(cell: "Cell") -> list[str]:
+    """Say what to do next with a cell."""
+    step = cell.status().step
+    return [f"Next step: {step.command}" if step.command else f"Nothing to do: {step.reason}."]
+
+
 def use(
     cell: CellFolder,
     model: Annotated[str, typer.Argument(help="Name of the model.")],
@@ -202,7 +241,7 @@ def event(
     from pisigma.workflow.cell.cell import Cell
 
     opened = Cell.open(cell)
-    recorded = opened.record(kind, date, note)
+    recorded = opened.history.record(kind, date, note)
     if as_json:
         print_json({"day": recorded.day, "kind": recorded.kind, "note": recorded.note})
     else:

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from pisigma.cli.arguments import AsJson, ModelFolder, PayloadKg, TemperatureC, complete_export
+from pisigma.cli.arguments import AsJson, ModelOrCell, PayloadKg, TemperatureC, complete_export
 from pisigma.cli.endings import NOT_ACCEPTED, fail
 from pisigma.cli.output import print_json, print_line
 from pisigma.deployment.export.registry import BUILT_IN
@@ -94,7 +94,7 @@ PresentCounts = Annotated[
 
 
 def export(
-    model: ModelFolder,
+    model: ModelOrCell,
     out: Out,
     form: Form,
     like: Like = None,
@@ -121,9 +121,10 @@ def export(
     """
     from pisigma.deployment.export.export_format import ExportRequest
     from pisigma.deployment.export.registry import export_format, export_model
+    from pisigma.lifetime.cell.layout import model_folder
 
     request = ExportRequest(
-        model=model,
+        model=model_folder(model),
         out=out,
         like=like,
         tip=tip,

@@ -7,12 +7,15 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from pisigma.cli.arguments import AsJson
+from pisigma.cli.cell import next_lines, tell_replaced
 from pisigma.cli.endings import REFUSED, fail
 from pisigma.cli.output import print_json, print_lines, print_table
-from pisigma.cli.settings_options import takes_settings
+from pisigma.cli.settings_options import StatedOptions, takes_settings
 from pisigma.workflow.settings.importing import ImportSettings
 
 if TYPE_CHECKING:
+    from pisigma.measurement.dataset import Measurements
+    from pisigma.workflow.cell.cell import Cell
     from pisigma.workflow.import_rows import ImportProposal
 
 Files = Annotated[list[Path], typer.Argument(help="Exports (tables as text, in any encoding).")]
@@ -23,8 +26,16 @@ SaveMap = Annotated[Path | None, typer.Option(help="Write the mapping to this fi
 @takes_settings
 def import_(
     files: Files,
-    out: Annotated[Path, typer.Option(help="Measurement file to write (.csv).")],
     settings: ImportSettings,
+    stated: StatedOptions,
+    out: Annotated[Path | None, typer.Option(help="Measurement file to write (.csv).")] = None,
+    cell: Annotated[Path | None, typer.Option(help="Take the rows in as a session of this cell.")] = None,
+    date: Annotated[
+        str, typer.Option(help="Day of the session. [default: column date, name of the file, today]")
+    ] = "",
+    accept_implausible: Annotated[
+        bool, typer.Option("--accept-implausible", help="Take in rows that must not be trusted.")
+    ] = False,
     yes: Yes = False,
     save_map: SaveMap = None,
     as_json: AsJson = False,
@@ -35,21 +46,55 @@ def import_(
     confirmation. Without a terminal, exits with status 2 unless --yes or a complete --map is given.
     """
     from pisigma.files.output_file import check_output
+    from pisigma.measurement.csv.reading import is_measurement_file
     from pisigma.workflow import import_rows as workflow
+    from pisigma.workflow.cell.cell import Cell
 
-    check_output(out, (".csv",), "a measurement file", files)
+    if (cell is None) is (out is None):
+        raise typer.BadParameter("expected either --out FILE or --cell CELL", param_hint="'--out'")
+    if out is not None:
+        check_output(out, (".csv",), "a measurement file", files)
     if save_map is not None:
-        check_output(save_map, (".yaml", ".yml"), "a mapping", [*files, out])
+        check_output(save_map, (".yaml", ".yml"), "a mapping", [*files, *([] if out is None else [out])])
+    if cell is not None:
+        opened = Cell.open(cell)
+        settings = opened.file.settings("import", **tell_replaced(opened, "import", stated))
+        if len(files) == 1 and is_measurement_file(files[0]):
+            return _take_in(opened, files[0], date, accept_implausible, as_json)
     proposal = workflow.propose_import(files, settings)
     _confirm(proposal, yes, as_json)
     rows = workflow.import_rows(proposal)
-    rows.save(out)
+    if out is not None:
+        rows.save(out)
     if save_map is not None:
         proposal.save_map(save_map)
+    if cell is not None:
+        if not as_json:
+            print_lines(rows.sentences)
+        return _take_in(opened, rows.measurements, date, accept_implausible, as_json)
     if as_json:
         print_json({"file": str(out)} | rows.to_json())
         return
     print_lines([*rows.sentences, f"{rows.rows} measurements written to {out}."])
+
+
+def _take_in(
+    cell: "Cell", rows: "Path | Measurements", date: str, accept_implausible: bool, as_json: bool
+) -> None:
+    """Take rows in as a session of a cell."""
+    entry = cell.take_in(rows, accept_implausible, date)
+    if as_json:
+        print_json(
+            {
+                "session": entry.name,
+                "rows": entry.rows,
+                "day": entry.day,
+                "next": cell.status().step.to_json(),
+            }
+        )
+        return
+    remark = [f"Warning: {entry.remark}"] if entry.remark else []
+    print_lines([f"{entry.rows} rows taken in as session '{entry.name}'.", *remark, *next_lines(cell)])
 
 
 def _confirm(proposal: "ImportProposal", yes: bool, as_json: bool) -> None:

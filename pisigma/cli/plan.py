@@ -7,14 +7,16 @@ import typer
 
 from pisigma.cli.arguments import AsJson, Verbose, complete_robot
 from pisigma.cli.calibrate import Base, Tip
+from pisigma.cli.cell import cell_at, refuse_beside_cell, tell_replaced
 from pisigma.cli.output import print_json
 from pisigma.cli.progress import progress_of
 from pisigma.cli.screen import print_screen, sentences, table
-from pisigma.cli.settings_options import takes_settings
+from pisigma.cli.settings_options import StatedOptions, takes_settings
 from pisigma.planning.plan_settings import PlanSettings
 from pisigma.reporting.verdict import Verdict, counted, rounded
 
 if TYPE_CHECKING:
+    from pisigma.workflow.cell.cell import Cell as OpenedCell
     from pisigma.workflow.plan import Plan
 
 MAX_POINTS = 8
@@ -23,12 +25,12 @@ MAX_POINTS = 8
 Subject = Annotated[
     str,
     typer.Argument(
-        metavar="ROBOT|MODEL",
-        help="Catalogue name, robot file (YAML or URDF), or a model folder to measure again.",
+        metavar="ROBOT|MODEL|CELL",
+        help="Catalogue name, robot file (YAML or URDF), a model folder to measure again, or a cell.",
         autocompletion=complete_robot,
     ),
 ]
-Out = Annotated[Path, typer.Option(help="CSV file of poses to write, with a .plan.yaml next to it.")]
+Out = Annotated[Path | None, typer.Option(help="CSV file of poses to write, with a .plan.yaml next to it.")]
 CellFile = Annotated[Path | None, typer.Option("--cell", help="Obstacles around the robot (YAML).")]
 Programs = Annotated[
     list[Path] | None,
@@ -42,8 +44,9 @@ Programs = Annotated[
 @takes_settings
 def plan(
     subject: Subject,
-    out: Out,
     settings: PlanSettings,
+    stated: StatedOptions,
+    out: Out = None,
     cell: CellFile = None,
     program: Programs = None,
     base: Base = None,
@@ -60,6 +63,11 @@ def plan(
     from pisigma.planning.subject import Subject as PlanningSubject
     from pisigma.workflow import plan as workflow
 
+    if (opened := cell_at(subject)) is not None:
+        refuse_beside_cell(__out=out, __cell=cell, __base=base, __tip=tip)
+        return _plan_cell(opened, stated, program or [], verbose, as_json)
+    if out is None:
+        raise typer.BadParameter("expected a CSV file", param_hint="'--out'")
     planned_for, programs = PlanningSubject.of(subject, base, tip), program or []
     workflow.check_files(out, programs, settings, planned_for.robot, (subject, cell))
     with progress_of("plan") as progress:
@@ -67,6 +75,20 @@ def plan(
     planned.save(out, programs)
     if as_json:
         print_json({"file": str(out), **planned.to_json()})
+    else:
+        _print(planned, [out, yaml_of(out), *programs], verbose)
+
+
+def _plan_cell(
+    cell: "OpenedCell", stated: StatedOptions, programs: list[Path], verbose: bool, as_json: bool
+) -> None:
+    """Plan for a cell, and store the plan there."""
+    from pisigma.planning.plan_file import yaml_of
+
+    with progress_of("plan") as progress:
+        planned, out = cell.plan(progress, programs, **tell_replaced(cell, "plan", stated))
+    if as_json:
+        print_json({"file": str(out), **planned.to_json(), "next": cell.status().step.to_json()})
     else:
         _print(planned, [out, yaml_of(out), *programs], verbose)
 

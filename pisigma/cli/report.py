@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from pisigma.cli.arguments import AsJson, ModelFolder
+from pisigma.cli.arguments import AsJson, ModelOrCell
 from pisigma.cli.output import print_json
 from pisigma.cli.progress import progress_of
 from pisigma.cli.screen import print_screen, sentences
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 @takes_settings
 def report(
-    model: ModelFolder,
+    model: ModelOrCell,
     data: Annotated[
         Path | None,
         typer.Argument(
@@ -36,8 +36,10 @@ def report(
 
     Exits with status 3 if the rows must not be trusted; the page says why.
     """
+    from pisigma.lifetime.cell.layout import model_folder
     from pisigma.workflow import report as workflow
 
+    model = model_folder(model)
     workflow.check_report_outputs(out, figures, inputs=(model, data, *(cameras.files if cameras else ())))
     with progress_of("report") as progress:
         result = workflow.report(model, data, progress, cameras)

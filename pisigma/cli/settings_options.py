@@ -12,26 +12,50 @@ import typer
 from pisigma.files.errors import PisigmaError
 from pisigma.files.setting import Setting, settings_of
 
+_CONTEXT = "context_of_command"
+"""Parameter by which a command gets its context that does not ask for it."""
+
+
+class StatedOptions(dict[str, Any]):
+    """Options of settings that the command line states, by their keys in `cell.yaml` and in the units of the options."""
+
 
 def takes_settings(command: Callable[..., None]) -> Callable[..., None]:
     """Replace every parameter of a command whose type is a class of settings by the options of that class.
 
-    The command is called with the settings; a parameter that may be None is None if none of its options is given.
+    The command is called with the settings; a parameter that may be None is None if none of its options is given. A
+    parameter of type `StatedOptions` gets the options that the command line states.
     """
     parameters: list[inspect.Parameter] = []
     groups: dict[str, tuple[type, bool]] = {}
+    wants_stated = ""
     for one in inspect.signature(command).parameters.values():
         group, *others = get_args(one.annotation) or (one.annotation,)
-        if not is_dataclass(group):
+        if group is StatedOptions:
+            wants_stated = one.name
+        elif not is_dataclass(group):
             parameters.append(one)
-            continue
-        groups[one.name] = group, bool(others)  # type: ignore[assignment]
-        parameters += map(_parameter, _options(group))  # type: ignore[arg-type]
+        else:
+            groups[one.name] = group, bool(others)  # type: ignore[assignment]
+            parameters += map(_parameter, _options(group))  # type: ignore[arg-type]
+    context = next((one.name for one in parameters if one.annotation is typer.Context), None)
+    if wants_stated and context is None:
+        parameters.append(
+            inspect.Parameter(_CONTEXT, inspect.Parameter.KEYWORD_ONLY, annotation=typer.Context)
+        )
 
     @functools.wraps(command)
     def with_options(**values: Any) -> None:
         names = {_name(option) for group, _ in groups.values() for option in _options(group)}
         stated = {name: values.pop(name) for name in names}
+        if wants_stated:
+            running = values[context] if context else values.pop(_CONTEXT)
+            values[wants_stated] = StatedOptions(
+                (option.name[2:].replace("-", "_"), stated[_name(option)])
+                for group, _ in groups.values()
+                for option in _options(group)
+                if running.get_parameter_source(_name(option)).name == "COMMANDLINE"
+            )
         command(**values, **{name: _built(*group, stated) for name, group in groups.items()})
 
     by_name = inspect.Parameter.KEYWORD_ONLY

@@ -5,16 +5,18 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from pisigma.cli.arguments import AsJson, ModelFolder, Verbose
-from pisigma.cli.output import print_json, screen_width
+from pisigma.cli.arguments import AsJson, ModelOrCell, Verbose
+from pisigma.cli.cell import cell_at, next_lines, refuse_beside_cell, tell_replaced
+from pisigma.cli.output import print_json, print_lines, screen_width
 from pisigma.cli.progress import progress_of
 from pisigma.cli.screen import Block, print_screen, table
-from pisigma.cli.settings_options import takes_settings
+from pisigma.cli.settings_options import StatedOptions, takes_settings
 from pisigma.files.errors import AcceptanceError
 from pisigma.workflow.settings.verification import VerificationSettings
 
 if TYPE_CHECKING:
     from pisigma.validation.held_out.model_comparison import ModelComparison, ModelFigures
+    from pisigma.workflow.cell.cell import Cell
     from pisigma.workflow.verify import Verification
 
 Hash = Annotated[
@@ -24,7 +26,15 @@ Hash = Annotated[
         help="Refuse another model than that with this SHA-256 of model.yaml.",
     ),
 ]
-Data = Annotated[Path, typer.Argument(help="New measurements (CSV) at commanded joint values.")]
+Data = Annotated[
+    Path | None,
+    typer.Argument(
+        help="New measurements (CSV) at commanded joint values. [default: newest session of a cell]"
+    ),
+]
+OfModel = Annotated[
+    str | None, typer.Option("--model", help="Model of the cell. [default: in use, else the newest]")
+]
 
 NEXT_STEPS = {
     "better": "use the model, and verify again after a change of tool, base or arm.",
@@ -38,9 +48,11 @@ NEXT_STEPS = {
 
 @takes_settings
 def verify(
-    model: ModelFolder,
-    data: Data,
+    model: ModelOrCell,
     settings: VerificationSettings,
+    stated: StatedOptions,
+    data: Data = None,
+    of_model: OfModel = None,
     sha256: Hash = None,
     verbose: Verbose = False,
     as_json: AsJson = False,
@@ -55,6 +67,11 @@ def verify(
     from pisigma.files.model_files import check_model_hash
     from pisigma.workflow import verify as workflow
 
+    if (cell := cell_at(model)) is not None:
+        refuse_beside_cell(DATA=data, __sha256=sha256)
+        return _verify_cell(cell, stated, of_model, verbose, as_json)
+    if data is None or of_model is not None:
+        raise typer.BadParameter("expected DATA" if data is None else "--model names a model of a cell")
     if sha256 is not None:
         check_model_hash(model, sha256)
     with progress_of("verify") as progress:
@@ -64,6 +81,27 @@ def verify(
         print_json(verification.to_json())
     else:
         _print(verification, verbose)
+    if not verification.accepted:
+        raise AcceptanceError(verification.sentence)
+
+
+def _verify_cell(
+    cell: "Cell", stated: StatedOptions, model: str | None, verbose: bool, as_json: bool
+) -> None:
+    """Verify a model of a cell with its newest session."""
+    with progress_of("verify") as progress:
+        progress("comparing the models and looking for setup faults")
+        verification, entry = cell.verify(None, model, **tell_replaced(cell, "verify", stated))
+    in_use = cell.history.in_use
+    if as_json:
+        use = None if in_use is None else in_use.name
+        print_json({**verification.to_json(), "in_use": use, "next": cell.status().step.to_json()})
+    else:
+        _print(verification, verbose)
+        used = (
+            [f"Model '{entry.name}' is in use."] if in_use is not None and in_use.name == entry.name else []
+        )
+        print_lines([*used, *next_lines(cell)])
     if not verification.accepted:
         raise AcceptanceError(verification.sentence)
 

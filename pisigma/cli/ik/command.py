@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from pisigma.cli.arguments import AsJson, ModelFolder, PayloadKg, TemperatureC
+from pisigma.cli.arguments import AsJson, ModelOrCell, PayloadKg, TemperatureC
 from pisigma.cli.endings import fail
 from pisigma.cli.output import print_json, print_lines
 from pisigma.cli.progress import progress_of
@@ -36,7 +36,7 @@ ElbowDeg = Annotated[float | None, typer.Option(help="Elbow angle of an arm with
 
 
 def ik(
-    model: ModelFolder,
+    model: ModelOrCell,
     pose: Annotated[
         Pose | None, typer.Option(help="X Y Z ROLL PITCH YAW of the tool in the base frame [mm, deg].")
     ] = None,
@@ -80,11 +80,12 @@ def ik(
         if given and poses is None:
             raise typer.BadParameter("use it with --poses", param_hint=f"'{name}'")
     from pisigma.files.output_file import check_output
+    from pisigma.lifetime.cell.layout import model_folder
     from pisigma.model.inverse.corrected_ik import load
 
     if out is not None:
         check_output(out, inputs=(model, poses))
-    solver = load(model)
+    solver = load(model_folder(model))
     stated = {"payload_kg": payload_kg, "temperature_c": temperature_c}
     if conditions := {name: value for name, value in stated.items() if value is not None}:
         solver = solver.under(**conditions)

@@ -5,22 +5,25 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from pisigma.cli.arguments import AsJson, ModelFolder, Verbose
+from pisigma.cli.arguments import AsJson, ModelOrCell, Verbose
+from pisigma.cli.cell import cell_at, next_lines, refuse_beside_cell, tell_replaced
 from pisigma.cli.endings import NOT_ACCEPTED
-from pisigma.cli.output import print_json
+from pisigma.cli.output import print_json, print_lines
 from pisigma.cli.progress import progress_of
 from pisigma.cli.screen import print_screen, sentences, table
-from pisigma.cli.settings_options import takes_settings
+from pisigma.cli.settings_options import StatedOptions, takes_settings
 from pisigma.reporting.verdict import Verdict, counted, rounded, uncapitalised
 from pisigma.workflow.settings.monitoring import MonitorSettings
 
 if TYPE_CHECKING:
+    from pisigma.workflow.cell.cell import Cell
     from pisigma.workflow.monitor import Monitoring
 
 Sessions = Annotated[
-    list[Path],
+    list[Path] | None,
     typer.Argument(
-        metavar="SESSION...", help="Measurements (CSV), one file per session of five poses or more."
+        metavar="SESSION...",
+        help="Measurements (CSV), one file per session of five poses or more, unless of a cell.",
     ),
 ]
 MAX_SESSIONS = 6
@@ -31,9 +34,10 @@ Page = Annotated[Path | None, typer.Option(help="HTML page to write, with charts
 
 @takes_settings
 def monitor(
-    model: ModelFolder,
-    sessions: Sessions,
+    model: ModelOrCell,
     settings: MonitorSettings,
+    stated: StatedOptions,
+    sessions: Sessions = None,
     page: Page = None,
     verbose: Verbose = False,
     as_json: AsJson = False,
@@ -46,6 +50,11 @@ def monitor(
     from pisigma.files.output_file import check_page
     from pisigma.workflow import monitor as workflow
 
+    if (cell := cell_at(model)) is not None:
+        refuse_beside_cell(SESSION=sessions)
+        return _monitor_cell(cell, stated, page, as_json, verbose)
+    if not sessions:
+        raise typer.BadParameter("expected SESSION..., or a cell instead of a model")
     if page is not None:
         check_page(page, (model, *sessions, *(settings.cameras.files if settings.cameras else ())))
     with progress_of("monitor") as progress:
@@ -53,6 +62,25 @@ def monitor(
         if page is not None:
             monitoring.save_page(page)
     _print(monitoring, page, as_json, verbose)
+    if monitoring.action:
+        raise typer.Exit(NOT_ACCEPTED)
+
+
+def _monitor_cell(
+    cell: "Cell", stated: StatedOptions, page: Path | None, as_json: bool, verbose: bool
+) -> None:
+    """Judge the sessions of a cell that its model in use was not made of."""
+    from pisigma.files.output_file import check_page
+
+    if page is not None:
+        check_page(page, (cell.folder,))
+    with progress_of("monitor") as progress:
+        monitoring = cell.monitor(progress, **tell_replaced(cell, "monitor", stated))
+        if page is not None:
+            monitoring.save_page(page)
+    _print(monitoring, page, as_json, verbose)
+    if not as_json:
+        print_lines(next_lines(cell))
     if monitoring.action:
         raise typer.Exit(NOT_ACCEPTED)
 

@@ -6,22 +6,27 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from pisigma.cli.arguments import AcceptImplausible, AsJson, ModelFolder, Overwrite, Verbose
-from pisigma.cli.output import command_line, print_json, saved
+from pisigma.cli.arguments import AcceptImplausible, AsJson, ModelOrCell, Overwrite, Verbose
+from pisigma.cli.cell import cell_at, next_lines, refuse_beside_cell, tell_replaced
+from pisigma.cli.output import command_line, print_json, print_lines, saved
 from pisigma.cli.progress import progress_of
 from pisigma.cli.screen import print_screen, sentences, table
-from pisigma.cli.settings_options import takes_settings
+from pisigma.cli.settings_options import StatedOptions, takes_settings
 from pisigma.files.errors import AcceptanceError
 from pisigma.reporting.verdict import Verdict, counted, rounded, uncapitalised
 from pisigma.workflow.settings.recalibration import RecalibrationSettings
 
 if TYPE_CHECKING:
     from pisigma.robot.description import Robot
+    from pisigma.workflow.cell.cell import Cell
     from pisigma.workflow.recalibrate import Recalibration
 
 Data = Annotated[
-    list[Path],
-    typer.Argument(metavar="ROWS...", help="New measurements (CSV) of ten poses or more."),
+    list[Path] | None,
+    typer.Argument(
+        metavar="ROWS...",
+        help="New measurements (CSV) of ten poses or more. [default: newest session of a cell]",
+    ),
 ]
 Out = Annotated[Path | None, typer.Option(help="Model folder to write, unless --dry-run.")]
 DryRun = Annotated[bool, typer.Option("--dry-run", help="Say what would be kept without writing it.")]
@@ -30,9 +35,10 @@ DryRun = Annotated[bool, typer.Option("--dry-run", help="Say what would be kept 
 @takes_settings
 def recalibrate(
     context: typer.Context,
-    model: ModelFolder,
-    data: Data,
+    model: ModelOrCell,
     settings: RecalibrationSettings,
+    stated: StatedOptions,
+    data: Data = None,
     out: Out = None,
     dry_run: DryRun = False,
     accept_implausible: AcceptImplausible = False,
@@ -47,11 +53,16 @@ def recalibrate(
     """
     from pisigma.files.output_folder import check_folder
 
+    if (cell := cell_at(model)) is not None:
+        refuse_beside_cell(ROWS=data, __out=out, __dry_run=dry_run, __overwrite=overwrite)
+        return _recalibrate_cell(cell, stated, accept_implausible, as_json, verbose)
+    if not data:
+        raise typer.BadParameter("expected ROWS..., or a cell instead of a model")
     if (out is None) is not dry_run:
         raise typer.BadParameter("expected either --out DIR or --dry-run", param_hint="'--out'")
     if out is not None:
-        stated = settings.cameras.files if settings.cameras else ()
-        check_folder(out, overwrite, inputs=(model, *data, *stated))
+        seen_by = settings.cameras.files if settings.cameras else ()
+        check_folder(out, overwrite, inputs=(model, *data, *seen_by))
     recalibrate_into(context, model, data, settings, out, accept_implausible, overwrite, as_json, verbose)
 
 
@@ -97,6 +108,23 @@ def recalibrate_into(
         return
     with saved(recalibration, out, accept_implausible, overwrite, command=command_line(context)) as folder:
         _print(recalibration, folder, as_json, verbose)
+
+
+def _recalibrate_cell(
+    cell: "Cell", stated: StatedOptions, accept_implausible: bool, as_json: bool, verbose: bool
+) -> None:
+    """Recalibrate the model in use of a cell with its newest session."""
+    tell_replaced(cell, "recalibrate", stated)
+    with progress_of("recalibration") as progress:
+        recalibration, entry = cell.recalibrate(None, progress, accept_implausible, **stated)
+    folder = None if entry is None else cell.model_folder(entry.name)
+    _print(recalibration, folder, as_json, verbose)
+    if entry is None:
+        raise AcceptanceError(
+            "no model was stored, because the result must not be trusted, for the reasons above."
+        )
+    if not as_json:
+        print_lines([f"Model '{entry.name}' is in use.", *next_lines(cell)])
 
 
 def _print(recalibration: "Recalibration", folder: Path | None, as_json: bool, verbose: bool) -> None:

@@ -14,7 +14,10 @@ from pisigma.deployment.serve.settings import ServeSettings
 if TYPE_CHECKING:
     from pisigma.deployment.serve.models import ServedModels
 
-Model = Annotated[Path | None, typer.Argument(help="Model folder.", autocompletion=complete_model)]
+Model = Annotated[
+    Path | None,
+    typer.Argument(metavar="[MODEL|CELL]", help="Model folder, or a cell.", autocompletion=complete_model),
+]
 Models = Annotated[Path | None, typer.Option("--models", help="Folder of model folders to serve by name.")]
 
 
@@ -45,9 +48,10 @@ def serve(
 def _load(model: Path | None, models: Path | None) -> "ServedModels":
     """Load the model, or those of a folder."""
     from pisigma.deployment.serve.models import ServedModels, model_folders
+    from pisigma.lifetime.cell.layout import model_folder
 
     if model is not None and models is None:
-        return ServedModels([model])
+        return ServedModels([model_folder(model)])
     if models is None or model is not None:
         raise typer.BadParameter(
             "expected either a model folder or --models", param_hint="'MODEL' / '--models'"

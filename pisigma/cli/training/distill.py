@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from pisigma.cli.arguments import AsJson, ModelFolder, Overwrite, Verbose
+from pisigma.cli.arguments import AsJson, ModelOrCell, Overwrite, Verbose
 from pisigma.cli.output import command_line, print_json
 from pisigma.cli.progress import progress_of
 from pisigma.cli.screen import print_screen, sentences, table
@@ -50,7 +50,7 @@ Harmonics = Annotated[
 @takes_settings
 def distill(
     context: typer.Context,
-    model: ModelFolder,
+    model: ModelOrCell,
     out: Out,
     settings: DistillationSettings,
     region: RegionMm = None,
@@ -66,8 +66,10 @@ def distill(
     Prints its error against the full solution at held-out poses.
     """
     from pisigma.files.output_folder import check_folder
+    from pisigma.lifetime.cell.layout import model_folder
     from pisigma.workflow import distill as workflow
 
+    model = model_folder(model)
     check_folder(out, overwrite, inputs=(model, joints))
     size = _size(orders, harmonics)
     settings = replace(settings, region=_region(model, region, joints), size=size)

@@ -12,7 +12,8 @@ from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any, Literal, TypeVar, get_args
 
-from pisigma.files.errors import ModelError, OutputError, Place, check_choice
+from pisigma.files.errors import MeasurementError, ModelError, OutputError, Place, check_choice
+from pisigma.measurement.dates import WANTED, is_date
 
 HISTORY = "history.sqlite"
 SCHEMA_VERSION = 1
@@ -219,6 +220,25 @@ class History:
                     f"INSERT OR REPLACE INTO {_TABLES[type(entry)]} ({names}) VALUES ({marks})",
                     tuple(values.values()),
                 )
+
+    def record(self, kind: str, day: str = "", note: str = "") -> Event:
+        """Record that something was changed; see `EventKind`.
+
+        Args:
+            kind: of the event.
+            day: on which it happened (ISO 8601). "": today.
+            note: free text.
+
+        Raises:
+            MeasurementError: the kind is unknown, or the day is not one.
+        """
+        check_choice(MeasurementError, "event", kind, event_kinds())
+        day = day or datetime.date.today().isoformat()
+        if not is_date(day):
+            raise MeasurementError(expected=WANTED, value=day, option="--date")
+        event = Event(day, kind, note, now())  # type: ignore[arg-type]  # checked above
+        self.add(event)
+        return event
 
     def _read(self, kind: type[Entry]) -> tuple[Entry, ...]:
         if not self.path.exists():

@@ -93,6 +93,11 @@ class CellFacts:
         """A command of this cell."""
         return shlex.join(["pisigma", verb, self.folder, *words])
 
+    @property
+    def import_command(self) -> str:
+        """The command that takes rows in."""
+        return shlex.join(["pisigma", "import", "ROWS.csv", "--cell", self.folder])
+
     def checks_of(self, model: str, *commands: str) -> list[Check]:
         """Checks of a model by some commands, the newest last."""
         return [one for one in self.checks if one.model == model and one.command in commands]
@@ -131,13 +136,20 @@ def _no_session(facts: CellFacts) -> Step | None:
         return None
     ended = [one for one in facts.events if one.kind in ARM_EVENTS] if facts.sessions else []
     why = f"{ended[-1].kind} on {ended[-1].day} ended the validity of all sessions" if ended else ""
-    if not facts.plans:
-        return Step("no_plan", why or "nothing is planned and nothing is measured", facts.command("plan"))
-    return Step("not_measured", why or f"plan '{facts.plans[-1]}' is not measured", facts.command("measure"))
+    if not facts.plans or why:
+        few = () if facts.in_use is None else ("--count", str(VERIFICATION_POSES), "--check", "0")
+        return Step(
+            "no_plan", why or "nothing is planned and nothing is measured", facts.command("plan", *few)
+        )
+    return Step(
+        "not_measured",
+        f"plan '{facts.plans[-1]}' is not measured: add the measured columns",
+        facts.import_command,
+    )
 
 
 def _not_calibrated(facts: CellFacts) -> Step | None:
-    if facts.newest_model is not None:
+    if facts.newest_model is not None or facts.in_use is not None:
         return None
     rows = sum(one.rows for one in facts.valid_sessions)
     calibrations = [one for one in facts.checks if one.command == "calibrate"]
@@ -146,7 +158,7 @@ def _not_calibrated(facts: CellFacts) -> Step | None:
         return Step(
             "not_trusted",
             f"the calibration must not be trusted: {calibrations[-1].summary}",
-            facts.command("measure"),
+            facts.import_command,
         )
     return Step(
         "not_calibrated", f"{rows} rows are measured and no model is made", facts.command("calibrate")
@@ -248,7 +260,7 @@ def _verification_due(facts: CellFacts) -> Step | None:
 
 def _up_to_date(facts: CellFacts) -> Step:
     assert facts.in_use is not None
-    return Step("up_to_date", f"model '{facts.in_use.name}' is in use and nothing has to be done")
+    return Step("up_to_date", f"model '{facts.in_use.name}' is in use and no check asks for more")
 
 
 RULES: tuple[Callable[[CellFacts], Step | None], ...] = (

@@ -253,7 +253,7 @@ def import_hint(path: str | os.PathLike[str]) -> str:
     Args:
         path: a file whose table or header was refused as a measurement file.
     """
-    if _has_columns(path):
+    if is_measurement_file(path):
         return ""
     try:
         mapping = map_columns(read_export(path, most=_MAX_BYTES), {}, None, {})
@@ -265,7 +265,7 @@ def import_hint(path: str | os.PathLike[str]) -> str:
     return f" The command `{_command(mapping)}` would read it as an export."
 
 
-def _has_columns(path: str | os.PathLike[str]) -> bool:
+def is_measurement_file(path: str | os.PathLike[str]) -> bool:
     """Return whether a file's header has the columns of measurement files or of corners, so that it is no export."""
     try:
         header = read_table(path).header

@@ -13,29 +13,24 @@ from pathlib import Path
 from typing import Any
 
 from pisigma.files.errors import (
-    MeasurementError,
     ModelError,
     Place,
-    check_choice,
 )
 from pisigma.files.model_files import is_model, model_hash
 from pisigma.files.progress import Progress
 from pisigma.lifetime.cell.history import (
     HISTORY,
     Check,
-    Event,
     History,
     ModelEntry,
     SessionEntry,
     Use,
-    event_kinds,
     now,
 )
 from pisigma.lifetime.cell.layout import MODELS, PLANS, SESSIONS
 from pisigma.lifetime.cell.status import CellFacts, CellStatus, next_step
 from pisigma.measurement.camera.camera_files import CameraFiles
 from pisigma.measurement.dataset import Measurements
-from pisigma.measurement.dates import WANTED, is_date
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.folder.model_folder import load_model
 from pisigma.robot.description import Robot
@@ -144,11 +139,14 @@ class Cell:
             self.history.model(name)
         return self.folder / MODELS / name
 
-    def plan(self, progress: Progress = lambda what: None, **changed: Any) -> tuple[Plan, Path]:
+    def plan(
+        self, progress: Progress = lambda what: None, programs: Sequence[Path] = (), **changed: Any
+    ) -> tuple[Plan, Path]:
         """Plan which poses to measure, for the model in use or for the robot as drawn.
 
         Args:
             progress: called with what is being done.
+            programs: files of robot programs to write too.
             **changed: options of `pisigma plan` other than in `cell.yaml`, by its keys.
 
         Returns:
@@ -160,7 +158,7 @@ class Cell:
             subject, self.file.settings("plan", **changed), self.file.document.surroundings, progress
         )
         path = free_path(self.folder / PLANS, datetime.date.today().isoformat(), ".csv")
-        planned.save(path)
+        planned.save(path, programs)
         return planned, path
 
     @cached_property
@@ -174,28 +172,9 @@ class Cell:
         """See `Sessions.take_in`."""
         return self.sessions.take_in(file, accept_implausible, day)
 
-    def record(self, kind: str, day: str = "", note: str = "") -> Event:
-        """Record that something was changed; see `pisigma.lifetime.cell.history.EventKind`.
-
-        Args:
-            kind: of the event.
-            day: on which it happened (ISO 8601). "": today.
-            note: free text.
-
-        Raises:
-            MeasurementError: the kind is unknown, or the day is not one.
-        """
-        check_choice(MeasurementError, "event", kind, event_kinds())
-        day = day or datetime.date.today().isoformat()
-        if not is_date(day):
-            raise MeasurementError(expected=WANTED, value=day, option="--date")
-        event = Event(day, kind, note, now())  # type: ignore[arg-type]  # checked above
-        self.history.add(event)
-        return event
-
     def calibrate(
-        self, progress: Progress = lambda what: None, **changed: Any
-    ) -> tuple[Calibration, ModelEntry]:
+        self, progress: Progress = lambda what: None, accept_implausible: bool = False, **changed: Any
+    ) -> tuple[Calibration, ModelEntry | None]:
         """Calibrate with all rows since the last event that changed the arm, and store the model.
 
         The first model goes into use after `verify`. A later one goes into use where rows that neither it nor the one
@@ -204,32 +183,33 @@ class Cell:
 
         Args:
             progress: called with what is being done.
+            accept_implausible: store the model although it must not be trusted; it does not go into use by itself.
             **changed: options of `pisigma calibrate` other than in `cell.yaml`, by its keys.
+
+        Returns:
+            The calibration and its entry; None where it must not be trusted, and so was not stored.
 
         Raises:
             MeasurementError: there are no valid sessions.
-            AcceptanceError: the result must not be trusted; nothing is stored.
         """
         sessions = self.sessions.valid()
         settings: CalibrationSettings = self.file.settings("calibrate", **changed)
-        robot = self.robot
-        result = calibrate(robot, self.sessions.rows_of(sessions), replace(settings, cameras=None), progress)
-        if not result.trusted:
-            sentence = next(one.sentence for one in result.diagnostics if one.severity == "implausible")
-            self.history.add(Check("calibrate", "", "", "not_trusted", sentence, None, True, now()))
-        path = free_path(self.folder / MODELS, datetime.date.today().isoformat(), "")
-        result.save(path)
-        remark, better = "not verified yet", False
-        if self.history.in_use is not None:
-            better, remark = is_better(self.sessions, self.history.in_use, sessions, settings, progress)
-        judged = result.summary.cross_validation
-        entry = self._entry(path, sessions, remark, _p95(judged))
-        summary = next(iter(result.warnings), "")
-        self.history.add(
-            entry, Check("calibrate", entry.name, "", "trusted", summary, entry.p95_mm, False, now())
+        result = calibrate(
+            self.robot, self.sessions.rows_of(sessions), replace(settings, cameras=None), progress
         )
-        if better:
-            self._use(entry, remark)
+        doubt = "" if result.trusted else result.diagnostics[0].sentence
+        if doubt and not accept_implausible:
+            self.history.add(Check("calibrate", "", "", "not_trusted", doubt, None, True, now()))
+            return result, None
+        path = free_path(self.folder / MODELS, datetime.date.today().isoformat(), "")
+        result.save(path, accept_implausible=accept_implausible)
+        remark, better = doubt or "not verified yet", False
+        if not doubt and (in_use := self.history.in_use) is not None:
+            better, remark = is_better(self.sessions, in_use, sessions, settings, progress)
+        entry = self._entry(path, sessions, remark, _p95(result.summary.cross_validation))
+        verdict = "accepted_implausible" if doubt else "trusted"
+        check = Check("calibrate", entry.name, "", verdict, doubt, entry.p95_mm, False, now())
+        self.history.add(entry, check, *([Use(entry.name, now(), remark)] if better else []))
         return result, entry
 
     def verify(
@@ -264,7 +244,7 @@ class Cell:
         )
         in_use = self.history.in_use
         if found.accepted and (in_use is None or in_use.made < entry.made):
-            self._use(entry, f"verified with session '{chosen.name}'")
+            self.history.add(Use(entry.name, now(), f"verified with session '{chosen.name}'"))
         return found, entry
 
     def monitor(self, progress: Progress = lambda what: None, **changed: Any) -> Monitoring:
@@ -294,19 +274,26 @@ class Cell:
         return found
 
     def recalibrate(
-        self, session: str | None = None, progress: Progress = lambda what: None, **changed: Any
-    ) -> tuple[Recalibration, ModelEntry]:
+        self,
+        session: str | None = None,
+        progress: Progress = lambda what: None,
+        accept_implausible: bool = False,
+        **changed: Any,
+    ) -> tuple[Recalibration, ModelEntry | None]:
         """Recalibrate the model in use with the newest session; what is trusted goes into use.
 
         Args:
             session: its name. None: the newest that the model was not made of.
             progress: called with what is being done.
+            accept_implausible: store the model although it must not be trusted; it does not go into use by itself.
             **changed: options of `pisigma recalibrate` other than in `cell.yaml`, by its keys.
+
+        Returns:
+            The recalibration and its entry; None where it must not be trusted, and so was not stored.
 
         Raises:
             ModelError: no model is in use.
             MeasurementError: there is no such session.
-            AcceptanceError: the result must not be trusted; nothing is stored.
         """
         parent = self._candidate(None)
         chosen = self.sessions.chosen(parent, session)
@@ -315,8 +302,10 @@ class Cell:
         if seen.moved and settings.moved is None:
             settings = replace(settings, moved=seen.moved)
         result = recalibrate(self.model_folder(parent.name), seen.rows, settings, progress)
+        if not (result.trusted or accept_implausible):
+            return result, None
         path = free_path(self.folder / MODELS, datetime.date.today().isoformat(), "")
-        result.save(path)
+        result.save(path, accept_implausible=accept_implausible)
         remark = result.summary.verdict
         entry = replace(
             self._entry(path, [chosen], remark, None),
@@ -326,8 +315,7 @@ class Cell:
             parent=parent.name,
         )
         check = Check("recalibrate", entry.name, chosen.name, result.summary.kept, remark, None, False, now())
-        self.history.add(entry, check)
-        self._use(entry, remark)
+        self.history.add(entry, check, *([Use(entry.name, now(), remark)] if result.trusted else []))
         return result, entry
 
     def use(self, model: str, reason: str) -> None:
@@ -342,7 +330,7 @@ class Cell:
             raise ModelError(
                 "the model was changed after it was made", at=Place(folder), remedy="use another one"
             )
-        self._use(entry, reason or "by hand")
+        self.history.add(Use(entry.name, now(), reason or "by hand"))
 
     def status(self) -> CellStatus:
         """Where the cell stands, and the next step."""
@@ -390,9 +378,6 @@ class Cell:
             p95_mm=p95_mm,
             remark=remark,
         )
-
-    def _use(self, entry: ModelEntry, reason: str) -> None:
-        self.history.add(Use(entry.name, now(), reason))
 
 
 def _p95(judged: ValidationFigures | None) -> float | None:

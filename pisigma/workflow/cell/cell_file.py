@@ -4,7 +4,7 @@ import functools
 import itertools
 import os
 import textwrap
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar, get_args
@@ -163,12 +163,14 @@ class CellFile:
 
         Args:
             step: a key of `STEPS`.
-            **changed: options that are stated otherwise, by the keys of the file.
+            **changed: options other than in the file, by its keys; paths among them may be outside the cell.
 
         Raises:
             PisigmaError: a setting cannot be used; the message names file, line and key.
         """
-        return settings_from(STEPS[step], self.stated(step) | changed, self._place(step), self.path.parent)
+        return settings_from(
+            STEPS[step], self.stated(step) | changed, self._place(step), self.path.parent, frozenset(changed)
+        )
 
     def _place(self, step: str) -> "_Places":
         return _Places(self.path, step)
@@ -202,7 +204,13 @@ def flat_settings(group: type) -> tuple[Setting, ...]:
     return tuple(itertools.chain.from_iterable(parts))
 
 
-def settings_from(group: type[Group], stated: Mapping[str, Any], places: _Places, folder: Path) -> Group:
+def settings_from(
+    group: type[Group],
+    stated: Mapping[str, Any],
+    places: _Places,
+    folder: Path,
+    outside: Collection[str] = (),
+) -> Group:
     """Make settings of what a file states.
 
     Args:
@@ -210,12 +218,13 @@ def settings_from(group: type[Group], stated: Mapping[str, Any], places: _Places
         stated: values by their keys, in the units of the command line.
         places: where the keys are.
         folder: of the cell, which paths are relative to.
+        outside: keys whose paths are relative to the working directory.
 
     Raises:
         PisigmaError: a key is unknown, or a value is of another type or not a valid one.
     """
     values = dict(_checked(group, stated, places))
-    built = _built(group, values, folder, is_optional=False)
+    built = _built(group, values, folder, outside, is_optional=False)
     assert isinstance(built, group)
     return built
 
@@ -244,18 +253,21 @@ def _listed(value: Any, kind: Any) -> Any:
     return [value] if is_repeated and not is_list else value
 
 
-def _built(group: type, values: Mapping[str, Any], folder: Path, is_optional: bool) -> Any:
+def _built(
+    group: type, values: Mapping[str, Any], folder: Path, outside: Collection[str], is_optional: bool
+) -> Any:
     found: dict[str, Any] = {}
     for setting in _settings(group):
         if setting.is_group:
-            if (built := _built(setting.kind, values, folder, is_optional=True)) is not None:
+            if (built := _built(setting.kind, values, folder, outside, is_optional=True)) is not None:
                 found[setting.field] = built
         elif key_of(setting) in values:
             value = values[key_of(setting)]
-            if setting.kind is Path:
+            is_inside = key_of(setting) not in outside
+            if setting.kind is Path and is_inside:
                 value = inside(folder, value)
             elif isinstance(value, list):
-                are_paths = get_args(setting.kind) == (Path,)
+                are_paths = is_inside and get_args(setting.kind) == (Path,)
                 value = tuple(inside(folder, one) for one in value) if are_paths else tuple(value)
             found[setting.field] = setting.read(value)
     return None if is_optional and not found else group(**found)

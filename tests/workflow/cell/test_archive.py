@@ -15,7 +15,7 @@ from pisigma.workflow.cell.cell import Cell
 @pytest.fixture
 def cell(tmp_path, repository):
     cell = Cell.create(tmp_path / "here" / "welder7", "ur10", limit_mm=0.3)
-    cell.record("maintenance", "2026-01-10", "new gear")
+    cell.history.record("maintenance", "2026-01-10", "new gear")
     (cell.folder / "sessions" / "notes.txt").write_text("by hand")
     return cell
 

@@ -150,7 +150,7 @@ def test_sessions_before_and_after_an_event_of_the_instrument_are_in_two_frames(
     cell = Cell.create(tmp_path / "cell", "ur10")
     moved = np.add(BASE, [0.5, 0.2, 0, 0.3, 0, 0])
     cell.take_in(measured(30, 1), day="2026-01-10")
-    cell.record("instrument", "2026-01-15")
+    cell.history.record("instrument", "2026-01-15")
     cell.take_in(measured(30, 2, base=moved), day="2026-01-20")
     rows = cell.sessions.rows_of(cell.history.sessions())
     assert set(rows.frame) == {"", "since 2026-01-15"}
@@ -162,12 +162,12 @@ def test_sessions_before_and_after_an_event_of_the_instrument_are_in_two_frames(
     verification, _ = cell.verify()
     assert verification.verdict == "better"
     assert not verification.settings.fit_frame
-    cell.record("instrument", "2026-02-02")
+    cell.history.record("instrument", "2026-02-02")
     cell.take_in(measured(12, 4), day="2026-02-03")
     again, _ = cell.verify()
     assert again.settings.fit_frame
     assert again.verdict == "better"
-    cell.record("mastering", "2026-02-10")
+    cell.history.record("mastering", "2026-02-10")
     assert cell.status().step.state == "no_plan"
     with refused(MeasurementError):
         cell.calibrate()
