@@ -17,7 +17,7 @@ _CONTEXT = "context_of_command"
 
 
 class StatedOptions(dict[str, Any]):
-    """Options of settings that the command line states, by their keys in `cell.yaml` and in the units of the options."""
+    """Options of settings that the command line states, by their keys in `cell.yaml`."""
 
 
 def takes_settings(command: Callable[..., None]) -> Callable[..., None]:

@@ -3,6 +3,7 @@
 import json
 
 import pytest
+from testing.cell_rows import ROBOT, day, measured
 
 from pisigma.files.errors import MeasurementError, ModelError, PlanningError
 
@@ -54,3 +55,108 @@ def test_what_is_not_there_is_refused(refuses, cell, tmp_path):
     )
     refuses("event", cell, "earthquake", error=MeasurementError, option="event", value="earthquake")
     refuses("event", cell, "tool", "--date", "10.1.2026", error=MeasurementError, option="--date")
+
+
+def rows_file(folder, name, *arguments, **options):
+    measured(*arguments, **options).write_csv(folder / f"{name}.csv", ROBOT)
+    return folder / f"{name}.csv"
+
+
+@pytest.fixture(scope="module")
+def used(run, tmp_path_factory):
+    """A cell that was measured, calibrated, verified, monitored and recalibrated; what the commands printed as JSON."""
+    folder = tmp_path_factory.mktemp("used")
+    cell, printed = folder / "cell", {}
+
+    def step(name, *arguments, status=0):
+        result = run(*arguments, "--json")
+        assert result.exit_code == status, result.output
+        printed[name] = json.loads(result.stdout)
+        return result
+
+    step("new", "new", "ur10", "--out", cell, "--limit-mm", 0.5)
+    step("plan", "plan", cell, "--count", 12, "--check", 2, "--candidates", 200)
+    step("import", "import", rows_file(folder, day(60), 60, 1), "--cell", cell)
+    step("calibrate", "calibrate", cell, "--folds", 0)
+    step("import 2", "import", rows_file(folder, "later", 12, 2), "--cell", cell, "--date", day(30))
+    step("verify", "verify", cell)
+    step("import 3", "import", rows_file(folder, day(2), 12, 3, zero=0.08), "--cell", cell)
+    step("monitor", "monitor", cell, status=3)
+    step("recalibrate", "recalibrate", cell)
+    return cell, printed
+
+
+def test_every_step_names_the_next(used):
+    _, printed = used
+    states = {name: one["next"]["state"] for name, one in printed.items() if "next" in one}
+    assert states == {
+        "new": "no_plan",
+        "plan": "not_measured",
+        "import": "not_calibrated",
+        "calibrate": "not_verified",
+        "import 2": "not_verified",
+        "verify": "up_to_date",
+        "import 3": "session_not_judged",
+    }
+    assert printed["verify"]["in_use"] == printed["calibrate"]["model"].rpartition("/")[2]
+    assert [one["what"] for one in printed["monitor"]["sessions"][-1]["moved"]] == ["joint 3"]
+
+
+def test_commands_on_models_take_the_one_in_use(run, used, tmp_path):
+    cell, printed = used
+    folder = printed["recalibrate"]["model"]
+    for command in (("ik", "--pose", 700, 200, 500, 0, 0, 180), ("report", "--out", tmp_path / "page.html")):
+        of_cell, of_model = (
+            json.loads(run(command[0], of, *command[1:], "--json").stdout) for of in (cell, folder)
+        )
+        for one in (of_cell, of_model):
+            one.pop("seconds", None)
+        assert of_cell == of_model
+    exported = run("export", cell, "--format", "urdf", "--out", tmp_path / "arm.urdf", "--json")
+    assert exported.exit_code == 0, exported.output
+
+
+def test_status_shows_sessions_and_the_model_in_use(run, used):
+    cell, printed = used
+    status = json.loads(run("status", cell, "--json").stdout)
+    assert status["model"] == printed["recalibrate"]["model"].rpartition("/")[2]
+    assert [one["rows"] for one in status["sessions"]] == [60, 12, 12]
+    assert status["next"]["state"] == "up_to_date"
+
+
+def test_an_option_wins_over_the_file_and_says_so(run, used):
+    cell, _ = used
+    path = cell / "cell.yaml"
+    text = path.read_text()
+    path.write_text(text.replace("  # count: 40", "  count: 30"))
+    try:
+        result = run("plan", cell, "--count", 5, "--check", 0, "--candidates", 100, "--json")
+        assert json.loads(result.stdout)["poses"] == 5
+        assert "--count" in result.stderr
+    finally:
+        path.write_text(text)
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("calibrate", "{cell}", "rows.csv"),
+        ("calibrate", "{cell}", "--out", "model"),
+        ("calibrate", "ur10"),
+        ("calibrate", "ur10", "rows.csv"),
+        ("plan", "{cell}", "--out", "plan.csv"),
+        ("plan", "ur10"),
+        ("verify", "{cell}", "rows.csv"),
+        ("verify", "model"),
+        ("monitor", "{cell}", "rows.csv"),
+        ("monitor", "model"),
+        ("recalibrate", "{cell}", "rows.csv"),
+        ("recalibrate", "model", "--dry-run"),
+        ("import", "rows.csv"),
+        ("import", "rows.csv", "--out", "rows2.csv", "--cell", "{cell}"),
+    ],
+)
+def test_what_a_cell_knows_is_not_stated_again_and_what_is_missing_is(run, cell, arguments):
+    result = run(*(str(one).format(cell=cell) for one in arguments))
+    assert result.exit_code == 2
+    assert result.stdout == ""

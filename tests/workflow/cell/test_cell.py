@@ -4,35 +4,20 @@ import dataclasses
 
 import numpy as np
 import pytest
-import torch
+from testing.cell_rows import ROBOT, day, measured
 from testing.closeness import assert_close
 from testing.models import no_type_checker
 from testing.refusals import refused
-from testing.simulated_arm import BASE, TOOL, dh_errors, draw_joints
+from testing.simulated_arm import BASE
 
 import pisigma
 from pisigma.files.errors import AcceptanceError, MeasurementError, ModelError, OutputError
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.folder.model_folder import load_model
-from pisigma.robot import Robot
-from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.workflow.calibrate import calibrate
 from pisigma.workflow.cell import sessions
 from pisigma.workflow.cell.cell import Cell
 from pisigma.workflow.settings.calibration import CalibrationSettings
-
-ROBOT = Robot.load("ur10")
-
-
-def measured(rows, seed, zero=0.0, base=BASE, scale=1.0):
-    """Rows of a UR10 with errors, whose third joint has moved by `zero` [deg]."""
-    dh = ROBOT.dh + dh_errors(ROBOT, 3e-4, 5e-4, np.random.default_rng(0))
-    dh[2, 0] += np.deg2rad(zero)
-    rng = np.random.default_rng([seed, 7])
-    q = draw_joints(ROBOT, rows, rng)
-    T = forward_kinematics(ROBOT.with_geometry(dh=dh, base=base, tool=TOOL), q)
-    noise = 3e-5 * torch.from_numpy(rng.normal(size=(rows, 3)))
-    return Measurements(q=q, position=scale * T[:, :3, 3] + noise)
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -53,11 +38,11 @@ def year(tmp_path_factory):
         return result
 
     then(lambda: cell.plan(candidates=200, count=12, check=2))
-    then(lambda: cell.take_in(measured(60, 1), day="2026-01-10"))
+    then(lambda: cell.take_in(measured(60, 1), day=day(60)))
     calibrated = then(lambda: cell.calibrate(folds=2))
-    then(lambda: cell.take_in(measured(12, 2), day="2026-02-10"))
+    then(lambda: cell.take_in(measured(12, 2), day=day(30)))
     verified = then(cell.verify)
-    then(lambda: cell.take_in(measured(12, 3, zero=0.08), day="2026-11-10"))
+    then(lambda: cell.take_in(measured(12, 3, zero=0.08), day=day(2)))
     return cell, states, calibrated, verified
 
 
@@ -69,7 +54,7 @@ def test_status_names_every_step_on_the_way(year):
 
 def test_the_model_is_that_of_the_rows_without_a_cell_to_the_bit(year):
     cell, _, (calibration, entry), _ = year
-    rows = Measurements.read_csv(cell.folder / "sessions" / "2026-01-10.csv", ROBOT)
+    rows = Measurements.read_csv(cell.folder / "sessions" / f"{day(60)}.csv", ROBOT)
     alone = calibrate("ur10", rows, CalibrationSettings(folds=2))
     assert np.array_equal(alone.model.identified.dh, calibration.model.identified.dh)
     assert_close(
@@ -107,26 +92,26 @@ def test_rows_that_are_known_are_refused(year, again, tmp_path):
         rows.write_csv(tmp_path / "again.csv", ROBOT)
         rows = tmp_path / "again.csv"
     with refused(MeasurementError):
-        cell.take_in(rows, day="2026-03-10")
+        cell.take_in(rows, day=day(1))
 
 
 def test_rows_in_inches_are_refused_and_not_stored(year):
     cell, *_ = year
     before = cell.history.sessions()
     with refused(AcceptanceError):
-        cell.take_in(measured(12, 5, scale=1 / 25.4), day="2026-03-11")
+        cell.take_in(measured(12, 5, scale=1 / 25.4), day=day(1))
     assert cell.history.sessions() == before
     assert cell.status().not_taken_in == ()
 
 
 def test_a_file_that_was_edited_is_named_and_not_used(year):
     cell, *_ = year
-    path = cell.folder / "sessions" / "2026-01-10.csv"
+    path = cell.folder / "sessions" / f"{day(60)}.csv"
     content = path.read_bytes()
     path.write_bytes(content.replace(b"0", b"1", 1))
     try:
         assert cell.status().step.state == "edited_session"
-        with refused(MeasurementError, file="2026-01-10.csv"):
+        with refused(MeasurementError, file=f"{day(60)}.csv"):
             cell.calibrate()
     finally:
         path.write_bytes(content)
