@@ -1,0 +1,170 @@
+"""A simulated year of a cell: are events named in their month, are wrong sessions refused, is the model in use right?
+
+`python benchmarks/cell_year.py FOLDER_OF_SIM [--arm irb120] [--seeds 20]`
+
+FOLDER_OF_SIM holds the independent simulator `sim.py` and its URDF files. An arm is calibrated with 80 poses and
+verified with 10. Then 12 sessions of 10 poses are taken in, one a month, while joint 2 drifts by 0.005 deg a month, a
+collision moves joint 3 by 0.05 deg in month 7, the tracker is set up again in month 9, and the reflector is changed in
+month 10. Nobody records these events. A session of another robot and one in inches are offered, too. The steps that
+`pisigma status` names are done: monitor, recalibrate. Every month the simulator judges the model in use at 300 other
+poses, after a rigid fit, and in comparison the model before, a recalibration with the session, and a calibration from
+all rows since the last true event.
+"""
+
+import argparse
+import datetime
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from scipy.spatial.transform import Rotation
+
+from pisigma.files.errors import PisigmaError
+from pisigma.measurement.dataset import Measurements
+from pisigma.model.calibrated_model import CalibratedModel, poses_of_rows
+from pisigma.workflow.calibrate import calibrate
+from pisigma.workflow.cell.cell import Cell
+from pisigma.workflow.recalibrate import recalibrate
+from pisigma.workflow.settings.calibration import CalibrationSettings
+
+QUIET = CalibrationSettings(folds=0)
+WANTED = {7: "joint 3", 9: "base", 10: "tool"}
+"""By the month, what has to be named."""
+
+
+class Year:
+    """One arm with its cell and its simulator."""
+
+    def __init__(self, sim: Any, arm: str, seed: int, folder: Path) -> None:
+        """Calibrate and verify."""
+        self.sim, self.true, self.folder = sim, sim.True_(arm, seed=seed), folder
+        self.tool: tuple[float, ...] | None = None
+        self.cell = Cell.create(folder / "cell", sim_folder(sim) / f"{arm}.urdf", limit_mm=0.5)
+        today = datetime.date.today()
+        self.days = [
+            (today - datetime.timedelta(days=30 * (12 - month) + 1)).isoformat() for month in range(13)
+        ]
+        earlier = (today - datetime.timedelta(days=400)).isoformat()
+        self.cell.take_in(self.rows(80, 1), day=earlier)
+        self.cell.calibrate(folds=0)
+        self.cell.take_in(self.rows(10, 2), day=self.days[0])
+        self.cell.verify()
+        self.since = [earlier, self.days[0]]
+
+    def rows(self, count: int, seed: int, scale: float = 1.0, of: Any = None) -> Path:
+        """Measure random poses."""
+        q = self.true.sample(count, seed)
+        x, _ = (of or self.true).measure(q, rng=np.random.default_rng(seed), tool=self.tool)
+        path = self.folder / f"rows {seed} {scale:.3f}.csv"
+        self.sim.write_csv(path, self.true, q, x * scale)
+        return path
+
+    def error(self, model: CalibratedModel) -> float:
+        """RMS position error of a model at other poses, after a rigid fit [mm]."""
+        q = self.true.sample(300, 99)
+        x, _ = self.true.tip(q, self.tool)
+        names = {
+            "frame": (([*model.bases] or [""])[-1],) * len(q),
+            "target": (([*model.tools] or [""])[-1],) * len(q),
+        }
+        rows = Measurements(q=torch.from_numpy(q), position=torch.from_numpy(x), **names)
+        poses = poses_of_rows(model, rows)[:, :3, 3].numpy()
+        a, b = poses - poses.mean(0), x - x.mean(0)
+        turn, _ = Rotation.align_vectors(b, a)
+        return float(np.sqrt(((turn.apply(a) - b) ** 2).sum(1).mean()) * 1e3)
+
+    def happen(self, month: int) -> None:
+        """Change the arm and its set-up as the month has it."""
+        self.true.perturb[1] = np.deg2rad(0.005 * month)
+        if month == 7:
+            self.true.perturb[2] = np.deg2rad(0.05)
+        if month == 9:
+            turn = Rotation.from_euler("xyz", [2, -1, 100], degrees=True).as_matrix()
+            self.true.base = (turn, np.array([2.0, 1.0, 0.3]))
+        if month == 10:
+            self.tool = (0.08, 0.02, 0.10)
+        if month in WANTED:
+            self.since = []
+
+    def month(self, month: int) -> tuple[set[str], float, list[float]]:
+        """Take in the session of a month; return what was named, and errors [mm] of the model in use and of others."""
+        self.happen(month)
+        rows = self.rows(10, 100 + month)
+        before = self.cell.model
+        assert before is not None
+        entry = self.cell.take_in(rows, day=self.days[month])
+        self.since.append(entry.day)
+        found = self.cell.monitor().sessions[-1]
+        named = {one["what"] for one in found.to_json()["moved"]}
+        others = [self.error(before)]
+        others += [self.error(recalibrate(before, self.cell.sessions.as_measured(entry)).model)]
+        if self.cell.status().step.state == "moved":
+            self.cell.recalibrate()
+        sessions = [one for one in self.cell.history.sessions() if one.day in self.since]
+        if sum(one.rows for one in sessions) >= 30:
+            others.append(
+                self.error(calibrate(self.cell.robot, self.cell.sessions.rows_of(sessions), QUIET).model)
+            )
+        in_use = self.cell.model
+        assert in_use is not None
+        return named, self.error(in_use), others
+
+    def refuses(self, path: Path, day: str) -> bool:
+        """Whether a wrong session is refused."""
+        try:
+            self.cell.take_in(path, day=day)
+        except PisigmaError:
+            return True
+        return False
+
+
+def sim_folder(sim: Any) -> Path:
+    """The folder of the simulator."""
+    return Path(sim.__file__).parent
+
+
+def main() -> None:
+    """Run the years of several seeds and print what was found."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--arm", default="irb120")
+    parser.add_argument("--seeds", type=int, default=20)
+    stated = parser.parse_args()
+    sys.path.insert(0, str(stated.folder.resolve()))
+    import sim  # type: ignore[import-not-found]
+
+    named, refused, ratios, alarms = dict.fromkeys(WANTED, 0), 0, [], 0
+    for seed in range(stated.seeds):
+        with tempfile.TemporaryDirectory() as folder:
+            year = Year(sim, stated.arm, seed, Path(folder))
+            for month in range(1, 13):
+                found, error, others = year.month(month)
+                if month in WANTED:
+                    named[month] += WANTED[month] in found
+                alarms += len(found - {"joint 2", WANTED.get(month, "joint 2"), "base", "tool"})
+                ratios.append(error / min(others))
+                if month == 4:
+                    other = sim.True_("kr10" if stated.arm != "kr10" else "irb120", seed=seed)
+                    refused += year.refuses(year.rows(10, 500, of=other), year.days[month])
+                if month == 6:
+                    refused += year.refuses(year.rows(10, 501, 1 / 25.4), year.days[month])
+        print(
+            f"seed {seed}: named {named}, refused {refused}, ratio {np.median(ratios):.2f}", file=sys.stderr
+        )
+    for month, what in WANTED.items():
+        print(f"month {month}, {what}: named in {named[month]} of {stated.seeds} years")
+    print(
+        f"wrong sessions refused: {refused} of {2 * stated.seeds}; joints named that have not moved: {alarms}"
+    )
+    print(
+        f"model in use over the best of three: median {np.median(ratios):.2f}, 90 % {np.quantile(ratios, 0.9):.2f}"
+    )
+
+
+if __name__ == "__main__":
+    main()
