@@ -160,3 +160,27 @@ def test_what_a_cell_knows_is_not_stated_again_and_what_is_missing_is(run, cell,
     result = run(*(str(one).format(cell=cell) for one in arguments))
     assert result.exit_code == 2
     assert result.stdout == ""
+
+
+def test_a_model_is_verified_and_put_into_use_by_name(run, used):
+    cell, printed = used
+    first, second = (printed[name]["model"].rpartition("/")[2] for name in ("calibrate", "recalibrate"))
+    verified = run("verify", cell, "--model", first, "--json")
+    assert json.loads(verified.stdout)["model"].endswith(first)
+    changed = json.loads(run("use", cell, first, "--reason", "a trial", "--json").stdout)
+    assert changed == {"model": first, "before": second}
+    assert json.loads(run("use", cell, second, "--json").stdout)["before"] == first
+
+
+def test_status_is_printed_again_until_it_is_interrupted(run, cell, monkeypatch):
+    waited = []
+
+    def sleep(seconds):
+        waited.append(seconds)
+        if len(waited) == 2:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr("time.sleep", sleep)
+    result = run("status", cell, "--watch", 5)
+    assert waited == [5.0, 5.0]
+    assert result.stdout.count("pisigma plan") == 2

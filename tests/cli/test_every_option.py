@@ -17,11 +17,14 @@ from typer.main import get_command
 from pisigma.cli.main import app
 
 REPOSITORY = Path(__file__).parents[2]
-ELSEWHERE = {("train", "--resume"): "tests/cli/test_train_interruption.py"}
+ELSEWHERE = {("train", "--resume"): "tests/cli/test_train_interruption.py"} | dict.fromkeys(
+    (("status", "--watch"), ("use", "--reason"), ("use", "--json"), ("verify", "--model")),
+    "tests/cli/test_cell_commands.py",
+)
 """Options that need a test of their own, and where it is."""
 OF_ALL_COMMANDS = ("--plugin", "--help-all")
 """Options that one command is enough to test."""
-QUICK = ("robots --json", "import", "simulate rb5")
+QUICK = ("robots --json", "import exports", "simulate rb5")
 """How calls begin that the suite runs too, in this process, so none with a plug-in."""
 QUICK_CALLS = [
     call for call in calls() if shlex.join(call.words).startswith(QUICK) and "--plugin" not in call.words
