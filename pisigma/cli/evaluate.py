@@ -5,10 +5,11 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from pisigma.cli.arguments import AsJson, Verbose
+from pisigma.cli.cell import cell_at, refuse_beside_cell, tell_replaced
 from pisigma.cli.output import print_json
 from pisigma.cli.progress import progress_of
 from pisigma.cli.screen import print_screen
-from pisigma.cli.settings_options import takes_settings
+from pisigma.cli.settings_options import StatedOptions, takes_settings
 from pisigma.cli.verify import comparison_blocks, model_rms
 from pisigma.files.errors import AcceptanceError
 from pisigma.workflow.settings.evaluation import EvaluationSettings
@@ -19,9 +20,9 @@ if TYPE_CHECKING:
 Paths = Annotated[
     list[str],
     typer.Argument(
-        metavar="MODEL... DATA",
+        metavar="MODEL... DATA|CELL",
         help="Model folders, 'nominal' (base and tool fitted) or 'geometric' (without the joint correction), and last "
-        "the measurements (CSV) in the models' frames.",
+        "the measurements (CSV) in the models' frames; or a cell.",
     ),
 ]
 Hashes = Annotated[
@@ -37,6 +38,7 @@ Hashes = Annotated[
 def evaluate(
     paths: Paths,
     settings: EvaluationSettings,
+    stated: StatedOptions,
     sha256: Hashes = None,
     verbose: Verbose = False,
     as_json: AsJson = False,
@@ -49,6 +51,9 @@ def evaluate(
     from pisigma.files.model_files import check_model_hash
     from pisigma.workflow import evaluate as workflow
 
+    if len(paths) == 1 and (cell := cell_at(paths[0])) is not None:
+        refuse_beside_cell(__sha256=sha256)
+        return _tell(cell.evaluate(**tell_replaced(cell, "evaluate", stated)), verbose, as_json)
     if len(paths) < 2:
         raise typer.BadParameter("expected a model folder and, last, a file of measurements")
     folders = [path for path in paths[:-1] if path not in workflow.REFERENCES]
@@ -57,11 +62,16 @@ def evaluate(
             f"expected one for each of the {len(folders)} model folders, got {len(sha256)}",
             param_hint="'--sha256'",
         )
-    for folder, stated in zip(folders, sha256 or (), strict=False):
-        check_model_hash(folder, stated)
+    for folder, expected in zip(folders, sha256 or (), strict=False):
+        check_model_hash(folder, expected)
     with progress_of("evaluate") as progress:
         progress("comparing the models")
         evaluation = workflow.evaluate(paths[:-1], paths[-1], settings)
+    _tell(evaluation, verbose, as_json)
+
+
+def _tell(evaluation: "Evaluation", verbose: bool, as_json: bool) -> None:
+    """Print an evaluation, and end with status 3 where it is not accepted."""
     if as_json:
         print_json(evaluation.to_json())
     else:

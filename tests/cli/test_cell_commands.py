@@ -162,6 +162,28 @@ def test_what_a_cell_knows_is_not_stated_again_and_what_is_missing_is(run, cell,
     assert result.stdout == ""
 
 
+def test_a_cell_is_evaluated_compared_and_measured(run, used, tmp_path):
+    cell, printed = used
+    compared = json.loads(run("compare", cell, "--json").stdout)
+    assert [one["name"] for one in compared["models"]] == [
+        printed[name]["model"].rpartition("/")[2] for name in ("calibrate", "recalibrate")
+    ]
+    session = rows_file(tmp_path, day(0), 12, 4, zero=0.08)
+    assert run("import", session, "--cell", cell, "--json").exit_code == 0
+    evaluated = json.loads(run("evaluate", cell, "--json").stdout)
+    assert evaluated["rows"] == 12
+    assert evaluated["model"].endswith(printed["recalibrate"]["model"].rpartition("/")[2])
+    run("session", cell, day(0), "--set-aside", "a trial", "--json")
+    plan = max((cell / "plans").glob("*.csv"), key=lambda path: path.stat().st_mtime)
+    measured(4, 5).write_csv(tmp_path / "rows.csv", ROBOT)
+    of_plan, of_cell = (
+        run("measure", one, "--rows", tmp_path / "rows.csv", "--no-replan", "--once", "--json")
+        for one in (plan, cell)
+    )
+    assert of_cell.exit_code == of_plan.exit_code
+    assert json.loads(of_cell.stdout) == json.loads(of_plan.stdout)
+
+
 def test_a_model_is_verified_and_put_into_use_by_name(run, used):
     cell, printed = used
     first, second = (printed[name]["model"].rpartition("/")[2] for name in ("calibrate", "recalibrate"))

@@ -21,12 +21,18 @@ if TYPE_CHECKING:
 First = Annotated[
     str,
     typer.Argument(
-        metavar="A", help="Model folder, 'nominal' or 'geometric'.", autocompletion=complete_model
+        metavar="A|CELL",
+        help="Model folder, 'nominal' or 'geometric', or a cell.",
+        autocompletion=complete_model,
     ),
 ]
 Second = Annotated[
-    str,
-    typer.Argument(metavar="B", help="Second model, given in the same way.", autocompletion=complete_model),
+    str | None,
+    typer.Argument(
+        metavar="B",
+        help="Second model, given in the same way. [default: of a cell the model in use, and A the one before]",
+        autocompletion=complete_model,
+    ),
 ]
 Rows = Annotated[Path | None, typer.Option(help="Measurements (CSV) that both models predict.")]
 Program = Annotated[
@@ -41,8 +47,8 @@ Page = Annotated[Path | None, typer.Option(help="HTML page to write, with a map 
 @takes_settings
 def compare(
     first: First,
-    second: Second,
     settings: ComparisonSettings,
+    second: Second = None,
     rows: Rows = None,
     program: Program = None,
     page: Page = None,
@@ -54,8 +60,13 @@ def compare(
     Tests differences with the posteriors of both models. Exits with status 3 where the rows must not be trusted.
     """
     from pisigma.files.output_file import check_page
+    from pisigma.lifetime.cell.layout import is_cell, models_in_turn
     from pisigma.workflow import compare as workflow
 
+    if second is None and is_cell(first):
+        first, second = map(str, models_in_turn(first))
+    if second is None:
+        raise typer.BadParameter("expected two models, or a cell")
     if page is not None:
         stated = settings.cameras.files if settings.cameras else ()
         check_page(page, (Path(first), Path(second), rows, program, *stated))

@@ -28,7 +28,11 @@ if TYPE_CHECKING:
     from pisigma.workflow.measure import MeasuringSession
 
 PlanFile = Annotated[
-    Path, typer.Argument(metavar="PLAN", help="Plan of `pisigma plan` (CSV, or the YAML next to it).")
+    Path,
+    typer.Argument(
+        metavar="PLAN|CELL",
+        help="Plan of `pisigma plan` (CSV, or the YAML next to it), or a cell with its newest plan.",
+    ),
 ]
 RowsFile = Annotated[Path, typer.Option("--rows", help="Measurements (CSV) that grow row by row.")]
 Programs = Annotated[
@@ -122,10 +126,12 @@ def measure(
     again are written to --rest. With --json, progress goes to stderr and one JSON object to stdout at the end. Exits
     with status 3 while all rows have the same fault.
     """
+    from pisigma.lifetime.cell.layout import newest_plan
     from pisigma.planning.session.growing_images import growing_file
     from pisigma.workflow.follow import check_programs, follow, rest_file
     from pisigma.workflow.measure import MeasuringSession
 
+    plan = newest_plan(plan)
     session = MeasuringSession.read(plan, settings)
     growing = growing_file(rows, session.plan.arm.robot, session.plan.settings)
     rest = rest_file(plan, rows, rest)

@@ -3,7 +3,7 @@
 import os
 from pathlib import Path
 
-from pisigma.files.errors import ModelError, Place
+from pisigma.files.errors import ModelError, Place, PlanningError
 from pisigma.lifetime.cell.history import HISTORY, History
 
 CELL_FILE = "cell.yaml"
@@ -13,6 +13,38 @@ PLANS, SESSIONS, MODELS = "plans", "sessions", "models"
 def is_cell(path: str | os.PathLike[str]) -> bool:
     """Whether a folder is a cell."""
     return (Path(path) / CELL_FILE).is_file()
+
+
+def newest_plan(path: str | os.PathLike[str]) -> Path:
+    """The newest plan, where a path is a cell; else the path itself.
+
+    Raises:
+        PlanningError: the cell has no plan.
+    """
+    if not is_cell(path):
+        return Path(path)
+    plans = sorted((Path(path) / PLANS).glob("*.csv"), key=lambda one: one.stat().st_mtime)
+    if not plans:
+        raise PlanningError("the cell has no plan", at=Place(path), remedy=f"run `pisigma plan {path}`")
+    return plans[-1]
+
+
+def models_in_turn(path: str | os.PathLike[str]) -> tuple[Path, Path]:
+    """The folder of the model that was in use before, and of the one in use.
+
+    Raises:
+        ModelError: fewer than two models were in use.
+    """
+    used = [one.model for one in History(Path(path) / HISTORY).uses() if one.model]
+    earlier = [name for name in used if name != used[-1]]
+    if not earlier:
+        raise ModelError(
+            expected="two models that were in use",
+            value=len(set(used)),
+            at=Place(path),
+            remedy="name two models",
+        )
+    return Path(path) / MODELS / earlier[-1], Path(path) / MODELS / used[-1]
 
 
 def model_folder(path: str | os.PathLike[str]) -> Path:

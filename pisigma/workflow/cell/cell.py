@@ -34,12 +34,19 @@ from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.folder.model_folder import load_model
 from pisigma.robot.description import Robot
-from pisigma.validation.held_out.validation_figures import ValidationFigures
 from pisigma.workflow.calibrate import Calibration, calibrate
 from pisigma.workflow.cell.cell_file import CellFile
-from pisigma.workflow.cell.model_choice import check_of, is_better
+from pisigma.workflow.cell.model_choice import check_of, is_better, p95_of
 from pisigma.workflow.cell.new_cell import write_new_cell
-from pisigma.workflow.cell.sessions import Sessions, edited_sessions, free_path, newest_day, not_taken_in
+from pisigma.workflow.cell.sessions import (
+    ModelRows,
+    Sessions,
+    edited_sessions,
+    free_path,
+    newest_day,
+    not_taken_in,
+)
+from pisigma.workflow.evaluate import Evaluation, evaluate
 from pisigma.workflow.monitor import Monitoring, monitor
 from pisigma.workflow.plan import Plan, plan
 from pisigma.workflow.recalibrate import Recalibration, recalibrate
@@ -206,7 +213,7 @@ class Cell:
         remark, better = doubt or "not verified yet", False
         if not doubt and (in_use := self.history.in_use) is not None:
             better, remark = is_better(self.sessions, in_use, sessions, settings, progress)
-        entry = self._entry(path, sessions, remark, _p95(result.summary.cross_validation))
+        entry = self._entry(path, sessions, remark, p95_of(result.summary.cross_validation))
         verdict = "accepted_implausible" if doubt else "trusted"
         check = Check("calibrate", entry.name, "", verdict, doubt, entry.p95_mm, False, now())
         self.history.add(entry, check, *([Use(entry.name, now(), remark)] if better else []))
@@ -226,16 +233,8 @@ class Cell:
             ModelError: there is no model.
             MeasurementError: there is no such session.
         """
-        entry = self._candidate(model)
-        chosen = self.sessions.chosen(entry, session)
-        seen = self.sessions.rows_for(entry, self.sessions.as_measured(chosen), chosen.day)
-        settings = self.file.settings("verify", **changed)
-        settings = replace(
-            settings,
-            cameras=None,
-            fit_frame=settings.fit_frame or seen.fit_frame,
-            fit_tool=settings.fit_tool or seen.fit_tool,
-        )
+        entry, chosen, seen = self._new_rows(model, session)
+        settings = seen.fitted(self.file.settings("verify", **changed))
         found = verify(self.model_folder(entry.name), seen.rows, settings)
         p95 = found.comparison.models[-1].position.statistics["p95"]
         action = found.verdict in ("moved", "not_better", "implausible", "setup_fault")
@@ -273,6 +272,20 @@ class Cell:
         assert found is not None  # there is a session
         return found
 
+    def evaluate(self, **changed: Any) -> Evaluation:
+        """Compare the model in use with the nominal robot on the newest session that it was not made of.
+
+        Args:
+            **changed: options of `pisigma evaluate` other than in `cell.yaml`, by its keys.
+
+        Raises:
+            ModelError: there is no model.
+            MeasurementError: no session is new to the model.
+        """
+        entry, _, seen = self._new_rows(None, None)
+        settings = seen.fitted(self.file.settings("evaluate", **changed))
+        return evaluate(self.model_folder(entry.name), seen.rows, settings)
+
     def recalibrate(
         self,
         session: str | None = None,
@@ -295,9 +308,7 @@ class Cell:
             ModelError: no model is in use.
             MeasurementError: there is no such session.
         """
-        parent = self._candidate(None)
-        chosen = self.sessions.chosen(parent, session)
-        seen = self.sessions.rows_for(parent, self.sessions.as_measured(chosen), chosen.day)
+        parent, chosen, seen = self._new_rows(None, session)
         settings = replace(self.file.settings("recalibrate", **changed), cameras=None)
         if seen.moved and settings.moved is None:
             settings = replace(settings, moved=seen.moved)
@@ -363,6 +374,12 @@ class Cell:
             )
         return models[-1]
 
+    def _new_rows(self, model: str | None, session: str | None) -> tuple[ModelEntry, SessionEntry, ModelRows]:
+        """A model, the newest session that it was not made of or a named one, and its rows as the model sees them."""
+        entry = self._candidate(model)
+        chosen = self.sessions.chosen(entry, session)
+        return entry, chosen, self.sessions.rows_for(entry, self.sessions.as_measured(chosen), chosen.day)
+
     def _entry(
         self, path: Path, sessions: Sequence[SessionEntry], remark: str, p95_mm: float | None
     ) -> ModelEntry:
@@ -378,8 +395,3 @@ class Cell:
             p95_mm=p95_mm,
             remark=remark,
         )
-
-
-def _p95(judged: ValidationFigures | None) -> float | None:
-    """95 % quantile of the position errors of held-out rows under the best calibration [mm]."""
-    return None if judged is None else list(judged.models.values())[-1].p95_mm

@@ -9,6 +9,7 @@ from pisigma.lifetime.cell.history import Check, ModelEntry, SessionEntry, now
 from pisigma.lifetime.cell.layout import MODELS
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.folder.model_folder import load_model
+from pisigma.validation.held_out.validation_figures import ValidationFigures
 from pisigma.workflow.calibrate import calibrate
 from pisigma.workflow.cell.sessions import Sessions, newest_day, since
 from pisigma.workflow.evaluate import evaluate
@@ -106,3 +107,8 @@ def check_of(found: Monitoring, entry: ModelEntry, session: SessionEntry) -> Che
     return Check(
         "monitor", entry.name, session.name, judged.verdict, judged.sentence, None, judged.recalibrate, now()
     )
+
+
+def p95_of(judged: ValidationFigures | None) -> float | None:
+    """95 % quantile of the position errors of held-out rows under the best calibration [mm]."""
+    return None if judged is None else list(judged.models.values())[-1].p95_mm

@@ -7,6 +7,7 @@ import tempfile
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -41,6 +42,11 @@ class ModelRows:
 
     rows: Measurements
     moved: tuple[str, ...]
+
+    def fitted(self, settings: Any) -> Any:
+        """Settings that fit frame and tool where an event says that they were changed; cameras were read already."""
+        fit_frame, fit_tool = settings.fit_frame or self.fit_frame, settings.fit_tool or self.fit_tool
+        return replace(settings, cameras=None, fit_frame=fit_frame, fit_tool=fit_tool)
 
     @property
     def fit_frame(self) -> bool:
