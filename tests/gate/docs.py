@@ -35,6 +35,7 @@ NOT_HERE: Mapping[str, str] = {
     "OMP_NUM_THREADS=1 python benchmarks/": "takes hours",
     "python benchmarks/": "takes hours",
     "pisigma calibrate ur5 corners.csv tracker.csv --camera wrist.yaml": "needs two cameras and a tracker",
+    "pisigma use cells/welder7": "names a model of the reader's cell",
     "pisigma export models/my_arm --format fanuc-mastering": "has ... for the counts of the reader's robot",
 }
 """Starts of lines that do not run here, and why."""
@@ -239,6 +240,11 @@ MADE: Mapping[str, Mapping[str, inputs.Maker]] = {
 }
 """How to create the files that a page names."""
 AT: Mapping[str, Mapping[str, inputs.Maker]] = {
+    "pisigma new ur5 --out cells/welder7": {
+        "measured.csv": inputs.measured("ur5", 0, 40),
+        "check.csv": inputs.measured("ur5", 40, 50),
+        "november.csv": inputs.measured("ur5", 50, 60),
+    },
     "pisigma robots --check mast.yaml": {"mast.yaml": inputs.mast},
     "pisigma calibrate my_robot.yaml": {
         "my_robot.yaml": yaml_block(f"{HOW_TO}add-a-robot.md", 0),

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, Literal, TypeVar, get_args
 
 from pisigma.files.errors import MeasurementError, ModelError, OutputError, Place, check_choice
-from pisigma.measurement.dates import WANTED, is_date
+from pisigma.measurement.dates import EXPECTED_DATE, is_date
 
 HISTORY = "history.sqlite"
 SCHEMA_VERSION = 1
@@ -235,7 +235,7 @@ class History:
         check_choice(MeasurementError, "event", kind, event_kinds())
         day = day or datetime.date.today().isoformat()
         if not is_date(day):
-            raise MeasurementError(expected=WANTED, value=day, option="--date")
+            raise MeasurementError(expected=EXPECTED_DATE, value=day, option="--date")
         event = Event(day, kind, note, now())  # type: ignore[arg-type]  # checked above
         self.add(event)
         return event

@@ -20,7 +20,7 @@ from pisigma.measurement.camera.camera_files import CameraFiles
 from pisigma.measurement.camera.corner_file import read_rows
 from pisigma.measurement.copies import RowValues, copies_of_known
 from pisigma.measurement.dataset import Measurements, join
-from pisigma.measurement.dates import WANTED, date_in_name, is_date
+from pisigma.measurement.dates import EXPECTED_DATE, date_in_name, is_date
 from pisigma.model.folder.model_folder import load_model
 from pisigma.robot.description import Robot
 from pisigma.validation.gate import check_rows
@@ -93,7 +93,7 @@ class Sessions:
         rows = read_rows(file, self.robot, self.cameras)
         day = day or _day_of(rows)
         if not is_date(day):
-            raise MeasurementError(expected=WANTED, value=day, option="--date")
+            raise MeasurementError(expected=EXPECTED_DATE, value=day, option="--date")
         entry = self._judged(rows, day, accept_implausible)
         if isinstance(file, Measurements):
             with tempfile.TemporaryDirectory() as scratch:
