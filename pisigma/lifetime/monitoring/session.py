@@ -127,7 +127,9 @@ class Session:
             return f"something changed, but these rows cannot distinguish what: {' or '.join(named)}."
         if self.verdict == "unchanged":
             return "nothing moved beyond its uncertainty."
-        moved = (f"{one.sentence} ({shown_probability(one.probability)})" for one in self.moved)
+        # of a base or a tool that moved, not its rotation where only its origin did, and the other way round
+        clear = [one for one in self.moved if one.is_significant or not is_frame(one.what)] or self.moved
+        moved = (f"{one.sentence} ({shown_probability(one.probability)})" for one in clear)
         return f"{'; '.join(moved)}."
 
     @property

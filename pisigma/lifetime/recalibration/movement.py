@@ -50,6 +50,11 @@ class Movement:
         return self.shift - half, self.shift + half
 
     @property
+    def is_significant(self) -> bool:
+        """Whether the shift is above `CLEAR` standard deviations."""
+        return abs(self.shift) > CLEAR * self.deviation
+
+    @property
     def size(self) -> str:
         """Shift, half-width of its 95 % interval and unit, such as "0.25 ± 0.01 deg"."""
         half = NORMAL_95 * self.deviation
@@ -101,7 +106,7 @@ def significant_movements(adaptation: Adaptation) -> tuple[Movement, ...]:
         if group.size and group.what.split()[0] in ("base", "tool", "joint", "lengths", "angles"):
             estimate = adaptation.search.shift(number, held=not group.what.startswith("joint"))
             moved += movements_of_group(adaptation.problem, adaptation.arm.geometry, group, *estimate)
-    return tuple(one for one in moved if abs(one.shift) > CLEAR * one.deviation)
+    return tuple(one for one in moved if one.is_significant)
 
 
 def movements_of_group(

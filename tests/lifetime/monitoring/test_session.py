@@ -9,6 +9,7 @@ from testing.aged import model_before, rows_later
 from testing.closeness import assert_close
 
 from pisigma.lifetime.monitoring.session import judge_session
+from pisigma.lifetime.recalibration.movement import Movement
 from pisigma.model.model_posterior import ModelPosterior
 
 ELSEWHERE = (0.3, -0.2, 0.1, 0.5, 0.2, -0.3)
@@ -97,3 +98,12 @@ def test_scores_are_as_large_as_expected_where_nothing_changes():
         [one.shift / (one.influence @ one.influence.mT + one.own).diagonal().sqrt() for one in zeros]
     )
     assert 0.4 < float(scores[:, :5].square().mean().sqrt()) < 1.6
+
+
+def test_only_the_part_of_a_tool_that_moved_is_named():
+    session, _ = judged(rows_later(10, 3))
+    origin = Movement("tool", 30.0, 0.01, "mm", 0.999)
+    still = Movement("tool", 0.0, 0.0001, "deg", 0.999)
+    both = replace(session, moved=(origin, still))
+    assert both.sentence == replace(session, moved=(origin,)).sentence
+    assert replace(session, moved=(still,)).sentence != both.sentence
