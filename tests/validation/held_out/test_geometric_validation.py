@@ -1,4 +1,4 @@
-"""Geometric calibration on rows that it never saw: whole placements of sockets and of jigs held out."""
+"""Geometric calibration judged on held-out rows: complete placements of sockets and of jigs."""
 
 from dataclasses import replace
 
