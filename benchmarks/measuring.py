@@ -19,7 +19,7 @@ from pisigma.calibration.hybrid.calibrator import HybridCalibrator
 from pisigma.measurement.dataset import Measurements
 from pisigma.planning.plan_settings import PlanSettings
 from pisigma.planning.session.row_judgement import judge_rows
-from pisigma.planning.surroundings.arm_in_cell import ArmInCell
+from pisigma.planning.surroundings.arm_in_surroundings import ArmInSurroundings
 from pisigma.validation.held_out.few_rows import fit_where_it_helps
 from pisigma.workflow.measure import MeasuringSession
 from pisigma.workflow.plan import plan
@@ -114,7 +114,7 @@ def session(arm: Arm, how: str) -> tuple[int, float]:
         few = plan(arm.planned, replace(settings, count=1)).stored
         stored = replace(
             few,
-            arm=ArmInCell.of(arm.planned),
+            arm=ArmInSurroundings.of(arm.planned),
             q=q,
             check=torch.zeros(count, dtype=torch.bool),
             candidate=torch.arange(count),

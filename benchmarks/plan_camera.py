@@ -31,8 +31,8 @@ from pisigma.planning.plan_inputs import find_candidates, instrument_of, views_o
 from pisigma.planning.plan_settings import Criterion, PlanSettings
 from pisigma.planning.pose_selection import select_poses
 from pisigma.planning.robot_posterior import RobotPosterior
-from pisigma.planning.surroundings.arm_in_cell import ArmInCell
-from pisigma.planning.surroundings.cell import Cell
+from pisigma.planning.surroundings.arm_in_surroundings import ArmInSurroundings
+from pisigma.planning.surroundings.surroundings import Surroundings
 from pisigma.planning.task import TASK_POSES
 from pisigma.robot import Robot
 from pisigma.robot.kinematics.forward import forward_kinematics
@@ -41,7 +41,7 @@ from pisigma.simulation.camera.simulated_images import ImageNoise, simulate_imag
 
 LENGTH, ANGLE, POSTURES = 1e-3, np.deg2rad(0.3), 400
 PRIOR = Prior(theta=ANGLE, d=LENGTH, a=LENGTH, alpha=ANGLE, beta=ANGLE)
-CELL = Cell.model_validate(
+CELL = Surroundings.model_validate(
     {
         "tool": {"x_mm": 30, "y_mm": 20, "z_mm": 60, "roll_deg": 5.7, "pitch_deg": 1.1, "yaw_deg": -1.7},
         "view": {
@@ -59,7 +59,7 @@ BOARD = {"name": "board", "rows": 6, "columns": 9, "square_mm": 30}
 class Bench:
     """The arm, the candidates, and the prior."""
 
-    arm: ArmInCell
+    arm: ArmInSurroundings
     settings: PlanSettings
     q: Tensor
     task: Tensor
@@ -77,7 +77,7 @@ class Bench:
             settings = PlanSettings(
                 sensor="camera", camera=CameraSettings(*map(str, files)), candidates=candidates
             )
-            arm, instrument = ArmInCell.of(Robot.load("ur5"), CELL), instrument_of(settings)
+            arm, instrument = ArmInSurroundings.of(Robot.load("ur5"), CELL), instrument_of(settings)
             drawn, views = find_candidates(settings, arm), views_of(settings, arm)
         assert views is not None
         base = xyzrpy_from_transform(invert(views.T_cell_frame)).numpy()

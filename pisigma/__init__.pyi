@@ -10,13 +10,14 @@ from pisigma.model.inverse.corrected_ik import CorrectedIK as CorrectedIK
 from pisigma.model.inverse.solution import Solution as Solution
 from pisigma.network.pi_sigma import PiSigma as PiSigma
 from pisigma.planning.plan_settings import PlanSettings as PlanSettings
-from pisigma.planning.surroundings.cell import Cell as Cell
+from pisigma.planning.surroundings.surroundings import Surroundings as Surroundings
 from pisigma.robot.description import Robot as Robot
 from pisigma.robot.kernels.array_kinematics import forward_kinematics as forward_kinematics
 from pisigma.robot.kernels.array_kinematics import joint_jacobian as joint_jacobian
 from pisigma.robot.kinematics.status import Status as Status
 from pisigma.workflow.calibrate import Calibration as Calibration
 from pisigma.workflow.calibrate import calibrate as calibrate
+from pisigma.workflow.cell.cell import Cell as Cell
 from pisigma.workflow.compare import ComparedModels as ComparedModels
 from pisigma.workflow.compare import compare as compare
 from pisigma.workflow.distill import Distillation as Distillation

@@ -16,7 +16,7 @@ from typer.main import get_command
 
 from pisigma.cli.main import app
 from pisigma.measurement.csv.columns import column_choices, find_column
-from pisigma.planning.surroundings.cell import Cell, read_cell
+from pisigma.planning.surroundings.surroundings import Surroundings, read_surroundings
 from pisigma.robot import Robot, catalogue
 from pisigma.robot.kinematics.status import Status
 
@@ -237,9 +237,9 @@ def test_the_example_cells_show_every_key(tmp_path: Path) -> None:
     shown: set[str] = set()
     for block in blocks:
         (tmp_path / "cell.yaml").write_text(block, encoding="utf-8")
-        cell = read_cell(tmp_path / "cell.yaml", Robot.load("ur10"))
+        cell = read_surroundings(tmp_path / "cell.yaml", Robot.load("ur10"))
         shown |= set(cell.model_dump(exclude_defaults=True))
-    assert shown == set(Cell.model_fields), "the examples show everything"
+    assert shown == set(Surroundings.model_fields), "the examples show everything"
 
 
 def test_the_keys_of_recipes_are_those_of_the_models() -> None:

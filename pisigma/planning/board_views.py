@@ -10,8 +10,8 @@ from torch import Tensor
 
 from pisigma.measurement.camera.pattern import board_sheet
 from pisigma.planning.board_sight import BoardSight
-from pisigma.planning.surroundings.arm_in_cell import POSES_PER_CHUNK, ArmInCell
-from pisigma.planning.surroundings.cell import ViewSection
+from pisigma.planning.surroundings.arm_in_surroundings import POSES_PER_CHUNK, ArmInSurroundings
+from pisigma.planning.surroundings.surroundings import ViewSection
 from pisigma.robot.kinematics.closed_form.registry import closed_form_solver
 from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.robot.kinematics.numeric import solve_numeric
@@ -58,7 +58,9 @@ class BoardViews:
             sight, T_cell_frame, nearest, farthest, math.radians(view.oblique_deg), view.margin_px
         )
 
-    def draw(self, arm: ArmInCell, count: int, generator: torch.Generator) -> Float64[Tensor, "count dof"]:
+    def draw(
+        self, arm: ArmInSurroundings, count: int, generator: torch.Generator
+    ) -> Float64[Tensor, "count dof"]:
         """Draw joint values [rad or m] of random views, each in a random branch; NaN where a view is not reached.
 
         Depth, obliqueness, its direction, the rotation about the line of sight and the position in the image are
@@ -82,16 +84,20 @@ class BoardViews:
         chosen: Tensor = branches[torch.arange(count), rank.argmax(1)]
         return chosen
 
-    def faults(self, arm: ArmInCell, q: Float64[Tensor, "poses dof"]) -> dict[str, Bool[Tensor, " poses"]]:
+    def faults(
+        self, arm: ArmInSurroundings, q: Float64[Tensor, "poses dof"]
+    ) -> dict[str, Bool[Tensor, " poses"]]:
         """Return which poses fail, by reason."""
         chunks = [self._faults(arm, chunk) for chunk in torch.split(q, POSES_PER_CHUNK)]
         return {reason: torch.cat([chunk[reason] for chunk in chunks]) for reason in chunks[0]}
 
-    def obliqueness(self, arm: ArmInCell, q: Float64[Tensor, "poses dof"]) -> Float64[Tensor, " poses"]:
+    def obliqueness(
+        self, arm: ArmInSurroundings, q: Float64[Tensor, "poses dof"]
+    ) -> Float64[Tensor, " poses"]:
         """Compute the angle between board normal and line of sight to its centre [rad]; from behind > π / 2."""
         return self._obliqueness(self._boards(arm, q)[0])
 
-    def room(self, arm: ArmInCell, q: Float64[Tensor, "poses dof"]) -> Float64[Tensor, " poses"]:
+    def room(self, arm: ArmInSurroundings, q: Float64[Tensor, "poses dof"]) -> Float64[Tensor, " poses"]:
         """Compute how far the board may be from its stated place before it leaves the image [m]."""
         points, pixels, _ = self._shown(self._boards(arm, q)[0])
         edge = pixels.new_tensor([self.sight.camera.width, self.sight.camera.height])
@@ -116,7 +122,9 @@ class BoardViews:
         R = R @ rotation_from_rpy(torch.stack([turn, nothing, nothing], 1))
         return transform(R, middle - R @ self._middle)
 
-    def _faults(self, arm: ArmInCell, q: Float64[Tensor, "poses dof"]) -> dict[str, Bool[Tensor, " poses"]]:
+    def _faults(
+        self, arm: ArmInSurroundings, q: Float64[Tensor, "poses dof"]
+    ) -> dict[str, Bool[Tensor, " poses"]]:
         T, T_cell_board = self._boards(arm, q)
         points, pixels, is_regular = self._shown(T)
         camera, oblique = self.sight.camera, self._obliqueness(T)
@@ -136,7 +144,7 @@ class BoardViews:
         return faults | arm.hidden(q, lines, "the board from the camera")
 
     def _boards(
-        self, arm: ArmInCell, q: Float64[Tensor, "poses dof"]
+        self, arm: ArmInSurroundings, q: Float64[Tensor, "poses dof"]
     ) -> tuple[Float64[Tensor, "poses 4 4"], Float64[Tensor, "poses 4 4"]]:
         """Return T_camera_board and T_cell_board [m]."""
         T_cell_target = forward_kinematics(arm.robot, q)

@@ -13,7 +13,7 @@ from torch import Tensor
 from pisigma.files.errors import PlanningError
 from pisigma.measurement.csv.reading import read_joints
 from pisigma.planning.board_views import BoardViews
-from pisigma.planning.surroundings.arm_in_cell import ArmInCell, Faults
+from pisigma.planning.surroundings.arm_in_surroundings import ArmInSurroundings, Faults
 from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.robot.kinematics.joint_limits import nearest_turn
 from pisigma.robot.se3 import wrap_to_pi
@@ -78,7 +78,7 @@ class Candidates:
 
 
 def draw_candidates(
-    arm: ArmInCell,
+    arm: ArmInSurroundings,
     count: int,
     seed: int,
     workspace: Workspace | None = None,
@@ -118,7 +118,7 @@ def draw_candidates(
     return candidates if views is not None else with_workspace(arm, candidates, candidates)
 
 
-def with_workspace(arm: ArmInCell, candidates: Candidates, others: Candidates) -> Candidates:
+def with_workspace(arm: ArmInSurroundings, candidates: Candidates, others: Candidates) -> Candidates:
     """Add the whole workspace to candidates that cover a part of it, and unwrap the joint values of both.
 
     A joint that is rarely free at some angles, such as a shoulder above a floor, is unwrapped about the centre of the
@@ -145,7 +145,7 @@ def with_workspace(arm: ArmInCell, candidates: Candidates, others: Candidates) -
 
 
 def read_candidates(
-    arm: ArmInCell,
+    arm: ArmInSurroundings,
     path: str | os.PathLike[str],
     workspace: Workspace | None = None,
     views: BoardViews | None = None,
@@ -175,7 +175,7 @@ def _repeats(q: Float64[Tensor, "poses dof"]) -> Bool[Tensor, " poses"]:
 
 
 def spread(
-    arm: ArmInCell, q: Float64[Tensor, "poses dof"], count: int, others: Float64[Tensor, "others dof"]
+    arm: ArmInSurroundings, q: Float64[Tensor, "poses dof"], count: int, others: Float64[Tensor, "others dof"]
 ) -> Int64[Tensor, " chosen"]:
     """Select poses spread over the workspace: each time the one farthest from all that are selected or given.
 
@@ -205,7 +205,10 @@ def spread(
 
 
 def _faults(
-    arm: ArmInCell, q: Float64[Tensor, "poses dof"], workspace: Workspace | None, views: BoardViews | None
+    arm: ArmInSurroundings,
+    q: Float64[Tensor, "poses dof"],
+    workspace: Workspace | None,
+    views: BoardViews | None,
 ) -> Faults:
     """Return why poses are not allowed by the cell, the workspace, or the camera."""
     failed = {} if views is None else {UNREACHED: q.isnan().any(1)}
@@ -226,7 +229,7 @@ def _allowed(q: Float64[Tensor, "poses dof"], faults: Faults) -> Candidates:
     return Candidates(allowed, faults.allowed.nonzero()[:, 0] + 1, len(q), faults.counts(), allowed)
 
 
-def _drawn_range(arm: ArmInCell) -> Float64[Tensor, "axes 2"]:
+def _drawn_range(arm: ArmInSurroundings) -> Float64[Tensor, "axes 2"]:
     """Return the range of the controller's values that are drawn [rad or m]."""
     limits = arm.limits.clone()
     for index, (joint, (lower, upper)) in enumerate(zip(arm.robot.axes, arm.limits.tolist(), strict=True)):

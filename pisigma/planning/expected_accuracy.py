@@ -13,7 +13,7 @@ from pisigma.planning.board_views import BoardViews
 from pisigma.planning.candidates import Candidates
 from pisigma.planning.pose_selection import select_poses
 from pisigma.planning.robot_posterior import RobotPosterior
-from pisigma.planning.surroundings.arm_in_cell import ArmInCell
+from pisigma.planning.surroundings.arm_in_surroundings import ArmInSurroundings
 
 RANDOM_SELECTIONS = 5
 """Random selections of poses that a plan is compared with."""
@@ -165,7 +165,7 @@ class CameraProspects:
         chosen: Int64[Tensor, " chosen"],
         task: Float64[Tensor, "tasks dof"],
         views: BoardViews,
-        arm: ArmInCell,
+        arm: ArmInSurroundings,
     ) -> "CameraProspects":
         """Predict the errors.
 
@@ -232,7 +232,7 @@ class CameraProspects:
         )
 
 
-def _unidentifiable(arm: ArmInCell, is_fixed: bool) -> tuple[str, ...]:
+def _unidentifiable(arm: ArmInSurroundings, is_fixed: bool) -> tuple[str, ...]:
     """Say which parameters the unknown target and frame absorb: those of the last row, and those along axis 1."""
     frame, target = ("camera", "board") if is_fixed else ("board", "camera")
     first, last = arm.robot.joint_rows[0] + 1, arm.robot.joint_rows[-1] + 1

@@ -19,8 +19,8 @@ from pisigma.measurement.csv.columns import PLAN_COLUMNS
 from pisigma.measurement.csv.reading import read_joints
 from pisigma.measurement.csv.table import Table, read_table
 from pisigma.planning.plan_settings import PlanSettings
-from pisigma.planning.surroundings.arm_in_cell import ArmInCell
-from pisigma.planning.surroundings.cell import Cell
+from pisigma.planning.surroundings.arm_in_surroundings import ArmInSurroundings
+from pisigma.planning.surroundings.surroundings import Surroundings
 from pisigma.robot.description import Robot
 from pisigma.robot.robot_file import RobotDocument
 from pisigma.robot.row import Bounded
@@ -58,7 +58,7 @@ class PlanDocument(Section):
     robot: RobotDocument
     model: str | None = None
     settings: PlanSettings
-    cell: Cell = Cell()
+    cell: Surroundings = Surroundings()
     way_points: tuple[WayPoint, ...] = ()
 
 
@@ -77,7 +77,7 @@ class StoredPlan:
         number: number of each pose, kept in parts of the plan; () where they count from 1.
     """
 
-    arm: ArmInCell
+    arm: ArmInSurroundings
     settings: PlanSettings
     model: Path | None
     q: Float64[Tensor, "poses dof"]
@@ -170,7 +170,7 @@ def read_plan(path: str | os.PathLike[str]) -> StoredPlan:
             )
         file = yaml_of(file)
     document = read_yaml(file, PlanDocument, PlanningError)
-    arm = ArmInCell.of(Robot(*document.robot.to_fields()), document.cell)
+    arm = ArmInSurroundings.of(Robot(*document.robot.to_fields()), document.cell)
     poses = file.parent / document.poses
     table, q = read_table(poses), read_joints(poses, arm.robot)
     order = _numbers(table, "order")

@@ -25,7 +25,7 @@ from pisigma.planning.candidates import (
 )
 from pisigma.planning.plan_settings import PlanSettings
 from pisigma.planning.robot_posterior import Instrument
-from pisigma.planning.surroundings.arm_in_cell import ArmInCell
+from pisigma.planning.surroundings.arm_in_surroundings import ArmInSurroundings
 from pisigma.robot.description import Robot
 
 WORKSPACE_POSES = 1000
@@ -56,7 +56,7 @@ def instrument_of(settings: PlanSettings, anchor: Float64[Tensor, " 3"] | None =
     return Instrument(settings.sensor, **stated)
 
 
-def find_candidates(settings: PlanSettings, arm: ArmInCell) -> Candidates:
+def find_candidates(settings: PlanSettings, arm: ArmInSurroundings) -> Candidates:
     """Draw or read the poses to select from.
 
     Raises:
@@ -73,7 +73,7 @@ def find_candidates(settings: PlanSettings, arm: ArmInCell) -> Candidates:
     return with_workspace(arm, candidates, draw_candidates(arm, WORKSPACE_POSES, settings.seed, workspace))
 
 
-def with_measured(settings: PlanSettings, arm: ArmInCell) -> ArmInCell:
+def with_measured(settings: PlanSettings, arm: ArmInSurroundings) -> ArmInSurroundings:
     """Return the arm such that candidates that were measured are free of self-collision.
 
     Raises:
@@ -100,7 +100,7 @@ def read_planned_rows(settings: PlanSettings, path: str | os.PathLike[str], robo
     return read_rows(path, robot, None if settings.camera is None else settings.camera.files)
 
 
-def views_of(settings: PlanSettings, arm: ArmInCell) -> BoardViews | None:
+def views_of(settings: PlanSettings, arm: ArmInSurroundings) -> BoardViews | None:
     """Return the conditions under which the camera sees its board; None without a camera.
 
     Raises:

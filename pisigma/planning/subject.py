@@ -18,8 +18,8 @@ from pisigma.planning.board_views import BoardViews
 from pisigma.planning.plan_inputs import instrument_of, read_planned_rows, views_of
 from pisigma.planning.plan_settings import PlanSettings
 from pisigma.planning.robot_posterior import RobotPosterior
-from pisigma.planning.surroundings.arm_in_cell import ArmInCell
-from pisigma.planning.surroundings.cell import Cell
+from pisigma.planning.surroundings.arm_in_surroundings import ArmInSurroundings
+from pisigma.planning.surroundings.surroundings import Surroundings
 from pisigma.robot.description import Robot
 from pisigma.robot.robot_file import FrameSection
 from pisigma.robot.se3 import invert, transform_from_xyzrpy, xyzrpy_from_transform
@@ -78,10 +78,10 @@ class Subject:
             )
         return Subject(subject.drawn, subject)
 
-    def arm(self, cell: Cell | None) -> ArmInCell:
+    def arm(self, cell: Surroundings | None) -> ArmInSurroundings:
         """Return the robot in its cell, with target and board as the cell states them, else as in the model."""
         if self.model is None:
-            return ArmInCell.of(self.robot, cell)
+            return ArmInSurroundings.of(self.robot, cell)
         if cell is not None and cell.view is not None and cell.view.frame is None and self._saw_board:
             x, y, z, *angles = xyzrpy_from_transform(invert(self._from_cell())).tolist()
             lengths = {f"{name}_mm": value * 1e3 for name, value in zip("xyz", (x, y, z), strict=True)}
@@ -90,9 +90,9 @@ class Subject:
             cell = cell.model_copy(update={"view": cell.view.model_copy(update={"frame": frame})})
         has_tool = cell is not None and cell.tool is not None
         robot = self.robot if has_tool else self.robot.with_geometry(tool=self.model.identified.tool)
-        return ArmInCell.of(robot, cell)
+        return ArmInSurroundings.of(robot, cell)
 
-    def posterior(self, arm: ArmInCell, settings: PlanSettings) -> RobotPosterior:
+    def posterior(self, arm: ArmInSurroundings, settings: PlanSettings) -> RobotPosterior:
         """Return the distribution of the unknowns before the first pose of the plan is measured.
 
         Raises:
@@ -117,7 +117,9 @@ class Subject:
         rows = read_planned_rows(settings, settings.measured, arm.robot).split_sets()[0]
         return posterior.after(rows) if self.model is None else posterior.informed(rows.q)
 
-    def _seen_by_camera(self, arm: ArmInCell, settings: PlanSettings, views: BoardViews) -> RobotPosterior:
+    def _seen_by_camera(
+        self, arm: ArmInSurroundings, settings: PlanSettings, views: BoardViews
+    ) -> RobotPosterior:
         """Return the distribution of the unknowns in the frame of the board, or of a fixed camera.
 
         A model that was calibrated with another board, camera or sensor does not determine the pose of these.

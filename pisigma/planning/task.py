@@ -16,7 +16,7 @@ from pisigma.measurement.csv.table import read_table
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.inverse.corrected_ik import CorrectedIK
 from pisigma.planning.plan_settings import PlanSettings
-from pisigma.planning.surroundings.arm_in_cell import ArmInCell
+from pisigma.planning.surroundings.arm_in_surroundings import ArmInSurroundings
 from pisigma.robot import Robot
 from pisigma.robot.kinematics.status import Status
 from pisigma.robot.kinematics.tolerances import LIMIT_TOLERANCE
@@ -30,7 +30,7 @@ STARTS = 200
 
 
 def task_poses(
-    arm: ArmInCell,
+    arm: ArmInSurroundings,
     settings: PlanSettings,
     q: Float64[Tensor, "poses dof"],
     model: CalibratedModel | None = None,

@@ -37,9 +37,9 @@ from pisigma.planning.plan_settings import PlanSettings
 from pisigma.planning.pose_selection import select_poses
 from pisigma.planning.robot_posterior import RobotPosterior
 from pisigma.planning.subject import Subject
-from pisigma.planning.surroundings.arm_in_cell import ArmInCell
-from pisigma.planning.surroundings.cell import Cell, read_cell
+from pisigma.planning.surroundings.arm_in_surroundings import ArmInSurroundings
 from pisigma.planning.surroundings.motion import Motions
+from pisigma.planning.surroundings.surroundings import Surroundings, read_surroundings
 from pisigma.planning.task import task_poses
 from pisigma.planning.tour import Tour, order_of_use, stages_of, tour
 from pisigma.robot.description import Robot
@@ -171,7 +171,7 @@ def check_files(
 def plan(
     subject: Robot | CalibratedModel | HoldsModel | Subject | str | os.PathLike[str],
     settings: PlanSettings | None = None,
-    cell: Cell | str | os.PathLike[str] | None = None,
+    cell: Surroundings | str | os.PathLike[str] | None = None,
     progress: Progress = lambda what: None,
 ) -> Plan:
     """Plan which poses to measure and in which order, and predict the accuracy of a calibration with them.
@@ -193,8 +193,8 @@ def plan(
     """
     started, settings = time.perf_counter(), settings or PlanSettings()
     subject = subject if isinstance(subject, Subject) else Subject.of(subject)
-    if cell is not None and not isinstance(cell, Cell):
-        cell = read_cell(cell, subject.robot)
+    if cell is not None and not isinstance(cell, Surroundings):
+        cell = read_surroundings(cell, subject.robot)
     arm = with_measured(settings, subject.arm(cell))
     progress("candidates")
     candidates = find_candidates(settings, arm)
@@ -241,7 +241,7 @@ class _Problem:
 
     subject: Subject
     settings: PlanSettings
-    arm: ArmInCell
+    arm: ArmInSurroundings
     candidates: Candidates
     posterior: RobotPosterior
     task: Float64[Tensor, "tasks dof"]

@@ -13,10 +13,10 @@ from pisigma.planning.candidates import draw_candidates
 from pisigma.planning.plan_file import StoredPlan, read_plan
 from pisigma.planning.plan_inputs import instrument_of
 from pisigma.planning.plan_settings import PlanSettings
-from pisigma.planning.surroundings.arm_in_cell import ArmInCell
+from pisigma.planning.surroundings.arm_in_surroundings import ArmInSurroundings
 from pisigma.robot import Robot
 
-ARM = ArmInCell.of(Robot.load("fanuc_r2000"), CELL)
+ARM = ArmInSurroundings.of(Robot.load("fanuc_r2000"), CELL)
 DRAWN = draw_candidates(ARM, 6, 0)
 
 

@@ -8,14 +8,14 @@ import torch
 from pisigma.measurement.camera.board import Board
 from pisigma.measurement.camera.camera import Camera
 from pisigma.planning.camera_settings import CameraSettings
-from pisigma.planning.surroundings.arm_in_cell import ArmInCell
-from pisigma.planning.surroundings.cell import Cell
+from pisigma.planning.surroundings.arm_in_surroundings import ArmInSurroundings
+from pisigma.planning.surroundings.surroundings import Surroundings
 from pisigma.robot import Robot
 from pisigma.robot.kinematics.forward import forward_kinematics
 
 NEAR, FAR, OBLIQUE, MARGIN = 0.3, 0.7, 45.0, 20.0
 """[m, m, deg, px]"""
-CELL = Cell.model_validate(
+CELL = Surroundings.model_validate(
     {
         "floor_mm": -20.0,
         "boxes": [{"name": "table", "center_mm": (450, -100, 0), "size_mm": (300, 300, 98)}],
@@ -48,12 +48,12 @@ def camera_settings(folder: Path, is_fixed: bool = False) -> CameraSettings:
     return CameraSettings(str(camera), str(board), is_fixed)
 
 
-def arm_before_board(robot: Robot | None = None) -> ArmInCell:
+def arm_before_board(robot: Robot | None = None) -> ArmInSurroundings:
     """Return a robot (default: a UR5) in the cell."""
-    return ArmInCell.of(robot or Robot.load("ur5"), CELL)
+    return ArmInSurroundings.of(robot or Robot.load("ur5"), CELL)
 
 
-def sees_board(arm: ArmInCell, settings: CameraSettings, q: np.ndarray, radius: np.ndarray) -> bool:
+def sees_board(arm: ArmInSurroundings, settings: CameraSettings, q: np.ndarray, radius: np.ndarray) -> bool:
     """Whether the whole printed sheet is in the image, sharp, near enough to frontal, and not behind a link."""
     camera, board = Camera.load(settings.camera), Board.load(settings.board)
     assert arm.cell.view is not None

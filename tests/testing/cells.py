@@ -2,11 +2,11 @@
 
 import numpy as np
 
-from pisigma.planning.surroundings.cell import Cell
+from pisigma.planning.surroundings.surroundings import Surroundings
 from pisigma.robot import Robot
 from pisigma.robot.urdf_frames import frame_of, row_frame
 
-CELL = Cell.model_validate(
+CELL = Surroundings.model_validate(
     {
         "clearance_mm": 20.0,
         "floor_mm": 0.0,
@@ -44,7 +44,7 @@ def lines_of(robot: Robot, q: np.ndarray) -> list[np.ndarray]:
     return lines
 
 
-def is_collision_free(robot: Robot, cell: Cell, q: np.ndarray, radius: np.ndarray) -> bool:
+def is_collision_free(robot: Robot, cell: Surroundings, q: np.ndarray, radius: np.ndarray) -> bool:
     """Whether all points of the links keep the clearance from floor, boxes and non-adjacent links.
 
     Args:
@@ -69,7 +69,7 @@ def is_collision_free(robot: Robot, cell: Cell, q: np.ndarray, radius: np.ndarra
     )
 
 
-def is_visible(robot: Robot, cell: Cell, q: np.ndarray, radius: np.ndarray) -> bool:
+def is_visible(robot: Robot, cell: Surroundings, q: np.ndarray, radius: np.ndarray) -> bool:
     """Whether the beam from the tracker passes boxes and the links before the wrist, and meets the reflector's cone."""
     assert cell.tracker is not None
     assert cell.reflector is not None

@@ -12,7 +12,7 @@ from pisigma.measurement.dataset import Measurements
 from pisigma.planning.plan_file import StoredPlan
 from pisigma.planning.plan_inputs import find_candidates
 from pisigma.planning.plan_settings import PlanSettings
-from pisigma.planning.surroundings.arm_in_cell import ArmInCell
+from pisigma.planning.surroundings.arm_in_surroundings import ArmInSurroundings
 from pisigma.robot.description import Robot
 from pisigma.robot.kinematics.forward import forward_kinematics
 
@@ -52,7 +52,7 @@ def measured_plan(name: str = "ur5", poses: int = 24, seed: int = 0) -> Measured
         dh=robot.dh + dh_errors(robot, 3e-4, 6e-4, np.random.default_rng(seed)), base=BASE, tool=TOOL
     )
     settings = PlanSettings(count=poses - CHECKS, check=CHECKS, candidates=120, sigma_mm=NOISE * 1e3)
-    arm = ArmInCell.of(robot)
+    arm = ArmInSurroundings.of(robot)
     candidates = find_candidates(settings, arm)
     check = torch.arange(poses) % (poses // CHECKS) == 4
     return MeasuredPlan(

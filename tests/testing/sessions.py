@@ -14,8 +14,8 @@ from pisigma.planning.session.state import (
     RowsSoFar,
     SessionState,
 )
-from pisigma.planning.surroundings.arm_in_cell import ArmInCell
-from pisigma.planning.surroundings.cell import Box, Cell, ReflectorSection, TrackerSection
+from pisigma.planning.surroundings.arm_in_surroundings import ArmInSurroundings
+from pisigma.planning.surroundings.surroundings import Box, ReflectorSection, Surroundings, TrackerSection
 from pisigma.robot.description import Robot
 from pisigma.robot.kinematics.forward import forward_kinematics
 
@@ -23,20 +23,20 @@ POSES, JUDGED_FROM = 30, 8
 """In the plan; rows from which on base and tool can be worked out."""
 
 
-def arm_beside_tracker(robot: Robot | None = None) -> ArmInCell:
+def arm_beside_tracker(robot: Robot | None = None) -> ArmInSurroundings:
     """Return a robot (default: a UR10) in a cell with all kinds of surroundings."""
     cabinet = Box(name="control <cabinet>", center_mm=(-900, 900, 380), size_mm=(500, 600, 800), yaw_deg=20)
     tracker = TrackerSection(x_mm=2200, y_mm=-1200, z_mm=1100)
-    cell = Cell(floor_mm=-20, boxes=(cabinet,), tracker=tracker, reflector=ReflectorSection())
-    return ArmInCell.of(robot or Robot.load("ur10"), cell)
+    cell = Surroundings(floor_mm=-20, boxes=(cabinet,), tracker=tracker, reflector=ReflectorSection())
+    return ArmInSurroundings.of(robot or Robot.load("ur10"), cell)
 
 
-def planned(arm: ArmInCell) -> np.ndarray:
+def planned(arm: ArmInSurroundings) -> np.ndarray:
     """Return joint values `(POSES, dof)` [rad or m] of a plan."""
     return np.random.default_rng(1).uniform(-1.5, 1.5, (POSES, arm.robot.dof))
 
 
-def session_state(arm: ArmInCell, rows: int, wrong: int | None = None) -> SessionState:
+def session_state(arm: ArmInSurroundings, rows: int, wrong: int | None = None) -> SessionState:
     """Return a session after some rows, every sixth of which is a test row.
 
     Args:

@@ -11,12 +11,12 @@ from pisigma.planning.candidates import draw_candidates
 from pisigma.planning.plan_file import StoredPlan, read_plan
 from pisigma.planning.plan_settings import PlanSettings
 from pisigma.planning.session.state import NextPose
-from pisigma.planning.surroundings.arm_in_cell import ArmInCell
+from pisigma.planning.surroundings.arm_in_surroundings import ArmInSurroundings
 
 
 def test_a_plan_holds_the_controllers_values_within_its_limits(tmp_path: Path) -> None:
     robot = coupled_robot()
-    arm = ArmInCell.of(robot)
+    arm = ArmInSurroundings.of(robot)
     q = draw_candidates(arm, 20, seed=1).q
     assert robot.coupling.is_inside(q.numpy()).all()
     count = len(q)

@@ -21,7 +21,7 @@ from pisigma.workflow.settings.measuring import MeasureSettings
 if TYPE_CHECKING:
     from pisigma.planning.camera_settings import CameraSettings
     from pisigma.planning.session.state import SessionState
-    from pisigma.planning.surroundings.arm_in_cell import ArmInCell
+    from pisigma.planning.surroundings.arm_in_surroundings import ArmInSurroundings
     from pisigma.reporting.viewing.body import MeshBody
     from pisigma.robot.description import Robot
     from pisigma.workflow.follow import SessionStep
@@ -77,7 +77,10 @@ class PageOptions:
 
 @contextmanager
 def shown_in_browser(
-    arm: "ArmInCell", limit_mm: float | None, page: PageOptions | None, camera: "CameraSettings | None" = None
+    arm: "ArmInSurroundings",
+    limit_mm: float | None,
+    page: PageOptions | None,
+    camera: "CameraSettings | None" = None,
 ) -> Iterator[Callable[["SessionState"], None]]:
     """Serve the page of a session, and yield what shows a state on it; on a terminal the page stays until Ctrl-C.
 

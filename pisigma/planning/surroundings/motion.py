@@ -4,7 +4,7 @@ import torch
 from jaxtyping import Bool, Float64
 from torch import Tensor
 
-from pisigma.planning.surroundings.arm_in_cell import ArmInCell
+from pisigma.planning.surroundings.arm_in_surroundings import ArmInSurroundings
 
 MIN_STEP = 1e-3
 """[m] Motion of any point of the robot below which a piece is not divided further, nor below half the clearance."""
@@ -24,7 +24,7 @@ class Motions:
         pool: joint values of free poses that can be way points [rad or m].
     """
 
-    def __init__(self, arm: ArmInCell, pool: Float64[Tensor, "free dof"]) -> None:
+    def __init__(self, arm: ArmInSurroundings, pool: Float64[Tensor, "free dof"]) -> None:
         """Start without checked motions."""
         self.arm, self.pool = arm, pool
         self._free: dict[tuple[bytes, bytes], bool] = {}
@@ -60,7 +60,7 @@ class Motions:
 
 
 def is_free(
-    arm: ArmInCell, start: Float64[Tensor, "motions dof"], end: Float64[Tensor, "motions dof"]
+    arm: ArmInSurroundings, start: Float64[Tensor, "motions dof"], end: Float64[Tensor, "motions dof"]
 ) -> Bool[Tensor, " motions"]:
     """Return which straight joint motions are collision-free.
 
@@ -88,7 +88,7 @@ def is_free(
 
 
 def way_points(
-    arm: ArmInCell,
+    arm: ArmInSurroundings,
     start: Float64[Tensor, " dof"],
     end: Float64[Tensor, " dof"],
     pool: Float64[Tensor, "poses dof"],
@@ -127,7 +127,7 @@ def way_points(
     return None
 
 
-def _travel(arm: ArmInCell, start: Tensor, end: Tensor) -> Float64[Tensor, " poses"]:
+def _travel(arm: ArmInSurroundings, start: Tensor, end: Tensor) -> Float64[Tensor, " poses"]:
     """Compute the largest motion of any point of the robot [m]."""
     length: Tensor = (end - start).abs() @ arm.lever
     return length

@@ -11,8 +11,8 @@ from pisigma.measurement.camera.board import Board
 from pisigma.measurement.camera.pattern import board_sheet
 from pisigma.planning.board_sight import BoardSight
 from pisigma.planning.session.state import RowsSoFar, SessionState
-from pisigma.planning.surroundings.arm_in_cell import ArmInCell
-from pisigma.planning.surroundings.cell import Cell, ReflectorSection
+from pisigma.planning.surroundings.arm_in_surroundings import ArmInSurroundings
+from pisigma.planning.surroundings.surroundings import ReflectorSection, Surroundings
 from pisigma.reporting.viewing.body import AbstractBody
 from pisigma.reporting.viewing.colors import (
     ALARM,
@@ -50,7 +50,11 @@ class SessionScene:
     """Scene of the robot and the rows; every call replaces what was drawn before."""
 
     def __init__(
-        self, scene: "viser.SceneApi", arm: ArmInCell, body: AbstractBody, sight: BoardSight | None = None
+        self,
+        scene: "viser.SceneApi",
+        arm: ArmInSurroundings,
+        body: AbstractBody,
+        sight: BoardSight | None = None,
     ) -> None:
         """Draw the cell.
 
@@ -195,7 +199,7 @@ def draw_board(scene: "viser.SceneApi", name: str, board: Board) -> None:
     scene.add_point_cloud(f"{name}/corners", board.corners, PRINT, point_size=size, precision="float32")
 
 
-def draw_cell(scene: "viser.SceneApi", cell: Cell, reach: float) -> None:
+def draw_cell(scene: "viser.SceneApi", cell: Surroundings, reach: float) -> None:
     """Draw floor, boxes and tracker.
 
     Args:
@@ -222,7 +226,11 @@ def draw_cell(scene: "viser.SceneApi", cell: Cell, reach: float) -> None:
 
 
 def draw_sight(
-    scene: "viser.SceneApi", name: str, cell: Cell, T_base_tool: Float64[np.ndarray, "4 4"], reach: float
+    scene: "viser.SceneApi",
+    name: str,
+    cell: Surroundings,
+    T_base_tool: Float64[np.ndarray, "4 4"],
+    reach: float,
 ) -> None:
     """Draw the beam from the tracker to the reflector, and the acceptance cone of the reflector.
 

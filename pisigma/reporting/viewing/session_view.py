@@ -15,7 +15,7 @@ from pisigma.files.errors import OutputError
 from pisigma.files.templates import template_environment
 from pisigma.planning.board_sight import BoardSight
 from pisigma.planning.session.state import AccuracyPoint, RowsSoFar, SessionState
-from pisigma.planning.surroundings.arm_in_cell import ArmInCell
+from pisigma.planning.surroundings.arm_in_surroundings import ArmInSurroundings
 from pisigma.reporting.viewing.body import AbstractBody, CapsuleBody
 from pisigma.reporting.viewing.colors import RAMP, round_up
 from pisigma.reporting.viewing.scene import SessionScene
@@ -54,7 +54,7 @@ class SessionView:
 
     def __init__(
         self,
-        arm: ArmInCell,
+        arm: ArmInSurroundings,
         body: AbstractBody | None = None,
         limit: float | None = None,
         host: str = "127.0.0.1",
@@ -144,7 +144,7 @@ def _check_host(host: str) -> None:
         ) from None
 
 
-def first_view(arm: ArmInCell) -> tuple[Float64[np.ndarray, " 3"], Float64[np.ndarray, " 3"]]:
+def first_view(arm: ArmInSurroundings) -> tuple[Float64[np.ndarray, " 3"], Float64[np.ndarray, " 3"]]:
     """Return camera position and target of a view with robot and tracker side by side [m]."""
     tracker = np.zeros(3) if arm.cell.tracker is None else arm.cell.tracker.position.numpy()
     around = AROUND_ROBOT * arm.robot.reach

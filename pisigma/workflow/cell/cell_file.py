@@ -17,7 +17,7 @@ from pisigma.files.setting import Setting, settings_of
 from pisigma.files.yaml_file import Section, place_of_key, read_yaml
 from pisigma.lifetime.cell.layout import CELL_FILE
 from pisigma.planning.plan_settings import PlanSettings
-from pisigma.planning.surroundings.cell import Cell as Surroundings
+from pisigma.planning.surroundings.surroundings import Surroundings
 from pisigma.robot.row import Bounded
 from pisigma.workflow.settings.calibration import CalibrationSettings
 from pisigma.workflow.settings.comparison import ComparisonSettings

@@ -9,12 +9,12 @@ from testing.closeness import assert_close
 from pisigma.deployment.export.programs.planned import planned_program
 from pisigma.planning.plan_file import StoredPlan
 from pisigma.planning.plan_settings import PlanSettings
-from pisigma.planning.surroundings.arm_in_cell import ArmInCell
+from pisigma.planning.surroundings.arm_in_surroundings import ArmInSurroundings
 from pisigma.robot import Robot
 
 Q = torch.deg2rad(torch.arange(24, dtype=torch.float64).reshape(4, 6))
 PLAN = StoredPlan(
-    ArmInCell.of(Robot.load("fanuc_r2000")),
+    ArmInSurroundings.of(Robot.load("fanuc_r2000")),
     PlanSettings(settling_s=2.5),
     None,
     Q[[0, 3]],

@@ -16,7 +16,7 @@ from pisigma.planning.plan_file import StoredPlan
 from pisigma.planning.plan_inputs import find_candidates
 from pisigma.planning.plan_settings import PlanSettings
 from pisigma.planning.session.growing_images import growing_file
-from pisigma.planning.surroundings.arm_in_cell import ArmInCell
+from pisigma.planning.surroundings.arm_in_surroundings import ArmInSurroundings
 from pisigma.robot import Robot
 from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.robot.se3 import invert, xyzrpy_from_transform
@@ -32,7 +32,7 @@ CORNERS = 54
 def plan(tmp_path_factory: pytest.TempPathFactory) -> StoredPlan:
     camera = camera_settings(tmp_path_factory.mktemp("camera"))
     settings = PlanSettings(count=IMAGES, check=0, sensor="camera", camera=camera, candidates=40)
-    arm = ArmInCell.of(Robot.load("ur5"), CELL)
+    arm = ArmInSurroundings.of(Robot.load("ur5"), CELL)
     drawn = find_candidates(settings, arm)
     q = drawn.q[:IMAGES]
     none = (q[:0],) * IMAGES

@@ -1,4 +1,4 @@
-"""Cell files: the surroundings of a robot that is measured, with joint margins, floor, boxes, tracker and camera."""
+"""Surroundings of a robot that is measured: joint margins, floor, boxes, tracker and camera."""
 
 import os
 from typing import Annotated
@@ -235,7 +235,7 @@ class ViewSection(Section):
         return self.near_mm / 1e3, self.far_mm / 1e3
 
 
-class Cell(Section):
+class Surroundings(Section):
     """Surroundings of a robot. All sections are optional, in the robot's base frame in mm and deg.
 
     Attributes:
@@ -262,7 +262,7 @@ class Cell(Section):
     view: ViewSection | None = None
 
     @model_validator(mode="after")
-    def _fits_together(self) -> "Cell":
+    def _fits_together(self) -> "Surroundings":
         names = [box.name for box in self.boxes]
         if twice := sorted({name for name in names if names.count(name) > 1}):
             raise ValueError(f"the name '{twice[0]}' appears twice in boxes; names must differ")
@@ -304,7 +304,7 @@ class Cell(Section):
         )
 
 
-def read_cell(path: str | os.PathLike[str], robot: Robot) -> Cell:
+def read_surroundings(path: str | os.PathLike[str], robot: Robot) -> Surroundings:
     """Read a cell file.
 
     Args:
@@ -314,7 +314,7 @@ def read_cell(path: str | os.PathLike[str], robot: Robot) -> Cell:
     Raises:
         PlanningError: the file cannot be used, or it names links or joints that the robot does not have.
     """
-    cell = read_yaml(path, Cell, PlanningError)
+    cell = read_yaml(path, Surroundings, PlanningError)
     names = [row.name for row in robot.rows]
     for name in cell.links.radii_mm:
         if name not in names:

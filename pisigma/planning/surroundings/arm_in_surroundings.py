@@ -11,8 +11,8 @@ from jaxtyping import Bool, Float64, Int64
 from torch import Tensor
 
 from pisigma.planning.surroundings.capsules import TOOL_RADIUS, Capsules
-from pisigma.planning.surroundings.cell import Cell, LinkSection
 from pisigma.planning.surroundings.distances import box_distance, segment_distance
+from pisigma.planning.surroundings.surroundings import LinkSection, Surroundings
 from pisigma.robot.description import Robot
 from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.robot.kinematics.tolerances import LIMIT_TOLERANCE
@@ -52,7 +52,7 @@ class Faults:
 
 
 @dataclass(frozen=True, eq=False)
-class ArmInCell:
+class ArmInSurroundings:
     """A robot in its cell.
 
     Attributes:
@@ -69,7 +69,7 @@ class ArmInCell:
 
     drawn: Robot
     robot: Robot
-    cell: Cell
+    cell: Surroundings
     capsules: Capsules
     pairs: Int64[Tensor, "pairs 2"]
     room: Float64[Tensor, " pairs"]
@@ -77,12 +77,12 @@ class ArmInCell:
     limits: Float64[Tensor, "axes 2"]
 
     @staticmethod
-    def of(robot: Robot, cell: Cell | None = None) -> "ArmInCell":
+    def of(robot: Robot, cell: Surroundings | None = None) -> "ArmInSurroundings":
         """Put a robot into its cell; with None, only limits and self-collision are checked."""
-        cell = cell or Cell()
+        cell = cell or Surroundings()
         capsules = cell.capsules(robot)
         pairs = capsules.pairs(cell.clearance / 2)
-        return ArmInCell(
+        return ArmInSurroundings(
             robot,
             capsules.robot,
             cell,
@@ -93,7 +93,7 @@ class ArmInCell:
             cell.joints.limits(robot),
         )
 
-    def with_measured(self, q: Float64[Tensor, "poses dof"]) -> "ArmInCell":
+    def with_measured(self, q: Float64[Tensor, "poses dof"]) -> "ArmInSurroundings":
         """Return the arm such that measured poses are free of self-collision, for any radii of the links.
 
         Args:

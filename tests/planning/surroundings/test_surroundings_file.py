@@ -7,7 +7,7 @@ from testing.closeness import assert_close
 from testing.refusals import refused
 
 from pisigma.files.errors import PlanningError
-from pisigma.planning.surroundings.cell import read_cell
+from pisigma.planning.surroundings.surroundings import read_surroundings
 from pisigma.robot import Robot
 
 ROBOT = Robot.load("ur10")
@@ -16,13 +16,13 @@ ROBOT = Robot.load("ur10")
 def _read(tmp_path: Path, text: str) -> object:
     path = tmp_path / "cell.yaml"
     path.write_text(text)
-    return read_cell(path, ROBOT)
+    return read_surroundings(path, ROBOT)
 
 
 def test_stated_limits_and_margins_narrow_the_range(tmp_path: Path):
     path = tmp_path / "cell.yaml"
     path.write_text("joints:\n  margin_deg: 10\n  limits_deg: {theta_2: [-180, 0], theta_3: [-400, 170]}\n")
-    limits = read_cell(path, ROBOT).joints.limits(ROBOT).rad2deg()
+    limits = read_surroundings(path, ROBOT).joints.limits(ROBOT).rad2deg()
     assert_close(limits[:3], [[-350.0, 350.0], [-170.0, -10.0], [-350.0, 160.0]], atol=1e-9)
 
 
