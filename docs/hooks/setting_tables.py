@@ -42,7 +42,7 @@ def _groups(command: Any, path: tuple[str, ...] = ("pisigma",)) -> Iterator[tupl
 
 def _table(group: type, commands: list[str]) -> str:
     summary = (group.__doc__ or "").strip().splitlines()[0]
-    used = f" Of {', '.join(f'`{name}`' for name in commands)}." if commands else ""
+    used = f" Used by {', '.join(f'`{name}`' for name in commands)}." if commands else ""
     lines = [f"### {group.__name__}", "", f"{summary}{used}", ""]
     lines += ["| option | in Python | default | meaning |", "|---|---|---|---|"]
     lines += [f"| {' | '.join(_cells(one))} |" for one in settings_of(group)]
