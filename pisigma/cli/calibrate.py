@@ -59,10 +59,11 @@ Prior = Annotated[
 def calibrate(
     context: typer.Context,
     robot: RobotName,
-    settings: CalibrationSettings,
-    stated: StatedOptions,
+    *,
     data: Data = None,
     out: Out = None,
+    settings: CalibrationSettings,
+    stated: StatedOptions,
     base: Base = None,
     tip: Tip = None,
     prior: Prior = None,

@@ -44,9 +44,10 @@ Programs = Annotated[
 @takes_settings
 def plan(
     subject: Subject,
+    *,
+    out: Out = None,
     settings: PlanSettings,
     stated: StatedOptions,
-    out: Out = None,
     cell: CellFile = None,
     program: Programs = None,
     base: Base = None,

@@ -49,9 +49,10 @@ NEXT_STEPS = {
 @takes_settings
 def verify(
     model: ModelOrCell,
+    *,
+    data: Data = None,
     settings: VerificationSettings,
     stated: StatedOptions,
-    data: Data = None,
     of_model: OfModel = None,
     sha256: Hash = None,
     verbose: Verbose = False,

@@ -47,8 +47,9 @@ Page = Annotated[Path | None, typer.Option(help="HTML page to write, with a map 
 @takes_settings
 def compare(
     first: First,
-    settings: ComparisonSettings,
+    *,
     second: Second = None,
+    settings: ComparisonSettings,
     rows: Rows = None,
     program: Program = None,
     page: Page = None,

@@ -35,9 +35,10 @@ Page = Annotated[Path | None, typer.Option(help="HTML page to write, with charts
 @takes_settings
 def monitor(
     model: ModelOrCell,
+    *,
+    sessions: Sessions = None,
     settings: MonitorSettings,
     stated: StatedOptions,
-    sessions: Sessions = None,
     page: Page = None,
     verbose: Verbose = False,
     as_json: AsJson = False,

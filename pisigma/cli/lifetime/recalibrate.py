@@ -36,9 +36,10 @@ DryRun = Annotated[bool, typer.Option("--dry-run", help="Say what would be kept 
 def recalibrate(
     context: typer.Context,
     model: ModelOrCell,
+    *,
+    data: Data = None,
     settings: RecalibrationSettings,
     stated: StatedOptions,
-    data: Data = None,
     out: Out = None,
     dry_run: DryRun = False,
     accept_implausible: AcceptImplausible = False,

@@ -20,6 +20,7 @@ from pisigma.model.inverse.corrected_ik import CorrectedIK, load
 from pisigma.model.inverse.solution import Solution
 from pisigma.robot import Robot
 from pisigma.robot.kinematics.status import Status
+from pisigma.workflow.load import load as workflow_load
 
 
 @pytest.fixture(scope="module")
@@ -260,5 +261,5 @@ def test_a_network_model_has_the_same_solutions_by_both_routes():
 
 
 def test_public_names():
-    assert pisigma.load is load
+    assert pisigma.load is workflow_load
     assert pisigma.CorrectedIK is CorrectedIK
