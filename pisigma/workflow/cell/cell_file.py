@@ -12,12 +12,13 @@ from typing import Annotated, Any, Literal, TypeVar, get_args
 import yaml
 from pydantic import Field, TypeAdapter, ValidationError
 
-from pisigma.files.errors import Place, PlanningError, nearest_choice
+from pisigma.files.errors import PisigmaError, Place, PlanningError, nearest_choice
 from pisigma.files.setting import Setting, settings_of
 from pisigma.files.yaml_file import Section, place_of_key, read_yaml
 from pisigma.lifetime.cell.layout import CELL_FILE
 from pisigma.planning.plan_settings import PlanSettings
 from pisigma.planning.surroundings.surroundings import Surroundings
+from pisigma.robot.robot_file import robot_file
 from pisigma.robot.row import Bounded
 from pisigma.workflow.settings.calibration import CalibrationSettings
 from pisigma.workflow.settings.comparison import ComparisonSettings
@@ -141,8 +142,8 @@ class CellFile:
     @property
     def robot(self) -> str:
         """The robot as `Robot.load` takes it."""
-        inside = self.path.parent / self.document.robot
-        return str(inside) if inside.is_file() else self.document.robot
+        name = self.document.robot
+        return name if robot_file(name) is None else str(inside(self.path.parent, name))
 
     def stated(self, step: str) -> dict[str, Any]:
         """What the file states for a step, by option names; shared keys count where the step has such an option."""
@@ -184,7 +185,7 @@ class _Places:
     step: str
 
     def of(self, key: str) -> Place:
-        return place_of_key(self.path, (self.step, key))
+        return place_of_key(self.path, (self.step, key) if key else (self.step,))
 
 
 def key_of(setting: Setting) -> str:
@@ -224,9 +225,19 @@ def settings_from(
         PisigmaError: a key is unknown, or a value is of another type or not a valid one.
     """
     values = dict(_checked(group, stated, places))
-    built = _built(group, values, folder, outside, is_optional=False)
+    try:
+        built = _built(group, values, folder, outside, is_optional=False)
+    except PisigmaError as problem:  # of a value that the class of the settings refuses
+        key = problem.option.removeprefix("--").replace("-", "_")
+        raise (
+            problem if key in outside else problem.located(places.of(key if key in values else ""))
+        ) from None
     assert isinstance(built, group)
     return built
+
+
+_TYPES = {bool: "true or false", int: "an integer", float: "a number", str: "a text", Path: "a path"}
+"""What messages call the types of options."""
 
 
 def _checked(group: type, stated: Mapping[str, Any], places: _Places) -> Iterator[tuple[str, Any]]:
@@ -239,10 +250,7 @@ def _checked(group: type, stated: Mapping[str, Any], places: _Places) -> Iterato
         try:
             yield key, TypeAdapter(kind).validate_python(_listed(value, kind))
         except ValidationError:
-            expected = (
-                getattr(kind, "__name__", str(kind)).replace("str", "a text").replace("float", "a number")
-            )
-            raise PlanningError(expected=expected, value=value, at=places.of(key)) from None
+            raise PlanningError(expected=_TYPES.get(kind, "a list"), value=value, at=places.of(key)) from None
 
 
 def _listed(value: Any, kind: Any) -> Any:

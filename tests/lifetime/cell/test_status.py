@@ -84,7 +84,7 @@ def test_facts_lead_to_their_state_and_its_command(state):
     assert step.to_json() == {"state": state, "reason": step.reason, "command": step.command or None}
 
 
-@pytest.mark.parametrize("kind", ["instrument", "tool", "firmware", *ARM_EVENTS])
+@pytest.mark.parametrize("kind", ["instrument", "tool", "firmware", *sorted(ARM_EVENTS)])
 def test_only_events_of_the_arm_end_the_validity_of_sessions(kind):
     event = Event("2026-02-01", kind, "", "2026-02-01T08:00:00+00:00")
     valid = valid_sessions((FIRST, SECOND), (event,))

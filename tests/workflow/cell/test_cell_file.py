@@ -3,7 +3,7 @@
 import pytest
 from testing.refusals import refused
 
-from pisigma.files.errors import PlanningError
+from pisigma.files.errors import PisigmaError, PlanningError
 from pisigma.lifetime.cell.layout import CELL_FILE
 from pisigma.workflow.cell.cell_file import (
     CAMERA_KEYS,
@@ -73,6 +73,7 @@ def test_a_camera_is_stated_once_with_paths_inside_the_cell(tmp_path):
         ("robot: ur10\nimport:\n  wuthin: 3\n", {"line": 3, "column": "import.wuthin"}),
         ("robot: ur10\nplan:\n  count: 1.5\n", {"line": 3, "column": "plan.count", "value": 1.5}),
         ("robot: ur10\nplan:\n  task: ../secret.csv\n", {"value": "../secret.csv"}),
+        ("robot: ur10\nverify:\n  fit_frame: maybe\n", {"line": 3, "expected": "true or false"}),
     ],
 )
 def test_a_fault_is_refused_with_its_line_and_key(tmp_path, text, fields):
@@ -86,3 +87,15 @@ def test_a_fault_is_refused_with_its_line_and_key(tmp_path, text, fields):
 def test_a_document_that_is_not_one_is_refused(tmp_path, text):
     with pytest.raises(PlanningError):
         cell_file(tmp_path, text)
+
+
+def test_a_value_that_the_settings_refuse_has_its_place(tmp_path):
+    with refused(PisigmaError, file=CELL_FILE, line=4, column="calibrate.seed", value=-1):
+        cell_file(tmp_path, "robot: ur10\ncalibrate:\n  folds: 3\n  seed: -1\n")
+
+
+@pytest.mark.parametrize("robot", ["/etc/arm.urdf", "../arm.yaml", "robot/../../arm.urdf"])
+def test_a_robot_outside_the_cell_is_refused(tmp_path, robot):
+    file = cell_file(tmp_path, f"robot: {robot}\n")
+    with refused(PlanningError, file=CELL_FILE, value=robot):
+        _ = file.robot
