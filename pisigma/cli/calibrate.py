@@ -14,7 +14,7 @@ from pisigma.cli.arguments import (
     complete_model,
     complete_robot,
 )
-from pisigma.cli.cell import cell_at, next_lines, refuse_beside_cell, tell_replaced
+from pisigma.cli.cell import cell_at, next_lines, refuse_with_cell, report_overrides
 from pisigma.cli.lifetime.recalibrate import recalibrate_into
 from pisigma.cli.output import (
     command_line,
@@ -83,7 +83,7 @@ def calibrate(
     from pisigma.workflow import calibrate as workflow
 
     if (cell := cell_at(robot)) is not None:
-        refuse_beside_cell(DATA=data, __out=out, __base=base, __tip=tip, __prior=prior)
+        refuse_with_cell(DATA=data, __out=out, __base=base, __tip=tip, __prior=prior)
         return _calibrate_cell(cell, stated, accept_implausible, verbose, as_json)
     if not data or out is None:
         raise typer.BadParameter(f"expected {'--out DIR' if data else 'DATA'}, or a cell instead of a robot")
@@ -111,7 +111,7 @@ def _calibrate_cell(
     """Calibrate with the rows of a cell, store the model there, and print it."""
     with progress_of("calibrate") as progress:
         calibration, entry = cell.calibrate(
-            progress, accept_implausible, **tell_replaced(cell, "calibrate", stated)
+            progress, accept_implausible, **report_overrides(cell, "calibrate", stated)
         )
     folder = None if entry is None else cell.model_folder(entry.name)
     if as_json:

@@ -1,4 +1,4 @@
-"""`pisigma new`, `status`, `use`, `session`, `event`, `pack` and `unpack`: a cell, and what to do with it next."""
+"""`pisigma new`, `status`, `use`, `session`, `event`, `pack` and `unpack`: the commands of cells."""
 
 import time
 from pathlib import Path
@@ -16,9 +16,9 @@ if TYPE_CHECKING:
     from pisigma.workflow.cell.cell import Cell
 
 CellFolder = Annotated[Path, typer.Argument(metavar="CELL", help="Folder of a cell.")]
-Reason = Annotated[str, typer.Option(help="Reason, which the history keeps.")]
+Reason = Annotated[str, typer.Option(help="Reason to record in the history.")]
 MAX_LINES = 12
-"""Newest sessions that are shown."""
+"""Number of newest sessions that are printed."""
 
 
 def new(
@@ -31,20 +31,20 @@ def new(
         ),
     ],
     out: Annotated[Path, typer.Option(help="Folder to write.")],
-    sensor: Annotated[str, typer.Option(help="tracker, camera, sockets, draw-wire or touch.")] = "tracker",
+    sensor: Annotated[str, typer.Option(help="Sensor: tracker, camera, sockets, draw-wire or touch.")] = "tracker",
     limit_mm: Annotated[
-        float | None, typer.Option(help="Length below which 95 % of the position errors have to stay [mm].")
+        float | None, typer.Option(help="Limit of the 95 % quantile of the position errors [mm].")
     ] = None,
-    base: Annotated[str | None, typer.Option(help="Link of a URDF file that poses are given in.")] = None,
-    tip: Annotated[str | None, typer.Option(help="Link of a URDF file that is the tool.")] = None,
+    base: Annotated[str | None, typer.Option(help="Link of the URDF file in whose frame poses are given.")] = None,
+    tip: Annotated[str | None, typer.Option(help="Link of the URDF file that is the tool.")] = None,
     camera: Annotated[list[Path] | None, typer.Option(help="Camera file (YAML); may be repeated.")] = None,
     board: Annotated[list[Path] | None, typer.Option(help="Board file (YAML); may be repeated.")] = None,
     fixed_camera: Annotated[
-        bool, typer.Option("--fixed-camera", help="The camera is fixed and the board is on the flange.")
+        bool, typer.Option("--fixed-camera", help="State that the camera is fixed and the board is on the flange.")
     ] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Make a cell: the folder of one robot on its mount, with its settings, sessions, models and history."""
+    """Create a cell: the folder of one robot on its mount, with its settings, sessions, models and history."""
     from pisigma.measurement.camera.camera_files import CameraFiles
     from pisigma.workflow.cell.cell import Cell
 
@@ -62,12 +62,12 @@ def new(
 def status(
     cell: Annotated[Path, typer.Argument(metavar="CELL|FOLDER", help="A cell, or a folder of cells.")],
     exit_code: Annotated[
-        bool, typer.Option("--exit-code", help="End with status 3 where something has to be done.")
+        bool, typer.Option("--exit-code", help="Exit with status 3 if something has to be done.")
     ] = False,
-    watch: Annotated[float | None, typer.Option(min=1, help="Print again every so many seconds [s].")] = None,
+    watch: Annotated[float | None, typer.Option(min=1, help="Interval at which to print the status again [s].")] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Say where a robot stands and what to do next, with the command; of a folder, of every cell in it."""
+    """Print the state of a cell, or of every cell in a folder, and the command to run next."""
     while True:
         states = _status(cell, as_json)
         if watch is None:
@@ -78,7 +78,7 @@ def status(
 
 
 def _status(path: Path, as_json: bool) -> set[str]:
-    """Print the status of a cell or of a folder of cells; give the states."""
+    """Print the status of a cell or of a folder of cells; return the states."""
     from pisigma.lifetime.cell.layout import is_cell
     from pisigma.workflow.cell.cell import Cell
     from pisigma.workflow.cell.cell_file import cells_in
@@ -108,9 +108,9 @@ def _status(path: Path, as_json: bool) -> set[str]:
 
 
 def _print_status(status: "CellStatus") -> None:
-    """Print where a cell stands on one screen."""
+    """Print the status of a cell."""
     facts, model = status.facts, status.facts.in_use
-    limit = "no limit is stated" if facts.limit_mm is None else f"the limit is {facts.limit_mm:g} mm"
+    limit = "there is no limit" if facts.limit_mm is None else f"the limit is {facts.limit_mm:g} mm"
     if model is None:
         print_lines([f"{facts.folder}: no model is in use; {limit}."])
     else:
@@ -118,7 +118,7 @@ def _print_status(status: "CellStatus") -> None:
             "" if model.p95_mm is None else f", 95 % of held-out position errors below {model.p95_mm:.3f} mm"
         )
         count = len(model.sessions.split(","))
-        made = f"made of {count} session{'s' if count > 1 else ''} until {model.day}"
+        made = f"fitted to {count} session{'s' if count > 1 else ''} until {model.day}"
         print_lines([f"{facts.folder}: model '{model.name}' is in use, {made}{accuracy}; {limit}."])
     verdicts = {one.session: one.verdict for one in facts.checks}
     rows = [
@@ -134,7 +134,7 @@ def _print_status(status: "CellStatus") -> None:
         print_table(f"sessions ({len(facts.sessions)})", ("session", "rows", "sensor", "verdict"), rows)
     print_lines(f"{one.day}: {one.kind}{f' ({one.note})' if one.note else ''}" for one in facts.events)
     print_lines(
-        f"sessions/{name} is taken in by the next step that reads rows." for name in status.not_taken_in
+        f"sessions/{name} will be added by the next command that reads rows." for name in status.not_taken_in
     )
     _print_next(status)
 
@@ -150,7 +150,7 @@ def _print_next(status: "CellStatus") -> None:
 
 
 def cell_at(path: str | Path) -> "Cell | None":
-    """Open the cell at a path; None where it is something else."""
+    """Open the cell at a path; return None if the path is not a cell."""
     from pisigma.lifetime.cell.layout import is_cell
 
     if not is_cell(path):
@@ -160,15 +160,15 @@ def cell_at(path: str | Path) -> "Cell | None":
     return Cell.open(path)
 
 
-def tell_replaced(cell: "Cell", step: str, stated: StatedOptions) -> StatedOptions:
-    """Say on stderr which settings of a step the command line replaces; return what it states."""
+def report_overrides(cell: "Cell", step: str, stated: StatedOptions) -> StatedOptions:
+    """Print to stderr which settings of a step the command line overrides; return `stated`."""
     for key in sorted(stated.keys() & cell.file.stated(step).keys()):
-        print_line(f"--{key.replace('_', '-')} replaces {key} of {cell.file.path}.", to_stderr=True)
+        print_line(f"--{key.replace('_', '-')} overrides {key} of {cell.file.path}.", to_stderr=True)
     return stated
 
 
-def refuse_beside_cell(**given: object) -> None:
-    """Refuse what a cell knows already.
+def refuse_with_cell(**given: object) -> None:
+    """Refuse arguments whose values a cell already contains.
 
     Args:
         **given: values of options and arguments, by their names.
@@ -176,12 +176,12 @@ def refuse_beside_cell(**given: object) -> None:
     for name, value in given.items():
         if value:
             raise typer.BadParameter(
-                f"leave out {name.replace('_', '-')}: a cell uses its own robot, rows and models"
+                f"remove {name.replace('_', '-')}: a cell contains its robot, rows and models"
             )
 
 
 def next_lines(cell: "Cell") -> list[str]:
-    """Say what to do next with a cell."""
+    """Return the line that names the next step of a cell."""
     step = cell.status().step
     return [f"Next step: {step.command}" if step.command else f"Nothing to do: {step.reason}."]
 
@@ -192,7 +192,7 @@ def use(
     reason: Reason = "by hand",
     as_json: AsJson = False,
 ) -> None:
-    """Put a model of a cell into use; the one before stays, so that this can be undone."""
+    """Put a model of a cell into use; the previous model is kept, so that this can be undone."""
     from pisigma.workflow.cell.cell import Cell
 
     opened = Cell.open(cell)
@@ -208,7 +208,7 @@ def use(
 def session(
     cell: CellFolder,
     name: Annotated[str, typer.Argument(help="Name of the session.")],
-    set_aside: Annotated[str, typer.Option(help="Leave the session out from now on, for this reason.")],
+    set_aside: Annotated[str, typer.Option(help="Reason for no longer using the session.")],
     as_json: AsJson = False,
 ) -> None:
     """Set a session of a cell aside; its file is kept."""
@@ -227,16 +227,18 @@ def event(
     cell: CellFolder,
     kind: Annotated[
         str,
-        typer.Argument(help="instrument, tool, mastering, encoder, collision, maintenance or firmware."),
+        typer.Argument(
+            help="What was changed: instrument, tool, mastering, encoder, collision, maintenance or firmware."
+        ),
     ],
     date: Annotated[str, typer.Option(help="Day of the event, such as 2026-11-22. [default: today]")] = "",
     note: Annotated[str, typer.Option(help="Free text.")] = "",
     as_json: AsJson = False,
 ) -> None:
-    """Record that the instrument, the tool or the arm was changed, which decides which sessions still count.
+    """Record that the instrument, the tool or the arm was changed; this determines which sessions remain valid.
 
-    After an event of the instrument or the tool, rows are in a frame or of a target of their own. Mastering, encoder,
-    collision and maintenance end the validity of all earlier sessions for a calibration.
+    Rows measured after an instrument or tool event have a new frame or target. Sessions from before a mastering,
+    encoder, collision or maintenance event are no longer used for calibration.
     """
     from pisigma.workflow.cell.cell import Cell
 
@@ -254,7 +256,7 @@ def pack(
     out: Annotated[Path, typer.Option(help="File to write (.zip).")],
     as_json: AsJson = False,
 ) -> None:
-    """Write a whole cell into one file that can be sent."""
+    """Write a cell into one ZIP file."""
     from pisigma.workflow.cell.archive import pack as workflow
     from pisigma.workflow.cell.cell import Cell
 
@@ -270,7 +272,7 @@ def unpack(
     out: Annotated[Path, typer.Option(help="Folder to write.")],
     as_json: AsJson = False,
 ) -> None:
-    """Make a cell of a file of `pisigma pack`."""
+    """Restore a cell from a file that `pisigma pack` wrote."""
     from pisigma.workflow.cell.archive import unpack as workflow
 
     opened = workflow(file, out)

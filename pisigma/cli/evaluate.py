@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from pisigma.cli.arguments import AsJson, Verbose
-from pisigma.cli.cell import cell_at, refuse_beside_cell, tell_replaced
+from pisigma.cli.cell import cell_at, refuse_with_cell, report_overrides
 from pisigma.cli.output import print_json
 from pisigma.cli.progress import progress_of
 from pisigma.cli.screen import print_screen
@@ -52,8 +52,8 @@ def evaluate(
     from pisigma.workflow import evaluate as workflow
 
     if len(paths) == 1 and (cell := cell_at(paths[0])) is not None:
-        refuse_beside_cell(__sha256=sha256)
-        return _tell(cell.evaluate(**tell_replaced(cell, "evaluate", stated)), verbose, as_json)
+        refuse_with_cell(__sha256=sha256)
+        return _tell(cell.evaluate(**report_overrides(cell, "evaluate", stated)), verbose, as_json)
     if len(paths) < 2:
         raise typer.BadParameter("expected a model folder and, last, a file of measurements")
     folders = [path for path in paths[:-1] if path not in workflow.REFERENCES]

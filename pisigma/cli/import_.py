@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from pisigma.cli.arguments import AsJson
-from pisigma.cli.cell import next_lines, tell_replaced
+from pisigma.cli.cell import next_lines, report_overrides
 from pisigma.cli.endings import REFUSED, fail
 from pisigma.cli.output import print_json, print_lines, print_table
 from pisigma.cli.settings_options import StatedOptions, takes_settings
@@ -58,7 +58,7 @@ def import_(
         check_output(save_map, (".yaml", ".yml"), "a mapping", [*files, *([] if out is None else [out])])
     if cell is not None:
         opened = Cell.open(cell)
-        settings = opened.file.settings("import", **tell_replaced(opened, "import", stated))
+        settings = opened.file.settings("import", **report_overrides(opened, "import", stated))
         if len(files) == 1 and is_measurement_file(files[0]):
             return _take_in(opened, files[0], date, accept_implausible, as_json)
     proposal = workflow.propose_import(files, settings)

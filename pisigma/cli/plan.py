@@ -7,7 +7,7 @@ import typer
 
 from pisigma.cli.arguments import AsJson, Verbose, complete_robot
 from pisigma.cli.calibrate import Base, Tip
-from pisigma.cli.cell import cell_at, refuse_beside_cell, tell_replaced
+from pisigma.cli.cell import cell_at, refuse_with_cell, report_overrides
 from pisigma.cli.output import print_json
 from pisigma.cli.progress import progress_of
 from pisigma.cli.screen import print_screen, sentences, table
@@ -65,7 +65,7 @@ def plan(
     from pisigma.workflow import plan as workflow
 
     if (opened := cell_at(subject)) is not None:
-        refuse_beside_cell(__out=out, __cell=cell, __base=base, __tip=tip)
+        refuse_with_cell(__out=out, __cell=cell, __base=base, __tip=tip)
         return _plan_cell(opened, stated, program or [], verbose, as_json)
     if out is None:
         raise typer.BadParameter("expected a CSV file", param_hint="'--out'")
@@ -87,7 +87,7 @@ def _plan_cell(
     from pisigma.planning.plan_file import yaml_of
 
     with progress_of("plan") as progress:
-        planned, out = cell.plan(progress, programs, **tell_replaced(cell, "plan", stated))
+        planned, out = cell.plan(progress, programs, **report_overrides(cell, "plan", stated))
     if as_json:
         print_json({"file": str(out), **planned.to_json(), "next": cell.status().step.to_json()})
     else:

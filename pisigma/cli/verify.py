@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from pisigma.cli.arguments import AsJson, ModelOrCell, Verbose
-from pisigma.cli.cell import cell_at, next_lines, refuse_beside_cell, tell_replaced
+from pisigma.cli.cell import cell_at, next_lines, refuse_with_cell, report_overrides
 from pisigma.cli.output import print_json, print_lines, screen_width
 from pisigma.cli.progress import progress_of
 from pisigma.cli.screen import Block, print_screen, table
@@ -69,7 +69,7 @@ def verify(
     from pisigma.workflow import verify as workflow
 
     if (cell := cell_at(model)) is not None:
-        refuse_beside_cell(DATA=data, __sha256=sha256)
+        refuse_with_cell(DATA=data, __sha256=sha256)
         return _verify_cell(cell, stated, of_model, verbose, as_json)
     if data is None or of_model is not None:
         raise typer.BadParameter("expected DATA" if data is None else "--model names a model of a cell")
@@ -92,7 +92,7 @@ def _verify_cell(
     """Verify a model of a cell with its newest session."""
     with progress_of("verify") as progress:
         progress("comparing the models and looking for setup faults")
-        verification, entry = cell.verify(None, model, **tell_replaced(cell, "verify", stated))
+        verification, entry = cell.verify(None, model, **report_overrides(cell, "verify", stated))
     in_use = cell.history.in_use
     if as_json:
         use = None if in_use is None else in_use.name

@@ -61,11 +61,11 @@ def compare(
     Tests differences with the posteriors of both models. Exits with status 3 where the rows must not be trusted.
     """
     from pisigma.files.output_file import check_page
-    from pisigma.lifetime.cell.layout import is_cell, models_in_turn
+    from pisigma.lifetime.cell.layout import is_cell, previous_and_current_model
     from pisigma.workflow import compare as workflow
 
     if second is None and is_cell(first):
-        first, second = map(str, models_in_turn(first))
+        first, second = map(str, previous_and_current_model(first))
     if second is None:
         raise typer.BadParameter("expected two models, or a cell")
     if page is not None:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from pisigma.cli.arguments import AsJson, ModelOrCell, Verbose
-from pisigma.cli.cell import cell_at, next_lines, refuse_beside_cell, tell_replaced
+from pisigma.cli.cell import cell_at, next_lines, refuse_with_cell, report_overrides
 from pisigma.cli.endings import NOT_ACCEPTED
 from pisigma.cli.output import print_json, print_lines
 from pisigma.cli.progress import progress_of
@@ -52,7 +52,7 @@ def monitor(
     from pisigma.workflow import monitor as workflow
 
     if (cell := cell_at(model)) is not None:
-        refuse_beside_cell(SESSION=sessions)
+        refuse_with_cell(SESSION=sessions)
         return _monitor_cell(cell, stated, page, as_json, verbose)
     if not sessions:
         raise typer.BadParameter("expected SESSION..., or a cell instead of a model")
@@ -76,7 +76,7 @@ def _monitor_cell(
     if page is not None:
         check_page(page, (cell.folder,))
     with progress_of("monitor") as progress:
-        monitoring = cell.monitor(progress, **tell_replaced(cell, "monitor", stated))
+        monitoring = cell.monitor(progress, **report_overrides(cell, "monitor", stated))
         if page is not None:
             monitoring.save_page(page)
     _print(monitoring, page, as_json, verbose)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from pisigma.cli.arguments import AcceptImplausible, AsJson, ModelOrCell, Overwrite, Verbose
-from pisigma.cli.cell import cell_at, next_lines, refuse_beside_cell, tell_replaced
+from pisigma.cli.cell import cell_at, next_lines, refuse_with_cell, report_overrides
 from pisigma.cli.output import command_line, print_json, print_lines, saved
 from pisigma.cli.progress import progress_of
 from pisigma.cli.screen import print_screen, sentences, table
@@ -55,7 +55,7 @@ def recalibrate(
     from pisigma.files.output_folder import check_folder
 
     if (cell := cell_at(model)) is not None:
-        refuse_beside_cell(ROWS=data, __out=out, __dry_run=dry_run, __overwrite=overwrite)
+        refuse_with_cell(ROWS=data, __out=out, __dry_run=dry_run, __overwrite=overwrite)
         return _recalibrate_cell(cell, stated, accept_implausible, as_json, verbose)
     if not data:
         raise typer.BadParameter("expected ROWS..., or a cell instead of a model")
@@ -115,7 +115,7 @@ def _recalibrate_cell(
     cell: "Cell", stated: StatedOptions, accept_implausible: bool, as_json: bool, verbose: bool
 ) -> None:
     """Recalibrate the model in use of a cell with its newest session."""
-    tell_replaced(cell, "recalibrate", stated)
+    report_overrides(cell, "recalibrate", stated)
     with progress_of("recalibration") as progress:
         recalibration, entry = cell.recalibrate(None, progress, accept_implausible, **stated)
     folder = None if entry is None else cell.model_folder(entry.name)

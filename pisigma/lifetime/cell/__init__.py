@@ -1,1 +1,1 @@
-"""What is known of one robot on its mount: its sessions, events, models, and which model is in use."""
+"""State of a cell, one robot on its mount: its sessions, events and models, and the model in use."""

@@ -1,7 +1,7 @@
-"""The history of a cell in one SQLite file: sessions, events, models, checks, and which model was in use when.
+"""History of a cell in one SQLite file: sessions, events, models, checks, and which model was in use when.
 
-The tables are named after the classes below, and their columns after the attributes, so that DuckDB or pandas read
-them as they are. Every change is one transaction; SQLite's rollback journal and lock make two processes safe.
+DuckDB and pandas can read the tables directly; `_TABLES` maps the classes below to tables, and columns are named after
+attributes. Every change is one transaction. SQLite's rollback journal and lock let several processes write safely.
 """
 
 import datetime
@@ -18,30 +18,30 @@ from pisigma.measurement.dates import EXPECTED_DATE, is_date
 HISTORY = "history.sqlite"
 SCHEMA_VERSION = 1
 LOCK_TIMEOUT = 10.0
-"""[s] Wait for another process that writes."""
+"""[s] Longest wait for another process that is writing."""
 
 EventKind = Literal["instrument", "tool", "mastering", "encoder", "collision", "maintenance", "firmware"]
-"""What was changed: the instrument (tracker, camera, board) was set up again, the tool or reflector was changed, or
-something that ends the validity of everything that was measured of the arm."""
+"""What was changed: the instrument (tracker, camera, board) was set up again, the tool or reflector was exchanged, or
+the arm was changed (see `ARM_EVENTS`); "firmware" is only recorded."""
 ARM_EVENTS: frozenset[EventKind] = frozenset(("mastering", "encoder", "collision", "maintenance"))
 """Events after which earlier sessions no longer describe the arm."""
 
 
 @dataclass(frozen=True)
 class SessionEntry:
-    """A session of rows, as it was measured.
+    """A session of measured rows.
 
     Attributes:
-        name: of the session and, with ".csv", of its file in `sessions/`.
-        sha256: of the file.
-        taken_in: when it was taken in (ISO 8601, UTC).
+        name: name of the session and, with ".csv", of its file in `sessions/`.
+        sha256: SHA-256 of the file.
+        taken_in: time at which it was added to the cell (ISO 8601, UTC).
         day: first day on which rows were measured (ISO 8601).
         rows: number of rows.
-        sensor: kinds of readings, with commas between.
-        temperature_c: mean temperature [deg C]; None where rows do not state it.
-        judged_by: what the rows were checked against: "robot" as drawn, or the name of a model.
+        sensor: kinds of readings, separated by commas.
+        temperature_c: mean temperature [deg C]; None if the rows do not state it.
+        judged_by: what the rows were checked against: "robot" (the nominal robot), or the name of a model.
         remark: warnings of the check.
-        set_aside: why the session is not used; empty where it is.
+        set_aside: why the session is not used; empty if it is used.
     """
 
     name: str
@@ -61,10 +61,10 @@ class Event:
     """A change of the robot, its tool or its instrument.
 
     Attributes:
-        day: on which it happened (ISO 8601); sessions of that day were measured after it.
+        day: day on which it happened (ISO 8601); sessions of that day were measured after it.
         kind: see `EventKind`.
         note: free text.
-        recorded: when it was recorded (ISO 8601, UTC).
+        recorded: time at which it was recorded (ISO 8601, UTC).
     """
 
     day: str
@@ -78,16 +78,17 @@ class ModelEntry:
     """A model of the cell.
 
     Attributes:
-        name: of its folder in `models/`.
-        sha256: of its `model.yaml`.
-        made: when (ISO 8601, UTC).
-        sessions: names of the sessions that it was made of, with commas between.
+        name: name of its folder in `models/`.
+        sha256: SHA-256 of its `model.yaml`.
+        made: time at which it was calibrated or recalibrated (ISO 8601, UTC).
+        sessions: names of the sessions that it was fitted to, separated by commas.
         day: day of the newest of them (ISO 8601).
-        frame_day: day of the instrument event whose frame is the newest one of the model; empty where it has only
-            the first.
-        target_day: the same for the tool.
-        parent: the model that was recalibrated; empty for a calibration.
-        p95_mm: 95 % quantile of the position errors of held-out rows [mm]; None where it was not judged.
+        frame_day: day of the instrument event with which the newest frame of the model begins; empty if the model has
+            only the first frame.
+        target_day: day of the tool event with which the newest target of the model begins; empty if it has only the
+            first target.
+        parent: name of the model that was recalibrated; empty for a calibration.
+        p95_mm: 95 % quantile of the position errors of held-out rows [mm]; None if no rows were held out.
         remark: why it is or is not in use.
     """
 
@@ -105,17 +106,17 @@ class ModelEntry:
 
 @dataclass(frozen=True)
 class Check:
-    """What a command found of a model with a session.
+    """Verdict of a command on a model and a session.
 
     Attributes:
-        command: `calibrate`, `verify`, `monitor` or `recalibrate`.
-        model: name of the model; empty where none was written.
-        session: name of the session; empty where all valid ones were used.
-        verdict: in one word, see the result of the command.
-        summary: in one sentence.
-        p95_mm: 95 % quantile of the position errors [mm]; None where it is not known.
-        action: whether something has to be done.
-        checked: when (ISO 8601, UTC).
+        command: "calibrate", "verify", "monitor" or "recalibrate".
+        model: name of the model; empty if none was written.
+        session: name of the session; empty if all valid sessions were used.
+        verdict: verdict in one word; the result class of the command lists them.
+        summary: verdict in one sentence.
+        p95_mm: 95 % quantile of the position errors [mm]; None if it is unknown.
+        action: whether the user has to do something.
+        checked: time of the check (ISO 8601, UTC).
     """
 
     command: str
@@ -130,12 +131,12 @@ class Check:
 
 @dataclass(frozen=True)
 class Use:
-    """Which model was in use from some moment on.
+    """A change of the model in use.
 
     Attributes:
-        model: its name; empty where none was in use.
-        since: when (ISO 8601, UTC).
-        reason: why.
+        model: name of the model; empty if none was in use.
+        since: time from which it was in use (ISO 8601, UTC).
+        reason: why it was put into use.
     """
 
     model: str
@@ -155,7 +156,7 @@ _SQL_TYPES = {str: "TEXT NOT NULL", int: "INTEGER NOT NULL", bool: "INTEGER NOT 
 
 
 def now() -> str:
-    """The time as the history states it (ISO 8601, UTC, to the second)."""
+    """Return the time as stored in a history (ISO 8601, UTC, to the second)."""
     return datetime.datetime.now(datetime.timezone.utc).isoformat(timespec="seconds")
 
 
@@ -163,43 +164,43 @@ class History:
     """The history of a cell.
 
     Attributes:
-        path: of its SQLite file, which is made with the first entry.
+        path: path of its SQLite file, which is created with the first entry.
     """
 
     def __init__(self, path: Path) -> None:
         self.path = path
 
     def sessions(self) -> tuple[SessionEntry, ...]:
-        """All sessions by their days, those that were set aside among them."""
+        """Return all sessions in the order of their days, including those that were set aside."""
         return tuple(sorted(self._read(SessionEntry), key=lambda one: (one.day, one.taken_in, one.name)))
 
     def events(self) -> tuple[Event, ...]:
-        """All events by their days."""
+        """Return all events in the order of their days."""
         return tuple(sorted(self._read(Event), key=lambda one: (one.day, one.recorded)))
 
     def models(self) -> tuple[ModelEntry, ...]:
-        """All models in the order in which they were made."""
+        """Return all models in the order in which they were made."""
         return self._read(ModelEntry)
 
     def checks(self) -> tuple[Check, ...]:
-        """All checks in the order in which they were made."""
+        """Return all checks in the order in which they were made."""
         return self._read(Check)
 
     def uses(self) -> tuple[Use, ...]:
-        """Which models were in use, the one of today last."""
+        """Return the changes of the model in use; the last one names the model in use now."""
         return self._read(Use)
 
     @property
     def in_use(self) -> ModelEntry | None:
-        """The model in use; None where there is none."""
+        """The model in use; None if there is none."""
         uses = self.uses()
         return self.model(uses[-1].model) if uses and uses[-1].model else None
 
     def model(self, name: str) -> ModelEntry:
-        """The entry of a model.
+        """Return the entry of a model.
 
         Raises:
-            ModelError: the cell has no such model.
+            ModelError: the cell has no model with this name.
         """
         models = {one.name: one for one in self.models()}
         check_choice(ModelError, "model", name, tuple(models), Place(self.path.parent))
@@ -225,12 +226,12 @@ class History:
         """Record that something was changed; see `EventKind`.
 
         Args:
-            kind: of the event.
-            day: on which it happened (ISO 8601). "": today.
+            kind: kind of the event.
+            day: day on which it happened (ISO 8601). "": today.
             note: free text.
 
         Raises:
-            MeasurementError: the kind is unknown, or the day is not one.
+            MeasurementError: the kind is unknown, or the day is not a valid date.
         """
         check_choice(MeasurementError, "event", kind, event_kinds())
         day = day or datetime.date.today().isoformat()
@@ -270,7 +271,7 @@ class History:
             raise OutputError(
                 f"the history of the cell cannot be used: {problem}",
                 at=Place(self.path),
-                remedy="check that the file is one and that the folder can be written to",
+                remedy="check that the file is an SQLite database and that its folder is writable",
             ) from None
 
 
@@ -294,5 +295,5 @@ def _entry(kind: type[Entry], values: dict[str, Any]) -> Entry:
 
 
 def event_kinds() -> tuple[str, ...]:
-    """The kinds of events."""
+    """Return the kinds of events."""
     return get_args(EventKind)

@@ -1,4 +1,4 @@
-"""Where things are in the folder of a cell."""
+"""Layout of the folder of a cell: its file, plans, sessions and models."""
 
 import os
 from pathlib import Path
@@ -11,12 +11,12 @@ PLANS, SESSIONS, MODELS = "plans", "sessions", "models"
 
 
 def is_cell(path: str | os.PathLike[str]) -> bool:
-    """Whether a folder is a cell."""
+    """Return whether a folder is a cell."""
     return (Path(path) / CELL_FILE).is_file()
 
 
 def newest_plan(path: str | os.PathLike[str]) -> Path:
-    """The newest plan, where a path is a cell; else the path itself.
+    """Return the newest plan of a cell; a path that is not a cell is returned unchanged.
 
     Raises:
         PlanningError: the cell has no plan.
@@ -29,17 +29,17 @@ def newest_plan(path: str | os.PathLike[str]) -> Path:
     return plans[-1]
 
 
-def models_in_turn(path: str | os.PathLike[str]) -> tuple[Path, Path]:
-    """The folder of the model that was in use before, and of the one in use.
+def previous_and_current_model(path: str | os.PathLike[str]) -> tuple[Path, Path]:
+    """Return the folders of the model that was in use before and of the model in use.
 
     Raises:
-        ModelError: fewer than two models were in use.
+        ModelError: fewer than two models have been in use.
     """
     used = [one.model for one in History(Path(path) / HISTORY).uses() if one.model]
     earlier = [name for name in used if name != used[-1]]
     if not earlier:
         raise ModelError(
-            expected="two models that were in use",
+            expected="two models that have been in use",
             value=len(set(used)),
             at=Place(path),
             remedy="name two models",
@@ -48,7 +48,7 @@ def models_in_turn(path: str | os.PathLike[str]) -> tuple[Path, Path]:
 
 
 def model_folder(path: str | os.PathLike[str]) -> Path:
-    """The folder of the model in use, where a path is a cell; else the path itself.
+    """Return the folder of a cell's model in use; a path that is not a cell is returned unchanged.
 
     Raises:
         ModelError: no model of the cell is in use.

@@ -1,4 +1,4 @@
-"""What to do next with a cell: stated rules over what is known of it, each with its reason and its command."""
+"""Next step of a cell: rules that derive a state, a reason and a command from its sessions, events, models and checks."""
 
 import datetime
 import shlex
@@ -9,9 +9,9 @@ from typing import Any, Literal
 from pisigma.lifetime.cell.history import ARM_EVENTS, Check, Event, ModelEntry, SessionEntry
 
 MAX_DAYS_UNVERIFIED = 92
-"""[days] After a quarter without a session the model in use has to be verified again."""
+"""[days] Time without a session after which the model in use has to be verified again: a quarter of a year."""
 VERIFICATION_POSES = 10
-"""Poses of a session that verifies or monitors."""
+"""Number of poses of a session for verification or monitoring."""
 
 State = Literal[
     "edited_session",
@@ -32,12 +32,12 @@ State = Literal[
 
 @dataclass(frozen=True)
 class Step:
-    """The next step.
+    """The next step of a cell.
 
     Attributes:
-        state: where the cell stands.
+        state: state of the cell.
         reason: why the step is due, in one sentence.
-        command: what to run; empty where nothing is to be done.
+        command: command to run; empty if nothing has to be done.
     """
 
     state: State
@@ -45,24 +45,24 @@ class Step:
     command: str = ""
 
     def to_json(self) -> dict[str, Any]:
-        """The step as plain values."""
+        """Return the step as plain values."""
         return {"state": self.state, "reason": self.reason, "command": self.command or None}
 
 
 @dataclass(frozen=True)
 class CellFacts:
-    """What the rules look at.
+    """Facts about a cell from which the rules derive its next step.
 
     Attributes:
-        folder: of the cell, as the user names it.
+        folder: folder of the cell, as the user named it.
         plans: names of the plans.
-        sessions: all sessions by their days.
-        edited: names of sessions whose files have changed since they were taken in.
-        events: all events by their days.
+        sessions: all sessions in the order of their days.
+        edited: names of sessions whose files were changed or removed after they were added.
+        events: all events in the order of their days.
         models: all models in the order in which they were made.
         checks: all checks in the order in which they were made.
-        in_use: the model in use; None where there is none.
-        limit_mm: length below which 95 % of the position errors have to stay [mm]; None where none is stated.
+        in_use: the model in use; None if there is none.
+        limit_mm: limit of the 95 % quantile of the position errors [mm]; None if there is none.
         today: day (ISO 8601).
     """
 
@@ -79,43 +79,43 @@ class CellFacts:
 
     @property
     def valid_sessions(self) -> tuple[SessionEntry, ...]:
-        """Sessions that describe the arm of today: not set aside, and since the last event that changed the arm."""
+        """Sessions that describe the present arm: not set aside, and measured since the arm was last changed."""
         return valid_sessions(self.sessions, self.events)
 
     @property
     def newest_model(self) -> ModelEntry | None:
-        """The model that was made last, of valid sessions; None where there is none."""
+        """The newest model that was fitted to valid sessions only; None if there is none."""
         valid = {one.name for one in self.valid_sessions}
         made = [one for one in self.models if valid.issuperset(one.sessions.split(","))]
         return made[-1] if made else None
 
     def command(self, verb: str, *words: str) -> str:
-        """A command of this cell."""
+        """Return a command line for this cell."""
         return shlex.join(["pisigma", verb, self.folder, *words])
 
     @property
     def import_command(self) -> str:
-        """The command that takes rows in."""
+        """The command that adds rows to the cell."""
         return shlex.join(["pisigma", "import", "ROWS.csv", "--cell", self.folder])
 
     def checks_of(self, model: str, *commands: str) -> list[Check]:
-        """Checks of a model by some commands, the newest last."""
+        """Return the checks of a model by some commands, newest last."""
         return [one for one in self.checks if one.model == model and one.command in commands]
 
-    def unseen_sessions(self, model: ModelEntry) -> list[SessionEntry]:
-        """Valid sessions that a model was not made of, measured on its newest day or later."""
+    def new_sessions(self, model: ModelEntry) -> list[SessionEntry]:
+        """Return the valid sessions that a model was not fitted to, measured on its newest day or later."""
         made_of = model.sessions.split(",")
         return [one for one in self.valid_sessions if one.name not in made_of and one.day >= model.day]
 
 
 def valid_sessions(sessions: tuple[SessionEntry, ...], events: tuple[Event, ...]) -> tuple[SessionEntry, ...]:
-    """Sessions that are not set aside and were measured since the last event that changed the arm."""
+    """Return the sessions that are not set aside and were measured since the last event that changed the arm."""
     since = max((one.day for one in events if one.kind in ARM_EVENTS), default="")
     return tuple(one for one in sessions if not one.set_aside and one.day >= since)
 
 
 def next_step(facts: CellFacts) -> Step:
-    """The first rule that applies, in the order of `RULES`."""
+    """Return the step of the first rule that applies, in the order of `RULES`."""
     return next(step for rule in RULES if (step := rule(facts)) is not None)
 
 
@@ -125,8 +125,8 @@ def _edited_session(facts: CellFacts) -> Step | None:
     name = facts.edited[0]
     return Step(
         "edited_session",
-        f"the file of session '{name}' was changed or removed after it was taken in; put the measured file back, or "
-        "set the session aside",
+        f"the file of session '{name}' was changed or removed after it was added; restore the measured file, or set "
+        "the session aside",
         facts.command("session", name, "--set-aside", "edited"),
     )
 
@@ -139,11 +139,11 @@ def _no_session(facts: CellFacts) -> Step | None:
     if not facts.plans or why:
         few = () if facts.in_use is None else ("--count", str(VERIFICATION_POSES), "--check", "0")
         return Step(
-            "no_plan", why or "nothing is planned and nothing is measured", facts.command("plan", *few)
+            "no_plan", why or "there is no plan and no session", facts.command("plan", *few)
         )
     return Step(
         "not_measured",
-        f"plan '{facts.plans[-1]}' is not measured: add the measured columns",
+        f"plan '{facts.plans[-1]}' has not been measured yet; add the measured columns to its rows",
         facts.import_command,
     )
 
@@ -161,7 +161,7 @@ def _not_calibrated(facts: CellFacts) -> Step | None:
             facts.import_command,
         )
     return Step(
-        "not_calibrated", f"{rows} rows are measured and no model is made", facts.command("calibrate")
+        "not_calibrated", f"there are {rows} measured rows, but no model", facts.command("calibrate")
     )
 
 
@@ -172,19 +172,19 @@ def _not_verified(facts: CellFacts) -> Step | None:
     assert model is not None  # else an earlier rule applies
     verdicts = facts.checks_of(model.name, "verify")
     judged = {one.session for one in verdicts}
-    new = [one for one in facts.unseen_sessions(model) if one.name not in judged]
+    new = [one for one in facts.new_sessions(model) if one.name not in judged]
     if new:
         return Step(
             "not_verified",
-            f"model '{model.name}' is not in use; session '{new[-1].name}', which it was not made of, can verify it",
+            f"model '{model.name}' is not in use; session '{new[-1].name}', to which it was not fitted, can verify it",
             facts.command("verify"),
         )
     if verdicts and verdicts[-1].verdict != "better":
         return Step("verification_failed", verdicts[-1].summary, facts.command("calibrate"))
     return Step(
         "not_verified",
-        f"model '{model.name}' is not in use until rows verify it that it was not made of; measure "
-        f"{VERIFICATION_POSES} poses, take them in, and run `{facts.command('verify')}`",
+        f"model '{model.name}' has not been verified with new rows; measure {VERIFICATION_POSES} poses, import them, "
+        f"and run `{facts.command('verify')}`",
         facts.command("plan", "--count", str(VERIFICATION_POSES), "--check", "0"),
     )
 
@@ -193,12 +193,12 @@ def _session_not_judged(facts: CellFacts) -> Step | None:
     model = facts.in_use
     assert model is not None
     judged = {one.session for one in facts.checks_of(model.name, "verify", "monitor", "recalibrate")}
-    new = [one for one in facts.unseen_sessions(model) if one.name not in judged]
+    new = [one for one in facts.new_sessions(model) if one.name not in judged]
     if not new:
         return None
     return Step(
         "session_not_judged",
-        f"session '{new[-1].name}' was not compared with model '{model.name}'",
+        f"session '{new[-1].name}' has not been compared with model '{model.name}'",
         facts.command("monitor"),
     )
 
@@ -218,12 +218,12 @@ def _better_model(facts: CellFacts) -> Step | None:
     if newest is None or newest.name == model.name or newest.made <= model.made:
         return None
     judged = {one.session for one in facts.checks_of(newest.name, "verify")}
-    new = [one for one in facts.unseen_sessions(newest) if one.name not in judged]
+    new = [one for one in facts.new_sessions(newest) if one.name not in judged]
     if not new:
         return None
     return Step(
         "better_model",
-        f"model '{newest.name}' is not in use; session '{new[-1].name}', which it was not made of, can verify it",
+        f"model '{newest.name}' is not in use; session '{new[-1].name}', to which it was not fitted, can verify it",
         facts.command("verify", "--model", newest.name),
     )
 
@@ -237,8 +237,8 @@ def _outside_limit(facts: CellFacts) -> Step | None:
         return None
     return Step(
         "outside_limit",
-        f"95 % of the position errors are below {p95:.3f} mm, and the limit is {limit:g} mm; more poses help until the "
-        "repeatability of the robot is reached",
+        f"the 95 % quantile of the position errors is {p95:.3f} mm, above the limit of {limit:g} mm; more poses reduce "
+        "it until the repeatability of the robot is reached",
         facts.command("plan"),
     )
 
@@ -260,7 +260,7 @@ def _verification_due(facts: CellFacts) -> Step | None:
 
 def _up_to_date(facts: CellFacts) -> Step:
     assert facts.in_use is not None
-    return Step("up_to_date", f"model '{facts.in_use.name}' is in use and no check asks for more")
+    return Step("up_to_date", f"model '{facts.in_use.name}' is in use, and all checks have passed")
 
 
 RULES: tuple[Callable[[CellFacts], Step | None], ...] = (
@@ -279,12 +279,12 @@ RULES: tuple[Callable[[CellFacts], Step | None], ...] = (
 
 @dataclass(frozen=True)
 class CellStatus:
-    """Where a cell stands.
+    """Status of a cell.
 
     Attributes:
-        facts: all that is known.
-        step: what to do next.
-        not_taken_in: files in `sessions/` that are not in the history yet.
+        facts: facts from which the next step was derived.
+        step: the next step.
+        not_taken_in: names of the files in `sessions/` that are not in the history yet.
     """
 
     facts: CellFacts
@@ -292,7 +292,7 @@ class CellStatus:
     not_taken_in: tuple[str, ...]
 
     def to_json(self) -> dict[str, Any]:
-        """The status as plain values; `next.command` and `next.reason` are the next step."""
+        """Return the status as plain values; `next.command` and `next.reason` are the next step."""
         facts, model = self.facts, self.facts.in_use
         return {
             "cell": facts.folder,
