@@ -31,16 +31,21 @@ def new(
         ),
     ],
     out: Annotated[Path, typer.Option(help="Folder to write.")],
-    sensor: Annotated[str, typer.Option(help="Sensor: tracker, camera, sockets, draw-wire or touch.")] = "tracker",
+    sensor: Annotated[
+        str, typer.Option(help="Sensor: tracker, camera, sockets, draw-wire or touch.")
+    ] = "tracker",
     limit_mm: Annotated[
         float | None, typer.Option(help="Limit of the 95 % quantile of the position errors [mm].")
     ] = None,
-    base: Annotated[str | None, typer.Option(help="Link of the URDF file in whose frame poses are given.")] = None,
+    base: Annotated[
+        str | None, typer.Option(help="Link of the URDF file in whose frame poses are given.")
+    ] = None,
     tip: Annotated[str | None, typer.Option(help="Link of the URDF file that is the tool.")] = None,
     camera: Annotated[list[Path] | None, typer.Option(help="Camera file (YAML); may be repeated.")] = None,
     board: Annotated[list[Path] | None, typer.Option(help="Board file (YAML); may be repeated.")] = None,
     fixed_camera: Annotated[
-        bool, typer.Option("--fixed-camera", help="State that the camera is fixed and the board is on the flange.")
+        bool,
+        typer.Option("--fixed-camera", help="State that the camera is fixed and the board is on the flange."),
     ] = False,
     as_json: AsJson = False,
 ) -> None:
@@ -64,7 +69,9 @@ def status(
     exit_code: Annotated[
         bool, typer.Option("--exit-code", help="Exit with status 3 if something has to be done.")
     ] = False,
-    watch: Annotated[float | None, typer.Option(min=1, help="Interval at which to print the status again [s].")] = None,
+    watch: Annotated[
+        float | None, typer.Option(min=1, help="Interval at which to print the status again [s].")
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Print the state of a cell, or of every cell in a folder, and the command to run next."""

@@ -138,9 +138,7 @@ def _no_session(facts: CellFacts) -> Step | None:
     why = f"{ended[-1].kind} on {ended[-1].day} ended the validity of all sessions" if ended else ""
     if not facts.plans or why:
         few = () if facts.in_use is None else ("--count", str(VERIFICATION_POSES), "--check", "0")
-        return Step(
-            "no_plan", why or "there is no plan and no session", facts.command("plan", *few)
-        )
+        return Step("no_plan", why or "there is no plan and no session", facts.command("plan", *few))
     return Step(
         "not_measured",
         f"plan '{facts.plans[-1]}' has not been measured yet; add the measured columns to its rows",
@@ -160,9 +158,7 @@ def _not_calibrated(facts: CellFacts) -> Step | None:
             f"the calibration must not be trusted: {calibrations[-1].summary}",
             facts.import_command,
         )
-    return Step(
-        "not_calibrated", f"there are {rows} measured rows, but no model", facts.command("calibrate")
-    )
+    return Step("not_calibrated", f"there are {rows} measured rows, but no model", facts.command("calibrate"))
 
 
 def _not_verified(facts: CellFacts) -> Step | None:

@@ -1,1 +1,1 @@
-"""A cell as Python uses it: its file, and every step of a calibration with what the file states."""
+"""Calibration steps on a cell: its file, its sessions and its models."""

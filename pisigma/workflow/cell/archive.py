@@ -1,4 +1,4 @@
-"""A cell as one ZIP file that can be sent, and back; nothing in it leads out of its folder."""
+"""Packing of a cell into one ZIP file, and unpacking; links and paths that lead out of the folder are refused."""
 
 import os
 import stat
@@ -12,7 +12,7 @@ from pisigma.lifetime.cell.layout import CELL_FILE
 from pisigma.workflow.cell.cell import Cell
 
 MAX_BYTES = 2 * 10**9
-"""Of all files of a cell together."""
+"""Largest total size of the files of a cell."""
 _CHUNK = 2**20
 
 
@@ -20,20 +20,24 @@ def pack(cell: Cell, path: str | os.PathLike[str]) -> int:
     """Write all files of a cell into a ZIP file, whole or not at all.
 
     Args:
-        cell: whose sessions have to be as they were taken in.
-        path: the file (.zip).
+        cell: the cell; the files of its sessions must be unchanged.
+        path: the ZIP file to write.
 
     Returns:
         The number of files.
 
     Raises:
         MeasurementError: a session was changed or removed.
-        OutputError: the file cannot be written, or the cell holds a link or more than 2 GB.
+        OutputError: the file cannot be written, or the cell contains a link or more than 2 GB.
     """
     target = Path(path)
     check_output(target, (".zip",), "a packed cell", (cell.folder,))
     if edited := cell.status().facts.edited:
-        raise MeasurementError(f"session '{edited[0]}' was changed or removed", at=Place(cell.folder))
+        raise MeasurementError(
+            f"the file of session '{edited[0]}' was changed or removed after it was added",
+            at=Place(cell.folder),
+            remedy="restore the measured file, or set the session aside",
+        )
     files = sorted(one for one in cell.folder.rglob("*") if not one.is_dir() or one.is_symlink())
     for one in files:
         if one.is_symlink() or not one.is_file():
@@ -53,15 +57,15 @@ def pack(cell: Cell, path: str | os.PathLike[str]) -> int:
 
 
 def unpack(path: str | os.PathLike[str], folder: str | os.PathLike[str]) -> Cell:
-    """Make a cell of a ZIP file that `pack` wrote, whole or not at all.
+    """Restore a cell from a ZIP file that `pack` wrote, whole or not at all.
 
     Args:
-        path: the file.
-        folder: to write; it must not exist.
+        path: the ZIP file.
+        folder: folder to write; it must not exist.
 
     Raises:
-        PlanningError: the file is not a packed cell, is damaged, holds links, paths that lead out of the folder or
-            more than 2 GB.
+        PlanningError: the file is not a packed cell, is damaged, or contains links, paths that lead out of the folder
+            or more than 2 GB.
         OutputError: the folder exists or cannot be written.
     """
     target = Path(folder)
@@ -86,14 +90,16 @@ def unpack(path: str | os.PathLike[str], folder: str | os.PathLike[str]) -> Cell
 
 
 def _check_members(archive: zipfile.ZipFile, path: str | os.PathLike[str]) -> None:
-    """Refuse what no packed cell holds."""
+    """Refuse an archive that is not a packed cell, or that would write outside its folder."""
     names = [one.filename for one in archive.infolist()]
     if CELL_FILE not in names:
         raise PlanningError(
             expected=f"a packed cell with its {CELL_FILE}", value="another archive", at=Place(path)
         )
     if len({name.casefold() for name in names}) < len(names):
-        raise PlanningError(expected="different names of files", value="one name twice", at=Place(path))
+        raise PlanningError(
+            expected="a different name for every file", value="a name that appears twice", at=Place(path)
+        )
     for one in archive.infolist():
         inside = PurePosixPath(one.filename)
         leads_out = (
@@ -109,7 +115,7 @@ def _check_members(archive: zipfile.ZipFile, path: str | os.PathLike[str]) -> No
 def _extract(
     archive: zipfile.ZipFile, member: zipfile.ZipInfo, folder: Path, path: str | os.PathLike[str]
 ) -> None:
-    """Write one file, and no more of it than the archive states."""
+    """Write one file; refuse it if it is longer than the archive states."""
     target = folder / member.filename
     if member.is_dir():
         target.mkdir(parents=True, exist_ok=True)

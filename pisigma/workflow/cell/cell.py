@@ -55,12 +55,12 @@ from pisigma.workflow.verify import Verification, verify
 
 
 class Cell:
-    """A cell: its folder, its file and its history.
+    """A cell: one robot on its mount, with its settings, sessions, models and history in one folder.
 
     Attributes:
-        folder: of the cell.
+        folder: folder of the cell.
         file: its `cell.yaml`.
-        history: its sessions, events, models and checks.
+        history: history of its sessions, events, models and checks.
     """
 
     def __init__(self, folder: Path, file: CellFile) -> None:
@@ -72,10 +72,10 @@ class Cell:
         """Open a cell.
 
         Args:
-            folder: with a `cell.yaml`.
+            folder: folder that contains a `cell.yaml`.
 
         Raises:
-            PlanningError: the folder has no `cell.yaml`, or one that cannot be used.
+            PlanningError: there is no `cell.yaml`, or it is not valid.
         """
         return Cell(Path(folder), CellFile.read(Path(folder)))
 
@@ -92,48 +92,48 @@ class Cell:
         """Write the folder of a new cell.
 
         Args:
-            folder: to write; it must not exist, or be empty.
+            folder: folder to write; it must not exist, or must be empty.
             robot: catalogue name, or a robot file (YAML or URDF), which is copied into the cell.
             sensor: "tracker", "camera", "sockets", "draw-wire" or "touch".
-            limit_mm: length below which 95 % of the position errors have to stay [mm].
-            base: of a URDF file: link that poses are given in.
-            tip: of a URDF file: link that is the tool.
+            limit_mm: limit of the 95 % quantile of the position errors [mm]; None for no limit.
+            base: link of the URDF file in whose frame poses are given; None for its root.
+            tip: link of the URDF file that is the tool; None for its only end.
             cameras: cameras and boards, whose files are copied into the cell.
 
         Raises:
             OutputError: the folder exists and is not empty, or cannot be written.
             RobotError: there is no such robot.
-            PlanningError: a value cannot be used.
+            PlanningError: a value is not valid.
         """
         write_new_cell(Path(folder), os.fspath(robot), sensor, limit_mm, base, tip, cameras)
         return Cell.open(folder)
 
     @property
     def robot(self) -> Robot:
-        """The robot as drawn."""
+        """The nominal robot."""
         document = self.file.document
         return Robot.load(self.file.robot, document.base, document.tip)
 
     @property
     def cameras(self) -> CameraFiles | None:
-        """What the pixels of corners mean; None where no camera measures."""
+        """Cameras and boards that measure; None without cameras."""
         settings: CalibrationSettings = self.file.settings("calibrate")
         return settings.cameras
 
     @property
     def model(self) -> CalibratedModel | None:
-        """The model in use; None where there is none."""
+        """The model in use; None if there is none."""
         entry = self.history.in_use
         return None if entry is None else load_model(self.model_folder(entry.name))
 
     def model_folder(self, name: str | None = None) -> Path:
-        """The folder of a model.
+        """Return the folder of a model.
 
         Args:
-            name: of the model. None: of the one in use.
+            name: name of the model. None: the model in use.
 
         Raises:
-            ModelError: there is no such model, or none in use.
+            ModelError: there is no model with this name, or none is in use.
         """
         if name is None:
             entry = self.history.in_use
@@ -149,15 +149,15 @@ class Cell:
     def plan(
         self, progress: Progress = lambda what: None, programs: Sequence[Path] = (), **changed: Any
     ) -> tuple[Plan, Path]:
-        """Plan which poses to measure, for the model in use or for the robot as drawn.
+        """Plan which poses to measure, for the model in use or, if there is none, for the nominal robot.
 
         Args:
-            progress: called with what is being done.
-            programs: files of robot programs to write too.
-            **changed: options of `pisigma plan` other than in `cell.yaml`, by its keys.
+            progress: called with the name of each step.
+            programs: files of robot programs to write as well.
+            **changed: options of `pisigma plan` that override `cell.yaml`, by its keys.
 
         Returns:
-            The plan, and the CSV file in `plans/` that it was written to.
+            The plan, and the CSV file in `plans/` to which it was written.
         """
         entry = self.history.in_use
         subject = self.robot if entry is None else self.model_folder(entry.name)
@@ -170,13 +170,13 @@ class Cell:
 
     @cached_property
     def sessions(self) -> Sessions:
-        """Its sessions."""
+        """The sessions of the cell."""
         return Sessions(self.folder, self.robot, self.cameras, self.history)
 
     def take_in(
         self, file: str | os.PathLike[str] | Measurements, accept_implausible: bool = False, day: str = ""
     ) -> SessionEntry:
-        """See `Sessions.take_in`."""
+        """Add a session of measured rows to the cell; see `Sessions.take_in`."""
         return self.sessions.take_in(file, accept_implausible, day)
 
     def calibrate(
@@ -184,17 +184,18 @@ class Cell:
     ) -> tuple[Calibration, ModelEntry | None]:
         """Calibrate with all rows since the last event that changed the arm, and store the model.
 
-        The first model goes into use after `verify`. A later one goes into use where rows that neither it nor the one
-        in use was made of show that it is better: the newest session of ten rows or more is held out, and the
-        calibration without it is compared with the model in use.
+        The first model is put into use by `verify`. A later one is put into use if it is better on held-out rows: the
+        newest session, if it has ten rows or more, is held out, and the calibration without it is compared with the
+        model in use.
 
         Args:
-            progress: called with what is being done.
-            accept_implausible: store the model although it must not be trusted; it does not go into use by itself.
-            **changed: options of `pisigma calibrate` other than in `cell.yaml`, by its keys.
+            progress: called with the name of each step.
+            accept_implausible: store the model even if it must not be trusted; it is then not put into use.
+            **changed: options of `pisigma calibrate` that override `cell.yaml`, by its keys.
 
         Returns:
-            The calibration and its entry; None where it must not be trusted, and so was not stored.
+            The calibration and the entry of its model; None instead of the entry if it was not stored, because it must
+            not be trusted.
 
         Raises:
             MeasurementError: there are no valid sessions.
@@ -222,16 +223,19 @@ class Cell:
     def verify(
         self, session: str | None = None, model: str | None = None, **changed: Any
     ) -> tuple[Verification, ModelEntry]:
-        """Verify a model with a session that it was not made of; the first that is verified goes into use.
+        """Verify a model with a session to which it was not fitted; put it into use if it passes and is newer.
 
         Args:
-            session: its name. None: the newest that the model was not made of.
-            model: its name. None: the newest model where none is in use, else the one in use.
-            **changed: options of `pisigma verify` other than in `cell.yaml`, by its keys.
+            session: name of the session. None: the newest to which the model was not fitted.
+            model: name of the model. None: the model in use or, if there is none, the newest.
+            **changed: options of `pisigma verify` that override `cell.yaml`, by its keys.
+
+        Returns:
+            The verification and the entry of the model.
 
         Raises:
             ModelError: there is no model.
-            MeasurementError: there is no such session.
+            MeasurementError: there is no session with this name, or none to which the model was not fitted.
         """
         entry, chosen, seen = self._new_rows(model, session)
         settings = seen.fitted(self.file.settings("verify", **changed))
@@ -247,18 +251,21 @@ class Cell:
         return found, entry
 
     def monitor(self, progress: Progress = lambda what: None, **changed: Any) -> Monitoring:
-        """Say of every session that was measured since the model in use was made what has moved.
+        """Compare every session that is newer than the model in use with this model, to detect what has moved.
 
         Args:
-            progress: called with what is being done.
-            **changed: options of `pisigma monitor` other than in `cell.yaml`, by its keys.
+            progress: called with the name of each step.
+            **changed: options of `pisigma monitor` that override `cell.yaml`, by its keys.
+
+        Returns:
+            The result for the newest session; the history contains a check for every session.
 
         Raises:
             ModelError: no model is in use.
             MeasurementError: no session is newer than the model.
         """
         entry = self._candidate(None)
-        sessions = self.sessions.unseen(entry)
+        sessions = self.sessions.new_to(entry)
         found: Monitoring | None = None
         for one in sessions:
             seen = self.sessions.rows_for(entry, self.sessions.as_measured(one), one.day)
@@ -273,14 +280,14 @@ class Cell:
         return found
 
     def evaluate(self, **changed: Any) -> Evaluation:
-        """Compare the model in use with the nominal robot on the newest session that it was not made of.
+        """Compare the model in use with the nominal robot on the newest session to which it was not fitted.
 
         Args:
-            **changed: options of `pisigma evaluate` other than in `cell.yaml`, by its keys.
+            **changed: options of `pisigma evaluate` that override `cell.yaml`, by its keys.
 
         Raises:
             ModelError: there is no model.
-            MeasurementError: no session is new to the model.
+            MeasurementError: there is no session to which the model was not fitted.
         """
         entry, _, seen = self._new_rows(None, None)
         settings = seen.fitted(self.file.settings("evaluate", **changed))
@@ -293,20 +300,21 @@ class Cell:
         accept_implausible: bool = False,
         **changed: Any,
     ) -> tuple[Recalibration, ModelEntry | None]:
-        """Recalibrate the model in use with the newest session; what is trusted goes into use.
+        """Recalibrate the model in use with the newest session; put the result into use if it can be trusted.
 
         Args:
-            session: its name. None: the newest that the model was not made of.
-            progress: called with what is being done.
-            accept_implausible: store the model although it must not be trusted; it does not go into use by itself.
-            **changed: options of `pisigma recalibrate` other than in `cell.yaml`, by its keys.
+            session: name of the session. None: the newest to which the model was not fitted.
+            progress: called with the name of each step.
+            accept_implausible: store the model even if it must not be trusted; it is then not put into use.
+            **changed: options of `pisigma recalibrate` that override `cell.yaml`, by its keys.
 
         Returns:
-            The recalibration and its entry; None where it must not be trusted, and so was not stored.
+            The recalibration and the entry of its model; None instead of the entry if it was not stored, because it
+            must not be trusted.
 
         Raises:
-            ModelError: no model is in use.
-            MeasurementError: there is no such session.
+            ModelError: there is no model.
+            MeasurementError: there is no session with this name, or none to which the model was not fitted.
         """
         parent, chosen, seen = self._new_rows(None, session)
         settings = replace(self.file.settings("recalibrate", **changed), cameras=None)
@@ -330,10 +338,14 @@ class Cell:
         return result, entry
 
     def use(self, model: str, reason: str) -> None:
-        """Put a model into use by hand; the earlier ones stay in the history, so that this can be undone.
+        """Put a model into use by hand; earlier models are kept, so that this can be undone.
+
+        Args:
+            model: name of the model.
+            reason: reason to record in the history.
 
         Raises:
-            ModelError: the cell has no such model, or its folder was changed.
+            ModelError: the cell has no model with this name, or its folder was changed.
         """
         entry = self.history.model(model)
         folder = self.folder / MODELS / model
@@ -344,7 +356,7 @@ class Cell:
         self.history.add(Use(entry.name, now(), reason or "by hand"))
 
     def status(self) -> CellStatus:
-        """Where the cell stands, and the next step."""
+        """Return the status of the cell and its next step."""
         sessions = self.history.sessions()
         folder = self.folder / SESSIONS
         facts = CellFacts(
@@ -362,7 +374,7 @@ class Cell:
         return CellStatus(facts, next_step(facts), not_taken_in(folder, sessions))
 
     def _candidate(self, model: str | None) -> ModelEntry:
-        """The model that a step is about."""
+        """Return the named model, else the model in use, else the newest."""
         if model is not None:
             return self.history.model(model)
         models = self.history.models()
@@ -370,12 +382,14 @@ class Cell:
             return entry
         if not models:
             raise ModelError(
-                "there is no model", at=Place(self.folder), remedy="run `pisigma calibrate` of it first"
+                "the cell has no model",
+                at=Place(self.folder),
+                remedy=f"run `pisigma calibrate {self.folder}` first",
             )
         return models[-1]
 
     def _new_rows(self, model: str | None, session: str | None) -> tuple[ModelEntry, SessionEntry, ModelRows]:
-        """A model, the newest session that it was not made of or a named one, and its rows as the model sees them."""
+        """Return a model, a session (by default the newest to which it was not fitted), and its rows with its names."""
         entry = self._candidate(model)
         chosen = self.sessions.chosen(entry, session)
         return entry, chosen, self.sessions.rows_for(entry, self.sessions.as_measured(chosen), chosen.day)

@@ -1,4 +1,4 @@
-"""`cell.yaml`: what a cell is, and the settings of every step, with the names and units of the command line."""
+"""`cell.yaml`: robot, sensor and limit of a cell, and the settings of every step, as on the command line."""
 
 import functools
 import itertools
@@ -38,30 +38,30 @@ STEPS: dict[str, type] = {
     "compare": ComparisonSettings,
     "evaluate": EvaluationSettings,
 }
-"""By the section of `cell.yaml`, which has the name of the command, the class of its settings."""
+"""Class of the settings of every step, by its section of `cell.yaml`, which has the name of the command."""
 CAMERA_KEYS = ("camera", "board", "fixed_camera", "intrinsics", "repeatability_mm", "repeatability_deg")
 SHARED_KEYS = (*CAMERA_KEYS, "limit_mm")
-"""Keys that are stated once for all steps."""
+"""Keys that are stated once and apply to all steps."""
 MAX_WIDTH = 100
 
 SensorName = Literal["tracker", "camera", "sockets", "draw-wire", "touch"]
 PLANNED_SENSORS: dict[SensorName, str] = {"camera": "camera", "draw-wire": "distance"}
-"""What `plan` calls the sensors that do not measure positions."""
+"""Names that `pisigma plan` uses for the sensors that do not measure positions."""
 
 Group = TypeVar("Group")
 _Steps = dict[str, Any] | None
 
 
 class CameraSection(Section):
-    """Which cameras see which boards; paths are inside the cell.
+    """Cameras and boards of a cell; their paths are inside the cell.
 
     Attributes:
         camera: camera files (YAML of pisigma, ROS or OpenCV).
         board: board files (YAML: rows, columns, square_mm).
-        fixed_camera: the cameras are fixed and the boards are on the flange, not the other way round.
+        fixed_camera: whether the cameras are fixed and the boards are on the flange, instead of the opposite.
         intrinsics: fixed, prior or free.
-        repeatability_mm: standard deviation with which a position repeats, per axis [mm].
-        repeatability_deg: standard deviation with which an orientation repeats, per axis [deg].
+        repeatability_mm: standard deviation of the robot's position repeatability, per axis [mm].
+        repeatability_deg: standard deviation of the robot's orientation repeatability, per axis [deg].
     """
 
     camera: tuple[str, ...]
@@ -77,12 +77,12 @@ class CellDocument(Section):
 
     Attributes:
         robot: catalogue name, or a robot file (YAML or URDF) inside the cell.
-        base: link of a URDF file that poses are given in; None for its root.
-        tip: link of a URDF file that is the tool; None for its only end.
-        sensor: what measures the robot.
-        limit_mm: length below which 95 % of the position errors have to stay [mm]; None where none is stated.
-        camera: cameras and boards; None where no camera measures.
-        surroundings: what is around the robot; None for nothing.
+        base: link of the URDF file in whose frame poses are given; None for its root.
+        tip: link of the URDF file that is the tool; None for its only end.
+        sensor: sensor that measures the robot.
+        limit_mm: limit of the 95 % quantile of the position errors [mm]; None for no limit.
+        camera: cameras and boards; None without cameras.
+        surroundings: obstacles around the robot and limits of its motion; None for none.
         plan: settings of `pisigma plan`, by the names of its options.
         import_: settings of `pisigma import`.
         calibrate: settings of `pisigma calibrate`.
@@ -115,7 +115,7 @@ class CellFile:
     """`cell.yaml` as it was read.
 
     Attributes:
-        path: of the file.
+        path: path of the file.
         document: its content.
     """
 
@@ -127,8 +127,8 @@ class CellFile:
         """Read the file of a cell, and check the settings of every step.
 
         Raises:
-            PlanningError: it is missing or not a `cell.yaml`; the message names file, line and key.
-            PisigmaError: a setting of a step cannot be used.
+            PlanningError: the file is missing or not a valid `cell.yaml`; the message names file, line and key.
+            PisigmaError: a setting of a step is not valid.
         """
         path = folder / CELL_FILE
         read = CellFile(path, read_yaml(path, CellDocument, PlanningError))
@@ -141,12 +141,12 @@ class CellFile:
 
     @property
     def robot(self) -> str:
-        """The robot as `Robot.load` takes it."""
+        """The robot as an argument of `Robot.load`."""
         name = self.document.robot
         return name if robot_file(name) is None else str(inside(self.path.parent, name))
 
     def stated(self, step: str) -> dict[str, Any]:
-        """What the file states for a step, by option names; shared keys count where the step has such an option."""
+        """Return the values that the file states for a step, by its keys, including the shared keys that it uses."""
         section = dict(getattr(self.document, {"import": "import_"}.get(step, step)) or {})
         known = {key_of(one) for one in flat_settings(STEPS[step])}
         shared: dict[str, Any] = {}
@@ -160,14 +160,14 @@ class CellFile:
         return {key: value for key, value in shared.items() if key in known} | section
 
     def settings(self, step: str, **changed: Any) -> Any:
-        """The settings of a step.
+        """Return the settings of a step.
 
         Args:
             step: a key of `STEPS`.
-            **changed: options other than in the file, by its keys; paths among them may be outside the cell.
+            **changed: values that override the file, by its keys; their paths may be outside the cell.
 
         Raises:
-            PisigmaError: a setting cannot be used; the message names file, line and key.
+            PisigmaError: a setting is not valid; the message names file, line and key.
         """
         return settings_from(
             STEPS[step], self.stated(step) | changed, self._place(step), self.path.parent, frozenset(changed)
@@ -179,7 +179,7 @@ class CellFile:
 
 @dataclass(frozen=True)
 class _Places:
-    """Where the keys of a step are in a file."""
+    """Places of the keys of a step in a file."""
 
     path: Path
     step: str
@@ -189,7 +189,7 @@ class _Places:
 
 
 def key_of(setting: Setting) -> str:
-    """The key of a setting in `cell.yaml`: its option without dashes before it, such as "prior_mm"."""
+    """Return the key of a setting in `cell.yaml`: its option without leading dashes, such as "prior_mm"."""
     return setting.name.removeprefix("--").replace("-", "_")
 
 
@@ -200,7 +200,7 @@ def _settings(group: type) -> tuple[Setting, ...]:
 
 @functools.cache
 def flat_settings(group: type) -> tuple[Setting, ...]:
-    """The settings of a class, with those of the classes that it is made of."""
+    """Return the settings of a class, including those of its fields that are classes of settings."""
     parts = [flat_settings(one.kind) if one.is_group else (one,) for one in _settings(group)]
     return tuple(itertools.chain.from_iterable(parts))
 
@@ -212,22 +212,22 @@ def settings_from(
     folder: Path,
     outside: Collection[str] = (),
 ) -> Group:
-    """Make settings of what a file states.
+    """Make an instance of a class of settings from the values of a file.
 
     Args:
-        group: their class.
+        group: class of the settings.
         stated: values by their keys, in the units of the command line.
-        places: where the keys are.
-        folder: of the cell, which paths are relative to.
+        places: places of the keys in the file.
+        folder: folder of the cell, to which paths are relative.
         outside: keys whose paths are relative to the working directory.
 
     Raises:
-        PisigmaError: a key is unknown, or a value is of another type or not a valid one.
+        PisigmaError: a key is unknown, or a value has the wrong type or is not valid.
     """
     values = dict(_checked(group, stated, places))
     try:
         built = _built(group, values, folder, outside, is_optional=False)
-    except PisigmaError as problem:  # of a value that the class of the settings refuses
+    except PisigmaError as problem:  # the class of the settings refuses a value
         key = problem.option.removeprefix("--").replace("-", "_")
         raise (
             problem if key in outside else problem.located(places.of(key if key in values else ""))
@@ -237,11 +237,11 @@ def settings_from(
 
 
 _TYPES = {bool: "true or false", int: "an integer", float: "a number", str: "a text", Path: "a path"}
-"""What messages call the types of options."""
+"""Names of the types of options in messages."""
 
 
 def _checked(group: type, stated: Mapping[str, Any], places: _Places) -> Iterator[tuple[str, Any]]:
-    """Values by their keys, each of the type that its option takes."""
+    """Yield keys and values, after converting every value to the type of its option."""
     known = {key_of(one): one for one in flat_settings(group)}
     for key, value in stated.items():
         if key not in known:
@@ -254,7 +254,7 @@ def _checked(group: type, stated: Mapping[str, Any], places: _Places) -> Iterato
 
 
 def _listed(value: Any, kind: Any) -> Any:
-    """A single value as a list of one where the option may be repeated, and a list of one as its value elsewhere."""
+    """Return a single value as a list if the option may be repeated, else a list of one value as this value."""
     is_list, is_repeated = isinstance(value, list | tuple), getattr(kind, "__origin__", None) is list
     if is_list and not is_repeated and len(value) == 1:
         return value[0]
@@ -282,10 +282,10 @@ def _built(
 
 
 def inside(folder: Path, path: str | os.PathLike[str]) -> Path:
-    """A path that a cell states, which has to be inside the cell.
+    """Return the full path of a file that a cell states; it must be inside the cell.
 
     Raises:
-        PlanningError: it leads out of the cell.
+        PlanningError: the path leads out of the cell.
     """
     whole = folder / path
     if not Path(os.path.realpath(whole)).is_relative_to(os.path.realpath(folder)):
@@ -299,16 +299,16 @@ def inside(folder: Path, path: str | os.PathLike[str]) -> Path:
 
 
 def template(document: Mapping[str, Any]) -> str:
-    """The text of a new `cell.yaml`: what is known, and every setting with its help and default commented out.
+    """Return the text of a new `cell.yaml`: the known values, and every setting as a comment with help and default.
 
     Args:
-        document: what is known, by the keys of `CellDocument`.
+        document: known values by the keys of `CellDocument`.
     """
-    lines = ["# A cell: one robot on its mount and what measures it. Lines that begin with # are defaults."]
+    lines = ["# A cell: one robot on its mount, and its sensor. Lines that begin with # state defaults."]
     optional = {
-        "base": "link of the URDF file that poses are given in",
+        "base": "link of the URDF file in whose frame poses are given",
         "tip": "link of the URDF file that is the tool",
-        "limit_mm": "length below which 95 % of the position errors have to stay [mm]",
+        "limit_mm": "limit of the 95 % quantile of the position errors [mm]",
     }
     for key in ("robot", "base", "tip", "sensor", "limit_mm"):
         if document.get(key) is not None:
@@ -321,7 +321,7 @@ def template(document: Mapping[str, Any]) -> str:
         "# surroundings:  # floor, boxes, tracker, joint margins: see the documentation of `pisigma plan`"
     )
     for step, group in STEPS.items():
-        lines += ["", f"{step}:  # as the options of `pisigma {step}`"]
+        lines += ["", f"{step}:  # options of `pisigma {step}`"]
         for setting in flat_settings(group):
             key = key_of(setting)
             if key in SHARED_KEYS or (step == "plan" and key == "sensor"):
@@ -338,16 +338,16 @@ def _yaml(value: Any) -> str:
 
 
 def cells_in(folder: str | os.PathLike[str]) -> tuple[Path, ...]:
-    """The cells in a folder, by their names.
+    """Return the cells in a folder, sorted by name.
 
     Raises:
-        PlanningError: there is none.
+        PlanningError: the folder contains no cell.
     """
     found = tuple(sorted(path.parent for path in Path(folder).glob(f"*/{CELL_FILE}")))
     if not found:
         raise PlanningError(
             expected=f"a cell (a folder with a {CELL_FILE}) or a folder of cells",
             value=os.fspath(folder),
-            remedy="make one with `pisigma new`",
+            remedy="create one with `pisigma new`",
         )
     return found

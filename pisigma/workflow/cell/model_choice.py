@@ -1,4 +1,4 @@
-"""What new rows say of the models of a cell: which is better, and whether the one in use still holds."""
+"""Choice between models of a cell with new rows: whether a new calibration is better than the model in use."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -18,7 +18,7 @@ from pisigma.workflow.settings.calibration import CalibrationSettings
 from pisigma.workflow.settings.evaluation import EvaluationSettings
 
 MIN_ROWS = 10
-"""Of the newest session, which is held out."""
+"""Minimum number of rows of the newest session, which is held out."""
 Value = TypeVar("Value")
 
 
@@ -29,21 +29,21 @@ def is_better(
     settings: CalibrationSettings,
     progress: Progress,
 ) -> tuple[bool, str]:
-    """Say whether a calibration from some sessions is better than the model in use, and why.
+    """Return whether a calibration from some sessions is better than the model in use, and the reason.
 
-    The calibration is repeated without the newest session, on which both are then compared: it is better where the
+    The calibration is repeated without the newest session, on which both are then compared. It is better if the
     confidence interval of the difference of the mean position errors is below 0.
 
     Args:
         stored: the sessions of the cell.
         in_use: the model in use.
-        sessions: that the new calibration was made of, by their days.
-        settings: of the calibration.
-        progress: called with what is being done.
+        sessions: sessions to which the new calibration was fitted, by their days.
+        settings: settings of the calibration.
+        progress: called with the name of each step.
     """
     newest, older = sessions[-1], list(sessions[:-1])
     if newest.name in in_use.sessions.split(",") or newest.rows < MIN_ROWS or not older:
-        return False, f"no session of {MIN_ROWS} rows or more is new to it and to '{in_use.name}'"
+        return False, f"there is no session of {MIN_ROWS} rows or more to compare it with '{in_use.name}'"
     progress("calibration without the newest session")
     alone = replace(settings, cameras=None, folds=0, hold_out=None)
     without = calibrate(stored.robot, stored.rows_of(older), alone)
@@ -67,12 +67,12 @@ def is_better(
     difference = judged.models[-1].position.difference
     interval = None if difference is None else difference.intervals["mean"]
     means = [f"{one.position.statistics['mean']:.3f} mm ({one.name})" for one in judged.models]
-    figures = f"mean errors of session '{newest.name}', which neither was made of: {' and '.join(means)}"
+    figures = f"mean errors of session '{newest.name}', to which neither was fitted: {' and '.join(means)}"
     return interval is not None and interval[1] < 0, figures
 
 
 def with_names_of(model: CalibratedModel, entry: ModelEntry, other: ModelEntry) -> CalibratedModel:
-    """A model whose newest frame and tool have the names that those of another model have."""
+    """Return a model whose newest frame and tool are renamed to those of another model."""
 
     def renamed(values: Mapping[str, Value], day: str, other_day: str) -> dict[str, Value]:
         newest = {since(name, other_day): value for name, value in _of_day(values, day).items()}
@@ -89,7 +89,7 @@ def with_names_of(model: CalibratedModel, entry: ModelEntry, other: ModelEntry) 
 
 
 def _of_day(values: Mapping[str, Value], day: str) -> dict[str, Value]:
-    """What was set up on a day, by the names of the files of rows."""
+    """Return the frames or tools that were set up on a day, by their names in files of rows."""
     ending = since("", day)
     if not day:
         return {name: value for name, value in values.items() if " since " not in f" {name}"}
@@ -99,7 +99,7 @@ def _of_day(values: Mapping[str, Value], day: str) -> dict[str, Value]:
 
 
 def check_of(found: Monitoring, entry: ModelEntry, session: SessionEntry) -> Check:
-    """The entry of what monitoring found of a session."""
+    """Return the history entry of a session's monitoring result."""
     if found.untrusted:
         summary = found.untrusted[0].sentence
         return Check("monitor", entry.name, session.name, "implausible", summary, None, True, now())
@@ -110,5 +110,5 @@ def check_of(found: Monitoring, entry: ModelEntry, session: SessionEntry) -> Che
 
 
 def p95_of(judged: ValidationFigures | None) -> float | None:
-    """95 % quantile of the position errors of held-out rows under the best calibration [mm]."""
+    """Return the 95 % quantile of the position errors of held-out rows of the best calibration [mm]."""
     return None if judged is None else list(judged.models.values())[-1].p95_mm

@@ -49,7 +49,7 @@ def write_new_cell(
 
 
 def _copied(cameras: CameraFiles, folder: Path) -> dict[str, Any]:
-    """The section of cameras, whose files are copied into the cell."""
+    """Copy the files of cameras and boards into the cell; return the section `camera`."""
     for path in cameras.files:
         shutil.copyfile(path, folder / Path(path).name)
     return {

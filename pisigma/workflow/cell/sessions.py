@@ -1,4 +1,4 @@
-"""Sessions of a cell: checked when they are taken in, stored as they were measured, and read for a model."""
+"""Sessions of a cell: they are checked and stored as measured, and read with the names of a model."""
 
 import datetime
 import hashlib
@@ -28,23 +28,23 @@ from pisigma.workflow.recalibrate import may_move
 from pisigma.workflow.settings.recalibration import RecalibrationSettings
 
 MAX_NAMES = 10_000
-"""Of one day."""
+"""Largest number of files with the date of one day in a folder."""
 
 
 @dataclass(frozen=True, eq=False)
 class ModelRows:
-    """Rows as a model sees them.
+    """Rows with the names of a model's frame and target.
 
     Attributes:
-        rows: with the names of the newest frame and tool that the model has.
-        moved: "base" and "tool", where an event since says that they were changed.
+        rows: the rows, with the names of the newest frame and target of the model.
+        moved: "base" or "tool" or both, if events since the model record that they were changed.
     """
 
     rows: Measurements
     moved: tuple[str, ...]
 
     def fitted(self, settings: Any) -> Any:
-        """Settings that fit frame and tool where an event says that they were changed; cameras were read already."""
+        """Return settings that also fit a frame and tool that were changed; cameras are removed, as rows are read."""
         fit_frame, fit_tool = settings.fit_frame or self.fit_frame, settings.fit_tool or self.fit_tool
         return replace(settings, cameras=None, fit_frame=fit_frame, fit_tool=fit_tool)
 
@@ -63,17 +63,17 @@ class Sessions:
     """The sessions of a cell.
 
     Attributes:
-        folder: that they are in.
-        robot: as drawn.
-        cameras: what the pixels of corners mean; None where no camera measures.
-        history: of the cell.
+        folder: folder of the sessions.
+        robot: the nominal robot.
+        cameras: cameras and boards that measure; None without cameras.
+        history: history of the cell.
     """
 
     def __init__(self, cell: Path, robot: Robot, cameras: CameraFiles | None, history: History) -> None:
         self.folder, self.robot, self.cameras, self.history = cell / SESSIONS, robot, cameras, history
 
     def path(self, session: SessionEntry) -> Path:
-        """The file of a session."""
+        """Return the file of a session."""
         return self.folder / f"{session.name}.csv"
 
     def take_in(
@@ -83,11 +83,15 @@ class Sessions:
 
         Args:
             file: measurements (CSV), or rows in memory.
-            accept_implausible: take them in although the check says that they must not be trusted.
-            day: on which they were measured (ISO 8601). "": the column `date`, the name of the file, or today.
+            accept_implausible: add them even if the check finds that they must not be trusted.
+            day: day on which they were measured (ISO 8601). "": from the column `date`, else from the name of the
+                file, else today.
+
+        Returns:
+            The entry of the session.
 
         Raises:
-            MeasurementError: the rows cannot be read, or are all known.
+            MeasurementError: the rows cannot be read, or the cell already contains all of them.
             AcceptanceError: the rows must not be trusted.
         """
         rows = read_rows(file, self.robot, self.cameras)
@@ -110,7 +114,7 @@ class Sessions:
         return entry
 
     def _judged(self, rows: Measurements, day: str, accept_implausible: bool) -> SessionEntry:
-        """The entry of rows that the gate lets through."""
+        """Check rows and return the entry of their session, still without name and hash."""
         known = [one for one in self.history.sessions() if not one.set_aside]
         again = torch.zeros(rows.rows, dtype=torch.bool)
         for one in known:
@@ -118,7 +122,7 @@ class Sessions:
             again |= copies_of_known(rows.as_fields(), self.robot, values)
         if bool(again.all()):
             raise MeasurementError(
-                "every row was taken in before", at=Place(rows.source), remedy="give new rows"
+                "the cell already contains every row", at=Place(rows.source), remedy="import new rows"
             )
         model = self.history.in_use
         if model is None:
@@ -132,7 +136,7 @@ class Sessions:
             raise AcceptanceError(
                 f"the rows must not be trusted: {verdict.implausible[0].sentence.rstrip('.')}",
                 at=Place(rows.source),
-                remedy="correct the file, or take it in with --accept-implausible",
+                remedy="correct the file, or import it with --accept-implausible",
             )
         temperature = None if rows.temperature is None else float(rows.temperature.nanmean())
         return SessionEntry(
@@ -148,10 +152,10 @@ class Sessions:
         )
 
     def set_aside(self, session: str, reason: str) -> None:
-        """Leave a session out of everything from now on; its file stays.
+        """Exclude a session from all further steps; its file is kept.
 
         Raises:
-            MeasurementError: there is no such session, or no reason.
+            MeasurementError: there is no session with this name, or the reason is empty.
         """
         sessions = {one.name: one for one in self.history.sessions()}
         check_choice(MeasurementError, "session", session, tuple(sessions), Place(self.folder))
@@ -160,7 +164,7 @@ class Sessions:
         self.history.add(replace(sessions[session], set_aside=reason.strip()))
 
     def valid(self) -> list[SessionEntry]:
-        """Sessions that describe the arm of today, by their days; new files in the folder are taken in first.
+        """Return the sessions that describe the present arm by their days, after adding new files in the folder.
 
         Raises:
             MeasurementError: there is none.
@@ -170,14 +174,14 @@ class Sessions:
         sessions = list(valid_sessions(self.history.sessions(), self.history.events()))
         if not sessions:
             raise MeasurementError(
-                "there is no session of the arm as it is now",
+                "the cell has no session since the arm was last changed",
                 at=Place(self.folder),
-                remedy="measure rows and take them in",
+                remedy="measure rows and import them",
             )
         return sessions
 
-    def unseen(self, model: ModelEntry) -> list[SessionEntry]:
-        """Valid sessions that a model was not made of, measured on its newest day or later.
+    def new_to(self, model: ModelEntry) -> list[SessionEntry]:
+        """Return the valid sessions to which a model was not fitted, measured on its newest day or later.
 
         Raises:
             MeasurementError: there is none.
@@ -186,62 +190,62 @@ class Sessions:
         found = [one for one in self.valid() if one.name not in made_of and one.day >= model.day]
         if not found:
             raise MeasurementError(
-                f"no valid session is new to model '{model.name}'",
+                f"every valid session is older than model '{model.name}' or was used to fit it",
                 at=Place(self.folder),
-                remedy="measure new rows and take them in",
+                remedy="measure new rows and import them",
             )
         return found
 
     def chosen(self, model: ModelEntry, name: str | None) -> SessionEntry:
-        """A session by its name; None for the newest that a model was not made of.
+        """Return a session by its name; None: the newest to which a model was not fitted.
 
         Raises:
-            MeasurementError: there is no such session.
+            MeasurementError: there is no session with this name.
         """
         if name is None:
-            return self.unseen(model)[-1]
+            return self.new_to(model)[-1]
         sessions = {one.name: one for one in self.valid()}
         check_choice(MeasurementError, "session", name, tuple(sessions), Place(self.folder))
         return sessions[name]
 
     def rows_of(self, sessions: Sequence[SessionEntry]) -> Measurements:
-        """The rows of sessions, those after an instrument or tool event in frames or of targets of their own.
+        """Return the rows of sessions; rows after an instrument or tool event have a new frame or target.
 
         Raises:
-            MeasurementError: a file was changed or removed since it was taken in.
+            MeasurementError: a file was changed or removed after it was added.
         """
         events, parts = self.history.events(), []
         for one in sessions:
             days = newest_day(events, "instrument", one.day), newest_day(events, "tool", one.day)
             parts.append(named(self.as_measured(one), *days))
         if any(one.split is not None for one in parts):
-            # sessions without check poses are all for calibration
+            # all rows of a session without a column "set" are for calibration
             parts = [one if one.split else replace(one, split=("train",) * one.rows) for one in parts]
         return parts[0] if len(parts) == 1 else read_rows(join(parts), self.robot)
 
     def as_measured(self, session: SessionEntry) -> Measurements:
-        """The rows of a session with the names of their file.
+        """Return the rows of a session with the frame and target names of their file.
 
         Raises:
-            MeasurementError: the file was changed or removed since it was taken in.
+            MeasurementError: the file was changed or removed after it was added.
         """
         path = self.path(session)
         if sha256_of(path) != session.sha256:
             raise MeasurementError(
-                f"session '{session.name}' was changed or removed after it was taken in",
+                f"the file of session '{session.name}' was changed or removed after it was added",
                 at=Place(path),
-                remedy=f"put the measured file back, or set the session aside (pisigma session {self.folder.parent} "
+                remedy=f"restore the measured file, or set the session aside (pisigma session {self.folder.parent} "
                 f"{session.name} --set-aside REASON)",
             )
         return read_rows(path, self.robot, self.cameras)
 
     def rows_for(self, model: ModelEntry, rows: Measurements, day: str) -> ModelRows:
-        """Rows of a day with the names that a model has for frame and tool, and what has moved since.
+        """Return rows with the names of a model's frame and target, and what was moved since the model.
 
         Args:
             model: the model.
-            rows: with the names of their file.
-            day: on which they were measured (ISO 8601).
+            rows: rows with the frame and target names of their file.
+            day: day on which they were measured (ISO 8601).
         """
         events = self.history.events()
         changed = {"base": "instrument", "tool": "tool"}
@@ -250,65 +254,65 @@ class Sessions:
 
 
 def named(rows: Measurements, frame_day: str, target_day: str) -> Measurements:
-    """Rows in frames and of targets that were set up on a day; the first ones have the names of the file."""
+    """Return rows whose frame and target names state the day of their setup; "": the names of the file."""
     frame = tuple(since(name, frame_day) for name in rows.frame)
     target = tuple(since(name, target_day) for name in rows.target)
     return replace(rows, frame=frame, target=target)
 
 
 def since(name: str, day: str) -> str:
-    """Name of a frame or target that was set up on a day; "" for the first one."""
+    """Return the name of a frame or target that was set up on a day; day "" for the first one."""
     return f"{name} since {day}".lstrip() if day else name
 
 
 def newest_day(events: Sequence[Event], kind: str, day: str) -> str:
-    """Day of the newest event of a kind up to a day; "" where there is none."""
+    """Return the day of the newest event of a kind until a day; "" if there is none."""
     return max((one.day for one in events if one.kind == kind and one.day <= day), default="")
 
 
 def _day_of(rows: Measurements) -> str:
-    """First day of rows: of the column `date`, the name of their file, or today."""
+    """Return the first day of rows: from the column `date`, else from the name of their file, else today."""
     if rows.date is not None and all(rows.date):
         return min(rows.date)
     return date_in_name(Path(rows.source).name) or datetime.date.today().isoformat()
 
 
 def sha256_of(path: Path) -> str:
-    """Hash of a file; "" where it is missing."""
+    """Return the SHA-256 of a file; "" if it is missing."""
     return hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else ""
 
 
 def not_taken_in(folder: Path, sessions: Sequence[SessionEntry]) -> tuple[str, ...]:
-    """Names of the files in the folder of sessions that the history does not know yet."""
+    """Return the names of the files in the folder of sessions that are not in the history yet."""
     names = {one.name for one in sessions}
     return tuple(sorted(path.name for path in folder.glob("*.csv") if path.stem not in names))
 
 
 def free_path(folder: Path, name: str, suffix: str, taken: Collection[str] = ()) -> Path:
-    """A path in a folder that is not taken: NAME, NAME-2, NAME-3 and so on.
+    """Return a path in a folder that is not taken: NAME, NAME-2, NAME-3 and so on.
 
     Raises:
-        OutputError: all are taken.
+        OutputError: all names are taken.
     """
     for number in range(1, MAX_NAMES):
         stem = name if number == 1 else f"{name}-{number}"
         path = folder / f"{stem}{suffix}"
         if not path.exists() and stem not in taken:
             return path
-    raise OutputError(f"there are {MAX_NAMES:,} files of {name} already", at=Place(folder))
+    raise OutputError(f"the folder already contains {MAX_NAMES:,} files named after {name}", at=Place(folder))
 
 
 def write_new(folder: Path, name: str, content: bytes, taken: Collection[str]) -> Path:
-    """Write a session under a name that no file has, whole or not at all, whatever other processes do meanwhile.
+    """Write a session under a new name, whole or not at all, even if other processes write to the folder.
 
     Args:
-        folder: to write to.
-        name: of the file, without ".csv"; see `free_path`.
-        content: of the file.
+        folder: folder of the sessions.
+        name: name of the file without ".csv"; see `free_path`.
+        content: content of the file.
         taken: further names that are taken.
 
     Raises:
-        OutputError: it cannot be written.
+        OutputError: the file cannot be written.
     """
     while True:
         path = free_path(folder, name, ".csv", taken)
@@ -328,6 +332,6 @@ def write_new(folder: Path, name: str, content: bytes, taken: Collection[str]) -
 
 
 def edited_sessions(folder: Path, sessions: Sequence[SessionEntry]) -> tuple[str, ...]:
-    """Names of sessions that count and whose files were changed or removed since they were taken in."""
+    """Return the names of sessions in use whose files were changed or removed after they were added."""
     used = [one for one in sessions if not one.set_aside]
     return tuple(one.name for one in used if sha256_of(folder / f"{one.name}.csv") != one.sha256)
