@@ -1,4 +1,4 @@
-"""Next step of a cell: rules that derive a state, a reason and a command from its sessions, events, models and checks."""
+"""Next step of a cell: rules that derive a state, a reason and a command from its sessions, events and models."""
 
 import datetime
 import shlex
