@@ -49,12 +49,14 @@ Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace the model 
 
 PayloadKg = Annotated[
     float | None,
-    typer.Option(help="Payload of the robot [kg], for models that learned its effect. [default: the usual]"),
+    typer.Option(
+        help="Payload of the robot [kg], for models that learned its effect. [default: the mean of its rows]"
+    ),
 ]
 TemperatureC = Annotated[
     float | None,
     typer.Option(
-        help="Temperature of the robot [deg C], for models that learned its effect. [default: the usual]"
+        help="Temperature of the robot [deg C], for models that learned its effect. [default: the mean of its rows]"
     ),
 ]
 

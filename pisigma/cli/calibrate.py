@@ -75,7 +75,7 @@ def calibrate(
     """Calibrate a robot from measurements and write a model folder with card and figures.
 
     Estimates geometry, base, tool and, where it predicts held-out rows better, a joint correction. Exits with status 3
-    and writes no folder where the result must not be trusted.
+    and writes no folder if the result must not be trusted.
     """
     from pisigma.files.output_folder import check_folder
     from pisigma.robot.description import Robot

@@ -39,7 +39,7 @@ PluginFiles = Annotated[
     typer.Option(
         "--plugin",
         metavar="FILE",
-        help="Python file that registers sensors, features or other plug-ins and runs with your rights. May be "
+        help="Python file that registers sensors, features or other plug-ins and runs with your permissions. May be "
         "repeated.",
     ),
 ]

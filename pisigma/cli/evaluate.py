@@ -29,7 +29,7 @@ Hashes = Annotated[
     list[str] | None,
     typer.Option(
         "--sha256",
-        help="Refuse other models than those with these SHA-256 of model.yaml, one per folder in their order.",
+        help="Refuse the models unless their model.yaml have these SHA-256, one per folder, in order.",
     ),
 ]
 
@@ -45,7 +45,7 @@ def evaluate(
 ) -> None:
     """Compare models on measurements, with confidence intervals, and accept them or not.
 
-    Compares a single model with the nominal robot. Leaves out rows of the set "train". Exits with status 3 where a
+    Compares a single model with the nominal robot. Leaves out rows of the set "train". Exits with status 3 if a
     model misses a limit, the base or the tool has moved, or the errors are too large for a calibrated robot.
     """
     from pisigma.files.model_files import check_model_hash
@@ -71,7 +71,7 @@ def evaluate(
 
 
 def _tell(evaluation: "Evaluation", verbose: bool, as_json: bool) -> None:
-    """Print an evaluation, and end with status 3 where it is not accepted."""
+    """Print an evaluation, and end with status 3 if it is not accepted."""
     if as_json:
         print_json(evaluation.to_json())
     else:

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 Out = Annotated[
     Path,
     typer.Option(
-        help="File to write, whose ending goes with the format: .urdf, .csv, .yaml, .conf, .cfx, .xacro, .onnx, "
+        help="File to write, with the suffix of the format: .urdf, .csv, .yaml, .conf, .cfx, .xacro, .onnx, "
         ".script (URScript), .src (KUKA), .mod (ABB) or .ls (FANUC); for library a folder."
     ),
 ]

@@ -29,12 +29,12 @@ def import_(
     settings: ImportSettings,
     stated: StatedOptions,
     out: Annotated[Path | None, typer.Option(help="Measurement file to write (.csv).")] = None,
-    cell: Annotated[Path | None, typer.Option(help="Take the rows in as a session of this cell.")] = None,
+    cell: Annotated[Path | None, typer.Option(help="Cell to which the rows are added as a session.")] = None,
     date: Annotated[
         str, typer.Option(help="Day of the session. [default: column date, name of the file, today]")
     ] = "",
     accept_implausible: Annotated[
-        bool, typer.Option("--accept-implausible", help="Take in rows that must not be trusted.")
+        bool, typer.Option("--accept-implausible", help="Add rows even if they must not be trusted.")
     ] = False,
     yes: Yes = False,
     save_map: SaveMap = None,

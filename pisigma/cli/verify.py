@@ -23,7 +23,7 @@ Hash = Annotated[
     str | None,
     typer.Option(
         "--sha256",
-        help="Refuse another model than that with this SHA-256 of model.yaml.",
+        help="Refuse the model unless its model.yaml has this SHA-256.",
     ),
 ]
 Data = Annotated[
@@ -62,7 +62,7 @@ def verify(
 
     Compares the corrected model with the nominal robot. Also says what has moved since the model was made and how to
     recalibrate, and names setup faults (units, order, signs or zeros of joints, a correction applied twice or not at
-    all) that explain large errors. Leaves out rows of the set "train". Exits with status 3 where the corrected model
+    all) that explain large errors. Leaves out rows of the set "train". Exits with status 3 if the corrected model
     does not explain the measurements better, or the arm has moved.
     """
     from pisigma.files.model_files import check_model_hash

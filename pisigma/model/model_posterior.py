@@ -69,7 +69,7 @@ class ModelPosterior:
         known = model.uncertainty
         if known is None:
             raise ModelError(
-                f"model '{model.name}' ({model.kind}) has no posterior of its parameters to which rows can be added",
+                f"model '{model.name}' ({model.kind}) has no posterior of its parameters that rows could update",
                 value=model.kind,
                 remedy="calibrate a hybrid with `pisigma calibrate ROBOT DATA --out DIR`",
             )

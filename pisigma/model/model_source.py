@@ -10,7 +10,7 @@ ModelSource = CalibratedModel | str | os.PathLike[str]
 
 
 @runtime_checkable
-class HoldsModel(Protocol):
+class HasModel(Protocol):
     """Object with a model: a `pisigma.CorrectedIK`, or a result of `pisigma.calibrate` and similar functions."""
 
     @property
@@ -18,6 +18,6 @@ class HoldsModel(Protocol):
         """The calibrated model."""
 
 
-def model_or_folder(source: ModelSource | HoldsModel) -> ModelSource:
+def model_or_folder(source: ModelSource | HasModel) -> ModelSource:
     """Return the model of an object that has one; a model or a folder is returned as it is."""
-    return source.model if isinstance(source, HoldsModel) else source
+    return source.model if isinstance(source, HasModel) else source

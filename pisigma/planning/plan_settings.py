@@ -43,11 +43,11 @@ class PlanSettings:
     Attributes:
         count: number of poses to calibrate with.
         check: number of additional poses that test the calibration (rows of the set test).
-        sensor: what is measured, position (of a reflector), pose, distance (from a fixed point) or camera (corners of a
+        sensor: what is measured: position (of a reflector), pose, distance (from a fixed point) or camera (corners of a
             board).
         camera: camera and board, for the sensor camera only.
         sigma_mm: standard deviation of a measured length [mm]. None: of laser trackers.
-        criterion: optimality criterion, I (uncertainty of the tool's position over the task) or D (uncertainty of all
+        criterion: optimality criterion: I (uncertainty of the tool's position over the task) or D (uncertainty of all
             unknowns).
         limit_mm: limit of the 95 % quantile of the tool's position errors over the task [mm], as in `measure`. The plan
             then states how many poses this takes.
@@ -59,7 +59,7 @@ class PlanSettings:
         measured: measurements that already exist (CSV).
         seed: random seed.
         speed_deg_s: joint speed between the poses [deg/s].
-        settling_s: time at every pose before it is measured [s].
+        settling_s: time to wait at every pose before it is measured [s].
 
     Raises:
         PlanningError: a setting is not a valid choice, or a number is out of range.

@@ -13,7 +13,7 @@ from torch import Tensor
 from pisigma.files.errors import PlanningError
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.folder.model_folder import load_model
-from pisigma.model.model_source import HoldsModel
+from pisigma.model.model_source import HasModel
 from pisigma.planning.board_views import BoardViews
 from pisigma.planning.plan_inputs import instrument_of, read_planned_rows, views_of
 from pisigma.planning.plan_settings import PlanSettings
@@ -46,7 +46,7 @@ class Subject:
 
     @staticmethod
     def of(
-        subject: Robot | CalibratedModel | HoldsModel | str | os.PathLike[str],
+        subject: Robot | CalibratedModel | HasModel | str | os.PathLike[str],
         base: str | None = None,
         tip: str | None = None,
     ) -> "Subject":
@@ -64,7 +64,7 @@ class Subject:
         """
         if isinstance(subject, Robot):
             return Subject(subject)
-        if isinstance(subject, HoldsModel):
+        if isinstance(subject, HasModel):
             subject = subject.model
         if not isinstance(subject, CalibratedModel):
             if not Path(subject).is_dir():

@@ -64,7 +64,7 @@ class RowVerdict:
 
     @property
     def implausible(self) -> tuple[Diagnostic, ...]:
-        """Findings because of which the rows must not be used; commands end with status 3."""
+        """Findings because of which the rows must not be used; commands exit with status 3."""
         return tuple(one for one in self.diagnostics if one.severity == "implausible")
 
     @property

@@ -20,7 +20,7 @@ from pisigma.measurement.camera.corner_file import MeasurementFiles, read_rows
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.joint_range import row_warnings
 from pisigma.model.calibrated_model import CalibratedModel
-from pisigma.model.model_source import HoldsModel, ModelSource, model_or_folder
+from pisigma.model.model_source import HasModel, ModelSource, model_or_folder
 from pisigma.model.training_rows import training_row_warnings
 from pisigma.planning.task import read_task
 from pisigma.validation.checks.rows.wrong_rows import without_wrong_rows
@@ -166,8 +166,8 @@ class ComparedModels:
 
 
 def compare(
-    first: ModelSource | HoldsModel,
-    second: ModelSource | HoldsModel,
+    first: ModelSource | HasModel,
+    second: ModelSource | HasModel,
     rows: MeasurementFiles | Measurements | None = None,
     program: str | os.PathLike[str] | None = None,
     settings: ComparisonSettings = ComparisonSettings(),

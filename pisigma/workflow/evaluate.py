@@ -15,7 +15,7 @@ from pisigma.measurement.joint_range import row_warnings
 from pisigma.measurement.sensors.socket import matching_sockets
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.folder.model_folder import load_model
-from pisigma.model.model_source import HoldsModel, ModelSource, model_or_folder
+from pisigma.model.model_source import HasModel, ModelSource, model_or_folder
 from pisigma.model.stated_conditions import condition_warnings
 from pisigma.model.training_rows import training_row_warnings
 from pisigma.validation.checks.rows.other_sensors import missed_distances
@@ -121,7 +121,7 @@ class Evaluation:
 
 
 def evaluate(
-    models: ModelSource | HoldsModel | Sequence[ModelSource | HoldsModel],
+    models: ModelSource | HasModel | Sequence[ModelSource | HasModel],
     data: Measurements | MeasurementFiles,
     settings: EvaluationSettings | None = None,
 ) -> Evaluation:
@@ -140,7 +140,7 @@ def evaluate(
         PoseError: the joint values do not fit a robot.
     """
     settings, started = settings or EvaluationSettings(), time.perf_counter()
-    if isinstance(models, str | os.PathLike | CalibratedModel | HoldsModel):
+    if isinstance(models, str | os.PathLike | CalibratedModel | HasModel):
         models = [models]
     sources = labelled(models)
     loaded = load_models(sources)
@@ -213,7 +213,7 @@ def _text(source: ModelSource) -> str:
     return source.name if isinstance(source, CalibratedModel) else os.fspath(source)
 
 
-def labelled(stated: Sequence[ModelSource | HoldsModel]) -> dict[str, ModelSource]:
+def labelled(stated: Sequence[ModelSource | HasModel]) -> dict[str, ModelSource]:
     """Return the models by their names in tables: the last part of the folder, or the whole path where two are equal.
 
     Raises:

@@ -45,7 +45,7 @@ from pisigma.measurement.joint_range import row_warnings
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.folder.model_folder import load_model
 from pisigma.model.model_posterior import FLEET_PRIOR, ModelPosterior
-from pisigma.model.model_source import HoldsModel, ModelSource, model_or_folder
+from pisigma.model.model_source import HasModel, ModelSource, model_or_folder
 from pisigma.model.stated_conditions import condition_warnings
 from pisigma.validation.gate import check_rows
 from pisigma.validation.held_out.diagnostic import Diagnostic
@@ -197,7 +197,7 @@ class Monitoring:
 
 
 def monitor(
-    model: ModelSource | HoldsModel,
+    model: ModelSource | HasModel,
     sessions: Sequence[Measurements | str | os.PathLike[str]],
     settings: MonitorSettings = MonitorSettings(),
     progress: Progress = lambda what: None,

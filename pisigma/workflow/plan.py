@@ -20,7 +20,7 @@ from pisigma.files.output_file import check_output, write_whole
 from pisigma.files.progress import Progress
 from pisigma.measurement.joint_range import row_warnings
 from pisigma.model.calibrated_model import CalibratedModel
-from pisigma.model.model_source import HoldsModel
+from pisigma.model.model_source import HasModel
 from pisigma.model.training_rows import known_rows, training_row_warnings
 from pisigma.planning.board_views import BoardViews
 from pisigma.planning.candidates import Candidates, spread
@@ -169,7 +169,7 @@ def check_files(
 
 
 def plan(
-    subject: Robot | CalibratedModel | HoldsModel | Subject | str | os.PathLike[str],
+    subject: Robot | CalibratedModel | HasModel | Subject | str | os.PathLike[str],
     settings: PlanSettings | None = None,
     cell: Surroundings | str | os.PathLike[str] | None = None,
     progress: Progress = lambda what: None,

@@ -27,9 +27,9 @@ from pisigma.lifetime.recalibration.recalibrated_model import (
 from pisigma.lifetime.recalibration.recalibration_problem import FrameKey, frame_keys, recalibration_problem
 from pisigma.lifetime.recalibration.relocated_frames import relocated_frames
 from pisigma.lifetime.recalibration.summary import (
-    LeftOutFigures,
+    HeldOutFigures,
     RecalibrationSummary,
-    WrongRowFigures,
+    ContradictingRowFigures,
 )
 from pisigma.measurement.camera.corner_file import MeasurementFiles, read_rows
 from pisigma.measurement.dataset import Measurements
@@ -38,7 +38,7 @@ from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.folder.model_folder import load_model
 from pisigma.model.geometric_model import model_of_hybrid
 from pisigma.model.model_posterior import FLEET_PRIOR, ModelPosterior, check_fleet_prior
-from pisigma.model.model_source import HoldsModel, ModelSource, model_or_folder
+from pisigma.model.model_source import HasModel, ModelSource, model_or_folder
 from pisigma.model.stated_conditions import condition_warnings
 from pisigma.model.training_rows import with_wide_limits, without_known_rows
 from pisigma.reporting.recalibration_card import write_recalibration_card
@@ -96,7 +96,7 @@ class Recalibration(AbstractModelResult):
 
 
 def recalibrate(
-    model: ModelSource | HoldsModel,
+    model: ModelSource | HasModel,
     data: Measurements | MeasurementFiles,
     settings: RecalibrationSettings = RecalibrationSettings(),
     progress: Progress = lambda what: None,
@@ -145,7 +145,7 @@ def recalibrate(
     right = WithoutWrongRows(rows) if parent.kind == FLEET_PRIOR else right_rows(settings, parent, rows)
     verdict = check_rows(right.rows, parent, settings.fitted, may_move(settings))
     progress("what has moved")
-    elsewhere = _elsewhere(parent, posterior, rows, settings)
+    elsewhere = _moved_frames(parent, posterior, rows, settings)
     every = rows
     rows, adaptation, outliers = _adapted(parent, posterior, rows, elsewhere, right.numbers)
     calibrator = HybridCalibrator(drawn)
@@ -184,7 +184,7 @@ def _adapted(
     rows: Measurements,
     elsewhere: frozenset[FrameKey],
     far: Sequence[int],
-) -> tuple[Measurements, Adaptation, tuple[WrongRowFigures, ...]]:
+) -> tuple[Measurements, Adaptation, tuple[ContradictingRowFigures, ...]]:
     """Return the rows without wrong ones, the model adapted to them, and the wrong rows including `far`."""
     left = [row for row in range(rows.rows) if row not in far]
     right = rows.select(torch.tensor(left)) if far else rows
@@ -239,7 +239,7 @@ def _kept_model(
 
 def _outliers(
     adaptation: Adaptation, rows: Measurements, wrong: Sequence[int]
-) -> tuple[WrongRowFigures, ...]:
+) -> tuple[ContradictingRowFigures, ...]:
     """Return the rows that were left out as wrong, with their residuals under the others' calibration."""
     errors = errors_under(adaptation, rows)
     sizes = {"residual_mm": (errors.position, 1e3), "residual_deg": (errors.rotation, math.degrees(1.0))}
@@ -250,7 +250,7 @@ def _outliers(
             for name, (those, factor) in sizes.items()
             if those is not None and math.isfinite(those[row])
         }
-        outliers.append(WrongRowFigures(row=row, place=rows.place(row), **off))
+        outliers.append(ContradictingRowFigures(row=row, place=rows.place(row), **off))
     return tuple(outliers)
 
 
@@ -279,7 +279,7 @@ def _summary(
         verdict=choice.sentence,
         left_out=choice.rows,
         cross_validation={
-            name: LeftOutFigures(rms_mm=None if rms is None else rms * 1e3)
+            name: HeldOutFigures(rms_mm=None if rms is None else rms * 1e3)
             for name, rms in choice.rms.items()
         },
         changed=UNBELIEVABLE if moved is None else movements_text(moved),
@@ -300,7 +300,7 @@ def _fleet_consistency(model: CalibratedModel, rows: Measurements) -> "FleetCons
     return FleetConsistency.of(model, rows)
 
 
-def _elsewhere(
+def _moved_frames(
     model: CalibratedModel, posterior: ModelPosterior, rows: Measurements, settings: RecalibrationSettings
 ) -> frozenset[FrameKey]:
     """Return the bases and tools that have moved: those that are stated to, or else those that the evidence shows.

@@ -314,7 +314,7 @@ def cross_validate(
         )
     measurements, folds = data.splits()
     with_orientation, not_predicted = measurements.rotation is not None, 0
-    nominal, corrected = (PoseErrors.none(measurements.rows, with_orientation) for _ in range(2))
+    nominal, corrected = (PoseErrors.unknown(measurements.rows, with_orientation) for _ in range(2))
     tasks = [
         partial(
             _compared_fold,

@@ -17,7 +17,7 @@ from pisigma.measurement.joint_range import row_warnings
 from pisigma.measurement.sensors.socket import matching_sockets
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.folder.model_folder import load_model
-from pisigma.model.model_source import HoldsModel, ModelSource, model_or_folder
+from pisigma.model.model_source import HasModel, ModelSource, model_or_folder
 from pisigma.model.stated_conditions import condition_warnings
 from pisigma.model.training_rows import training_row_warnings
 from pisigma.robot.row import Row
@@ -156,7 +156,7 @@ def _without_limits(rows: Sequence[Row]) -> tuple[Row, ...]:
 
 
 def verify(
-    model: ModelSource | HoldsModel,
+    model: ModelSource | HasModel,
     data: str | os.PathLike[str] | Measurements,
     settings: VerificationSettings | None = None,
 ) -> Verification:

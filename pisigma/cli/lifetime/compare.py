@@ -58,7 +58,7 @@ def compare(
 ) -> None:
     """Compare two models of one robot: parameters, positions of the tool, rows and programs.
 
-    Tests differences with the posteriors of both models. Exits with status 3 where the rows must not be trusted.
+    Tests differences with the posteriors of both models. Exits with status 3 if the rows must not be trusted.
     """
     from pisigma.files.output_file import check_page
     from pisigma.lifetime.cell.layout import is_cell, previous_and_current_model

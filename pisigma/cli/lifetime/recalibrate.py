@@ -29,7 +29,9 @@ Data = Annotated[
     ),
 ]
 Out = Annotated[Path | None, typer.Option(help="Model folder to write, unless --dry-run.")]
-DryRun = Annotated[bool, typer.Option("--dry-run", help="Say what would be kept without writing it.")]
+DryRun = Annotated[
+    bool, typer.Option("--dry-run", help="Report which model would be kept, without writing it.")
+]
 
 
 @takes_settings
@@ -50,7 +52,7 @@ def recalibrate(
     """Bring a model up to date with new rows, and say what has moved since it was made.
 
     Keeps the model that predicts held-out rows best: the old one with the frames of these rows, the recalibrated one,
-    or a calibration from scratch. Exits with status 3 and writes no folder where the result must not be trusted.
+    or a calibration from scratch. Exits with status 3 and writes no folder if the result must not be trusted.
     """
     from pisigma.files.output_folder import check_folder
 

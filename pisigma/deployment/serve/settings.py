@@ -24,7 +24,7 @@ class ServeSettings:
     """Settings of a server.
 
     Attributes:
-        host: address to listen at. An address other than that of this machine needs a token.
+        host: address to listen on. Addresses other than those of this machine need a token.
         json_port: port for lines of JSON (0: any free port).
         binary_port: port for binary frames (0: any free port).
         zmq_port: port for ZeroMQ (0: any free port). Needs the extra serve. None: no ZeroMQ.

@@ -34,7 +34,7 @@ class ZeroMq:
             models: models of the server.
             metrics: counters of the answers.
             host: address of this machine.
-            port: port to listen at; 0 for a free one.
+            port: port to listen on; 0 for a free one.
             token: token in a separate part before every message; None if none is required.
 
         Raises:

@@ -140,7 +140,7 @@ def frames_of(
     return T[0], T[1]
 
 
-def as_drawn(model: CalibratedModel) -> Robot:
+def nominal_robot(model: CalibratedModel) -> Robot:
     """Return the nominal robot of a model."""
     return model.drawn or model.robot
 
@@ -171,7 +171,7 @@ def _frame_names(
 
 def _check_one_robot(first: CalibratedModel, second: CalibratedModel) -> None:
     """Refuse models of different robots."""
-    robots = as_drawn(first), as_drawn(second)
+    robots = nominal_robot(first), nominal_robot(second)
     quantity, what = _difference(*robots)
     if quantity:
         raise ModelError(

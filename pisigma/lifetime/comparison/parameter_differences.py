@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from pisigma.calibration.geometric.problem.parameters import ParameterSpace
-from pisigma.lifetime.comparison.model_pair import ModelPair, as_drawn
+from pisigma.lifetime.comparison.model_pair import ModelPair, nominal_robot
 from pisigma.lifetime.comparison.parameter_effects import Difference, ParameterEffects
 from pisigma.lifetime.recalibration.movement import Movement
 from pisigma.measurement.sensors.sensor import SHOWN_UNITS, ShownUnit
@@ -144,7 +144,7 @@ def _tested(
 
 def _side_by_side(pair: ModelPair) -> tuple[ParameterDifference, ...]:
     """Return the values and their standard deviations, without tests."""
-    space = ParameterSpace(as_drawn(pair.first))
+    space = ParameterSpace(nominal_robot(pair.first))
     models = pair.first, pair.second
     values = [model.identified.dh.ravel() for model in models]
     known = [_deviations(model, space.arm_size) for model in models]
@@ -169,4 +169,4 @@ def _is_drawn(model: CalibratedModel) -> bool:
     """Return whether a model is the nominal robot, which has no uncertainty."""
     if model.network is not None or model.hybrid is not None:
         return False
-    return bool(np.array_equal(model.identified.dh, as_drawn(model).dh))
+    return bool(np.array_equal(model.identified.dh, nominal_robot(model).dh))

@@ -152,8 +152,8 @@ class ParameterEffects:
         """Estimate the shifts of chosen parameters together with base and tool.
 
         Returns:
-            The shifts of the parameters, those of joint zeros in the direction of the joint; and the distances and
-            angles by which base and tool of the second model differ, empty where frames are fixed.
+            The shifts of the parameters (of joint zeros in the direction of the joint), and the distances and angles by
+            which base and tool of the second model differ (empty if the frames are fixed).
         """
         inverse = torch.linalg.pinv(self._W[:, [*chosen, *self._free]])
         shift, covariance = (inverse @ self._y)[:, 0], inverse @ inverse.t()

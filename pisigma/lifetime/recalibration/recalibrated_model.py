@@ -91,12 +91,12 @@ def recalibrated_model(model: CalibratedModel, adaptation: Adaptation, rows: Mea
 
 
 def _taken_along(frames: Frames, from_: Frames, onto: Frames, before: bool) -> Frames:
-    """Move frames as others have moved; new ones are taken from the others.
+    """Move frames like reference frames of the same names; frames without a counterpart are copied from the reference.
 
     Args:
         frames: frames to move.
-        from_: the others before the motion.
-        onto: the others after the motion.
+        from_: reference frames before the motion.
+        onto: reference frames after the motion.
         before: whether the motion multiplies from the left, as for a base, or from the right.
     """
     T = {name: _transforms(those) for name, those in (("own", frames), ("from", from_), ("onto", onto))}

@@ -7,13 +7,13 @@ from pisigma.validation.held_out.distillation_summary import ParentFigures
 from pisigma.validation.held_out.summary import AbstractSummary
 
 
-class LeftOutFigures(Section):
+class HeldOutFigures(Section):
     """RMS position error of held-out rows under one candidate [mm]; None where the rows are too few for it."""
 
     rms_mm: float | None
 
 
-class WrongRowFigures(Section):
+class ContradictingRowFigures(Section):
     """A row that was left out because it contradicts the others under any drift.
 
     Attributes:
@@ -64,11 +64,11 @@ class RecalibrationSummary(AbstractSummary):
     parent: ParentFigures
     date: str
     rows: int
-    outliers: tuple[WrongRowFigures, ...] = ()
+    outliers: tuple[ContradictingRowFigures, ...] = ()
     kept: Kept
     verdict: str
     left_out: int
-    cross_validation: dict[str, LeftOutFigures]
+    cross_validation: dict[str, HeldOutFigures]
     changed: str
     moved: tuple[SummaryMovement, ...]
     elsewhere: tuple[str, ...]

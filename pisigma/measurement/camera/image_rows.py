@@ -182,14 +182,15 @@ def _refuse_other_boards(images: Images, board: Board, poses: Sequence[BoardPose
     """Refuse images whose corners do not fit the board, and images that show it mirrored.
 
     Raises:
-        MeasurementError: see above.
+        MeasurementError: an image does not fit the board or shows it mirrored.
     """
     for name, line, pose in zip(images.names, images.lines, poses, strict=True):
         residual = float(np.median(pose.distance))
         if not residual < MAX_MEDIAN_RESIDUAL:
             raise MeasurementError(
-                expected=f"corners of image '{name}' on a board of {board.rows} x {board.columns} corners",
-                value=f"a median residual of {residual:.3g} px",
+                f"the corners of image '{name}' do not fit a board of {board.rows} x {board.columns} corners: the "
+                f"median residual is {residual:.3g} px",
+                value=residual,
                 at=Place(images.source, line),
                 remedy="check the numbers of the corners, the board and the camera, or remove the image",
             )

@@ -248,7 +248,7 @@ _NEEDED = {
 
 
 def _check_lengths(place: Place, columns: tuple[Column, ...]) -> None:
-    """Check that columns which mean nothing without another one have it."""
+    """Check that every column that requires another one has it."""
     present = {column.quantity: column for column in columns}
     needed = dict(_NEEDED)
     for name in ANCHOR_PLACE:
@@ -259,10 +259,10 @@ def _check_lengths(place: Place, columns: tuple[Column, ...]) -> None:
             needed[name] = (("anchor",), "add the column anchor, its name")
     for quantity, (others, remedy) in needed.items():
         if quantity in present and not set(others) & set(present):
-            raise _fault(place, "the column needs another one", present[quantity], remedy)
+            raise _fault(place, "the column requires another column", present[quantity], remedy)
     if "touch" in present and "frame" not in present:
         remedy = "add the column frame, the placement of the jig that was touched"
-        raise _fault(place, "the column needs the frame of a jig", present["touch"], remedy)
+        raise _fault(place, "the column requires the frame of a jig", present["touch"], remedy)
     _check_one_unit(place, [present[name] for name in ANCHOR_PLACE if name in present])
 
 

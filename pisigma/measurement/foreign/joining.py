@@ -196,7 +196,7 @@ def _by_point(measured: ConvertedRows, joints: ConvertedRows) -> Int64[np.ndarra
         if values[row_of.setdefault(name, row)] != values[row] and name:
             first, text = joints.lines[row_of[name]], joints.cells["point"][row]
             raise MeasurementError(
-                f"the point '{text}' has other joint values in line {first}",
+                f"the point '{text}' has different joint values in line {first}",
                 at=Place(joints.source, joints.lines[row]),
                 value=text,
                 remedy="give every pose a different name",

@@ -45,7 +45,7 @@ def summary_rows(records: Sequence[Sequence[str]], numbers: NumberFormat) -> dic
         numbers: format of numbers.
 
     Returns:
-        By row, why it is a summary.
+        The reason why a row is a summary, by the index of the row.
     """
     named = named_statistics(records)
     is_mode = len(named) == len(records) or (

@@ -166,7 +166,8 @@ def with_hybrid(
     if learned is not None:
         if (list(learned.bases), list(learned.tools)) != (list(model.bases), list(model.tools)):
             raise MisfitError(
-                "the learned part has other frames or targets than the geometric one", column="learned"
+                "the frames or targets of the learned part differ from those of the geometric part",
+                column="learned",
             )
         place = (_exact("learned", drawn, tensors, ()), _frames(learned.bases), _frames(learned.tools))
         arm = HybridArm(place[0], _correction(learned, drawn, tensors), _coverage(drawn, tensors))

@@ -264,7 +264,9 @@ def _calibrated_robot(document: ModelDocument, robot: Robot) -> Robot | None:
         return None
     calibrated = Robot(*document.calibrated.to_fields()._replace(urdf=robot.urdf))
     if [(row.name, row.type) for row in calibrated.rows] != [(row.name, row.type) for row in robot.rows]:
-        raise MisfitError("the calibrated robot has other rows than the nominal one", column="calibrated")
+        raise MisfitError(
+            "the rows of the calibrated robot differ from those of the nominal one", column="calibrated"
+        )
     if not (np.array_equal(calibrated.base, robot.base) and np.array_equal(calibrated.tool, robot.tool)):
         raise MisfitError(
             "the base or tool of the calibrated robot differs from the nominal one", column="calibrated"

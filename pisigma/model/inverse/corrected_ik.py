@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pisigma.files.errors import ModelError, Place, PoseError
-from pisigma.files.model_files import COMPILED, model_hash, ready_hash
+from pisigma.files.model_files import COMPILED, model_hash, hash_if_compiled
 from pisigma.model.inverse.joint_input import Postures, as_array, checked_approach, pose_array
 from pisigma.model.inverse.solution import AbstractInverse, Solution
 from pisigma.robot.kernels.array_kinematics import by_torch, is_tensor
@@ -386,7 +386,7 @@ def load(folder: str | os.PathLike[str]) -> CorrectedIK:
 
 def _stored_kernels(path: Path) -> "pisigma.model.inverse.compiled_ik.CompiledIK | None":
     """Read the compiled arrays of a model folder; None if they are missing, damaged or out of date."""
-    stated = ready_hash(path)
+    stated = hash_if_compiled(path)
     if stated is None:
         return None
     from pisigma.model.inverse.compiled_ik import CompiledIK

@@ -215,7 +215,7 @@ class ViewSection(Section):
         stated = self.near_mm is not None and self.far_mm is not None
         if (self.near_mm is None) != (self.far_mm is None) or stated == (self.lens is not None):
             raise ValueError(
-                "expected either near_mm and far_mm or lens, between which depths images are sharp"
+                "expected near_mm and far_mm, or lens, to determine at which depths images are sharp"
             )
         if stated and not self.near_mm < self.far_mm:  # type: ignore[operator]
             raise ValueError(f"expected near_mm < far_mm, got {self.near_mm:g} and {self.far_mm:g}")

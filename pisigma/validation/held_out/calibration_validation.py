@@ -146,13 +146,13 @@ def _joined(measurements: Measurements, judged: Sequence[JudgedFold], folds: int
     """Combine the folds, in the order of the rows."""
     units = {SENSORS[kind].unit for kind in measurements.kinds if kind in SENSORS}
     turned = measurements.rotation is not None or "rad" in units
-    errors = {name: PoseErrors.none(measurements.rows, turned) for name in judged[0].errors}
+    errors = {name: PoseErrors.unknown(measurements.rows, turned) for name in judged[0].errors}
     spread = None
     for fold in judged:
         for name, of_fold in fold.errors.items():
             errors[name].put(fold.test, of_fold)
         if fold.spread is not None:
-            spread = spread or PredictedSpread.none(measurements.rows)
+            spread = spread or PredictedSpread.unknown(measurements.rows)
             spread.error[fold.test], spread.sigma[fold.test] = fold.spread.error, fold.spread.sigma
     distances = DistanceErrors.joined([fold.distances for fold in judged])
     frames, sockets, left_out = (

@@ -85,7 +85,7 @@ class PoseErrors:
         return ErrorVectors.between(measurements, expected).sizes
 
     @staticmethod
-    def none(rows: int, turned: bool) -> "PoseErrors":
+    def unknown(rows: int, turned: bool) -> "PoseErrors":
         """Make errors that are all NaN, with orientations or without."""
         nothing = torch.full((rows,), torch.nan, dtype=torch.float64)
         return PoseErrors(nothing, nothing.clone() if turned else None)
@@ -210,7 +210,7 @@ class PredictedSpread:
     sigma: Float64[Tensor, "rows 3"]
 
     @staticmethod
-    def none(rows: int) -> "PredictedSpread":
+    def unknown(rows: int) -> "PredictedSpread":
         """Make a spread that is all NaN."""
         nothing = torch.full((rows, 3), torch.nan, dtype=torch.float64)
         return PredictedSpread(nothing, nothing.clone())
@@ -255,7 +255,7 @@ def predicted_spread(result: HybridResult, measurements: Measurements) -> Predic
     Raises:
         IdentificationError: a row has a target that was not calibrated.
     """
-    spread = PredictedSpread.none(measurements.rows)
+    spread = PredictedSpread.unknown(measurements.rows)
     errors = result.errors_of(measurements).get("position")
     if measurements.position is None or errors is None:
         return spread

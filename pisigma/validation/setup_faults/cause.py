@@ -14,12 +14,12 @@ class Cause:
             "joint_sign", "joint_coupling", "joint_zero", "joint_values" or "correction".
         clause: what is wrong, such as "the sign of joint 3 is reversed".
         advice: what it means or what to check.
-        size: complexity of the assumption, at least 1; of equally good explanations the simplest is chosen.
+        size: complexity of the assumption, at least 1; among equally good explanations, the simplest is chosen.
         joints: indices of the joints concerned, from 0.
-        moved: largest motion of a joint zero [rad or m]; infinite for faults of other kinds.
-        amount: motion of a frame or tool [m], correct over stated values with a wrong unit, or the number of
-            corrections applied in addition to those logged (1 or -1), or the number of targets under one name; NaN for
-            faults of other kinds.
+        moved: largest displacement of a joint zero [rad or m]; infinite for faults of other kinds.
+        amount: displacement of a frame or tool [m]; for a wrong unit, the ratio of correct to stated values; the number
+            of corrections applied in addition to those logged (1 or -1); or the number of targets under one name. NaN
+            for faults of other kinds.
     """
 
     kind: str

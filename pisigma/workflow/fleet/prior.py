@@ -82,7 +82,7 @@ def estimate_fleet_prior(
             rows[one.id] = some
     if refused and len(rows) < MIN_ROBOTS:
         raise FleetError(
-            f"expected {MIN_ROBOTS} robots or more, got {len(rows)} with readable files; correct, among others: "
+            f"expected {MIN_ROBOTS} robots or more, got {len(rows)} with readable files; the first refused file: "
             f"{next(iter(refused.values()))}",
             value=len(rows),
         )

@@ -78,20 +78,20 @@ class CalibrationSettings:
     """Settings of a calibration and of its validation.
 
     Attributes:
-        model: kind of calibration, hybrid (geometry and, where the data support it, a joint correction) or geometric.
+        model: kind of calibration: hybrid (geometry and, where the data support it, a joint correction) or geometric.
         folds: number of folds of the cross-validation (0: none). None: 5, or one per placement.
         hold_out: fraction of the rows to hold out once, instead of a cross-validation.
-        split: how to split the rows, by joints (at random), interleaved, time, space or placement. Rows of equal joint
+        split: how to split the rows: joints (at random), interleaved, time, space or placement. Rows of equal joint
             values always stay together.
         repeats: number of repeats of the cross-validation. None: 200 / number of different joint values, 1 to 10.
         jobs: number of processes that calibrate in parallel, for all rows and for each fold. Each uses one thread.
             None: threads of one process.
         seed: random seed of the split and of the choice of training rows.
         train_rows: number of randomly chosen rows to calibrate with, also in each fold. None: all.
-        free: parameters to identify, either identifiable, joint_offsets, or names such as a_2,theta_3.
+        free: parameters to identify: identifiable, joint_offsets, or names such as a_2,theta_3.
         prior_length: prior standard deviation of length errors [m] (0: no prior).
         prior_angle: prior standard deviation of angle errors [rad] (0: no prior).
-        robot_class: expected size of the geometric errors, industrial, cobot or hobby (also for old and surgical arms).
+        robot_class: expected size of the geometric errors: industrial, cobot or hobby (also for old and surgical arms).
             None: from the maker and the data.
         robust: down-weight outliers.
         features: features of the joint correction to try, such as gravity,lines,series. None: all that apply, including

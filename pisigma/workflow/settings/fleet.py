@@ -17,13 +17,13 @@ class FleetSettings:
     """Settings of the calibration of a fleet.
 
     Attributes:
-        task: what to do with each robot's sessions, calibrate, recalibrate or monitor. Calibrate treats every session
+        task: what to do with each robot's sessions: calibrate, recalibrate or monitor. Calibrate treats every session
             by itself, recalibrate updates the model of the session before, and monitor compares later sessions with the
             first one's model. A robot that states a model starts from it.
         validate: cross-validate every calibration and draw the figures of its card.
         calibration: settings of every robot's calibration, which the robot's own options override. Its folds are used
             only with `validate`.
-        engine: where to run, processes (of this machine) or ray.
+        engine: where to run: processes (on this machine) or ray.
         jobs: number of processes that work in parallel. None: one per core.
         address: address of a Ray cluster. None: Ray on this machine.
         prior: model folder of `pisigma fleet prior` to start the calibrations from. It replaces the settings of the

@@ -27,7 +27,7 @@ class IntrinsicsSettings:
 
     Attributes:
         name: name of the camera.
-        free_k3: also estimate k3, which is otherwise 0.
+        free_k3: also estimate k3 (default: 0).
         most_blur: maximum blur of the edges in an image, as a standard deviation [px].
     """
 

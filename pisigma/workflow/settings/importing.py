@@ -43,7 +43,7 @@ class ImportSettings:
         rotation: maker whose rotation convention applies, such as kuka or ur, or none to skip rotations. None: from the
             headings.
         decimal: decimal separator, point or comma on a command line. None: from the cells.
-        join: how to join joint values of one file with measurements of another, by point, order or time. None:
+        join: how to join joint values of one file with measurements of another: by point, order or time. None:
             the files are concatenated.
         within: maximum difference between joined time stamps [s].
 

@@ -18,10 +18,10 @@ class MonitorSettings:
     Attributes:
         dates: date of each file, such as 2026-10-01,2026-11-01. None: the column date, else the file's name, else its
             time of modification.
-        moved: what was moved after the model was made, base, tool or base,tool (empty: neither). None: as the rows
+        moved: what was moved after the model was made: base, tool or base,tool (empty: neither). None: as the rows
             show.
-        limit_mm: limit of the RMS error [mm], whose crossing is predicted.
-        history: without history, neither read nor write MODEL.history.sqlite, which keeps the sessions of every call.
+        limit_mm: limit of the RMS error [mm]; the date of crossing it is predicted.
+        history: do not read or write MODEL.history.sqlite, which keeps the sessions of all calls.
         cameras: cameras and boards, for files of detected board corners.
 
     Raises:

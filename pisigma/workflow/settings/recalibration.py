@@ -19,7 +19,7 @@ class RecalibrationSettings:
     """Settings of a recalibration.
 
     Attributes:
-        moved: what was moved after the model was made, base, tool or base,tool (empty: neither). None: as the rows
+        moved: what was moved after the model was made: base, tool or base,tool (empty: neither). None: as the rows
             show.
         cameras: cameras and boards, for files of detected board corners.
 

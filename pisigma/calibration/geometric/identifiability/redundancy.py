@@ -231,8 +231,8 @@ def rank_extension(information: Information, kept: int) -> list[int]:
     """Find columns that the data determine in addition to the kept ones.
 
     Nominal axes are exactly parallel or intersect exactly, but real ones do not, so dependencies of the nominal robot
-    hold only approximately for the real one. Columns are added one by one while the data determine the next one to a
-    usual error, or all of them if the residuals show that they are needed (as with exact data).
+    are only approximate for the real one. Columns are added one by one while the standard error of the next one is
+    below a typical error, or all of them if the residuals show that they are needed (as with exact data).
 
     Args:
         information: information on all candidates near the solution, with rows in standard deviations.

@@ -92,7 +92,12 @@ def what_to_measure(setup: CalibrationSetup, wanted: int) -> tuple[CalibrationWa
         )
         few.append(CalibrationWarning("few_values", "", sentence))
     robot = problem.space.robot
-    return (*few, *_still_joints(robot, problem), *_targets_on_axis(robot, problem), *_undetermined(setup))
+    return (
+        *few,
+        *_unexcited_joints(robot, problem),
+        *_targets_on_axis(robot, problem),
+        *_undetermined(setup),
+    )
 
 
 def _missing_poses(problem: CalibrationProblem, wanted: int) -> int:
@@ -111,7 +116,7 @@ def distinct_values(problem: CalibrationProblem) -> int:
     return round(sum(problem.values_measured) * share)
 
 
-def _still_joints(robot: Robot, problem: CalibrationProblem) -> list[CalibrationWarning]:
+def _unexcited_joints(robot: Robot, problem: CalibrationProblem) -> list[CalibrationWarning]:
     """Warn of every joint that hardly moves."""
     span = (problem.q.amax(0) - problem.q.amin(0)).tolist()
     warnings = []

@@ -49,7 +49,7 @@ class BaseToolFit:
     def rms_rotation(self) -> float:
         """Root mean square angle of the rotation errors [rad]; NaN if none was measured."""
         state = self.solution.linearisation.point
-        return _rms_rotation(self.problem, state) if self.problem.turned else float("nan")
+        return _rms_rotation(self.problem, state) if self.problem.has_rotations else float("nan")
 
     @property
     def status(self) -> str:
@@ -135,7 +135,7 @@ def _base_and_tools(
 ) -> tuple[Float64[np.ndarray, " 6"], dict[str, Float64[np.ndarray, " 6"]]]:
     """Return the base and every target's tool; the tool keeps its orientation if no rotation was measured."""
     rpy_base, rpy_tool = rpy_from_rotation(torch.stack([state.R_base, state.R_tool])).cpu().numpy()
-    if not problem.turned:
+    if not problem.has_rotations:
         rpy_tool = robot.tool[3:]
     tools = {
         name: np.concatenate([point.cpu().numpy(), rpy_tool])
@@ -165,7 +165,9 @@ def _off(robot: Robot, problem: BaseToolProblem, solution: Solution[BaseToolStat
     it by its own noise.
     """
     shift = _rms_position(problem, solution.linearisation.point)
-    turn = robot.reach * _rms_rotation(problem, solution.linearisation.point) if problem.turned else 0.0
+    turn = (
+        robot.reach * _rms_rotation(problem, solution.linearisation.point) if problem.has_rotations else 0.0
+    )
     return math.hypot(shift, turn), shift < CLEAR_FIT * robot.reach
 
 

@@ -32,7 +32,7 @@ def base_and_tool_starts(robot: Robot, problem: BaseToolProblem) -> Iterator[Bas
     like = problem.position
     R_tool, R_base = (rotation_from_rpy(like.new_tensor(frame[3:])) for frame in (robot.tool, robot.base))
     point, p_base = like.new_tensor(robot.tool[:3]), like.new_tensor(robot.base[:3])
-    rows = problem.rotated if problem.turned else problem.target == problem.target.mode().values
+    rows = problem.rotated if problem.has_rotations else problem.target == problem.target.mode().values
     R_flange, p_flange = problem.R_flange[rows], problem.p_flange[rows]
     position, rotation = problem.position[rows], problem.rotation[rows]
     candidates: Iterator[tuple[Tensor, Tensor, Tensor, Tensor]]
@@ -40,17 +40,21 @@ def base_and_tool_starts(robot: Robot, problem: BaseToolProblem) -> Iterator[Bas
         candidates = iter([(R_base, p_base, R_tool, point)])
     elif not problem.free_base:
         candidates = iter(
-            [_tool_start(R_base, p_base, R_flange, p_flange, position, rotation, problem.turned, R_tool)]
+            [
+                _tool_start(
+                    R_base, p_base, R_flange, p_flange, position, rotation, problem.has_rotations, R_tool
+                )
+            ]
         )
     elif not problem.free_tool:
         arm = p_flange + R_flange @ point
         R_fitted = _procrustes(arm, position)
-        if problem.turned:
+        if problem.has_rotations:
             R_fitted = nearest_rotation((rotation @ R_tool.mT @ R_flange.mT).sum(0))
         candidates = iter([(R_fitted, (position - arm @ R_fitted.mT).mean(0), R_tool, point)])
     else:
         starts = starts_from_positions(R_flange, p_flange, position, point, robot.reach)
-        if problem.turned:
+        if problem.has_rotations:
             first = start_from_poses(R_flange, p_flange, position, rotation, R_tool)
             rest = ((R, p, _mean_turn(R, R_flange, rotation), place) for R, p, place in starts)
             candidates = itertools.chain([first], rest)

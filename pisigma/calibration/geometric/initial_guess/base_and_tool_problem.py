@@ -76,7 +76,7 @@ class BaseToolProblem(AbstractLeastSquares[BaseToolState]):
     free_tool: bool = True
 
     @cached_property
-    def turned(self) -> bool:
+    def has_rotations(self) -> bool:
         """Whether any rotation was measured."""
         return bool(self.rotated.any())
 
@@ -87,7 +87,7 @@ class BaseToolProblem(AbstractLeastSquares[BaseToolState]):
         free = torch.zeros(unknowns, dtype=torch.bool)
         free[:6] = self.free_base
         free[6:-3] = self.free_tool
-        free[-3:] = self.free_tool and self.turned
+        free[-3:] = self.free_tool and self.has_rotations
         return free.nonzero()[:, 0].to(self.position.device)
 
     @cached_property
@@ -98,7 +98,7 @@ class BaseToolProblem(AbstractLeastSquares[BaseToolState]):
     def residuals(self, state: BaseToolState) -> tuple[Float64[Tensor, "rows 3"], Float64[Tensor, "rows 3"]]:
         """Compute measured minus predicted positions [m] and rotation vectors [rad], in the measuring frame."""
         position = self.position_residual(state)
-        return position, self.rotation_residual(state) if self.turned else torch.zeros_like(position)
+        return position, self.rotation_residual(state) if self.has_rotations else torch.zeros_like(position)
 
     def position_residual(self, state: BaseToolState) -> Float64[Tensor, "rows 3"]:
         """Compute measured minus predicted positions [m]."""
@@ -117,7 +117,7 @@ class BaseToolProblem(AbstractLeastSquares[BaseToolState]):
         noise = (1.0, 1.0) if like is None else _view_of(like).noise
         R_base_flange = point.R_base @ self.R_flange
         blocks = [(self._shifts(point, R_base_flange), self.position_residual(point), self.sigma_position)]
-        if self.turned:
+        if self.has_rotations:
             blocks.append((self._turns(R_base_flange), self.rotation_residual(point), self.sigma_rotation))
         sums = []
         for J, residual, sigma in blocks:

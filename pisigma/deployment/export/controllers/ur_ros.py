@@ -99,7 +99,7 @@ def read_kinematics(text: str, source: str, nominal: Robot) -> Robot:
     base and tool of the comments that pisigma writes.
 
     Raises:
-        RobotError: the file is not such a YAML file, or the robot has other joints.
+        RobotError: the file is not a kinematics file of the driver, or the robot has different joints.
     """
     own = own_geometry(nominal).robot
     links = parse_yaml(text, KinematicsDocument, RobotError, source).kinematics

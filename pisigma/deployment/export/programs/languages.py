@@ -329,7 +329,7 @@ def _check_turns(targets: Targets) -> None:
     if len(turns) and bool((turns != turns[0]).any()):
         row = int((turns != turns[0]).any(-1).nonzero()[0, 0])
         raise OutputError(
-            f"a joint has another number of turns than in line {targets.line[0]}, so one --config cannot describe both",
+            f"the number of turns of a joint differs from line {targets.line[0]}, so one --config cannot describe both",
             option="--config",
             at=Place(targets.source, targets.line[row]),
             remedy="choose --targets joints or write two programs",

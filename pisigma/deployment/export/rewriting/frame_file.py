@@ -30,7 +30,7 @@ class FrameFile(Section):
         """Read a file; None stands for an empty one.
 
         Raises:
-            OutputError: the file is not such a YAML file; the message states file, line and key.
+            OutputError: the file is not a valid frame file (YAML); the message states file, line and key.
         """
         return FrameFile() if path is None else read_yaml(path, FrameFile, OutputError)
 

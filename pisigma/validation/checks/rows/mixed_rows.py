@@ -88,7 +88,7 @@ def _cause(judged: RowsUnderModel, wrong: Bool[Tensor, " rows"]) -> str:
 def _agreements(judged: RowsUnderModel) -> Iterator[Float64[Tensor, "rows 4 4"]]:
     """Yield the predicted poses, and those with a base or a tool that agrees with as many rows as possible."""
     if not judged.fitted:
-        yield judged.drawn
+        yield judged.unfitted
     if len(set(judged.rows.frame)) > 1 or len(set(judged.rows.target)) > 1:
         return
     limit = AGREES * judged.usual
@@ -119,10 +119,10 @@ def _samples(rows: int) -> Iterator[Tensor]:
 
 def _fitted(judged: RowsUnderModel, kind: str, chosen: Tensor) -> Float64[Tensor, "rows 4 4"]:
     """Predict the poses with the base or the tool fitted to some rows."""
-    some, measured = judged.drawn[chosen], judged.measured.select(chosen)
+    some, measured = judged.unfitted[chosen], judged.measured.select(chosen)
     if kind == "base":
-        return best_base(some, measured) @ judged.drawn
-    return judged.drawn @ best_tool(some, measured)
+        return best_base(some, measured) @ judged.unfitted
+    return judged.unfitted @ best_tool(some, measured)
 
 
 def _apart(judged: RowsUnderModel, T: Float64[Tensor, "rows 4 4"]) -> Bool[Tensor, " rows"] | None:
@@ -145,7 +145,7 @@ def _joints_explain(judged: RowsUnderModel) -> bool:
         moved = known.q.clone()
         moved[:, joint] += STEP
         there = poses_of_rows(judged.model, Measurements(moved, frame=known.frame, target=known.target))
-        columns.append((there - judged.drawn)[:, :3, 3] / STEP)
+        columns.append((there - judged.unfitted)[:, :3, 3] / STEP)
     J = torch.stack(columns, -1).flatten(0, 1)
     solution = torch.linalg.lstsq(J, error.flatten(), driver="gelsd").solution
     left = (error.flatten() - J @ solution).view(-1, 3).norm(dim=-1)

@@ -13,7 +13,7 @@ from pisigma.files.errors import IdentificationError
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel, poses_of_rows
 from pisigma.robot.se3 import transform
-from pisigma.validation.checks.rows.row_check import LARGE_SHARE, MIN_ROWS, Move, fitted_or_new
+from pisigma.validation.checks.rows.row_check import LARGE_SHARE, MIN_ROWS, Move, kinds_to_fit
 from pisigma.validation.held_out.diagnostic import Diagnostic
 from pisigma.validation.held_out.frames.fitted_frames import FrameKind, with_names_of
 from pisigma.validation.held_out.frames.row_errors import errors_of_rows
@@ -78,7 +78,7 @@ def diagnosed_lengths(
     Returns:
         The findings that make the rows implausible, and the setup fault that explains them, which may be a motion.
     """
-    kinds = fitted_or_new(model, rows, fitted)
+    kinds = kinds_to_fit(model, rows, fitted)
     free = {"tool"} & {*kinds}
     moves = free | ({*may_move} - {"frame"})
     if ("base" in kinds or "frame" in may_move) and (rows.touch is not None or rows.anchor_place is not None):

@@ -65,7 +65,7 @@ class RowsUnderModel:
         """
         if rows.position is None:
             return None
-        kinds = fitted_or_new(model, rows, fitted)
+        kinds = kinds_to_fit(model, rows, fitted)
         some = judged_values(model, rows)
         T = poses_of_rows(model, with_names_of(model, some, kinds))
         there = torch.isfinite(rows.position).all(-1) & torch.isfinite(T).flatten(1).all(-1)
@@ -80,14 +80,18 @@ class RowsUnderModel:
         return with_names_of(self.model, self.rows, self.fitted)
 
     @cached_property
-    def drawn(self) -> Float64[Tensor, "rows 4 4"]:
+    def unfitted(self) -> Float64[Tensor, "rows 4 4"]:
         """Predicted poses before anything is fitted."""
         return poses_of_rows(self.model, self.known)
 
     @cached_property
     def predicted(self) -> Float64[Tensor, "rows 4 4"]:
         """Predicted poses, after fitting."""
-        return fit_frames(self.drawn, self.measured, self.rows, self.fitted)[0] if self.fitted else self.drawn
+        return (
+            fit_frames(self.unfitted, self.measured, self.rows, self.fitted)[0]
+            if self.fitted
+            else self.unfitted
+        )
 
     @cached_property
     def measured(self) -> MeasuredPoses:
@@ -144,7 +148,7 @@ class AbstractRowCheck(ABC):
         """Report faults; yield nothing if none is found."""
 
 
-def fitted_or_new(
+def kinds_to_fit(
     model: CalibratedModel, rows: Measurements, fitted: Collection[FrameKind]
 ) -> tuple[FrameKind, ...]:
     """Add frames and tools to what is fitted, if rows have some that a model does not have."""

@@ -35,8 +35,8 @@ class ScaleOfRowsCheck(AbstractRowCheck):
         single = len(set(judged.rows.frame)) == len(set(judged.rows.target)) == 1
         if not single or 3 * judged.rows.rows < 2 * FITTED or not usual > 0:
             return
-        base, tool = best_base_and_tool(judged.drawn, judged.measured)
-        T = base @ judged.drawn @ tool
+        base, tool = best_base_and_tool(judged.unfitted, judged.measured)
+        T = base @ judged.unfitted @ tool
         error = (judged.measured.position - T[:, :3, 3]).flatten()
         before, _, _ = _fit(_frames(T), error)
         if not before > UNUSUAL * usual:
@@ -70,7 +70,7 @@ def _frames(T: Float64[Tensor, "rows 4 4"]) -> Float64[Tensor, "values numbers"]
 
 def _joints(judged: RowsUnderModel, base: Tensor, tool: Tensor) -> Iterator[Float64[Tensor, " values"]]:
     """Differentiate positions by the zero of every joint, by finite differences."""
-    known, here = judged.known, base @ judged.drawn @ tool
+    known, here = judged.known, base @ judged.unfitted @ tool
     for joint in range(known.dof):
         q = known.q.clone()
         q[:, joint] += STEP
