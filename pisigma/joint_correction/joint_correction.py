@@ -81,7 +81,7 @@ class JointCorrection(nn.Module):
         """Compute the corrections to add to joint values [rad or m].
 
         Args:
-            q: joint values [rad or m], under the mean conditions and in the middle of all backlash; or joint states
+            q: joint values [rad or m], under the usual conditions and in the middle of all backlash; or joint states
                 with further data.
             approach: approach direction of every joint for plain joint values: +1 if its value increases, -1 if it
                 decreases, 0 if not stated.

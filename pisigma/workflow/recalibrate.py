@@ -27,9 +27,9 @@ from pisigma.lifetime.recalibration.recalibrated_model import (
 from pisigma.lifetime.recalibration.recalibration_problem import FrameKey, frame_keys, recalibration_problem
 from pisigma.lifetime.recalibration.relocated_frames import relocated_frames
 from pisigma.lifetime.recalibration.summary import (
+    ContradictingRowFigures,
     HeldOutFigures,
     RecalibrationSummary,
-    ContradictingRowFigures,
 )
 from pisigma.measurement.camera.corner_file import MeasurementFiles, read_rows
 from pisigma.measurement.dataset import Measurements

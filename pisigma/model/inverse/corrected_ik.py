@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pisigma.files.errors import ModelError, Place, PoseError
-from pisigma.files.model_files import COMPILED, model_hash, hash_if_compiled
+from pisigma.files.model_files import COMPILED, hash_if_compiled, model_hash
 from pisigma.model.inverse.joint_input import Postures, as_array, checked_approach, pose_array
 from pisigma.model.inverse.solution import AbstractInverse, Solution
 from pisigma.robot.kernels.array_kinematics import by_torch, is_tensor
