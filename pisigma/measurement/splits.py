@@ -260,7 +260,7 @@ def _check_several(measurements: Measurements, sizes: Int64[Tensor, " groups"], 
     """Refuse a single group.
 
     Raises:
-        MeasurementError: see above.
+        MeasurementError: there is only one group.
     """
     if len(sizes) < 2:
         what = "placement" if by == "placement" else "pose, with equal joint values"

@@ -258,7 +258,7 @@ class FleetConsistency:
 
     @property
     def sentence(self) -> str:
-        """The same as a sentence."""
+        """The result of the comparison as a sentence."""
         if self.odd:
             return (
                 f"This robot is inconsistent with the fleet: fewer than 1 in {1 / FALSE_ALARM:,.0f} of its robots are "

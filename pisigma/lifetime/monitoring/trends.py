@@ -58,7 +58,7 @@ class Trend:
 
     @property
     def sentence(self) -> str:
-        """The same as a sentence."""
+        """The drift as a sentence."""
         half = NORMAL_95 * self.deviation
         return f"{self.what} drifts by {self.slope:.4f} ± {half:.4f} {self.unit} per {self.over}"
 
@@ -92,7 +92,7 @@ class Jump:
 
     @property
     def sentence(self) -> str:
-        """The same as a sentence."""
+        """The change as a sentence."""
         half = NORMAL_95 * self.deviation
         if self.alone:
             return f"{self.what} deviated by {self.size:.4f} ± {half:.4f} {self.unit} on {self.after} only"
@@ -128,7 +128,7 @@ class Forecast:
 
     @property
     def sentence(self) -> str:
-        """The same as a sentence."""
+        """The forecast as a sentence."""
         if self.passed:
             return f"The RMS error of the last session is above the limit of {self.limit_mm:g} mm."
         if self.date is None:

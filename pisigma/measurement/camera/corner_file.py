@@ -261,7 +261,7 @@ def _check_corners(
     """Refuse corners that the board does not have, pixels outside the image, and standard deviations of 0 or less.
 
     Raises:
-        MeasurementError: see above.
+        MeasurementError: a corner, a pixel or a standard deviation is not valid.
     """
     corners, size = len(board.corners), np.array([camera.width, camera.height])
     for row, corner in enumerate(number):
@@ -292,7 +292,7 @@ def _check_resolution(table: Table, pixels: Float64[np.ndarray, "rows 2"], camer
     """Refuse images of which none shows a corner outside the upper left quarter of the field of view.
 
     Raises:
-        MeasurementError: see above.
+        MeasurementError: the images of a camera show corners in the upper left quarter only.
     """
     if (pixels.max(0) < np.array([camera.width, camera.height]) / 2).all():
         raise MeasurementError(

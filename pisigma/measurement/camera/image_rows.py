@@ -188,8 +188,9 @@ def _refuse_other_boards(images: Images, board: Board, poses: Sequence[BoardPose
         residual = float(np.median(pose.distance))
         if not residual < MAX_MEDIAN_RESIDUAL:
             raise MeasurementError(
-                f"the corners of image '{name}' do not fit a board of {board.rows} x {board.columns} corners: the "
+                f"the corners of image '{name}' do not fit a board of {board.rows} x {board.columns} corners: their "
                 f"median residual is {residual:.3g} px",
+                expected=f"corners of image '{name}'",
                 value=residual,
                 at=Place(images.source, line),
                 remedy="check the numbers of the corners, the board and the camera, or remove the image",

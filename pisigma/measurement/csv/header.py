@@ -141,7 +141,7 @@ def check_separators(name: str, place: Place) -> None:
     """Refuse a header whose fields are not separated by commas.
 
     Raises:
-        MeasurementError: see above.
+        MeasurementError: the fields are not separated by commas.
     """
     for separator, called in ((";", "semicolons"), ("\t", "tabs")):
         if separator in name:

@@ -63,7 +63,8 @@ def check_complete(mapping: FileMapping) -> None:
     """Check that quantities of the kept columns are unique, and that their units are stated and agree.
 
     Raises:
-        MeasurementError: see above, or the encoding of a rotation is unknown.
+        MeasurementError: a quantity appears twice, a unit is missing or contradicts another, or the encoding of a
+            rotation is unknown.
     """
     kept = [one for one in mapping.columns if one.target.quantity != LEFT_OUT]
     header = Place(mapping.file.source, mapping.file.header_line)

@@ -178,7 +178,7 @@ def _check_decimal(dialect: Dialect, rows: Sequence[tuple[int, list[str]]], sour
     column contains such numbers together with whole numbers of three digits only.
 
     Raises:
-        MeasurementError: see above.
+        MeasurementError: the numbers of the table are ambiguous.
     """
     sign, width = dialect.numbers.decimal, Counter(len(row) for _, row in rows).most_common(1)[0][0]
     columns = [

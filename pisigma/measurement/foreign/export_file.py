@@ -163,7 +163,7 @@ def _check_skipped(row: list[str], dialect: Dialect, width: int, at: Place) -> N
     """Refuse a row of another width, which would be lost.
 
     Raises:
-        MeasurementError: see above.
+        MeasurementError: the number of cells of a row differs from that of its table.
     """
     if sum(map(dialect.is_number, row)) < 2:
         return

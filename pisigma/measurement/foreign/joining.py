@@ -143,7 +143,7 @@ def _check_names(
         Warnings of names that cannot be compared.
 
     Raises:
-        MeasurementError: see above.
+        MeasurementError: the two files name a point differently.
     """
     if "point" not in measured.cells or "point" not in joints.cells:
         return []

@@ -187,7 +187,7 @@ def _check_times(proposal: Proposal, of_index: Mapping[int, str]) -> None:
         of_index: quantities of its columns by their order.
 
     Raises:
-        MeasurementError: see above.
+        MeasurementError: the column may contain times.
     """
     file = proposal.file
     for index, quantity in of_index.items():

@@ -64,7 +64,7 @@ def check_used(maps: StatedMaps, headings: Sequence[Sequence[str]]) -> None:
     """Refuse a heading in a mapping that no file has.
 
     Raises:
-        MeasurementError: see above.
+        MeasurementError: no file has a heading of the mapping.
     """
     there = {name for one in headings for name in (*one, *map(str, range(1, len(one) + 1)))}
     for name in dict.fromkeys(name for one in maps for name in one):

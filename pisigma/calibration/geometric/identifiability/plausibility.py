@@ -69,7 +69,7 @@ def _refuse_ruined_links(problem: CalibrationProblem, point: Tensor, source: str
     """Refuse an arm with long links that changed by half, as with metres in a column of millimetres.
 
     Raises:
-        ImplausibleError: see above.
+        ImplausibleError: a long link changed by more than half of its length.
     """
     robot = problem.space.robot
     is_length = problem.space.is_length.numpy()

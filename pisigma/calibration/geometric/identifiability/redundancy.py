@@ -34,7 +34,7 @@ class Dependency:
     Attributes:
         names: the parameter that is kept, followed by those that depend on it.
         coefficients: coefficients of the combination in SI units; 1 for the first.
-        sentence: the same as a sentence.
+        sentence: the dependency as a sentence.
     """
 
     names: tuple[str, ...]

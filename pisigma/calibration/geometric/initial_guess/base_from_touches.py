@@ -94,7 +94,7 @@ def check_touched_base(measurements: Measurements, name: str, rms: float, reach:
     """Refuse a guess of a touched frame with large residuals.
 
     Raises:
-        IdentificationError: see above.
+        IdentificationError: the RMS residual of the touches is too large.
     """
     if rms <= MAX_RMS_SHARE * reach:
         return
@@ -113,7 +113,7 @@ def check_touched_frames(measurements: Measurements, names: tuple[str, ...]) -> 
     """Refuse frames with no more touches than the six unknowns of the frame.
 
     Raises:
-        IdentificationError: see above.
+        IdentificationError: a frame has six touches or fewer.
     """
     if measurements.touch is None:
         return

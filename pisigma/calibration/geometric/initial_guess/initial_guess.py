@@ -273,7 +273,7 @@ def _check_frame_names(stated: Mapping[str, object], frames: tuple[str, ...], so
     """Refuse guesses of frames without measurements.
 
     Raises:
-        IdentificationError: see above.
+        IdentificationError: no row was measured in a frame with a guess.
     """
     for name in stated:
         if name not in frames:

@@ -226,7 +226,7 @@ def _refuse_other_units(
     """Refuse distances that fit far better in another unit; errors are compared in the measured unit.
 
     Raises:
-        ImplausibleError: see above.
+        ImplausibleError: the distances fit far better in another unit.
     """
     if not distances.is_doubtful(*fit):
         return
