@@ -12,21 +12,10 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from pisigma.files.errors import (
-    ModelError,
-    Place,
-)
+from pisigma.files.errors import ModelError, Place
 from pisigma.files.model_files import is_model, model_hash
 from pisigma.files.progress import Progress
-from pisigma.lifetime.cell.history import (
-    HISTORY,
-    Check,
-    History,
-    ModelEntry,
-    SessionEntry,
-    Use,
-    now,
-)
+from pisigma.lifetime.cell.history import HISTORY, Check, History, ModelEntry, SessionEntry, Use, now
 from pisigma.lifetime.cell.layout import MODELS, PLANS, SESSIONS
 from pisigma.lifetime.cell.status import CellFacts, CellStatus, next_step
 from pisigma.measurement.camera.camera_files import CameraFiles
@@ -194,8 +183,7 @@ class Cell:
             **changed: options of `pisigma calibrate` that override `cell.yaml`, by its keys.
 
         Returns:
-            The calibration and the entry of its model; None instead of the entry if it was not stored, because it must
-            not be trusted.
+            The calibration and the entry of its model; None if it was not stored because it must not be trusted.
 
         Raises:
             MeasurementError: there are no valid sessions.
@@ -309,8 +297,7 @@ class Cell:
             **changed: options of `pisigma recalibrate` that override `cell.yaml`, by its keys.
 
         Returns:
-            The recalibration and the entry of its model; None instead of the entry if it was not stored, because it
-            must not be trusted.
+            The recalibration and the entry of its model; None if it was not stored because it must not be trusted.
 
         Raises:
             ModelError: there is no model.
