@@ -139,7 +139,7 @@ def print_calibration(
 
     Args:
         summary: its figures.
-        folder: where the model was written; None where it was not.
+        folder: where the model was written; None if it was not.
         seconds: time it took [s].
         verbose: print all tables and all parameters.
         also: what a command prints in addition.

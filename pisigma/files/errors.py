@@ -79,8 +79,8 @@ class PisigmaError(Exception):
         column: name or number of the column, or the YAML key; None for the whole line.
         option: the option or argument at fault, for example ``"--camera"``; empty if there is none.
         value: the value that was given; None if it is not known.
-        expected: what was expected; empty where `problem` says what is wrong.
-        problem: what is wrong, a clause; empty where the message says what was expected.
+        expected: what was expected; empty if `problem` says what is wrong.
+        problem: what is wrong, a clause; empty if the message says what was expected.
         remedy: how to correct the input; empty if the message does not say.
     """
 

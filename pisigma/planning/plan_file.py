@@ -48,7 +48,7 @@ class PlanDocument(Section):
     Attributes:
         poses: name of the CSV file in the same folder.
         robot: nominal robot.
-        model: folder of the model that was planned for, relative to this file; None for a robot as drawn.
+        model: folder of the model that was planned for, relative to this file; None for a nominal robot.
         settings: settings of the plan, with paths relative to this file.
         cell: surroundings of the robot.
         way_points: way points between poses where the straight joint motion is not free.
@@ -69,7 +69,7 @@ class StoredPlan:
     Attributes:
         arm: the robot in its cell.
         settings: settings of the plan, with paths relative to the working directory.
-        model: folder of the model that was planned for; None for a robot as drawn.
+        model: folder of the model that was planned for; None for a nominal robot.
         q: joint values [rad or m].
         check: whether each pose tests the calibration (set "test") or is calibrated with ("train").
         candidate: row of each pose in the file of candidates, or its number among the random poses; from 1.

@@ -54,8 +54,8 @@ class PlanSettings:
         candidates: number of random candidate poses to choose from.
         candidates_from: CSV file of candidate joint values to choose from, instead of random ones.
         box_mm: box of the reflector's positions, lowest and then highest x, y, z in the robot's base frame [mm].
-        task: CSV file of joint values or tool poses where the robot has to be accurate. Poses are of the drawing's or
-            the model's tool. None: the whole workspace.
+        task: CSV file of joint values or tool poses where the robot has to be accurate. Poses are of the nominal or the
+            model's tool. None: the whole workspace.
         measured: measurements that already exist (CSV).
         seed: random seed.
         speed_deg_s: joint speed between the poses [deg/s].

@@ -213,7 +213,7 @@ class PoseSelection:
         self._P = self._X @ self._X.mT
 
     def _change(self, number: int, sign: float) -> _Change | None:
-        """Compute the effect of adding (+1) or removing (-1) a candidate; None where removing it loses all digits."""
+        """Compute the effect of adding (+1) or removing (-1) a candidate; None if removing it loses all digits."""
         G = self._C @ self._B[number].t()
         here = torch.eye(G.shape[1]).to(G) + sign * self._B[number] @ G
         lower, failed = torch.linalg.cholesky_ex(here)

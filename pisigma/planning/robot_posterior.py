@@ -66,7 +66,7 @@ class RobotPosterior:
 
     Attributes:
         uncertainty: covariance `R R^T` of all unknowns, and the geometry at which derivatives are computed.
-        correction: mean joint correction; None where it is 0.
+        correction: mean joint correction; None if it is 0.
         instrument: the measuring instrument.
     """
 

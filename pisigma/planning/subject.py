@@ -1,4 +1,4 @@
-"""Subject of a plan: a robot as drawn or a calibrated one, and the distribution of its unknowns."""
+"""Subject of a plan: a nominal or calibrated robot, and the distribution of its unknowns."""
 
 import math
 import os
@@ -37,7 +37,7 @@ class Subject:
     Attributes:
         robot: nominal robot.
         model: calibrated model; None for a robot that was not calibrated yet.
-        folder: folder of the model; None where it is in memory only, or there is none.
+        folder: folder of the model; None if it is in memory only, or there is none.
     """
 
     robot: Robot

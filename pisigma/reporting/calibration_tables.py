@@ -110,7 +110,7 @@ def learned_lines(hybrid: HybridFigures) -> list[str]:
 
 
 def coverage_line(figures: AbstractValidationFigures) -> str:
-    """Say how often held-out coordinates are within the predicted intervals; "" where none are predicted."""
+    """Say how often held-out coordinates are within the predicted intervals; "" if none are predicted."""
     return "".join(_say("coverage", figures))
 
 
@@ -160,7 +160,7 @@ def _sentence(line: str) -> str:
 
 
 def write_parameters(parameters: Sequence[ParameterFigures], path: Path) -> None:
-    """Write the parameter table with all digits; a cell is empty where there is no figure.
+    """Write the parameter table with all digits; a cell is empty if there is no figure.
 
     Args:
         parameters: parameters in mm and deg.

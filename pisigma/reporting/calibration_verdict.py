@@ -60,7 +60,7 @@ def calibration_verdict(summary: CalibrationSummary, folder: Path | None, warnin
 
     Args:
         summary: its figures.
-        folder: of the model; None where none was written.
+        folder: of the model; None if none was written.
         warnings: number of warnings.
     """
     return Verdict(_accuracy(summary), _trust(summary, warnings), _next_step(summary, folder, warnings))

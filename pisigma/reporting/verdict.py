@@ -9,7 +9,7 @@ if TYPE_CHECKING:
     from pisigma.validation.held_out.validation_figures import ErrorFigures
 
 MANY_ROWS = 100
-"""Number of rows from which on errors deserve three digits, as their RMS is known to a few percent."""
+"""Number of rows from which errors deserve three digits, because their RMS is known to a few percent."""
 SMALLEST = 1e-4
 """Errors [mm or deg] below which their size does not matter."""
 

@@ -169,15 +169,15 @@ def invert(T: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch 4 4"]:
 
 
 def pose_error(
-    T_a_wanted: Float[Tensor, "*batch 4 4"], T_a_actual: Float[Tensor, "*batch 4 4"]
+    T_a_target: Float[Tensor, "*batch 4 4"], T_a_actual: Float[Tensor, "*batch 4 4"]
 ) -> Float[Tensor, "*batch 6"]:
-    """Return the displacement in frame a that moves the actual pose onto the wanted one.
+    """Return the displacement in frame a that moves the actual pose onto the target pose.
 
     Returns:
-        Translation wanted - actual [m] and the rotation vector of `R_wanted · R_actual^T` [rad].
+        Translation target - actual [m] and the rotation vector of `R_target · R_actual^T` [rad].
     """
-    translation = T_a_wanted[..., :3, 3] - T_a_actual[..., :3, 3]
-    rotation = T_a_wanted[..., :3, :3] @ T_a_actual[..., :3, :3].mT
+    translation = T_a_target[..., :3, 3] - T_a_actual[..., :3, 3]
+    rotation = T_a_target[..., :3, :3] @ T_a_actual[..., :3, :3].mT
     return torch.cat([translation, rotation_vector(rotation)], -1)
 
 

@@ -61,7 +61,7 @@ class Evaluation:
         comparison: figures of every model, with confidence intervals and differences to the first.
         evaluated: the models by their names in the comparison, without the references.
         missed: limits that are missed, as clauses without a full stop.
-        diagnostics: why errors of a model cannot be those of a calibrated robot; empty where they can.
+        diagnostics: why errors of a model cannot be those of a calibrated robot; empty if they can.
         warnings: further remarks, one sentence each.
         seconds: computing time [s].
     """

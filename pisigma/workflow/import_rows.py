@@ -192,7 +192,7 @@ def import_rows(
 def _joined(
     converted: Sequence[tuple[FileMapping, ConvertedRows]], settings: ImportSettings
 ) -> tuple[ConvertedRows, JoinedRows | None]:
-    """Return all rows, and how they were joined; None where the files were concatenated.
+    """Return all rows, and how they were joined; None if the files were concatenated.
 
     Raises:
         MeasurementError: files are to be joined, but all or none have joint values.

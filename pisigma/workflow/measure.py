@@ -139,7 +139,7 @@ class MeasuringSession:
         return alarms
 
     def next_step(self) -> Callable[[], tuple[Alarm, ...]] | None:
-        """Return the most urgent step of `update`, except the cross-validation; None where all is done."""
+        """Return the most urgent step of `update`, except the cross-validation; None if all is done."""
         if self.is_due:
             return self._calibrate
         if self._so_far is not self._ahead_of:
@@ -149,7 +149,7 @@ class MeasuringSession:
         return None
 
     def idle_step(self) -> Callable[[], tuple[Alarm, ...]] | None:
-        """Return the cross-validation, which ends when new rows arrive; None where it is done."""
+        """Return the cross-validation, which ends when new rows arrive; None if it is done."""
         return None if self._so_far is self._validated else self._cross_validate_idle
 
     def _calibrate(self, progress: Progress = lambda what: None) -> tuple[Alarm, ...]:
@@ -229,7 +229,7 @@ class MeasuringSession:
 
     @property
     def rows(self) -> Measurements | None:
-        """The rows that are used; None where there are none."""
+        """The rows that are used; None if there are none."""
         return None if self._rows is None else self._rows.select(self._counting)
 
     @property

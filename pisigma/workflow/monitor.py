@@ -128,7 +128,7 @@ class Monitoring:
     def advised(self) -> Record | None:
         """The last session with which a recalibration pays.
 
-        None where there is none, or where a later session that observes as many joints agrees with the model.
+        None if there is none, or where a later session that observes as many joints agrees with the model.
         """
         paying = [one for one in self.sessions if one.session.recalibrate]
         if not paying:

@@ -324,7 +324,7 @@ class _Problem:
 
     @property
     def unexcited_joints(self) -> tuple[str, ...]:
-        """Warning about joints that the candidates of a file hardly move; empty where there are none."""
+        """Warning about joints that the candidates of a file hardly move; empty if there are none."""
         arm, q = self.arm, self.candidates.q
         if self.settings.candidates_from is None:
             return ()
@@ -386,7 +386,7 @@ def _check_measured(model: CalibratedModel | None, settings: PlanSettings, robot
 
 
 def _warnings(way: Tour) -> tuple[str, ...]:
-    """Return a warning about poses without a collision-free path; empty where there are none."""
+    """Return a warning about poses without a collision-free path; empty if there are none."""
     if not len(way.left_out):
         return ()
     left_out = f"{len(way.left_out)} poses were left out, as there is no collision-free path to them"

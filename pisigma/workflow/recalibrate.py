@@ -269,7 +269,7 @@ def _summary(
     choice: CandidateChoice,
     moved: tuple[Movement, ...] | None,
 ) -> RecalibrationSummary:
-    """Return all figures; `moved` is None where it is unknown."""
+    """Return all figures; `moved` is None if it is unknown."""
     return RecalibrationSummary(
         command=f"pisigma.recalibrate({parent.name!r}, {rows.file_names!r})",
         parent=ParentFigures(name=parent.name, kind=parent.kind, sha256=""),
@@ -292,7 +292,7 @@ def _summary(
 
 
 def _fleet_consistency(model: CalibratedModel, rows: Measurements) -> "FleetConsistency | None":
-    """Return how similar the robot of the rows is to its fleet; None where the model is not the prior of a fleet."""
+    """Return how similar the robot of the rows is to its fleet; None if the model is not the prior of a fleet."""
     if model.kind != FLEET_PRIOR:
         return None
     from pisigma.lifetime.fleet.prior import FleetConsistency  # imports statistics, which takes half a second

@@ -84,9 +84,9 @@ class Verification:
         better_share: fraction of the configurations in which the corrected model has the smaller error.
         comparison: figures of "nominal", "geometric" (of a hybrid) and "corrected".
         diagnostics: why the rows must not be trusted; see `pisigma.validation.gate`.
-        setup_faults: setup faults that explain large errors; empty where `motion` explains them.
-        motion: what has moved since the model was made; None where the model or the rows do not show it.
-        recalibration: command that updates the model; empty where that does not pay.
+        setup_faults: setup faults that explain large errors; empty if `motion` explains them.
+        motion: what has moved since the model was made; None if the model or the rows do not show it.
+        recalibration: command that updates the model; empty if that does not pay.
         warnings: further remarks, one sentence each.
         seconds: computing time [s].
     """
@@ -238,7 +238,7 @@ def _compared_models(model: CalibratedModel, with_orientation: bool) -> dict[str
 
 
 def _recalibration(name: str, data: str, settings: VerificationSettings, motion: Session | None) -> str:
-    """Return the command that updates a model; empty where recalibrating does not pay."""
+    """Return the command that updates a model; empty if recalibrating does not pay."""
     if motion is None or not motion.recalibrate:
         return ""
     return RecalibrationSettings(settings.fitted or None, settings.cameras).command(name, data)
@@ -251,7 +251,7 @@ def _motion(
     comparison: ModelComparison,
     faults: Sequence[SetupFault],
 ) -> Session | None:
-    """Return what has moved; None where another setup fault or the nominal robot explains the rows better."""
+    """Return what has moved; None if another setup fault or the nominal robot explains the rows better."""
     if any(not MOTIONS.issuperset(fault.kinds) for fault in faults):
         return None
     motion = judged_motion(model, rows, fitted)

@@ -225,8 +225,8 @@ class GeometricCalibrator:
         floating = set(floating_bases(setup))
         chosen = self._chosen(problem.space, sizes, redundancy)
         active = [*(index for index in chosen if index not in floating), *unknowns]
-        wanted = free_parameters(redundancy, explicit, len(unknowns))
-        return Findings(sizes, redundancy, [], wanted), candidates, active
+        estimated = free_parameters(redundancy, explicit, len(unknowns))
+        return Findings(sizes, redundancy, [], estimated), candidates, active
 
     def _chosen(
         self,

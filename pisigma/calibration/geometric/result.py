@@ -226,7 +226,7 @@ class CalibrationResult:
     @cached_property
     def warning_details(self) -> tuple[CalibrationWarning, ...]:
         """What the measurements do not determine, what to measure next, and what does not fit."""
-        return (*what_to_measure(self.solved.setup, self.solved.findings.wanted), *_warnings(self.solved))
+        return (*what_to_measure(self.solved.setup, self.solved.findings.estimated), *_warnings(self.solved))
 
     @property
     def warnings(self) -> tuple[str, ...]:

@@ -32,7 +32,7 @@ class ParameterDifference:
         unit: "mm", "deg", "px" or "1", of all figures.
         first: value in the first model.
         second: value in the second model.
-        deviations: posterior standard deviations; None where a model keeps no posterior.
+        deviations: posterior standard deviations; None if a model keeps no posterior.
         shift: estimated difference given the significant ones, with base and tool free where these are fitted; None
             without posteriors, and where the parameter moves the tool as those do.
         deviation: standard deviation of the shift.

@@ -117,7 +117,7 @@ class ParameterEffects:
         """Estimate the shift of one parameter given others, and its standard deviation [m or rad].
 
         Returns:
-            None where the parameter moves the tool as the others do.
+            None if the parameter moves the tool as the others do.
         """
         left, observable = self._left(given)
         if not bool(observable[number]):

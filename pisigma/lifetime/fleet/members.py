@@ -26,7 +26,7 @@ class SessionFile:
 
     Attributes:
         name: name of the session in its results: the date, else the name of the file without suffix.
-        date: date (ISO 8601); "" where neither the manifest nor the name of the file states it.
+        date: date (ISO 8601); "" if neither the manifest nor the name of the file states it.
         data: measurements (CSV).
     """
 
@@ -42,7 +42,7 @@ class Member:
     Attributes:
         id: name in the fleet, valid as the name of a folder.
         robot: nominal robot: a name of the catalogue or a robot file.
-        sessions: sessions sorted by date; empty where the description is faulty.
+        sessions: sessions sorted by date; empty if the description is faulty.
         model: folder of the model that the first session is compared with; None to calibrate with the first session.
         options: names and values of settings of this robot alone.
         cameras: cameras and boards where its files contain corners in images.
@@ -143,7 +143,7 @@ def _in_manifest(path: Path, robot: str | None) -> list[Member]:
 
 
 def _broken(path: Path, table: Table, number: int) -> FleetError | None:
-    """Return the fault of a row; None where there is none."""
+    """Return the fault of a row; None if there is none."""
     at = Place(path, table.lines[number])
     if number in table.broken:
         return FleetError(table.broken[number].removesuffix("."), at=at)

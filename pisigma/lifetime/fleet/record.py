@@ -28,7 +28,7 @@ class ParameterValue:
         unit: "mm" or "deg", of the three figures.
         value: identified value.
         change: difference from the nominal value.
-        standard_error: standard error of the estimate; None where there is none.
+        standard_error: standard error of the estimate; None if there is none.
     """
 
     name: str
@@ -44,13 +44,13 @@ class SessionRecord:
 
     Attributes:
         session: name of the session.
-        date: date (ISO 8601); "" where it is unknown.
+        date: date (ISO 8601); "" if it is unknown.
         file: name of the file of measurements.
         rows: number of rows that count; 0 where the file was refused.
         verdict: "calibrated"; for a recalibration the model that was kept ("old", "recalibrated" or "scratch"); for a
             monitored session "unchanged", "moved" or "unclear"; or "refused".
         sentence: the verdict as a sentence; for a refused session the reason.
-        model: folder of the model, relative to the folder of the fleet; "" where none was written.
+        model: folder of the model, relative to the folder of the fleet; "" if none was written.
         rms_mm: RMS position error [mm] of the rows that were calibrated with, of the rows held out by a recalibration,
             or of the monitored rows under the model.
         held_out_rms_mm: RMS position error of the cross-validation [mm]; None without one.
@@ -101,7 +101,7 @@ class RobotRecord:
 
     @property
     def reason(self) -> str | None:
-        """Why a session was refused; None where none was."""
+        """Why a session was refused; None if none was."""
         return next((f"{one.session}: {one.sentence}" for one in self.sessions if one.refused), None)
 
 
@@ -125,7 +125,7 @@ def write_record(out: Path, record: RobotRecord) -> None:
 
 
 def read_record(path: Path) -> RobotRecord | None:
-    """Read a record; None where it is missing or unreadable, so that the robot is processed again."""
+    """Read a record; None if it is missing or unreadable, so that the robot is processed again."""
     try:
         return _RECORD.validate_json(path.read_bytes()) if path.is_file() else None
     except (OSError, ValidationError):

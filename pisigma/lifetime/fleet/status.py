@@ -15,9 +15,9 @@ class RobotStatus:
 
     Attributes:
         robot: id of the robot.
-        last: last session that was not refused; None where there is none.
-        refused: session that was refused; None where none was.
-        days: days since the last session; None where that has no date.
+        last: last session that was not refused; None if there is none.
+        refused: session that was refused; None if none was.
+        days: days since the last session; None if that has no date.
         overdue: whether that is too long.
         compared: whether the last session was compared with an earlier one, or there is no earlier one.
     """

@@ -100,7 +100,7 @@ class Chart:
 
     @property
     def alarm(self) -> int | None:
-        """Index of the first session since which a statistic has been outside its limit; None where neither is."""
+        """Index of the first session since which a statistic has been outside its limit; None if neither is."""
         outside = torch.stack(list(self.outside.values())).any(0)
         if not len(outside) or not bool(outside[-1]):
             return None

@@ -38,7 +38,7 @@ class Record:
         file: file of the rows.
         date: date of the measurement (ISO 8601).
         rows_sha256: SHA-256 of the rows.
-        temperature_c: mean temperature of the rows [°C]; None where they do not state it.
+        temperature_c: mean temperature of the rows [°C]; None if they do not state it.
         session: result of the session.
         zeros: zeros of the joints.
         values: joint values and readings of the rows, by which repeated rows are recognised; None in histories of
@@ -113,7 +113,7 @@ def store_sessions(path: Path, model: str, records: Sequence[Record]) -> tuple[R
 
 
 def read_sessions(path: Path, model: str) -> tuple[Record, ...]:
-    """Read all sessions of a model, sorted by date; empty where there is no history yet.
+    """Read all sessions of a model, sorted by date; empty if there is no history yet.
 
     Raises:
         OutputError: the file is not a history.

@@ -117,7 +117,7 @@ class Forecast:
     Attributes:
         limit_mm: the limit [mm].
         passed: whether the error of the last session is above the limit.
-        date: date on which the trend passes it; None where it does not within ten years.
+        date: date on which the trend passes it; None if it does not within ten years.
         earliest: start of the 95 % confidence interval of the date; None likewise.
     """
 
@@ -245,7 +245,7 @@ class _Zero:
 
     @staticmethod
     def of(records: Sequence[Record], joint: int, overs: Sequence[tuple[str, Tensor]]) -> "_Zero | None":
-        """Find the changes of a joint zero; None where too few sessions determine it."""
+        """Find the changes of a joint zero; None if too few sessions determine it."""
         values, covariance = _joint_values(records, joint)
         there = torch.isfinite(values).nonzero()[:, 0]
         if len(there) < MIN_SESSIONS + len(overs) - 1:

@@ -37,7 +37,7 @@ class AdaptedArm:
 
     Attributes:
         geometry: identified geometry in the user's coordinates.
-        correction: joint correction; None where the model has none.
+        correction: joint correction; None if the model has none.
     """
 
     geometry: IdentifiedGeometry

@@ -48,7 +48,7 @@ class CandidateChoice:
 
     Attributes:
         kept: "recalibrated", unless another candidate is better by more than 5 % and by more than chance.
-        rms: RMS error of held-out rows under each candidate [m]; None where the rows are too few for it.
+        rms: RMS error of held-out rows under each candidate [m]; None if the rows are too few for it.
         rows: number of held-out rows that count.
         names: names of the candidates, at the start of a sentence.
     """

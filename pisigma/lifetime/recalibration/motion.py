@@ -37,7 +37,7 @@ def judged_motion(
         fitted: bases or tools that are known to have moved.
 
     Returns:
-        The session without movements of what is fitted; None where the model keeps no posterior, where the rows do not
+        The session without movements of what is fitted; None if the model keeps no posterior, where the rows do not
         determine what is fitted, and where the rows are implausible, see `session_diagnostics`.
     """
     with suppress(IdentificationError, ModelError):

@@ -34,7 +34,7 @@ class Movement:
             joint. Of a base or a tool: the distance of its origins, or the angle of its rotation.
         deviation: standard deviation of the shift [`unit`].
         unit: "mm" or "deg"; a base or a tool has one movement of each.
-        probability: posterior probability of this explanation among all others; None where it was not computed.
+        probability: posterior probability of this explanation among all others; None if it was not computed.
     """
 
     what: str

@@ -8,7 +8,7 @@ from pisigma.validation.held_out.summary import AbstractSummary
 
 
 class HeldOutFigures(Section):
-    """RMS position error of held-out rows under one candidate [mm]; None where the rows are too few for it."""
+    """RMS position error of held-out rows under one candidate [mm]; None if the rows are too few for it."""
 
     rms_mm: float | None
 

@@ -52,7 +52,7 @@ def write_fields(data: MeasuredFields, path: str | os.PathLike[str], revolute: S
 def _numbers(data: MeasuredFields, revolute: Sequence[bool]) -> dict[str, Float64[np.ndarray, " rows"]]:
     """Return the numeric columns in the file's units, without those that would be empty.
 
-    The columns of the position are written even if empty where there is no other length, as the file could not be read
+    The columns of the position are written, even empty, if there is no other length, because the file could not be read
     without them.
     """
     columns: dict[str, Float64[np.ndarray, " rows"]] = {}

@@ -190,7 +190,7 @@ def _dates(file: ExportFile, column: MappedColumn) -> tuple[str, ...]:
 
 
 def _numbers(file: ExportFile, column: MappedColumn) -> tuple[str, ...]:
-    """Return the numbers of a column in the unit of measurement files; "" where nothing was measured.
+    """Return the numbers of a column in the unit of measurement files; "" if nothing was measured.
 
     Raises:
         MeasurementError: a cell is not a number.
@@ -235,7 +235,7 @@ def _rotation(
 def _quaternion_texts(
     encoding: RotationEncoding, values: Float64[Tensor, "rows values"], measured: Tensor
 ) -> list[tuple[str, ...]]:
-    """Return the quaternion of every row as texts, empty where nothing was measured."""
+    """Return the quaternion of every row as texts, empty if nothing was measured."""
     texts: list[tuple[str, ...]] = [("",) * 4] * len(values)
     quaternions = quaternion_from_rotation(encoding.to_rotation(values[measured]))
     for row, quaternion in zip(measured.nonzero()[:, 0].tolist(), quaternions.tolist(), strict=True):

@@ -49,14 +49,14 @@ def reached(
     task: Float64[Tensor, "tasks dof"],
     progress: Progress = lambda what: None,
 ) -> Reached | None:
-    """Compute accuracy and posterior given the rows of a plan; None where they are too few or contradict each other.
+    """Compute accuracy and posterior given the rows of a plan; None if they are too few or contradict each other.
 
     Args:
         plan: plan for a nominal robot, which is calibrated with the rows, or for a model, whose posterior is updated by
             their joint values alone.
         before: prior of the session, with the instrument.
         rows: rows to calibrate with.
-        check: rows that test the calibration; None where there are none yet. Unused with a model.
+        check: rows that test the calibration; None if there are none yet. Unused with a model.
         task: joint values where the robot has to be accurate [rad or m].
         progress: called with the name of each step.
     """

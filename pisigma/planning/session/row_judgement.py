@@ -241,7 +241,7 @@ class RowModel:
 
     @cached_property
     def _size(self) -> Float64[Tensor, " unknowns"]:
-        """Prior standard deviation of the unknowns; infinite where there is no prior."""
+        """Prior standard deviation of the unknowns; infinite if there is no prior."""
         of_class = RobotClass.of(self.setup.problem.space.robot)
         prior = self.design.prior([of_class.usual.of(group) / USUAL_LENGTH for group in PriorGroup])
         sizes = torch.cat(
@@ -336,7 +336,7 @@ def judge_rows(
 def _contradicted(
     robot: Robot, rows: Measurements, sigma: float | None, model: RowModel, errors: LeftOutRows, few: bool
 ) -> tuple[RowModel, LeftOutRows] | None:
-    """Leave out the row that the others contradict; None where there is none.
+    """Leave out the row that the others contradict; None if there is none.
 
     A wrong row among few moves base and tool so far that it can be distinguished only by leaving out each in turn.
     """

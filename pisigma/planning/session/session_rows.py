@@ -48,7 +48,7 @@ class SessionRows:
     """Rows of a session, each judged by all others as they arrive.
 
     Attributes:
-        rows: all readable rows in the order of the file; None where there are none.
+        rows: all readable rows in the order of the file; None if there are none.
         usable: rows that are not copies of others.
         judgement: judgement of the usable rows.
         alarms: alarms on single rows.
@@ -90,7 +90,7 @@ class SessionRows:
         """Add new rows and judge all rows together.
 
         Args:
-            new: new rows in their order; None where there are none.
+            new: new rows in their order; None if there are none.
             left_out: rows that cannot be read.
             planned: joint values of all planned poses [rad or m].
             names: names of these poses.
@@ -169,7 +169,7 @@ def _steps(known: int, count: int) -> Iterator[int]:
 def setup_sentence(
     rows: Measurements, counts: Bool[Tensor, " rows"], against: Robot | CalibratedModel
 ) -> str:
-    """Describe a fault that all rows have in common; "" where there is none.
+    """Describe a fault that all rows have in common; "" if there is none.
 
     Where a quarter of the rows or more contradict the others, all rows are judged, including these.
 
@@ -225,7 +225,7 @@ class FurtherPoses:
             remaining: indices of the remaining poses, the next one first.
 
         Returns:
-            The new plan; None where nothing can be selected.
+            The new plan; None if nothing can be selected.
         """
         first = remaining[:1]
         check = remaining[1:][plan.check[remaining[1:]]]

@@ -152,7 +152,7 @@ class SessionState:
     Attributes:
         rows: all rows that were read.
         alarms: alarms on rows, in the order of the file.
-        next_pose: pose to be measured next; None where the plan is finished.
+        next_pose: pose to be measured next; None if the plan is finished.
         remaining: joint values of all remaining poses, the next one first [rad or m].
         coverage: measured range of every joint.
         reached: accuracy so far, one point for each time it was computed; the last one is valid.

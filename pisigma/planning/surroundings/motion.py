@@ -44,7 +44,7 @@ class Motions:
     def points_between(
         self, start: Float64[Tensor, " dof"], end: Float64[Tensor, " dof"]
     ) -> Float64[Tensor, "points dof"] | None:
-        """Return the way points of a motion, empty where it is free without; None where none were found."""
+        """Return the way points of a motion, empty if it is free without; None if none were found."""
         if bool(self.are_free(start[None], end[None])):
             return self.pool[:0]
         (pair,) = zip(_names(start[None]), _names(end[None]), strict=True)
@@ -102,7 +102,7 @@ def way_points(
         pool: joint values of free poses that can be way points [rad or m].
 
     Returns:
-        Joint values of the way points [rad or m]; None where no way was found.
+        Joint values of the way points [rad or m]; None if no way was found.
     """
     to, back = _travel(arm, start, pool), _travel(arm, pool, end)
     tried = (to + back).argsort()[:MAX_WAY_POINTS_TRIED]

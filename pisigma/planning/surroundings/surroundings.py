@@ -39,7 +39,7 @@ class JointSection(Section):
     limits_mm: dict[str, Limits] = Field(default_factory=dict)
 
     def limits(self, robot: Robot) -> Float64[Tensor, "axes 2"]:
-        """Return the allowed range of the controller's values [rad or m]; infinite where there is no limit.
+        """Return the allowed range of the controller's values [rad or m]; infinite if there is no limit.
 
         Raises:
             RecipeError: a name is not a joint of the robot, or is one of the other kind.
@@ -194,7 +194,7 @@ class ViewSection(Section):
     """Conditions under which a camera sees its board: completely, sharply, and not too obliquely.
 
     Attributes:
-        frame: pose of the board, or of a fixed camera, in the robot's base frame; None where a model states it. The
+        frame: pose of the board, or of a fixed camera, in the robot's base frame; None if a model states it. The
             board's x axis runs along its rows, y from row to row, and z away from the viewer.
         near_mm: smallest depth of the board in front of the camera [mm]; None to compute it from the lens.
         far_mm: largest depth [mm]; None likewise.
@@ -223,7 +223,7 @@ class ViewSection(Section):
 
     @property
     def T_cell_frame(self) -> Float64[Tensor, "4 4"] | None:
-        """Pose of the measuring frame in the frame of the cell [m]; None where it is not stated."""
+        """Pose of the measuring frame in the frame of the cell [m]; None if it is not stated."""
         return None if self.frame is None else transform_from_xyzrpy(torch.from_numpy(self.frame.to_si()))
 
     def depths(self, f: float) -> tuple[float, float]:
@@ -246,8 +246,8 @@ class Surroundings(Section):
         boxes: boxes that the robot must not touch.
         links: radii of the links.
         tool: pose of the reflector, or of the camera or board on the flange; None for the tool of the robot.
-        tracker: tracker that has to see the reflector; None where the sensor needs no line of sight.
-        reflector: reflector with an acceptance cone; None where it is turned to the tracker at every pose.
+        tracker: tracker that has to see the reflector; None if the sensor needs no line of sight.
+        reflector: reflector with an acceptance cone; None if it is turned to the tracker at every pose.
         view: conditions under which a camera sees its board; None without a camera.
     """
 

@@ -152,8 +152,8 @@ class ReportContent:
         remarks: remarks on these rows, one sentence each.
         map: points of the error map.
         dependences: errors over joint values, order, payload and temperature.
-        frames: errors per frame; empty where there is one.
-        targets: errors per target; empty where there is one.
+        frames: errors per frame; empty if there is only one.
+        targets: errors per target; empty if there is only one.
         correlations: correlations of the parameters.
         curves: curves of the learned correction.
         learned: sentences on the learned correction.

@@ -99,7 +99,7 @@ class ReportFigures:
         dependences: errors over joint values, order, payload and temperature.
         correlations: correlations of lengths and of angles.
         corrections: corrections of the joints.
-        learning_curve: learning curve; empty where there is none.
+        learning_curve: learning curve; empty if there is none.
     """
 
     map: Drawing

@@ -151,7 +151,7 @@ def comparison_page(
         models: two models by name.
         parameters: differences of the parameters.
         displacements: displacements of the tool, by description of the poses.
-        rows: errors of both models on rows; None where none were given.
+        rows: errors of both models on rows; None if none were given.
         says: sentences, and warnings.
     """
     first, second = models

@@ -35,8 +35,8 @@ class NumericSolution:
     Attributes:
         q: joint values [rad or m]; if the status is NOT_CONVERGED, the best values found, which do not reach the pose.
         status: a `Status` for every pose: REACHED, SINGULAR, OUTSIDE_JOINT_LIMITS or NOT_CONVERGED.
-        position_residual: distance of the tool from the wanted position [m].
-        rotation_residual: angle between the tool and the wanted orientation [rad].
+        position_residual: distance of the tool from the target position [m].
+        rotation_residual: angle between the tool and the target orientation [rad].
         iterations: number of Jacobians computed for the pose.
     """
 
@@ -71,7 +71,7 @@ class _Iterate:
         return (position < tolerance) & (rotation < tolerance)
 
     def residuals(self) -> tuple[Float[Tensor, " poses"], Float[Tensor, " poses"]]:
-        """Return distance [m] and angle [rad] from the wanted pose."""
+        """Return distance [m] and angle [rad] from the target pose."""
         return torch.linalg.vector_norm(self.error[:, :3], dim=-1), torch.linalg.vector_norm(
             self.error[:, 3:], dim=-1
         )
@@ -97,7 +97,7 @@ def solve_numeric(
 
     Args:
         robot: the robot, with any number of joints.
-        T: wanted T_base_tool, `(*batch, 4, 4)` [m].
+        T: target T_base_tool, `(*batch, 4, 4)` [m].
         start: initial joint values [rad or m]; batch dimensions broadcast with those of T.
         tolerance: residuals at which the iteration has converged [m and rad]; None: 1e-13 in float64, 1e-5 in float32.
         max_iterations: largest number of steps.
@@ -188,7 +188,7 @@ class TaskMotion:
     def errors(
         self, T: Float[Tensor, "poses 4 4"], q: Float[Tensor, "poses dof"]
     ) -> tuple[Float[Tensor, "poses 6"], Float[Tensor, "poses 6 dof"]]:
-        """Return the weighted error from the wanted poses at joint values, and its Jacobian."""
+        """Return the weighted error from the target poses at joint values, and its Jacobian."""
         reached, J = self.motion(q)
         if self.axes.whole:
             return pose_error(T, reached), J.clone()
@@ -290,7 +290,7 @@ def solve_within_tolerances(
 
     Args:
         robot: the robot.
-        T: wanted T_base_tool [m].
+        T: target T_base_tool [m].
         start: initial joint values [rad or m].
         motion: function that returns pose and Jacobian.
         axes: tool axes of the task, some of them with tolerances.
@@ -325,7 +325,7 @@ def approach_preferred(
     Args:
         robot: the robot.
         task: weighted pose errors of the arm.
-        T: wanted poses.
+        T: target poses.
         q: joint values that reach them [rad or m].
         preferred: preferred joint values [rad or m].
         units: scale of the motion of every joint [rad or m].

@@ -24,8 +24,8 @@ _FREE = {3: ("roll", "pitch", "yaw"), 4: ("roll", "pitch"), 5: ("yaw",)}
 class TaskAxes:
     """Requirements of a task on the tool pose, in the axes of the tool frame.
 
-    Position errors are `R^T (p_wanted - p)` [m] along the axes of the wanted tool. Rotation errors are the rotation
-    from the reached to the wanted tool [rad], about the axes of the reached one: a rotation vector or, if one axis
+    Position errors are `R^T (p_target - p)` [m] along the axes of the target tool. Rotation errors are the rotation
+    from the reached to the target tool [rad], about the axes of the reached one: a rotation vector or, if one axis
     differs from the two others (`pivot`), the twist about that axis and its swing, so that ignored rotations do not
     affect the others.
 

@@ -15,14 +15,14 @@ def task_error(
 ) -> tuple[Float[Tensor, "poses 6"], Float[Tensor, "poses 6 6"]]:
     """Compute pose errors in all tool axes, and the matrices that convert pose Jacobians to Jacobians of the errors.
 
-    For the rotation D from the reached to the wanted tool and a tool axis k, the swing of the axis is
+    For the rotation D from the reached to the target tool and a tool axis k, the swing of the axis is
     `atan2(|k × Dk|, k · Dk)` about `k × Dk`, and the twist about it is `atan2(D_ji - D_ij, D_ii + D_jj)` with i, j, k
     cyclic, with the derivative `(k + Dk) · ω / (1 + k · Dk)`. Derivatives of rotation vectors and swings are those for
     small rotations, as in all Gauss-Newton steps of this package.
 
     Args:
         axes: the task.
-        T: wanted T_base_tool [m].
+        T: target T_base_tool [m].
         reached: reached T_base_tool [m].
 
     Returns:

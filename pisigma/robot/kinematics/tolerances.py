@@ -19,7 +19,7 @@ ROUNDING_UNITS = 500
 float64)."""
 
 TILT_TOLERANCE = 1e-9
-"""Largest tilt [rad] of the wanted tool axis from the joint axes of a SCARA that counts as rounding."""
+"""Largest tilt [rad] of the target tool axis from the joint axes of a SCARA that counts as rounding."""
 
 TRIANGLE_MARGIN = 1e-9
 """Relative distance of two links from stretched or folded, if a free joint moves to make them reach."""

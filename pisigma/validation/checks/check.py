@@ -74,7 +74,7 @@ class CheckedCalibration:
 
     @cached_property
     def figures(self) -> ValidationFigures | None:
-        """Errors of the rows of the calibration under every result; None where no length was measured."""
+        """Errors of the rows of the calibration under every result; None if no length was measured."""
         errors = {name: errors_under(result, self.rows) for name, result in self.results.items()}
         if not any(bool(torch.isfinite(one.position).any()) for one in errors.values()):
             return None

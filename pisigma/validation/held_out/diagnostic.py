@@ -17,7 +17,7 @@ class Diagnostic(Section):
         kind: kind of the finding, such as "search" or "prior_ratio"; one check may report several kinds.
         severity: "implausible": the result must not be trusted, and commands end with status 3; or "warning".
         sentence: what is wrong, where, and what to do.
-        rows: places (file and line) of the rows at fault; empty where all rows are concerned.
+        rows: places (file and line) of the rows at fault; empty if all rows are concerned.
         cause: what was found, among the findings of this kind, such as "frame" or "tool" of "row_order"; may be empty.
         values: numbers and names of the sentence by name; the unit ends the name ("shift_mm"). Joints count from 1.
     """

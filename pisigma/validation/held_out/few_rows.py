@@ -73,7 +73,7 @@ def _helps(
     calibrator: GeometricCalibrator, result: CalibrationResult, rows: Measurements, progress: Progress
 ) -> bool:
     """Say whether there are enough values per parameter, or else whether a fit predicts held-out poses better."""
-    ratio = distinct_values(result.solved.problem) / max(result.solved.findings.wanted, 1)
+    ratio = distinct_values(result.solved.problem) / max(result.solved.findings.estimated, 1)
     if ratio >= MIN_RATIO:
         return True
     if any(noise.used > USED_UP * noise.values for noise in result.noise):

@@ -172,7 +172,7 @@ class AccuracyLimit:
     """Contribution of measurement scatter to the error.
 
     Attributes:
-        noise: RMS length of the scatter of a measured position [mm]; None where it is not known.
+        noise: RMS length of the scatter of a measured position [mm]; None if it is not known.
         source: where `noise` comes from: "repeats" of joint values in the rows, or the "hybrid" calibration.
         error: RMS length of the position error [mm]; 0 where no position was judged.
         residual_sigma: standard deviation of the residuals of the geometric calibration per coordinate [mm]; None
@@ -190,7 +190,7 @@ class AccuracyLimit:
 
     @property
     def share(self) -> float | None:
-        """Share of the scatter in the squared error; None where it is unknown or the scatter exceeds the error."""
+        """Share of the scatter in the squared error; None if it is unknown or the scatter exceeds the error."""
         return None if self.noise is None or self.noise >= self.error else (self.noise / self.error) ** 2
 
     @property

@@ -40,7 +40,7 @@ class ParameterCorrelations:
     """Correlations of the columns of the identification Jacobian.
 
     Attributes:
-        tables: names and matrix of lengths and of angles; empty where the folder does not keep them.
+        tables: names and matrix of lengths and of angles; empty if the folder does not keep them.
         pairs: two strongly correlated parameters and their correlation each, the strongest first.
     """
 
@@ -55,7 +55,7 @@ def parameter_correlations(folder: Path) -> ParameterCorrelations:
 
 
 def read_correlations(path: Path) -> tuple[Correlations, ...]:
-    """Read the correlations of lengths and of angles; empty where there is no such file or it has another form."""
+    """Read the correlations of lengths and of angles; empty if there is no such file or it has another form."""
     if not path.is_file():
         return ()
     kinds: dict[str, dict[tuple[str, str], float]] = {"lengths": {}, "angles": {}}
@@ -122,7 +122,7 @@ class CorrectionCurve:
 
     @property
     def measured_range(self) -> tuple[float, float] | None:
-        """Lowest and highest measured value [`unit`]; None where all of the curve was measured, or nothing."""
+        """Lowest and highest measured value [`unit`]; None if all of the curve was measured, or nothing."""
         inside = self.values[self.measured]
         low, high = inside.min(initial=math.inf), inside.max(initial=-math.inf)
         return (float(low), float(high)) if not self.measured.all() and high > low else None

@@ -69,7 +69,7 @@ class OrderTest:
         change: mean error of the last tenth of the rows minus that of the first, in the unit of the errors; 0 where
             the correlation is not significant.
         ordered_joint: number of the joint, from 1, whose values follow the order of the rows, so that order and
-            position cannot be separated; None where none does.
+            position cannot be separated; None if none does.
         joint_correlation: absolute rank correlation of that joint with the order.
         of_training: whether signed errors are residuals of rows that the model was calibrated with.
     """
@@ -140,9 +140,9 @@ class NameErrors:
     Attributes:
         name: frame or target.
         rows: number of rows.
-        before: RMS error of the robot as drawn [mm or deg].
+        before: RMS error of the nominal robot [mm or deg].
         after: RMS error of the model [mm or deg].
-        bias: mean signed error in the row's frame [mm]; None where no signed error is known.
+        bias: mean signed error in the row's frame [mm]; None if no signed error is known.
     """
 
     name: str
@@ -157,7 +157,7 @@ class ErrorsByName:
     """Errors per frame or per target.
 
     Attributes:
-        names: errors of each; empty where there is one only.
+        names: errors of each; empty if there is one only.
         unit: "mm" or "deg", of the RMS errors.
         p: probability of such differences by chance (Kruskal and Wallis).
     """
@@ -173,7 +173,7 @@ class ErrorsByName:
 
     @property
     def largest(self) -> NameErrors | None:
-        """The frame or target with the largest RMS error under the model; None where none has rows."""
+        """The frame or target with the largest RMS error under the model; None if none has rows."""
         return max((one for one in self.names if one.rows), key=lambda one: one.after, default=None)
 
 
@@ -232,7 +232,7 @@ def dependences(rows: JudgedRows, robot: Robot) -> tuple[Dependence, ...]:
 
 
 def by_name(rows: JudgedRows, names: Sequence[str]) -> ErrorsByName:
-    """Compute errors per name, and test whether they differ; empty where there is one name only.
+    """Compute errors per name, and test whether they differ; empty if there is one name only.
 
     Args:
         rows: rows with their errors.
@@ -292,7 +292,7 @@ def _over_order(rows: JudgedRows, errors: dict[str, np.ndarray], judged: np.ndar
 
 
 def _ordered_joint(rows: JudgedRows) -> tuple[int | None, float]:
-    """Find the joint whose values follow the order of the rows most closely; None where none does."""
+    """Find the joint whose values follow the order of the rows most closely; None if none does."""
     q = rows.measurements.q.numpy()
     r = [abs(rank_correlation(np.arange(float(len(q))), values)[0]) for values in q.T]
     return (None, 0.0) if max(r) < ORDERED else (int(np.argmax(r)) + 1, max(r))

@@ -26,7 +26,7 @@ Quantity = Literal[
 ]
 """Quantity that a map shows.
 
-"before" and "after": position error of the robot as drawn and of the model; with "_deg" the orientation error.
+"before" and "after": position error of the nominal robot and of the model; with "_deg" the orientation error.
 "predicted": standard deviation of the predicted position. "correction": distance by which the calibration moves the
 tool. "distance" and "turn": distance and angle between the poses of two models.
 """

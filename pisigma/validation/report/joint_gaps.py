@@ -53,8 +53,8 @@ class OutsideErrors:
     Attributes:
         outside: number of such rows.
         rows: number of all rows.
-        rms_outside: their RMS position error [mm]; None where it is not known.
-        rms_inside: RMS position error of the other rows [mm]; None where it is not known.
+        rms_outside: their RMS position error [mm]; None if it is not known.
+        rms_inside: RMS position error of the other rows [mm]; None if it is not known.
     """
 
     outside: int
@@ -96,7 +96,7 @@ def joint_gaps(model: CalibratedModel, rows: JudgedRows | None) -> tuple[JointGa
 
 
 def outside_errors(rows: JudgedRows | None) -> OutsideErrors | None:
-    """Compare rows beyond the measured joint values with the others; None where there are no such rows."""
+    """Compare rows beyond the measured joint values with the others; None if there are no such rows."""
     if rows is None or bool(rows.inside.all()):
         return None
     after = rows.after.position.numpy() * 1e3

@@ -44,7 +44,7 @@ class LargestErrors:
         error: its error [`unit`].
         unit: "mm" of positions, "deg" of orientations.
         position: position of the tool at that row in the robot's base frame [m].
-        region: the worst region; None where there are too few rows to compare regions.
+        region: the worst region; None if there are too few rows to compare regions.
     """
 
     row: int
@@ -55,7 +55,7 @@ class LargestErrors:
 
 
 def largest_errors(rows: JudgedRows) -> LargestErrors | None:
-    """Find the worst row and the worst region; None where no error is known."""
+    """Find the worst row and the worst region; None if no error is known."""
     _, after, unit = error_lengths(rows)
     finite = np.isfinite(after)
     if not finite.any():
@@ -76,7 +76,7 @@ def worst_region(place: Float64[np.ndarray, "rows 3"], errors: Float64[np.ndarra
         errors: lengths of the errors, all finite.
 
     Returns:
-        None where there are too few rows, or all are in one cell.
+        None if there are too few rows, or all are in one cell.
     """
     low, high = (place.min(0), place.max(0)) if len(place) else (np.zeros(3), np.zeros(3))
     width = np.where(high > low, (high - low) / CELLS, 1.0)

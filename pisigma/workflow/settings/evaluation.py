@@ -24,7 +24,7 @@ _LIMITED = {
 
 @dataclass(frozen=True)
 class Limits:
-    """Limits of acceptance; None where there is no limit.
+    """Limits of acceptance; None if there is no limit.
 
     Attributes:
         mean_mm: limit of the mean position error [mm].
@@ -56,7 +56,7 @@ class Limits:
         return {name: limit for name, limit in asdict(self).items() if limit is not None}
 
     def missed_by(self, model: "ModelFigures") -> list[str]:
-        """Return the limits that a model misses, as clauses without a full stop; empty where it meets all.
+        """Return the limits that a model misses, as clauses without a full stop; empty if it meets all.
 
         A model that cannot predict some of the rows misses every limit.
 

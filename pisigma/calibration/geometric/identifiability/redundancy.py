@@ -95,13 +95,13 @@ class Findings:
         sizes: values of the candidates at the start.
         redundancy: their redundancy there.
         extended: indices of parameters that were added later.
-        wanted: number of unknowns to estimate; see `sufficiency.free_parameters`.
+        estimated: number of unknowns to estimate; see `sufficiency.free_parameters`.
     """
 
     sizes: Float64[np.ndarray, " candidates"]
     redundancy: Redundancy
     extended: list[int]
-    wanted: int
+    estimated: int
 
     @property
     def information(self) -> Information:
@@ -125,8 +125,8 @@ def find_redundancy(
     """
     jacobian, names = information.jacobian, np.array(information.names)
     lengths, preference = _lengths(jacobian), preferences(information.parameters, sizes)
-    wanted = np.divide(preference, lengths, out=np.zeros_like(lengths), where=lengths > 0)
-    triangle, pivots = pivoted_triangle(jacobian * wanted)
+    scale = np.divide(preference, lengths, out=np.zeros_like(lengths), where=lengths > 0)
+    triangle, pivots = pivoted_triangle(jacobian * scale)
     rank = _rank(triangle / preference[pivots], tolerance)
     acting = int((lengths > 0).sum())  # the others are the last pivots
 

@@ -75,20 +75,20 @@ def refuse_too_few(
     )
 
 
-def what_to_measure(setup: CalibrationSetup, wanted: int) -> tuple[CalibrationWarning, ...]:
+def what_to_measure(setup: CalibrationSetup, estimated: int) -> tuple[CalibrationWarning, ...]:
     """Warn of free parameters that the data hardly determine, and say what to measure next.
 
     Args:
         setup: the problem at its start.
-        wanted: number of unknowns to estimate.
+        estimated: number of unknowns to estimate.
     """
     problem = setup.problem
     values = distinct_values(problem)
     few = []
-    if values < GOOD_RATIO * wanted:
+    if values < GOOD_RATIO * estimated:
         sentence = (
-            f"{values} values are few for {wanted} free parameters; measure about "
-            f"{_missing_poses(problem, wanted)} more poses."
+            f"there are only {values} values for {estimated} free parameters; measure about "
+            f"{_missing_poses(problem, estimated)} more poses."
         )
         few.append(CalibrationWarning("few_values", "", sentence))
     robot = problem.space.robot
@@ -100,9 +100,9 @@ def what_to_measure(setup: CalibrationSetup, wanted: int) -> tuple[CalibrationWa
     )
 
 
-def _missing_poses(problem: CalibrationProblem, wanted: int) -> int:
+def _missing_poses(problem: CalibrationProblem, estimated: int) -> int:
     values = distinct_values(problem)
-    return int(np.ceil((GOOD_RATIO * wanted - values) / (values / max(distinct_rows(problem), 1))))
+    return int(np.ceil((GOOD_RATIO * estimated - values) / (values / max(distinct_rows(problem), 1))))
 
 
 def distinct_rows(problem: CalibrationProblem) -> int:
