@@ -65,7 +65,7 @@ def begun_with(prior: CalibratedModel, rows: Measurements) -> Adaptation:
     posterior = ModelPosterior.of(prior)
     rows = posterior.renamed(rows)
     problem = recalibration_problem(prior, posterior, rows, frame_keys(rows, ("base", "tool")))
-    return adapt(problem, posterior.noise)
+    return adapt(problem)
 
 
 def alone(rows: Measurements) -> Any:

@@ -1,6 +1,5 @@
 """Posterior of a calibrated model: values of all unknowns of its arm, and a root of their covariance."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -11,6 +10,7 @@ from torch import Tensor
 
 from pisigma.calibration.geometric.problem.parameters import ParameterSpace
 from pisigma.calibration.geometric.problem.setup import IdentifiedGeometry
+from pisigma.calibration.hybrid.noise import CalibrationNoise
 from pisigma.files.errors import MeasurementError, ModelError, Place
 from pisigma.joint_correction.feature import AbstractFeature
 from pisigma.joint_correction.input_products import InputProducts
@@ -49,7 +49,7 @@ class ModelPosterior:
         weights: weights of the used columns of the features.
         root: `R` with the covariance `R R^T`; first the rows of the parameters, in the user's coordinates, then those
             of the weights.
-        noise: standard deviation of the noise by sensor [m or rad], see `PositionUncertainty`.
+        noise: noise of the sensors of the calibration.
     """
 
     space: ParameterSpace
@@ -57,7 +57,7 @@ class ModelPosterior:
     features: tuple[AbstractFeature, ...]
     weights: Float64[Tensor, " weights"]
     root: Float64[Tensor, "unknowns directions"]
-    noise: Mapping[str, float]
+    noise: CalibrationNoise
 
     @staticmethod
     def of(model: CalibratedModel) -> "ModelPosterior":

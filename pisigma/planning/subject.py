@@ -139,7 +139,7 @@ class Subject:
     def _saw_board(self) -> bool:
         """Whether the model was calibrated with a camera."""
         uncertainty = None if self.model is None else self.model.uncertainty
-        return uncertainty is not None and "corner" in uncertainty.noise
+        return uncertainty is not None and "corner" in uncertainty.noise.value
 
     def _from_cell(self) -> Float64[Tensor, "4 4"]:
         """Return the frame of the cell (the nominal robot's base) in the frame of the model's poses [m]."""

@@ -188,11 +188,11 @@ def _adapted(
     """Return the rows without wrong ones, the model adapted to them, and the wrong rows including `far`."""
     left = [row for row in range(rows.rows) if row not in far]
     right = rows.select(torch.tensor(left)) if far else rows
-    adaptation = adapt(recalibration_problem(parent, posterior, right, elsewhere), posterior.noise)
+    adaptation = adapt(recalibration_problem(parent, posterior, right, elsewhere))
     wrong = [left[row] for row in adaptation.wrong_rows]
     if wrong:  # they have biased the first adaptation
         right = rows.select(torch.tensor([row for row in left if row not in wrong]))
-        adaptation = adapt(recalibration_problem(parent, posterior, right, elsewhere), posterior.noise)
+        adaptation = adapt(recalibration_problem(parent, posterior, right, elsewhere))
     return right, adaptation, _outliers(adaptation, rows, sorted((*far, *wrong)))
 
 
@@ -233,7 +233,7 @@ def _kept_model(
         assert isinstance(result, HybridResult)
         return replace(model_of_hybrid(parent.name, calibrator.geometric.robot, result, rows), kind=KIND)
     if choice.kept == "old":
-        adaptation = adapt(adaptation.problem.without_arm(), adaptation.noise)
+        adaptation = adapt(adaptation.problem.without_arm(), adaptation.drift.noise)
     return recalibrated_model(parent, adaptation, rows)
 
 
@@ -286,7 +286,7 @@ def _summary(
         moved=moved or (),
         elsewhere=(),
         effective_parameters=adaptation.effective,
-        noise=adaptation.noise,
+        noise=dict(adaptation.noise.value),
         warnings=_warnings(parent, choice, rows),
     )
 
@@ -310,7 +310,7 @@ def _moved_frames(
     if model.kind == FLEET_PRIOR:
         return frame_keys(rows, ("base", "tool"))
     if settings.moved is None:
-        return relocated_frames(model, posterior, rows, posterior.noise)
+        return relocated_frames(model, posterior, rows)
     return frame_keys(rows, settings.moved)
 
 

@@ -1,6 +1,5 @@
 """Standard deviations of predicted positions from the posterior of parameters and weights."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import torch
@@ -11,6 +10,7 @@ from pisigma.calibration.geometric.problem.parameters import ParameterSpace
 from pisigma.calibration.geometric.problem.setup import IdentifiedGeometry
 from pisigma.calibration.hybrid.design import FOLDS, FOLDS_OF_FEW, MAX_GROUPS, Design, Rows
 from pisigma.calibration.hybrid.design_regression import AbstractDesignRegression
+from pisigma.calibration.hybrid.noise import CalibrationNoise, stated_sigmas
 from pisigma.calibration.hybrid.sensor_values import joint_columns, weight_columns
 from pisigma.estimation.covariance_root import CovarianceRoot
 from pisigma.estimation.left_out import LeftOut, left_out_scale
@@ -45,8 +45,7 @@ class PositionUncertainty:
         covariance_root: `R` with `C = R R^T` for all parameters of the space (0 for those that were not free), followed
             by all weights, scaled so that predicted and observed leave-out errors agree.
         prior_scale: factor on the variances by this scaling.
-        noise: standard deviation per sensor [m or rad], or a factor on those that the rows state; empty in folders of
-            earlier versions.
+        noise: noise of the sensors; empty in folders of earlier versions.
     """
 
     space: ParameterSpace
@@ -54,7 +53,7 @@ class PositionUncertainty:
     features: tuple[AbstractFeature, ...]
     covariance_root: CovarianceRoot
     prior_scale: float
-    noise: Mapping[str, float] = field(default_factory=dict)
+    noise: CalibrationNoise = field(default_factory=CalibrationNoise)
 
     @property
     def root(self) -> Float64[Tensor, "unknowns directions"]:
@@ -145,5 +144,6 @@ def position_uncertainty(
     root = fit.covariance_root(posterior)
     change = geometry.change[:, design.problem.active.cpu()]
     root = root.extended(root_of_sizes(posterior, root), prior_scale**0.5, change)
-    noise = {sensor.name: sigma for sensor, sigma in zip(rows.values, posterior.noise, strict=True)}
+    value = {sensor.name: sigma for sensor, sigma in zip(rows.values, posterior.noise, strict=True)}
+    noise = CalibrationNoise(value, stated_sigmas(design.problem.sensors))
     return PositionUncertainty(design.problem.space, geometry, design.features, root, prior_scale, noise)

@@ -1,6 +1,6 @@
 """Fleet prior: distribution of the errors of robots of one type by empirical Bayes, and consistency with it."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -12,6 +12,7 @@ from torch import Tensor
 from pisigma.calibration.geometric.problem.parameters import ParameterSpace
 from pisigma.calibration.geometric.problem.setup import IdentifiedGeometry
 from pisigma.calibration.hybrid.arm import HybridArm, JointCoverage
+from pisigma.calibration.hybrid.noise import CalibrationNoise
 from pisigma.calibration.hybrid.uncertainty import PositionUncertainty
 from pisigma.estimation.covariance_root import CovarianceRoot
 from pisigma.estimation.population import FALSE_ALARM, MIN_ROBOTS, Information, Population, without_outliers
@@ -61,7 +62,7 @@ class RobotEvidence(Information):
         noise: noise of each sensor, see `Adaptation.noise`.
     """
 
-    noise: Mapping[str, float]
+    noise: CalibrationNoise
 
 
 def fleet_prior(name: str, robot: Robot, fleet: Sequence[Measurements]) -> FleetPrior:
@@ -90,7 +91,7 @@ def fleet_prior(name: str, robot: Robot, fleet: Sequence[Measurements]) -> Fleet
     space = posterior.uncertainty.space
     first = population = class_population(robot)
     usual = first.covariance.diagonal()
-    noise: Mapping[str, float] = {"position": Instrument().sigma}
+    noise = CalibrationNoise({"position": Instrument().sigma})
     odd: tuple[int, ...] = ()
     for _ in range(LINEARISATIONS):
         model = mean_robot(name, posterior, population, fleet, noise)
@@ -120,7 +121,7 @@ def mean_robot(
     posterior: RobotPosterior,
     population: Population,
     fleet: Sequence[Measurements],
-    noise: Mapping[str, float],
+    noise: CalibrationNoise,
 ) -> CalibratedModel:
     """Make the mean robot of a population, with the covariance between robots as its uncertainty.
 
@@ -195,7 +196,7 @@ def evidence_of(
     rows = posterior.renamed(rows)
     problem = recalibration_problem(model, posterior, rows, frame_keys(rows, ("base", "tool")))
     problem = replace(problem, groups=tuple(group for group in problem.groups if group.fixed_size))
-    adaptation = adapt(problem, posterior.noise)
+    adaptation = adapt(problem)
     values, space = adaptation.values, problem.design.problem.space
     deviation = values.deviation(adaptation.drift.noise)
     X, y = values.X / deviation[:, None], values.y / deviation
@@ -210,11 +211,16 @@ def evidence_of(
     return RobotEvidence(normal, descent + normal @ mean, adaptation.noise)
 
 
-def _medians(noises: Sequence[Mapping[str, float]]) -> dict[str, float]:
-    """Return the median noise of each sensor."""
-    names = dict.fromkeys(name for noise in noises for name in noise)
-    values = {name: sorted(noise[name] for noise in noises if name in noise) for name in names}
-    return {name: those[len(those) // 2] for name, those in values.items()}
+def _medians(noises: Sequence[CalibrationNoise]) -> CalibrationNoise:
+    """Return the median noise of each sensor; of the robots whose rows state standard deviations, if some do."""
+    value, stated = dict[str, float](), dict[str, float]()
+    for name in dict.fromkeys(name for noise in noises for name in noise.value):
+        of_sensor = [noise for noise in noises if name in noise.value]
+        stating = [noise for noise in of_sensor if name in noise.stated]
+        value[name] = float(np.median([noise.value[name] for noise in stating or of_sensor]))
+        if stating:
+            stated[name] = float(np.median([noise.stated[name] for noise in stating]))
+    return CalibrationNoise(value, stated)
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from pisigma.estimation.hypotheses import Explanation, Motion, SessionEvidence
 from pisigma.estimation.posterior_update import PosteriorUpdate
 from pisigma.estimation.wrong_rows import Explained, with_wrong_rows
 from pisigma.files.errors import IdentificationError
-from pisigma.lifetime.recalibration.adaptation import AdaptedArm, linear_values, noise_of_sensors
+from pisigma.lifetime.recalibration.adaptation import AdaptedArm, linear_values, usual_noise
 from pisigma.lifetime.recalibration.movement import HistoryMovement, Movement, movements_of_group
 from pisigma.lifetime.recalibration.recalibration_problem import (
     FrameKey,
@@ -254,7 +254,7 @@ def _solve(
 ) -> _Solved:
     """Linearise and explain repeatedly until the linearisation converges."""
     problem = recalibration_problem(model, posterior, rows, relocated)
-    noise = noise_of_sensors(problem, posterior.noise)
+    noise = usual_noise(problem)
     group = held_out_groups(problem.setup.measurements)
     x = problem.mean
     wrong: Mapping[int, float] = {}

@@ -12,6 +12,7 @@ from pisigma.calibration.geometric.initial_guess.initial_guess import chosen_row
 from pisigma.calibration.geometric.prediction import predicted_poses
 from pisigma.calibration.geometric.problem.setup import IdentifiedGeometry, identified_geometry
 from pisigma.calibration.hybrid.design import Rows
+from pisigma.calibration.hybrid.noise import CalibrationNoise, stated_sigmas
 from pisigma.calibration.hybrid.refinement import linearised, network
 from pisigma.estimation.drift import Drift, DriftGroup, DriftSearch, LinearValues
 from pisigma.estimation.posterior_update import PosteriorUpdate
@@ -103,10 +104,11 @@ class Adaptation:
         return torch.cat([self.problem.change @ root[:active], root[active:]])
 
     @property
-    def noise(self) -> dict[str, float]:
-        """Noise of each sensor [m or rad]; a factor where the rows state it."""
-        names = (sensor.name for sensor in self.problem.design.problem.sensors)
-        return dict(zip(names, self.drift.noise.tolist(), strict=True))
+    def noise(self) -> CalibrationNoise:
+        """Noise of the sensors of the new rows."""
+        sensors = self.problem.design.problem.sensors
+        value = {sensor.name: sigma for sensor, sigma in zip(sensors, self.drift.noise.tolist(), strict=True)}
+        return CalibrationNoise(value, stated_sigmas(sensors))
 
     def errors_of(self, measurements: Measurements) -> dict[str, Float64[Tensor, "rows components"]]:
         """Compute measured - predicted values; see `CalibrationResult.errors_of`."""
@@ -114,17 +116,19 @@ class Adaptation:
 
 
 def adapt(
-    problem: RecalibrationProblem, usual_noise: Mapping[str, float], start: Drift | None = None
+    problem: RecalibrationProblem,
+    usual: Float64[Tensor, " sensors"] | None = None,
+    start: Drift | None = None,
 ) -> Adaptation:
     """Adapt a model to new rows.
 
     Args:
         problem: rows and prior.
-        usual_noise: noise of each sensor in the calibration [m or rad].
+        usual: noise of each sensor [m or rad], or a factor where the rows state it; None for `usual_noise`.
         start: initial sizes and noise, such as those of other rows of the session; None for zero drift.
     """
     design, mean = problem.design, problem.mean
-    usual = noise_of_sensors(problem, usual_noise)
+    usual = usual_noise(problem) if usual is None else usual
     group = held_out_groups(problem.setup.measurements)
     x, effective = mean, 0.0
     wrong: Mapping[int, float] = {}
@@ -156,17 +160,18 @@ def adapt(
     )
 
 
-def noise_of_sensors(
-    problem: RecalibrationProblem, usual_noise: Mapping[str, float]
-) -> Float64[Tensor, " sensors"]:
-    """Return the usual noise of all sensors of a problem [m or rad]; a factor where the rows state it."""
-    return torch.tensor(
-        [
-            usual_noise.get(sensor.name, 1.0 if sensor.sigma is not None else FIRST_NOISE[sensor.unit])
-            for sensor in problem.design.problem.sensors
-        ],
-        dtype=torch.float64,
-    )
+def usual_noise(problem: RecalibrationProblem) -> Float64[Tensor, " sensors"]:
+    """Return the noise of all sensors of a problem in the calibration [m or rad]; a factor where the new rows state it.
+
+    Raises:
+        MeasurementError: see `CalibrationNoise.usual`.
+    """
+    known = problem.posterior.noise
+    sensors = problem.design.problem.sensors
+    first = [1.0 if sensor.sigma is not None else FIRST_NOISE[sensor.unit] for sensor in sensors]
+    usual = [known.usual(sensor) for sensor in sensors]
+    chosen = [new if old is None else old for old, new in zip(usual, first, strict=True)]
+    return torch.tensor(chosen, dtype=torch.float64)
 
 
 def linear_values(problem: RecalibrationProblem, rows: Rows) -> LinearValues:

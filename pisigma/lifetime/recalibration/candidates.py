@@ -101,7 +101,7 @@ def choose_candidate(
         calibrator: calibrator for the calibration from scratch.
         progress: called with the fold that is being predicted.
     """
-    posterior, noise = whole.problem.posterior, whole.noise
+    posterior, noise = whole.problem.posterior, whole.drift.noise
     folds = min(FOLDS, int(groups_to_keep_whole(rows).max()) + 1)
     names = get_args(Kept)
     errors: dict[Kept, Tensor] = {name: torch.full((rows.rows,), torch.nan).double() for name in names}

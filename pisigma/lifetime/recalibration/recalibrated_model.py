@@ -65,7 +65,7 @@ def recalibrated_model(model: CalibratedModel, adaptation: Adaptation, rows: Mea
     robot = drawn.with_geometry(base=calibrated.base, tool=calibrated.tool)
     root = CovarianceRoot(adaptation.root)
     space = adaptation.problem.design.problem.space
-    noise = {**known.noise, **adaptation.noise}
+    noise = known.noise.updated(adaptation.noise)
     return replace(
         model,
         kind=KIND,
@@ -149,8 +149,8 @@ def _left_out(parent: CalibratedModel, judged: CandidateChoice, rows: Measuremen
     error, limit = judged.rms[judged.kept], PLAUSIBLE_SHARE * parent.robot.reach
     if error is None:
         return ()
-    noise = {} if parent.uncertainty is None else parent.uncertainty.noise
-    usual = max(math.sqrt(3) * noise.get("position", 0.0), image_deviation(rows))
+    noise = math.nan if parent.uncertainty is None else parent.uncertainty.noise.absolute("position")
+    usual = max(math.sqrt(3) * (0.0 if math.isnan(noise) else noise), image_deviation(rows))
     missed = f"{rows.source}: the RMS error of held-out rows is {error * 1e3:.3g} mm"
     if error > limit:
         sentence = (

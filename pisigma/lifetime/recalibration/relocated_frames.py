@@ -1,6 +1,6 @@
 """Bases and tools that were moved since a model was made, by the evidence of new rows."""
 
-from collections.abc import Mapping, Set
+from collections.abc import Set
 from contextlib import suppress
 
 from pisigma.calibration.geometric.initial_guess.initial_guess import chosen_rows
@@ -19,7 +19,7 @@ MIN_MOVE = 1e-3
 
 
 def relocated_frames(
-    model: CalibratedModel, posterior: ModelPosterior, rows: Measurements, noise: Mapping[str, float]
+    model: CalibratedModel, posterior: ModelPosterior, rows: Measurements
 ) -> frozenset[FrameKey]:
     """Find the bases and tools of a model that were moved.
 
@@ -30,7 +30,6 @@ def relocated_frames(
         model: the model.
         posterior: posterior of the model.
         rows: new rows, frames and targets by the names of the model.
-        noise: noise of each sensor in the calibration.
 
     Returns:
         The bases and tools that were moved, without frames and targets that the model does not have.
@@ -47,9 +46,9 @@ def relocated_frames(
 
     def evidence(relocated: Set[FrameKey]) -> float:
         problem = recalibration_problem(model, posterior, rows, relocated)
-        return adapt(problem, noise).drift.log_evidence - LOG_PRIOR_PENALTY * len(relocated)
+        return adapt(problem).drift.log_evidence - LOG_PRIOR_PENALTY * len(relocated)
 
-    unmoved = adapt(recalibration_problem(model, posterior, rows, frozenset()), noise).drift
+    unmoved = adapt(recalibration_problem(model, posterior, rows, frozenset())).drift
     if all(group.size < MIN_MOVE for group in unmoved.groups if group.what.startswith(("base", "tool"))):
         return frozenset()
     tried = {frozenset[FrameKey](): unmoved.log_evidence}

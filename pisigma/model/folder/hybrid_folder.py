@@ -17,6 +17,7 @@ from torch import Tensor
 from pisigma.calibration.geometric.problem.parameters import ParameterSpace
 from pisigma.calibration.geometric.problem.setup import IdentifiedGeometry
 from pisigma.calibration.hybrid.arm import HybridArm, JointCoverage
+from pisigma.calibration.hybrid.noise import CalibrationNoise
 from pisigma.calibration.hybrid.uncertainty import PositionUncertainty
 from pisigma.estimation.covariance_root import CovarianceRoot
 from pisigma.files.model_files import WEIGHTS
@@ -67,7 +68,8 @@ def hybrid_sections(model: CalibratedModel) -> dict[str, Any]:
             "free": _free_rows(known),
             "features": [chosen.name for chosen in known.features],
             "prior_scale": known.prior_scale,
-            "noise": dict(known.noise),
+            "noise": dict(known.noise.value),
+            "stated_noise": dict(known.noise.stated),
         }
     return result
 
@@ -299,9 +301,8 @@ def _uncertainty(
             )
     geometry = IdentifiedGeometry(robot, bases, tools, unknowns)
     features = _weighted(known, None if hybrid is None else hybrid.correction)
-    return PositionUncertainty(
-        space, geometry, features, CovarianceRoot(full), known.prior_scale, known.noise
-    )
+    noise = CalibrationNoise(known.noise, known.stated_noise)
+    return PositionUncertainty(space, geometry, features, CovarianceRoot(full), known.prior_scale, noise)
 
 
 def _unknowns_section(group: UnknownGroup) -> dict[str, object]:

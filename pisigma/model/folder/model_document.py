@@ -93,7 +93,8 @@ class UncertaintySection(Section):
         features: names of the features whose weights follow: those of the learned part, and `products` for the products
             of inputs in its product units.
         prior_scale: see `pisigma.calibration.hybrid.uncertainty.PositionUncertainty`.
-        noise: see there.
+        noise: see `pisigma.calibration.hybrid.noise.CalibrationNoise`.
+        stated_noise: see there.
     """
 
     unknowns: tuple[UnknownsSection, ...] = ()
@@ -102,6 +103,7 @@ class UncertaintySection(Section):
     features: Annotated[tuple[str, ...], Field(max_length=MAX_UNITS)]
     prior_scale: Annotated[float, Field(gt=0)]
     noise: dict[str, Annotated[FiniteFloat, Field(gt=0)]] = Field(default_factory=dict)
+    stated_noise: dict[str, Annotated[FiniteFloat, Field(gt=0)]] = Field(default_factory=dict)
 
 
 class ProvenanceSection(Section):

@@ -8,6 +8,7 @@ from testing.fleet_robots import DRAWN, common_errors, rows_of
 from testing.models import no_type_checker
 from testing.refusals import refused
 
+from pisigma.calibration.hybrid.noise import CalibrationNoise
 from pisigma.estimation.population import Population, expectation_maximisation, without_outliers
 from pisigma.files.errors import FleetError
 from pisigma.lifetime.fleet.prior import FleetConsistency, RobotEvidence, fleet_prior
@@ -75,7 +76,7 @@ def test_expectation_maximisation_finds_a_population():
     g = torch.Generator().manual_seed(0)
     mean, deviation = torch.tensor([1.0, -2.0]).double(), torch.tensor([0.5, 0.1]).double()
     x = mean + deviation * torch.randn(4000, 2, generator=g, dtype=torch.float64)
-    evidence = [RobotEvidence(1e8 * torch.eye(2).double(), 1e8 * one, {}) for one in x]
+    evidence = [RobotEvidence(1e8 * torch.eye(2).double(), 1e8 * one, CalibrationNoise()) for one in x]
     start = Population(torch.zeros(2).double(), torch.eye(2).double(), 1)
     found = expectation_maximisation(evidence, start, torch.ones(2).double())
     assert (found.mean - mean).abs().max() < 0.03
@@ -88,7 +89,7 @@ def test_the_prior_of_few_robots_is_wider():
     beyond = []
     for _ in range(200):
         x = torch.randn(6, 2, generator=g, dtype=torch.float64)
-        robots = [RobotEvidence(1e8 * torch.eye(2).double(), 1e8 * one, {}) for one in x]
+        robots = [RobotEvidence(1e8 * torch.eye(2).double(), 1e8 * one, CalibrationNoise()) for one in x]
         off = x[:5] - x[:5].mean(0)
         population = Population(x[:5].mean(0), off.square().mean(0).diag(), 0).of_another(5)
         square, count = population.surprise(robots[5])
@@ -99,8 +100,8 @@ def test_the_prior_of_few_robots_is_wider():
 def test_a_robot_without_information_does_not_count():
     g = torch.Generator().manual_seed(0)
     x = 0.3 * torch.randn(50, 2, generator=g, dtype=torch.float64)
-    evidence = [RobotEvidence(1e6 * torch.eye(2).double(), 1e6 * one, {}) for one in x]
-    nothing = RobotEvidence(torch.zeros(2, 2).double(), torch.zeros(2).double(), {})
+    evidence = [RobotEvidence(1e6 * torch.eye(2).double(), 1e6 * one, CalibrationNoise()) for one in x]
+    nothing = RobotEvidence(torch.zeros(2, 2).double(), torch.zeros(2).double(), CalibrationNoise())
     start = Population(torch.zeros(2).double(), torch.eye(2).double(), 1)
     few, many = (
         expectation_maximisation(those, start, torch.ones(2).double())
@@ -115,7 +116,7 @@ def test_similar_inconsistent_robots_do_not_mask_each_other(odd):
     g = torch.Generator().manual_seed(odd)
     x = torch.tensor([1.0, -2.0, 0.5]).double() + 0.2 * torch.randn(20, 3, generator=g, dtype=torch.float64)
     x[20 - odd :] += 3.0
-    evidence = [RobotEvidence(1e4 * torch.eye(3).double(), 1e4 * one, {}) for one in x]
+    evidence = [RobotEvidence(1e4 * torch.eye(3).double(), 1e4 * one, CalibrationNoise()) for one in x]
     start = Population(torch.zeros(3).double(), 9 * torch.eye(3).double(), 2)
     population, found = without_outliers(evidence, start, 9 * torch.ones(3).double())
     assert found == tuple(range(20 - odd, 20))

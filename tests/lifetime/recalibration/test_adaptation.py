@@ -26,7 +26,7 @@ SHIFTED = (0.3, -0.2, 0.1, 0.5, 0.2, -0.3)
 
 def adapted(model, rows, relocated=frozenset()) -> Adaptation:
     posterior = ModelPosterior.of(model)
-    return adapt(recalibration_problem(model, posterior, rows, relocated), posterior.noise)
+    return adapt(recalibration_problem(model, posterior, rows, relocated))
 
 
 def rms(errors: torch.Tensor) -> float:
@@ -69,8 +69,8 @@ def test_an_unchanged_robot_has_no_movements():
 def test_a_moved_instrument_is_found(moved):
     model, rows = model_before(), rows_later(12, 2, moved, SHIFTED)
     posterior = ModelPosterior.of(model)
-    assert relocated_frames(model, posterior, rows, posterior.noise) == {("base", "")}
-    assert not relocated_frames(model, posterior, rows_later(12, 2, moved), posterior.noise)
+    assert relocated_frames(model, posterior, rows) == {("base", "")}
+    assert not relocated_frames(model, posterior, rows_later(12, 2, moved))
     adaptation = adapted(model, rows, {("base", "")})
     errors = adaptation.errors_of(rows_later(300, 50, moved, SHIFTED, noise=0.0))["position"]
     assert rms(errors) < 1.5 * rms_of(model, rows_later(300, 50, noise=0.0))

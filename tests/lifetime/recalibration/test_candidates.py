@@ -69,7 +69,7 @@ def test_held_out_rows_decide(count):
     model, rows = model_before(), rows_later(count, 2, (0.0, 0.0, math.radians(0.25), 0.0, 0.0, 0.0))
     posterior = ModelPosterior.of(model)
     problem = recalibration_problem(model, posterior, rows, frozenset())
-    whole = adapt(problem, posterior.noise)
+    whole = adapt(problem)
     calibrator = HybridCalibrator(posterior.space.robot)
     judged = choose_candidate(model, whole, frozenset(), rows, calibrator, lambda what: None)
     assert (judged.kept, judged.rows) == ("recalibrated", count)

@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
+from pisigma.calibration.hybrid.noise import CalibrationNoise
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.accuracy import deviation_of_rows
 from pisigma.model.calibrated_model import CalibratedModel, poses_of_rows
@@ -113,9 +114,10 @@ class RowsUnderModel:
         """Standard deviation of every row's error by the model's posterior and noise [m]; NaN if it has none."""
         deviation = deviation_of_rows(self.model, self.known).square().sum(-1)
         known = self.model.uncertainty
-        noise = torch.as_tensor(math.nan if known is None else known.noise.get("position", 0.0))
-        if self.rows.sigma_position is not None:
-            noise = noise * torch.nan_to_num(self.rows.sigma_position, nan=1.0)
+        noise = torch.as_tensor(math.nan if known is None else _position_noise(known.noise))
+        if known is not None and self.rows.sigma_position is not None:
+            factor = known.noise.value.get("position", 1.0) if known.noise.is_factor("position") else 1.0
+            noise = torch.where(self.rows.sigma_position.isnan(), noise, factor * self.rows.sigma_position)
         result: Tensor = (deviation + 3 * noise.square()).sqrt()
         return result
 
@@ -164,3 +166,8 @@ def _unknown(names: tuple[str, ...], known: Collection[str]) -> bool:
     if not set(known) - {""}:
         return len(set(names)) > 1
     return not set(names) <= set(known) and not (len(known) == 1 and not any(names))
+
+
+def _position_noise(noise: CalibrationNoise) -> float:
+    """Return the noise of a coordinate [m]; 0 where the calibration had no positions, NaN where it is not known."""
+    return noise.absolute("position") if "position" in noise.value else 0.0
