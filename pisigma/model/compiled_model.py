@@ -74,7 +74,7 @@ def describe(model: CalibratedModel) -> tuple[arrays.Description, tuple[str, ...
             f"model '{model.name}' has both an identified geometry and a network that corrects nominal joint values, "
             "which has no compiled form",
             value="network",
-            remedy="leave one of them out",
+            remedy="omit one of them",
         )
     solver = closed_form_solver(model.robot)
     if solver is None and not len(model.starts):

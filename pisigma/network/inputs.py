@@ -61,7 +61,7 @@ class Inputs:
             meaning = (function if factors else name, tuple(factors))
             if meaning in meanings:
                 problem = f"the network inputs '{meanings[meaning]}' and '{name}' are the same"
-                raise RecipeError(problem, value=name, remedy="leave one out")
+                raise RecipeError(problem, value=name, remedy="omit one")
             meanings[meaning] = name
             if function:
                 _check_angle(robot, name, factors)
@@ -144,4 +144,4 @@ def _check_angle(robot: Robot, name: str, factors: Sequence[float]) -> None:
             )
     if not any(factors):
         problem = f"the network input '{name}' is the same for all joint values"
-        raise RecipeError(problem, expected="a variable angle", value=name, remedy="leave it out")
+        raise RecipeError(problem, expected="a variable angle", value=name, remedy="omit it")

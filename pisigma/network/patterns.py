@@ -97,7 +97,7 @@ def _check_varying(names: Sequence[str], width: Float64[Tensor, " inputs"], rows
             f"the network input '{name}' does not vary over the {rows} training rows, so no correction can be learned "
             "from it",
             value=name,
-            remedy="measure where it varies, or leave it out of the recipe",
+            remedy="measure where it varies, or omit it of the recipe",
         )
 
 

@@ -85,7 +85,7 @@ class Checkpoints:
             raise TrainingError(expected=expected, at=Place(self.file), remedy=remedy) from None
         if fingerprint != self.fingerprint:
             raise TrainingError(
-                "the interrupted training has another recipe or other data",
+                "the recipe or the data differ from those of the interrupted training",
                 expected="the same recipe and data",
                 at=Place(self.folder),
                 remedy="run without --resume to start from scratch, or choose another --out",

@@ -115,7 +115,7 @@ class RobotPosterior:
         """
         if model.uncertainty is None:
             raise IdentificationError(
-                f"model '{model.name}' keeps no posterior, from which poses to measure could be planned",
+                f"model '{model.name}' has no stored posterior, which planning requires",
                 value=model.name,
                 remedy="plan for its robot, or calibrate it with this version",
             )

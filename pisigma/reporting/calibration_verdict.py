@@ -70,7 +70,7 @@ def _accuracy(summary: CalibrationSummary) -> str:
     figures, implausible = summary.judged, any(one.severity == "implausible" for one in summary.diagnostics)
     if figures is None and summary.predicted_rms_mm is not None and not implausible:
         return (
-            f"{rounded(summary.predicted_rms_mm, 0)} mm RMS at other poses, as the calibration's own uncertainty "
+            f"{rounded(summary.predicted_rms_mm, 0)} mm RMS at other poses, because the calibration's own uncertainty "
             "predicts; no row was held out."
         )
     figures = figures or summary.calibrated

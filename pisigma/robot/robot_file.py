@@ -163,7 +163,7 @@ def read_robot(robot: str | os.PathLike[str], base: str | None, tip: str | None)
                 f"'{link}' is a link of a URDF file, but '{name}' is not a URDF file",
                 value=link,
                 option=option,
-                remedy="leave it out or give a .urdf file",
+                remedy="omit it or give a .urdf file",
             )
     if name in catalogue():
         text = (resources.files("pisigma.robot") / "catalogue" / f"{name}.yaml").read_text(encoding="utf-8")
@@ -199,7 +199,7 @@ def from_modified(
         raise RobotError(
             f"row {row + 1}: the modified convention has no beta_deg",
             value=float(np.rad2deg(dh[row, 4])),
-            remedy="leave it out or use the standard convention",
+            remedy="omit it or use the standard convention",
         )
     standard = dh.copy()
     standard[:, 2:4] = np.roll(dh[:, 2:4], -1, axis=0)

@@ -150,7 +150,7 @@ class SimulatedPairs(AbstractCommanded):
     @model_validator(mode="after")
     def _even(self) -> "SimulatedPairs":
         if getattr(self.poses, "count", 0) % 2:
-            raise ValueError("expected an even number of poses, as they form pairs")
+            raise ValueError("expected an even number of poses, because they form pairs")
         return self
 
     def measure(self, robot: TrueRobot) -> Measurements:

@@ -72,7 +72,7 @@ def check_names(placements: Sequence[JigPlacement]) -> None:
             f"the placement '{twice[0]}' appears twice",
             option="touches",
             value=twice[0],
-            remedy="rename one, as a jig that was moved has a new frame",
+            remedy="rename one, because a jig that was moved has a new frame",
         )
 
 

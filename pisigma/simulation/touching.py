@@ -99,7 +99,7 @@ def simulate_touches(
             at=Place(source),
             option="touches",
             value=missed[0],
-            remedy="correct the placement, choose more margin or travel, or leave out such touches with on_miss",
+            remedy="correct the placement, choose more margin or travel, or omit such touches with on_miss",
         )
     touched = replace(candidates.select(met), q=contact.q[met])
     sigma = row_sigma(noise, touched.count)

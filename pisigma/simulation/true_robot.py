@@ -241,7 +241,7 @@ class TrueRobot:
         worst = self.nominal.joints[int(moved.reshape(-1, self.nominal.dof).amax(0).argmax())].name
         raise UnreachablePoseError(
             f"joint '{worst}' of the true robot still moves by {float(moved.max()):.1e} rad or m after "
-            f"{MAX_ITERATIONS} iterations, as its error changes faster than the joint itself",
+            f"{MAX_ITERATIONS} iterations, because its error changes faster than the joint itself",
             option="errors",
             value=worst,
             remedy="reduce amplitudes or compliances, and check that the joint values are finite",

@@ -290,8 +290,8 @@ def _warnings(comparison: ModelComparison) -> list[str]:
     warnings = []
     if comparison.rows_without_position:
         warnings.append(
-            f"{comparison.rows_without_position} rows were not evaluated, as they have no position or are alone in "
-            "their socket."
+            f"{comparison.rows_without_position} rows were not evaluated, because they have no position or are alone "
+            "in their socket."
         )
     for model in comparison.models:
         if model.rows_not_predicted:

@@ -374,7 +374,7 @@ def _check_measured(model: CalibratedModel | None, settings: PlanSettings, robot
         raise MeasurementError(f"{settings.measured}: {implausible[0].sentence}", value=implausible[0].kind)
     if model is not None and bool(known_rows(model, rows).all()):
         raise MeasurementError(
-            f"expected rows that model '{model.name}' was not made from, as these would count twice",
+            f"expected rows to which model '{model.name}' was not fitted, because these would count twice",
             value=model.name,
             at=Place(settings.measured),
             option="--measured",
@@ -389,5 +389,5 @@ def _warnings(way: Tour) -> tuple[str, ...]:
     """Return a warning about poses without a collision-free path; empty if there are none."""
     if not len(way.left_out):
         return ()
-    left_out = f"{len(way.left_out)} poses were left out, as there is no collision-free path to them"
+    left_out = f"{len(way.left_out)} poses were left out, because there is no collision-free path to them"
     return (f"{left_out}; give more candidates.",)

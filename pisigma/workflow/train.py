@@ -141,7 +141,7 @@ def _refuse_resume(recipe: Recipe) -> None:
         f"a recipe of kind {recipe.kind} ('{recipe.name}') cannot be resumed",
         value=recipe.kind,
         option="--resume",
-        remedy="leave it out",
+        remedy="omit it",
     )
 
 

@@ -67,14 +67,14 @@ def _hybrid_geometry(model: CalibratedModel) -> Robot:
             f"the network of model '{model.name}' corrects nominal joint values and has no geometry",
             option="--geometry",
             value=HYBRID,
-            remedy="leave --geometry hybrid out, or export the model that it was distilled from",
+            remedy="omit --geometry hybrid, or export the model that it was distilled from",
         )
     if model.hybrid is None:
         raise ModelError(
             f"model '{model.name}' has no learned joint correction and therefore no hybrid geometry",
             option="--geometry",
             value=HYBRID,
-            remedy="leave --geometry hybrid out",
+            remedy="omit --geometry hybrid",
         )
     if model.robot.coupling is not None:
         raise ModelError(
@@ -82,7 +82,7 @@ def _hybrid_geometry(model: CalibratedModel) -> Robot:
             "geometry",
             option="--geometry",
             value=HYBRID,
-            remedy="leave --geometry hybrid out, or use pisigma.load",
+            remedy="omit --geometry hybrid, or use pisigma.load",
         )
     return model.hybrid.robot
 

@@ -96,7 +96,7 @@ def export_model(name: str, request: ExportRequest) -> Exported:
                 f"is an option of --format {takers}, not of {name}",
                 option=f"--{option.replace('_', '-')}",
                 value=name,
-                remedy="leave it out",
+                remedy="omit it",
             )
     form.check(request)
     inputs = (request.model, request.like, request.poses, request.program, request.frames)

@@ -84,7 +84,7 @@ def _check(request: ExportRequest) -> None:
         )
     elif request.frames is not None or request.tolerance_mm is not None:
         option = "--frames" if request.frames is not None else "--tolerance-mm"
-        raise OutputError("is an option of --program", option=option, remedy="leave it out")
+        raise OutputError("is an option of --program", option=option, remedy="omit it")
 
 
 def _check_options(request: ExportRequest) -> None:
@@ -99,7 +99,7 @@ def _check_options(request: ExportRequest) -> None:
                     "is an option of programs; a .csv file includes all targets",
                     option=name,
                     value=value,
-                    remedy="leave it out",
+                    remedy="omit it",
                 )
 
 

@@ -122,7 +122,7 @@ def read_rows(
             raise MeasurementError(
                 expected=f"corners of images for the given camera, with the columns {', '.join(CORNERS)}",
                 at=Place(rows[0].source),
-                remedy="add a file of corners, or leave out camera and board",
+                remedy="add a file of corners, or omit camera and board",
             )
     return with_one_noise(join(rows, without_duplicates))
 

@@ -84,7 +84,7 @@ def _check(data: MeasuredFields, texts: Mapping[str, Sequence[str]]) -> None:
         raise MeasurementError(
             "nothing was measured in this row",
             at=data.at(int(nothing.nonzero()[0])),
-            remedy="leave it out with select before writing",
+            remedy="omit it with select before writing",
         )
     for name, names in texts.items():
         for text in set(names):

@@ -75,7 +75,7 @@ def check_complete(mapping: FileMapping) -> None:
                 f"the columns '{column.heading}' and '{other.heading}' are both {column.target.quantity}",
                 at=mapping.at(column),
                 value=column.target.quantity,
-                remedy=f"leave out one of them, such as with --map '{mapping.key(column)}=-'",
+                remedy=f"omit one of them, such as with --map '{mapping.key(column)}=-'",
             )
     for group in (coordinates(mapping.columns), joint_columns(mapping.columns), angles(mapping.columns)):
         for column in group:
@@ -92,14 +92,14 @@ def check_complete(mapping: FileMapping) -> None:
             at=header,
             option="--rotation",
             value=", ".join(mapping.rotations),
-            remedy=f"state one of {', '.join(mapping.rotations)}, or none to leave out the rotation",
+            remedy=f"state one of {', '.join(mapping.rotations)}, or none to omit the rotation",
         )
     if mapping.incomplete:
         raise MeasurementError(
             expected="all values of a rotation",
             value=", ".join(column.heading for column in mapping.incomplete),
             at=header,
-            remedy="add the missing column, or leave out the rotation with --rotation none",
+            remedy="add the missing column, or omit the rotation with --rotation none",
         )
     if lacking := mapping.without_unit:
         names, many = ", ".join(f"'{one.heading}'" for one in lacking), "s" if len(lacking) > 1 else ""

@@ -91,7 +91,7 @@ def join_rows(measured: ConvertedRows, joints: ConvertedRows, by: JoinBy, within
     if commanded:
         names = ", ".join(commanded)
         warnings.append(
-            f"{joints.source}: {names} are left out, as the measurements are in {measured.source}."
+            f"{joints.source}: {names} are left out, because the measurements are in {measured.source}."
         )
     if by == "time":
         warnings += _moving(joints, partner[matched], within)
@@ -171,7 +171,7 @@ def _check_names(
                 f"{joints.source}, in which '{_point(measured, row)}' is the point of line {lines[name]}",
                 at=Place(measured.source, measured.lines[row]),
                 value=_point(measured, row),
-                remedy="join by point, or leave out the column of the names with --map",
+                remedy="join by point, or omit the column of the names with --map",
             )
     return []
 
@@ -381,7 +381,7 @@ def join_joints(names: Sequence[str], path: str | os.PathLike[str], within: floa
     columns = tuple(name for name in rows if find_column(name))
     others = [name for name in rows if name not in (*columns, *images)]
     unread = [
-        f"{table.source}: {', '.join(others)} are left out, as they are not columns of measurement files."
+        f"{table.source}: {', '.join(others)} are left out, because they are not columns of measurement files."
     ]
     values = zip(*(rows[name] for name in columns), strict=True)
     of_image = dict(zip(rows["point"], values, strict=True))

@@ -188,7 +188,7 @@ def _with_units(
                 expected=f"{written[stated]} as the file states",
                 value=symbol,
                 at=Place(file.source),
-                remedy=f"leave out {symbol}, or state the units of single columns with --map",
+                remedy=f"omit {symbol}, or state the units of single columns with --map",
             )
     others = {one.target.unit for one in coordinates(columns) if one.is_stated and one.target.unit}
     of_others: dict[UnitKind, str] = {"length": next(iter(others))} if len(others) == 1 else {}

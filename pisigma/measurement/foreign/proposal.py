@@ -162,7 +162,7 @@ def _take_by_order(proposal: Proposal, rotation: str | None) -> None:
         )
     for index, quantity in of_index.items():
         if index not in proposal.columns:
-            proposal.put(index, quantity, "order of the columns, as there is no heading")
+            proposal.put(index, quantity, "order of the columns, because there is no heading")
 
 
 def _has_place(stated: str | None) -> bool:

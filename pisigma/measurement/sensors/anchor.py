@@ -217,7 +217,7 @@ def _check_wire(
     """
     if len(rows) < MIN_DISTANCES:
         raise IdentificationError(
-            expected=f"{MIN_DISTANCES} or more distances from anchor '{name}', as its position and zero are 4 unknowns",
+            expected=f"{MIN_DISTANCES} or more distances from anchor '{name}', whose position and zero are 4 unknowns",
             value=len(rows),
             at=Place(measurements.source),
             remedy="measure more poses from it, spread over the workspace",
@@ -236,8 +236,8 @@ def _check_wire(
     apart = f"{float((points[worst] - points[partner]).norm()) * 1e3:.4g} mm"
     raise IdentificationError(
         f"the distance {shown:g} mm from anchor '{name}' is {'shorter' if short else 'longer'} than any position of "
-        f"the anchor allows, as it is {other:g} mm in {measurements.place(int(rows[partner]))}, where the tool is only "
-        f"{apart} away",
+        f"the anchor allows, because it is {other:g} mm in {measurements.place(int(rows[partner]))}, where the tool is "
+        f"only {apart} away",
         at=measurements.at(int(rows[worst]), "distance"),
         value=shown,
         remedy="correct it, or remove the row",

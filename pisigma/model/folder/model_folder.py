@@ -255,7 +255,7 @@ def _build_model(
 
 def _made_of(robot: Robot, numbers: Tensor, measured: Tensor, steps: Tensor) -> RowValues:
     if not len(numbers) == len(measured) == len(steps):
-        raise MisfitError("the training rows lack numbers or steps", file=WEIGHTS, value=_ROWS[0])
+        raise MisfitError("the training rows have no numbers or steps", file=WEIGHTS, value=_ROWS[0])
     return RowValues.kept(torch.where(measured.bool(), numbers, torch.nan), steps, robot)
 
 

@@ -55,7 +55,7 @@ class ControllerValues:
                 "other axes than the default ones are not supported for an arm with passive joints",
                 value=axes.ignored,
                 option="ignore_axes",
-                remedy="leave it out, and tolerances too",
+                remedy="omit it, and tolerances too",
             )
         return ControllerValues(self.ik.with_axes(axes), self.coupling)
 

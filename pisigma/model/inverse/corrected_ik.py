@@ -325,7 +325,7 @@ class CorrectedIK(AbstractInverse):
                 expected="a finite angle [rad], for a robot with seven revolute joints",
                 value=elbow_angle,
                 option="elbow_angle",
-                remedy="leave it out for other robots",
+                remedy="omit it for other robots",
             )
         return self.with_axes(task_axes(self.axes, ignore_axes, tolerance_mm, tolerance_deg, elbow_angle))
 

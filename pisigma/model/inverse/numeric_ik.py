@@ -78,7 +78,7 @@ class NumericIK:
                 f"is supported only by compiled kernels, which are not available for model '{model.name}'",
                 value=self.axes.elbow_angle,
                 option="elbow_angle",
-                remedy="leave it out",
+                remedy="omit it",
             )
         self._network = model.network if model.calibrated is None else None
         self._arm = NumericArm(model.robot, model.identified, model.hybrid, self.axes)

@@ -35,7 +35,7 @@ class CouplingDeviation(AbstractJointSource):
                 f"robot '{robot.name}' has no coupled joints",
                 option=place,
                 value=robot.name,
-                remedy="leave out the source",
+                remedy="omit the source",
             )
         stated = {section.joint: section for section in self.coupling}
         nominal = {

@@ -60,7 +60,7 @@ class StatedNoiseCheck(AbstractCheck):
             kind="stated_noise",
             severity="implausible" if held_back else "warning",
             sentence=f"The standard deviations stated in the rows for {sensor} are {factor:.3g} times as large as the "
-            f"residuals, {consequence} check the unit of the column, or leave it out.",
+            f"residuals, {consequence} check the unit of the column, or omit it.",
             cause=sensor,
             values={"residual_over_stated": 1 / factor},
         )

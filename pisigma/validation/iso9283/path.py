@@ -151,7 +151,7 @@ def _crossings(
             f"path {path} does not pass command point {first + point} (both counted from 0)",
             option="measured",
             value=(path, first + point),
-            remedy="record it from before the first point to after the last, or leave out the points at the ends",
+            remedy="record it from before the first point to after the last, or omit the points at the ends",
         )
     return piece, share.gather(-1, piece[..., None])[..., 0]
 

@@ -338,7 +338,7 @@ class Cell:
         folder = self.folder / MODELS / model
         if model_hash(folder) != entry.sha256:
             raise ModelError(
-                "the model was changed after it was made", at=Place(folder), remedy="use another one"
+                "the model was changed after it was made", at=Place(folder), remedy="use another model"
             )
         self.history.add(Use(entry.name, now(), reason or "by hand"))
 

@@ -81,7 +81,7 @@ def settings_for(settings: FleetSettings, member: Member) -> CalibrationSettings
             f"robot '{member.id}': the task {settings.task} adds rows to the model of the first session, which has to "
             "be a hybrid",
             value=settings.task,
-            remedy="leave out --model geometric, or state a model folder in the column 'model'",
+            remedy="omit --model geometric, or state a model folder in the column 'model'",
         )
     return calibration if settings.validate else replace(calibration, folds=0, hold_out=None, repeats=None)
 

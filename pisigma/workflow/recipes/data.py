@@ -76,7 +76,7 @@ def load_data(recipe: Recipe, data: Measurements | str | os.PathLike[str] | None
                 f"recipe '{recipe.name}' simulates its data",
                 value=recipe.name,
                 option="--data",
-                remedy="leave it out",
+                remedy="omit it",
             )
         return simulate(recipe, recipe.repeats if isinstance(recipe, HybridRecipe) else 1)
     if data is None:

@@ -141,14 +141,14 @@ class CalibrationSettings:
                 "only folds can be repeated",
                 value=self.repeats,
                 option="repeats",
-                remedy="leave out hold_out, and folds 0",
+                remedy="omit hold_out and folds=0",
             )
         if self.hold_out is not None and self.folds is not None:
             raise MeasurementError(
                 f"{self.hold_out:g} cannot be combined with folds {self.folds}",
                 value=self.hold_out,
                 option="hold_out",
-                remedy="leave one out",
+                remedy="omit one",
             )
         if not 0 <= self.seed < 2**63:
             raise MeasurementError(expected="an integer from 0 to 2^63 - 1", value=self.seed, option="seed")
@@ -164,7 +164,7 @@ class CalibrationSettings:
                     f"a geometric calibration does not use it, got {value}",
                     value=value,
                     option=name,
-                    remedy="leave it out, or choose the model hybrid",
+                    remedy="omit it, or choose the model hybrid",
                 )
         prior = (self.prior_length, self.prior_angle)
         if not all(map(math.isfinite, prior)) or min(prior) < 0 or (prior[0] == 0) != (prior[1] == 0):
@@ -188,5 +188,5 @@ class CalibrationSettings:
                 "a calibration with the prior of a fleet is a hybrid of all its parameters, and is cross-validated "
                 "row by row",
                 option=", ".join(stated),
-                remedy="leave this out, or the prior",
+                remedy="omit this, or the prior",
             )

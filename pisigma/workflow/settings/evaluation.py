@@ -75,7 +75,7 @@ class Limits:
                     "no orientations were measured",
                     value=limit,
                     option=f"--{option}",
-                    remedy="leave the limit out, or give rows with orientations",
+                    remedy="omit the limit, or give rows with orientations",
                 )
             value = errors.statistics[statistic]
             if not value <= limit:

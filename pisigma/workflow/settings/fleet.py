@@ -52,5 +52,5 @@ class FleetSettings:
                 f"only the engine ray has an address, got '{self.address}'",
                 value=self.address,
                 option="address",
-                remedy="choose the engine ray, or leave the address out",
+                remedy="choose the engine ray, or omit the address",
             )

@@ -130,5 +130,5 @@ def check_touched_frames(measurements: Measurements, names: tuple[str, ...]) -> 
             expected=f"more than {BASE_UNKNOWNS} touches of frame '{name}'",
             value=touches,
             at=Place(measurements.source),
-            remedy=f"touch it about {3 * BASE_UNKNOWNS} times along x, y and z, or leave out its rows",
+            remedy=f"touch it about {3 * BASE_UNKNOWNS} times along x, y and z, or omit its rows",
         )

@@ -70,7 +70,7 @@ def read_arm(text: str, source: str, nominal: Robot) -> Robot:
         values = {name: _number(element, name, source) for name in ATTRIBUTES}
         if values["b"]:
             raise RobotError(
-                "expected b = 0, as DH + Hayati rows have no such parameter",
+                "expected b = 0, because DH + Hayati rows have no such parameter",
                 expected="0",
                 value=values["b"],
                 at=Place(source, element.sourceline, "b"),

@@ -271,7 +271,7 @@ def check_program(path: Path, robot: Robot, cartesian: bool, config: str | None)
                 f"is an option of {endings} files with --targets cartesian",
                 option="--config",
                 value=config,
-                remedy="leave it out",
+                remedy="omit it",
             )
     elif config is None:
         raise OutputError(

@@ -58,7 +58,7 @@ def check_rewriting(request: ExportRequest) -> None:
                 "is an option of --poses; the poses of a --program stay poses",
                 option=f"--{name}",
                 value=value,
-                remedy="leave it out",
+                remedy="omit it",
             )
     if request.tolerance_mm is not None and not 0 < request.tolerance_mm < float("inf"):
         raise OutputError(expected="a length > 0 mm", value=request.tolerance_mm, option="--tolerance-mm")
@@ -89,7 +89,7 @@ def rewrite_program(request: ExportRequest) -> Exported:
         solver = solver.under(**request.conditions)
     if solver.model.robot.dof > MAX_JOINTS:
         raise OutputError(
-            f"expected a robot with at most {MAX_JOINTS} joints, got {solver.model.robot.dof}, as the poses of a "
+            f"expected a robot with at most {MAX_JOINTS} joints, got {solver.model.robot.dof}, because the poses of a "
             "program do not determine further joints",
             expected=f"at most {MAX_JOINTS} joints",
             value=solver.model.robot.dof,

@@ -315,7 +315,7 @@ def external_axes(values: Mapping[str, str], in_use: Mapping[str, int]) -> str:
     if not open_axes:
         return ""
     names = ", ".join(f"{name} (in use in line {in_use[name]})" for name in open_axes)
-    return f"the external axes {names} may not be at 0, as the pose does not state them"
+    return f"the external axes {names} may not be at 0, because the pose does not state them"
 
 
 def _is_zero(text: str) -> bool:
