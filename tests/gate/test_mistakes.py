@@ -1,4 +1,4 @@
-"""The common check of all commands notices forty mistakes in rows; three of them go through every command.
+"""The common check of all commands notices forty mistakes in rows; five of them go through every command.
 
 `python tests/gate/run.py mistakes` runs every command with all of them.
 """
@@ -14,8 +14,14 @@ from pisigma.validation.gate import check_rows
 
 pytestmark = pytest.mark.usefixtures("without_type_checker")
 
-EVERYWHERE = ("metres named mm", "tracker moved by 2 mm half-way", "lengths x 1.001")
-"""One mistake for each kind of diagnostic: a setup fault, mixed rows and a wrong scale."""
+EVERYWHERE = (
+    "metres named mm",
+    "sign of q5",
+    "half in inches",
+    "tracker moved by 2 mm half-way",
+    "lengths x 1.001",
+)
+"""Mistakes of five kinds: a unit, mixed rows, a wrong scale, and others that siblings could judge apart."""
 
 
 @pytest.mark.parametrize("mistake", MISTAKES, ids=lambda one: one.name)
