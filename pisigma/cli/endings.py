@@ -31,7 +31,7 @@ TRACEBACK = "PISIGMA_TRACEBACK"
 
 _INTERRUPTED = 130
 _NO_READER = 141
-"""As shells report a program that SIGPIPE ended, such as `pisigma robots | head -1`."""
+"""Status that shells report for a program ended by SIGPIPE, such as `pisigma robots | head -1`."""
 
 
 PluginFiles = Annotated[

@@ -39,7 +39,7 @@ RARELY_USED: Mapping[str, tuple[str, ...]] = {
         "--payload-kg", "--temperature-c",
     ),
 }  # fmt: skip
-"""By command, the options that only `--help-all` shows, in addition to those that all commands have."""
+"""Options that only `--help-all` shows, by command, in addition to the common ones."""
 
 _SHOWS_ALL = "pisigma.help_all"
 

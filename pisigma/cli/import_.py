@@ -116,5 +116,5 @@ def _confirm(proposal: "ImportProposal", yes: bool, as_json: bool) -> None:
 
 
 def _is_asked() -> bool:
-    """Whether there is a terminal to ask on."""
+    """Return whether there is a terminal for questions."""
     return sys.stdin.isatty()

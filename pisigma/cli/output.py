@@ -98,8 +98,8 @@ def saved(
     """Write a result as a model folder, and yield the folder for printing; None if it was not written.
 
     Args:
-        result: with its diagnostics.
-        folder: to write.
+        result: result with its diagnostics.
+        folder: folder to write.
         accept_implausible: write it even if it must not be trusted.
         overwrite: replace the model in the folder.
         texts: name and command, see `AbstractModelResult.save`.
@@ -127,7 +127,7 @@ def command_line(context: typer.Context, files: Collection[str] = ("out",)) -> s
     """Return the running command for cards, without the folders of files and options at their defaults.
 
     Args:
-        context: of the command.
+        context: context of the command.
         files: names of the options whose values are files or folders; all arguments may be.
     """
     above: Any = context.parent

@@ -57,7 +57,7 @@ def print_screen(
     """Print a result, and repeat the accuracy at its end where that has left the screen.
 
     Args:
-        verdict: in three sentences.
+        verdict: verdict in three sentences.
         warnings: sentences; all are printed.
         blocks: the most important first; those for which there is no room are named only.
         details: printed with `verbose` alone.

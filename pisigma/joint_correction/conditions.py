@@ -31,8 +31,8 @@ class ConditionSection(FeatureSection):
 class ConditionFeatures(AbstractFeature):
     """Payload and temperature, each times 1, sine and cosine of the joint's own value (prismatic: scaled value).
 
-    A condition is expressed in standard deviations from its mean over the measured rows, so that joint values alone
-    mean the usual conditions. The payload also multiplies the gravity torques of a mass in the frame of the last row;
+    A condition is expressed in standard deviations from its mean over the measured rows, so that missing
+    conditions count as their means. The payload also multiplies the gravity torques of a mass in the last row's frame;
     its effect is proportional, beyond the measured values too. Beyond the lowest and highest measured temperature the
     correction is constant, because thermal expansion of an arm is not linear and extrapolation soon does harm.
 
@@ -99,7 +99,7 @@ class ConditionFeatures(AbstractFeature):
         return (ConditionFeatures(robot, options.varying, mean, spread, measured, options.gravity),)
 
     def columns(self, state: JointState) -> Float[Tensor, "*batch dof columns"]:
-        """Return the products; 0 under the usual conditions, and for conditions that are NaN or missing."""
+        """Return the products; 0 under mean conditions, and for conditions that are NaN or missing."""
         q = state.q
         if not any(name in state.stated for name in self.names):
             return q.new_zeros((*q.shape, self.count))

@@ -25,7 +25,7 @@ class JointState:
     Attributes:
         q: joint values [rad or m].
         stated: by name, conditions `(*batch,)` [kg, deg C] and `APPROACH` `(*batch, dof)`. Missing entries and NaN mean
-            the usual condition.
+            the mean condition.
     """
 
     q: Float[Tensor, "*batch dof"]

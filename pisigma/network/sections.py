@@ -51,7 +51,7 @@ class GradientDescentSection(Section):
     Attributes:
         learning_rate: η of every joint, by name.
         epochs: number of steps.
-        seed: of the start.
+        seed: random seed of the initial weights.
         spread: half width of the uniform start of weights (around 0) and biases (around 1).
     """
 
@@ -83,11 +83,11 @@ class LevenbergMarquardtSection(Section):
     """Least squares for every output, from several starts; the best by validation error is kept.
 
     Attributes:
-        epochs: largest number of iterations; it stops earlier when nothing moves any more.
+        epochs: largest number of iterations; fewer if the weights converge.
         starts: number of starts of every output.
         validation_share: share of the patterns that only choose between starts.
         ridge: pull of the weights (not the biases) towards 0, relative to a mean square of 1.
-        seed: of starts and validation patterns.
+        seed: random seed of initial weights and validation patterns.
         spread: half width of the uniform start of weights (around 0) and biases (around 1).
     """
 
@@ -107,10 +107,10 @@ class MiniBatchSection(Section):
 
     Attributes:
         batch_rows: rows of a mini-batch.
-        epochs: how often every row is visited.
+        epochs: number of passes over all rows.
         optimiser: "adam", "adamw", or "sgd" with momentum 0.9.
-        learning_rate: of the first step.
-        seed: of the start and of the order of the rows.
+        learning_rate: learning rate of the first step.
+        seed: random seed of the initial weights and of the order of the rows.
         spread: half width of the uniform start of weights (around 0) and biases (around 1).
     """
 

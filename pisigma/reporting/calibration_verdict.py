@@ -60,7 +60,7 @@ def calibration_verdict(summary: CalibrationSummary, folder: Path | None, warnin
 
     Args:
         summary: its figures.
-        folder: of the model; None if none was written.
+        folder: folder of the model; None if none was written.
         warnings: number of warnings.
     """
     return Verdict(_accuracy(summary), _trust(summary, warnings), _next_step(summary, folder, warnings))
@@ -117,7 +117,7 @@ def _next_step(summary: CalibrationSummary, folder: Path | None, warnings: int) 
 
 
 def scale_matters(summary: CalibrationSummary, odds: float = LIKELY_SCALE) -> bool:
-    """Whether a wrong scale of the sensor has at least these odds, and an error that matters."""
+    """Return whether a wrong scale of the sensor has at least these odds and causes an error that matters."""
     scale, judged = summary.scale, summary.judged
     if scale is None or judged is None or scale.odds < odds:
         return False

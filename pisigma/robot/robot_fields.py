@@ -18,8 +18,8 @@ class RobotFields(NamedTuple):
         source: origin of the parameter values.
         rows: joints and fixed rows, from the base to the tool.
         dh: `(rows, 5)`, columns as `DH_COLUMNS`.
-        base: as `FRAME_COLUMNS`.
-        tool: as `FRAME_COLUMNS`.
+        base: frame in the order of `FRAME_COLUMNS`.
+        tool: frame in the order of `FRAME_COLUMNS`.
         coupling: relation of joint values and controller values; None if they are equal.
         urdf: content of the file if it is a URDF file, else None.
     """

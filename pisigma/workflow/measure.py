@@ -343,7 +343,7 @@ class MeasuringSession:
         return torch.roll(torch.arange(len(self.plan.q)), -last)[torch.roll(is_open, -last)]
 
     def _all_rows(self) -> RowsSoFar:
-        """All rows with their errors."""
+        """Return all rows with their errors."""
         rows = self._rows
         if rows is None:
             nothing = np.zeros((0, 3))
@@ -354,7 +354,7 @@ class MeasuringSession:
         return RowsSoFar(rows.line, rows.q.numpy(), *self._judged.errors(), *flags)
 
     def _advice(self, left: int) -> Advice:
-        """What to do next: correct a fault of the setup, else repeat a wrong row, else measure on or stop."""
+        """Return the advice: correct a fault of the setup, else repeat a wrong row, else continue or stop."""
         if self._setup:
             return Advice("correct", of_all_rows(self._setup).sentence)
         last = None if self._rows is None else self._rows.line[-1]

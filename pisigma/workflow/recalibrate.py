@@ -255,7 +255,7 @@ def _outliers(
 
 
 def _believable(choice: CandidateChoice, robot: Robot) -> bool:
-    """Whether the recalibrated model predicts held-out rows well enough for its changes of the arm to be credible."""
+    """Return whether the recalibrated model predicts held-out rows well enough for its changes to be credible."""
     error, kept = choice.rms["recalibrated"], choice.rms[choice.kept]
     if error is None or kept is None:
         return not choice.rows

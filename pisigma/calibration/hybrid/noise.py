@@ -44,10 +44,10 @@ class CalibrationNoise:
         return CalibrationNoise({**self.value, **other.value}, kept | dict(other.stated))
 
     def usual(self, sensor: AbstractSensor) -> float | None:
-        """Return what the noise is for other rows, in the form that these have; None for a sensor that is new.
+        """Return the noise of earlier rows of a sensor, in the form of its new rows; None for a new sensor.
 
         Args:
-            sensor: with the rows.
+            sensor: sensor with the rows.
 
         Raises:
             MeasurementError: the calibration knows the noise only as a factor on stated standard deviations, and these

@@ -41,7 +41,7 @@ class FailedRow:
     """A row without joint values that can be commanded.
 
     Attributes:
-        line: in the file of poses.
+        line: line in the file of poses.
         status: `bad_row`, or the name of a `Status` in lower case.
         reason: what is wrong and what to do.
     """
@@ -56,11 +56,11 @@ class Outcome:
     """How the poses of a file were solved.
 
     Attributes:
-        rows: all of them.
-        statuses: how many have which status.
+        rows: number of rows.
+        statuses: number of rows by status.
         first_failed: the first `LISTED` rows that failed, in the order of the file.
-        failed: how many failed.
-        switches: of a path, the lines where it changes its branch or stops, with what happens there.
+        failed: number of rows that failed.
+        switches: lines where a path changes its branch or stops, with what happens there.
     """
 
     rows: int = 0

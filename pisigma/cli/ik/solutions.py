@@ -18,7 +18,7 @@ FAILURES = tuple(status for status in Status if status not in (Status.REACHED, S
 
 
 def solution_records(solution: Solution, solver: CorrectedIK) -> list[dict[str, Any]]:
-    """One record per solution: status, joint values, branch.
+    """Return one record per solution: status, joint values, branch.
 
     A robot whose joints all turn gets `q_deg`, `q_nominal_deg`, `correction_deg` as lists; with a prismatic
     joint `q`, `q_nominal`, `correction` are lists of `{"joint", "value", "unit"}`. What is not known is None.

@@ -84,7 +84,7 @@ def recalibrate_into(
     """Add rows to a model, write the model that was kept if a folder is stated, and print it.
 
     Args:
-        context: of the command, for the card.
+        context: context of the command, for the card.
         model: folder of the model.
         data: files of the rows.
         settings: how.

@@ -32,7 +32,7 @@ BUILT_IN = {
     "onnx": ("pisigma.deployment.export.onnx_model", "the network alone"),
     "library": ("pisigma.deployment.export.library.c_library", "a shared library for C with a header"),
 }
-"""By name, the module with `FORMAT` (or the attribute after the colon), imported on use, and the text for the help."""
+"""Module with `FORMAT` (or the attribute after the colon), which is imported on use, and help text, by name."""
 
 _REGISTERED: dict[str, ExportFormat] = {}
 

@@ -10,7 +10,7 @@ from pisigma.measurement.foreign.rotations import ROTATIONS
 from pisigma.measurement.foreign.units import UNITS, UnitKind
 
 LEFT_OUT = "-"
-"""In mappings, the target of a column that is left out."""
+"""Target of a column that a mapping omits."""
 KEYS = ("point", "time")
 """Quantities by which rows of two files are joined; they are not in measurement files."""
 

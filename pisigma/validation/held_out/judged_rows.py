@@ -40,7 +40,7 @@ class JudgedRows:
         place: position of the tool in the robot's base frame [m].
         models: errors of every row by model, "nominal" first and the model last.
         residual: measured minus predicted position in the row's frame under the model [m]; NaN if there is none.
-        residual_origin: as `origin`, for the residuals.
+        residual_origin: origin of the residuals, in the form of `origin`.
         predicted: standard deviation of the predicted position [m]; NaN if there is none.
         inside: whether every joint value is in the range measured for the model.
         left_out: number of rows of the file that are marked as training rows and are not included.

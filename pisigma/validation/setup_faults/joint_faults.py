@@ -48,7 +48,7 @@ class JointMaps:
 
     Attributes:
         matrix: weights of the logged columns in every joint value.
-        offset: of each joint [rad or m].
+        offset: offset of each joint [rad or m].
     """
 
     matrix: Float64[Tensor, "maps dof dof"]

@@ -144,7 +144,7 @@ class _Fit:
         probability: probability that a row belongs to the second population.
         difference: difference of the two.
         factor: see `Populations`.
-        log_likelihood: with the difference, and without it.
+        log_likelihood: log likelihood with the difference, and without it.
         used: effective number of unknowns.
         unknowns: effective number of unknowns of the difference.
         values: number of values.

@@ -294,7 +294,7 @@ class _Search:
         If motions and parameters use up nearly all values, nothing can contradict them: the odds are 0.
 
         Args:
-            fit: of the candidate.
+            fit: fit of the candidate.
             values_per_independent: number of values per independent value.
         """
         if fit.effective > MAX_USED * self.rows.values:

@@ -157,7 +157,7 @@ def _plans(members: Sequence[Member], settings: FleetSettings) -> dict[str, Cali
 
 @contextmanager
 def _engine(settings: FleetSettings, items: int) -> Iterator[AbstractEngine]:
-    """The engine that the settings choose."""
+    """Yield the engine that the settings choose."""
     jobs = settings.jobs or os.cpu_count() or 1
     if settings.engine == "processes" or not items:
         yield ProcessEngine(max(1, min(jobs, items)))
@@ -200,7 +200,7 @@ def _prepare(folder: Path, source: Path, members: tuple[Member, ...]) -> None:
 
 
 def _finished(out: Path, member: Member, key: str) -> RobotRecord | None:
-    """What an earlier call came to, where it was made of the same and its models are there."""
+    """Return the record of an earlier call if its inputs were the same and its models still exist, else None."""
     record = read_record(record_path(out, member.id))
     if record is None or record.key != key:
         return None

@@ -20,7 +20,7 @@ from pisigma.robot.writing import comment_text
 
 ARRAY, ELEMENT, NAME = "DhArray", "DH", "dhOffset"
 ATTRIBUTES = ("theta", "d", "a", "b", "alpha", "beta")
-"""In the maker's order, in degrees and millimetres. b is a shift along y, which is 0 here."""
+"""Keys in the order of the maker, in degrees and millimetres. b is a shift along y, which is 0 here."""
 _FACTORS = np.array([np.pi / 180 if name in ("theta", "alpha", "beta") else 1e-3 for name in DH_COLUMNS])
 
 

@@ -27,7 +27,7 @@ _D_AND_A = {
     "UR20": ((0.2363, 0.2010, 0.1593, 0.1543), (0.8620, 0.7287)),
     "UR30": ((0.2363, 0.2010, 0.1593, 0.1543), (0.6370, 0.5037)),
 }
-"""By model, d of the joints 1, 4, 5 and 6, and minus a of the joints 2 and 3 [m].
+"""d of joints 1, 4, 5 and 6, and minus a of joints 2 and 3 [m], by model.
 
 The UR30 is from UniversalRobots/Universal_Robots_ROS2_Description, config/ur30/default_kinematics.yaml."""
 _ALPHA = np.array([1.0, 0.0, 0.0, 1.0, -1.0, 0.0]) * np.pi / 2

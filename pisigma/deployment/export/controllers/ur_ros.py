@@ -21,7 +21,7 @@ from pisigma.robot.row import Bounded
 from pisigma.robot.urdf_frames import Frame, frame_of, rotation, translation, xyzrpy_of
 
 COLUMNS = ("x", "y", "z", "yaw", "pitch", "roll")
-"""In the order of `frame_of`: the driver's roll is about x, that of pisigma about z."""
+"""Keys in the order of `frame_of`: the driver's roll is about x, that of pisigma about z."""
 
 
 class LinkSection(Section):

@@ -242,7 +242,7 @@ FANUC = Language(
 )
 
 LANGUAGES = {".script": URSCRIPT, ".src": KRL, ".mod": RAPID, ".ls": FANUC}
-"""By the suffix of the file."""
+"""Languages by the suffix of the file."""
 
 
 def check_program(path: Path, robot: Robot, cartesian: bool, config: str | None) -> None:

@@ -25,7 +25,7 @@ SCANNERS: dict[str, Callable[[str, FrameFile], ScannedProgram]] = {
     ".mod": scan_rapid,
     ".ls": scan_fanuc,
 }
-"""By the suffix of the file."""
+"""Scanners by the suffix of the file."""
 
 TOLERANCE_MM = 0.1
 MAX_BYTES = 2**24
