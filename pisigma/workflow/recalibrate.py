@@ -153,7 +153,7 @@ def recalibrate(
         parent, adaptation, elsewhere, rows, calibrator, stage(progress, "cross-validation")
     )
     consistency = _fleet_consistency(parent, rows)
-    odd = consistency is not None and consistency.odd
+    odd = consistency is not None and consistency.is_inconsistent
     from_scratch = stage(progress, "from scratch")
     choice, kept = _kept(choice, odd, parent, adaptation, rows, calibrator, from_scratch)
     moved = significant_movements(adaptation) if consistency is None and _believable(choice, drawn) else None

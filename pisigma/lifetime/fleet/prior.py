@@ -258,14 +258,14 @@ class FleetConsistency:
         return FleetConsistency(float(chi2.sf(square, count)), gain)
 
     @property
-    def odd(self) -> bool:
+    def is_inconsistent(self) -> bool:
         """Whether the robot is inconsistent with the fleet, and its class explains the rows better."""
         return self.probability < FALSE_ALARM and self.gain < 0
 
     @property
     def sentence(self) -> str:
         """The result of the comparison as a sentence."""
-        if self.odd:
+        if self.is_inconsistent:
             return (
                 f"This robot is inconsistent with the fleet: fewer than 1 in {1 / FALSE_ALARM:,.0f} of its robots are "
                 "as far from the mean, and the usual errors of its class explain the rows better. The fleet prior is "

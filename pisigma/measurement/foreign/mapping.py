@@ -90,8 +90,8 @@ class FileMapping:
     def likely_units(self) -> dict[UnitKind, str]:
         """Likely units of the columns without a unit, by kind of unit."""
         kinds = {one.target.needs for one in self.without_unit}
-        small_angles = is_certain("rad", largest(self.file, joint_columns(self.columns)))
-        length = "m" if is_certain("m", largest(self.file, coordinates(self.columns))) else "mm"
+        small_angles = is_certain("rad", largest_value(self.file, joint_columns(self.columns)))
+        length = "m" if is_certain("m", largest_value(self.file, coordinates(self.columns))) else "mm"
         likely = (length, "rad" if small_angles else "deg", "kg", "c")
         return {UNITS[symbol].kind: symbol for symbol in likely if UNITS[symbol].kind in kinds}
 
@@ -247,7 +247,9 @@ def _units_of_maker(
         ("length", maker.length, coordinates(columns)),
     )
     return {
-        kind: symbol for kind, symbol, group in kinds if symbol and is_certain(symbol, largest(file, group))
+        kind: symbol
+        for kind, symbol, group in kinds
+        if symbol and is_certain(symbol, largest_value(file, group))
     }
 
 
@@ -271,7 +273,7 @@ def angles(columns: tuple[MappedColumn, ...]) -> list[MappedColumn]:
     ]
 
 
-def largest(file: ExportFile, columns: list[MappedColumn]) -> float:
+def largest_value(file: ExportFile, columns: list[MappedColumn]) -> float:
     """Return the largest absolute value in columns, in the file's unit."""
     return max((abs(number) for column in columns for number in file.numbers(column.index)), default=0.0)
 

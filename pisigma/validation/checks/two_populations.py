@@ -57,7 +57,7 @@ class Mixture:
     log_bayes_factor: float
 
     @property
-    def apart(self) -> bool:
+    def are_distinct(self) -> bool:
         """Whether these are two populations, and not the shape of a single one."""
         return (
             self.log_bayes_factor > math.log(100.0)
@@ -92,7 +92,7 @@ class TwoPopulationsCheck(AbstractCheck):
         for sensor, errors in checked.final_errors.items():
             residuals = np.asarray(errors)
             residuals = residuals[np.isfinite(residuals).all(1)]
-            if len(residuals) < MIN_ROWS or not (fit := two_populations(residuals)).apart:
+            if len(residuals) < MIN_ROWS or not (fit := two_populations(residuals)).are_distinct:
                 continue
             unit = "mm" if SENSORS[sensor].unit == "m" else "mrad"
             size, scatter = fit.off * 1e3, fit.scatter * 1e3

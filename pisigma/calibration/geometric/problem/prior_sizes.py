@@ -139,11 +139,11 @@ def settled_scales(
         held.diagonal().add_(scaled_precision(precision, group, before))
         covariance = covariance_of(held)
         scale = prior_scales(covariance @ pull, precision, group, before, covariance, floor)
-        if alike(before, scale, CONVERGENCE_TOLERANCE):
+        if has_converged(before, scale, CONVERGENCE_TOLERANCE):
             break
     return scale
 
 
-def alike(before: Tensor, after: Tensor, share: float) -> bool:
+def has_converged(before: Tensor, after: Tensor, share: float) -> bool:
     """Say whether two estimates (of noise or prior scales) differ by less than a relative tolerance."""
     return bool(((after / before - 1).abs() < share).all())

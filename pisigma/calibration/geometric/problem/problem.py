@@ -28,7 +28,7 @@ from pisigma.calibration.geometric.problem.noise import (
 from pisigma.calibration.geometric.problem.parameters import EVERYWHERE, ParameterSpace, PriorSizes
 from pisigma.calibration.geometric.problem.prior_sizes import (
     SMALLEST_PRIOR,
-    alike,
+    has_converged,
     prior_scales,
     settled_scales,
 )
@@ -231,7 +231,9 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
             torch.cat([one.noise, one.repetition, one.disagreement, one.prior_scale])
             for one in (view, renewed)
         )
-        return self.combined(linearisation.point, renewed), alike(before, after, CONVERGENCE_TOLERANCE)
+        return self.combined(linearisation.point, renewed), has_converged(
+            before, after, CONVERGENCE_TOLERANCE
+        )
 
     def _prior_scales(
         self, view: SensorView, off: Tensor, covariance: Tensor, refine: bool

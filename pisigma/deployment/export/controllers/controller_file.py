@@ -91,7 +91,7 @@ class ControllerFile:
         name: name of the `--format`.
         contents: contents of a file, with an article.
         suffixes: suffixes of its files.
-        source: a sentence on where the format is described and where it was tested; see `untried`.
+        source: a sentence on where the format is described and where it was tested; see `untested_on_controller`.
         convention: function for the controller's description of a robot; raises a `PisigmaError` if there is none.
         relies: sentences on what the file requires of the controller.
         text: function that returns the text of a file.
@@ -161,7 +161,7 @@ class ControllerFile:
         return Exported(text, model_facts(model) | facts, tuple(sentences))
 
 
-def untried(source: str) -> str:
+def untested_on_controller(source: str) -> str:
     """Return the sentence on a file that was not tested on a controller."""
     return f"Written from the published description ({source}), not tried on a controller."
 

@@ -5,7 +5,11 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from pisigma.deployment.export.controllers.controller_file import ControllerFile, FileText, untried
+from pisigma.deployment.export.controllers.controller_file import (
+    ControllerFile,
+    FileText,
+    untested_on_controller,
+)
 from pisigma.deployment.export.controllers.offset_table import read_offsets
 from pisigma.deployment.export.dh_table import cells, csv_table
 from pisigma.deployment.export.export_format import ExportRequest
@@ -117,7 +121,7 @@ def _file(name: str, contents: str, source: str, meaning: str) -> ControllerFile
         name=name,
         contents=contents,
         suffixes=(".csv",),
-        source=untried(source),
+        source=untested_on_controller(source),
         relies=(meaning, *_SIGN),
         text=write_counts,
         read=read_offsets,

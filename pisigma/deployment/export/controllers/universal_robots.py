@@ -9,7 +9,7 @@ from pisigma.deployment.export.controllers.controller_file import (
     ControllerFile,
     FileText,
     frame_sentences,
-    untried,
+    untested_on_controller,
     with_frames,
 )
 from pisigma.deployment.export.controllers.ur_models import JOINTS, check_robot, convention, own_geometry
@@ -117,7 +117,7 @@ FILE = ControllerFile(
     name="ur-calibration",
     contents="the calibration.conf of a Universal Robots controller",
     suffixes=(".conf",),
-    source=untried("forum.universal-robots.com/t/18921 and /t/1638"),
+    source=untested_on_controller("forum.universal-robots.com/t/18921 and /t/1638"),
     relies=(
         "The controller adds these differences to its own nominal DH parameters, which are in urcontrol.conf.",
         "The file includes neither base nor tool. The line 'base' below is the pose of the controller's frame 'base' "

@@ -7,7 +7,7 @@ from pisigma.deployment.export.controllers.controller_file import (
     ControllerFile,
     FileText,
     frame_sentences,
-    untried,
+    untested_on_controller,
     with_frames,
 )
 from pisigma.deployment.export.controllers.universal_robots import without_beta
@@ -146,7 +146,7 @@ FILE = ControllerFile(
     name="ur-ros",
     contents="the kinematics YAML of Universal Robots' ROS driver",
     suffixes=(".yaml", ".yml"),
-    source=untried(
+    source=untested_on_controller(
         "github.com/UniversalRobots/Universal_Robots_ROS2_Driver, ur_calibration/doc/algorithm.rst"
     ),
     relies=(
