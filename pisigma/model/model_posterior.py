@@ -84,7 +84,7 @@ class ModelPosterior:
         return ModelPosterior(known.space, known.geometry, known.features, weights, known.root, known.noise)
 
     @cached_property
-    def usual_weights(self) -> Float64[Tensor, " weights"]:
+    def rms_weights(self) -> Float64[Tensor, " weights"]:
         """Posterior root mean square [rad or m] of the weights that share a prior size, for every weight."""
         square = self.weights.square() + self.root[len(self.space.parameters) :].square().sum(1)
         first, numbers = 0, []

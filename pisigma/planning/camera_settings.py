@@ -19,7 +19,7 @@ class CameraSettings:
     Attributes:
         camera: YAML file of the camera (of pisigma, ROS or OpenCV), for the sensor camera.
         board: YAML file of the board, for the sensor camera.
-        is_fixed: the camera is fixed and the board is on the flange (default: the opposite).
+        is_fixed: state that the camera is fixed and the board is on the flange (default: the opposite).
         sigma_px: standard deviation of u and v of a detected corner [px].
         repeatability_mm: standard deviation of the robot's position repeatability, per axis [mm].
         repeatability_deg: standard deviation of the robot's orientation repeatability, per axis [deg].

@@ -97,7 +97,7 @@ class Robot:
 
         Raises:
             UnknownRobotError: neither a catalogue name nor a file; the message lists the catalogue.
-            RobotError: the file does not describe a robot, or links are named where there is no URDF file.
+            RobotError: the file does not describe a robot, or links are given for a file that is not URDF.
         """
         return Robot(*read_robot(robot, base, tip))
 

@@ -180,7 +180,7 @@ def compose(
         recipe: name and SHA-256 of the recipe; empty without one.
 
     Raises:
-        IdentificationError: the measurements cannot be of this robot.
+        IdentificationError: the measurements cannot come from this robot.
     """
     checked = CheckedCalibration(
         geometric_of(calibrator), rows, trained(calibrator, rows, result=result), validation

@@ -18,10 +18,10 @@ from pisigma.lifetime.monitoring.charts import FALSE_ALARMS_PER_YEAR, SESSIONS_P
 from pisigma.lifetime.monitoring.history import (
     Record,
     history_path,
-    in_order,
     new_rows,
     read_sessions,
     rows_hash,
+    sorted_sessions,
     store_sessions,
 )
 from pisigma.lifetime.monitoring.session import judge_session
@@ -259,7 +259,7 @@ def monitor(
             )
     if not (trusted or untrusted):
         raise MeasurementError(f"expected new rows, got none: {' '.join(warnings)}", expected="new rows")
-    records = new = in_order(trusted)
+    records = new = sorted_sessions(trusted)
     if folder is not None:
         records = store_sessions(history_path(folder), model_hash(folder), new)
         warnings += [

@@ -30,8 +30,8 @@ class ServeSettings:
         zmq_port: port for ZeroMQ (0: any free port). Needs the extra serve. None: no ZeroMQ.
         token: token that every client has to send first; on a command line, a file that contains it.
         client_timeout: see `CLIENT_TIMEOUT`.
-        polling: time to busy-poll for the next request [s] (0: sleep at once). The server polls only where requests
-            come that often and no other program needs the processor.
+        polling: time to busy-poll for the next request [s] (0: sleep at once). The server polls only if requests
+            arrive at least that often and no other program needs the processor.
     """
 
     host: str = "127.0.0.1"

@@ -129,7 +129,7 @@ def _records(database: sqlite3.Connection, model: str) -> tuple[Record, ...]:
     rows = database.execute(
         "SELECT file, date, rows, temperature_c, session, zeros FROM sessions WHERE model = ?", (model,)
     )
-    return in_order(
+    return sorted_sessions(
         [
             Record(file, date, sha256, temperature, _SESSION.validate_json(session), *_unpacked(zeros))
             for file, date, sha256, temperature, session, zeros in rows
@@ -137,7 +137,7 @@ def _records(database: sqlite3.Connection, model: str) -> tuple[Record, ...]:
     )
 
 
-def in_order(records: Sequence[Record]) -> tuple[Record, ...]:
+def sorted_sessions(records: Sequence[Record]) -> tuple[Record, ...]:
     """Sort sessions by date, and by file within a day."""
     return tuple(sorted(records, key=lambda one: (one.date, one.file, one.rows_sha256)))
 

@@ -249,7 +249,7 @@ def _groups(
                 groups.append(_relocated_group(space, f"{own.name} {owner}", index))
     if len(posterior.weights):
         index = torch.arange(parameters, len(root))
-        scale = CORRECTION_SCALE * posterior.usual_weights
+        scale = CORRECTION_SCALE * posterior.rms_weights
         groups.append(
             DriftGroup("correction", index, scale, log_prior_penalty=CORRECTION_PENALTY, single=False)
         )

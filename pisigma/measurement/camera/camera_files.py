@@ -41,11 +41,11 @@ class CameraFiles:
 
     Attributes:
         cameras: YAML file of a camera (of pisigma, ROS or OpenCV), if the rows are corners of boards in images.
-            Needs `boards`. With several cameras, the column camera contains their names.
+            Needs a board. With several cameras, the column camera contains their names.
         boards: YAML file of a board (rows, columns, square_mm). With several boards, the column board contains their
             names.
-        is_fixed: all cameras are fixed and the boards are on the flange (default: the opposite). If only some
-            are fixed, state is_fixed in their files instead.
+        is_fixed: state that all cameras are fixed and the boards are on the flange (default: the opposite). If only
+            some are fixed, state is_fixed in their files instead.
         repeatability: repeatability of the robot.
         intrinsics: treatment of the cameras' intrinsics: fixed (as in their files), prior (within their standard
             deviations) or free. Where a file states no standard deviations, those of a typical calibration are used.

@@ -34,8 +34,8 @@ from pisigma.measurement.foreign.units import (
     UNITS,
     UnitKind,
     ambiguous_unit,
-    doubt,
     is_certain,
+    reason_to_doubt,
     stated_units,
     unit_symbol,
 )
@@ -309,7 +309,7 @@ def _of_unit(mapping: FileMapping, name: str, columns: list[MappedColumn], unit:
     largest, line, column = max(values, key=lambda one: one[0], default=(0.0, 0, columns[0]))
     if name.startswith("angles") and largest < _MIN_TILT:
         return ""
-    reason = doubt(unit, largest, len(mapping.file.records))
+    reason = reason_to_doubt(unit, largest, len(mapping.file.records))
     return f"{mapping.at(column, line)}: the {name} have {reason}; check their unit." if reason else ""
 
 

@@ -140,7 +140,7 @@ def scaled(number: str, symbol: str) -> str:
     return "0" if not value else f"{value:f}" if is_plain else str(value)
 
 
-def doubt(symbol: str, largest: float, rows: int) -> str:
+def reason_to_doubt(symbol: str, largest: float, rows: int) -> str:
     """Return why values are unlikely to be in their unit; "" if they are not.
 
     Joints rotate by at most two or three turns, nothing is measured from more than 200 m away, and a measured robot
@@ -166,6 +166,6 @@ def doubt(symbol: str, largest: float, rows: int) -> str:
 
 
 def is_certain(symbol: str, largest: float) -> bool:
-    """Return whether values can only be in a unit, and not in the other usual unit of its kind; see `doubt`."""
+    """Return whether values can only be in a unit, not in the other usual unit of its kind (see `reason_to_doubt`)."""
     bounds = {"deg": largest > 4 * math.pi, "rad": 0.2 < largest <= 2 * math.pi + 0.1}
     return bounds.get(symbol, {"mm": largest > 200, "m": 0.05 < largest < 20}.get(symbol, False))

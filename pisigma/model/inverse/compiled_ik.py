@@ -236,12 +236,12 @@ class CompiledIK:
         return T, J, out[:, 6 * dof : 7 * dof], out[:, 7 * dof]
 
     def _checked(self, axes: TaskAxes | None) -> TaskAxes:
-        """Return the constrained axes; models that correct by the whole pose accept no others than the default ones."""
+        """Return the constrained axes; models that correct by the whole pose accept only the default ones."""
         if axes is None or not self.description.network.used or axes == self.axes:
             return axes or self.axes
         raise PoseError(
-            f"model '{self.name}' corrects nominal joint values by the whole pose, so only the default axes "
-            f"({', '.join(self.axes.ignored) or 'none'}) can be ignored",
+            f"model '{self.name}' corrects nominal joint values as a function of the whole pose, so only the default "
+            f"axes ({', '.join(self.axes.ignored) or 'none'}) can be ignored",
             value=axes.ignored,
             option="ignore_axes",
             remedy="calibrate a hybrid",

@@ -28,7 +28,7 @@ def images_page(
     title: str,
     detection: DetectedBoards,
     tables: Sequence[tuple[str, Table]],
-    says: tuple[Sequence[str], Sequence[str]],
+    texts: tuple[Sequence[str], Sequence[str]],
 ) -> str:
     """Render the page of images as HTML; texts are escaped.
 
@@ -36,9 +36,9 @@ def images_page(
         title: title of the page.
         detection: boards in the images.
         tables: tables with their titles.
-        says: sentences, and warnings.
+        texts: sentences of the result, and warnings.
     """
-    sentences, warnings = says
+    sentences, warnings = texts
     scale = arrow_scale(detection)
     return render(
         "images.html.j2",

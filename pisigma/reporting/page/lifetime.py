@@ -143,7 +143,7 @@ def comparison_page(
     parameters: ParameterDifferences,
     displacements: Mapping[str, Displacement],
     rows: ModelComparison | None,
-    says: tuple[Sequence[str], Sequence[str]],
+    texts: tuple[Sequence[str], Sequence[str]],
 ) -> str:
     """Render a comparison of two models as HTML; texts are escaped.
 
@@ -152,10 +152,10 @@ def comparison_page(
         parameters: differences of the parameters.
         displacements: displacements of the tool, by description of the poses.
         rows: errors of both models on rows; None if none were given.
-        says: sentences, and warnings.
+        texts: sentences of the result, and warnings.
     """
     first, second = models
-    sentences, warnings = says
+    sentences, warnings = texts
     return render(
         "comparison.html.j2",
         names=(first, second),

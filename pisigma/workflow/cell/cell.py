@@ -226,7 +226,7 @@ class Cell:
             MeasurementError: there is no session with this name, or none to which the model was not fitted.
         """
         entry, chosen, seen = self._new_rows(model, session)
-        settings = seen.fitted(self.file.settings("verify", **changed))
+        settings = seen.settings_to_fit(self.file.settings("verify", **changed))
         found = verify(self.model_folder(entry.name), seen.rows, settings)
         p95 = found.comparison.models[-1].position.statistics["p95"]
         action = found.verdict in ("moved", "not_better", "implausible", "setup_fault")
@@ -278,7 +278,7 @@ class Cell:
             MeasurementError: there is no session to which the model was not fitted.
         """
         entry, _, seen = self._new_rows(None, None)
-        settings = seen.fitted(self.file.settings("evaluate", **changed))
+        settings = seen.settings_to_fit(self.file.settings("evaluate", **changed))
         return evaluate(self.model_folder(entry.name), seen.rows, settings)
 
     def recalibrate(

@@ -43,7 +43,7 @@ class ModelRows:
     rows: Measurements
     moved: tuple[str, ...]
 
-    def fitted(self, settings: Any) -> Any:
+    def settings_to_fit(self, settings: Any) -> Any:
         """Return settings that also fit a frame and tool that were changed; cameras are removed, as rows are read."""
         fit_frame, fit_tool = settings.fit_frame or self.fit_frame, settings.fit_tool or self.fit_tool
         return replace(settings, cameras=None, fit_frame=fit_frame, fit_tool=fit_tool)

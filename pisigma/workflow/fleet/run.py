@@ -187,7 +187,7 @@ def _prepare(folder: Path, source: Path, members: tuple[Member, ...]) -> None:
             raise OutputError(expected="a folder", at=Place(folder), remedy="choose another --out")
         if folder.is_dir() and any(folder.iterdir()) and not mark.is_file():
             raise OutputError(
-                expected="the folder of a fleet, or an empty one",
+                expected="the folder of a fleet, or an empty folder",
                 at=Place(folder),
                 remedy="choose another --out",
             )

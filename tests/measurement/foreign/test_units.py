@@ -7,9 +7,9 @@ from testing.refusals import refused
 
 from pisigma.files.errors import MeasurementError
 from pisigma.measurement.foreign.units import (
-    doubt,
     is_certain,
     parse_units,
+    reason_to_doubt,
     scaled,
     stated_units,
     unit_symbol,
@@ -77,12 +77,14 @@ def test_stated_units():
 
 
 def test_values_that_cannot_be_in_a_unit():
-    assert "degrees" in doubt("rad", 170.0, 20)
-    assert "radians" in doubt("deg", 3.1, 20)
-    assert "lengths" in doubt("deg", 2103.0, 20)
-    assert "millimetres" in doubt("m", 2103.0, 20)
-    assert "metres" in doubt("mm", 2.9, 20)
-    assert not any(doubt(*case, 20) for case in (("rad", 6.2), ("deg", 170.0), ("m", 2.9), ("mm", 2103.0)))
+    assert "degrees" in reason_to_doubt("rad", 170.0, 20)
+    assert "radians" in reason_to_doubt("deg", 3.1, 20)
+    assert "lengths" in reason_to_doubt("deg", 2103.0, 20)
+    assert "millimetres" in reason_to_doubt("m", 2103.0, 20)
+    assert "metres" in reason_to_doubt("mm", 2.9, 20)
+    assert not any(
+        reason_to_doubt(*case, 20) for case in (("rad", 6.2), ("deg", 170.0), ("m", 2.9), ("mm", 2103.0))
+    )
     assert is_certain("deg", 170.0)
     assert not is_certain("deg", math.pi)
     assert is_certain("mm", 2103.0)

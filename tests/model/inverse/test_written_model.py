@@ -196,7 +196,7 @@ def test_a_folder_predicts_the_same_as_the_model(
     assert differences(model, loaded) == []
     assert differences(parameter_posterior(model), parameter_posterior(loaded)) == []
     before, after = ModelPosterior.of(model), ModelPosterior.of(loaded)
-    assert torch.equal(after.usual_weights, before.usual_weights)
+    assert torch.equal(after.rms_weights, before.rms_weights)
     start = 0
     for one in before.features:
         count = int(one.used.sum())

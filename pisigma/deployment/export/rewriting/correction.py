@@ -71,7 +71,7 @@ class CorrectedProgram:
 
 
 @dataclass(frozen=True, eq=False)
-class Commanded:
+class CommandedPoses:
     """Poses to command for target poses.
 
     Attributes:
@@ -138,7 +138,7 @@ class ProgramCorrection:
 
     def commanded(
         self, targets: Sequence[Target], poses: Sequence[Float64[Tensor, "_poses 4 4"]]
-    ) -> list[Commanded]:
+    ) -> list[CommandedPoses]:
         """Compute the poses to command for target poses of each target's tool in its frame."""
         robot, counts = self.solver.model.robot, torch.tensor([len(T) for T in poses])
         base, tool = (
@@ -152,7 +152,7 @@ class ProgramCorrection:
         parts = (invert(before) @ drawn @ invert(after), solution.status, solution.branch)
         split = (part.split(counts.tolist()) for part in parts)
         return [
-            Commanded(T, tuple(Status(value) for value in status.tolist()), frozenset(branch.tolist()))
+            CommandedPoses(T, tuple(Status(value) for value in status.tolist()), frozenset(branch.tolist()))
             for T, status, branch in zip(*split, strict=True)
         ]
 
@@ -174,7 +174,7 @@ class ProgramCorrection:
         length = float(arc.angle * arc.radius.norm())
         return _round(start, via, end, _steps(start, end, length))[0]
 
-    def way_points(self, move: PathMove, there: Commanded) -> list[Frame] | str:
+    def way_points(self, move: PathMove, there: CommandedPoses) -> list[Frame] | str:
         """Return the way points of a move, see `PathMove.way_points`, or the reason why it is not split."""
         if not there.reached:
             return f"the {_kind(move)} has poses that are not reached, so it has no way points"
@@ -193,7 +193,7 @@ def _kind(move: PathMove) -> str:
 
 
 def _edits(
-    reached: Sequence[tuple[Pose, Commanded]], cuts: Sequence[tuple[PathMove, list[Frame]]]
+    reached: Sequence[tuple[Pose, CommandedPoses]], cuts: Sequence[tuple[PathMove, list[Frame]]]
 ) -> list[Edit]:
     """Return the edits of targets and way points; the last way point of an arc replaces its via point."""
     added = [edit for move, way in cuts for edit in move.way_points(way)]
