@@ -110,7 +110,7 @@ def test_sessions_recalibrate_or_are_monitored(plant):
 def test_outputs_that_are_not_a_fleets_are_refused(plant):
     (plant / "mine").mkdir()
     (plant / "mine" / "notes.txt").write_text("mine", encoding="utf-8")
-    with refused(OutputError, expected="the folder of a fleet, or an empty one", file=plant / "mine"):
+    with refused(OutputError, expected="the folder of a fleet, or an empty folder", file=plant / "mine"):
         run_fleet(plant / "fleet.csv", plant / "mine", SETTINGS)
     for out in (".", "fleet.csv"):
         with pytest.raises(OutputError):
