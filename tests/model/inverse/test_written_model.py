@@ -18,6 +18,7 @@ from testing.same_model import differences
 
 from pisigma.calibration.geometric.problem.parameters import ParameterSpace
 from pisigma.calibration.geometric.problem.setup import IdentifiedGeometry
+from pisigma.calibration.hybrid.noise import CalibrationNoise
 from pisigma.calibration.hybrid.uncertainty import PositionUncertainty
 from pisigma.estimation.covariance_root import CovarianceRoot
 from pisigma.files.errors import ModelError
@@ -167,7 +168,12 @@ def model_with(
         hybrid_bases=bases,
         hybrid_tools=tools,
         uncertainty=PositionUncertainty(
-            space, geometry, tuple(features), CovarianceRoot(root), 1.5, {"position": 1e-5}
+            space,
+            geometry,
+            tuple(features),
+            CovarianceRoot(root),
+            1.5,
+            CalibrationNoise({"position": 1e-5}, {"position": 2e-5}),
         ),
     )
 
