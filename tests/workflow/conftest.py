@@ -1,8 +1,18 @@
-"""Steps of the workflow write blank figures, as figures are tested in `reporting`."""
+"""Steps of the workflow write blank figures, as figures are tested in `reporting`, and check no types, as rooms do."""
+
+from collections.abc import Iterator
 
 import pytest
+from testing.models import no_type_checker
 
 
 @pytest.fixture(scope="module", autouse=True)
 def without_pictures(blank_pictures: None) -> None:
     """See `blank_pictures`."""
+
+
+@pytest.fixture(scope="module", autouse=True)
+def quick() -> Iterator[None]:
+    """Whole steps call most functions many times; their types are checked by the tests of their rooms."""
+    with no_type_checker():
+        yield

@@ -21,7 +21,7 @@ from pisigma.workflow.settings.calibration import CalibrationSettings
 
 
 @pytest.fixture(scope="module", autouse=True)
-def quick(blank_pictures):
+def quick_pictures(blank_pictures):
     with no_type_checker():
         yield
 
