@@ -130,13 +130,12 @@ def trained_run(name: str):
 
 @contextmanager
 def no_type_checker() -> Iterator[None]:
-    """Call pisigma without the type checker, like users do; blocks may be nested."""
-    before = jaxtyping.config.jaxtyping_disable
+    """Call pisigma without the type checker, like users do; leaving an inner block turns the checker on again."""
     jaxtyping.config.update("jaxtyping_disable", True)
     try:
         yield
     finally:
-        jaxtyping.config.update("jaxtyping_disable", before)
+        jaxtyping.config.update("jaxtyping_disable", False)
 
 
 def poses_around(name: str, *batch: int, seed: int = 3) -> torch.Tensor:
