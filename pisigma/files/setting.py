@@ -4,14 +4,18 @@ The type and the default of a setting are those of the field, its help is the at
 class, and an `Option` in the annotation states how the command line differs.
 """
 
+import functools
+import itertools
 import math
 import re
 import sys
 import types
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import MISSING, dataclass, fields, is_dataclass
 from pathlib import Path
 from typing import Annotated, Any, ForwardRef, Literal, Union, get_args, get_origin
+
+from pisigma.files.errors import PisigmaError
 
 UNITS = {"mm": ("m", 1e-3), "mrad": ("rad", 1e-3), "deg": ("rad", math.pi / 180.0), "ms": ("s", 1e-3)}
 """Units of the command line, with the unit of the setting and the conversion factor."""
@@ -94,6 +98,11 @@ class Setting:
         """Name of the option, such as "--prior-mm"."""
         return self.option.name or f"--{self.field.replace('_', '-')}"
 
+    @property
+    def key(self) -> str:
+        """Key in files: the option without leading dashes, such as "prior_mm"."""
+        return self.name.removeprefix("--").replace("-", "_")
+
     def read(self, stated: Any) -> Any:
         """Convert a command-line value to the setting."""
         if self.option.read is not None:
@@ -101,7 +110,8 @@ class Setting:
         return stated if self.option.unit is None else stated * UNITS[self.option.unit][1]
 
 
-def settings_of(group: type) -> list[Setting]:
+@functools.cache
+def settings_of(group: type) -> tuple[Setting, ...]:
     """Return the settings of a class that have command-line options.
 
     A setting whose type cannot be resolved, because it is imported for type checkers only, is read as text.
@@ -119,7 +129,46 @@ def settings_of(group: type) -> list[Setting]:
         kind = option.kind or _stated_as(kind)
         meaning = _help(meanings.get(one.name, ""), option, get_origin(kind) is list)
         found.append(Setting(one.name, kind, default, is_required, meaning, option))
-    return found
+    return tuple(found)
+
+
+@functools.cache
+def flat_settings(group: type) -> tuple[Setting, ...]:
+    """Return the settings of a class, including those of its fields that are classes of settings."""
+    parts = [flat_settings(one.kind) if one.is_group else (one,) for one in settings_of(group)]
+    return tuple(itertools.chain.from_iterable(parts))
+
+
+def build_settings(group: type, stated: Mapping[str, Any], is_optional: bool = False) -> Any:
+    """Make an instance of a class of settings.
+
+    Args:
+        group: class of the settings.
+        stated: values by `Setting.key`, as on a command line; other settings keep their defaults.
+        is_optional: return None if nothing is stated of the class.
+
+    Raises:
+        PisigmaError: some settings are stated that need others.
+    """
+    found: dict[str, Any] = {}
+    for setting in settings_of(group):
+        if setting.is_group:
+            if (built := build_settings(setting.kind, stated, is_optional=True)) is not None:
+                found[setting.field] = built
+        elif setting.key in stated:
+            value = stated[setting.key]
+            found[setting.field] = setting.read(tuple(value) if isinstance(value, list) else value)
+    if is_optional and not found:
+        return None
+    needed = [one for one in settings_of(group) if one.is_required]
+    missing = [one for one in needed if one.field not in found]
+    names = " and ".join(one.name for one in needed)
+    if missing == needed != []:
+        given = ", ".join(one.name for one in flat_settings(group) if one.key in stated)
+        raise PisigmaError(f"needs {names}", option=given, expected=names)
+    if missing:
+        raise PisigmaError(expected=f"{names} together", option=missing[0].name, remedy="give both")
+    return group(**found)
 
 
 def attributes_of(documented: type) -> dict[str, str]:

@@ -1,7 +1,5 @@
 """`cell.yaml`: robot, sensor and limit of a cell, and the settings of every step, as on the command line."""
 
-import functools
-import itertools
 import os
 import textwrap
 from collections.abc import Collection, Iterator, Mapping
@@ -13,7 +11,7 @@ import yaml
 from pydantic import Field, TypeAdapter, ValidationError
 
 from pisigma.files.errors import PisigmaError, Place, PlanningError, nearest_choice
-from pisigma.files.setting import Setting, settings_of
+from pisigma.files.setting import build_settings, flat_settings
 from pisigma.files.yaml_file import Section, place_of_key, read_yaml
 from pisigma.lifetime.cell.layout import CELL_FILE
 from pisigma.planning.plan_settings import PlanSettings
@@ -40,8 +38,8 @@ STEPS: dict[str, type] = {
 }
 """Class of the settings of every step, by its section of `cell.yaml`, which has the name of the command."""
 CAMERA_KEYS = ("camera", "board", "fixed_camera", "intrinsics", "repeatability_mm", "repeatability_deg")
-SHARED_KEYS = (*CAMERA_KEYS, "limit_mm")
-"""Keys that are stated once and apply to all steps."""
+STATED_ABOVE = {"plan": ("limit_mm", "sensor")}
+"""Keys of a step whose values are those of the cell, in addition to `CAMERA_KEYS`."""
 MAX_WIDTH = 100
 
 SensorName = Literal["tracker", "camera", "sockets", "draw-wire", "touch"]
@@ -148,9 +146,11 @@ class CellFile:
     def stated(self, step: str) -> dict[str, Any]:
         """Return the values that the file states for a step, by its keys, including the shared keys that it uses."""
         section = dict(getattr(self.document, {"import": "import_"}.get(step, step)) or {})
-        known = {key_of(one) for one in flat_settings(STEPS[step])}
+        known = {one.key for one in flat_settings(STEPS[step])}
         shared: dict[str, Any] = {}
-        if self.document.limit_mm is not None:
+        if (
+            self.document.limit_mm is not None and step == "plan"
+        ):  # the limit of `monitor` is of the RMS error
             shared["limit_mm"] = self.document.limit_mm
         sensor = PLANNED_SENSORS.get(self.document.sensor, "position")
         if self.document.camera is not None and (step != "plan" or sensor == "camera"):
@@ -188,23 +188,6 @@ class _Places:
         return place_of_key(self.path, (self.step, key) if key else (self.step,))
 
 
-def key_of(setting: Setting) -> str:
-    """Return the key of a setting in `cell.yaml`: its option without leading dashes, such as "prior_mm"."""
-    return setting.name.removeprefix("--").replace("-", "_")
-
-
-@functools.cache
-def _settings(group: type) -> tuple[Setting, ...]:
-    return tuple(settings_of(group))
-
-
-@functools.cache
-def flat_settings(group: type) -> tuple[Setting, ...]:
-    """Return the settings of a class, including those of its fields that are classes of settings."""
-    parts = [flat_settings(one.kind) if one.is_group else (one,) for one in _settings(group)]
-    return tuple(itertools.chain.from_iterable(parts))
-
-
 def settings_from(
     group: type[Group],
     stated: Mapping[str, Any],
@@ -226,7 +209,7 @@ def settings_from(
     """
     values = dict(_checked(group, stated, places))
     try:
-        built = _built(group, values, folder, outside, is_optional=False)
+        built = build_settings(group, dict(_with_paths(group, values, folder, outside)))
     except PisigmaError as problem:  # the class of the settings refuses a value
         key = problem.option.removeprefix("--").replace("-", "_")
         raise (
@@ -242,7 +225,7 @@ _TYPES = {bool: "true or false", int: "an integer", float: "a number", str: "a t
 
 def _checked(group: type, stated: Mapping[str, Any], places: _Places) -> Iterator[tuple[str, Any]]:
     """Yield keys and values, after converting every value to the type of its option."""
-    known = {key_of(one): one for one in flat_settings(group)}
+    known = {one.key: one for one in flat_settings(group)}
     for key, value in stated.items():
         if key not in known:
             raise PlanningError(f"unknown key '{key}'", at=places.of(key), remedy=nearest_choice(key, known))
@@ -261,24 +244,18 @@ def _listed(value: Any, kind: Any) -> Any:
     return [value] if is_repeated and not is_list else value
 
 
-def _built(
-    group: type, values: Mapping[str, Any], folder: Path, outside: Collection[str], is_optional: bool
-) -> Any:
-    found: dict[str, Any] = {}
-    for setting in _settings(group):
-        if setting.is_group:
-            if (built := _built(setting.kind, values, folder, outside, is_optional=True)) is not None:
-                found[setting.field] = built
-        elif key_of(setting) in values:
-            value = values[key_of(setting)]
-            is_inside = key_of(setting) not in outside
-            if setting.kind is Path and is_inside:
-                value = inside(folder, value)
-            elif isinstance(value, list):
-                are_paths = is_inside and get_args(setting.kind) == (Path,)
-                value = tuple(inside(folder, one) for one in value) if are_paths else tuple(value)
-            found[setting.field] = setting.read(value)
-    return None if is_optional and not found else group(**found)
+def _with_paths(
+    group: type, values: Mapping[str, Any], folder: Path, outside: Collection[str]
+) -> Iterator[tuple[str, Any]]:
+    """Yield keys and values, with the full paths of files inside the cell."""
+    kinds = {one.key: one.kind for one in flat_settings(group)}
+    for key, value in values.items():
+        if key not in outside and kinds[key] is Path:
+            yield key, inside(folder, value)
+        elif key not in outside and get_args(kinds[key]) == (Path,):
+            yield key, [inside(folder, one) for one in value]
+        else:
+            yield key, value
 
 
 def inside(folder: Path, path: str | os.PathLike[str]) -> Path:
@@ -323,8 +300,8 @@ def template(document: Mapping[str, Any]) -> str:
     for step, group in STEPS.items():
         lines += ["", f"{step}:  # options of `pisigma {step}`"]
         for setting in flat_settings(group):
-            key = key_of(setting)
-            if key in SHARED_KEYS or (step == "plan" and key == "sensor"):
+            key = setting.key
+            if key in (*CAMERA_KEYS, *STATED_ABOVE.get(step, ())):
                 continue
             lines += textwrap.wrap(setting.help, MAX_WIDTH, initial_indent="  # ", subsequent_indent="  # ")
             lines.append(f"  # {key}: {_yaml(setting.default)}".rstrip())

@@ -4,13 +4,13 @@ import pytest
 from testing.refusals import refused
 
 from pisigma.files.errors import PisigmaError, PlanningError
+from pisigma.files.setting import flat_settings
 from pisigma.lifetime.cell.layout import CELL_FILE
 from pisigma.workflow.cell.cell_file import (
     CAMERA_KEYS,
+    STATED_ABOVE,
     STEPS,
     CellFile,
-    flat_settings,
-    key_of,
     template,
 )
 from pisigma.workflow.settings.calibration import CalibrationSettings
@@ -29,8 +29,8 @@ def test_a_new_file_states_every_setting_as_a_comment_and_gives_the_defaults(tmp
     for step, group in STEPS.items():
         section = text.partition(f"\n{step}:")[2].partition("\n\n")[0]
         for setting in flat_settings(group):
-            if key_of(setting) not in (*CAMERA_KEYS, "limit_mm", "sensor"):
-                assert f"\n  # {key_of(setting)}:" in section, (step, key_of(setting))
+            if setting.key not in (*CAMERA_KEYS, *STATED_ABOVE.get(step, ())):
+                assert f"\n  # {setting.key}:" in section, (step, setting.key)
     assert file.settings("calibrate") == CalibrationSettings()
     assert file.settings("recalibrate") == RecalibrationSettings()
 
@@ -49,9 +49,13 @@ def test_values_have_the_units_and_forms_of_the_command_line(tmp_path):
 
 def test_what_is_stated_once_counts_for_every_step_and_a_step_may_state_another(tmp_path):
     file = cell_file(tmp_path, "robot: ur10\nlimit_mm: 0.3\nplan:\n  limit_mm: 0.5\n")
-    assert file.settings("monitor").limit_mm == 0.3
     assert file.settings("plan").limit_mm == 0.5
-    assert file.settings("monitor", limit_mm=0.4).limit_mm == 0.4
+    assert file.settings("plan", limit_mm=0.4).limit_mm == 0.4
+    assert cell_file(tmp_path, "robot: ur10\nlimit_mm: 0.3\n").settings("plan").limit_mm == 0.3
+
+
+def test_the_limit_of_95_percent_is_not_taken_for_one_of_the_rms(tmp_path):
+    assert cell_file(tmp_path, "robot: ur10\nlimit_mm: 0.3\n").settings("monitor").limit_mm is None
 
 
 def test_a_camera_is_stated_once_with_paths_inside_the_cell(tmp_path):
