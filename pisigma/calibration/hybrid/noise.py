@@ -8,9 +8,7 @@ from pisigma.files.errors import MeasurementError
 from pisigma.measurement.sensors.sensor import AbstractSensor
 
 MAX_ABSOLUTE = 0.01
-"""[m or rad] No instrument scatters more: a larger value is no standard deviation by itself."""
-MIN_FACTOR = 0.5
-"""Stated standard deviations are never that far too large: a smaller value is no factor on them."""
+"""[m or rad] In folders of earlier versions a larger noise is a factor on stated standard deviations."""
 
 
 @dataclass(frozen=True)
@@ -20,28 +18,30 @@ class CalibrationNoise:
     Attributes:
         value: by sensor, the standard deviation of its readings [m or rad]; a factor on the stated ones where the rows
             state them.
-        stated: by sensor whose rows state them, the median of the stated standard deviations [m or rad]. Folders of
-            earlier versions have none.
+        stated: by sensor whose rows state them, the median of the stated standard deviations [m or rad]; None for
+            folders of earlier versions, which do not say.
     """
 
     value: Mapping[str, float] = field(default_factory=dict)
-    stated: Mapping[str, float] = field(default_factory=dict)
+    stated: Mapping[str, float] | None = field(default_factory=dict)
 
     def is_factor(self, name: str) -> bool:
         """Return whether the value of a sensor is a factor on stated standard deviations."""
-        return name in self.stated or self.value[name] >= MIN_FACTOR
+        return self.value[name] > MAX_ABSOLUTE if self.stated is None else name in self.stated
 
     def absolute(self, name: str) -> float:
         """Return the standard deviation of a sensor [m or rad]; NaN where it is not known."""
-        value = self.value.get(name, math.nan)
-        if name in self.stated:
-            return value * self.stated[name]
-        return value if value <= MAX_ABSOLUTE else math.nan
+        if name not in self.value or not self.is_factor(name):
+            return self.value.get(name, math.nan)
+        return math.nan if self.stated is None else self.value[name] * self.stated[name]
 
     def updated(self, other: "CalibrationNoise") -> "CalibrationNoise":
         """Return the noise with that of the sensors of other rows replaced."""
-        kept = {name: sigma for name, sigma in self.stated.items() if name not in other.value}
-        return CalibrationNoise({**self.value, **other.value}, kept | dict(other.stated))
+        value = {**self.value, **other.value}
+        if self.stated is None and value.keys() != other.value.keys():  # not known of the sensors that stay
+            return CalibrationNoise(value, None)
+        kept = {name: sigma for name, sigma in (self.stated or {}).items() if name not in other.value}
+        return CalibrationNoise(value, kept | dict(other.stated or {}))
 
     def usual(self, sensor: AbstractSensor) -> float | None:
         """Return the noise of earlier rows of a sensor, in the form of its new rows; None for a new sensor.
@@ -64,7 +64,7 @@ class CalibrationNoise:
                     remedy="add the column (such as sigma_mm), or calibrate again with this version",
                 )
             return usual
-        if sensor.sigma is not None and not self.is_factor(name) and self.value[name] <= MAX_ABSOLUTE:
+        if sensor.sigma is not None and not self.is_factor(name):
             # a calibration never takes stated standard deviations for too large
             return max(self.value[name] / median_sigma(sensor), 1.0)
         return self.value[name]

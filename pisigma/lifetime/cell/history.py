@@ -115,7 +115,7 @@ class Check:
         verdict: verdict in one word; the result class of the command lists them.
         summary: verdict in one sentence.
         p95_mm: 95 % quantile of the position errors [mm]; None if it is unknown.
-        action: whether the user has to do something.
+        recalibrate: whether recalibrating with the session is due.
         checked: time of the check (ISO 8601, UTC).
     """
 
@@ -125,7 +125,7 @@ class Check:
     verdict: str
     summary: str
     p95_mm: float | None
-    action: bool
+    recalibrate: bool
     checked: str
 
 

@@ -13,6 +13,9 @@ MAX_DAYS_UNVERIFIED = 92
 VERIFICATION_POSES = 10
 """Number of poses of a session for verification or monitoring."""
 
+NOT_TRUSTED = ("implausible", "setup_fault")
+"""Verdicts of `verify` and `monitor` after which nothing is concluded from a session."""
+
 State = Literal[
     "edited_session",
     "no_plan",
@@ -22,6 +25,7 @@ State = Literal[
     "not_verified",
     "verification_failed",
     "session_not_judged",
+    "session_not_trusted",
     "moved",
     "outside_limit",
     "better_model",
@@ -199,13 +203,24 @@ def _session_not_judged(facts: CellFacts) -> Step | None:
     )
 
 
-def _moved(facts: CellFacts) -> Step | None:
+def _last_verdict(facts: CellFacts) -> Step | None:
+    """Return the step that follows from the last session that was compared with the model in use."""
     model = facts.in_use
     assert model is not None
-    verdicts = facts.checks_of(model.name, "verify", "monitor")
-    if not verdicts or not verdicts[-1].action:
+    aside = {one.name for one in facts.sessions if one.set_aside}
+    checks = [one for one in facts.checks_of(model.name, "verify", "monitor") if one.session not in aside]
+    if not checks:
         return None
-    return Step("moved", verdicts[-1].summary, facts.command("recalibrate"))
+    last = checks[-1]
+    if last.verdict in NOT_TRUSTED:
+        return Step(
+            "session_not_trusted",
+            f"nothing can be concluded from session '{last.session}': {last.summary}",
+            facts.command("session", last.session, "--set-aside", last.verdict),
+        )
+    if last.verdict == "not_better":
+        return Step("verification_failed", last.summary, facts.command("calibrate"))
+    return Step("moved", last.summary, facts.command("recalibrate")) if last.recalibrate else None
 
 
 def _better_model(facts: CellFacts) -> Step | None:
@@ -229,8 +244,15 @@ def _outside_limit(facts: CellFacts) -> Step | None:
     assert model is not None
     found = [one.p95_mm for one in facts.checks_of(model.name, "verify") if one.p95_mm is not None]
     p95 = found[-1] if found else model.p95_mm
-    if limit is None or p95 is None or p95 <= limit:
+    if limit is None or (p95 is not None and p95 <= limit):
         return None
+    if p95 is None:
+        return Step(
+            "verification_due",
+            f"it is not known whether model '{model.name}' meets the limit of {limit:g} mm; measure "
+            f"{VERIFICATION_POSES} poses, import them, and run `{facts.command('verify')}`",
+            facts.command("plan", "--count", str(VERIFICATION_POSES), "--check", "0"),
+        )
     return Step(
         "outside_limit",
         f"the 95 % quantile of the position errors is {p95:.3f} mm, above the limit of {limit:g} mm; more poses reduce "
@@ -256,7 +278,7 @@ def _verification_due(facts: CellFacts) -> Step | None:
 
 def _up_to_date(facts: CellFacts) -> Step:
     assert facts.in_use is not None
-    return Step("up_to_date", f"model '{facts.in_use.name}' is in use, and all checks have passed")
+    return Step("up_to_date", f"model '{facts.in_use.name}' is in use, and no rule asks for more")
 
 
 RULES: tuple[Callable[[CellFacts], Step | None], ...] = (
@@ -265,7 +287,7 @@ RULES: tuple[Callable[[CellFacts], Step | None], ...] = (
     _not_calibrated,
     _not_verified,
     _session_not_judged,
-    _moved,
+    _last_verdict,
     _better_model,
     _outside_limit,
     _verification_due,

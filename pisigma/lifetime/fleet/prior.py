@@ -216,10 +216,10 @@ def _medians(noises: Sequence[CalibrationNoise]) -> CalibrationNoise:
     value, stated = dict[str, float](), dict[str, float]()
     for name in dict.fromkeys(name for noise in noises for name in noise.value):
         of_sensor = [noise for noise in noises if name in noise.value]
-        stating = [noise for noise in of_sensor if name in noise.stated]
+        stating = [noise for noise in of_sensor if noise.is_factor(name)]
         value[name] = float(np.median([noise.value[name] for noise in stating or of_sensor]))
         if stating:
-            stated[name] = float(np.median([noise.stated[name] for noise in stating]))
+            stated[name] = float(np.median([noise.absolute(name) / noise.value[name] for noise in stating]))
     return CalibrationNoise(value, stated)
 
 

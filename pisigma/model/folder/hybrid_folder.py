@@ -69,7 +69,7 @@ def hybrid_sections(model: CalibratedModel) -> dict[str, Any]:
             "features": [chosen.name for chosen in known.features],
             "prior_scale": known.prior_scale,
             "noise": dict(known.noise.value),
-            "stated_noise": dict(known.noise.stated),
+            "stated_noise": None if known.noise.stated is None else dict(known.noise.stated),
         }
     return result
 

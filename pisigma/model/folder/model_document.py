@@ -103,7 +103,7 @@ class UncertaintySection(Section):
     features: Annotated[tuple[str, ...], Field(max_length=MAX_UNITS)]
     prior_scale: Annotated[float, Field(gt=0)]
     noise: dict[str, Annotated[FiniteFloat, Field(gt=0)]] = Field(default_factory=dict)
-    stated_noise: dict[str, Annotated[FiniteFloat, Field(gt=0)]] = Field(default_factory=dict)
+    stated_noise: dict[str, Annotated[FiniteFloat, Field(gt=0)]] | None = None
 
 
 class ProvenanceSection(Section):

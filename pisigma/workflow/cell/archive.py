@@ -3,6 +3,7 @@
 import os
 import stat
 import zipfile
+import zlib
 from pathlib import Path, PurePosixPath
 
 from pisigma.files.errors import MeasurementError, OutputError, Place, PlanningError
@@ -80,7 +81,7 @@ def unpack(path: str | os.PathLike[str], folder: str | os.PathLike[str]) -> Cell
             Cell.open(scratch)
             scratch.chmod(0o755)
             os.replace(scratch, target)
-    except (zipfile.BadZipFile, NotImplementedError, EOFError) as problem:
+    except (zipfile.BadZipFile, zlib.error, RuntimeError, EOFError) as problem:  # damaged or encrypted
         raise PlanningError(f"the file is not a packed cell: {problem}", at=Place(path)) from None
     except FileNotFoundError:
         raise PlanningError("there is no such file", at=Place(path)) from None
@@ -102,6 +103,8 @@ def _check_members(archive: zipfile.ZipFile, path: str | os.PathLike[str]) -> No
         )
     for one in archive.infolist():
         inside = PurePosixPath(one.filename)
+        if one.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+            raise PlanningError(expected="deflated files", value=one.filename, at=Place(path))
         leads_out = (
             inside.is_absolute() or ".." in inside.parts or "\\" in one.filename or ":" in one.filename
         )

@@ -195,7 +195,7 @@ class Cell:
         )
         doubt = "" if result.trusted else result.diagnostics[0].sentence
         if doubt and not accept_implausible:
-            self.history.add(Check("calibrate", "", "", "not_trusted", doubt, None, True, now()))
+            self.history.add(Check("calibrate", "", "", "not_trusted", doubt, None, False, now()))
             return result, None
         path = free_path(self.folder / MODELS, datetime.date.today().isoformat(), "")
         result.save(path, accept_implausible=accept_implausible)
@@ -229,9 +229,9 @@ class Cell:
         settings = seen.settings_to_fit(self.file.settings("verify", **changed))
         found = verify(self.model_folder(entry.name), seen.rows, settings)
         p95 = found.comparison.models[-1].position.statistics["p95"]
-        action = found.verdict in ("moved", "not_better", "implausible", "setup_fault")
+        moved = found.verdict == "moved"
         self.history.add(
-            Check("verify", entry.name, chosen.name, found.verdict, found.sentence, p95, action, now())
+            Check("verify", entry.name, chosen.name, found.verdict, found.sentence, p95, moved, now())
         )
         in_use = self.history.in_use
         if found.accepted and (in_use is None or in_use.made < entry.made):
@@ -316,6 +316,7 @@ class Cell:
         entry = replace(
             self._entry(path, [chosen], remark, None),
             sessions=",".join((*parent.sessions.split(","), chosen.name)),
+            day=max(parent.day, chosen.day),
             frame_day=parent.frame_day,
             target_day=parent.target_day,
             parent=parent.name,

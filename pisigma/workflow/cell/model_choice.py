@@ -102,7 +102,7 @@ def check_of(found: Monitoring, entry: ModelEntry, session: SessionEntry) -> Che
     """Return the history entry of a session's monitoring result."""
     if found.untrusted:
         summary = found.untrusted[0].sentence
-        return Check("monitor", entry.name, session.name, "implausible", summary, None, True, now())
+        return Check("monitor", entry.name, session.name, "implausible", summary, None, False, now())
     judged = found.sessions[-1].session
     return Check(
         "monitor", entry.name, session.name, judged.verdict, judged.sentence, None, judged.recalibrate, now()

@@ -1,5 +1,6 @@
 """Write the folder of a new cell."""
 
+import math
 import shutil
 from pathlib import Path
 from typing import Any
@@ -49,12 +50,25 @@ def write_new_cell(
 
 
 def _copied(cameras: CameraFiles, folder: Path) -> dict[str, Any]:
-    """Copy the files of cameras and boards into the cell; return the section `camera`."""
+    """Copy the files of cameras and boards into the cell; return the section `camera`.
+
+    Raises:
+        OutputError: two files have the same name, or that of another file of the cell.
+    """
     for path in cameras.files:
+        if (folder / Path(path).name).exists() or Path(path).name == CELL_FILE:
+            raise OutputError(
+                "expected different names of the files of a cell",
+                value=Path(path).name,
+                at=Place(path),
+                remedy="rename one of them",
+            )
         shutil.copyfile(path, folder / Path(path).name)
     return {
         "camera": [Path(one).name for one in cameras.cameras],
         "board": [Path(one).name for one in cameras.boards],
         "fixed_camera": cameras.is_fixed,
         "intrinsics": cameras.intrinsics,
+        "repeatability_mm": cameras.repeatability.length * 1e3,
+        "repeatability_deg": math.degrees(cameras.repeatability.angle),
     }

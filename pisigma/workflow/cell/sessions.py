@@ -95,6 +95,13 @@ class Sessions:
             AcceptanceError: the rows must not be trusted.
         """
         rows = read_rows(file, self.robot, self.cameras)
+        if day and rows.date is not None and all(rows.date) and day != _day_of(rows):
+            raise MeasurementError(
+                expected=f"the first day of the rows, {_day_of(rows)}",
+                value=day,
+                option="--date",
+                remedy="omit it",
+            )
         day = day or _day_of(rows)
         if not is_date(day):
             raise MeasurementError(expected=EXPECTED_DATE, value=day, option="--date")
@@ -237,7 +244,17 @@ class Sessions:
                 remedy=f"restore the measured file, or set the session aside (pisigma session {self.folder.parent} "
                 f"{session.name} --set-aside REASON)",
             )
-        return read_rows(path, self.robot, self.cameras)
+        rows = read_rows(path, self.robot, self.cameras)
+        last = max(rows.date or (session.day,))
+        if spanned := [one for one in self.history.events() if session.day < one.day <= last]:
+            raise MeasurementError(
+                f"rows of session '{session.name}' were measured before and after the event '{spanned[0].kind}' of "
+                f"{spanned[0].day}",
+                value=spanned[0].kind,
+                at=Place(path),
+                remedy="set the session aside, and import its rows as one session before and one after the event",
+            )
+        return rows
 
     def rows_for(self, model: ModelEntry, rows: Measurements, day: str) -> ModelRows:
         """Return rows with the names of a model's frame and target, and what was moved since the model.

@@ -17,8 +17,10 @@ def model(name, sessions, day="2026-01-10", **changed):
     return ModelEntry(name, "hash", f"{day}T12:00:00+00:00", sessions, day, **changed)
 
 
-def check(command, of, session="", verdict="better", action=False, p95=0.1, at="2026-02-10T10:00:00+00:00"):
-    return Check(command, of, session, verdict, f"{verdict} was found", p95, action, at)
+def check(
+    command, of, session="", verdict="better", recalibrate=False, p95=0.1, at="2026-02-10T10:00:00+00:00"
+):
+    return Check(command, of, session, verdict, f"{verdict} was found", p95, recalibrate, at)
 
 
 FIRST, SECOND = session("2026-01-10"), session("2026-02-10", rows=10)
@@ -45,15 +47,20 @@ CASES = {
     ),
     "not_verified": (MEASURED_AGAIN, "verify"),
     "verification_failed": (
-        replace(MEASURED_AGAIN, checks=(check("verify", "a", "2026-02-10", "not_better", True),)),
+        replace(MEASURED_AGAIN, checks=(check("verify", "a", "2026-02-10", "not_better"),)),
         "calibrate",
     ),
     "session_not_judged": (MONITORED, "monitor"),
     "moved": (
         replace(
-            MONITORED, checks=(*VERIFIED.checks, check("monitor", "a", "2026-03-10", "moved", action=True))
+            MONITORED,
+            checks=(*VERIFIED.checks, check("monitor", "a", "2026-03-10", "moved", recalibrate=True)),
         ),
         "recalibrate",
+    ),
+    "session_not_trusted": (
+        replace(MONITORED, checks=(*VERIFIED.checks, check("monitor", "a", "2026-03-10", "implausible"))),
+        "session",
     ),
     "better_model": (
         replace(
@@ -121,3 +128,24 @@ def test_verification_is_due_after_a_quarter(days, state):
 
     today = datetime.date(2026, 2, 10) + datetime.timedelta(days=MAX_DAYS_UNVERIFIED + days)
     assert next_step(replace(VERIFIED, today=today.isoformat())).state == state
+
+
+def test_a_session_that_cannot_be_trusted_is_not_recalibrated_with():
+    for verdict in ("implausible", "setup_fault"):
+        checks = (*VERIFIED.checks, check("verify", "a", "2026-03-10", verdict, recalibrate=False))
+        facts = replace(MONITORED, checks=checks)
+        assert next_step(facts).state == "session_not_trusted"
+        aside = (FIRST, SECOND, replace(THIRD, set_aside=verdict))
+        assert next_step(replace(facts, sessions=aside)).state == "up_to_date"
+
+
+def test_a_model_that_new_rows_do_not_confirm_is_calibrated_again():
+    checks = (*VERIFIED.checks, check("verify", "a", "2026-03-10", "not_better"))
+    assert next_step(replace(MONITORED, checks=checks)).state == "verification_failed"
+
+
+def test_a_limit_that_no_rows_have_confirmed_is_verified():
+    recalibrated = model("b", "2026-01-10,2026-02-10", day="2026-02-10", parent="a")
+    facts = replace(VERIFIED, models=(MODEL, recalibrated), in_use=recalibrated)
+    assert next_step(facts).state == "verification_due"
+    assert next_step(replace(facts, limit_mm=None)).state == "up_to_date"

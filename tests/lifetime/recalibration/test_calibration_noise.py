@@ -1,5 +1,6 @@
 """Rows that state their standard deviations, and those that do not, mean the same to every model."""
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -45,7 +46,7 @@ def as_written_before(model, folder):
     assert "stated_noise" in path.read_text()
     loaded = load_model(folder)
     assert loaded.uncertainty.noise == model.uncertainty.noise
-    older = replace(loaded.uncertainty, noise=CalibrationNoise(loaded.uncertainty.noise.value))
+    older = replace(loaded.uncertainty, noise=CalibrationNoise(loaded.uncertainty.noise.value, None))
     return replace(loaded, uncertainty=older)
 
 
@@ -110,3 +111,25 @@ def test_an_older_folder_with_a_standard_deviation_takes_rows_of_both_kinds(mode
         with no_type_checker():
             session = monitor(older, [rows], MonitorSettings(history=False)).sessions[-1].session
         assert [one.what for one in session.moved] == ["joint 3"]
+
+
+@pytest.mark.parametrize("value", [0.02, 0.3, 1.0, 4.0])
+def test_no_factor_is_taken_for_metres(value):
+    older = CalibrationNoise({"position": value}, None)
+    assert older.is_factor("position")
+    assert math.isnan(older.absolute("position"))
+
+
+def test_a_coarse_instrument_of_a_new_folder_has_its_own_standard_deviation():
+    noise = CalibrationNoise({"position": 0.02})
+    assert not noise.is_factor("position")
+    assert noise.absolute("position") == 0.02
+
+
+def test_other_rows_replace_the_noise_of_their_sensors_only():
+    before = CalibrationNoise({"position": 1.0, "rotation": 2.0}, {"position": 3e-5, "rotation": 1e-4})
+    after = before.updated(CalibrationNoise({"position": 4e-5}))
+    assert after == CalibrationNoise({"position": 4e-5, "rotation": 2.0}, {"rotation": 1e-4})
+    older = CalibrationNoise({"position": 1.0, "rotation": 2.0}, None)
+    assert older.updated(CalibrationNoise({"position": 4e-5})).stated is None
+    assert older.updated(CalibrationNoise({"position": 4e-5, "rotation": 1e-4})).stated == {}

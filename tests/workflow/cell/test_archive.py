@@ -97,3 +97,14 @@ def test_a_cell_with_an_edited_session_is_not_packed(cell, tmp_path, repository)
     cell.history.add(SessionEntry("gone", "abc", "2026-01-11T00:00:00+00:00", "2026-01-11", 5, "position"))
     with refused(MeasurementError):
         pack(cell, tmp_path / "cell.zip")
+
+
+def test_a_damaged_file_is_refused_and_nothing_is_written(cell, tmp_path):
+    pack(cell, tmp_path / "cell.zip")
+    content = bytearray((tmp_path / "cell.zip").read_bytes())
+    for place in range(60, len(content) // 2, 97):
+        content[place] ^= 0xFF
+    (tmp_path / "cell.zip").write_bytes(content)
+    with refused(PlanningError, file="cell.zip"):
+        unpack(tmp_path / "cell.zip", tmp_path / "other")
+    assert not (tmp_path / "other").exists()

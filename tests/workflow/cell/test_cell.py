@@ -12,6 +12,7 @@ from testing.simulated_arm import BASE
 
 import pisigma
 from pisigma.files.errors import AcceptanceError, MeasurementError, ModelError, OutputError
+from pisigma.measurement.camera.camera_files import CameraFiles, Repeatability
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.folder.model_folder import load_model
 from pisigma.workflow.calibrate import calibrate
@@ -78,7 +79,7 @@ def test_a_move_is_found_and_recalibrated(year):
     assert result.trusted
     assert cell.history.in_use == entry
     assert entry.parent == cell.history.models()[0].name
-    assert cell.status().step.state == "up_to_date"
+    assert cell.status().step.state == "verification_due"  # the limit is not confirmed yet
     cell.use(entry.parent, "try")
     assert cell.history.in_use.name == entry.parent
     cell.use(entry.name, "back")
@@ -222,3 +223,43 @@ def test_a_session_never_replaces_a_file_that_appeared_meanwhile(tmp_path, monke
     assert path.read_bytes() == b"rows"
     assert (tmp_path / "2026-01-10.csv").read_text() == "another process"
     assert sorted(one.name for one in tmp_path.iterdir()) == ["2026-01-10-2.csv", "2026-01-10.csv"]
+
+
+def test_rows_before_and_after_an_event_in_one_file_are_refused(tmp_path):
+    cell = Cell.create(tmp_path / "cell", "ur10")
+    days = ("2026-01-10",) * 15 + ("2026-01-12",) * 15
+    cell.take_in(dataclasses.replace(measured(30, 1), date=days))
+    cell.history.record("instrument", "2026-01-11")
+    with refused(MeasurementError, value="instrument"):
+        cell.calibrate(model="geometric", folds=0)
+    with refused(MeasurementError, option="--date", value="2026-01-12"):
+        cell.take_in(dataclasses.replace(measured(30, 2), date=days), day="2026-01-12")
+
+
+def test_a_recalibration_with_an_older_session_keeps_the_day_of_the_model(year):
+    cell, *_ = year
+    entry = cell.history.models()[-1]
+    assert entry.day == max(
+        one.day for one in cell.history.sessions() if one.name in entry.sessions.split(",")
+    )
+
+
+def test_cameras_are_copied_whole_and_never_over_another_file(tmp_path):
+    for folder in ("left", "right"):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "camera.yaml").write_text(folder)
+    (tmp_path / "board.yaml").write_text("board")
+    left, right, board = (
+        str(tmp_path / name) for name in ("left/camera.yaml", "right/camera.yaml", "board.yaml")
+    )
+    repeatability = Repeatability(5e-5, 1e-3)
+    cell = Cell.create(
+        tmp_path / "one",
+        "ur10",
+        "camera",
+        cameras=CameraFiles((left,), (board,), repeatability=repeatability),
+    )
+    assert cell.cameras.repeatability.length == pytest.approx(5e-5)
+    assert cell.cameras.repeatability.angle == pytest.approx(1e-3)
+    with refused(OutputError, value="camera.yaml"):
+        Cell.create(tmp_path / "two", "ur10", "camera", cameras=CameraFiles((left, right), (board,)))

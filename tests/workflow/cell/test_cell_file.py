@@ -103,3 +103,8 @@ def test_a_robot_outside_the_cell_is_refused(tmp_path, robot):
     file = cell_file(tmp_path, f"robot: {robot}\n")
     with refused(PlanningError, file=CELL_FILE, value=robot):
         _ = file.robot
+
+
+def test_a_setting_that_needs_another_is_refused_with_its_step(tmp_path):
+    with refused(PisigmaError, file=CELL_FILE, option="--board", expected="--camera and --board together"):
+        cell_file(tmp_path, "robot: ur10\ncalibrate:\n  camera: [a.yaml]\n")
