@@ -100,7 +100,7 @@ def error(solved: SolvedCalibration, refined: Refined, rows: Measurements) -> fl
     with torch.no_grad():
         moved = replace(rows, q=rows.q + refined.correction.of_rows(rows))
     T: Tensor = predicted_poses(geometry.robot, geometry.bases, geometry.tools, moved)
-    measured = MeasuredPoses.of(rows.position, rows.rotation, LEVER_SHARE * geometry.robot.reach)
+    measured = MeasuredPoses.from_tensors(rows.position, rows.rotation, LEVER_SHARE * geometry.robot.reach)
     T, _ = fit_frames(T, measured, rows, ("base", "tool"))
     assert rows.position is not None
     return float((rows.position - T[:, :3, 3]).square().sum(1).mean().sqrt() * 1e3)

@@ -54,7 +54,9 @@ def calibrate_scipy(nominal: Robot, q: np.ndarray, p: np.ndarray) -> Callable[[n
 
     def predict_with(x: np.ndarray, joints: np.ndarray) -> np.ndarray:
         robot = nominal.with_geometry(x[:30].reshape(6, 5), x[30:36], np.concatenate([x[36:], np.zeros(3)]))
-        return forward_kinematics(robot, torch.from_numpy(joints), Geometry.of(robot))[:, :3, 3].numpy()
+        return forward_kinematics(robot, torch.from_numpy(joints), Geometry.from_robot(robot))[
+            :, :3, 3
+        ].numpy()
 
     found = least_squares(lambda x: (predict_with(x, q) - p).ravel(), start, x_scale="jac", method="trf")
     return lambda joints: predict_with(found.x, joints)

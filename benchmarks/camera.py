@@ -93,7 +93,7 @@ class Cell:
     judged: dict[str, Tensor]
 
     @staticmethod
-    def of(count: int) -> "Cell":
+    def with_images(count: int) -> "Cell":
         """Return the cell with a number of images."""
         nominal, rng = Robot.load("ur5"), np.random.default_rng(0)
         q = far_apart(views(nominal, CANDIDATES * count, rng), count)
@@ -136,7 +136,7 @@ def bound(true: Robot, rows: Measurements, q: Tensor) -> float:
     """Return the Cramér-Rao bound [m] of the same figure: no prior, noise of corners and repeatability known."""
     setup = GeometricCalibrator(true, prior=None).build(rows)
     problem, point = setup.problem, setup.start
-    unknown = [*range(problem.space.of("tool").stop), *setup.free_unknowns]
+    unknown = [*range(problem.space.indices_of("tool").stop), *setup.free_unknowns]
     everything = torch.tensor(unknown)
     here, unknowns = slice(0, rows.rows), problem.space.sensor_unknowns(point)
     motion = problem.motion(point, here, everything)
@@ -163,7 +163,7 @@ CHOICES: dict[str, IntrinsicsChoice] = {
 
 def main(draws: int, count: int) -> None:
     """Print root mean squares over all draws, with their bounds."""
-    cell = Cell.of(count)
+    cell = Cell.with_images(count)
     squares: dict[tuple[str, str], list[tuple[float, float]]] = {}
     seconds = dict.fromkeys(CHOICES, 0.0)
 

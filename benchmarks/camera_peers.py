@@ -132,7 +132,7 @@ def robot_with_hand_eye(nominal: Robot, R: np.ndarray, t: np.ndarray) -> Robot:
 
 def main(draws: int, count: int) -> None:
     """Print accuracies over the workspace, times, and the lowest ratio to hand-eye calibration alone."""
-    cell = Cell.of(count)
+    cell = Cell.with_images(count)
     q, methods = cell.judged["workspace"], hasattr(cv2, "calibrateHandEye")
     errors, seconds, ratios = {"pisigma": 0.0, "scipy": 0.0}, {"pisigma": 0.0, "scipy": 0.0}, []
     for number in range(draws):

@@ -75,7 +75,7 @@ def in_sockets(nominal: Robot, true: Robot, rng: np.random.Generator) -> Measure
 
 def main(draws: int) -> None:
     """Print coverages, and errors of the estimated scale."""
-    cell = Cell.of(50)
+    cell = Cell.with_images(50)
     for choice in CHOICES:
         share = torch.stack(
             [inside(cell, cell.draw(number), choice).double().mean() for number in range(draws)]

@@ -84,7 +84,7 @@ def report(name: str, model: CalibratedModel, rows: int) -> None:
         line = figures(found.status.numpy(), found.position_residual.numpy(), found.rotation_residual.numpy())
         print(f"{name:9s} {label:20s} torch     {len(T):6d} poses, {line}", flush=True)
         try:
-            kernels = CompiledIK.of(model)
+            kernels = CompiledIK.from_model(model)
         except ModelError:
             continue
         done = kernels.solve_batch(T.numpy(), near=None if near is None else near.numpy())
@@ -144,7 +144,7 @@ def report_tasks(rows: int) -> None:
     for label, robot, ignored in TASKS:
         rng = np.random.default_rng(0)
         model = make_model(robot, 24, rng)
-        kernels = CompiledIK.of(model)
+        kernels = CompiledIK.from_model(model)
         T = kernels.forward(draw_joints(model.robot, rows, rng).numpy())[0]
         axes = task_axes(kernels.axes, ignored)
         if "yaw" in axes.ignored:
@@ -164,7 +164,7 @@ def report_branches(rows: int, starts: int = 40) -> None:
     """Print how many solutions that a search from random starts finds for a calibrated UR10 are among its branches."""
     rng = np.random.default_rng(0)
     model = make_model("ur10", 24, rng)
-    kernels = CompiledIK.of(model)
+    kernels = CompiledIK.from_model(model)
     T = kernels.forward(draw_joints(model.robot, rows, rng).numpy())[0]
     start = time.perf_counter()
     every = kernels.all_branches(T, threads=1)

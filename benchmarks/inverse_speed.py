@@ -73,7 +73,7 @@ def make_model(name: str | Robot, harmonics: int, rng: np.random.Generator) -> C
             weight.copy_(5e-4 / math.sqrt(chosen.count) * torch.from_numpy(rng.normal(size=weight.shape)))
         correction.weight.copy_(0.01 * torch.from_numpy(rng.normal(size=correction.weight.shape)))
     starts = draw_joints(robot, 400, rng)
-    arm = HybridArm(geometric, correction.requires_grad_(False), JointCoverage.of(robot, starts))
+    arm = HybridArm(geometric, correction.requires_grad_(False), JointCoverage.from_joints(robot, starts))
     return CalibratedModel(
         robot.name, "benchmark", robot, None, None, (), starts, calibrated=geometric, hybrid=arm
     )
@@ -108,7 +108,7 @@ def main() -> None:
     rng = np.random.default_rng(0)
     folder = Path(options.robot).is_dir()
     model = load_model(options.robot) if folder else make_model(options.robot, options.harmonics, rng)
-    kernels = CompiledIK.of(model)
+    kernels = CompiledIK.from_model(model)
     drawn = (
         draw_between(model.starts, options.poses, rng)
         if folder and not options.anywhere

@@ -114,7 +114,7 @@ def session(arm: Arm, how: str) -> tuple[int, float]:
         few = plan(arm.planned, replace(settings, count=1)).stored
         stored = replace(
             few,
-            arm=ArmInSurroundings.of(arm.planned),
+            arm=ArmInSurroundings.from_robot(arm.planned),
             q=q,
             check=torch.zeros(count, dtype=torch.bool),
             candidate=torch.arange(count),

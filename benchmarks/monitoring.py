@@ -119,7 +119,7 @@ def main() -> None:
     print("robot rows tracker  joint  right  seconds  unobservable")
     for name, count, joints, tracker in CASES:
         model, rest = made[name]
-        posterior, generator = ModelPosterior.of(model), torch.Generator().manual_seed(3)
+        posterior, generator = ModelPosterior.from_model(model), torch.Generator().manual_seed(3)
         for joint in joints:
             begun, right = time.perf_counter(), 0
             for _ in range(draws):

@@ -68,7 +68,7 @@ class Bench:
     board: Board
 
     @staticmethod
-    def of(candidates: int) -> "Bench":
+    def with_candidates(candidates: int) -> "Bench":
         """Draw the candidates."""
         with TemporaryDirectory() as folder:
             files = [Path(folder, f"{name}.yaml") for name in ("camera", "board")]
@@ -77,7 +77,7 @@ class Bench:
             settings = PlanSettings(
                 sensor="camera", camera=CameraSettings(*map(str, files)), candidates=candidates
             )
-            arm, instrument = ArmInSurroundings.of(Robot.load("ur5"), CELL), instrument_of(settings)
+            arm, instrument = ArmInSurroundings.from_robot(Robot.load("ur5"), CELL), instrument_of(settings)
             drawn, views = find_candidates(settings, arm), views_of(settings, arm)
         assert views is not None
         base = xyzrpy_from_transform(invert(views.T_cell_frame)).numpy()
@@ -113,7 +113,7 @@ def aligned_error(true: Tensor, estimated: Tensor) -> float:
 
 def main(draws: int, candidates: int, counts: list[int]) -> None:
     """Print root mean squares over all draws."""
-    bench = Bench.of(candidates)
+    bench = Bench.with_candidates(candidates)
     judged = torch.from_numpy(np.random.default_rng(0).uniform(-np.pi, np.pi, (POSTURES, 6)))
     for count in counts:
         ways = {

@@ -89,6 +89,6 @@ def test_figures_are_reproduced(folder, repository):
         for joint in model.metrics["joints"]:
             index = names.index(joint["name"])
             for when, errors in (("before", before), ("after", after)):
-                found = JointErrorFigures.of(errors[:, index], model.robot.revolute[index])
+                found = JointErrorFigures.from_errors(errors[:, index], model.robot.revolute[index])
                 for name, value in joint[part][when].items():
                     assert_close(getattr(found, name), value, rtol=1e-6, atol=1e-9)

@@ -69,7 +69,7 @@ def plan(
         return _plan_cell(opened, stated, program or [], verbose, as_json)
     if out is None:
         raise typer.BadParameter("expected a CSV file", param_hint="'--out'")
-    planned_for, programs = PlanningSubject.of(subject, base, tip), program or []
+    planned_for, programs = PlanningSubject.load(subject, base, tip), program or []
     workflow.check_files(out, programs, settings, planned_for.robot, (subject, cell))
     with progress_of("plan") as progress:
         planned = workflow.plan(planned_for, settings, cell, progress)

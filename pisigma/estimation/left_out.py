@@ -31,7 +31,7 @@ class LeftOut:
     sensor: Int64[Tensor, " values"]
 
     @staticmethod
-    def of(
+    def from_fit(
         M: Float64[Tensor, "values values"],
         residual: Float64[Tensor, " values"],
         sensor: Int64[Tensor, " values"],

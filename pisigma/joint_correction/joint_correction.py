@@ -70,7 +70,7 @@ class JointCorrection(nn.Module):
 
     def of_rows(self, measurements: Measurements) -> Float[Tensor, "rows dof"]:
         """Compute the corrections of measured rows; data that a row does not state have their usual values."""
-        delta: Tensor = self(JointState.of(measurements))
+        delta: Tensor = self(JointState.from_measurements(measurements))
         return delta
 
     def forward(

@@ -105,7 +105,7 @@ class NominalPose(AbstractSharedFeature):
 
     def __init__(self, robot: Robot) -> None:
         """Make a feature for a robot."""
-        self._inputs = Inputs.of(robot, ("x", "y", "z", "roll", "pitch", "yaw"))
+        self._inputs = Inputs.from_names(robot, ("x", "y", "z", "roll", "pitch", "yaw"))
         super().__init__(robot)
 
     def values(self, q: Float[Tensor, "*batch dof"]) -> Float[Tensor, "*batch columns"]:

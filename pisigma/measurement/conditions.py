@@ -32,7 +32,7 @@ class JointState:
     stated: Mapping[str, Tensor] = field(default_factory=dict)
 
     @staticmethod
-    def of(measurements: Measurements) -> "JointState":
+    def from_measurements(measurements: Measurements) -> "JointState":
         """Return the joint values of measured rows with the conditions that they state."""
         columns = {
             "payload_kg": measurements.payload,

@@ -72,7 +72,7 @@ class RowValues:
     file: Int64[Tensor, " rows"]
 
     @staticmethod
-    def of(rows: MeasuredFields, robot: Robot) -> "RowValues":
+    def from_rows(rows: MeasuredFields, robot: Robot) -> "RowValues":
         """Return the values of a robot's rows."""
         q = torch.from_numpy(robot.to_controller(rows.numbers["q"].detach().cpu().double().numpy()))
         length = _lengths(rows)
@@ -188,7 +188,7 @@ def originals(values: RowValues, known: int = 0) -> Int64[Tensor, " rows"]:
         first, second = first[between], second[between]
     swapped = rank[first] > rank[second]
     better, worse = torch.where(swapped, second, first), torch.where(swapped, first, second)
-    same_joints = _SameJoints.of(values)
+    same_joints = _SameJoints.from_values(values)
     standing = same_joints.run[better] == same_joints.run[worse]
     best = rank.clone()
     # consecutive rows at one pose repeat better than returns to it, so each has its own probability of equal readings
@@ -239,7 +239,7 @@ class _SameJoints:
     run: Int64[Tensor, " rows"]
 
     @staticmethod
-    def of(values: RowValues) -> "_SameJoints":
+    def from_values(values: RowValues) -> "_SameJoints":
         coarsest = values.column_steps[:, : values.q.shape[1]].amax(0)
         group = torch.unique((values.q / coarsest).round() + 0.0, dim=0, return_inverse=True)[1]
         continues = (group[1:] == group[:-1]) & (values.file[1:] == values.file[:-1])
@@ -342,7 +342,7 @@ def copies_of_known(rows: MeasuredFields, robot: Robot, known: RowValues) -> Boo
     if rows.rows == 0 or not len(known.numbers) or rows.numbers["q"].shape[1] != robot.dof:
         return torch.zeros(rows.rows, dtype=torch.bool)
     count = len(known.numbers)
-    values = known + RowValues.of(rows, robot)
+    values = known + RowValues.from_rows(rows, robot)
     original = originals(values, count)[count:]
     return _whole_pairs(rows, original != torch.arange(count, count + rows.rows))
 
@@ -354,7 +354,7 @@ def without_copies(rows: MeasuredFields, robot: Robot) -> MeasuredFields:
     """
     if rows.rows < 2 or rows.numbers["q"].shape[1] != robot.dof:
         return rows
-    original = originals(RowValues.of(rows, robot))
+    original = originals(RowValues.from_rows(rows, robot))
     copied = _whole_pairs(rows, original != torch.arange(rows.rows))
     if not copied.any():
         return rows

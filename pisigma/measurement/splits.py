@@ -48,7 +48,7 @@ class Splitting:
     folds: int | None
     hold_out: float | None
 
-    def of(
+    def split(
         self, measurements: Measurements, times: int | None, train_rows: int | None
     ) -> Sequence[Sequence[TrainTest]]:
         """Return training and held-out rows of every fold, per repeat; empty without a validation.

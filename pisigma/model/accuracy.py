@@ -69,4 +69,6 @@ def parameter_posterior(model: CalibratedModel) -> ParameterPosterior | None:
         weights of the joint correction; None if the model has no uncertainty.
     """
     known = model.uncertainty
-    return None if known is None else ParameterPosterior.of(known.space, known.geometry, known.root)
+    return (
+        None if known is None else ParameterPosterior.from_geometry(known.space, known.geometry, known.root)
+    )

@@ -321,7 +321,7 @@ def hybrid_poses(arm: HybridArm, q: Float[Tensor, "*batch dof"]) -> Float[Tensor
 
 def corrected_joints(arm: HybridArm, measurements: Measurements) -> Float64[Tensor, "rows dof"]:
     """Compute the corrected joint values `q + Δ(q)` [rad or m] of measured rows at their measured conditions."""
-    chunks = JointState.of(measurements).split(CHUNK)
+    chunks = JointState.from_measurements(measurements).split(CHUNK)
     with torch.no_grad():
         return torch.cat([state.q + arm.correction(state) for state in chunks])
 

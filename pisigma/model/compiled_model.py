@@ -209,7 +209,7 @@ def _network(model: CalibratedModel) -> arrays.Network:
             weight[joint, used, : net.inputs] = net.weight.detach().numpy()[output] * fixed[output][:, None]
             bias[joint, used] = net.bias.detach().numpy()[output] * fixed[output]
             scaling[:, joint] = float(net.output_offset[output]), float(net.output_scale[output])
-    domain = _Domain.of(model, inputs, members)
+    domain = _Domain.from_model(model, inputs, members)
     return arrays.Network(
         used=int(model.network is not None),
         source=np.array([source for source, _ in inputs], dtype=np.int64),
@@ -243,7 +243,7 @@ class _Domain(NamedTuple):
     coarse: int
 
     @staticmethod
-    def of(model: CalibratedModel, inputs: Sequence[_Input], members: Sequence[_Member]) -> "_Domain":
+    def from_model(model: CalibratedModel, inputs: Sequence[_Input], members: Sequence[_Member]) -> "_Domain":
         """Convert the domain of a model; without a domain the result has no rows."""
         none = np.zeros(0, dtype=np.int64)
         if model.network is None or model.domain is None:

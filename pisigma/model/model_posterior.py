@@ -60,7 +60,7 @@ class ModelPosterior:
     noise: CalibrationNoise
 
     @staticmethod
-    def of(model: CalibratedModel) -> "ModelPosterior":
+    def from_model(model: CalibratedModel) -> "ModelPosterior":
         """Take the posterior from a model of `pisigma calibrate` or `pisigma recalibrate`.
 
         Raises:
@@ -134,7 +134,7 @@ class ModelPosterior:
             ),
         ):
             for name in names:
-                first = space.of(group).start + size * among.index(name)
+                first = space.indices_of(group).start + size * among.index(name)
                 positions += range(first, first + size)
         return positions
 

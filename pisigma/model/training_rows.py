@@ -20,7 +20,7 @@ MAX_KEPT_ROWS = 10_000
 
 def kept_rows(robot: Robot, rows: Measurements, before: RowValues | None = None) -> RowValues:
     """Return the values of training rows that a model stores, after those of its earlier training rows `before`."""
-    values = RowValues.of(rows.as_fields(), robot)
+    values = RowValues.from_rows(rows.as_fields(), robot)
     values = values if before is None else before + values
     count = len(values.numbers)
     return values.select(torch.linspace(0, count - 1, min(count, MAX_KEPT_ROWS)).round().long())

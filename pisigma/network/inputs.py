@@ -38,7 +38,7 @@ class Inputs:
     reference: Float64[np.ndarray, "3 3"]
 
     @staticmethod
-    def of(
+    def from_names(
         robot: Robot, names: Sequence[str], reference: Float64[np.ndarray, "3 3"] | None = None
     ) -> "Inputs":
         """Make the inputs for a robot.

@@ -45,7 +45,7 @@ def build_network(
     used = pairs.used
     groups, networks = [], []
     for section in sections:
-        inputs = Inputs.of(robot, section.inputs, np.array(section.reference, dtype=np.float64))
+        inputs = Inputs.from_names(robot, section.inputs, np.array(section.reference, dtype=np.float64))
         group = JointGroup(tuple(names.index(name) for name in section.joints), inputs)
         rows = int(used.sum())
         network = PiSigma(len(section.inputs), len(section.joints), section.orders, fixed_product=rows**-0.5)

@@ -51,7 +51,9 @@ class BoardViews:
     margin: float
 
     @staticmethod
-    def of(sight: BoardSight, T_cell_frame: Float64[Tensor, "4 4"], view: ViewSection) -> "BoardViews":
+    def from_sight(
+        sight: BoardSight, T_cell_frame: Float64[Tensor, "4 4"], view: ViewSection
+    ) -> "BoardViews":
         """Read the conditions from the section `view` of a cell."""
         nearest, farthest = view.depths(sight.camera.fx)
         return BoardViews(

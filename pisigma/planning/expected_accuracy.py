@@ -159,7 +159,7 @@ class CameraProspects:
     unidentifiable: tuple[str, ...]
 
     @staticmethod
-    def of(
+    def from_candidates(
         posterior: RobotPosterior,
         candidates: Candidates,
         chosen: Int64[Tensor, " chosen"],

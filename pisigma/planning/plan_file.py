@@ -170,7 +170,7 @@ def read_plan(path: str | os.PathLike[str]) -> StoredPlan:
             )
         file = yaml_of(file)
     document = read_yaml(file, PlanDocument, PlanningError)
-    arm = ArmInSurroundings.of(Robot(*document.robot.to_fields()), document.cell)
+    arm = ArmInSurroundings.from_robot(Robot(*document.robot.to_fields()), document.cell)
     poses = file.parent / document.poses
     table, q = read_table(poses), read_joints(poses, arm.robot)
     order = _numbers(table, "order")

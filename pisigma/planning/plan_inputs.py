@@ -118,7 +118,7 @@ def views_of(settings: PlanSettings, arm: ArmInSurroundings) -> BoardViews | Non
             remedy="state them in the cell, as view: {frame: {x_mm: 400, z_mm: 50, yaw_deg: 180}, near_mm: 300, "
             f"far_mm: 700}}, and the pose of the {target} on the flange as tool",
         )
-    return BoardViews.of(sight_of(settings.camera), view.T_cell_frame, view)
+    return BoardViews.from_sight(sight_of(settings.camera), view.T_cell_frame, view)
 
 
 def sight_of(camera: CameraSettings) -> BoardSight:

@@ -93,7 +93,7 @@ class RobotPosterior:
             gravity: direction of gravity in the robot's base frame.
         """
         space = ParameterSpace(robot)
-        usual, sizes = RobotClass.of(robot), [_geometric_sizes(space)]
+        usual, sizes = RobotClass.from_robot(robot), [_geometric_sizes(space)]
         features: tuple[AbstractFeature, ...] = ()
         if hybrid:
             torques = GravityTorques(robot, in_first_row(robot, gravity))
@@ -101,7 +101,7 @@ class RobotPosterior:
             sizes += [_weight_sizes(torques, (usual.gravity,)), _weight_sizes(series, usual.bands)]
             features = torques, series
         if instrument.kind == "distance":  # distances do not change with rotations about the anchor
-            sizes[0][[*space.of("base")][3:]] = 0.0
+            sizes[0][[*space.indices_of("base")][3:]] = 0.0
         root = CovarianceRoot(torch.diag(torch.cat(sizes)))
         geometry = IdentifiedGeometry(robot, {"": robot.base}, {"": robot.tool}, {})
         return RobotPosterior(PositionUncertainty(space, geometry, features, root, 1.0), None, instrument)
@@ -184,7 +184,7 @@ class RobotPosterior:
             flat = columns.flatten(0, 1)
             columns = (flat - rigid @ (rigid.t() @ flat)).view_as(columns)
         if self.instrument.kind == "distance":
-            columns[..., [*self.uncertainty.space.of("base")]] = 0.0
+            columns[..., [*self.uncertainty.space.indices_of("base")]] = 0.0
         return self.uncertainty.covariance_root.along(columns)
 
     def measured(self, q: Float64[Tensor, "poses dof"]) -> Float64[Tensor, "poses values directions"]:
@@ -271,11 +271,11 @@ class RobotPosterior:
 
 def _geometric_sizes(space: ParameterSpace) -> Float64[Tensor, " parameters"]:
     """Return the prior standard deviations of all parameters of a robot that was never measured [m or rad]."""
-    of_class, sizes = RobotClass.of(space.robot), []
+    of_class, sizes = RobotClass.from_robot(space.robot), []
     arm = zip(space.parameters[: space.arm_size], space.robot.dh.ravel().tolist(), strict=True)
     for parameter, value in arm:
         group = PriorGroup(prior_group_of(parameter.group, abs(value) > of_class.usual.length))
-        sizes.append(of_class.usual.of(group))
+        sizes.append(of_class.usual.size_of(group))
     return torch.tensor([*sizes, *WIDE_PRIOR], dtype=torch.float64)
 
 

@@ -45,7 +45,7 @@ class Subject:
     folder: Path | None = None
 
     @staticmethod
-    def of(
+    def load(
         subject: Robot | CalibratedModel | HasModel | str | os.PathLike[str],
         base: str | None = None,
         tip: str | None = None,
@@ -69,7 +69,7 @@ class Subject:
         if not isinstance(subject, CalibratedModel):
             if not Path(subject).is_dir():
                 return Subject(Robot.load(subject, base, tip))
-            return replace(Subject.of(load_model(Path(subject))), folder=Path(subject))
+            return replace(Subject.load(load_model(Path(subject))), folder=Path(subject))
         if subject.drawn is None:
             raise PlanningError(
                 f"model '{subject.name}' does not keep the nominal robot",
@@ -81,7 +81,7 @@ class Subject:
     def arm(self, cell: Surroundings | None) -> ArmInSurroundings:
         """Return the robot in its cell, with target and board as the cell states them, else as in the model."""
         if self.model is None:
-            return ArmInSurroundings.of(self.robot, cell)
+            return ArmInSurroundings.from_robot(self.robot, cell)
         if cell is not None and cell.view is not None and cell.view.frame is None and self._saw_board:
             x, y, z, *angles = xyzrpy_from_transform(invert(self._from_cell())).tolist()
             lengths = {f"{name}_mm": value * 1e3 for name, value in zip("xyz", (x, y, z), strict=True)}
@@ -90,7 +90,7 @@ class Subject:
             cell = cell.model_copy(update={"view": cell.view.model_copy(update={"frame": frame})})
         has_tool = cell is not None and cell.tool is not None
         robot = self.robot if has_tool else self.robot.with_geometry(tool=self.model.identified.tool)
-        return ArmInSurroundings.of(robot, cell)
+        return ArmInSurroundings.from_robot(robot, cell)
 
     def posterior(self, arm: ArmInSurroundings, settings: PlanSettings) -> RobotPosterior:
         """Return the distribution of the unknowns before the first pose of the plan is measured.

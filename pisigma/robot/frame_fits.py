@@ -37,7 +37,7 @@ class MeasuredPoses:
     lever: float
 
     @staticmethod
-    def of(
+    def from_tensors(
         position: Float64[Tensor, "rows 3"] | None, rotation: Float64[Tensor, "rows 3 3"] | None, lever: float
     ) -> "MeasuredPoses":
         """Make measured poses of positions [m] of all rows and rotations of some; rows without one are not finite."""

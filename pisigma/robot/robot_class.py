@@ -38,7 +38,7 @@ class GeometricSizes:
     no_length: float
     between_axes: float
 
-    def of(self, group: int) -> float:
+    def size_of(self, group: int) -> float:
         """Return the size for a group of parameters [m or rad]."""
         return (self.joint_offset, self.length, self.no_length, self.between_axes)[group]
 
@@ -85,7 +85,7 @@ class RobotClass:
     change: ChangeLimits
 
     @staticmethod
-    def of(robot: Robot) -> "RobotClass":
+    def from_robot(robot: Robot) -> "RobotClass":
         """Return the class of the robots of a maker, `INDUSTRIAL` if the maker is not known."""
         if robot.maker.startswith("Universal Robots"):
             return UNIVERSAL_ROBOTS
@@ -95,7 +95,7 @@ class RobotClass:
 
     def allows(self, sizes: Sequence[tuple[int, float]]) -> bool:
         """Return whether errors of these sizes [m or rad], by group of parameters, are possible in this class."""
-        return all(size <= self.largest.of(group) for group, size in sizes)
+        return all(size <= self.largest.size_of(group) for group, size in sizes)
 
 
 INDUSTRIAL: Final = RobotClass(

@@ -102,7 +102,7 @@ def check_rows(
         against = against.drawn
     if isinstance(against, Robot):
         return RowVerdict(_until_implausible(_against_robot(rows, against)))
-    judged = RowsUnderModel.of(against, rows, fitted, may_move, nominal)
+    judged = RowsUnderModel.from_rows(against, rows, fitted, may_move, nominal)
     if judged is None and rows.position is None:
         diagnostics, faults = diagnosed_lengths(against, rows, fitted, may_move)
         return RowVerdict(diagnostics, None, faults)
@@ -182,7 +182,7 @@ def joint_columns(robot: Robot, rows: Measurements) -> Iterator[Diagnostic]:
     maps = signs_and_exchanges(robot.dof)
     found = [
         (left, joint_causes(maps, number, robot)[0])
-        for number, left in enumerate(_errors(robot, group, maps.of(group.q)))
+        for number, left in enumerate(_errors(robot, group, maps.apply(group.q)))
         if left <= min(usual, COLLAPSED * here)
     ]
     if found:
@@ -199,7 +199,7 @@ def joint_columns(robot: Robot, rows: Measurements) -> Iterator[Diagnostic]:
 
 def _errors(robot: Robot, rows: Measurements, q: Float64[Tensor, "maps rows dof"]) -> list[float]:
     """Compute RMS position errors [m] with base and tool fitted, corrected for the degrees of freedom."""
-    measured = MeasuredPoses.of(rows.position, None, 0.0)
+    measured = MeasuredPoses.from_tensors(rows.position, None, 0.0)
     errors = []
     for T in forward_kinematics(robot, q):
         base, tool = best_base_and_tool(T, measured)

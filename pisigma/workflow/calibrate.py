@@ -124,7 +124,7 @@ def calibrate(
     beyond, nominal = row_warnings(nominal, measurements), with_limits_of_rows(nominal, measurements)
     training, test_rows = measurements.split_sets()
     splitting = Splitting(settings.split, settings.seed, settings.folds, settings.hold_out)
-    splits = splitting.of(training, settings.repeats, settings.train_rows)
+    splits = splitting.split(training, settings.repeats, settings.train_rows)
     rows = training
     if settings.train_rows is not None:
         rows = training.select(draw_rows(training, settings.train_rows, settings.seed))
@@ -196,7 +196,9 @@ def compose(
     if validation is None and summary.test is None and summary.held_out is None:
         predicted = predicted_at_other_poses(result, rows)
         summary = summary.having(predicted_rms_mm=None if predicted is None else predicted * 1e3)
-    kept = None if validation is None or held_out is None else HeldOutRows.of(validation, held_out)
+    kept = (
+        None if validation is None or held_out is None else HeldOutRows.from_validation(validation, held_out)
+    )
     if kept is not None:
         summary = summary.having(held_out_rows=kept.hashes(kept.to_csv(nominal)))
     model = model_of_calibration(recipe[0] or nominal.name, nominal, geometric_result(result), rows, recipe)

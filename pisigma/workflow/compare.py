@@ -200,7 +200,7 @@ def compare(
     loaded = load_models(sources)
     models = with_references(list(sources), loaded, with_orientation=True)
     one, other = models.values()
-    pair = ModelPair.of(one, other, settings.frames)
+    pair = ModelPair.from_models(one, other, settings.frames)
     compared, warnings = None, _warnings(pair, list(sources.values()))
     diagnostics: tuple[Diagnostic, ...] = ()
     if rows is not None:

@@ -227,7 +227,7 @@ def monitor(
             value=loaded.name,
             remedy="make a model with `pisigma calibrate ROBOT ROWS --prior MODEL --out DIR`",
         )
-    posterior = ModelPosterior.of(loaded)
+    posterior = ModelPosterior.from_model(loaded)
     rows = [read_rows(one, posterior.space.robot, settings.cameras) for one in sessions]
     warnings: list[str] = []
     trusted: list[Record] = []
@@ -337,5 +337,5 @@ def _record(
     if implausible := session_diagnostics(model, rows, session):
         return UntrustedSession(file, date, implausible)
     temperature = None if rows.temperature is None else float(rows.temperature.nanmean())
-    values = RowValues.of(rows.as_fields(), model.robot)
+    values = RowValues.from_rows(rows.as_fields(), model.robot)
     return Record(file, date, rows_hash(rows), temperature, session, zeros, values)

@@ -192,7 +192,7 @@ def plan(
         PlanningError: the cell cannot be used, or too few poses are possible in it.
     """
     started, settings = time.perf_counter(), settings or PlanSettings()
-    subject = subject if isinstance(subject, Subject) else Subject.of(subject)
+    subject = subject if isinstance(subject, Subject) else Subject.load(subject)
     if cell is not None and not isinstance(cell, Surroundings):
         cell = read_surroundings(cell, subject.robot)
     arm = with_measured(settings, subject.arm(cell))
@@ -320,7 +320,9 @@ class _Problem:
         """Return what limits a calibration with the chosen images; None without a camera."""
         if self.views is None:
             return None
-        return CameraProspects.of(self.posterior, self.candidates, chosen, self.task, self.views, self.arm)
+        return CameraProspects.from_candidates(
+            self.posterior, self.candidates, chosen, self.task, self.views, self.arm
+        )
 
     @property
     def unexcited_joints(self) -> tuple[str, ...]:

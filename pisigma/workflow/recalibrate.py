@@ -130,7 +130,7 @@ def recalibrate(
     sha256 = "" if isinstance(source, CalibratedModel) else model_hash(source)
     if drawn is not None:
         check_fleet_prior(parent)
-    posterior = ModelPosterior.of(parent)
+    posterior = ModelPosterior.from_model(parent)
     if drawn is not None and not np.array_equal(drawn.dh, posterior.space.robot.dh):
         raise ModelError(
             f"expected a model of robot '{drawn.name}', got model '{parent.name}' of robot "
@@ -297,7 +297,7 @@ def _fleet_consistency(model: CalibratedModel, rows: Measurements) -> "FleetCons
         return None
     from pisigma.lifetime.fleet.prior import FleetConsistency  # imports statistics, which takes half a second
 
-    return FleetConsistency.of(model, rows)
+    return FleetConsistency.from_rows(model, rows)
 
 
 def _moved_frames(

@@ -223,7 +223,7 @@ def _train_inverse(
     validation = None if data.folds is None else cross_validate(recipe, data, progress, settings.jobs)
     test = None
     if data.test is not None:
-        test = ComparisonFigures.of(compare_on(run.model, data.test), rows=data.test.rows)
+        test = ComparisonFigures.from_comparison(compare_on(run.model, data.test), rows=data.test.rows)
     summary = summarise_training(run, recipe.paper, validation, test).having(command=_call(recipe))
     model = replace(run.model, metrics=summary.to_json())
     return InverseTraining(model, recipe, run, summary)
@@ -285,8 +285,8 @@ def train_networks(
         starts=spread_rows(measurements.q[used]),
         provenance=_provenance(recipe, measurements, pairs, recipe_sha256),
     )
-    other = JointErrors.of(model, held_out) if held_out else None
-    return TrainingRun(model, history, pairs, JointErrors.of(model, pairs), other, measurements)
+    other = JointErrors.from_model(model, held_out) if held_out else None
+    return TrainingRun(model, history, pairs, JointErrors.from_model(model, pairs), other, measurements)
 
 
 def cross_validate(
@@ -330,7 +330,7 @@ def cross_validate(
         not_predicted += comparison.not_predicted
         nominal.put(test, comparison.nominal)
         corrected.put(test, comparison.corrected)
-    return ComparisonFigures.of(Comparison(nominal, corrected, not_predicted), folds=len(folds))
+    return ComparisonFigures.from_comparison(Comparison(nominal, corrected, not_predicted), folds=len(folds))
 
 
 def _compared_fold(

@@ -85,7 +85,7 @@ class Chain:
             return f"{lost} changed, {len(self._sessions - self.sessions())} sessions are gone"
         following = self.folder / f"link-{self.links}"
         if following.exists():
-            ModelPosterior.of(load_model(following))
+            ModelPosterior.from_model(load_model(following))
             self.links += 1
         return ""
 

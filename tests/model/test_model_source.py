@@ -20,4 +20,4 @@ def test_the_model_of_a_corrected_ik_is_taken():
     assert model_or_folder("models/kiro3") == "models/kiro3"
     assert list(labelled(["nominal", ik]).values()) == ["nominal", model]
     with refused(PlanningError, value=model.name):
-        Subject.of(ik)
+        Subject.load(ik)

@@ -42,7 +42,7 @@ def ur10() -> Robot:
 
 
 def test_values_by_hand(ur10):
-    inputs = Inputs.of(ur10, list(VALUES))
+    inputs = Inputs.from_names(ur10, list(VALUES))
     expected = torch.tensor(list(VALUES.values()), dtype=torch.float64)
     assert_close(inputs(transform_from_xyzrpy(POSE), Q), expected, atol=1e-15)
 
@@ -50,7 +50,7 @@ def test_values_by_hand(ur10):
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("batch", [(), (1,), (3, 1, 2), (0,)])
 def test_batch_shapes_and_dtypes(ur10, batch, dtype):
-    inputs = Inputs.of(ur10, ["x", "yaw", "sin(theta_1 + theta_2)"])
+    inputs = Inputs.from_names(ur10, ["x", "yaw", "sin(theta_1 + theta_2)"])
     values = inputs(transform_from_xyzrpy(POSE).to(dtype).expand(*batch, 4, 4), Q.to(dtype).expand(*batch, 6))
     assert values.shape == (*batch, 3)
     assert values.dtype == dtype
@@ -60,7 +60,7 @@ def test_angles_are_relative_to_the_reference(ur10):
     reference = np.array([[0.0, 0, 1], [0, -1, 0], [1, 0, 0]])
     T = transform_from_xyzrpy(POSE)
     T[:3, :3] = torch.from_numpy(reference) @ T[:3, :3]
-    values = Inputs.of(ur10, ["roll", "pitch", "yaw"], reference)(T, Q)
+    values = Inputs.from_names(ur10, ["roll", "pitch", "yaw"], reference)(T, Q)
     assert_close(values, POSE[3:], atol=1e-15)
 
 
@@ -85,7 +85,7 @@ def test_angles_are_relative_to_the_reference(ur10):
 )
 def test_unknown_names_are_rejected(ur10, name, nearest):
     with refused(RecipeError, value=name) as caught:
-        Inputs.of(ur10, [name])
+        Inputs.from_names(ur10, [name])
     assert nearest in caught.value.remedy
 
 
@@ -95,30 +95,30 @@ def test_unknown_names_are_rejected(ur10, name, nearest):
 )
 def test_duplicate_inputs_are_rejected(ur10, names):
     with refused(RecipeError, value=names[1], expected=""):
-        Inputs.of(ur10, names)
+        Inputs.from_names(ur10, names)
 
 
 def test_sines_of_lengths_and_constants_are_rejected(ur10):
     with refused(RecipeError, expected="a revolute joint", value="sin(theta_1 + d_3)"):
-        Inputs.of(Robot.load("kiro3"), ["sin(theta_1 + d_3)"])
+        Inputs.from_names(Robot.load("kiro3"), ["sin(theta_1 + d_3)"])
     with refused(RecipeError, expected="a variable angle", value="cos(theta_1 - theta_1)"):
-        Inputs.of(ur10, ["cos(theta_1 - theta_1)"])
-    assert Inputs.of(Robot.load("kiro3"), ["d_3"]).names == ("d_3",)
+        Inputs.from_names(ur10, ["cos(theta_1 - theta_1)"])
+    assert Inputs.from_names(Robot.load("kiro3"), ["d_3"]).names == ("d_3",)
 
 
 def test_a_joint_named_like_a_coordinate_is_not_confused_with_it():
     gantry = Robot("gantry", "", "", (Row("x", "prismatic"), Row("a-1", "revolute")), np.zeros((2, 5)))
     with refused(RecipeError, value="x", remedy="rename the joint"):
-        Inputs.of(gantry, ["x"])
+        Inputs.from_names(gantry, ["x"])
     q = torch.tensor([0.5, 0.25], dtype=torch.float64)
     T = torch.eye(4, dtype=torch.float64)
-    assert_close(Inputs.of(gantry, ["sin(a-1)", "y"])(T, q)[0], math.sin(0.25), atol=1e-16)
+    assert_close(Inputs.from_names(gantry, ["sin(a-1)", "y"])(T, q)[0], math.sin(0.25), atol=1e-16)
 
 
 def test_only_joints_in_groups_are_corrected(ur10, generator):
     groups, networks = [], []
     for joints, names in (((4, 0), ("x", "y")), ((2,), ("sin(theta_1)",))):
-        groups.append(JointGroup(joints, Inputs.of(ur10, names)))
+        groups.append(JointGroup(joints, Inputs.from_names(ur10, names)))
         networks.append(PiSigma(len(names), len(joints), (2,)))
         networks[-1].initialise(0.3, generator)
     network = CorrectionNetwork(6, groups, networks)
@@ -132,7 +132,7 @@ def test_only_joints_in_groups_are_corrected(ur10, generator):
 
 
 def test_inconsistent_groups_are_rejected(ur10):
-    group = JointGroup((0, 1), Inputs.of(ur10, ["x"]))
+    group = JointGroup((0, 1), Inputs.from_names(ur10, ["x"]))
     with pytest.raises(ValueError, match=r"\[0, 1, 0, 1\]"):
         CorrectionNetwork(6, [group, group], [PiSigma(1, 2, (1,))] * 2)
     with pytest.raises(ValueError, match="2 outputs and 1 inputs"):

@@ -60,7 +60,7 @@ def test_rms_and_deviation_are_those_of_the_papers_tables(recipe):
 
 
 def test_the_true_parameters_have_no_error(recipe):
-    bench = Bench.of(recipe)
+    bench = Bench.from_recipe(recipe)
     bases = {placement.name: placement.true_base.to_si() for placement in recipe.placements}
     accuracy = measure_accuracy(bench, JigCalibration(bench.true_robot.geometry, bases))
     assert_close(accuracy.points, torch.zeros(4, 3), atol=1e-12)
@@ -70,7 +70,7 @@ def test_the_true_parameters_have_no_error(recipe):
 
 
 def test_an_error_of_a_jigs_base_is_seen_from_that_jig_only(recipe):
-    bench = Bench.of(recipe)
+    bench = Bench.from_recipe(recipe)
     bases = {placement.name: placement.true_base.to_si() for placement in recipe.placements}
     bases["jig_2"] = bases["jig_2"] + np.array([1e-3, 0, -2e-3, 0, 0, 0])
     accuracy = measure_accuracy(bench, JigCalibration(bench.true_robot.geometry, bases))
@@ -80,7 +80,7 @@ def test_an_error_of_a_jigs_base_is_seen_from_that_jig_only(recipe):
 
 
 def test_errors_in_the_robot_and_jig_frames_differ_by_a_rotation_where_the_base_is_right(recipe):
-    bench = Bench.of(recipe)
+    bench = Bench.from_recipe(recipe)
     bases = {placement.name: placement.true_base.to_si() for placement in recipe.placements}
     accuracy = measure_accuracy(bench, JigCalibration(nominal_calibration(recipe).arm, bases))
     assert rms(accuracy.points) > 1e-3
@@ -104,7 +104,7 @@ def test_ratios_are_averages_over_averages():
 
 def test_the_default_is_no_worse_than_the_true_models_parameters_by_least_squares(recipe):
     """Over all 50 seeds the ratios are 0.98 and 0.99; for a single seed either can be better."""
-    bench, found = Bench.of(recipe), {"paper": [], "default": []}
+    bench, found = Bench.from_recipe(recipe), {"paper": [], "default": []}
     with no_type_checker():
         for seed in range(8):
             measurements = recipe.measure(recipe.draw_touches(seed), seed)

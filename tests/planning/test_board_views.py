@@ -63,7 +63,7 @@ def test_the_workspace_is_not_that_of_the_views(drawn: Candidates):
 def test_a_board_from_behind_is_refused(settings: PlanSettings, drawn: Candidates):
     assert CELL.view is not None
     over = CELL.view.model_copy(update={"frame": CELL.view.frame.model_copy(update={"yaw_deg": 0.0})})
-    arm = ArmInSurroundings.of(Robot.load("ur5"), CELL.model_copy(update={"view": over}))
+    arm = ArmInSurroundings.from_robot(Robot.load("ur5"), CELL.model_copy(update={"view": over}))
     views = views_of(settings, arm)
     assert views is not None
     faults = views.faults(arm, drawn.q[:3])
@@ -72,7 +72,7 @@ def test_a_board_from_behind_is_refused(settings: PlanSettings, drawn: Candidate
 
 def test_an_arm_without_closed_form_sees_the_board_too(settings: PlanSettings):
     robot = Robot.load("panda")
-    arm = ArmInSurroundings.of(robot, CELL)
+    arm = ArmInSurroundings.from_robot(robot, CELL)
     assert settings.camera is not None
     candidates = find_candidates(PlanSettings(sensor="camera", camera=settings.camera, candidates=2), arm)
     assert len(candidates.q) == 2
@@ -82,7 +82,10 @@ def test_an_arm_without_closed_form_sees_the_board_too(settings: PlanSettings):
 def test_a_fixed_camera_sees_the_board_on_the_flange(tmp_path: Path):
     view = {"frame": {"x_mm": 450, "y_mm": -100, "z_mm": 900, "yaw_deg": 180}, "near_mm": 300, "far_mm": 700}
     cell = Surroundings.model_validate({"floor_mm": -20, "tool": {"z_mm": 30, "yaw_deg": 180}, "view": view})
-    arm, camera = ArmInSurroundings.of(Robot.load("ur5"), cell), camera_settings(tmp_path, is_fixed=True)
+    arm, camera = (
+        ArmInSurroundings.from_robot(Robot.load("ur5"), cell),
+        camera_settings(tmp_path, is_fixed=True),
+    )
     candidates = find_candidates(PlanSettings(sensor="camera", camera=camera, candidates=8), arm)
     assert all(sees_board(arm, camera, q, arm.capsules.radius.numpy()) for q in candidates.q.numpy())
 
@@ -109,7 +112,7 @@ def test_depths_are_stated_once():
 
 def test_a_camera_needs_to_know_where_the_board_is(settings: PlanSettings):
     with refused(PlanningError, option="--cell"):
-        views_of(settings, ArmInSurroundings.of(Robot.load("ur5")))
+        views_of(settings, ArmInSurroundings.from_robot(Robot.load("ur5")))
     with refused(PlanningError, option="sensor", value="camera"):
         PlanSettings(sensor="camera")
 

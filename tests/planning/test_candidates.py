@@ -14,7 +14,7 @@ from pisigma.planning.surroundings.surroundings import Surroundings
 from pisigma.robot import Robot
 from pisigma.robot.kinematics.forward import forward_kinematics
 
-ARM = ArmInSurroundings.of(Robot.load("fanuc_r2000"), CELL)
+ARM = ArmInSurroundings.from_robot(Robot.load("fanuc_r2000"), CELL)
 
 
 def test_candidates_are_allowed_and_the_same_at_every_draw():
@@ -69,16 +69,16 @@ def test_too_few_candidates_are_refused_with_the_reasons():
 def test_a_prismatic_joint_needs_limits():
     robot = Robot.load("kiro3")
     rows = tuple(row if row.type == "revolute" else type(row)(row.name, row.type) for row in robot.rows)
-    arm = ArmInSurroundings.of(Robot(robot.name, "", "", rows, robot.dh))
+    arm = ArmInSurroundings.from_robot(Robot(robot.name, "", "", rows, robot.dh))
     with refused(PlanningError, value="d_3"):
         draw_candidates(arm, 5, 0)
     cell = Surroundings.model_validate({"joints": {"limits_mm": {"d_3": (-300.0, -10.0)}}})
-    drawn = draw_candidates(ArmInSurroundings.of(arm.robot, cell), 50, 0).q[:, 2]
+    drawn = draw_candidates(ArmInSurroundings.from_robot(arm.robot, cell), 50, 0).q[:, 2]
     assert -0.3 <= float(drawn.min()) < float(drawn.max()) <= -0.01
 
 
 def test_spread_poses_are_farther_apart_than_random_ones():
-    q = draw_candidates(ArmInSurroundings.of(ARM.drawn), 200, 0).q
+    q = draw_candidates(ArmInSurroundings.from_robot(ARM.drawn), 200, 0).q
     chosen = spread(ARM, q[20:], 10, q[:20])
     position = forward_kinematics(ARM.robot, q)[:, :3, 3]
 
@@ -91,7 +91,7 @@ def test_spread_poses_are_farther_apart_than_random_ones():
 
 
 def test_joints_are_unwrapped_away_from_angles_that_are_rarely_free():
-    arm = ArmInSurroundings.of(
+    arm = ArmInSurroundings.from_robot(
         Robot.load("ur5")
     )  # its wrist cannot fold against the forearm: joint 4 at 90 deg
     q = draw_candidates(arm, 400, 0).q[:, 3].rad2deg()

@@ -16,7 +16,7 @@ from pisigma.planning.plan_settings import PlanSettings
 from pisigma.planning.surroundings.arm_in_surroundings import ArmInSurroundings
 from pisigma.robot import Robot
 
-ARM = ArmInSurroundings.of(Robot.load("fanuc_r2000"), CELL)
+ARM = ArmInSurroundings.from_robot(Robot.load("fanuc_r2000"), CELL)
 DRAWN = draw_candidates(ARM, 6, 0)
 
 

@@ -36,7 +36,7 @@ def test_a_task_may_be_joint_values_or_poses(tmp_path: Path, kind: str):
             *(",".join(map(str, row)) for row in values.tolist()),
         ]
     (tmp_path / "task.csv").write_text("\n".join(rows))
-    arm, settings = ArmInSurroundings.of(robot), PlanSettings(task=str(tmp_path / "task.csv"))
+    arm, settings = ArmInSurroundings.from_robot(robot), PlanSettings(task=str(tmp_path / "task.csv"))
     with no_type_checker():
         read = task_poses(arm, settings, q)
     assert_close(forward_kinematics(robot, read), T, atol=1e-9)
@@ -56,7 +56,10 @@ def test_joint_values_of_a_task_outside_the_limits_are_refused(
 ):
     columns = ["q1_deg", "q2_deg", header, "q4_deg", "q5_deg", "q6_deg"]
     (tmp_path / "task.csv").write_text(f"{','.join(columns)}\n0,0,0,0,0,0\n0,0,{value},0,0,0\n")
-    arm, settings = ArmInSurroundings.of(Robot.load("ur10")), PlanSettings(task=str(tmp_path / "task.csv"))
+    arm, settings = (
+        ArmInSurroundings.from_robot(Robot.load("ur10")),
+        PlanSettings(task=str(tmp_path / "task.csv")),
+    )
     with refused(PlanningError, file="task.csv", line=3) as caught, no_type_checker():
         task_poses(arm, settings, torch.zeros(1, 6, dtype=torch.float64))
     assert caught.value.value == arm.robot.axes[2].name
@@ -65,6 +68,6 @@ def test_joint_values_of_a_task_outside_the_limits_are_refused(
 
 def test_without_a_task_the_whole_workspace_counts():
     q = torch.arange(4000.0, dtype=torch.float64).reshape(1000, 4)
-    some = task_poses(ArmInSurroundings.of(Robot.load("kiro3")), PlanSettings(), q)
+    some = task_poses(ArmInSurroundings.from_robot(Robot.load("kiro3")), PlanSettings(), q)
     assert len(some) == TASK_POSES
     assert_close(some[[0, -1]], q[[0, -1]])

@@ -17,13 +17,13 @@ from pisigma.planning.surroundings.surroundings import Surroundings
 from pisigma.planning.tour import Pace, order_of_use, stages_of, tour
 from pisigma.robot import Robot
 
-ARM = ArmInSurroundings.of(Robot.load("fanuc_r2000"), CELL)
+ARM = ArmInSurroundings.from_robot(Robot.load("fanuc_r2000"), CELL)
 PACE = Pace(speed=math.radians(20), settling=2.0)
 
 
 def test_few_poses_are_in_the_best_order():
     q = torch.from_numpy(np.random.default_rng(3).uniform(-0.4, 0.4, (7, 6)))
-    arm = ArmInSurroundings.of(Robot.load("fanuc_r2000"))
+    arm = ArmInSurroundings.from_robot(Robot.load("fanuc_r2000"))
     way = tour(Motions(arm, q), q, PACE)
 
     def seconds(order: tuple[int, ...]) -> float:
@@ -38,7 +38,7 @@ def test_few_poses_are_in_the_best_order():
 
 def test_a_tour_starts_at_the_present_joint_values():
     q = torch.from_numpy(np.random.default_rng(3).uniform(-0.4, 0.4, (7, 6)))
-    arm = ArmInSurroundings.of(Robot.load("fanuc_r2000"))
+    arm = ArmInSurroundings.from_robot(Robot.load("fanuc_r2000"))
     start = q[4] + 0.01
     way = tour(Motions(arm, q), q, PACE, start)
     assert int(way.order[0]) == 4
@@ -47,7 +47,7 @@ def test_a_tour_starts_at_the_present_joint_values():
 
 def test_the_most_useful_poses_come_in_the_first_stage():
     q = torch.from_numpy(np.random.default_rng(4).uniform(-0.4, 0.4, (9, 6)))
-    arm = ArmInSurroundings.of(Robot.load("fanuc_r2000"))
+    arm = ArmInSurroundings.from_robot(Robot.load("fanuc_r2000"))
     order = tour(Motions(arm, q), q, PACE, q[0], stages=(2, 5, 20)).order.tolist()
     assert [set(order[:2]), set(order[2:5]), set(order[5:])] == [{0, 1}, {2, 3, 4}, {5, 6, 7, 8}]
     assert stages_of(20) == ()
@@ -60,7 +60,9 @@ def test_test_poses_are_distributed_evenly():
 
 
 def test_every_motion_is_collision_free():
-    arm = ArmInSurroundings.of(ARM.drawn, CELL.model_copy(update={"tracker": None, "reflector": None}))
+    arm = ArmInSurroundings.from_robot(
+        ARM.drawn, CELL.model_copy(update={"tracker": None, "reflector": None})
+    )
     pool = draw_candidates(arm, 60, 0).q
     way = tour(Motions(arm, pool), pool[:5], PACE)
     assert not len(way.left_out)
@@ -79,7 +81,7 @@ def test_an_unreachable_pose_is_left_out():
     blocked = Surroundings.model_validate(
         {"boxes": [wall, wall | {"name": "other", "center_mm": (3200.0, 0.0, 1500.0)}]}
     )
-    way = tour(Motions(ArmInSurroundings.of(robot, blocked), q), q, PACE)
+    way = tour(Motions(ArmInSurroundings.from_robot(robot, blocked), q), q, PACE)
     assert len(way.left_out) == 1
     assert len(way.order) == 2
 

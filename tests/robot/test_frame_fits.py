@@ -31,7 +31,7 @@ def measured_as(T, turned: bool) -> MeasuredPoses:
     rows = Measurements(
         q=torch.zeros(len(T), 1).double(), position=T[:, :3, 3].contiguous(), rotation=rotation
     )
-    return MeasuredPoses.of(rows.position, rows.rotation, LEVER)
+    return MeasuredPoses.from_tensors(rows.position, rows.rotation, LEVER)
 
 
 @pytest.mark.parametrize("turned", [False, True])

@@ -11,7 +11,7 @@ from pisigma.robot.robot_class import COBOT, INDUSTRIAL, UNIVERSAL_ROBOTS, Robot
     ("name", "expected"), [("ur10", UNIVERSAL_ROBOTS), ("fanuc_r2000", INDUSTRIAL), ("rb5", COBOT)]
 )
 def test_the_maker_determines_the_class(name: str, expected: RobotClass) -> None:
-    assert RobotClass.of(Robot.load(name)) is expected
+    assert RobotClass.from_robot(Robot.load(name)) is expected
 
 
 @pytest.mark.parametrize("usual", [INDUSTRIAL, UNIVERSAL_ROBOTS])

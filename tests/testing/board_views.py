@@ -50,7 +50,7 @@ def camera_settings(folder: Path, is_fixed: bool = False) -> CameraSettings:
 
 def arm_before_board(robot: Robot | None = None) -> ArmInSurroundings:
     """Return a robot (default: a UR5) in the cell."""
-    return ArmInSurroundings.of(robot or Robot.load("ur5"), CELL)
+    return ArmInSurroundings.from_robot(robot or Robot.load("ur5"), CELL)
 
 
 def sees_board(arm: ArmInSurroundings, settings: CameraSettings, q: np.ndarray, radius: np.ndarray) -> bool:

@@ -78,7 +78,9 @@ def calibrated_robot(
     arm, starts = None, joints_of(robot, 400, share=covered)
     if hybrid:
         other = geometric.with_geometry(dh=geometric.dh + 0.2 * ERRORS * rng.normal(size=robot.dh.shape))
-        arm = HybridArm(other, random_correction(robot, shared, size=size), JointCoverage.of(robot, starts))
+        arm = HybridArm(
+            other, random_correction(robot, shared, size=size), JointCoverage.from_joints(robot, starts)
+        )
     return CalibratedModel(
         f"calibrated {robot.name}", "test", robot, None, None, (), starts, calibrated=geometric, hybrid=arm
     )

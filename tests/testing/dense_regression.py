@@ -34,7 +34,7 @@ class DenseRegression(AbstractDesignRegression):
     sensors: tuple[SensorCount, ...]
 
     @staticmethod
-    def of(design: Design, rows: Rows) -> "DenseRegression":
+    def from_rows(design: Design, rows: Rows) -> "DenseRegression":
         """Return the regression of all weighted rows of all sensors."""
         parts = []
         for number, values in enumerate(rows.values):

@@ -64,7 +64,7 @@ def hybrid_model(
     arm = HybridArm(
         off_by(model.calibrated, 1e-5, 1e-5, seed=1),
         correction,
-        JointCoverage.of(model.robot, model.starts),
+        JointCoverage.from_joints(model.robot, model.starts),
     )
     return CalibratedModel(
         **{

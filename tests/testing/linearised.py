@@ -88,7 +88,7 @@ class LinearisedArm:
     def fitted(self, features: Sequence[AbstractFeature], iterations: int = 40) -> Fitted:
         """Fit geometry and a unit of order 1, with prior sizes and noise by the evidence."""
         design = Design(self.rows.problem, tuple(features))
-        sums = NormalEquations.of(design, self.rows)
+        sums = NormalEquations.from_rows(design, self.rows)
         return Fitted(design, sums.maximise_evidence(design.prior(self.prior_scale), self.noise, iterations))
 
 

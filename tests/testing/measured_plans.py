@@ -52,7 +52,7 @@ def measured_plan(name: str = "ur5", poses: int = 24, seed: int = 0) -> Measured
         dh=robot.dh + dh_errors(robot, 3e-4, 6e-4, np.random.default_rng(seed)), base=BASE, tool=TOOL
     )
     settings = PlanSettings(count=poses - CHECKS, check=CHECKS, candidates=120, sigma_mm=NOISE * 1e3)
-    arm = ArmInSurroundings.of(robot)
+    arm = ArmInSurroundings.from_robot(robot)
     candidates = find_candidates(settings, arm)
     check = torch.arange(poses) % (poses // CHECKS) == 4
     return MeasuredPlan(

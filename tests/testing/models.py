@@ -52,7 +52,7 @@ def hand_made_model(
     network.initialise(0.1, torch.Generator().manual_seed(1))
     network.output_scale.fill_(scale)
     network.output_offset.fill_(-3 * scale)
-    group = JointGroup(tuple(range(robot.dof)), Inputs.of(robot, names))
+    group = JointGroup(tuple(range(robot.dof)), Inputs.from_names(robot, names))
     corrections = CorrectionNetwork(robot.dof, [group], [network]).requires_grad_(False)
     q = joints_around(name, 64)
     T = forward_kinematics(robot, q)

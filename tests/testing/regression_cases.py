@@ -45,7 +45,7 @@ class RegressionCase:
     @functools.cached_property
     def dense(self) -> DenseRegression:
         """The regression with all columns in one matrix."""
-        return DenseRegression.of(self.design, self.rows)
+        return DenseRegression.from_rows(self.design, self.rows)
 
     @functools.cached_property
     def folds(self) -> tuple[Tensor, ...]:

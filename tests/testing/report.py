@@ -71,7 +71,7 @@ def folder_with_held_out(arm: HybridArmUnderTest, model: CalibratedModel, folder
         found = judged_on(arm, arm.measurements)
         for errors in found.models.values():
             errors.position.mul_(1.1)
-        held_out = HeldOutRows.of(found, arm.measurements)
+        held_out = HeldOutRows.from_validation(found, arm.measurements)
         text = held_out.to_csv(model.robot)
         summary = CalibrationSummary.read(model).having(held_out_rows=held_out.hashes(text))
         model = replace(model, metrics=summary.to_json())

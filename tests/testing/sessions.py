@@ -28,7 +28,7 @@ def arm_beside_tracker(robot: Robot | None = None) -> ArmInSurroundings:
     cabinet = Box(name="control <cabinet>", center_mm=(-900, 900, 380), size_mm=(500, 600, 800), yaw_deg=20)
     tracker = TrackerSection(x_mm=2200, y_mm=-1200, z_mm=1100)
     cell = Surroundings(floor_mm=-20, boxes=(cabinet,), tracker=tracker, reflector=ReflectorSection())
-    return ArmInSurroundings.of(robot or Robot.load("ur10"), cell)
+    return ArmInSurroundings.from_robot(robot or Robot.load("ur10"), cell)
 
 
 def planned(arm: ArmInSurroundings) -> np.ndarray:

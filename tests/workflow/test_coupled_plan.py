@@ -16,7 +16,7 @@ from pisigma.planning.surroundings.arm_in_surroundings import ArmInSurroundings
 
 def test_a_plan_holds_the_controllers_values_within_its_limits(tmp_path: Path) -> None:
     robot = coupled_robot()
-    arm = ArmInSurroundings.of(robot)
+    arm = ArmInSurroundings.from_robot(robot)
     q = draw_candidates(arm, 20, seed=1).q
     assert robot.coupling.is_inside(q.numpy()).all()
     count = len(q)

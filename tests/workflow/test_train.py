@@ -122,7 +122,7 @@ def test_rows_of_the_test_set_do_not_change_the_model():
         ]
         run = train_networks(measured, load_data(measured, marked))
         summary = summarise_training(
-            run, {}, None, ComparisonFigures.of(compare_on(run.model, test), rows=test.rows)
+            run, {}, None, ComparisonFigures.from_comparison(compare_on(run.model, test), rows=test.rows)
         )
     states = [model.network.state_dict() for model in models]
     for name, values in states[0].items():

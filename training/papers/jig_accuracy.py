@@ -53,7 +53,7 @@ class Bench:
     workspace: Float64[Tensor, "poses dof"]
 
     @staticmethod
-    def of(recipe: JigRecipe) -> "Bench":
+    def from_recipe(recipe: JigRecipe) -> "Bench":
         """Return the bench of a recipe.
 
         Raises:

@@ -75,7 +75,7 @@ def run_jigs(recipe: JigRecipe, progress: Progress = lambda text: None) -> JigRu
         RecipeError: The recipe is inconsistent.
     """
     _check_jigs(recipe)
-    bench = Bench.of(recipe)
+    bench = Bench.from_recipe(recipe)
     progress("planning touches")
     planned_from = recipe.planning.candidates.find(Robot.load(recipe.robot), recipe.placements)
     problem = recipe.planning_problem(planned_from)

@@ -195,7 +195,7 @@ class GeometricCalibrator:
             IdentificationError: `free` names a parameter that does not exist.
         """
         chosen = {i for i, p in enumerate(space.parameters) if p.group == "base" and self.base == "free"}
-        tools = list(space.of("tool")) if self.tool != "fixed" else []
+        tools = list(space.indices_of("tool")) if self.tool != "fixed" else []
         chosen |= {i for k, i in enumerate(tools) if self.tool == "free" or k % 6 < 3}
         if self.free == "identifiable":
             chosen |= set(range(space.arm_size))

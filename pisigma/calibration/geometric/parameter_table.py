@@ -113,7 +113,7 @@ def _without_rows(
     names = [problem.space.names[i] for i in active.tolist()]
     shown = torch.tensor([name not in findings.redundancy.no_effect for name in names], dtype=torch.bool)
     lost = (normal.diagonal() <= 0) & shown
-    bases = problem.space.of("base")
+    bases = problem.space.indices_of("base")
     for start in range(bases.start, bases.stop, len(FRAME_COLUMNS)):
         own = ((active >= start) & (active < start + len(FRAME_COLUMNS)) & shown).nonzero()[:, 0]
         at_start = findings.information

@@ -32,7 +32,7 @@ class ParameterPosterior:
     root: Float64[Tensor, "unknowns directions"]
 
     @staticmethod
-    def of(
+    def from_geometry(
         space: ParameterSpace, geometry: IdentifiedGeometry, root: Float64[Tensor, "unknowns directions"]
     ) -> "ParameterPosterior":
         """Make the posterior of the parameters of a space, with their values in the user's coordinates."""

@@ -155,7 +155,7 @@ class CalibrationResult:
     def posterior(self) -> ParameterPosterior:
         """Joint posterior of all parameters in the user's coordinates; see `ParameterPosterior`."""
         solved = self.solved
-        return ParameterPosterior.of(solved.problem.space, solved.geometry, solved.root)
+        return ParameterPosterior.from_geometry(solved.problem.space, solved.geometry, solved.root)
 
     @cached_property
     def residuals(self) -> dict[str, Float64[np.ndarray, "rows components"]]:

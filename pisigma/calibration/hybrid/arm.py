@@ -37,7 +37,7 @@ class JointCoverage:
     turning: tuple[bool, ...]
 
     @staticmethod
-    def of(robot: Robot, q: Float64[Tensor, "rows dof"]) -> "JointCoverage":
+    def from_joints(robot: Robot, q: Float64[Tensor, "rows dof"]) -> "JointCoverage":
         """Compute the ranges covered by measured joint values."""
         rate = torch.from_numpy(turning_rate(robot))
         turning = tuple(bool(turns) for turns in robot.revolute)

@@ -151,7 +151,7 @@ class HybridCalibrator:
         return LearnedPart(
             geometry=with_frames_of(solved, refined),
             correction=refined.correction,
-            coverage=JointCoverage.of(self.geometric.robot, solved.problem.q),
+            coverage=JointCoverage.from_joints(self.geometric.robot, solved.problem.q),
             noise={sensor.name: sigma for sensor, sigma in noise if not sensor.certain},
             unknowns=refined.design.unknowns,
             effective=refined.posterior.effective,

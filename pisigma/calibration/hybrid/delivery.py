@@ -126,7 +126,9 @@ def left_out_rows(
         for _ in range(MAX_LINEARISATIONS):
             seen = _values(design, x)
             there = Rows.linearised(design, x, seen, weights, group)
-            differs = there.of(others).difference(here.of(others), x, design, rest.noise)
+            differs = there.select_groups(others).difference(
+                here.select_groups(others), x, design, rest.noise
+            )
             if not differs >= CONVERGENCE_TOLERANCE * rest.effective:
                 break
             rest = regression(design, there).without(groups).solve(rest.prior, rest.noise)

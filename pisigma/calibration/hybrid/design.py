@@ -177,7 +177,7 @@ class Rows:
             for sensor in self.values
         )
 
-    def of(self, groups: Int64[Tensor, " chosen"]) -> "Rows":
+    def select_groups(self, groups: Int64[Tensor, " chosen"]) -> "Rows":
         """Return the rows of some groups."""
         mask = torch.zeros(self.groups, dtype=torch.bool, device=self.group.device)
         mask[groups.to(mask.device)] = True
@@ -186,7 +186,7 @@ class Rows:
 
     def held_out(self, groups: Int64[Tensor, " chosen"]) -> "Rows":
         """Return the rows of some groups, without those of certain sensors."""
-        rows = self.of(groups)
+        rows = self.select_groups(groups)
         kept = [sensor.select(slice(0, 0)) if sensor.certain else sensor for sensor in rows.values]
         return replace(rows, values=tuple(kept))
 

@@ -36,7 +36,7 @@ class NormalEquations(PrimalRegression, AbstractDesignRegression):
     rows: Rows
 
     @staticmethod
-    def of(design: Design, rows: Rows) -> "NormalEquations":
+    def from_rows(design: Design, rows: Rows) -> "NormalEquations":
         """Sum the rows, chunk by chunk.
 
         The columns of a joint's weights are its features times the derivative by its value, `J_j f_jm`. Therefore, for
@@ -87,7 +87,7 @@ class NormalEquations(PrimalRegression, AbstractDesignRegression):
 
     def without(self, groups: Int64[Tensor, " groups"]) -> "NormalEquations":
         """See `AbstractDesignRegression.without`."""
-        other = NormalEquations.of(self.design, self.rows.held_out(groups))
+        other = NormalEquations.from_rows(self.design, self.rows.held_out(groups))
         counts = zip(self.sensors, other.sensors, strict=True)
         return replace(
             self,
@@ -121,7 +121,7 @@ class NormalEquations(PrimalRegression, AbstractDesignRegression):
         for rows in blocks(len(x), BLOCK):
             S = solved.inverse[rows, : rows.stop] @ whitened[:, : rows.stop].t()
             M.addmm_(S.t(), S, alpha=-1)
-        return LeftOut.of(M, torch.cat(r), torch.cat(number), self.sensors)
+        return LeftOut.from_fit(M, torch.cat(r), torch.cat(number), self.sensors)
 
     def first_sizes(
         self, posterior: Posterior, design: Design, features: AbstractFeature
@@ -233,7 +233,7 @@ class ValueCovariance(DualRegression, AbstractDesignRegression):
     group: Int64[Tensor, " values"]
 
     @staticmethod
-    def of(design: Design, rows: Rows) -> "ValueCovariance":
+    def from_rows(design: Design, rows: Rows) -> "ValueCovariance":
         """Make the matrices K of all rows."""
         parts = []
         for k, sensor in enumerate(rows.values):
@@ -299,7 +299,7 @@ class ValueCovariance(DualRegression, AbstractDesignRegression):
         for groups in folds:
             chosen = torch.cat([self._values_of_groups[k] for k in groups.tolist()]).sort().values
             parts.append(
-                LeftOut.of(P[chosen][:, chosen], residual[chosen], self.sensor[chosen], self.sensors)
+                LeftOut.from_fit(P[chosen][:, chosen], residual[chosen], self.sensor[chosen], self.sensors)
             )
         return LeftOut.joined(parts)
 
@@ -321,7 +321,7 @@ def regression(design: Design, rows: Rows) -> AbstractDesignRegression:
     """Make normal equations, or the covariance of the values if there are few values and more unknowns."""
     values = sum(sensor.residual.numel() for sensor in rows.values)
     few = values <= min(MAX_VALUES, design.unknowns)
-    return ValueCovariance.of(design, rows) if few else NormalEquations.of(design, rows)
+    return ValueCovariance.from_rows(design, rows) if few else NormalEquations.from_rows(design, rows)
 
 
 def extended(before: AbstractDesignRegression, design: Design, rows: Rows) -> AbstractDesignRegression:

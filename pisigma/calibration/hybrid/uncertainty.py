@@ -69,7 +69,7 @@ class PositionUncertainty:
             measurements: joint values, frames and targets.
             q_moved: joint values with their corrections [rad or m].
         """
-        state = JointState.of(measurements)
+        state = JointState.from_measurements(measurements)
         frame = numbers_of(measurements.frame, self.space.frames, measurements.rows)
         target = numbers_of(measurements.target, self.space.targets, measurements.rows)
         deviation = torch.full((measurements.rows, 3), torch.nan, dtype=torch.float64)
@@ -104,7 +104,7 @@ class PositionUncertainty:
         columns = J.new_zeros((len(q_moved), 6, len(self.covariance_root.directions)))
         columns[..., : space.arm_size] = J[..., : space.arm_size]
         for group, number, first in (("base", frame, space.arm_size), ("tool", target, space.arm_size + 6)):
-            start = space.of(group).start + 6 * number
+            start = space.indices_of(group).start + 6 * number
             columns[..., start : start + 6] = J[..., first : first + 6]
         columns[..., len(space.parameters) :] = self._weight_columns(J, state)
         return columns

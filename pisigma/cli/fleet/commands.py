@@ -141,7 +141,7 @@ def status(
 
     if page is not None:
         check_output(page, (".html", ".htm"), "a page", (folder / "records",))
-    seen = FleetStatus.of(read_records(folder), _day(today), overdue_days, expected_robots(folder))
+    seen = FleetStatus.from_records(read_records(folder), _day(today), overdue_days, expected_robots(folder))
     if page is not None:
         from pisigma.reporting.page.lifetime import fleet_page
 

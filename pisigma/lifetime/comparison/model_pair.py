@@ -49,7 +49,7 @@ class ModelPair:
     T_tool: Float64[Tensor, "4 4"]
 
     @staticmethod
-    def of(first: CalibratedModel, second: CalibratedModel, frames: FrameChoice) -> "ModelPair":
+    def from_models(first: CalibratedModel, second: CalibratedModel, frames: FrameChoice) -> "ModelPair":
         """Pair two models.
 
         Args:

@@ -154,7 +154,7 @@ def mean_robot(
         calibrated=mean,
         bases=frames[0],
         tools=frames[1],
-        hybrid=HybridArm(mean, correction, JointCoverage.of(drawn, q)),
+        hybrid=HybridArm(mean, correction, JointCoverage.from_joints(drawn, q)),
         hybrid_bases=frames[0],
         hybrid_tools=frames[1],
         uncertainty=PositionUncertainty(
@@ -192,7 +192,7 @@ def evidence_of(
     model: CalibratedModel, mean: Float64[Tensor, " unknowns"], rows: Measurements
 ) -> RobotEvidence:
     """Compute the information of a robot's rows, linearised at its most probable errors."""
-    posterior = ModelPosterior.of(model)
+    posterior = ModelPosterior.from_model(model)
     rows = posterior.renamed(rows)
     problem = recalibration_problem(model, posterior, rows, frame_keys(rows, ("base", "tool")))
     problem = replace(problem, groups=tuple(group for group in problem.groups if group.fixed_size))
@@ -236,7 +236,7 @@ class FleetConsistency:
     gain: float
 
     @staticmethod
-    def of(model: CalibratedModel, rows: Measurements) -> "FleetConsistency":
+    def from_rows(model: CalibratedModel, rows: Measurements) -> "FleetConsistency":
         """Compare a robot with the mean of a fleet prior.
 
         Args:
@@ -246,7 +246,7 @@ class FleetConsistency:
         Raises:
             IdentificationError: the rows do not determine the robot's base and tool.
         """
-        posterior = ModelPosterior.of(model)
+        posterior = ModelPosterior.from_model(model)
         root = of_arm(posterior.root, posterior.space)
         drawn = posterior.space.robot
         errors = torch.from_numpy(posterior.geometry.robot.dh - drawn.dh)

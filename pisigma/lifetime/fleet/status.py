@@ -62,7 +62,7 @@ class FleetStatus:
     warnings: tuple[str, ...] = ()
 
     @staticmethod
-    def of(
+    def from_records(
         records: Sequence[RobotRecord], today: datetime.date, overdue_days: int, expected: Sequence[str] = ()
     ) -> "FleetStatus":
         """Compute the status of a fleet.

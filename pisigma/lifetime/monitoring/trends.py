@@ -174,7 +174,7 @@ def trends_of(revolute: Sequence[bool], records: Sequence[Record]) -> tuple[Tren
         return ()
     overs, trends = _overs(records), list[Trend]()
     for joint in range(len(revolute)):
-        zero = _Zero.of(records, joint, overs)
+        zero = _Zero.from_records(records, joint, overs)
         if zero is None or len(zero.sessions) <= zero.columns.shape[1] + len(zero.events):
             continue
         unit, factor = SHOWN_UNITS["rad" if revolute[joint] else "m"]
@@ -197,7 +197,7 @@ def jumps_of(revolute: Sequence[bool], records: Sequence[Record]) -> tuple[Jump,
         return ()
     overs, jumps = _overs(records), list[Jump]()
     for joint in range(len(revolute)):
-        zero = _Zero.of(records, joint, overs)
+        zero = _Zero.from_records(records, joint, overs)
         if zero is None or not zero.events:
             continue
         unit, factor = SHOWN_UNITS["rad" if revolute[joint] else "m"]
@@ -244,7 +244,9 @@ class _Zero:
     drifts: bool
 
     @staticmethod
-    def of(records: Sequence[Record], joint: int, overs: Sequence[tuple[str, Tensor]]) -> "_Zero | None":
+    def from_records(
+        records: Sequence[Record], joint: int, overs: Sequence[tuple[str, Tensor]]
+    ) -> "_Zero | None":
         """Find the changes of a joint zero; None if too few sessions determine it."""
         values, covariance = _joint_values(records, joint)
         there = torch.isfinite(values).nonzero()[:, 0]

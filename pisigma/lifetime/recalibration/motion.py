@@ -41,7 +41,7 @@ def judged_motion(
         determine what is fitted, and where the rows are implausible, see `session_diagnostics`.
     """
     with suppress(IdentificationError, ModelError):
-        posterior = ModelPosterior.of(model)
+        posterior = ModelPosterior.from_model(model)
         some = judged_values(model, rows)
         if rows.position is not None:
             some = replace(some.select(spread(measured_rows(rows), MAX_ROWS)), pair=None, distance=None)

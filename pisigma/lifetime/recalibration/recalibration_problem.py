@@ -211,7 +211,7 @@ def _new_frames(kind: str, names: Sequence[str], frames: np.ndarray, new: Set[Fr
 def frame_slice(space: ParameterSpace, group: str, name: str) -> slice:
     """Return the slice of the parameters of a base or a tool."""
     number = (space.frames if group == "base" else space.targets).index(name)
-    first = space.of(group).start + 6 * number
+    first = space.indices_of(group).start + 6 * number
     return slice(first, first + 6)
 
 
@@ -244,7 +244,7 @@ def _groups(
     for own in space.unknowns:
         for number, owner in enumerate(own.owners):
             if owner not in posterior.geometry.unknowns.get(own.name, {}):
-                first = space.of(own.name).start + len(own.columns) * number
+                first = space.indices_of(own.name).start + len(own.columns) * number
                 index = torch.tensor([k for k in free_unknowns if first <= k < first + len(own.columns)])
                 groups.append(_relocated_group(space, f"{own.name} {owner}", index))
     if len(posterior.weights):

@@ -20,7 +20,7 @@ def beyond_wear(robot: Robot, moved: Sequence[Movement]) -> tuple[Diagnostic, ..
         robot: robot, whose class has the limits; see `RobotClass.change`.
         moved: movements that were found.
     """
-    of_class = RobotClass.of(robot)
+    of_class = RobotClass.from_robot(robot)
     far = [one for one in moved if not is_frame(one.what) and _is_beyond(one, of_class.change)]
     if not far or (len(far) == 1 and far[0].what.startswith("joint ")):
         return ()

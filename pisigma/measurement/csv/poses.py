@@ -89,7 +89,7 @@ def _chunks(file: TextIO, source: str, rows: int) -> Iterator[PoseChunk]:
     length = os.fstat(file.fileno()).st_size
     content = content_lines(_bounded_lines(file, source), source)
     header_line, header = next(content)
-    layout = _Layout.of(header, Place(source, header_line))
+    layout = _Layout.from_header(header, Place(source, header_line))
     any_row = False
     while some := list(islice(content, rows)):
         any_row = True
@@ -137,7 +137,7 @@ class _Layout:
     orientation: tuple[tuple[int, Column], ...]
 
     @staticmethod
-    def of(line: str, place: Place) -> "_Layout":
+    def from_header(line: str, place: Place) -> "_Layout":
         """Read the header, which must have every column of a pose once, with lengths in one unit."""
         if _is_foreign(line):
             raise _NOT_UTF8.error(place)

@@ -76,7 +76,7 @@ class ImageIntrinsics:
         return tuple(" ".join(f"{value:.17g}" for value in row) for row in np.concatenate(blocks, 1))
 
     @staticmethod
-    def of(texts: tuple[str, ...]) -> "ImageIntrinsics":
+    def from_texts(texts: tuple[str, ...]) -> "ImageIntrinsics":
         """Parse texts of the column of intrinsics; 0 for empty ones."""
         empty = [0.0] * SIZE
         block = np.array([numbers_in(text, SIZE) or empty for text in texts]).reshape(-1, 19, NUMBERS)
@@ -119,7 +119,7 @@ def without_stated(measurements: Measurements, counted: Mapping[str, Collection[
     if CAMERA_COLUMN not in measurements.readings:
         return measurements
     stated, scales = (texts_of(measurements, name) for name in (INTRINSICS_COLUMN, SCALE_COLUMN))
-    images, names = ImageIntrinsics.of(stated), cameras(measurements) or ("",) * len(stated)
+    images, names = ImageIntrinsics.from_texts(stated), cameras(measurements) or ("",) * len(stated)
     is_counted = np.array([name in counted.get("camera", ()) for name in names])
     images = replace(images, sigma=np.where(is_counted[:, None], UNINFORMATIVE, 1.0) * images.sigma)
     texts = {
@@ -214,7 +214,7 @@ class IntrinsicsSensor(AbstractSensor):
         data, names = rows.measurements, cameras(rows.measurements)
         if names is None or not bool(rows.by_corners.any()):
             return None
-        images = ImageIntrinsics.of(texts_of(data, INTRINSICS_COLUMN))
+        images = ImageIntrinsics.from_texts(texts_of(data, INTRINSICS_COLUMN))
         noise = torch.nan_to_num(rows.readings(NOISE_COLUMN), nan=1.0)
         number = numbers_of(names, names_of(names), data.rows).numpy()
         owners = np.full(data.rows, -1)
@@ -259,7 +259,7 @@ class IntrinsicsSensor(AbstractSensor):
         names = cameras(measurements)
         if names is None:
             return None
-        images = ImageIntrinsics.of(texts_of(measurements, INTRINSICS_COLUMN))
+        images = ImageIntrinsics.from_texts(texts_of(measurements, INTRINSICS_COLUMN))
         first = [names.index(name) for name in names_of(names)]
         return InitialUnknowns(
             torch.from_numpy(images.stated[first]), torch.from_numpy(images.sigma[first] > 0)

@@ -303,7 +303,7 @@ def _empty_network(document: ModelDocument, robot: Robot) -> CorrectionNetwork |
                     column="network",
                     value=name,
                 )
-        inputs = Inputs.of(robot, section.inputs, np.array(section.reference))
+        inputs = Inputs.from_names(robot, section.inputs, np.array(section.reference))
         groups.append(JointGroup(tuple(names.index(name) for name in section.joints), inputs))
         networks.append(PiSigma(len(section.inputs), len(section.joints), section.orders))
     return CorrectionNetwork(robot.dof, groups, networks) if groups else None

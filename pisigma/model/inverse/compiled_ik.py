@@ -67,7 +67,7 @@ class CompiledIK:
         self._threads = threading.local()
 
     @staticmethod
-    def of(model: "pisigma.model.calibrated_model.CalibratedModel") -> "CompiledIK":
+    def from_model(model: "pisigma.model.calibrated_model.CalibratedModel") -> "CompiledIK":
         """Compile a model.
 
         Raises:

@@ -111,7 +111,7 @@ class CorrectedIK(AbstractInverse):
         from pisigma.model.inverse.compiled_ik import CompiledIK
 
         try:
-            return CompiledIK.of(self.model)
+            return CompiledIK.from_model(self.model)
         except ModelError:
             return None
 

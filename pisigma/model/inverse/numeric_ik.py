@@ -110,7 +110,7 @@ class NumericIK:
         if branch is not None:
             check_choice(PoseError, "branch", branch, self.branches)
         requested = self.order if branch is None else (self.branches.index(branch),)
-        poses = _Poses.of(T_base_tool, single, throw)
+        poses = _Poses.from_values(T_base_tool, single, throw)
         valid, near_rows = poses.valid, None
         if near is not None:
             near_rows = self._joint_rows(near, "near", poses, throw)
@@ -132,7 +132,7 @@ class NumericIK:
         axes: TaskAxes | None = None,
     ) -> Solution:
         """Find solutions on every branch, as `(*batch, branches)`; one for a robot without a closed-form inverse."""
-        poses = _Poses.of(T_base_tool, single, True)
+        poses = _Poses.from_values(T_base_tool, single, True)
 
         def solve(ik: "NumericIK", rows: Tensor) -> Solution:
             every = ik._candidates(poses.T[rows], poses.single, None, ik.order)
@@ -342,7 +342,7 @@ class _Poses:
     batch: tuple[int, ...]
 
     @staticmethod
-    def of(values: Any, single: bool | None, throw: bool) -> "_Poses":
+    def from_values(values: Any, single: bool | None, throw: bool) -> "_Poses":
         """Convert and check poses.
 
         Raises:

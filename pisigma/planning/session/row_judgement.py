@@ -103,7 +103,9 @@ class RowModel:
     kept: Bool[Tensor, " rows"]
 
     @staticmethod
-    def of(robot: Robot, rows: Measurements, sigma: float | None, kept: Bool[Tensor, " rows"]) -> "RowModel":
+    def from_rows(
+        robot: Robot, rows: Measurements, sigma: float | None, kept: Bool[Tensor, " rows"]
+    ) -> "RowModel":
         """Linearise at the base and tool that are fitted to some of the rows.
 
         Args:
@@ -123,10 +125,12 @@ class RowModel:
         active = [*setup.free_unknowns, *chosen]
         setup = replace(setup, problem=setup.problem.with_active(active))
         gravity = GravityTorques(robot, in_first_row(robot, USUAL))
-        design = Design(setup.problem, (gravity, FourierSeries(robot, RobotClass.of(robot).harmonics)))
+        design = Design(
+            setup.problem, (gravity, FourierSeries(robot, RobotClass.from_robot(robot).harmonics))
+        )
         point, rounds = setup.start, LINEARISATIONS
         if not bool(kept.all()):
-            of_kept = RowModel.of(robot, rows.select(kept), sigma, kept[kept])
+            of_kept = RowModel.from_rows(robot, rows.select(kept), sigma, kept[kept])
             point, rounds = _start_at(setup, of_kept.geometry), 1
         values = sensor_values(setup.problem, point)
         columns = torch.cat([design.columns(one, slice(None)).flatten(0, 1) for one in values])
@@ -242,8 +246,8 @@ class RowModel:
     @cached_property
     def _size(self) -> Float64[Tensor, " unknowns"]:
         """Prior standard deviation of the unknowns; infinite if there is no prior."""
-        of_class = RobotClass.of(self.setup.problem.space.robot)
-        prior = self.design.prior([of_class.usual.of(group) / USUAL_LENGTH for group in PriorGroup])
+        of_class = RobotClass.from_robot(self.setup.problem.space.robot)
+        prior = self.design.prior([of_class.usual.size_of(group) / USUAL_LENGTH for group in PriorGroup])
         sizes = torch.cat(
             [prior.sizes[: prior.classes], prior.sizes.new_tensor([of_class.gravity, *of_class.bands])]
         )
@@ -264,7 +268,7 @@ def _start_at(setup: CalibrationSetup, geometry: IdentifiedGeometry) -> Float64[
             tools[number] = torch.cat([tool[:3], rpy_from_rotation(R)])
     point = setup.start.clone()
     for name, block in (("base", bases), ("tool", tools)):
-        stretch = setup.problem.space.of(name)
+        stretch = setup.problem.space.indices_of(name)
         point[stretch.start : stretch.stop] = block.flatten()
     return point
 
@@ -313,19 +317,19 @@ def judge_rows(
     Args:
         robot: nominal robot.
         rows: all rows, the last ones new.
-        sigma: see `RowModel.of`.
+        sigma: see `RowModel.from_rows`.
         trusted: rows that counted so far; of `FEW_ROWS` or fewer, none is trusted.
     """
     few = rows.rows <= FEW_ROWS
     counts = torch.ones_like(trusted) if few else trusted.clone()
     try:
-        model = RowModel.of(robot, rows, sigma, counts)
+        model = RowModel.from_rows(robot, rows, sigma, counts)
         errors = model.left_out()
         while (wrong := _contradicted(robot, rows, sigma, model, errors, few)) is not None:
             model, errors = wrong
         right = ~(errors.chance < FALSE_ALARMS) & ~model.kept
         if bool(right.any()):
-            model = RowModel.of(robot, rows, sigma, model.kept | right)
+            model = RowModel.from_rows(robot, rows, sigma, model.kept | right)
             again = model.left_out()
             errors = replace(again, chance=errors.chance)
         return RowJudgement(model.kept, model, errors)
@@ -351,13 +355,13 @@ def _contradicted(
         others[row] = False
         with contextlib.suppress(IdentificationError):
             every = torch.ones(int(others.sum()), dtype=torch.bool)
-            misfits[row] = RowModel.of(robot, rows.select(others), sigma, every).misfit
+            misfits[row] = RowModel.from_rows(robot, rows.select(others), sigma, every).misfit
     least = min(misfits.values(), default=0.0)
     likely = [row for row in suspects if misfits.get(row, math.inf) <= least + MIN_MISFIT_GAIN] or suspects
     for row in likely[-1:]:
         others = counts.clone()
         others[row] = False
-        model = RowModel.of(robot, rows, sigma, others)
+        model = RowModel.from_rows(robot, rows, sigma, others)
         errors = model.left_out()
         if float(errors.chance[row]) < FALSE_ALARMS:
             return model, errors

@@ -200,7 +200,9 @@ class FurtherPoses:
     task: Float64[Tensor, "tasks dof"]
 
     @staticmethod
-    def of(plan: StoredPlan, candidates: Candidates, task: Float64[Tensor, "tasks dof"]) -> "FurtherPoses":
+    def from_plan(
+        plan: StoredPlan, candidates: Candidates, task: Float64[Tensor, "tasks dof"]
+    ) -> "FurtherPoses":
         """Select evenly from the candidates of a plan."""
         count = len(candidates.q)
         some = torch.linspace(0, count - 1, min(count, MAX_CANDIDATES)).round().long()

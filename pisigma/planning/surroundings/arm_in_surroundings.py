@@ -77,7 +77,7 @@ class ArmInSurroundings:
     limits: Float64[Tensor, "axes 2"]
 
     @staticmethod
-    def of(robot: Robot, cell: Surroundings | None = None) -> "ArmInSurroundings":
+    def from_robot(robot: Robot, cell: Surroundings | None = None) -> "ArmInSurroundings":
         """Put a robot into its cell; with None, only limits and self-collision are checked."""
         cell = cell or Surroundings()
         capsules = cell.capsules(robot)

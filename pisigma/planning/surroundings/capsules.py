@@ -52,7 +52,7 @@ class Capsules:
     carrier: Bool[Tensor, " pieces"]
 
     @staticmethod
-    def of(
+    def from_robot(
         robot: Robot,
         tip: Float64[np.ndarray, " 3"] | None = None,
         radius: float | None = None,
@@ -102,7 +102,7 @@ class Capsules:
         return (frames[..., :3, :3] @ self.point[..., None])[..., 0] + frames[..., :3, 3]
 
     def _frames(self, q: Float64[Tensor, "*batch dof"]) -> list[Float64[Tensor, "*batch 4 4"]]:
-        rows = list(iterate_rows(self.robot, Geometry.of(self.robot), q.unbind(-1)))
+        rows = list(iterate_rows(self.robot, Geometry.from_robot(self.robot), q.unbind(-1)))
         return [as_transform(frame, q[..., 0]) for frame in (rows[0].before, *(row.after for row in rows))]
 
     def pairs(self, clearance: float) -> Int64[Tensor, "pairs 2"]:

@@ -295,7 +295,7 @@ class Surroundings(Section):
         radius = self.links.radius_mm
         radii = {name: size / 1e3 for name, size in self.links.radii_mm.items()}
         tool_radius = TOOL_RADIUS if self.tool is None else self.tool.radius_mm / 1e3
-        return Capsules.of(
+        return Capsules.from_robot(
             self.robot_with_tool(robot),
             robot.tool[:3],
             None if radius is None else radius / 1e3,

@@ -41,7 +41,7 @@ class Geometry:
     tool: Sequence[Scalar]
 
     @staticmethod
-    def of(robot: Robot) -> "Geometry":
+    def from_robot(robot: Robot) -> "Geometry":
         """Return the geometry of a robot as plain floats."""
         return Geometry(robot.dh.tolist(), robot.base.tolist(), robot.tool.tolist())
 
@@ -114,7 +114,7 @@ def forward_kinematics(
         PoseError: the number of columns of q is not the number of joints.
     """
     robot.check_joint_count(q.shape[-1])
-    geometry = geometry or Geometry.of(robot)
+    geometry = geometry or Geometry.from_robot(robot)
     chunks = [_forward_chunk(robot, geometry, chunk).contiguous() for chunk in iterate_chunks(q)]
     T = torch.cat(chunks) if len(chunks) > 1 else chunks[0]
     return T.reshape(*q.shape[:-1], 4, 4)

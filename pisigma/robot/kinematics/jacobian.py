@@ -44,7 +44,7 @@ def joint_jacobian(
     """
     robot.check_joint_count(q.shape[-1])
     batch = q.shape[:-1]
-    geometry = Geometry.of(robot)
+    geometry = Geometry.from_robot(robot)
     chunks = [_jacobian_chunk(robot, geometry, chunk) for chunk in iterate_chunks(q)]
     T, J = chunks[0]
     if len(chunks) > 1:

@@ -82,7 +82,7 @@ def render_image(
     if left < right and top < bottom:
         rays = _rays(camera, np.arange(left, right + 1) - 0.5, np.arange(top, bottom + 1) - 0.5)
         xy, depth = _on_surface(board, T_camera_board, rays)
-        sharp = _reflected(_Surface.of(board.pattern, exposure), xy)
+        sharp = _reflected(_Surface.from_pattern(board.pattern, exposure), xy)
         gray[top:bottom, left:right] = _blurred(sharp, _blur(camera, exposure, depth[1:, 1:]))
     gray *= _light(camera, exposure)
     gray += exposure.noise * rng.standard_normal(gray.shape, dtype=np.float32)
@@ -185,7 +185,7 @@ class _Surface:
     background: float
 
     @staticmethod
-    def of(pattern: Pattern, exposure: Exposure) -> "_Surface":
+    def from_pattern(pattern: Pattern, exposure: Exposure) -> "_Surface":
         """Build the grid from the sheet and its printed pattern."""
         rectangles = np.concatenate([pattern.sheet[None], pattern.black])
         x, y = np.unique(rectangles[:, [0, 2]]), np.unique(rectangles[:, [1, 3]])

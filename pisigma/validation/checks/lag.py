@@ -47,7 +47,7 @@ class LagCheck(AbstractCheck):
 
     def diagnose(self, checked: CheckedCalibration) -> Iterator[Diagnostic]:
         """See `AbstractCheck.diagnose`."""
-        rows = OrderedRows.of(checked.geometric)
+        rows = OrderedRows.from_result(checked.geometric)
         lag = None if rows is None else find_lag(rows, checked.rows)
         if lag is None or lag.log_bayes_factor < LIKELY or lag.factor < NOTICED:
             return

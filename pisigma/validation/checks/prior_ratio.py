@@ -69,7 +69,9 @@ def class_of(checked: CheckedCalibration, large: Sequence[PriorRatio]) -> RobotC
     at_least = [(ratio.group, ratio.size_at_least) for ratio in large]
     if usual.allows(at_least) or checked.calibrator.robot_class is not None:
         return usual if usual.allows(at_least) else None
-    if any(group != PriorGroup.JOINT_OFFSET for group, size in at_least if size > usual.largest.of(group)):
+    if any(
+        group != PriorGroup.JOINT_OFFSET for group, size in at_least if size > usual.largest.size_of(group)
+    ):
         return None
     names = list(CLASSES)
     wider = [CLASSES[name] for name in names[names.index(usual.name) + 1 :]]
@@ -100,7 +102,7 @@ def predicts_left_out_rows(checked: CheckedCalibration) -> bool:
 
 def _usual_class(checked: CheckedCalibration) -> RobotClass:
     stated = checked.calibrator.robot_class
-    return RobotClass.of(checked.robot) if stated is None else CLASSES[stated]
+    return RobotClass.from_robot(checked.robot) if stated is None else CLASSES[stated]
 
 
 def _size(ratio: PriorRatio) -> str:

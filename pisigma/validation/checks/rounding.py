@@ -105,7 +105,7 @@ def joint_rounding(result: CalibrationResult, measurements: Measurements) -> Rou
     if coupling is None:
         unit = np.where(result.robot.revolute, math.degrees(1), 1e3)
         steps = np.array([_common_step(column[:, None]) for column in (q * unit).T]) / unit
-    rows = OrderedRows.of(result) if steps.any() else None
+    rows = OrderedRows.from_result(result) if steps.any() else None
     if rows is None or len(rows.residual) < MIN_ROWS:
         return None
     made = rows.by_joints * steps / math.sqrt(12)

@@ -80,7 +80,7 @@ class TwoPopulationsCheck(AbstractCheck):
             checked.hybrid if checked.hybrid is not None and checked.hybrid.learned is not None else None
         )
         for result in (checked.geometric, learned):
-            ordered = None if result is None else OrderedRows.of(result)
+            ordered = None if result is None else OrderedRows.from_result(result)
             found = None if ordered is None else find_populations(ordered, checked.rows.rows)
             if found is not None and _differ(found):
                 yield _two_populations(checked.rows, found)

@@ -34,7 +34,7 @@ class UnexplainedCheck(AbstractCheck):
         if left is None or drawn is None or self._explained(checked, left):
             return
         reach = checked.robot.reach * 1e3
-        stated = checked.calibrator.robot_class or RobotClass.of(checked.robot).name
+        stated = checked.calibrator.robot_class or RobotClass.from_robot(checked.robot).name
         far = left > (FAR_HOBBY if stated == HOBBY.name else FAR) * reach
         if far or (left > LARGE * reach and drawn < HARDLY * left):
             what = "rows of the calibration" if checked.validation is None else "held-out rows"

@@ -346,7 +346,7 @@ def _judge(
     hybrid = results.get("hybrid")
     spread = predicted_spread(hybrid, held_out) if isinstance(hybrid, HybridResult) else None
     poses = {name: result.predicted_poses(rows) for name, result in results.items() if distances}
-    apart = DistanceErrors.of(poses, distances, rows)
+    apart = DistanceErrors.from_poses(poses, distances, rows)
     return JudgedFold(torch.arange(held_out.rows), errors, apart, spread)
 
 

@@ -47,7 +47,7 @@ class HeldOutRows:
     data_sha256: str
 
     @staticmethod
-    def of(validation: CalibrationValidation, measurements: Measurements) -> "HeldOutRows":
+    def from_validation(validation: CalibrationValidation, measurements: Measurements) -> "HeldOutRows":
         """Take the errors of the first repeat of a validation.
 
         Args:

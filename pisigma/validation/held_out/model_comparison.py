@@ -302,7 +302,7 @@ def _distances(
 ) -> SocketDistances | None:
     """Compute the figures of stated distances of sockets, each at the mean predicted position of its ball."""
     poses = {name: poses_of_rows(model, rows) for name, model in models.items() if stated}
-    return distance_figures([DistanceErrors.of(poses, stated, rows)])
+    return distance_figures([DistanceErrors.from_poses(poses, stated, rows)])
 
 
 def inside_domain(model: CalibratedModel, measurements: Measurements) -> Bool[Tensor, " rows"] | None:

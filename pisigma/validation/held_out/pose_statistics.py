@@ -177,7 +177,7 @@ class Comparison:
     not_predicted: int
 
     @staticmethod
-    def of(nominal: PoseErrors, corrected: PoseErrors) -> "Comparison":
+    def from_errors(nominal: PoseErrors, corrected: PoseErrors) -> "Comparison":
         """Compare on the rows for which both have errors."""
         both = ~(torch.isfinite(nominal.position) & torch.isnan(corrected.position))
         return Comparison(nominal.only(both), corrected, int((~both).sum()))
@@ -193,7 +193,7 @@ def compare_on(model: CalibratedModel, measurements: Measurements) -> Comparison
         PoseErrors.between(measurements, poses(model, measurements))
         for poses in (nominal_poses_of_rows, poses_of_rows)
     )
-    return Comparison.of(nominal, corrected)
+    return Comparison.from_errors(nominal, corrected)
 
 
 @dataclass(frozen=True, eq=False)

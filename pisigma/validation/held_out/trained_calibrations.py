@@ -218,7 +218,7 @@ class DistanceErrors:
     errors: Mapping[str, Float64[Tensor, " pairs"]] = field(default_factory=dict)
 
     @staticmethod
-    def of(
+    def from_poses(
         poses: Mapping[str, Float64[Tensor, "rows 4 4"]],
         stated: Mapping[PairOfSockets, float],
         rows: Measurements,

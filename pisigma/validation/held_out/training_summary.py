@@ -43,7 +43,7 @@ class JointErrors:
     after: Float64[Tensor, "rows dof"]
 
     @staticmethod
-    def of(model: CalibratedModel, pairs: TrainingPairs) -> "JointErrors":
+    def from_model(model: CalibratedModel, pairs: TrainingPairs) -> "JointErrors":
         """Compute the joint errors of the used rows, before and after the model's correction."""
         T, q, before = pairs.T[pairs.used], pairs.q_nominal[pairs.used], pairs.target[pairs.used]
         return JointErrors(T, before, before - model.correction(T, q))
@@ -85,7 +85,7 @@ class JointErrorFigures(Section):
     maximum_mm: float | None = None
 
     @staticmethod
-    def of(errors: Float64[Tensor, " rows"], revolute: bool) -> "JointErrorFigures":
+    def from_errors(errors: Float64[Tensor, " rows"], revolute: bool) -> "JointErrorFigures":
         """Compute the figures of the errors of a joint [rad or m]."""
         unit, factor = ("deg", math.degrees(1.0)) if revolute else ("mm", 1e3)
         sizes = errors.abs()
@@ -155,7 +155,7 @@ class ComparisonFigures(Section):
     corrected: ErrorFigures
 
     @staticmethod
-    def of(comparison: Comparison, **counts: int) -> "ComparisonFigures":
+    def from_comparison(comparison: Comparison, **counts: int) -> "ComparisonFigures":
         """Compute the figures of a comparison, with numbers of folds or rows."""
         return ComparisonFigures(
             **counts,
@@ -266,7 +266,7 @@ def _joint(run: TrainingRun, name: str, paper: Mapping[str, BeforeAfter]) -> Joi
     for rows, errors in (("training", run.training), ("held_out", run.held_out)):
         if errors is not None:
             before, after = (
-                JointErrorFigures.of(values[:, index], robot.revolute[index])
+                JointErrorFigures.from_errors(values[:, index], robot.revolute[index])
                 for values in (errors.before, errors.after)
             )
             figures[rows] = BeforeAfter(before=before, after=after)

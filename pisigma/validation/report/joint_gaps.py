@@ -116,7 +116,7 @@ def measured_stretches(
         model: a hybrid keeps the stretches that it was calibrated with.
         q: measured joint values, for models that keep none [rad or m].
     """
-    coverage = model.hybrid.coverage if model.hybrid else JointCoverage.of(model.robot, q)
+    coverage = model.hybrid.coverage if model.hybrid else JointCoverage.from_joints(model.robot, q)
     result = []
     for j, limits in enumerate(map(tuple, model.robot.limits.tolist())):
         of_joint, rate = coverage.joint == j, float(coverage.rate[j])

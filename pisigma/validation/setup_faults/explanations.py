@@ -103,7 +103,7 @@ def hypotheses(arm: PredictingArm, some: Measurements, here: Hypothesis, most: f
     for measured, cause in _likely_conventions(arm, here):
         yield from in_frames(arm, some, replace(here, measured=measured, causes=(cause,)), most)
     maps = likely_maps(arm, some, here.measured)
-    for number, q in enumerate(maps.of(some.q)):
+    for number, q in enumerate(maps.apply(some.q)):
         T = arm.poses(replace(some, q=q))
         if bool(torch.isfinite(T).all()):
             causes = joint_causes(maps, number, arm.robot)

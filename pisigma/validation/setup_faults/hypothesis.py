@@ -194,7 +194,7 @@ def _shifted_from_a_row(
     """
     inner = torch.arange(MARGIN, rows.rows - MARGIN)
     among = rows.select(inner)
-    measured = MeasuredPoses.of(among.position, among.rotation, LEVER_SHARE * arm.robot.reach)
+    measured = MeasuredPoses.from_tensors(among.position, among.rotation, LEVER_SHARE * arm.robot.reach)
     T = {shift: arm.poses(replace(rows, q=rows.q.roll(-shift, 0)))[inner] for shift in (0, *SHIFTS)}
     third = len(chosen) // ENDS
     for at_start, end in ((True, chosen[:third] - MARGIN), (False, chosen[-third:] - MARGIN)):

@@ -65,7 +65,7 @@ class JointMaps:
         """Multiply the joints by factors."""
         return JointMaps(torch.diag_embed(factors), torch.zeros_like(factors))
 
-    def of(self, q: Float64[Tensor, "rows dof"]) -> Float64[Tensor, "maps rows dof"]:
+    def apply(self, q: Float64[Tensor, "rows dof"]) -> Float64[Tensor, "maps rows dof"]:
         """Map joint values [rad or m]."""
         return q @ self.matrix.mT + self.offset[:, None]
 
@@ -250,7 +250,7 @@ def likely_maps(arm: PredictingArm, measurements: Measurements, measured: Measur
     some, few = measurements.select(rows), measured.select(rows)
 
     def errors_of(maps: JointMaps) -> Float64[Tensor, "modes maps"]:
-        return arm.screened_errors(some, maps.of(some.q), few)
+        return arm.screened_errors(some, maps.apply(some.q), few)
 
     kinds = (
         other_units(robot),

@@ -87,7 +87,7 @@ def find_nominal_robot_faults(robot: Robot, measurements: Measurements) -> tuple
         return ()
     chosen = spread(torch.arange(MARGIN, rows.rows - MARGIN), MAX_ROWS_NOMINAL)
     some, arm = rows.select(chosen), PredictingArm(robot)
-    measured = MeasuredPoses.of(some.position, some.rotation, LEVER_SHARE * robot.reach)
+    measured = MeasuredPoses.from_tensors(some.position, some.rotation, LEVER_SHARE * robot.reach)
     raw = Hypothesis(some.q, arm.poses(some), measured)
     here, usual = next(in_frames(arm, some, raw)), usual_error(robot, some.q)
     if len(set(measurements.target)) > 1:
@@ -147,7 +147,10 @@ def _named_otherwise(robot: Robot, measurements: Measurements, usual: float) -> 
     rows = largest_group(measurements, by_target=False)
     rows = rows.select(spread(torch.arange(rows.rows), MAX_ROWS))
     number, lever = numbers_of_names(rows.target), LEVER_SHARE * robot.reach
-    measured, T = MeasuredPoses.of(rows.position, rows.rotation, lever), forward_kinematics(robot, rows.q)
+    measured, T = (
+        MeasuredPoses.from_tensors(rows.position, rows.rotation, lever),
+        forward_kinematics(robot, rows.q),
+    )
     here = Hypothesis(rows.q, fit_targets(T, measured, number)[1], measured)
     if not here.error > usual:
         return ()

@@ -49,7 +49,7 @@ class OrderedRows:
     noise: Float64[np.ndarray, " values"]
 
     @staticmethod
-    def of(result: CalibrationResult | HybridResult) -> "OrderedRows | None":
+    def from_result(result: CalibrationResult | HybridResult) -> "OrderedRows | None":
         """Compute the residuals of a calibration; None if it has no positions or orientations with noise."""
         learned = result.learned if isinstance(result, HybridResult) else None
         geometric = result.geometric if isinstance(result, HybridResult) else result

@@ -126,7 +126,7 @@ def _differences(
     """Yield the derivatives by each thing that may differ, with the precision of the prior of its difference."""
     space = rows.problem.space
     for kind, group in (("tool", rows.problem.target), ("frame", rows.problem.frame)):
-        first = space.of("base" if kind == "frame" else "tool").start
+        first = space.indices_of("base" if kind == "frame" else "tool").start
         columns = first + 6 * group.cpu().numpy()[:, None] + np.arange(6)
         Z = np.take_along_axis(rows.derivative, columns[:, None], 2)
         turning = kind == "frame" or rows.residual.shape[1] > 3

@@ -83,7 +83,7 @@ def find_motion(result: CalibrationResult | HybridResult) -> Motion | None:
     Returns:
         None if no position or orientation was measured, or if there are too few rows.
     """
-    rows = OrderedRows.of(result)
+    rows = OrderedRows.from_result(result)
     if rows is None:
         return None
     search = _Search(rows)
@@ -209,7 +209,7 @@ class _Search:
         )
         for kind, groups, names in kinds:
             group = groups.cpu().numpy()
-            first = space.of("base" if kind == "frame" else "tool").start
+            first = space.indices_of("base" if kind == "frame" else "tool").start
             columns = first + 6 * group[:, None] + np.arange(6)
             Z = np.take_along_axis(self.rows.derivative, columns[:, None], 2)
             turning = kind == "frame" or self.rows.residual.shape[1] > 3

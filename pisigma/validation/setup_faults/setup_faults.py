@@ -71,7 +71,7 @@ def find_setup_faults(
     if not bool(predicted.any()):
         return ()
     some, known, T = some.select(predicted), known.select(predicted), T[predicted]
-    measured = MeasuredPoses.of(some.position, some.rotation, LEVER_SHARE * model.robot.reach)
+    measured = MeasuredPoses.from_tensors(some.position, some.rotation, LEVER_SHARE * model.robot.reach)
     here = Hypothesis(some.q, T, measured)
     if fitted:
         T, columns = fit_frames(T, measured, some, fitted)

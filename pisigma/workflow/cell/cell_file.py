@@ -184,7 +184,7 @@ class _Places:
     path: Path
     step: str
 
-    def of(self, key: str) -> Place:
+    def place_of(self, key: str) -> Place:
         return place_of_key(self.path, (self.step, key) if key else (self.step,))
 
 
@@ -213,7 +213,7 @@ def settings_from(
     except PisigmaError as problem:  # the class of the settings refuses a value
         key = problem.option.removeprefix("--").replace("-", "_")
         raise (
-            problem if key in outside else problem.located(places.of(key if key in values else ""))
+            problem if key in outside else problem.located(places.place_of(key if key in values else ""))
         ) from None
     assert isinstance(built, group)
     return built
@@ -228,12 +228,16 @@ def _checked(group: type, stated: Mapping[str, Any], places: _Places) -> Iterato
     known = {one.key: one for one in flat_settings(group)}
     for key, value in stated.items():
         if key not in known:
-            raise PlanningError(f"unknown key '{key}'", at=places.of(key), remedy=nearest_choice(key, known))
+            raise PlanningError(
+                f"unknown key '{key}'", at=places.place_of(key), remedy=nearest_choice(key, known)
+            )
         kind = known[key].kind
         try:
             yield key, TypeAdapter(kind).validate_python(_listed(value, kind))
         except ValidationError:
-            raise PlanningError(expected=_TYPES.get(kind, "a list"), value=value, at=places.of(key)) from None
+            raise PlanningError(
+                expected=_TYPES.get(kind, "a list"), value=value, at=places.place_of(key)
+            ) from None
 
 
 def _listed(value: Any, kind: Any) -> Any:

@@ -125,7 +125,7 @@ class Sessions:
         known = [one for one in self.history.sessions() if not one.set_aside]
         again = torch.zeros(rows.rows, dtype=torch.bool)
         for one in known:
-            values = RowValues.of(self.rows_of([one]).as_fields(), self.robot)
+            values = RowValues.from_rows(self.rows_of([one]).as_fields(), self.robot)
             again |= copies_of_known(rows.as_fields(), self.robot, values)
         if bool(again.all()):
             raise MeasurementError(

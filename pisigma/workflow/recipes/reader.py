@@ -109,7 +109,7 @@ def _network_checks(recipe: InverseRecipe, robot: Robot) -> Iterator[Check]:
     for index, group in enumerate(recipe.network):
         yield ("network", index, "joints"), partial(_check_joints, group.joints, joints, tuple(corrected))
         reference = np.array(group.reference, dtype=np.float64)
-        yield ("network", index, "inputs"), partial(Inputs.of, robot, group.inputs, reference)
+        yield ("network", index, "inputs"), partial(Inputs.from_names, robot, group.inputs, reference)
         corrected.extend(group.joints)
     for name in recipe.paper:
         yield ("paper", name), partial(_check_joints, (name,), joints, ())

@@ -27,7 +27,7 @@ def coverage_of(first: Tensor, name: str = "ur5", joint: int = 0) -> JointCovera
     columns = [torch.linspace(-np.pi, np.pi, len(first), dtype=torch.float64)] * robot.dof
     q = torch.stack(columns, 1) if all(robot.revolute) else q
     q[:, joint] = first
-    return JointCoverage.of(robot, q)
+    return JointCoverage.from_joints(robot, q)
 
 
 def beyond(coverage: JointCoverage, *angles: float) -> Tensor:
@@ -83,7 +83,7 @@ def test_values_a_full_turn_apart_are_the_same_for_turning_joints_only() -> None
 def test_one_row_is_a_stretch_of_no_length() -> None:
     robot = Robot.load("ur5")
     q = torch.full((1, 6), 0.4, dtype=torch.float64)
-    found = JointCoverage.of(robot, q)
+    found = JointCoverage.from_joints(robot, q)
     assert_close(found.half, torch.zeros(6))
     assert found.contains(q).tolist() == [True]
     assert found.contains(q + 0.5).tolist() == [False]
@@ -92,7 +92,7 @@ def test_one_row_is_a_stretch_of_no_length() -> None:
 
 
 def test_one_joint_beyond_its_measured_values_is_enough_but_rounding_is_not() -> None:
-    found = JointCoverage.of(Robot.load("ur5"), torch.zeros(1, 6, dtype=torch.float64))
+    found = JointCoverage.from_joints(Robot.load("ur5"), torch.zeros(1, 6, dtype=torch.float64))
     q = torch.tensor([[0.05, -0.1, 0.0, 0.0, 0.02, 0.0], [1e-10] * 6, [math.nan] * 6], dtype=torch.float64)
     assert_close(found.beyond(q)[0], q[0].abs())
     assert found.contains(q).tolist() == [False, True, False]
@@ -104,7 +104,7 @@ def test_the_correction_holds_where_joints_were_measured_and_beyond() -> None:
     correction = JointCorrection(robot, (FourierSeries(robot, 2),)).requires_grad_(False)
     correction.linear[0].fill_(1e-3)
     inside = drawn_joints(robot, 300, 0, widest=0.8)
-    arm = HybridArm(geometry, correction, JointCoverage.of(robot, inside))
+    arm = HybridArm(geometry, correction, JointCoverage.from_joints(robot, inside))
     outside = inside[:20] + torch.tensor([0.0, 0, 2.5, 0, 0, 0]).double()
     assert bool(arm.coverage.contains(inside).all())
     assert not bool(arm.coverage.contains(outside).any())

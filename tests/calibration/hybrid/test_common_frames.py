@@ -78,8 +78,10 @@ def test_a_moved_frame_moves_what_stands_in_it_with_its_uncertainty():
     like = with_frames_of(solved, refined)
     assert_close(moved.bases[""], like.bases[""], atol=1e-9)
     assert moved.point is not None
-    base = moved.setup.anchors.bases[0] @ transform_from_xyzrpy(turned[solved.problem.space.of("base")])
+    base = moved.setup.anchors.bases[0] @ transform_from_xyzrpy(
+        turned[solved.problem.space.indices_of("base")]
+    )
     assert_close(transform_from_xyzrpy(torch.from_numpy(moved.bases[""])), base, atol=1e-12)
-    anchor = solved.problem.space.of("anchor").start
+    anchor = solved.problem.space.indices_of("anchor").start
     place = moved.change[anchor : anchor + 3, anchor : anchor + 3]
     assert_close(place, moved.setup.anchors.bases[0, :3, :3], atol=1e-12)

@@ -114,7 +114,7 @@ def test_log_evidence_is_stationary_in_sizes_and_noise(seed: int) -> None:
 def test_log_evidence_of_linearised_rows_is_stationary() -> None:
     """Of normal equations, in the sizes of all groups that the data determine, and in both noises."""
     case = poses()
-    fit = NormalEquations.of(case.design, case.rows)
+    fit = NormalEquations.from_rows(case.design, case.rows)
     found = fit.maximise_evidence(case.prior, case.noise, 300, 1e-9)
     moving = (found.prior.sizes > 10 * SMALLEST_SIZE).nonzero()[found.prior.classes :, 0].tolist()
     assert moving

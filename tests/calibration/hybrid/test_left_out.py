@@ -21,7 +21,7 @@ FORMS = {"normal equations": NormalEquations, "value covariance": ValueCovarianc
 def test_closed_form_equals_fitting_without_every_group(name: str, form: str) -> None:
     """Where nothing else says where sockets of a placement or an anchor are, that is fitted to the left-out rows."""
     case = CASES[name]()
-    fit: AbstractDesignRegression = FORMS[form].of(case.design, case.rows)
+    fit: AbstractDesignRegression = FORMS[form].from_rows(case.design, case.rows)
     found = fit.left_out(fit.solve(case.prior, case.noise), case.folds)
     expected = case.refitted
     assert found.sensor.tolist() == expected.sensor.tolist()
@@ -35,7 +35,7 @@ def test_several_groups_can_be_left_out_together(form: str) -> None:
     case = poses()
     folds = case.rows.folds(4, 1000)
     assert sorted(torch.cat(folds).tolist()) == list(range(case.rows.groups))
-    fit: AbstractDesignRegression = FORMS[form].of(case.design, case.rows)
+    fit: AbstractDesignRegression = FORMS[form].from_rows(case.design, case.rows)
     found = fit.left_out(fit.solve(case.prior, case.noise), folds)
     expected = case.dense.left_out(case.dense.solve(case.prior, case.noise), folds)
     assert_close(found.error, expected.error, atol=1e-6)
@@ -46,7 +46,7 @@ def test_several_groups_can_be_left_out_together(form: str) -> None:
 def test_sizes_and_noise_can_be_estimated_anew_for_every_fold(form: str) -> None:
     case = poses()
     folds = case.rows.folds(3, 1000)
-    fit: AbstractDesignRegression = FORMS[form].of(case.design, case.rows)
+    fit: AbstractDesignRegression = FORMS[form].from_rows(case.design, case.rows)
     found = fit.left_out_refitted(fit.solve(case.prior, case.noise), folds, 3)
     expected = case.dense.left_out_refitted(case.dense.solve(case.prior, case.noise), folds, 3)
     assert_close(found.error, expected.error, atol=1e-4)
@@ -62,7 +62,7 @@ def test_the_noise_of_a_sensor_stands_of_which_a_fold_takes_all_values(form: str
     number = [values.name for values in case.rows.values].index("distance")
     wire = case.rows.group[case.rows.values[number].row].unique()
     assert len(wire) == 1
-    fit: AbstractDesignRegression = FORMS[form].of(case.design, case.rows)
+    fit: AbstractDesignRegression = FORMS[form].from_rows(case.design, case.rows)
     posterior = fit.solve(case.prior, case.noise)
     rest = fit.without(wire).maximise_evidence(posterior.prior, posterior.noise, 2)
     assert rest.noise[number] == case.noise[number]
@@ -72,7 +72,7 @@ def test_the_noise_of_a_sensor_stands_of_which_a_fold_takes_all_values(form: str
 
 def test_errors_are_larger_than_the_residuals_and_about_as_large_as_predicted() -> None:
     case = few_values()
-    fit = ValueCovariance.of(case.design, case.rows)
+    fit = ValueCovariance.from_rows(case.design, case.rows)
     posterior = fit.maximise_evidence(case.prior, case.noise)
     found = fit.left_out(posterior, case.folds)
     residual = sum(m / sigma**2 for m, sigma in zip(posterior.misfit, posterior.noise, strict=True))
@@ -105,7 +105,7 @@ def test_what_only_left_out_values_determine_counts_as_fitted_to_them() -> None:
     M = inverse - inverse @ Z @ torch.linalg.inv(Z.t() @ inverse @ Z) @ Z.t() @ inverse
     sensor = torch.zeros(8, dtype=torch.int64)
     counts = [SensorCount(8.0, False, False)]
-    found = LeftOut.of(M, M @ y, sensor, counts)
+    found = LeftOut.from_fit(M, M @ y, sensor, counts)
     expected = (y - Z @ torch.linalg.lstsq(Z, y).solution) * (8 / 6) ** 0.5
     assert_close(found.error, expected, atol=1e-9)
     free = torch.eye(8).double() - Z @ torch.linalg.pinv(Z)
@@ -119,8 +119,8 @@ def test_values_that_say_no_more_than_one_err_by_more_than_their_share() -> None
     sensor = torch.tensor([0, 0, 0, 1, 1, 1])
     counts = [SensorCount(3.0, False, False), SensorCount(1.0, False, False, 3.0)]
     M = torch.linalg.inv(S)
-    alone = LeftOut.of(M, M @ y, sensor, [counts[0], replace(counts[1], repetition=1.0)])
-    found = LeftOut.of(M, M @ y, sensor, counts)
+    alone = LeftOut.from_fit(M, M @ y, sensor, [counts[0], replace(counts[1], repetition=1.0)])
+    found = LeftOut.from_fit(M, M @ y, sensor, counts)
     assert_close(alone.error, y, atol=1e-12)
     assert_close(alone.spread, S.diagonal().sqrt(), rtol=1e-12)
     assert_close(found.error[:3], alone.error[:3])

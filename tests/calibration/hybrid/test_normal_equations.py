@@ -37,9 +37,9 @@ def assert_same_sums(found: NormalEquations, expected: DenseRegression) -> None:
 def test_sums_are_those_of_all_columns_at_once(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Whatever fits into a chunk."""
     case = CASES[name]()
-    assert_same_sums(NormalEquations.of(case.design, case.rows), case.dense)
+    assert_same_sums(NormalEquations.from_rows(case.design, case.rows), case.dense)
     monkeypatch.setattr("pisigma.calibration.hybrid.design.CHUNK", 7)
-    assert_same_sums(NormalEquations.of(case.design, case.rows), case.dense)
+    assert_same_sums(NormalEquations.from_rows(case.design, case.rows), case.dense)
 
 
 def test_the_cases_are_what_they_are_for() -> None:
@@ -57,7 +57,7 @@ def test_the_cases_are_what_they_are_for() -> None:
 @pytest.mark.parametrize("name", CASES)
 def test_posterior_is_that_of_the_dense_problem(name: str) -> None:
     case = CASES[name]()
-    found = NormalEquations.of(case.design, case.rows)
+    found = NormalEquations.from_rows(case.design, case.rows)
     assert_same_posterior(found, case.dense, case.prior, case.noise, case.exactness)
 
 
@@ -68,9 +68,9 @@ def test_sums_of_a_smaller_design_are_a_part_of_those_of_a_larger(name: str) -> 
     small = Design(case.rows.problem, case.smaller)
     places = case.design.indices(case.smaller)
     assert len(places) == len(set(places.tolist())) == small.unknowns
-    found = NormalEquations.of(case.design, case.rows).select(small)
+    found = NormalEquations.from_rows(case.design, case.rows).select(small)
     assert found.design is small
-    assert_same_sums(found, DenseRegression.of(small, case.rows))
+    assert_same_sums(found, DenseRegression.from_rows(small, case.rows))
     assert_same_sums(found, case.dense.select(places))
 
 
@@ -79,9 +79,9 @@ def test_sums_with_another_feature_are_those_of_all_columns_at_once(name: str) -
     """Of some of the features that were there, one of which may be smaller, and the new one."""
     case = CASES[name]()
     features = [one for one in case.design.features if one.name != case.smaller[0].name]
-    first = NormalEquations.of(Design(case.rows.problem, tuple(features)), case.rows)
+    first = NormalEquations.from_rows(Design(case.rows.problem, tuple(features)), case.rows)
     design = Design(case.rows.problem, (*features[:1], case.smaller[0]))
-    assert_same_sums(first.extended(design), DenseRegression.of(design, case.rows))
+    assert_same_sums(first.extended(design), DenseRegression.from_rows(design, case.rows))
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -89,7 +89,10 @@ def test_sums_without_some_groups_are_those_of_the_others(name: str) -> None:
     """What is certain stays."""
     case = CASES[name]()
     groups = torch.cat(case.folds[1:])
-    found, expected = NormalEquations.of(case.design, case.rows).without(groups), case.dense.without(groups)
+    found, expected = (
+        NormalEquations.from_rows(case.design, case.rows).without(groups),
+        case.dense.without(groups),
+    )
     assert_close(
         np.array([one.values for one in found.sensors]),
         np.array([one.values for one in expected.sensors]),
@@ -104,7 +107,7 @@ def test_sums_without_some_groups_are_those_of_the_others(name: str) -> None:
 
 def with_sums(normal: Tensor, descent: Tensor) -> NormalEquations:
     """Of one sensor, beside any rows."""
-    whole = NormalEquations.of(poses().design, poses().rows)
+    whole = NormalEquations.from_rows(poses().design, poses().rows)
     return replace(
         whole, normal=normal[None], descent=descent[None], square=(1.0,), sensors=whole.sensors[:1]
     )
@@ -125,7 +128,7 @@ def test_equal_columns_without_a_prior_are_still_solved() -> None:
 
 
 def test_values_that_are_not_finite_are_refused() -> None:
-    sums = NormalEquations.of(poses().design, poses().rows)
+    sums = NormalEquations.from_rows(poses().design, poses().rows)
     broken = replace(sums, normal=sums.normal * float("nan"))
     with pytest.raises(IdentificationError):
         broken.solve(poses().prior, poses().noise)
@@ -139,7 +142,7 @@ def test_first_sizes_say_nearly_what_the_whole_fit_gains() -> None:
     arm = linearised(robot, tracker_data(robot, q, delta, 3e-5))
     products = InputProducts(robot)
     design = Design(arm.rows.problem, (GravityTorques(robot),))
-    largest = NormalEquations.of(Design(arm.rows.problem, (*design.features, products)), arm.rows)
+    largest = NormalEquations.from_rows(Design(arm.rows.problem, (*design.features, products)), arm.rows)
     own = largest.select(design)
     before = own.maximise_evidence(design.prior(arm.prior_scale), arm.noise, 400, 1e-6)
     gain, sizes = largest.first_sizes(before, design, products)

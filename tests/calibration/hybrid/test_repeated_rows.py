@@ -30,7 +30,7 @@ def values_of(rows: int) -> SensorValues:
 
 def sums_of(design: Design, values: SensorValues) -> NormalEquations:
     group = torch.zeros(design.problem.q.shape[0], dtype=torch.int64)
-    return NormalEquations.of(design, Rows(design.problem, (values,), group))
+    return NormalEquations.from_rows(design, Rows(design.problem, (values,), group))
 
 
 def test_rows_that_do_not_count_are_left_out_and_the_others_weighted() -> None:
@@ -125,7 +125,7 @@ def test_identical_targets_come_to_the_regression_of_one() -> None:
     design = Design(problem, ())
     three = alike(3).shared(torch.arange(8).repeat_interleave(3))
     rows = [Rows(problem, (values,), torch.arange(24)) for values in (three, values_of(8))]
-    many, single = (NormalEquations.of(design, one) for one in rows)
+    many, single = (NormalEquations.from_rows(design, one) for one in rows)
     assert_close(many.normal, single.normal, rtol=1e-12)
     assert_close(many.descent, single.descent, rtol=1e-12, atol=1e-12)
     assert_close(many.square[0], single.square[0], rtol=1e-12)

@@ -29,7 +29,7 @@ def arm() -> LinearisedArm:
 def test_rows_of_a_group_are_never_parted(arm: LinearisedArm) -> None:
     rows = arm.rows
     assert rows.groups == 40
-    some = rows.of(torch.arange(0, 40, 3))
+    some = rows.select_groups(torch.arange(0, 40, 3))
     for sensor in some.values:
         expected = torch.isin(rows.group, torch.arange(0, 40, 3)).nonzero()[:, 0]
         assert sensor.row.tolist() == [row for row in rows.values[0].row.tolist() if row in expected]
@@ -39,7 +39,7 @@ def test_what_is_certain_is_not_held_out(arm: LinearisedArm) -> None:
     certain = replace(arm.rows, values=(arm.rows.values[0], replace(arm.rows.values[1], certain=True)))
     groups = torch.tensor([3, 4, 20])
     position, rotation = certain.held_out(groups).values
-    assert_close(position.residual, certain.of(groups).values[0].residual)
+    assert_close(position.residual, certain.select_groups(groups).values[0].residual)
     assert len(rotation.row) == 0
     assert rotation.residual.shape == (0, 3)
 
@@ -95,7 +95,7 @@ def test_rows_agree_as_far_as_their_weighted_residuals_are_equal(arm: Linearised
     left = (first.residual - first.geometry @ x) * first.root[:, None]
     expected = float(left.square().sum()) / 1e-10
     assert_close(heavier.difference(arm.rows, x, design, (1e-5, 1e-4)), expected, rtol=1e-9)
-    fewer = arm.rows.of(torch.arange(39))
+    fewer = arm.rows.select_groups(torch.arange(39))
     assert fewer.difference(arm.rows, x, design, (1e-5, 1e-4)) == math.inf
 
 

@@ -107,7 +107,7 @@ def uncertainty(arm: LinearisedArm) -> tuple[PositionUncertainty, Fitted, JointC
     point = problem.nominal.index_add(0, problem.active, fitted.posterior.x[: fitted.design.active])
     known = identified_geometry(arm.setup, point)
     found = position_uncertainty(
-        arm.rows, fitted.design, NormalEquations.of(fitted.design, arm.rows), fitted.posterior, known
+        arm.rows, fitted.design, NormalEquations.from_rows(fitted.design, arm.rows), fitted.posterior, known
     )
     correction = JointCorrection(robot, fitted.design.features).requires_grad_(False)
     for k, chosen in enumerate(fitted.design.features):
@@ -162,7 +162,7 @@ def test_deviation_is_that_of_the_derivative_by_all_unknowns(arm: LinearisedArm)
 def test_deviation_is_that_of_drawn_calibrations(arm: LinearisedArm) -> None:
     """The covariance of positions at the training rows, as their columns give it, widened."""
     found, fitted, correction = uncertainty(arm)
-    root = NormalEquations.of(fitted.design, arm.rows).covariance_root(fitted.posterior)
+    root = NormalEquations.from_rows(fitted.design, arm.rows).covariance_root(fitted.posterior)
     root = torch.cat([root.dense, root_of_sizes(fitted.posterior, root)], 1)
     C = root @ root.t()
     values = arm.rows.values[0].select(torch.arange(10))

@@ -19,9 +19,9 @@ from pisigma.files.errors import IdentificationError
 @pytest.mark.parametrize("name", CASES)
 def test_posterior_is_that_of_the_dense_problem_and_of_normal_equations(name: str) -> None:
     case = CASES[name]()
-    found = ValueCovariance.of(case.design, case.rows)
+    found = ValueCovariance.from_rows(case.design, case.rows)
     assert found.sensors == case.rows.sensors
-    for expected in (case.dense, NormalEquations.of(case.design, case.rows)):
+    for expected in (case.dense, NormalEquations.from_rows(case.design, case.rows)):
         assert_same_posterior(found, expected, case.prior, case.noise, case.exactness)
 
 
@@ -31,22 +31,22 @@ def test_of_a_smaller_design_it_is_as_if_made_from_that(name: str) -> None:
     case = CASES[name]()
     small = Design(case.rows.problem, case.smaller)
     found, made = (
-        ValueCovariance.of(case.design, case.rows).select(small),
-        ValueCovariance.of(small, case.rows),
+        ValueCovariance.from_rows(case.design, case.rows).select(small),
+        ValueCovariance.from_rows(small, case.rows),
     )
     assert_close(found.X, made.X)
     assert_close(found.K, made.K, rtol=1e-12, atol=1e-12 * float(made.K.abs().max()))
     prior = small.prior_like(case.design, case.prior)
-    dense = DenseRegression.of(small, case.rows)
+    dense = DenseRegression.from_rows(small, case.rows)
     assert_same_posterior(found, dense, prior, case.noise, case.exactness)
 
 
 def test_geometry_alone_has_no_matrices() -> None:
     case = few_values()
     geometry = Design(case.rows.problem, ())
-    found = ValueCovariance.of(case.design, case.rows).select(geometry)
+    found = ValueCovariance.from_rows(case.design, case.rows).select(geometry)
     assert len(found.K) == 0
-    dense = DenseRegression.of(geometry, case.rows)
+    dense = DenseRegression.from_rows(geometry, case.rows)
     assert_same_posterior(found, dense, geometry.prior((1.0,) * 4), case.noise, case.exactness)
 
 
@@ -55,7 +55,10 @@ def test_without_some_groups_it_is_that_of_the_others(name: str) -> None:
     """What is certain stays."""
     case = CASES[name]()
     groups = torch.cat(case.folds[1:])
-    found, expected = ValueCovariance.of(case.design, case.rows).without(groups), case.dense.without(groups)
+    found, expected = (
+        ValueCovariance.from_rows(case.design, case.rows).without(groups),
+        case.dense.without(groups),
+    )
     values = [np.array([one.values for one in form.sensors]) for form in (found, expected)]
     assert_close(values[0], values[1], rtol=1e-6)
     assert_close(found.X, expected.X)
@@ -68,7 +71,7 @@ def test_without_some_groups_it_is_that_of_the_others(name: str) -> None:
 
 def test_more_features_are_fitted_at_once() -> None:
     case = few_values()
-    found = ValueCovariance.of(case.design, case.rows)
+    found = ValueCovariance.from_rows(case.design, case.rows)
     small = Design(case.rows.problem, case.design.features[:2])
     posterior = found.select(small).solve(small.prior((1.0,) * 4), case.noise)
     assert found.first_sizes(posterior, small, case.design.features[2]) == (math.inf, None)
@@ -76,7 +79,7 @@ def test_more_features_are_fitted_at_once() -> None:
 
 def test_values_that_are_not_finite_are_refused() -> None:
     case = few_values()
-    found = ValueCovariance.of(case.design, case.rows)
+    found = ValueCovariance.from_rows(case.design, case.rows)
     found.X[3] = torch.nan
     with pytest.raises(IdentificationError):
         found.solve(case.prior, case.noise)
@@ -87,7 +90,10 @@ def test_noise_that_is_small_beside_the_values_is_left_to_normal_equations() -> 
     case = few_values()
     noise = tuple(1e-4 * sigma for sigma in case.noise)
     prior = replace(case.prior, sizes=case.prior.sizes * 10)
-    dual, normal = ValueCovariance.of(case.design, case.rows), NormalEquations.of(case.design, case.rows)
+    dual, normal = (
+        ValueCovariance.from_rows(case.design, case.rows),
+        NormalEquations.from_rows(case.design, case.rows),
+    )
     here, there = dual.solve(prior, noise), dual.primal.solve(prior, noise)
     assert torch.equal(here.x, there.x)
     assert here.log_evidence == there.log_evidence

@@ -14,7 +14,7 @@ from pisigma.robot import Robot
 
 Q = torch.deg2rad(torch.arange(24, dtype=torch.float64).reshape(4, 6))
 PLAN = StoredPlan(
-    ArmInSurroundings.of(Robot.load("fanuc_r2000")),
+    ArmInSurroundings.from_robot(Robot.load("fanuc_r2000")),
     PlanSettings(settling_s=2.5),
     None,
     Q[[0, 3]],

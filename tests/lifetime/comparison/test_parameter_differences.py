@@ -17,7 +17,7 @@ from pisigma.validation.held_out.reference_models import nominal_model
 @pytest.mark.parametrize("forth", [True, False])
 def test_only_the_moved_joint_differs_when_the_base_moved_as_well(forth):
     models = model_of(50), after_collision()
-    differences = parameter_differences(ModelPair.of(*models[:: 1 if forth else -1], "fitted"))
+    differences = parameter_differences(ModelPair.from_models(*models[:: 1 if forth else -1], "fitted"))
     (joint,) = (one.shift for one in differences.differing)
     assert joint.what == "joint 3"
     assert_close(joint.shift, 0.1 if forth else -0.1, atol=0.005)
@@ -32,7 +32,7 @@ def test_only_the_moved_joint_differs_when_the_base_moved_as_well(forth):
 
 def test_fixed_frames_find_the_same_joint():
     models = model_of(50), model_of(61, COLLISION)
-    differences = parameter_differences(ModelPair.of(*models, "fixed"))
+    differences = parameter_differences(ModelPair.from_models(*models, "fixed"))
     assert [one.shift.what for one in differences.differing] == ["joint 3"]
     assert differences.frames == ()
 
@@ -42,7 +42,7 @@ def test_models_of_disjoint_rows_differ_by_chance_only():
     models = [model_of(seed) for seed in (50, 51, 52, 53)]
     outside = tested = 0
     for pair in itertools.combinations(models, 2):
-        differences = parameter_differences(ModelPair.of(*pair, "fitted"))
+        differences = parameter_differences(ModelPair.from_models(*pair, "fitted"))
         assert differences.differing == ()
         assert differences.remainder is not None
         assert not differences.remainder.significant
@@ -55,7 +55,7 @@ def test_models_of_disjoint_rows_differ_by_chance_only():
 
 
 def test_parameters_equivalent_to_base_and_tool_have_no_shift():
-    parameters = parameter_differences(ModelPair.of(model_of(50), model_of(51), "fitted")).parameters
+    parameters = parameter_differences(ModelPair.from_models(model_of(50), model_of(51), "fitted")).parameters
     by_name = {one.name: one for one in parameters}
     for name in ("theta_1", "d_1", "theta_6", "d_6", "a_6", "alpha_6"):
         assert by_name[name].shift is None
@@ -64,7 +64,7 @@ def test_parameters_equivalent_to_base_and_tool_have_no_shift():
 
 def test_a_nominal_robot_has_no_uncertainty():
     model = model_of(50)
-    differences = parameter_differences(ModelPair.of(model, nominal_model(model, True), "fitted"))
+    differences = parameter_differences(ModelPair.from_models(model, nominal_model(model, True), "fitted"))
     assert differences.differing
     assert all(one.deviations[1] == 0.0 for one in differences.parameters)
 
@@ -72,7 +72,7 @@ def test_a_nominal_robot_has_no_uncertainty():
 def test_a_model_without_posterior_is_compared_without_tests():
     first = model_of(50)
     differences = parameter_differences(
-        ModelPair.of(first, replace(model_of(51), uncertainty=None), "fitted")
+        ModelPair.from_models(first, replace(model_of(51), uncertainty=None), "fitted")
     )
     assert differences.remainder is None
     assert all(one.p is None and one.deviations[1] is None for one in differences.parameters)

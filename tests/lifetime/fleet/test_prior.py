@@ -59,8 +59,8 @@ def test_the_prior_improves_a_calibration_with_ten_poses(prior):
 def test_a_robot_of_another_type_is_inconsistent_and_calibrated_from_scratch(prior):
     few = rows_of(60, 10, 3, odd=True)
     with no_type_checker():
-        assert FleetConsistency.of(prior.model, few).is_inconsistent
-        assert not FleetConsistency.of(prior.model, rows_of(61, 20, 4)).is_inconsistent
+        assert FleetConsistency.from_rows(prior.model, few).is_inconsistent
+        assert not FleetConsistency.from_rows(prior.model, rows_of(61, 20, 4)).is_inconsistent
         begun = recalibrate(prior.model, few)
         without = calibrate(DRAWN, few, CalibrationSettings(folds=0))
         fewer = recalibrate(prior.model, few.select(torch.arange(8)))
@@ -68,7 +68,9 @@ def test_a_robot_of_another_type_is_inconsistent_and_calibrated_from_scratch(pri
     assert begun.gate.rms["scratch"] is None
     assert np.array_equal(begun.model.calibrated.dh, without.model.calibrated.dh)
     assert fewer.gate.kept != "scratch"
-    assert fewer.summary.changed == FleetConsistency.of(prior.model, few.select(torch.arange(8))).sentence
+    assert (
+        fewer.summary.changed == FleetConsistency.from_rows(prior.model, few.select(torch.arange(8))).sentence
+    )
 
 
 def test_expectation_maximisation_finds_a_population():

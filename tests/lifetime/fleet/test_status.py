@@ -16,7 +16,7 @@ def session(date, verdict, rms=None, **more):
     )  # fmt: skip
 
 
-STATUS = FleetStatus.of(
+STATUS = FleetStatus.from_records(
     [
         RobotRecord(
             "moved", "", (session("2026-01-01", "calibrated", 0.1), session("2026-11-01", "moved", 0.9))
@@ -66,14 +66,14 @@ def test_tables_have_all_robots():
 
 def test_a_moved_joint_counts_as_drift_after_a_recalibration():
     sessions = session("2026-01-01", "calibrated"), session("2026-11-01", "recalibrated", 0.1, moved=True)
-    status = FleetStatus.of([RobotRecord("r", "", sessions)], TODAY, 180)
+    status = FleetStatus.from_records([RobotRecord("r", "", sessions)], TODAY, 180)
     assert status.robots[0].state == "drifting"
     assert status.robots[0].compared
 
 
 def test_separately_calibrated_sessions_do_not_show_drift():
     sessions = session("2026-01-01", "calibrated"), session("2026-11-01", "calibrated")
-    status = FleetStatus.of([RobotRecord(name, "", sessions) for name in "ab"], TODAY, 180)
+    status = FleetStatus.from_records([RobotRecord(name, "", sessions) for name in "ab"], TODAY, 180)
     assert status.to_json()["not_compared"] == ["a", "b"]
     assert not_compared(status).startswith("2 robots")
     assert not_compared(STATUS) == ""
@@ -81,12 +81,12 @@ def test_separately_calibrated_sessions_do_not_show_drift():
 
 def test_the_error_of_a_cross_validation_counts():
     figures = RobotRecord("r", "", (session("2026-11-01", "calibrated", 0.04, held_out_rms_mm=0.11),))
-    assert robot_table(FleetStatus.of([figures], TODAY, 180).robots).rows[0][4] == "0.110"
+    assert robot_table(FleetStatus.from_records([figures], TODAY, 180).robots).rows[0][4] == "0.110"
 
 
 def test_an_impossible_date_is_reported_and_ignored():
     record = RobotRecord("slip", "", (session("2206-01-01", "calibrated", 0.1),))
-    seen = FleetStatus.of([record], TODAY, 180)
+    seen = FleetStatus.from_records([record], TODAY, 180)
     assert seen.robots[0].days is None
     assert "2206-01-01" in seen.to_json()["warnings"][0]
     assert seen.to_json()["overdue"] == []

@@ -21,7 +21,7 @@ def moved_joint(joint, degrees=0.05):
 
 def judged(rows, stated=None):
     model = model_before()
-    return judge_session(model, ModelPosterior.of(model), rows, stated)
+    return judge_session(model, ModelPosterior.from_model(model), rows, stated)
 
 
 @pytest.mark.parametrize("joint", [1, 2, 3, 4, 5])

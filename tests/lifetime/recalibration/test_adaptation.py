@@ -25,7 +25,7 @@ SHIFTED = (0.3, -0.2, 0.1, 0.5, 0.2, -0.3)
 
 
 def adapted(model, rows, relocated=frozenset()) -> Adaptation:
-    posterior = ModelPosterior.of(model)
+    posterior = ModelPosterior.from_model(model)
     return adapt(recalibration_problem(model, posterior, rows, relocated))
 
 
@@ -68,7 +68,7 @@ def test_an_unchanged_robot_has_no_movements():
 @pytest.mark.parametrize("moved", [(0.0,) * 6, COLLISION])
 def test_a_moved_instrument_is_found(moved):
     model, rows = model_before(), rows_later(12, 2, moved, SHIFTED)
-    posterior = ModelPosterior.of(model)
+    posterior = ModelPosterior.from_model(model)
     assert relocated_frames(model, posterior, rows) == {("base", "")}
     assert not relocated_frames(model, posterior, rows_later(12, 2, moved))
     adaptation = adapted(model, rows, {("base", "")})
@@ -97,4 +97,4 @@ def test_adapting_row_by_row_agrees_with_all_rows_at_once():
 
 def test_a_model_without_a_posterior_is_refused():
     with refused(ModelError, value="inverse_calibration"):
-        ModelPosterior.of(hand_made_model("kiro3"))
+        ModelPosterior.from_model(hand_made_model("kiro3"))

@@ -81,7 +81,7 @@ def test_nothing_is_found_where_nothing_moved(models, of_model, of_rows):
 def test_checks_of_rows_know_the_noise_whatever_states_it(models, of_model):
     with no_type_checker():
         usual = [
-            RowsUnderModel.of(models[of_model], rows_with(sigma, 12, 3), (), (), None).usual
+            RowsUnderModel.from_rows(models[of_model], rows_with(sigma, 12, 3), (), (), None).usual
             for sigma in KINDS.values()
         ]
     assert_close(usual[0], usual[1], rtol=0.1)

@@ -67,7 +67,7 @@ def test_without_held_out_rows_the_recalibrated_model_is_kept():
 @pytest.mark.parametrize("count", [5, 10])
 def test_held_out_rows_decide(count):
     model, rows = model_before(), rows_later(count, 2, (0.0, 0.0, math.radians(0.25), 0.0, 0.0, 0.0))
-    posterior = ModelPosterior.of(model)
+    posterior = ModelPosterior.from_model(model)
     problem = recalibration_problem(model, posterior, rows, frozenset())
     whole = adapt(problem)
     calibrator = HybridCalibrator(posterior.space.robot)

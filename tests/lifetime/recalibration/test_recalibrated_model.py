@@ -20,7 +20,7 @@ ELSEWHERE = (0.3, -0.2, 0.1, 0.5, 0.2, -0.3)
 
 def recalibrated(rows, relocated=frozenset(), arm=True):
     model = model_before()
-    posterior = ModelPosterior.of(model)
+    posterior = ModelPosterior.from_model(model)
     problem = recalibration_problem(model, posterior, rows, relocated)
     adaptation = adapt(problem if arm else problem.without_arm())
     return recalibrated_model(model, adaptation, rows), adaptation
@@ -40,8 +40,8 @@ def test_the_model_is_the_same_after_writing_and_reading(tmp_path):
     assert_close(test.position - poses_of_rows(model, test)[:, :3, 3], errors, atol=1e-12)
     assert_close(loaded.uncertainty.root, model.uncertainty.root)
     assert loaded.uncertainty.noise == model.uncertainty.noise
-    again = ModelPosterior.of(loaded)
-    assert_close(again.weights, ModelPosterior.of(model).weights, atol=1e-12)
+    again = ModelPosterior.from_model(loaded)
+    assert_close(again.weights, ModelPosterior.from_model(model).weights, atol=1e-12)
     at = adaptation.arm.geometry.robot.dh - model_before().hybrid.robot.dh
     assert_close(loaded.calibrated.dh - model_before().calibrated.dh, at, atol=1e-12)
 
@@ -72,5 +72,5 @@ def test_a_new_frame_is_added_to_the_old_ones(name):
     two = type(rows)(q=rows.q, position=rows.position, frame=(name,) * 6 + ("wall",) * 6)
     model, _ = recalibrated(two)
     assert list(model.bases) == list(dict.fromkeys(["", name, "wall"]))
-    again = ModelPosterior.of(model)
+    again = ModelPosterior.from_model(model)
     assert again.space.frames == tuple(model.bases)

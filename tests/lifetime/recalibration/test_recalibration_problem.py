@@ -29,13 +29,13 @@ def test_owners_are_in_the_order_of_the_rows():
 
 def test_the_prior_is_the_posterior_of_the_model():
     model, rows = model_before(), rows_later(10, 2)
-    posterior = ModelPosterior.of(model)
+    posterior = ModelPosterior.from_model(model)
     problem = recalibration_problem(model, posterior, rows, frozenset())
     parameters = len(posterior.space.parameters)
     back = torch.cat([problem.change @ problem.root[:parameters], problem.root[parameters:]])
     assert_close(back, posterior.root, atol=1e-12)
     elsewhere = recalibration_problem(model, posterior, rows, {("base", "")})
-    base = elsewhere.design.problem.space.of("base")
+    base = elsewhere.design.problem.space.indices_of("base")
     assert not elsewhere.root[base.start : base.stop].any()
     assert [group.what for group in elsewhere.groups if group.fixed_size] == ["base"]
     still = problem.without_arm()

@@ -103,7 +103,7 @@ def test_tensors_have_gradients_through_the_map(ik, q):
 
 def test_compiled_models_refuse_coupled_joints(ik):
     with refused(ModelError, value="coupling"):
-        CompiledIK.of(ik.model)
+        CompiledIK.from_model(ik.model)
 
 
 def test_the_public_kinematics_take_the_controllers_values(true, q):

@@ -201,7 +201,7 @@ def test_a_folder_predicts_the_same_as_the_model(
     loaded = load_model(folder)
     assert differences(model, loaded) == []
     assert differences(parameter_posterior(model), parameter_posterior(loaded)) == []
-    before, after = ModelPosterior.of(model), ModelPosterior.of(loaded)
+    before, after = ModelPosterior.from_model(model), ModelPosterior.from_model(loaded)
     assert torch.equal(after.rms_weights, before.rms_weights)
     start = 0
     for one in before.features:

@@ -32,7 +32,7 @@ CORNERS = 54
 def plan(tmp_path_factory: pytest.TempPathFactory) -> StoredPlan:
     camera = camera_settings(tmp_path_factory.mktemp("camera"))
     settings = PlanSettings(count=IMAGES, check=0, sensor="camera", camera=camera, candidates=40)
-    arm = ArmInSurroundings.of(Robot.load("ur5"), CELL)
+    arm = ArmInSurroundings.from_robot(Robot.load("ur5"), CELL)
     drawn = find_candidates(settings, arm)
     q = drawn.q[:IMAGES]
     none = (q[:0],) * IMAGES

@@ -16,7 +16,7 @@ EVERY = torch.ones(14, dtype=torch.bool)
 
 
 def left_out(rows, kept=EVERY):
-    return RowModel.of(PLAN.stored.arm.robot, rows, NOISE, kept).left_out()
+    return RowModel.from_rows(PLAN.stored.arm.robot, rows, NOISE, kept).left_out()
 
 
 @pytest.fixture(scope="module")

@@ -11,7 +11,7 @@ from pisigma.planning.surroundings.motion import Motions, is_free, way_points
 from pisigma.planning.surroundings.surroundings import LinkSection, Surroundings
 from pisigma.robot import Robot
 
-ARM = ArmInSurroundings.of(Robot.load("fanuc_r2000"), CELL)
+ARM = ArmInSurroundings.from_robot(Robot.load("fanuc_r2000"), CELL)
 RADIUS = np.array([*(0.05 * 3.534 for _ in range(3)), *(0.035 * 3.534 for _ in range(3)), 0.025])
 LIMITS = ARM.limits.clamp(-np.pi, np.pi)
 DRAWS = torch.rand(300, 6, dtype=torch.float64, generator=torch.Generator().manual_seed(5))
@@ -59,7 +59,9 @@ def test_every_reason_is_named():
     ],
 )
 def test_links_too_thick_to_be_separated_are_named(links: dict[str, object], named: str | None):
-    arm = ArmInSurroundings.of(Robot.load("ur10"), Surroundings(links=LinkSection.model_validate(links)))
+    arm = ArmInSurroundings.from_robot(
+        Robot.load("ur10"), Surroundings(links=LinkSection.model_validate(links))
+    )
     assert len(arm.unseparated_links) == (named is not None)
     assert named is None or named in arm.unseparated_links[0]
 
@@ -100,7 +102,7 @@ def test_checked_motions_are_kept_in_both_directions():
 
 def test_a_measured_pose_is_free_of_self_collision():
     """Poses that touch by the drawing are allowed where they were measured, and so are those with more room."""
-    arm = ArmInSurroundings.of(Robot.load("ur5"))
+    arm = ArmInSurroundings.from_robot(Robot.load("ur5"))
     limits = torch.from_numpy(np.clip(arm.robot.limits, -np.pi, np.pi))
     draws = torch.rand(400, arm.robot.dof, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     q = limits[:, 0] + (limits[:, 1] - limits[:, 0]) * draws

@@ -25,7 +25,7 @@ SCARA = """<robot name="scara">
 def test_links_of_a_urdf_file_lead_from_joint_to_joint(tmp_path: Path):
     (tmp_path / "scara.urdf").write_text(SCARA)
     robot = Robot.load(tmp_path / "scara.urdf")
-    capsules = Capsules.of(robot, robot.tool[:3], radius=0.04, radii={"J2": 0.03})
+    capsules = Capsules.from_robot(robot, robot.tool[:3], radius=0.04, radii={"J2": 0.03})
     q = torch.tensor([0.0, 0.0, 0.1], dtype=torch.float64)
     joints = [[0, 0, 0], [0, 0, 0.38], [0.3, 0, 0.4], [0.5, 0, 0.4], [0.5, 0, 0.3], [0.5, 0, 0.25]]
     drawn = [torch.tensor(pair, dtype=torch.float64) for pair in itertools.pairwise(joints)]
@@ -36,7 +36,9 @@ def test_links_of_a_urdf_file_lead_from_joint_to_joint(tmp_path: Path):
 
 
 def test_links_of_a_dh_table_lead_along_d_and_a():
-    capsules = Capsules.of(Robot.load("kiro3").with_geometry(tool=np.array([0.0, 0.05, 0.0, 0, 0, 0])))
+    capsules = Capsules.from_robot(
+        Robot.load("kiro3").with_geometry(tool=np.array([0.0, 0.05, 0.0, 0, 0, 0]))
+    )
     q = torch.zeros(2, 4, dtype=torch.float64)
     q[:, 2] = -0.1
     corners = [

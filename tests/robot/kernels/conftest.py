@@ -68,7 +68,7 @@ def calibrated(name: str, hybrid: bool = True, covered: float = 1.0, joints: boo
     arm = None
     if hybrid:
         other = geometric.with_geometry(dh=geometric.dh + 0.2 * ERRORS * rng.normal(size=robot.dh.shape))
-        measured = JointCoverage.of(robot, draw_joints(robot, 400, share=covered))
+        measured = JointCoverage.from_joints(robot, draw_joints(robot, 400, share=covered))
         arm = HybridArm(other, draw_correction(robot, joints), measured)
     starts = draw_joints(robot, 400, share=covered)
     return CalibratedModel(
@@ -80,7 +80,7 @@ def calibrated(name: str, hybrid: bool = True, covered: float = 1.0, joints: boo
 def compiled(name: str, hybrid: bool = True, covered: float = 1.0, joints: bool = False):
     """The compiled inverse kinematics of `calibrated`."""
     with no_type_checker():
-        return CompiledIK.of(calibrated(name, hybrid, covered, joints))
+        return CompiledIK.from_model(calibrated(name, hybrid, covered, joints))
 
 
 @pytest.fixture(scope="session")

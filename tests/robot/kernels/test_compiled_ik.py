@@ -163,7 +163,7 @@ def test_statuses_describe_the_result(arms):
     geometric = arms.calibrated("ur5", hybrid=False)
     nominal = replace(geometric, calibrated=None)
     T = nominal.forward(stretched[None])[0].numpy()
-    assert CompiledIK.of(nominal).solve(T, near=stretched.numpy()).status == Status.SINGULAR
+    assert CompiledIK.from_model(nominal).solve(T, near=stretched.numpy()).status == Status.SINGULAR
 
 
 def test_limits_apply_to_the_corrected_values(arms):
@@ -178,7 +178,7 @@ def test_limits_apply_to_the_corrected_values(arms):
         (1.0, 2.0, Status.OUTSIDE_JOINT_LIMITS, 0.2),
     ):
         robots = [with_limits(robot, 5, lower, upper) for robot in (model.robot, model.calibrated)]
-        kernels = CompiledIK.of(replace(model, robot=robots[0], calibrated=robots[1]))
+        kernels = CompiledIK.from_model(replace(model, robot=robots[0], calibrated=robots[1]))
         branch = kernels.branches[arms.compiled("ur5", hybrid=False).solve(T, near=q.numpy()).branch]
         found = kernels.solve(T, near=q.numpy(), branch=branch)
         assert found.status == status
@@ -263,7 +263,7 @@ def test_models_without_a_compiled_form_are_rejected(arms):
     with refused(ModelError, value="starts"):
         describe(replace(panda, starts=panda.starts[:0]))
     with refused(ModelError, value=(800, 7)):
-        CompiledIK.of(replace(panda, starts=panda.starts.repeat(2, 1)))
+        CompiledIK.from_model(replace(panda, starts=panda.starts.repeat(2, 1)))
 
 
 @pytest.mark.parametrize("name", ["ur5", "panda"])

@@ -44,7 +44,7 @@ def grouped():
         network.input_scale[-1] = 500.0
         network.output_scale.fill_(1e-3)
         network.output_offset.fill_(2e-3)
-        groups.append(JointGroup(joints, Inputs.of(robot, names, turned)))
+        groups.append(JointGroup(joints, Inputs.from_names(robot, names, turned)))
         networks.append(network)
     correction = CorrectionNetwork(robot.dof, groups, networks).requires_grad_(False)
     seen = correction.scaled_inputs(forward_kinematics(robot, model.starts), model.starts)
@@ -77,7 +77,7 @@ def _model(name):
 @functools.cache
 def _kernels(name):
     with no_type_checker():
-        return CompiledIK.of(_model(name))
+        return CompiledIK.from_model(_model(name))
 
 
 def _poses(name, rows=80, spread=0.6):
@@ -159,7 +159,7 @@ def test_poses_at_ninety_degrees_of_pitch_agree_with_torch():
 def test_a_model_without_domain_has_no_measure():
     model = replace(_model("ur10"), domain=None)
     _, T = _poses("ur10", rows=3)
-    found = CompiledIK.of(model).solve_batch(T.numpy())
+    found = CompiledIK.from_model(model).solve_batch(T.numpy())
     assert np.isnan(found.domain_measure).all()
     assert np.isfinite(found.q).all()
 
@@ -175,5 +175,5 @@ def test_networks_that_are_too_large_are_rejected():
     model = _model("ur10")
     domain = Domain(model.domain.samples.repeat(40, 1), model.domain.radius)
     with refused(ModelError, expected="at most 2048 training rows", value=2560):
-        CompiledIK.of(replace(model, domain=domain))
+        CompiledIK.from_model(replace(model, domain=domain))
     assert describe(replace(model, domain=domain))[0].network.samples == 40 * 64

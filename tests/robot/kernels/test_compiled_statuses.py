@@ -44,9 +44,9 @@ def test_branches_are_tried_in_the_order_of_training_rows_and_limits_count(case,
         model = arms.calibrated("ur5", hybrid=case == "hybrid")
         T = model.forward(arms.draw_joints(model.robot, 150, seed=21)).numpy()
         model = _narrow(model)
-    names = CompiledIK.of(model).branches
+    names = CompiledIK.from_model(model).branches
     trained = (5, 2, 6)
-    kernels = CompiledIK.of(replace(model, branches=tuple(names[index] for index in trained)))
+    kernels = CompiledIK.from_model(replace(model, branches=tuple(names[index] for index in trained)))
     order = [*trained, *(index for index in range(len(names)) if index not in trained)]
     every, found = kernels.all_branches(T), kernels.solve_batch(T)
     chosen = _first(every, order)

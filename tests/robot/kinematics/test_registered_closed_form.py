@@ -52,7 +52,7 @@ class Mast(AbstractClosedForm):
     branches = ("only",)
 
     @classmethod
-    def of(cls, robot: Robot) -> "Mast | None":
+    def from_robot(cls, robot: Robot) -> "Mast | None":
         rows = canonical_rows(robot, ("prismatic", "revolute"), (0.0,))
         return cls(robot, rows) if rows and not rows.a[0] else None
 

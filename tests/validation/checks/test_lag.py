@@ -26,7 +26,7 @@ def test_a_lag_is_found_with_its_size(name, before):
     check = checked(GeometricCalibrator(arm.robot), rows)
     (found,) = LagCheck().diagnose(check)
     assert (found.kind, found.severity) == ("lag", "implausible")
-    lag = find_lag(OrderedRows.of(check.geometric), rows)
+    lag = find_lag(OrderedRows.from_result(check.geometric), rows)
     assert lag.before == before
     assert_close(lag.share, SHARE, rtol=0.15)
 

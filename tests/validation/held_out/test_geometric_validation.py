@@ -123,7 +123,7 @@ def test_a_ball_that_once_missed_its_socket_does_not_move_it() -> None:
     q[row, 1] += 0.01
     missed = replace(data, q=q)
     T = result.predicted_poses(missed)
-    errors = DistanceErrors.of({"geometric": T}, known, missed).errors["geometric"]
+    errors = DistanceErrors.from_poses({"geometric": T}, known, missed).errors["geometric"]
     assert_close(errors, torch.zeros(1, dtype=torch.float64), atol=1e-8)
 
 

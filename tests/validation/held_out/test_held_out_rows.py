@@ -39,7 +39,7 @@ def _kept(
     model: CalibratedModel, validation: CalibrationValidation, measured: Measurements
 ) -> tuple[str, CalibratedModel]:
     """The file of held-out rows, and the model whose metrics hold its hash."""
-    held_out = HeldOutRows.of(validation, measured)
+    held_out = HeldOutRows.from_validation(validation, measured)
     text = held_out.to_csv(model.robot)
     metrics = bare_summary(held_out_rows=held_out.hashes(text)).to_json()
     return text, replace(model, kind="geometric_calibration", metrics=metrics)

@@ -26,7 +26,7 @@ from pisigma.validation.held_out.training_summary import JointErrorFigures
 
 @pytest.mark.parametrize(("revolute", "unit", "factor"), [(True, "deg", math.degrees(1)), (False, "mm", 1e3)])
 def test_joint_errors_are_of_the_absolute_error_in_file_units(revolute, unit, factor):
-    figures = JointErrorFigures.of(torch.tensor([-0.3, 0.1, 0.2], dtype=torch.float64), revolute)
+    figures = JointErrorFigures.from_errors(torch.tensor([-0.3, 0.1, 0.2], dtype=torch.float64), revolute)
     assert figures.unit == unit
     average, deviation, maximum = figures.values
     assert_close(average, 0.2 * factor, rtol=1e-14)
@@ -89,7 +89,7 @@ def test_comparison_is_on_the_same_rows():
     nan = torch.nan
     nominal = PoseErrors(torch.tensor([1.0, 2.0, nan, 4.0], dtype=torch.float64), None)
     corrected = PoseErrors(torch.tensor([0.5, nan, nan, 0.5], dtype=torch.float64), None)
-    found = Comparison.of(nominal, corrected)
+    found = Comparison.from_errors(nominal, corrected)
     assert found.not_predicted == 1  # the third row was not measured
     assert torch.equal(found.nominal.position.isnan(), corrected.position.isnan())
     assert_close(found.nominal.figures.mean_mm, 2500.0)

@@ -16,7 +16,7 @@ def figures(position: float, rotation: float | None, largest: float | None = Non
     if largest is not None:
         moved[0] = largest
     after = PoseErrors(moved, None if rotation is None else rotation * one)
-    return ComparisonFigures.of(Comparison(PoseErrors(one, turn), after, 0), folds=2)
+    return ComparisonFigures.from_comparison(Comparison(PoseErrors(one, turn), after, 0), folds=2)
 
 
 @pytest.mark.parametrize(

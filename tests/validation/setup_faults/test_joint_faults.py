@@ -19,13 +19,13 @@ from pisigma.validation.setup_faults.joint_faults import (
 
 def test_joint_maps(generator):
     q = torch.rand(5, 4, generator=generator, dtype=torch.float64)
-    assert_close(JointMaps.unchanged(2, 4).of(q), q.expand(2, 5, 4), atol=0.0)
+    assert_close(JointMaps.unchanged(2, 4).apply(q), q.expand(2, 5, 4), atol=0.0)
     matrix = torch.tensor([[0.0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 2, 0], [0, 0, -1, 1]]).double()
     maps = JointMaps(matrix[None], torch.ones(1, 4).double())
     expected = torch.stack([q[:, 1] + 1, -q[:, 0] + 1, 2 * q[:, 2] + 1, q[:, 3] - q[:, 2] + 1], -1)
-    assert_close(maps.of(q)[0], expected, atol=1e-15)
+    assert_close(maps.apply(q)[0], expected, atol=1e-15)
     assert_close(
-        moved_zeros(torch.tensor([2]), torch.tensor([0.5]).double(), 4).of(q)[0, :, 2], q[:, 2] + 0.5
+        moved_zeros(torch.tensor([2]), torch.tensor([0.5]).double(), 4).apply(q)[0, :, 2], q[:, 2] + 0.5
     )
 
 

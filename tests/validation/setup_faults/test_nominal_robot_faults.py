@@ -57,7 +57,7 @@ def test_healthy_and_unrelated_rows_have_no_fault(arm):
 
 
 def test_no_rigid_base_and_tool_leave_less_than_affine_ones(arm):
-    measured = MeasuredPoses.of(arm.measurements.position, arm.measurements.rotation, 0.2)
+    measured = MeasuredPoses.from_tensors(arm.measurements.position, arm.measurements.rotation, 0.2)
     T = forward_kinematics(arm.nominal, arm.measurements.q)
     base, tool = best_base_and_tool(T, measured)
     rigid = measured.squares(base @ T @ tool).mean()

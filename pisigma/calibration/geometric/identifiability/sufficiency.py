@@ -261,7 +261,7 @@ def _scale(setup: CalibrationSetup) -> list[CalibrationWarning]:
 def _touched_frames(setup: CalibrationSetup) -> list[CalibrationWarning]:
     """Warn of every frame that is touched along some axes only."""
     data = setup.measurements
-    if data.touch is None or data.touch_axis is None or not setup.problem.space.of("base"):
+    if data.touch is None or data.touch_axis is None or not setup.problem.space.indices_of("base"):
         return []
     other = (data.measured("position") | data.measured("pose")).tolist()
     warnings = []
@@ -298,7 +298,7 @@ def floating_bases(setup: CalibrationSetup) -> list[int]:
         index
         for number, name in enumerate(space.frames)
         if name in floating
-        for index in space.of("base")[6 * number : 6 * number + 6]
+        for index in space.indices_of("base")[6 * number : 6 * number + 6]
     ]
 
 

@@ -217,9 +217,9 @@ class ParameterSpace:
         several = {"base": len(self.frames) > 1, "tool": len(self.targets) > 1}.get(group, False)
         if name in self.names or not several or column not in FRAME_COLUMNS:
             return [self.index(name)]
-        return list(self.of(group))[FRAME_COLUMNS.index(column) :: 6]
+        return list(self.indices_of(group))[FRAME_COLUMNS.index(column) :: 6]
 
-    def of(self, group: str) -> range:
+    def indices_of(self, group: str) -> range:
         """Return the indices of all parameters of a group: "base", "tool", or a group of sensors' unknowns."""
         return self._ranges[group]
 
@@ -253,13 +253,17 @@ class ParameterSpace:
         Float64[Tensor, "targets 6"],
     ]:
         """Split a vector of all parameters into rows, bases and tools."""
-        bases, tools = (values[self.of(group).start : self.of(group).stop] for group in ("base", "tool"))
+        bases, tools = (
+            values[self.indices_of(group).start : self.indices_of(group).stop] for group in ("base", "tool")
+        )
         return values[: self.arm_size].view(-1, 5), bases.view(-1, 6), tools.view(-1, 6)
 
     def sensor_unknowns(self, values: Float64[Tensor, " parameters"]) -> Unknowns:
         """Return the sensors' unknowns of a vector of all parameters."""
         return {
-            own.name: values[self.of(own.name).start : self.of(own.name).stop].view(-1, len(own.columns)).t()
+            own.name: values[self.indices_of(own.name).start : self.indices_of(own.name).stop]
+            .view(-1, len(own.columns))
+            .t()
             for own in self.unknowns
         }
 
@@ -268,7 +272,7 @@ class ParameterSpace:
     ) -> tuple[Int64[Tensor, " own"], Int64[Tensor, " own"], Int64[Tensor, " own"]]:
         """Find the parameters of a group of unknowns among some: position, index of the owner, and column."""
         size = next(len(own.columns) for own in self.unknowns if own.name == group)
-        stretch = self.of(group)
+        stretch = self.indices_of(group)
         positions = ((active >= stretch.start) & (active < stretch.stop)).nonzero()[:, 0]
         number = active[positions] - stretch.start
         return positions, number // size, number % size

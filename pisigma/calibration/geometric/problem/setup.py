@@ -162,11 +162,11 @@ def setup_around(
         pose=repeated(repeats, frame, target),
         configuration=repeated(repeats, frame) if len(space.targets) > 1 else None,
         pairs=len(set(measurements.pair or ()) - {""}),
-        stated=JointState.of(measurements).stated,
+        stated=JointState.from_measurements(measurements).stated,
         prior_sizes=options.prior_sizes,
     )
     free = [
-        space.of(own.name).start + index
+        space.indices_of(own.name).start + index
         for own in space.unknowns
         for index in guessed.free_unknowns[own.name].flatten().nonzero()[:, 0].tolist()
     ]
@@ -345,20 +345,20 @@ def coordinate_change(
     _, user_bases, user_tools = (torch.from_numpy(block) for block in behind_anchors(setup, point))
     change = torch.eye(len(point), dtype=point.dtype)
     for k, anchor in enumerate(anchors.bases.cpu()):
-        first = space.of("base").start + 6 * k
+        first = space.indices_of("base").start + 6 * k
         change[first : first + 3, first : first + 3] = anchor[:3, :3]
         # Angular velocities agree in both coordinates up to the anchor; the axes convert them from and to rpy.
         back = torch.linalg.pinv(turning_axes(user_bases[k, 3:]), rtol=1e-9)
         turns = slice(first + 3, first + 6)
         change[turns, turns] = back @ anchor[:3, :3] @ turning_axes(bases[k, 3:])
     for k in range(len(tools)):
-        first = space.of("tool").start + 6 * k + 3
+        first = space.indices_of("tool").start + 6 * k + 3
         back = torch.linalg.pinv(turning_axes(user_tools[k, 3:]), rtol=1e-9)
         change[first : first + 3, first : first + 3] = back @ turning_axes(tools[k, 3:])
     for own in space.unknowns:
         if own.has_point:
             for k, number in enumerate(setup.unknown_frames[own.name].tolist()):
-                first = space.of(own.name).start + len(own.columns) * k
+                first = space.indices_of(own.name).start + len(own.columns) * k
                 change[first : first + 3, first : first + 3] = anchors.bases[number, :3, :3].cpu()
     return change
 

@@ -104,7 +104,7 @@ def model_file(model: CalibratedModel) -> bytes:
     Raises:
         ModelError: the correction of the model has no compiled form.
     """
-    compiled = CompiledIK.of(model)
+    compiled = CompiledIK.from_model(model)
     description, branches = compiled.description, compiled.branches
     packed = pack(description, model.name, kernel_forms(description.forms))
     postures = Postures(

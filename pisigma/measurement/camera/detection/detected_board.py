@@ -135,7 +135,7 @@ class EdgeProfiles:
     profile: Float64[np.ndarray, "edges crossings samples"]
 
     @staticmethod
-    def of(image: Image, ends: Float64[np.ndarray, "edges 2 2"], clearance: float) -> "EdgeProfiles":
+    def from_image(image: Image, ends: Float64[np.ndarray, "edges 2 2"], clearance: float) -> "EdgeProfiles":
         """Sample an image across edges.
 
         Args:

@@ -157,7 +157,7 @@ def detect_board(path: Path, board: Board, max_blur: float) -> BoardImage:
         if isinstance(flipped, DetectedBoard):
             detected = NoBoard("it is mirrored, as its markers show; do not mirror images", is_mirrored=True)
         return BoardImage(path, size, detected, np.nan)
-    blur = EdgeProfiles.of(image, shown_edges(detected, board), board.clearance).blur
+    blur = EdgeProfiles.from_image(image, shown_edges(detected, board), board.clearance).blur
     if len(detected.corners) < MIN_CORNERS:
         reason = f"expected {MIN_CORNERS} or more corners in it, got {len(detected.corners)}"
     elif blur > max_blur:

@@ -65,7 +65,7 @@ class AbstractClosedForm(ABC):
 
     @classmethod
     @abstractmethod
-    def of(cls: type[Own], robot: Robot) -> Own | None:
+    def from_robot(cls: type[Own], robot: Robot) -> Own | None:
         """Return the solver for a robot, or None if its rows do not belong to this family."""
 
     @abstractmethod

@@ -7,7 +7,7 @@ from pisigma.robot.kinematics.closed_form.spherical_wrist import SphericalWristA
 from pisigma.robot.kinematics.closed_form.three_parallel import ThreeParallelArm
 
 CLOSED_FORMS: dict[str, type[AbstractClosedForm]] = {}
-"""Closed forms by name; the first whose `of` accepts a robot is used."""
+"""Closed forms by name; the first whose `from_robot` accepts a robot is used."""
 
 
 def register_closed_form(form: type[AbstractClosedForm]) -> type[AbstractClosedForm]:
@@ -31,7 +31,9 @@ def closed_form_solver(robot: Robot) -> AbstractClosedForm | None:
     Signs of twists, offsets, directions, base, tool, fixed rows before the first and after the last joint do
     not matter, nor do twist and beta of the last row.
     """
-    return next((solver for form in CLOSED_FORMS.values() if (solver := form.of(robot)) is not None), None)
+    return next(
+        (solver for form in CLOSED_FORMS.values() if (solver := form.from_robot(robot)) is not None), None
+    )
 
 
 for _form in (

@@ -57,7 +57,7 @@ class Scara(AbstractClosedForm):
     compiled = staticmethod(scara_branches)
 
     @classmethod
-    def of(cls, robot: Robot) -> "Scara | None":
+    def from_robot(cls, robot: Robot) -> "Scara | None":
         """Return the solver, or None unless the joints are R R P R with parallel axes and links longer than 0."""
         rows = canonical_rows(robot, ("revolute", "revolute", "prismatic", "revolute"), (0.0, 0.0, 0.0))
         solver = rows and cls(robot, rows)

@@ -108,7 +108,7 @@ class SphericalWristArm(AbstractClosedForm):
     compiled = staticmethod(spherical_wrist_branches)
 
     @classmethod
-    def of(cls, robot: Robot) -> "SphericalWristArm | None":
+    def from_robot(cls, robot: Robot) -> "SphericalWristArm | None":
         """Return the solver, or None if the rows are not those of such an arm or a link has no length."""
         rows = canonical_rows(robot, ("revolute",) * 6, _TWISTS)
         if (

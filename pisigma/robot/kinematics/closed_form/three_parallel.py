@@ -129,7 +129,7 @@ class ThreeParallelArm(AbstractClosedForm):
     compiled = staticmethod(three_parallel_branches)
 
     @classmethod
-    def of(cls, robot: Robot) -> "ThreeParallelArm | None":
+    def from_robot(cls, robot: Robot) -> "ThreeParallelArm | None":
         """Return the solver, or None if the rows are not those of such an arm or a link has no length."""
         rows = canonical_rows(robot, ("revolute",) * 6, _TWISTS)
         if rows is None or rows.a[4] or not rows.a[1] or not rows.a[2]:

@@ -115,7 +115,7 @@ def _fault(model: CalibratedModel, rows: Measurements, free: Collection[str]) ->
     maps = signs_and_exchanges(dof)
     found = [
         (_rms(_errors(model, replace(rows, q=q))), joint_causes(maps, number, model.robot)[0])
-        for number, q in enumerate(maps.of(rows.q))
+        for number, q in enumerate(maps.apply(rows.q))
     ]
     found.append(_moved_most(model, rows, free))
     after, cause = min(found, key=lambda one: one[0])

@@ -53,7 +53,7 @@ class RowsUnderModel:
     nominal: CalibratedModel | None = None
 
     @staticmethod
-    def of(
+    def from_rows(
         model: CalibratedModel,
         rows: Measurements,
         fitted: Collection[FrameKind],
@@ -97,7 +97,9 @@ class RowsUnderModel:
     @cached_property
     def measured(self) -> MeasuredPoses:
         """The measured poses."""
-        return MeasuredPoses.of(self.rows.position, self.rows.rotation, LEVER_SHARE * self.model.robot.reach)
+        return MeasuredPoses.from_tensors(
+            self.rows.position, self.rows.rotation, LEVER_SHARE * self.model.robot.reach
+        )
 
     @cached_property
     def errors(self) -> Float64[Tensor, " rows"]:

@@ -84,7 +84,7 @@ def _far_rows(
     if int(there.sum()) < (MIN_ROWS_TO_FIT if fitted else MIN_ROWS):
         return None
     numbers = there.nonzero()[:, 0]
-    judged = RowsUnderModel.of(model, rows.select(numbers), fitted, ())
+    judged = RowsUnderModel.from_rows(model, rows.select(numbers), fitted, ())
     if judged is None or judged.rows.rows != len(numbers):
         return None
     far, texts = _far(judged, _fitted_to_usual_rows(judged) if judged.fitted else judged.unfitted)

@@ -110,7 +110,7 @@ def errors_in_fitted_frames(
     rows = measurements.select(usable.nonzero()[:, 0])
     _check_configurations(model, measurements, rows, fitted)
     known = rows if has_orientation(model) or "tool" in fitted else replace(rows, rotation=None)
-    measured = MeasuredPoses.of(known.position, known.rotation, LEVER_SHARE * model.robot.reach)
+    measured = MeasuredPoses.from_tensors(known.position, known.rotation, LEVER_SHARE * model.robot.reach)
     fit, columns = fit_frames(T[usable], measured, rows, fitted)
     T = T.index_put((usable.nonzero()[:, 0],), fit)
     U, size, _ = torch.linalg.svd(columns.flatten(0, 1), full_matrices=False)

@@ -110,7 +110,7 @@ def test_no_more_is_independent_than_axes_targets_and_frames_have(
     )
     setup = GeometricCalibrator(robot).build(data)
     problem, point = setup.problem, setup.start.clone()
-    tools = problem.space.of("tool")
+    tools = problem.space.indices_of("tool")
     point[list(tools)] += 0.1 * torch.from_numpy(rng.standard_normal(len(tools)))
     seen = information(problem, point, list(range(len(point))))
     found = find_redundancy(seen, point.numpy())

@@ -43,7 +43,7 @@ def test_incomplete_and_missing_boards_are_distinguished() -> None:
 
 def test_edges_without_contrast_have_no_blur_and_are_not_moved() -> None:
     ends = np.array([[[100.0, 100.0], [150.0, 110.0]]])
-    profiles = EdgeProfiles.of(np.full((400, 640), 90, dtype=np.uint8), ends, 0.2)
+    profiles = EdgeProfiles.from_image(np.full((400, 640), 90, dtype=np.uint8), ends, 0.2)
     assert np.isnan(profiles.blur)
     assert_close(profiles.points, profiles.at)
 
@@ -52,5 +52,5 @@ def test_edges_without_contrast_have_no_blur_and_are_not_moved() -> None:
 def test_the_blur_of_edges(blur: float) -> None:
     R, t = view(BOARD, 0.3, (0.4, 0.3, 0.0))
     ends = CAMERA.project(BOARD.corners @ R.T + t)[0][BOARD.edges]
-    profiles = EdgeProfiles.of(draw_board(BOARD, R, t, blur=blur), ends, BOARD.clearance)
+    profiles = EdgeProfiles.from_image(draw_board(BOARD, R, t, blur=blur), ends, BOARD.clearance)
     assert_close(profiles.blur, np.hypot(blur, 0.5), rtol=0.05)
