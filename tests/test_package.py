@@ -39,6 +39,7 @@ ROOMS = (
     "deployment",
     "reporting",
     "workflow",
+    "workbench",
     "cli",
 )
 """A file imports only from its room and those before it; CONTRIBUTING.md describes them."""

@@ -243,6 +243,7 @@ EXTRAS = {
     "onnx": "onnx",
     "numba": "compile",
     "viser": "view",
+    "aiohttp": "view",
     "pyarrow": "fleet",
     "ray": "ray",
     "pyzmq": "serve",

@@ -22,8 +22,8 @@ if TYPE_CHECKING:
     from pisigma.planning.camera_settings import CameraSettings
     from pisigma.planning.session.state import SessionState
     from pisigma.planning.surroundings.arm_in_surroundings import ArmInSurroundings
-    from pisigma.reporting.viewing.body import MeshBody
     from pisigma.robot.description import Robot
+    from pisigma.workbench.viewing.body import MeshBody
     from pisigma.workflow.follow import SessionStep
     from pisigma.workflow.measure import MeasuringSession
 
@@ -70,7 +70,7 @@ class PageOptions:
         Raises:
             RobotError: the meshes cannot be shown.
         """
-        from pisigma.reporting.viewing.body import MeshBody
+        from pisigma.workbench.viewing.body import MeshBody
 
         return None if self.urdf is None else MeshBody(robot, self.urdf)
 
@@ -99,7 +99,7 @@ def shown_in_browser(
         yield lambda state: None
         return
     from pisigma.planning.plan_inputs import sight_of
-    from pisigma.reporting.viewing.session_view import SessionView
+    from pisigma.workbench.viewing.session_view import SessionView
 
     limit = None if limit_mm is None else limit_mm / 1e3
     sight = None if camera is None else sight_of(camera)

@@ -1,10 +1,10 @@
 """The page of `pisigma measure --view`."""
 
 import sys
-import urllib.request
 
 import pytest
 from testing.models import no_type_checker
+from testing.pages import visitor
 from testing.sessions import arm_beside_tracker, session_state
 
 from pisigma.cli.measure.command import PageOptions, shown_in_browser
@@ -25,8 +25,7 @@ def test_the_address_is_said_beside_the_results(capsys):
     with no_type_checker(), shown_in_browser(arm, 0.15, OPTIONS) as show:
         out, err = capsys.readouterr()
         assert out == ""
-        with urllib.request.urlopen(err.split()[-1]) as page:
-            assert b"<html" in page.read()
+        assert b"<html" in visitor(err.split()[-1]).ask().body
         show(session_state(arm, 3))
     assert "Ctrl-C" not in capsys.readouterr().err  # nobody could press it here
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from testing.closeness import assert_close
 
-from pisigma.reporting.viewing.surface import capsule, joined, revolve, rotation_to
+from pisigma.workbench.viewing.surface import capsule, joined, revolve, rotation_to
 
 
 def volume(surface) -> float:

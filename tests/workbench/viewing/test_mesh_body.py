@@ -7,9 +7,9 @@ from testing.closeness import assert_close
 from testing.refusals import refused
 
 from pisigma.files.errors import RobotError
-from pisigma.reporting.viewing.body import MeshBody
 from pisigma.robot.description import Robot
 from pisigma.robot.kinematics.forward import forward_kinematics
+from pisigma.workbench.viewing.body import MeshBody
 
 trimesh = pytest.importorskip("trimesh", reason="the extra view is not installed")
 

@@ -1,9 +1,6 @@
 """Live page of a measuring session in the browser."""
 
-import contextlib
-import io
 import math
-import socket
 import threading
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
@@ -16,10 +13,10 @@ from pisigma.files.templates import template_environment
 from pisigma.planning.board_sight import BoardSight
 from pisigma.planning.session.state import AccuracyPoint, RowsSoFar, SessionState
 from pisigma.planning.surroundings.arm_in_surroundings import ArmInSurroundings
-from pisigma.reporting.viewing.body import AbstractBody, CapsuleBody
-from pisigma.reporting.viewing.colors import RAMP, round_up
-from pisigma.reporting.viewing.scene import SessionScene
 from pisigma.robot.description import Robot
+from pisigma.workbench.viewing.body import AbstractBody, CapsuleBody
+from pisigma.workbench.viewing.colors import RAMP, round_up
+from pisigma.workbench.viewing.scene import SessionScene
 
 if TYPE_CHECKING:  # names in full, which type checkers at run time find without these imports
     import viser
@@ -49,7 +46,7 @@ class SessionView:
     The page is self-contained.
 
     Attributes:
-        url: address of the page.
+        url: link to the page, with its token.
     """
 
     def __init__(
@@ -75,15 +72,19 @@ class SessionView:
             ImportError: viser is not installed.
             OutputError: the host is not an address of this machine.
         """
-        import viser
+        from pisigma.workbench.server.front_server import FrontServer
+        from pisigma.workbench.server.viser_server import ViserBehind
 
-        _check_host(host)
         self._reach, self._lock = arm.robot.reach, threading.Lock()
         self._state: SessionState | None = None
         self._magnified_by_hand = False
-        with contextlib.redirect_stdout(io.StringIO()):  # viser prints a greeting to stdout
-            self._server = viser.ViserServer(host, port, label="pisigma measure", verbose=False)
-        self.url = f"http://{host}:{self._server.get_port()}"
+        self._behind = ViserBehind("pisigma measure")
+        try:
+            self._front = FrontServer(self._behind.pages(""), host, port, self._behind.close_sockets)
+        except OutputError:
+            self._behind.close()
+            raise
+        self.url, self._server = self._front.url, self._behind.server
         self._server.gui.configure_theme(show_logo=False, show_share_button=False, control_width="large")
         self._server.gui.main_panel.dock_right()
         self._server.scene.configure_default_lights(cast_shadow=False)
@@ -100,8 +101,8 @@ class SessionView:
 
     def __exit__(self, *_: object) -> None:
         """Stop serving."""
-        with contextlib.redirect_stdout(io.StringIO()):
-            self._server.stop()
+        self._behind.close()
+        self._front.close()
 
     def show(self, state: SessionState) -> None:
         """Show a state of the session on all open pages."""
@@ -127,21 +128,6 @@ class SessionView:
             if self._state is not None:
                 rows = self._state.rows
                 self._scene.show_rows(rows, top_of_scale(rows), self._panel.magnification.value)
-
-
-def _check_host(host: str) -> None:
-    """Refuse an address that is not one of this machine; viser would look for a free port there forever."""
-    try:
-        family, kind, _, _, address = socket.getaddrinfo(host, 0, type=socket.SOCK_STREAM)[0]
-        with socket.socket(family, kind) as trial:
-            trial.bind(address)
-    except OSError as problem:
-        raise OutputError(
-            f"the page cannot be served at '{host}': {problem.strerror}",
-            value=host,
-            option="--host",
-            remedy="give an address of this machine, such as 127.0.0.1, or 0.0.0.0 for all of them",
-        ) from None
 
 
 def first_view(arm: ArmInSurroundings) -> tuple[Float64[np.ndarray, " 3"], Float64[np.ndarray, " 3"]]:
@@ -179,7 +165,7 @@ class SessionPanel:
         """
         self._robot, self._limit = robot, limit
         environment = template_environment(
-            "pisigma.reporting.viewing", {"mm": lambda length: f"{length * 1e3:.3f}"}
+            "pisigma.workbench.viewing", {"mm": lambda length: f"{length * 1e3:.3f}"}
         )
         self._text: Any = environment.get_template("panel.html.j2").module
         self._advice = gui.add_html("")

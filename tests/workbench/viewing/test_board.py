@@ -7,7 +7,7 @@ from testing.closeness import assert_close
 
 pytest.importorskip("viser", reason="the extra view is not installed")
 
-from pisigma.reporting.viewing.scene import draw_board
+from pisigma.workbench.viewing.scene import draw_board
 
 
 class Scene:

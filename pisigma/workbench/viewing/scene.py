@@ -13,8 +13,10 @@ from pisigma.planning.board_sight import BoardSight
 from pisigma.planning.session.state import RowsSoFar, SessionState
 from pisigma.planning.surroundings.arm_in_surroundings import ArmInSurroundings
 from pisigma.planning.surroundings.surroundings import ReflectorSection, Surroundings
-from pisigma.reporting.viewing.body import AbstractBody
-from pisigma.reporting.viewing.colors import (
+from pisigma.robot.kinematics.forward import forward_kinematics
+from pisigma.robot.se3 import invert
+from pisigma.workbench.viewing.body import AbstractBody
+from pisigma.workbench.viewing.colors import (
     ALARM,
     FORBIDDEN,
     LINKS,
@@ -25,9 +27,7 @@ from pisigma.reporting.viewing.colors import (
     Color,
     shades,
 )
-from pisigma.reporting.viewing.surface import Surface, revolve, rotation_to
-from pisigma.robot.kinematics.forward import forward_kinematics
-from pisigma.robot.se3 import invert
+from pisigma.workbench.viewing.surface import Surface, revolve, rotation_to
 
 if TYPE_CHECKING:  # names in full, which type checkers at run time find without these imports
     import viser

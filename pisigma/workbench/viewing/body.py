@@ -15,12 +15,12 @@ from scipy.spatial.transform import Rotation
 from pisigma.files.errors import Place, RobotError
 from pisigma.files.input_file import read_input
 from pisigma.planning.surroundings.capsules import Capsules
-from pisigma.reporting.viewing.colors import Color
-from pisigma.reporting.viewing.surface import Surface, capsule, joined
 from pisigma.robot.description import Robot
 from pisigma.robot.urdf_chain import origin_of, read_chain
 from pisigma.robot.urdf_file import parse_xml, read_urdf
 from pisigma.robot.urdf_frames import Frame, frame_of, translation
+from pisigma.workbench.viewing.colors import Color
+from pisigma.workbench.viewing.surface import Surface, capsule, joined
 
 if TYPE_CHECKING:  # names in full, which type checkers at run time find without these imports
     import trimesh

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from testing.closeness import assert_close
 
-from pisigma.reporting.viewing.colors import RAMP, UNJUDGED, round_up, shades
+from pisigma.workbench.viewing.colors import RAMP, UNJUDGED, round_up, shades
 
 
 def test_colours_run_from_no_error_to_the_end_of_the_scale():

@@ -1,0 +1,1 @@
+"""The server of the pages: who may open them, and viser behind it."""
