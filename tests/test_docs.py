@@ -248,11 +248,12 @@ def test_the_keys_of_recipes_are_those_of_the_models() -> None:
     assert tables.page_with(text, tables.tables()) == text, "run: python docs/hooks/recipe_tables.py"
 
 
-def test_the_settings_are_those_of_the_commands(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(("page", "hook"), [("settings", "setting_tables"), ("history", "history_tables")])
+def test_tables_are_those_of_the_classes(monkeypatch: pytest.MonkeyPatch, page: str, hook: str) -> None:
     monkeypatch.syspath_prepend(DOCS / "hooks")
-    tables = _hook("setting_tables")
-    text = _text(DOCS / "reference" / "settings.md")
-    assert tables.page_with(text, tables.tables()) == text, "run: python docs/hooks/setting_tables.py"
+    tables = _hook(hook)
+    text = _text(DOCS / "reference" / f"{page}.md")
+    assert tables.page_with(text, tables.tables()) == text, f"run: python docs/hooks/{hook}.py"
 
 
 def test_every_status_and_every_robot_is_named() -> None:

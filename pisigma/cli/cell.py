@@ -139,7 +139,7 @@ def _print_status(status: "CellStatus") -> None:
     ]
     if rows:
         print_table(f"sessions ({len(facts.sessions)})", ("session", "rows", "sensor", "verdict"), rows)
-    print_lines(f"{one.day}: {one.kind}{f' ({one.note})' if one.note else ''}" for one in facts.events)
+    print_lines(one.sentence for one in facts.events)
     print_lines(
         f"sessions/{name} will be added by the next command that reads rows." for name in status.not_taken_in
     )
@@ -235,26 +235,31 @@ def event(
     kind: Annotated[
         str,
         typer.Argument(
-            help="What was changed: instrument, tool, mastering, encoder, collision, maintenance or firmware."
+            help="What was changed: instrument, tool, mastering, encoder, collision, maintenance or firmware; or "
+            "accepted, if a person accepted the model in use."
         ),
     ],
     date: Annotated[str, typer.Option(help="Day of the event, such as 2026-11-22. [default: today]")] = "",
     note: Annotated[str, typer.Option(help="Free text.")] = "",
+    by: Annotated[
+        str, typer.Option(help="Name of the person who accepted the model or reports the change.")
+    ] = "",
     as_json: AsJson = False,
 ) -> None:
-    """Record that the instrument, the tool or the arm was changed; this determines which sessions remain valid.
+    """Record that the instrument, the tool or the arm was changed, or that a person accepted the model in use.
 
-    Rows measured after an instrument or tool event have a new frame or target. Sessions from before a mastering,
-    encoder, collision or maintenance event are no longer used for calibration.
+    Events determine which sessions remain valid. Rows measured after an instrument or tool event have a new frame or
+    target. Sessions from before a mastering, encoder, collision or maintenance event are no longer used for
+    calibration.
     """
     from pisigma.workflow.cell.cell import Cell
 
     opened = Cell.open(cell)
-    recorded = opened.history.record(kind, date, note)
+    recorded = opened.history.record(kind, date, note, by)
     if as_json:
-        print_json({"day": recorded.day, "kind": recorded.kind, "note": recorded.note})
+        print_json(recorded.to_json())
     else:
-        print_lines([f"Recorded: {recorded.kind} on {recorded.day}."])
+        print_lines([f"Recorded: {recorded.sentence}"])
         _print_next(opened.status())
 
 

@@ -1,20 +1,30 @@
-"""`pisigma upgrade`: convert a model folder of an earlier version."""
+"""`pisigma upgrade`: convert a model folder or a cell of an earlier version."""
 
 from dataclasses import asdict
 
-from pisigma.cli.arguments import AsJson, ModelFolder
-from pisigma.cli.output import print_json, print_line, print_lines
+from pisigma.cli.arguments import AsJson, ModelOrCell
+from pisigma.cli.output import print_json, print_lines
 
 
-def upgrade(model: ModelFolder, as_json: AsJson = False) -> None:
-    """Convert a model folder of an earlier version to the present format."""
-    from pisigma.model.folder.upgrade import upgrade_folder
-    from pisigma.model.inverse.written_model import check_written
+def upgrade(model: ModelOrCell, as_json: AsJson = False) -> None:
+    """Convert a model folder or a cell of an earlier version to the present format, with its history."""
+    from pisigma.lifetime.cell.layout import is_cell
+    from pisigma.workflow.upgrade import upgrade as workflow
 
-    done = upgrade_folder(model, check_written)
-    if as_json:
-        print_json({"model": str(model), **asdict(done)})
-    elif done.before == done.after:
-        print_line(f"{model} already has the newest format ({done.after}).")
+    done = workflow(model)
+    models = [asdict(one) for one in done.models]
+    if as_json and is_cell(model):
+        print_json({"cell": str(model), "before": done.before, "after": done.after, "models": models})
+    elif as_json:
+        print_json({"model": str(model), **models[0]})
     else:
-        print_lines([f"{model}: format {done.before} was upgraded to {done.after}.", *done.changes])
+        if done.before != done.after:
+            print_lines([f"{model}: history of schema version {done.before} was upgraded to {done.after}."])
+        elif is_cell(model):
+            print_lines([f"The history of {model} already has the newest schema version ({done.after})."])
+        for one in done.models:
+            name = f"model '{one.name}'" if is_cell(model) else str(model)
+            if one.before == one.after:
+                print_lines([f"{name} already has the newest format ({one.after})."])
+            else:
+                print_lines([f"{name}: format {one.before} was upgraded to {one.after}.", *one.changes])

@@ -14,10 +14,10 @@ from pisigma.files.errors import MeasurementError, ModelError, Place
 from pisigma.files.model_files import model_hash
 from pisigma.files.output_file import check_page, write_whole
 from pisigma.files.progress import Progress
+from pisigma.lifetime.cell.layout import history_of_model
 from pisigma.lifetime.monitoring.charts import FALSE_ALARMS_PER_YEAR, SESSIONS_PER_YEAR, Chart
 from pisigma.lifetime.monitoring.history import (
     Record,
-    history_path,
     new_rows,
     read_sessions,
     rows_hash,
@@ -233,7 +233,7 @@ def monitor(
     trusted: list[Record] = []
     untrusted: list[UntrustedSession] = []
     folder = source if settings.history and not isinstance(source, CalibratedModel) else None
-    earlier = () if folder is None else read_sessions(history_path(folder), model_hash(folder))
+    earlier = () if folder is None else read_sessions(history_of_model(folder), model_hash(folder))
     for date, day in _by_day(rows, settings.dates):
         progress(f"{Path(day.source).name}, {date}")
         warnings += row_warnings(loaded.robot, day)
@@ -261,7 +261,7 @@ def monitor(
         raise MeasurementError(f"expected new rows, got none: {' '.join(warnings)}", expected="new rows")
     records = new = sorted_sessions(trusted)
     if folder is not None:
-        records = store_sessions(history_path(folder), model_hash(folder), new)
+        records = store_sessions(history_of_model(folder), model_hash(folder), new)
         warnings += [
             f"{one.file}: its session in the history was left out: expected {EXPECTED_DATE}, got {one.date}; monitor "
             "its rows again with --dates to correct the date."

@@ -36,7 +36,13 @@ def test_status_of_a_folder_has_every_cell(run, cell):
 
 def test_events_are_recorded(run, cell):
     recorded = run("event", cell, "mastering", "--date", "2026-01-10", "--note", "joint 3", "--json")
-    assert json.loads(recorded.stdout) == {"day": "2026-01-10", "kind": "mastering", "note": "joint 3"}
+    assert json.loads(recorded.stdout) == {
+        "day": "2026-01-10",
+        "kind": "mastering",
+        "note": "joint 3",
+        "person": "",
+        "model": "",
+    }
     assert json.loads(run("status", cell, "--json").stdout)["events"] == [json.loads(recorded.stdout)]
 
 
@@ -55,6 +61,7 @@ def test_what_is_not_there_is_refused(refuses, cell, tmp_path):
     )
     refuses("event", cell, "earthquake", error=MeasurementError, option="event", value="earthquake")
     refuses("event", cell, "tool", "--date", "10.1.2026", error=MeasurementError, option="--date")
+    refuses("event", cell, "accepted", error=MeasurementError, option="--by")
 
 
 def rows_file(folder, name, *arguments, **options):

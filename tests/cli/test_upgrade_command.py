@@ -1,7 +1,12 @@
 """`pisigma upgrade`."""
 
 import json
+import zipfile
+from pathlib import Path
 
+import pytest
+
+from pisigma.lifetime.cell.history import HISTORY, SCHEMA_VERSION, History
 from pisigma.model.folder.model_document import FORMAT
 
 
@@ -19,3 +24,28 @@ def test_what_is_new_already_is_said(run, models):
 
 def test_a_folder_without_a_model_is_refused(refuses, tmp_path):
     refuses("upgrade", tmp_path)
+
+
+@pytest.fixture
+def older(tmp_path):
+    """A cell of schema version 1."""
+    packed = Path(__file__).parents[1] / "lifetime" / "cell" / "cell_of_schema_1.zip"
+    with zipfile.ZipFile(packed) as archive:
+        archive.extractall(tmp_path / "cell")
+    return tmp_path / "cell"
+
+
+def test_a_cell_of_an_earlier_version_is_upgraded_with_its_models(run, older):
+    done = json.loads(run("upgrade", older, "--json").stdout)
+    assert (done["before"], done["after"]) == (1, SCHEMA_VERSION)
+    assert [one["name"] for one in done["models"]] == ["2026-11-26"]
+    again = json.loads(run("upgrade", older, "--json").stdout)
+    assert (again["before"], again["after"]) == (SCHEMA_VERSION, SCHEMA_VERSION)
+    assert json.loads(run("status", older, "--json").stdout)["model"] == "2026-11-26"
+
+
+def test_the_history_follows_a_model_whose_folder_was_upgraded(older):
+    history = History(older / HISTORY)
+    history.rename_model(history.models()[0].sha256, "new")
+    assert history.models()[0].sha256 == "new"
+    assert {one.model_sha256 for one in history.monitored_sessions()} == {"new"}

@@ -6,12 +6,10 @@
 import argparse
 import os
 import signal
-import sqlite3
 import subprocess
 import sys
 import tempfile
 import time
-from contextlib import closing
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
@@ -20,7 +18,7 @@ import numpy as np
 from hostile.kills import contents, start
 from testing.aged import model_before, rows_later
 
-from pisigma.lifetime.monitoring.history import history_path
+from pisigma.lifetime.cell.layout import history_of_model
 from pisigma.model.folder.model_folder import load_model, save_model
 from pisigma.model.model_posterior import ModelPosterior
 
@@ -68,12 +66,8 @@ class Chain:
         """Return the sessions in the histories of all models, by model and rows."""
         held: set[tuple[str, str]] = set()
         for number in range(self.links):
-            path = history_path(self.folder / f"link-{number}")
-            if path.exists():
-                with closing(sqlite3.connect(path)) as database:
-                    assert database.execute("PRAGMA integrity_check").fetchone() == ("ok",)
-                    if database.execute("SELECT name FROM sqlite_master").fetchall():
-                        held |= set(database.execute("SELECT model, rows FROM sessions"))
+            history = history_of_model(self.folder / f"link-{number}")
+            held |= {(one.model_sha256, one.rows_sha256) for one in history.monitored_sessions()}
         return held
 
     def fault(self) -> str:

@@ -1,28 +1,33 @@
-"""History of a cell in one SQLite file: sessions, events, models, checks, and which model was in use when.
+"""History in one SQLite file: sessions, events, models, checks, which model was in use when, and monitored sessions.
 
-DuckDB and pandas can read the tables directly; `_TABLES` maps the classes below to tables, and columns are named after
-attributes. Every change is one transaction. SQLite's rollback journal and lock let several processes write safely.
+A cell has one history; a model outside of a cell has one next to its folder, with monitored sessions only. DuckDB and
+pandas can read the tables directly: `TABLES` maps the classes below to tables, and columns are named after attributes.
 """
 
 import datetime
 import sqlite3
-from collections.abc import Iterator
-from contextlib import closing, contextmanager
-from dataclasses import asdict, dataclass, fields
+from collections.abc import Sequence
+from contextlib import closing
+from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any, Literal, TypeVar, get_args
+from typing import Literal, get_args
 
 from pisigma.files.errors import MeasurementError, ModelError, OutputError, Place, check_choice
+from pisigma.lifetime.cell.database import Database, Table
 from pisigma.measurement.dates import EXPECTED_DATE, is_date
 
 HISTORY = "history.sqlite"
-SCHEMA_VERSION = 1
-LOCK_TIMEOUT = 10.0
-"""[s] Longest wait for another process that is writing."""
+"""Name of the history of a cell."""
+MODEL_HISTORY = ".history.sqlite"
+"""Suffix of the history of a model outside of a cell, after the name of its folder."""
+SCHEMA_VERSION = 2
+"""Version of the schema. Version 1 had no monitored sessions: each model had a file for them, without a version."""
 
-EventKind = Literal["instrument", "tool", "mastering", "encoder", "collision", "maintenance", "firmware"]
+EventKind = Literal[
+    "instrument", "tool", "mastering", "encoder", "collision", "maintenance", "firmware", "accepted"
+]
 """What was changed: the instrument (tracker, camera, board) was set up again, the tool or reflector was exchanged, or
-the arm was changed (see `ARM_EVENTS`); "firmware" is only recorded."""
+the arm was changed (see `ARM_EVENTS`). "firmware" and "accepted", by a person, are only recorded."""
 ARM_EVENTS: frozenset[EventKind] = frozenset(("mastering", "encoder", "collision", "maintenance"))
 """Events after which earlier sessions no longer describe the arm."""
 
@@ -58,19 +63,36 @@ class SessionEntry:
 
 @dataclass(frozen=True)
 class Event:
-    """A change of the robot, its tool or its instrument.
+    """A change of the robot, its tool or its instrument, or the acceptance of a model by a person.
 
     Attributes:
         day: day on which it happened (ISO 8601); sessions of that day were measured after it.
-        kind: see `EventKind`.
+        kind: what happened: "instrument", "tool", "mastering", "encoder", "collision", "maintenance", "firmware" or
+            "accepted".
         note: free text.
         recorded: time at which it was recorded (ISO 8601, UTC).
+        person: who accepted the model or reported the change; empty if that is not stated.
+        model: name of the accepted model; empty for all other kinds.
     """
 
     day: str
     kind: EventKind
     note: str
     recorded: str
+    person: str = ""
+    model: str = ""
+
+    @property
+    def sentence(self) -> str:
+        """Day, kind, model and person, with the note, as one line."""
+        model = f" model '{self.model}'" if self.model else ""
+        by, note = f" by {self.person}" if self.person else "", f" ({self.note})" if self.note else ""
+        return f"{self.day}: {self.kind}{model}{by}{note}."
+
+    def to_json(self) -> dict[str, str]:
+        """Return the event as plain values, without the time at which it was recorded."""
+        names = ("day", "kind", "note", "person", "model")
+        return {name: getattr(self, name) for name in names}
 
 
 @dataclass(frozen=True)
@@ -144,15 +166,55 @@ class Use:
     reason: str
 
 
-Entry = TypeVar("Entry", SessionEntry, Event, ModelEntry, Check, Use)
-_TABLES: dict[type, str] = {
-    SessionEntry: "cell_sessions",
-    Event: "events",
-    ModelEntry: "models",
-    Check: "checks",
-    Use: "uses",
+@dataclass(frozen=True)
+class MonitoredSession:
+    """Result of comparing a session with a model over the months.
+
+    Attributes:
+        model_sha256: SHA-256 of the `model.yaml` of the model.
+        rows_sha256: SHA-256 of the rows, without their dates.
+        file: name of the file of the rows.
+        day: day of the measurement (ISO 8601).
+        rows: number of rows.
+        temperature_c: mean temperature [deg C]; None if the rows do not state it.
+        verdict: "unchanged", "moved" or "unclear".
+        unchanged: probability that nothing moved.
+        rms_mm: RMS position error under the model [mm].
+        rms_after_mm: RMS position error expected after a recalibration [mm].
+        session: the whole result as JSON; lengths in m, angles in rad.
+        arrays: NumPy archive (.npz) of the zeros of the joints with their covariance, and of the rows.
+    """
+
+    model_sha256: str
+    rows_sha256: str
+    file: str
+    day: str
+    rows: int
+    temperature_c: float | None
+    verdict: str
+    unchanged: float
+    rms_mm: float
+    rms_after_mm: float
+    session: str
+    arrays: bytes
+
+
+TABLES: dict[type, Table] = {
+    SessionEntry: Table("cell_sessions", ("name",)),
+    Event: Table("events"),
+    ModelEntry: Table("models", ("name",)),
+    Check: Table("checks"),
+    Use: Table("uses"),
+    MonitoredSession: Table("monitored_sessions", ("model_sha256", "rows_sha256")),
 }
-_SQL_TYPES = {str: "TEXT NOT NULL", int: "INTEGER NOT NULL", bool: "INTEGER NOT NULL"}
+_SESSIONS_OF_MODEL = """SELECT model, rows, file, date, json_extract(session, '$.rows'), temperature_c,
+    CASE WHEN json_array_length(session, '$.moved') THEN 'moved'
+         WHEN json_array_length(session, '$.candidates') THEN 'unclear' ELSE 'unchanged' END,
+    json_extract(session, '$.unchanged'), 1e3 * json_extract(session, '$.rms'),
+    1e3 * json_extract(session, '$.rms_after'), session, zeros FROM sessions"""
+"""Monitored sessions in the file of a model before schema version 2."""
+_OF_MODELS = "models/*.history.sqlite"
+"""These files in a cell."""
 
 
 def now() -> str:
@@ -161,34 +223,42 @@ def now() -> str:
 
 
 class History:
-    """The history of a cell.
+    """The history of a cell, or of a model outside of a cell.
 
     Attributes:
         path: path of its SQLite file, which is created with the first entry.
+        database: its tables. A file of an earlier schema version is upgraded when it is opened.
     """
 
     def __init__(self, path: Path) -> None:
         self.path = path
+        self.database = Database(path, TABLES, SCHEMA_VERSION, self._take_over)
 
     def sessions(self) -> tuple[SessionEntry, ...]:
         """Return all sessions in the order of their days, including those that were set aside."""
-        return tuple(sorted(self._read(SessionEntry), key=lambda one: (one.day, one.taken_in, one.name)))
+        return tuple(
+            sorted(self.database.read(SessionEntry), key=lambda one: (one.day, one.taken_in, one.name))
+        )
 
     def events(self) -> tuple[Event, ...]:
         """Return all events in the order of their days."""
-        return tuple(sorted(self._read(Event), key=lambda one: (one.day, one.recorded)))
+        return tuple(sorted(self.database.read(Event), key=lambda one: (one.day, one.recorded)))
 
     def models(self) -> tuple[ModelEntry, ...]:
         """Return all models in the order in which they were made."""
-        return self._read(ModelEntry)
+        return self.database.read(ModelEntry)
 
     def checks(self) -> tuple[Check, ...]:
         """Return all checks in the order in which they were made."""
-        return self._read(Check)
+        return self.database.read(Check)
+
+    def monitored_sessions(self) -> tuple[MonitoredSession, ...]:
+        """Return all monitored sessions of all models in the order in which they were added."""
+        return self.database.read(MonitoredSession)
 
     def uses(self) -> tuple[Use, ...]:
         """Return the changes of the model in use; the last one names the model in use now."""
-        return self._read(Use)
+        return self.database.read(Use)
 
     @property
     def in_use(self) -> ModelEntry | None:
@@ -206,92 +276,78 @@ class History:
         check_choice(ModelError, "model", name, tuple(models), Place(self.path.parent))
         return models[name]
 
-    def add(self, *entries: SessionEntry | Event | ModelEntry | Check | Use) -> None:
-        """Add entries in one transaction; a session or a model of the same name is replaced.
+    def add(self, *entries: SessionEntry | Event | ModelEntry | Check | Use | MonitoredSession) -> None:
+        """Add entries in one transaction; an entry with the same key (see `TABLES`) is replaced.
 
         Raises:
             OutputError: the history cannot be written.
         """
-        with self._opened() as database, database:
-            for entry in entries:
-                values = asdict(entry)
-                marks = ", ".join("?" * len(values))
-                names = ", ".join(values)
+        self.database.add(entries)
+
+    def rename_model(self, before: str, after: str) -> None:
+        """Replace the SHA-256 of a model whose folder was upgraded.
+
+        Raises:
+            OutputError: the history cannot be written.
+        """
+        with self.database.writing() as database:
+            for kind, column in ((ModelEntry, "sha256"), (MonitoredSession, "model_sha256")):
                 database.execute(
-                    f"INSERT OR REPLACE INTO {_TABLES[type(entry)]} ({names}) VALUES ({marks})",
-                    tuple(values.values()),
+                    f"UPDATE OR REPLACE {TABLES[kind].name} SET {column} = ? WHERE {column} = ?",
+                    (after, before),
                 )
 
-    def record(self, kind: str, day: str = "", note: str = "") -> Event:
-        """Record that something was changed; see `EventKind`.
+    def record(self, kind: str, day: str = "", note: str = "", person: str = "") -> Event:
+        """Record that something was changed, or that the model in use was accepted; see `EventKind`.
 
         Args:
             kind: kind of the event.
             day: day on which it happened (ISO 8601). "": today.
             note: free text.
+            person: who accepted the model or reports the change.
 
         Raises:
-            MeasurementError: the kind is unknown, or the day is not a valid date.
+            MeasurementError: the kind is unknown, the day is not a valid date, or nobody is named who accepted.
+            ModelError: no model is in use that could be accepted.
         """
         check_choice(MeasurementError, "event", kind, event_kinds())
-        day = day or datetime.date.today().isoformat()
+        day, model = day or datetime.date.today().isoformat(), ""
         if not is_date(day):
             raise MeasurementError(expected=EXPECTED_DATE, value=day, option="--date")
-        event = Event(day, kind, note, now())  # type: ignore[arg-type]  # checked above
+        if kind == "accepted":
+            if not person.strip():
+                raise MeasurementError(
+                    expected="the name of the person who accepted", value=person, option="--by"
+                )
+            if (entry := self.in_use) is None:
+                raise ModelError("no model of the cell is in use", at=Place(self.path.parent))
+            if day < entry.made[:10]:
+                expected = f"a day since {entry.made[:10]}, when model '{entry.name}' was made"
+                raise MeasurementError(expected=expected, value=day, option="--date")
+            model = entry.name
+        event = Event(day, kind, note, now(), person.strip(), model)  # type: ignore[arg-type]  # checked above
         self.add(event)
         return event
 
-    def _read(self, kind: type[Entry]) -> tuple[Entry, ...]:
-        if not self.path.exists():
-            return ()
-        names = [one.name for one in fields(kind)]
-        with self._opened() as database:
-            rows = database.execute(
-                f"SELECT {', '.join(names)} FROM {_TABLES[kind]} ORDER BY rowid"
-            ).fetchall()
-        return tuple(_entry(kind, dict(zip(names, row, strict=True))) for row in rows)
-
-    @contextmanager
-    def _opened(self) -> Iterator[sqlite3.Connection]:
-        try:
-            with closing(sqlite3.connect(self.path, timeout=LOCK_TIMEOUT)) as database:
-                (version,) = database.execute("PRAGMA user_version").fetchone()
-                if version > SCHEMA_VERSION:
-                    raise OutputError(
-                        expected=f"a history of schema version {SCHEMA_VERSION} or older",
-                        value=version,
-                        at=Place(self.path),
-                        remedy="update pisigma",
-                    )
-                if version < SCHEMA_VERSION:
-                    with database:
-                        _create_tables(database)
-                yield database
-        except sqlite3.Error as problem:
-            raise OutputError(
-                f"the history of the cell cannot be used: {problem}",
-                at=Place(self.path),
-                remedy="check that the file is an SQLite database and that its folder is writable",
-            ) from None
-
-
-def _create_tables(database: sqlite3.Connection) -> None:
-    for kind, table in _TABLES.items():
-        columns = [f"{one.name} {_sql_type(one.type)}" for one in fields(kind)]
-        key = ", PRIMARY KEY (name)" if "name" in {one.name for one in fields(kind)} else ""
-        database.execute(f"CREATE TABLE IF NOT EXISTS {table} ({', '.join(columns)}{key})")
-    database.execute(f"PRAGMA user_version = {SCHEMA_VERSION}")
-
-
-def _sql_type(kind: Any) -> str:
-    if kind == float | None:
-        return "REAL"
-    return _SQL_TYPES.get(kind, "TEXT NOT NULL")
-
-
-def _entry(kind: type[Entry], values: dict[str, Any]) -> Entry:
-    booleans = {one.name: bool(values[one.name]) for one in fields(kind) if one.type is bool}
-    return kind(**(values | booleans))
+    def _take_over(self, database: sqlite3.Connection) -> Sequence[Path]:
+        """Add the monitored sessions that versions before 2 stored in a file next to each model of the cell."""
+        known = database.execute("SELECT name FROM sqlite_master WHERE name = 'sessions'").fetchall()
+        rows = database.execute(_SESSIONS_OF_MODEL).fetchall() if known else []
+        database.execute("DROP TABLE IF EXISTS sessions")
+        moved = sorted(self.path.parent.glob(_OF_MODELS)) if self.path.name == HISTORY else []
+        for file in moved:
+            try:
+                with closing(sqlite3.connect(file)) as other:
+                    rows += other.execute(_SESSIONS_OF_MODEL).fetchall()
+            except sqlite3.Error as problem:
+                remedy = "move the file away"
+                raise OutputError(
+                    f"the history cannot be used: {problem}", at=Place(file), remedy=remedy
+                ) from None
+        marks = ", ".join("?" * len(fields(MonitoredSession)))
+        table = TABLES[MonitoredSession].name
+        database.executemany(f"INSERT OR REPLACE INTO {table} VALUES ({marks})", rows)
+        return moved
 
 
 def event_kinds() -> tuple[str, ...]:

@@ -4,7 +4,7 @@ import os
 from pathlib import Path
 
 from pisigma.files.errors import ModelError, Place, PlanningError
-from pisigma.lifetime.cell.history import HISTORY, History
+from pisigma.lifetime.cell.history import HISTORY, MODEL_HISTORY, History
 
 CELL_FILE = "cell.yaml"
 PLANS, SESSIONS, MODELS = "plans", "sessions", "models"
@@ -63,3 +63,18 @@ def model_folder(path: str | os.PathLike[str]) -> Path:
             remedy=f"see `pisigma status {path}` for the next step",
         )
     return Path(path) / MODELS / entry.name
+
+
+def history_of_model(folder: str | os.PathLike[str]) -> History:
+    """Return the history with the monitored sessions of a model: that of its cell, else a file next to its folder.
+
+    The file of a model outside of a cell is `MODEL.history.sqlite`.
+
+    Args:
+        folder: folder of the model.
+    """
+    model = Path(os.path.realpath(folder))
+    cell = model.parent.parent
+    if model.parent.name == MODELS and is_cell(cell):
+        return History(cell / HISTORY)
+    return History(model.with_name(model.name + MODEL_HISTORY))

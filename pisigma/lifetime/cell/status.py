@@ -323,7 +323,7 @@ class CellStatus:
                 {"name": one.name, "day": one.day, "rows": one.rows, "set_aside": one.set_aside or None}
                 for one in facts.sessions
             ],
-            "events": [{"day": one.day, "kind": one.kind, "note": one.note} for one in facts.events],
+            "events": [one.to_json() for one in facts.events],
             "models": [{"name": one.name, "remark": one.remark} for one in facts.models],
             "not_taken_in": list(self.not_taken_in),
             "next": self.step.to_json(),

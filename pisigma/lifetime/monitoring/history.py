@@ -1,10 +1,7 @@
-"""History of the sessions of a model, in a SQLite file next to the model folder."""
+"""Monitored sessions of a model: what its history contains of them, and which rows are new."""
 
 import io
-import os
-import sqlite3
-from collections.abc import Iterator, Sequence
-from contextlib import closing, contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -14,18 +11,13 @@ import torch
 from pydantic import TypeAdapter, ValidationError
 
 from pisigma.files.errors import OutputError, Place
+from pisigma.lifetime.cell.history import History, MonitoredSession
 from pisigma.lifetime.monitoring.session import JointZeros, Session
 from pisigma.measurement.copies import RowValues, copies_of_known
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.training_rows import again_warnings
 
-SUFFIX = ".history.sqlite"
-MAX_WAIT = 10.0
-"""[s] Time to wait for another process that writes."""
-_TABLE = """CREATE TABLE IF NOT EXISTS sessions (
-    model TEXT NOT NULL, rows TEXT NOT NULL, file TEXT NOT NULL, date TEXT NOT NULL, temperature_c REAL,
-    session TEXT NOT NULL, zeros BLOB NOT NULL, PRIMARY KEY (model, rows))"""
 _SESSION = TypeAdapter(Session)
 _VALUES = ("numbers", "steps", "kind", "file")
 
@@ -73,20 +65,14 @@ class Record:
         }
 
 
-def history_path(model: str | os.PathLike[str]) -> Path:
-    """Return the path of the history of a model folder: `MODEL.history.sqlite` next to it."""
-    folder = Path(os.path.realpath(model))
-    return folder.with_name(folder.name + SUFFIX)
-
-
-def store_sessions(path: Path, model: str, records: Sequence[Record]) -> tuple[Record, ...]:
+def store_sessions(history: History, model: str, records: Sequence[Record]) -> tuple[Record, ...]:
     """Store sessions in a history and return all sessions of the model.
 
     All are stored in one transaction, or none if the process ends before. A session with the same rows replaces the
     stored one.
 
     Args:
-        path: path of the history; created where missing.
+        history: history of the model, or of its cell.
         model: hash of the model.
         records: sessions to store.
 
@@ -96,63 +82,53 @@ def store_sessions(path: Path, model: str, records: Sequence[Record]) -> tuple[R
     Raises:
         OutputError: the file is not a history or cannot be written.
     """
-    with _opened(path) as database:
-        with database:  # one transaction
-            database.execute(_TABLE)
-            database.executemany(
-                "INSERT OR REPLACE INTO sessions VALUES (?, ?, ?, ?, ?, ?, ?)",
-                [
-                    (
-                        *(model, one.rows_sha256, one.file, one.date, one.temperature_c),
-                        *(_SESSION.dump_json(one.session).decode(), _packed(one.zeros, one.values)),
-                    )
-                    for one in records
-                ],
-            )
-        return _records(database, model)
+    history.add(*(_entry(model, one) for one in records))
+    return read_sessions(history, model)
 
 
-def read_sessions(path: Path, model: str) -> tuple[Record, ...]:
+def read_sessions(history: History, model: str) -> tuple[Record, ...]:
     """Read all sessions of a model, sorted by date; empty if there is no history yet.
 
     Raises:
-        OutputError: the file is not a history.
+        OutputError: the file is not a history, or a session cannot be read.
     """
-    if not path.exists():
-        return ()
-    with _opened(path) as database:
-        there = database.execute("SELECT name FROM sqlite_master WHERE name = 'sessions'").fetchall()
-        return _records(database, model) if there else ()
+    entries = [one for one in history.monitored_sessions() if one.model_sha256 == model]
+    try:
+        return sorted_sessions([_record(one) for one in entries])
+    except (ValidationError, ValueError, KeyError) as problem:
+        raise OutputError(
+            f"a monitored session cannot be read: {problem}",
+            at=Place(history.path),
+            remedy="restore the file, or monitor without a history (--no-history)",
+        ) from None
 
 
-def _records(database: sqlite3.Connection, model: str) -> tuple[Record, ...]:
-    rows = database.execute(
-        "SELECT file, date, rows, temperature_c, session, zeros FROM sessions WHERE model = ?", (model,)
+def _entry(model: str, record: Record) -> MonitoredSession:
+    session = record.session
+    return MonitoredSession(
+        model_sha256=model,
+        rows_sha256=record.rows_sha256,
+        file=record.file,
+        day=record.date,
+        rows=session.rows,
+        temperature_c=record.temperature_c,
+        verdict=session.verdict,
+        unchanged=session.unchanged,
+        rms_mm=session.rms * 1e3,
+        rms_after_mm=session.rms_after * 1e3,
+        session=_SESSION.dump_json(session).decode(),
+        arrays=_packed(record.zeros, record.values),
     )
-    return sorted_sessions(
-        [
-            Record(file, date, sha256, temperature, _SESSION.validate_json(session), *_unpacked(zeros))
-            for file, date, sha256, temperature, session, zeros in rows
-        ]
-    )
+
+
+def _record(entry: MonitoredSession) -> Record:
+    session, zeros = _SESSION.validate_json(entry.session), _unpacked(entry.arrays)
+    return Record(entry.file, entry.day, entry.rows_sha256, entry.temperature_c, session, *zeros)
 
 
 def sorted_sessions(records: Sequence[Record]) -> tuple[Record, ...]:
     """Sort sessions by date, and by file within a day."""
     return tuple(sorted(records, key=lambda one: (one.date, one.file, one.rows_sha256)))
-
-
-@contextmanager
-def _opened(path: Path) -> Iterator[sqlite3.Connection]:
-    try:
-        with closing(sqlite3.connect(path, timeout=MAX_WAIT)) as database:
-            yield database
-    except (sqlite3.Error, ValidationError, ValueError, KeyError) as problem:
-        raise OutputError(
-            f"the history of the model cannot be used: {problem}",
-            at=Place(path),
-            remedy="move the file away to start a new one, or monitor without a history (--no-history)",
-        ) from None
 
 
 def _packed(zeros: JointZeros, values: RowValues | None) -> bytes:

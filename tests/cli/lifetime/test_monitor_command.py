@@ -58,7 +58,7 @@ def test_a_page_has_to_be_html(refuses, folder):
 def test_a_year_mistyped_long_ago_is_named_left_out_and_corrected(run, folder):
     """Histories of earlier versions hold such days; a page is drawn all the same."""
     with closing(sqlite3.connect(folder / "model.history.sqlite")) as database, database:
-        database.execute("UPDATE sessions SET date = '0206-01-01' WHERE file = '2026-01-01.csv'")
+        database.execute("UPDATE monitored_sessions SET day = '0206-01-01' WHERE file = '2026-01-01.csv'")
     arguments = (
         "monitor",
         folder / "model",

@@ -75,6 +75,8 @@ def test_a_move_is_found_and_recalibrated(year):
     found = cell.monitor()
     assert [one["what"] for one in found.sessions[-1].to_json()["moved"]] == ["joint 3"]
     assert cell.status().step.state == "moved"
+    assert [one.day for one in cell.history.monitored_sessions()] == [day(30), day(2)]
+    assert not list((cell.folder / "models").glob("*.sqlite"))
     result, entry = cell.recalibrate()
     assert result.trusted
     assert cell.history.in_use == entry

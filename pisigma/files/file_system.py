@@ -1,0 +1,119 @@
+"""File systems of networks, whose locks do not reliably protect a database from two machines."""
+
+import os
+import re
+import subprocess
+import sys
+from collections.abc import Iterable
+from functools import lru_cache
+from pathlib import Path
+
+from pisigma.files.errors import OutputError, Place
+
+NETWORK_TYPES = frozenset(
+    {
+        *(
+            "9p",
+            "afp",
+            "afpfs",
+            "afs",
+            "beegfs",
+            "ceph",
+            "cifs",
+            "coda",
+            "davfs",
+            "gfs2",
+            "glusterfs",
+            "gpfs",
+        ),
+        *("lustre", "ncpfs", "nfs", "nfs4", "ocfs2", "orangefs", "pvfs2", "smb2", "smb3", "smbfs", "webdav"),
+        *("fuse.ceph", "fuse.cephfs", "fuse.davfs", "fuse.gcsfuse", "fuse.glusterfs", "fuse.gvfsd-fuse"),
+        *("fuse.juicefs", "fuse.rclone", "fuse.s3fs", "fuse.smbnetfs", "fuse.sshfs"),
+    }
+)
+"""Types of file systems that several machines can write to, by their names in mount tables."""
+MOUNTINFO = Path("/proc/self/mountinfo")
+"""Table of mounts on Linux."""
+_DRIVE_REMOTE = 4
+"""Result of `GetDriveTypeW` of Windows for a network drive."""
+_MACOS_MOUNT = re.compile(r"^.* on (?P<point>/.*) \((?P<type>\w+)[,)]", re.MULTILINE)
+"""A line of the macOS command `mount`: ``//user@server/share on /Volumes/share (smbfs, nodev)``."""
+
+
+def check_local(folder: Path) -> None:
+    """Check that a folder for a database is not on the file system of a network.
+
+    Args:
+        folder: the folder; a folder that does not exist is not checked.
+
+    Raises:
+        OutputError: the folder is on the file system of a network.
+    """
+    if folder.is_dir() and (kind := _network_type(os.path.realpath(folder), folder.stat().st_dev)):
+        raise OutputError(
+            expected="a folder on a local disk, because locks of network file systems cannot protect a history",
+            value=kind,
+            at=Place(folder),
+            remedy="move it to a local disk; `pisigma pack` and `pisigma unpack` copy a cell",
+        )
+
+
+@lru_cache
+def _network_type(folder: str, device: int) -> str | None:
+    """Return the type of the network file system of a folder; None for a local disk, or if the type is unknown.
+
+    Args:
+        folder: the real path of the folder.
+        device: number of its device, which changes when something else is mounted there.
+    """
+    if sys.platform == "win32":
+        import ctypes
+
+        drive = os.path.splitdrive(folder)[0]
+        remote = ctypes.windll.kernel32.GetDriveTypeW(f"{drive}\\") == _DRIVE_REMOTE
+        return "network drive" if remote or drive.startswith("\\\\") else None
+    try:
+        if sys.platform == "darwin":
+            mounts = macos_mounts(subprocess.run(["/sbin/mount"], capture_output=True, text=True).stdout)
+        else:
+            mounts = linux_mounts(MOUNTINFO.read_text(encoding="utf-8", errors="replace"))
+    except OSError:  # systems without a table of mounts
+        return None
+    kind = file_system_type(folder, mounts)
+    return kind if kind in NETWORK_TYPES else None
+
+
+def linux_mounts(mountinfo: str) -> list[tuple[str, str]]:
+    """Return the mount points and types of file systems in a table such as `/proc/self/mountinfo`.
+
+    Its format is that of proc(5): the fifth field is the mount point, with blanks as octal escapes, and the first
+    field after " - " is the type.
+    """
+    mounts = []
+    for line in mountinfo.splitlines():
+        fields, _, source = line.partition(" - ")
+        if source and len(fields.split()) > 4:
+            point = re.sub(r"\\([0-7]{3})", lambda match: chr(int(match[1], 8)), fields.split()[4])
+            mounts.append((point, source.split()[0]))
+    return mounts
+
+
+def macos_mounts(printed: str) -> list[tuple[str, str]]:
+    """Return the mount points and types of file systems that the macOS command `mount` prints."""
+    return [(match["point"], match["type"]) for match in _MACOS_MOUNT.finditer(printed)]
+
+
+def file_system_type(path: str, mounts: Iterable[tuple[str, str]]) -> str | None:
+    """Return the type of the file system that contains a path.
+
+    Args:
+        path: an absolute path without links.
+        mounts: mount points and types in the order in which they were mounted; a later one covers an earlier one at
+            the same place.
+
+    Returns:
+        The type, such as "ext4" or "nfs4"; None if no mount point contains the path.
+    """
+    containing = [(len(point), kind) for point, kind in mounts if Path(path).is_relative_to(point)]
+    longest = max((length for length, _ in containing), default=0)
+    return next((kind for length, kind in reversed(containing) if length == longest), None)

@@ -1,0 +1,193 @@
+"""SQLite file whose tables are classes: a column is an attribute, and a row is an object.
+
+Every change is one transaction. SQLite's rollback journal restores the state before a transaction whose process was
+killed or whose disk was full, and SQLite's lock ends with its process.
+"""
+
+import sqlite3
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager
+from dataclasses import MISSING, Field, asdict, dataclass, fields
+from pathlib import Path
+from typing import Any, TypeVar
+
+from pisigma.files.errors import OutputError, Place
+from pisigma.files.file_system import check_local
+
+LOCK_TIMEOUT = 10.0
+"""[s] Longest wait for another process that is writing."""
+
+Row = TypeVar("Row")
+_SQL_TYPES: dict[Any, str] = {
+    str: "TEXT NOT NULL",
+    int: "INTEGER NOT NULL",
+    bool: "INTEGER NOT NULL",
+    float: "REAL NOT NULL",
+    float | None: "REAL",
+    bytes: "BLOB NOT NULL",
+}
+"""Types of columns, by those of attributes; the type of any other attribute consists of texts."""
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table of a database.
+
+    Attributes:
+        name: name of the table.
+        key: columns that identify a row; a new row replaces one with the same values. Empty: every row is kept.
+    """
+
+    name: str
+    key: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Database:
+    """An SQLite file with tables for some classes.
+
+    Attributes:
+        path: path of the file, which is created with the first row.
+        tables: table of every class.
+        version: version of the schema, which the file states as `PRAGMA user_version`.
+        take_over: function that adds what an earlier version stored elsewhere, in the transaction that upgrades the
+            file; returns the files that are removed after it.
+    """
+
+    path: Path
+    tables: Mapping[type, Table]
+    version: int
+    take_over: Callable[[sqlite3.Connection], Sequence[Path]]
+
+    def add(self, rows: Sequence[Any]) -> None:
+        """Add rows in one transaction; a row with the same key is replaced.
+
+        Raises:
+            OutputError: the file cannot be written; see `opened`.
+        """
+        with self.writing() as database:
+            for row in rows:
+                values = asdict(row)
+                names, marks = ", ".join(values), ", ".join("?" * len(values))
+                table = self.tables[type(row)].name
+                database.execute(
+                    f"INSERT OR REPLACE INTO {table} ({names}) VALUES ({marks})", [*values.values()]
+                )
+
+    def read(self, kind: type[Row]) -> tuple[Row, ...]:
+        """Return all rows of a class in the order in which they were added; none if there is no file yet.
+
+        Raises:
+            OutputError: the file cannot be read; see `opened`.
+        """
+        if not self.path.exists():
+            return ()
+        columns = fields(kind)  # type: ignore[arg-type]  # classes with a table are dataclasses
+        names = ", ".join(one.name for one in columns)
+        with self.opened() as database:
+            rows = database.execute(f"SELECT {names} FROM {self.tables[kind].name} ORDER BY rowid").fetchall()
+        booleans = [one.type is bool for one in columns]
+        return tuple(
+            kind(*(bool(value) if is_bool else value for is_bool, value in zip(booleans, row, strict=True)))
+            for row in rows
+        )
+
+    def upgrade(self) -> int:
+        """Upgrade the file to the present version of the schema; return its version before.
+
+        Raises:
+            OutputError: the file cannot be upgraded; see `opened`.
+        """
+        with self._connected() as (database, before):
+            if before < self.version:
+                self._upgrade(database)
+        return before
+
+    @contextmanager
+    def writing(self) -> Iterator[sqlite3.Connection]:
+        """Open the file for changes that are made together, or not at all; other processes wait before they write.
+
+        Raises:
+            OutputError: the file cannot be written; see `opened`.
+        """
+        with self.opened() as database, _transaction(database):
+            yield database
+
+    @contextmanager
+    def opened(self) -> Iterator[sqlite3.Connection]:
+        """Open the file; one of an earlier version is upgraded first, as a whole or not at all.
+
+        Raises:
+            OutputError: the file is not a database, has a newer version, cannot be opened or upgraded, or is on the
+                file system of a network.
+        """
+        with self._connected() as (database, version):
+            if version < self.version:
+                self._upgrade(database)
+            yield database
+
+    @contextmanager
+    def _connected(self) -> Iterator[tuple[sqlite3.Connection, int]]:
+        """Yield a connection and the version of the schema; 0 for an empty file."""
+        check_local(self.path.parent)
+        try:
+            with closing(sqlite3.connect(self.path, timeout=LOCK_TIMEOUT, isolation_level=None)) as database:
+                version = _version(database)
+                if version > self.version:
+                    raise OutputError(
+                        expected=f"a history of schema version {self.version} or older",
+                        value=version,
+                        at=Place(self.path),
+                        remedy="update pisigma",
+                    )
+                yield database, version
+        except sqlite3.Error as problem:
+            raise OutputError(
+                f"the history cannot be used: {problem}",
+                at=Place(self.path),
+                remedy="check that it is an SQLite file, and that its folder is writable and its disk not full",
+            ) from None
+
+    def _upgrade(self, database: sqlite3.Connection) -> None:
+        """Add the tables and columns that are missing, and what an earlier version stored elsewhere."""
+        with _transaction(database):
+            if _version(database) >= self.version:  # another process was faster
+                return
+            for kind, table in self.tables.items():
+                columns = {one.name: _column(one) for one in fields(kind)}
+                key = f", PRIMARY KEY ({', '.join(table.key)})" if table.key else ""
+                database.execute(
+                    f"CREATE TABLE IF NOT EXISTS {table.name} ({', '.join(columns.values())}{key})"
+                )
+                stored = [row[1] for row in database.execute(f"PRAGMA table_info({table.name})")]
+                for name in [name for name in columns if name not in stored]:
+                    database.execute(f"ALTER TABLE {table.name} ADD COLUMN {columns[name]}")
+            moved = self.take_over(database)
+            database.execute(f"PRAGMA user_version = {self.version}")
+        for file in moved:
+            file.unlink(missing_ok=True)
+
+
+@contextmanager
+def _transaction(database: sqlite3.Connection) -> Iterator[None]:
+    """Make all changes together, or none of them."""
+    database.execute("BEGIN IMMEDIATE")  # waits for another process that writes
+    try:
+        yield
+        database.execute("COMMIT")
+    finally:
+        if database.in_transaction:
+            database.execute("ROLLBACK")
+
+
+def _version(database: sqlite3.Connection) -> int:
+    return int(database.execute("PRAGMA user_version").fetchone()[0])
+
+
+def _column(attribute: "Field[Any]") -> str:
+    """Return the declaration of a column; its default is that of the attribute."""
+    declared = f"{attribute.name} {_SQL_TYPES.get(attribute.type, _SQL_TYPES[str])}"
+    if attribute.default in (MISSING, None):
+        return declared
+    value = str(attribute.default).replace("'", "''")
+    return f"{declared} DEFAULT '{value}'"

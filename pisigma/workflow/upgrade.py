@@ -1,0 +1,49 @@
+"""Upgrade a model folder or a cell that an earlier version wrote."""
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+from pisigma.files.model_files import model_hash
+from pisigma.lifetime.cell.history import HISTORY, SCHEMA_VERSION, History
+from pisigma.lifetime.cell.layout import MODELS, history_of_model, is_cell
+from pisigma.model.folder.upgrade import Upgrade, upgrade_folder
+from pisigma.model.inverse.written_model import check_written
+
+
+@dataclass(frozen=True)
+class Upgraded:
+    """Result of `upgrade`.
+
+    Attributes:
+        models: results of the models.
+        before: version of the schema of the history before; that of now if there was no history.
+        after: version of the schema of the history now.
+    """
+
+    models: tuple[Upgrade, ...]
+    before: int
+    after: int = SCHEMA_VERSION
+
+
+def upgrade(path: str | os.PathLike[str]) -> Upgraded:
+    """Convert a model folder or a cell to the present formats; the history then names the upgraded models.
+
+    Args:
+        path: a model folder, whose history is upgraded too, or a cell, all of whose models are upgraded.
+
+    Raises:
+        ModelError: a folder is not a model, or cannot be upgraded; see `upgrade_folder`.
+        OutputError: a folder or the history cannot be written, or the history has a newer version.
+    """
+    cell = Path(path)
+    history = History(cell / HISTORY) if is_cell(cell) else history_of_model(path)
+    before = history.database.upgrade() if history.path.exists() else SCHEMA_VERSION
+    folders = [cell / MODELS / one.name for one in history.models()] if is_cell(cell) else [cell]
+    models = []
+    for folder in folders:
+        sha256 = model_hash(folder)
+        models.append(upgrade_folder(folder, check_written))
+        if history.path.exists():
+            history.rename_model(sha256, model_hash(folder))
+    return Upgraded(tuple(models), before)
