@@ -1,6 +1,5 @@
 """`pisigma calibrate`: geometric or hybrid calibration of measured data."""
 
-from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -22,14 +21,14 @@ from pisigma.cli.output import (
     saved,
 )
 from pisigma.cli.progress import progress_of
-from pisigma.cli.screen import Block, print_screen, sentences, table
+from pisigma.cli.screen import print_result
 from pisigma.cli.settings_options import StatedOptions, takes_settings
 from pisigma.files.errors import AcceptanceError
+from pisigma.reporting.result_text import sentences
 from pisigma.workflow.settings.calibration import CalibrationSettings
 from pisigma.workflow.settings.recalibration import RecalibrationSettings
 
 if TYPE_CHECKING:
-    from pisigma.validation.held_out.calibration_summary import CalibrationSummary
     from pisigma.workflow.cell.cell import Cell
 
 RobotName = Annotated[
@@ -78,6 +77,7 @@ def calibrate(
     and writes no folder if the result must not be trusted.
     """
     from pisigma.files.output_folder import check_folder
+    from pisigma.reporting.calibration_text import calibration_text
     from pisigma.robot.description import Robot
     from pisigma.robot.robot_file import robot_file
     from pisigma.workflow import calibrate as workflow
@@ -102,13 +102,15 @@ def calibrate(
         if as_json:
             print_json({"model": folder and str(folder), **calibration.to_json()})
         else:
-            print_calibration(calibration.summary, folder, calibration.seconds, verbose)
+            print_result(calibration_text(calibration.summary, folder, calibration.seconds), verbose)
 
 
 def _calibrate_cell(
     cell: "Cell", stated: StatedOptions, accept_implausible: bool, verbose: bool, as_json: bool
 ) -> None:
     """Calibrate with the rows of a cell, store the model there, and print it."""
+    from pisigma.reporting.calibration_text import calibration_text
+
     with progress_of("calibrate") as progress:
         calibration, entry = cell.calibrate(
             progress, accept_implausible, **report_overrides(cell, "calibrate", stated)
@@ -121,105 +123,8 @@ def _calibrate_cell(
     else:
         remark = [f"Model '{entry.name}': {entry.remark}."] if entry is not None else []
         also = [sentences("the cell", [*remark, *next_lines(cell)])]
-        print_calibration(calibration.summary, folder, calibration.seconds, verbose, also)
+        print_result(calibration_text(calibration.summary, folder, calibration.seconds, also), verbose)
     if entry is None:
         raise AcceptanceError(
             "no model was stored, because the result must not be trusted, for the reasons above."
         )
-
-
-def print_calibration(
-    summary: "CalibrationSummary",
-    folder: Path | None,
-    seconds: float,
-    verbose: bool = False,
-    also: Sequence[Block] = (),
-) -> None:
-    """Print a calibration for people: the verdict, warnings, and errors of held-out rows.
-
-    Args:
-        summary: its figures.
-        folder: where the model was written; None if it was not.
-        seconds: time it took [s].
-        verbose: print all tables and all parameters.
-        also: what a command prints in addition.
-    """
-    from pisigma.reporting import calibration_tables as tables
-    from pisigma.reporting.calibration_verdict import (
-        POSSIBLE_SCALE,
-        calibration_verdict,
-        scale_error,
-        scale_matters,
-        scale_text,
-    )
-
-    warnings = [*tables.implausible_lines(summary)[1:], *tables.warning_lines(summary)]
-    found = [one.sentence for one in summary.diagnostics if one.kind == "scale"]
-    remarks = []
-    if summary.scale is not None and found:
-        warnings = [f"{one} {scale_error(summary.scale)}" if one in found else one for one in warnings]
-    elif summary.scale is not None and scale_matters(summary):
-        warnings = [scale_text(summary.scale), *warnings]
-    elif summary.scale is not None and scale_matters(summary, POSSIBLE_SCALE):
-        remarks = [scale_text(summary.scale)]
-    written = f"Model written to {folder} in {seconds:.1f} s; its README.md has all figures."
-    print_screen(
-        calibration_verdict(summary, folder, len(warnings)),
-        warnings,
-        [*also, *_accuracy(summary), sentences("scale of the sensor", remarks)],
-        [*_learned(summary), *_fit(summary), *_parameters(summary)],
-        [] if folder is None else [written],
-        verbose,
-    )
-
-
-def _accuracy(summary: "CalibrationSummary") -> Iterator[Block]:
-    """Lay out the errors of rows that were held out, and what is to be said of them."""
-    from pisigma.reporting import calibration_tables as tables
-    from pisigma.reporting.calibration_verdict import error_table, how_held_out, of_what
-    from pisigma.reporting.tables import distance_table
-
-    judged = [one for one in (summary.cross_validation, summary.held_out, summary.test) if one is not None]
-    for figures in judged:
-        title = f"errors of {of_what(summary)}, {how_held_out(figures, summary)}"
-        yield table(title, *error_table(figures), "errors of held-out rows")
-        if figures.socket_distance is not None:
-            what = "stated distances of sockets, under calibrations without them"
-            yield table(what, *distance_table(figures.socket_distance), "distances of sockets")
-        yield sentences("remarks on the held-out rows", tables.held_out_lines(figures))
-
-
-def _learned(summary: "CalibrationSummary") -> Iterator[Block]:
-    """Lay out the joint correction, and what else was tried."""
-    from pisigma.reporting import calibration_tables as tables
-
-    if summary.hybrid is not None:
-        yield sentences("joint correction", tables.learned_lines(summary.hybrid))
-        yield table("joint corrections that were tried", *tables.trial_table(summary.hybrid), "trials")
-    if summary.judged is not None and (coverage := tables.coverage_line(summary.judged)):
-        yield sentences("predicted intervals", [coverage])
-    if summary.learning_curve is not None:
-        what = "errors of held-out rows by number of training rows"
-        yield table(what, *tables.curve_table(summary.learning_curve), "learning curve")
-
-
-def _fit(summary: "CalibrationSummary") -> Iterator[Block]:
-    """Lay out the errors of the rows that were calibrated with, and how the search ended."""
-    from pisigma.reporting.calibration_verdict import error_table, how_held_out
-
-    if summary.calibrated is not None:
-        what = f"errors of the rows used in the calibration, {how_held_out(summary.calibrated, summary)}"
-        yield table(what, *error_table(summary.calibrated), "errors of the fit")
-    count = len(summary.outliers)
-    worst = f"; the worst is {summary.outliers[0].place}" if count else ""
-    line = f"Rank {summary.rank}, {summary.iterations} iterations, {count} outliers{worst}."
-    yield sentences("outliers", [line])
-
-
-def _parameters(summary: "CalibrationSummary") -> Iterator[Block]:
-    """Lay out all parameters, and what the data cannot determine."""
-    from pisigma.reporting.calibration_tables import parameter_table, undetermined_lines
-
-    yield table("parameters", *parameter_table(summary.parameters), f"{len(summary.parameters)} parameters")
-    lines = ["What these data cannot determine:", *(f"- {one}" for one in undetermined_lines(summary))]
-    yield sentences("undetermined parameters", lines, "  ")

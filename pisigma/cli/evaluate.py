@@ -6,11 +6,10 @@ import typer
 
 from pisigma.cli.arguments import AsJson, Verbose
 from pisigma.cli.cell import cell_at, refuse_with_cell, report_overrides
-from pisigma.cli.output import print_json
+from pisigma.cli.output import print_json, screen_width
 from pisigma.cli.progress import progress_of
 from pisigma.cli.screen import print_screen
 from pisigma.cli.settings_options import StatedOptions, takes_settings
-from pisigma.cli.verify import comparison_blocks, model_rms
 from pisigma.files.errors import AcceptanceError
 from pisigma.workflow.settings.evaluation import EvaluationSettings
 
@@ -83,6 +82,7 @@ def _tell(evaluation: "Evaluation", verbose: bool, as_json: bool) -> None:
 
 def _print(evaluation: "Evaluation", verbose: bool) -> None:
     """Print the verdict, warnings, and the errors of all models."""
+    from pisigma.reporting.comparison_tables import comparison_blocks, model_rms
     from pisigma.reporting.verdict import Verdict
 
     rows = evaluation.rows
@@ -102,7 +102,7 @@ def _print(evaluation: "Evaluation", verbose: bool) -> None:
     print_screen(
         verdict,
         warnings,
-        *comparison_blocks(evaluation.comparison, evaluation.data, verbose),
+        *comparison_blocks(evaluation.comparison, evaluation.data, screen_width(), verbose),
         verbose=verbose,
     )
 

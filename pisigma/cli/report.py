@@ -8,10 +8,11 @@ import typer
 from pisigma.cli.arguments import AsJson, ModelOrCell
 from pisigma.cli.output import print_json
 from pisigma.cli.progress import progress_of
-from pisigma.cli.screen import print_screen, sentences
+from pisigma.cli.screen import print_screen
 from pisigma.cli.settings_options import takes_settings
 from pisigma.files.errors import AcceptanceError
 from pisigma.measurement.camera.camera_files import CameraFiles
+from pisigma.reporting.result_text import sentences
 from pisigma.reporting.verdict import Verdict, uncapitalised
 
 if TYPE_CHECKING:

@@ -1,10 +1,18 @@
 """Comparisons of models as tables."""
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 
-from pisigma.reporting.tables import Table
+from pisigma.reporting.result_text import Block, table
+from pisigma.reporting.tables import Table, distance_table
 from pisigma.reporting.verdict import rounded
-from pisigma.validation.held_out.model_comparison import Difference, Interval, ModelComparison, QuantityErrors
+from pisigma.validation.held_out.model_comparison import (
+    Difference,
+    Interval,
+    ModelComparison,
+    ModelFigures,
+    QuantityErrors,
+)
 
 _SHOWN = {"rms": "RMS", "mean": "mean", "p95": "95 %", "max": "largest"}
 _NONE = "-"
@@ -33,7 +41,33 @@ def comparison_tables(
     if len(names) > 1:
         title = f"Differences from {names[0]} on the same rows, negative is better"
         tables.append((title, names[1:], _difference_lines(comparison, whole)))
-    return [(title, table) for title, heads, lines in tables for table in _fitting(heads, lines, width)]
+    return [(title, one) for title, heads, lines in tables for one in _fitting(heads, lines, width)]
+
+
+def model_rms(figures: ModelFigures, rows: int) -> str:
+    """Write the RMS errors of a model."""
+    errors = (figures.position, figures.orientation)
+    return " and ".join(
+        f"{rounded(one.statistics['rms'], rows)} {one.unit}" for one in errors if one is not None
+    )
+
+
+def comparison_blocks(
+    comparison: ModelComparison, data: str, width: int, verbose: bool
+) -> tuple[list[Block], list[Block]]:
+    """Lay out the errors of models on the rows of a file, and what is left out of them without `verbose`."""
+
+    def blocks(whole: bool) -> list[Block]:
+        tables = comparison_tables(comparison, Path(data).name, width, whole)
+        return [
+            table(title, *cells, "all statistics" if whole else title.split()[0].lower())
+            for title, cells in tables
+        ]
+
+    shown = blocks(whole=verbose)
+    if comparison.socket_distance is not None:
+        shown.append(table("stated distances of sockets", *distance_table(comparison.socket_distance)))
+    return shown, [] if verbose else blocks(whole=True)
 
 
 def _fitting(heads: Sequence[str], lines: _Lines, width: int) -> list[Table]:

@@ -14,7 +14,7 @@ from testing.screens import assert_screen
 from testing.simulated_arm import simulate
 
 import pisigma
-from pisigma.cli.calibrate import print_calibration
+from pisigma.cli.screen import print_result
 from pisigma.files.errors import (
     AcceptanceError,
     IdentificationError,
@@ -23,6 +23,7 @@ from pisigma.files.errors import (
 )
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.folder.model_folder import load_model
+from pisigma.reporting.calibration_text import calibration_text
 from pisigma.reporting.verdict import rounded
 from pisigma.robot.kinematics.status import Status
 from pisigma.validation.held_out.calibration_summary import CalibrationSummary, ScaleFigures
@@ -131,11 +132,11 @@ def test_people_read_the_verdict_first_and_everything_on_demand(capsys, calibrat
     summary = CalibrationSummary.read(load_model(folder))
     errors = printed["cross_validation"]["geometric"]
     figures = f"{rounded(errors['rms_mm'], 60)} mm", f"{rounded(errors['p95_mm'], 60)}", "3-fold", "60 rows"
-    print_calibration(summary, folder, 1.0)
+    print_result(calibration_text(summary, folder, 1.0), verbose=False)
     text = capsys.readouterr().out
     assert_screen(text, *figures, "--verbose", str(folder))
     assert "theta_6" not in text
-    print_calibration(summary, folder, 1.0, verbose=True)
+    print_result(calibration_text(summary, folder, 1.0), verbose=True)
     whole = capsys.readouterr().out
     assert_screen(whole, *figures, "theta_6", "in a sum", "Rank 30, ", verbose=True)
     for dependency in printed["redundancy"]["dependencies"]:
@@ -154,7 +155,7 @@ def test_a_wrong_scale_of_the_sensor_is_a_warning_where_it_matters(capsys, calib
     ):
         scale = ScaleFigures(factor=1.00123, sigma=0.0002, odds=odds, rms_mm=share * rms)
         with no_type_checker():
-            print_calibration(summary.having(scale=scale), folder, 1.0)
+            print_result(calibration_text(summary.having(scale=scale), folder, 1.0), verbose=False)
         text = " ".join(capsys.readouterr().out.split())
         assert ("1.00123 +- 0.00020" in text) == is_said
         assert (text.count("Warning: ") > len(summary.warnings)) == is_warning

@@ -13,10 +13,11 @@ from testing.simulated_arm import simulate
 
 import pisigma
 from pisigma.calibration.hybrid.calibrator import HybridCalibrator
-from pisigma.cli.calibrate import print_calibration
+from pisigma.cli.screen import print_result
 from pisigma.files.errors import IdentificationError, MeasurementError, RecipeError
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.folder.model_folder import load_model
+from pisigma.reporting.calibration_text import calibration_text
 from pisigma.reporting.verdict import rounded
 from pisigma.validation.held_out.calibration_summary import CalibrationSummary
 
@@ -118,13 +119,13 @@ def test_people_read_the_verdict_and_what_was_tried_on_demand(capsys, calibrated
         f"{100 * figures['coverage']:.0f} %",
         "200 rows",
     )
-    print_calibration(summary, folder, 1.0)
+    print_result(calibration_text(summary, folder, 1.0), verbose=False)
     text = capsys.readouterr().out
     assert_screen(text, *words)
     head = next(line for line in text.splitlines() if line.startswith("error "))
     assert head.split() == ["error", "nominal", "geometric", "hybrid"]
     assert "gravity + series 8" not in text
-    print_calibration(summary, folder, 1.0, verbose=True)
+    print_result(calibration_text(summary, folder, 1.0), verbose=True)
     assert_screen(capsys.readouterr().out, *words, "gravity + series 8", verbose=True)
 
 

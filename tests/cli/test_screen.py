@@ -4,7 +4,8 @@ import pytest
 
 from pisigma.cli import progress
 from pisigma.cli.progress import progress_of, share_done, step_of
-from pisigma.cli.screen import MAX_ALIKE, MAX_LINES, Block, print_screen, ranges, together
+from pisigma.cli.screen import MAX_LINES, print_screen
+from pisigma.reporting.result_text import MAX_ALIKE, Block, ranges, together
 from pisigma.reporting.verdict import Verdict, rounded, uncapitalised
 
 VERDICT = Verdict("0.12 mm RMS, held out; nominal 1 mm.", "yes, for all: nothing is wrong.", "verify it.")

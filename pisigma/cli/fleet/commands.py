@@ -13,9 +13,10 @@ from pisigma.cli.endings import NOT_ACCEPTED, tell_problems
 from pisigma.cli.help import ShortHelpCommand
 from pisigma.cli.output import command_line, print_json
 from pisigma.cli.progress import progress_of
-from pisigma.cli.screen import print_screen, sentences, table
+from pisigma.cli.screen import print_screen
 from pisigma.cli.settings_options import takes_settings
 from pisigma.files.errors import FleetError
+from pisigma.reporting.result_text import sentences, table
 from pisigma.workflow.settings.calibration import CalibrationSettings
 from pisigma.workflow.settings.fleet import FleetSettings
 

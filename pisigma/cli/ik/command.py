@@ -10,7 +10,7 @@ from pisigma.cli.arguments import AsJson, ModelOrCell, PayloadKg, TemperatureC
 from pisigma.cli.endings import fail
 from pisigma.cli.output import print_json, print_lines
 from pisigma.cli.progress import progress_of
-from pisigma.cli.screen import together
+from pisigma.reporting.result_text import together
 
 if TYPE_CHECKING:
     import numpy as np

@@ -4,9 +4,10 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
-from pisigma.cli.screen import Block, print_screen, sentences, table
+from pisigma.cli.screen import print_screen
 from pisigma.model.inverse.corrected_ik import CorrectedIK
 from pisigma.model.inverse.solution import Solution
+from pisigma.reporting.result_text import Block, sentences, table
 from pisigma.reporting.verdict import Verdict
 from pisigma.robot.kinematics.status import Status
 

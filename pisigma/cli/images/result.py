@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from pisigma.cli.output import print_json
-from pisigma.cli.screen import print_screen, sentences, table
+from pisigma.cli.screen import print_screen
+from pisigma.reporting.result_text import sentences, table
 from pisigma.reporting.verdict import Verdict, counted
 
 if TYPE_CHECKING:

@@ -6,12 +6,12 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from pisigma.cli.arguments import AsJson, Verbose, complete_model
-from pisigma.cli.output import print_json
+from pisigma.cli.output import print_json, screen_width
 from pisigma.cli.progress import progress_of
-from pisigma.cli.screen import print_screen, sentences, table
+from pisigma.cli.screen import print_screen
 from pisigma.cli.settings_options import takes_settings
-from pisigma.cli.verify import comparison_blocks
 from pisigma.files.errors import AcceptanceError
+from pisigma.reporting.result_text import sentences, table
 from pisigma.reporting.verdict import Verdict, counted, rounded
 from pisigma.workflow.settings.comparison import ComparisonSettings
 
@@ -86,6 +86,7 @@ def compare(
 
 def _print(compared: "ComparedModels", page: Path | None, verbose: bool) -> None:
     """Print what differs, distances of the tool, and the parameters of both models."""
+    from pisigma.reporting.comparison_tables import comparison_blocks
     from pisigma.reporting.difference_tables import difference_table
     from pisigma.reporting.tables import pose_rows
 
@@ -93,7 +94,9 @@ def _print(compared: "ComparedModels", page: Path | None, verbose: bool) -> None
     parameters = difference_table(compared.parameters, ("A", "B"))
     distances = {what: one.errors.figures for what, one in compared.displacements.items()}
     short, whole = (
-        ([], []) if compared.rows is None else comparison_blocks(compared.rows, "the rows", verbose)
+        ([], [])
+        if compared.rows is None
+        else comparison_blocks(compared.rows, "the rows", screen_width(), verbose)
     )
     head, rows = pose_rows(distances)
     blocks = [

@@ -10,8 +10,9 @@ from pisigma.cli.cell import cell_at, next_lines, refuse_with_cell, report_overr
 from pisigma.cli.endings import NOT_ACCEPTED
 from pisigma.cli.output import print_json, print_lines
 from pisigma.cli.progress import progress_of
-from pisigma.cli.screen import print_screen, sentences, table
+from pisigma.cli.screen import print_screen
 from pisigma.cli.settings_options import StatedOptions, takes_settings
+from pisigma.reporting.result_text import sentences, table
 from pisigma.reporting.verdict import Verdict, counted, rounded, uncapitalised
 from pisigma.workflow.settings.monitoring import MonitorSettings
 

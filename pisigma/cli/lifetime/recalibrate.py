@@ -10,9 +10,10 @@ from pisigma.cli.arguments import AcceptImplausible, AsJson, ModelOrCell, Overwr
 from pisigma.cli.cell import cell_at, next_lines, refuse_with_cell, report_overrides
 from pisigma.cli.output import command_line, print_json, print_lines, saved
 from pisigma.cli.progress import progress_of
-from pisigma.cli.screen import print_screen, sentences, table
+from pisigma.cli.screen import print_screen
 from pisigma.cli.settings_options import StatedOptions, takes_settings
 from pisigma.files.errors import AcceptanceError
+from pisigma.reporting.result_text import sentences, table
 from pisigma.reporting.verdict import Verdict, counted, rounded, uncapitalised
 from pisigma.workflow.settings.recalibration import RecalibrationSettings
 

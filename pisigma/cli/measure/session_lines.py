@@ -5,9 +5,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pisigma.cli.screen import MAX_ALIKE, ranges, together
 from pisigma.files.errors import printable
 from pisigma.planning.session.state import AccuracyPoint, SessionState
+from pisigma.reporting.result_text import MAX_ALIKE, ranges, together
 from pisigma.reporting.verdict import Verdict, counted, rounded, uncapitalised
 from pisigma.workflow.follow import SessionStep
 

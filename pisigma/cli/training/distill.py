@@ -10,9 +10,10 @@ import typer
 from pisigma.cli.arguments import AsJson, ModelOrCell, Overwrite, Verbose
 from pisigma.cli.output import command_line, print_json
 from pisigma.cli.progress import progress_of
-from pisigma.cli.screen import print_screen, sentences, table
+from pisigma.cli.screen import print_screen
 from pisigma.cli.settings_options import takes_settings
 from pisigma.files.errors import PoseError, RecipeError
+from pisigma.reporting.result_text import sentences, table
 from pisigma.reporting.verdict import Verdict, counted, rms_text
 from pisigma.workflow.settings.distillation import DistillationSettings
 

@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from pisigma.cli.arguments import AcceptImplausible, AsJson, Overwrite, Verbose
-from pisigma.cli.calibrate import print_calibration
 from pisigma.cli.output import print_json, saved
 from pisigma.cli.progress import progress_of
-from pisigma.cli.screen import Block, print_screen, table
+from pisigma.cli.screen import print_result, print_screen
 from pisigma.cli.settings_options import takes_settings
 from pisigma.files.errors import printable
+from pisigma.reporting.result_text import Block, table
 from pisigma.reporting.verdict import Verdict, rms_text, rounded, uncapitalised
 from pisigma.workflow.settings.training import TrainSettings
 
@@ -47,6 +47,7 @@ def train(
     started = time.perf_counter()
     from pisigma.files.conflicts import check_conflicts
     from pisigma.files.output_folder import check_folder
+    from pisigma.reporting.calibration_text import calibration_text
     from pisigma.robot.robot_file import robot_file
     from pisigma.workflow.recipes.reader import read_recipe
     from pisigma.workflow.train import InverseTraining
@@ -73,7 +74,7 @@ def train(
             _print_training(training.summary, folder, training.seconds, verbose)
         else:
             also = list(_redundancy(training.summary))
-            print_calibration(training.summary, written, training.seconds, verbose, also)
+            print_result(calibration_text(training.summary, written, training.seconds, also), verbose)
 
 
 def _next_free(name: str) -> Path:

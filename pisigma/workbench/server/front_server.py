@@ -69,7 +69,9 @@ class FrontServer:
         self._loop.run_until_complete(runner.cleanup())
         if closing is not None:
             self._loop.run_until_complete(closing())
-        self._loop.run_until_complete(self._loop.shutdown_asyncgens())
+        for task in (left := asyncio.all_tasks(self._loop)):
+            task.cancel()
+        self._loop.run_until_complete(asyncio.gather(*left, return_exceptions=True))
         self._loop.close()
 
     def close(self) -> None:

@@ -1,0 +1,91 @@
+"""What people read of a result, in any layout: the verdict, warnings, sentences and tables.
+
+Commands print it on a screen, and pages show it in the browser.
+"""
+
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+from pisigma.reporting.verdict import Verdict
+
+MAX_ALIKE = 10
+"""Warnings of one kind that are shown one by one; more become one warning with their lines."""
+
+_NUMBER = re.compile(r"\d[\d,]*(?:\.\d+)?(?:e[+-]?\d+)?")
+_ROW = re.compile(r"\b(?:line|row|image) (\d+)")
+
+
+@dataclass(frozen=True)
+class Block:
+    """Sentences or a table that are shown together or not at all.
+
+    Attributes:
+        what: short name.
+        sentences: sentences; that before a table is its title.
+        columns: headings of the table; () without a table.
+        rows: cells of the table.
+        indent: before further lines of a sentence on a screen.
+    """
+
+    what: str
+    sentences: tuple[str, ...]
+    columns: tuple[str, ...] = ()
+    rows: tuple[tuple[str, ...], ...] = ()
+    indent: str = ""
+
+
+def table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]], what: str = "") -> Block:
+    """Return a table with its title; `what` is a shorter name of it."""
+    return Block(what or title, (title,), tuple(columns), tuple(map(tuple, rows)))
+
+
+def sentences(what: str, lines: Iterable[str], indent: str = "") -> Block:
+    """Return sentences."""
+    return Block(what, tuple(lines), indent=indent)
+
+
+@dataclass(frozen=True)
+class ResultText:
+    """A result for people.
+
+    Attributes:
+        verdict: verdict in three sentences.
+        warnings: sentences; all are shown.
+        blocks: the most important first.
+        details: what is shown on demand.
+        closing: what was written where.
+    """
+
+    verdict: Verdict
+    warnings: tuple[str, ...] = ()
+    blocks: tuple[Block, ...] = ()
+    details: tuple[Block, ...] = ()
+    closing: tuple[str, ...] = ()
+
+
+def together(warnings: Iterable[str]) -> list[str]:
+    """Join more than `MAX_ALIKE` warnings that differ in numbers only into one with their lines."""
+    kinds: dict[str, list[str]] = {}
+    for one in dict.fromkeys(warnings):
+        kinds.setdefault(_NUMBER.sub("#", one), []).append(one)
+    return [
+        line for alike in kinds.values() for line in (alike if len(alike) <= MAX_ALIKE else [_joined(alike)])
+    ]
+
+
+def _joined(alike: Sequence[str]) -> str:
+    rows = [int(match[1]) for one in alike[1:] if (match := _ROW.search(one))]
+    where = f": lines {ranges(rows)}" if len(rows) == len(alike) - 1 else ""
+    return f"{alike[0]} {len(alike) - 1} more of this kind{where}."
+
+
+def ranges(numbers: Iterable[int]) -> str:
+    """Write numbers with consecutive ones joined, such as "3, 7 to 9"."""
+    found: list[list[int]] = []
+    for number in sorted(set(numbers)):
+        if found and number == found[-1][-1] + 1:
+            found[-1] = [found[-1][0], number]
+        else:
+            found.append([number])
+    return ", ".join(" to ".join(map(str, one)) for one in found)

@@ -1,0 +1,111 @@
+"""Results of steps as text, for screens and pages."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from pisigma.reporting.comparison_tables import comparison_blocks, model_rms
+from pisigma.reporting.result_text import ResultText, sentences, table
+from pisigma.reporting.verdict import Verdict, counted, rounded, uncapitalised
+from pisigma.workflow.plan import Plan
+from pisigma.workflow.verify import Verification
+
+MAX_POINTS = 8
+"""Rows of the table of expected errors."""
+
+NEXT_STEPS = {
+    "better": "use the model, and verify again after a change of tool, base or arm.",
+    "not_better": "check that the controller applies the correction once, then measure again or recalibrate.",
+    "undecided": "measure more poses that differ, and verify again.",
+    "moved": "recalibrate the model with these rows.",
+    "setup_fault": "correct what is named above and measure again.",
+    "implausible": "correct what is named above and measure again.",
+}
+"""What to do after each verdict of a verification."""
+
+
+def plan_text(planned: Plan, files: Sequence[Path]) -> ResultText:
+    """Lay out what is expected of planned poses, and what remains uncertain.
+
+    Args:
+        planned: the plan.
+        files: what was written, the plan first.
+    """
+    columns = ("poses", "RMS [mm]", "95 % [mm]", "RMS of random poses [mm]")
+    rows = [
+        (str(point.poses), *(rounded(error * 1e3) for error in (point.rms, point.p95, point.random_rms)))
+        for point in planned.curve
+    ]
+    title = "expected errors of the tool's position by number of poses"
+    short = rows if len(rows) <= MAX_POINTS else [*rows[:: -(-len(rows) // MAX_POINTS)], rows[-1]]
+    weak = ["What the expected error will mostly come from:", *(f"- {line}" for line in planned.weak)]
+    points = sum(map(len, planned.stored.way_points))
+    lines = [planned.candidates.sentence, f"The poses are joined with {counted(points, 'way point')}."]
+    return ResultText(
+        _plan_verdict(planned, files[0]),
+        tuple(planned.warnings),
+        (
+            sentences("criterion and limit", _curve_lines(planned)),
+            table(title, columns, list(dict.fromkeys(short))),
+            sentences("what remains uncertain", weak, "  "),
+            sentences("what limits a camera", () if planned.camera is None else planned.camera.sentences),
+        ),
+        (
+            *([table(f"{title}, all", columns, rows)] if len(short) < len(rows) else []),
+            sentences("candidates and way points", lines),
+        ),
+        (f"Written to {', '.join(map(str, files))}.",),
+    )
+
+
+def _plan_verdict(planned: Plan, file: Path) -> Verdict:
+    """Say how accurate a calibration with the poses is expected to be."""
+    last, settings, warnings = planned.curve[-1], planned.stored.settings, planned.warnings
+    cautions = f"with caution ({counted(len(warnings), 'warning')})" if warnings else "yes"
+    return Verdict(
+        f"{rounded(last.rms * 1e3)} mm RMS and {rounded(last.p95 * 1e3)} mm for 95 % expected of the tool's position "
+        f"with {planned.poses} poses; {rounded(last.random_rms * 1e3)} mm RMS with random poses.",
+        f"{cautions}, if the sensor scatters as stated; {counted(planned.checks, 'pose')} will check it.",
+        f"measure the poses, about {planned.travel / 60:.0f} min at {settings.speed_deg_s:g} deg/s and "
+        f"{settings.settling_s:g} s a pose, with `pisigma measure {file} --rows ROWS.csv`.",
+    )
+
+
+def _curve_lines(planned: Plan) -> list[str]:
+    """Say what the curve does not show, and how many poses the limit needs, if there is one."""
+    lines, last, settings = [], planned.curve[-1], planned.stored.settings
+    limit = settings.limit_mm
+    if settings.criterion == "D" and last.rms > last.random_rms:
+        lines.append(
+            "Criterion D determines all unknowns of the robot and need not lower the error of the tool's position; use "
+            "criterion I for that."
+        )
+    if limit is not None and planned.needed is None:
+        lines.append(
+            f"More than {planned.poses} poses are needed to keep 95 % of the errors below {limit:g} mm."
+        )
+    elif limit is not None:
+        needed = f"with {planned.needed} poses" if planned.needed else "already, without more poses"
+        lines.append(f"95 % of the errors are expected below {limit:g} mm {needed}.")
+    return lines
+
+
+def verification_text(verification: Verification, width: int, verbose: bool = False) -> ResultText:
+    """Lay out a verification: the verdict, warnings, and the errors with and without the correction.
+
+    Args:
+        verification: the verification.
+        width: width of the screen [characters].
+        verbose: show all statistics.
+    """
+    trust = {"better": "yes", "undecided": "not known"}.get(verification.verdict, "no")
+    figures, rows = verification.comparison.models, verification.rows
+    errors = f"{model_rms(figures[-1], rows)} RMS with the correction, {model_rms(figures[0], rows)} without"
+    command = f"run `{verification.recalibration}`."
+    verdict = Verdict(
+        f"{errors} ({rows} rows of {Path(verification.data).name}).",
+        f"{trust}: {uncapitalised(verification.sentence)}",
+        command if verification.recalibration else NEXT_STEPS[verification.verdict],
+    )
+    warnings = [*(fault.sentence for fault in verification.setup_faults), *verification.warnings]
+    shown, details = comparison_blocks(verification.comparison, verification.data, width, verbose)
+    return ResultText(verdict, tuple(warnings), tuple(shown), tuple(details))
