@@ -69,15 +69,21 @@ class FrontServer:
         self._loop.run_until_complete(runner.cleanup())
         if closing is not None:
             self._loop.run_until_complete(closing())
-        for task in (left := asyncio.all_tasks(self._loop)):
-            task.cancel()
-        self._loop.run_until_complete(asyncio.gather(*left, return_exceptions=True))
+        self._loop.run_until_complete(_end_tasks())
         self._loop.close()
 
     def close(self) -> None:
         """Stop serving."""
         self._loop.call_soon_threadsafe(self._loop.stop)
         self._thread.join()
+
+
+async def _end_tasks() -> None:
+    """Cancel what is left of closed connections."""
+    left = asyncio.all_tasks() - {asyncio.current_task()}
+    for task in left:
+        task.cancel()
+    await asyncio.gather(*left, return_exceptions=True)
 
 
 def _bound(host: str, port: int) -> socket.socket:
