@@ -28,9 +28,13 @@ def tables() -> str:
                 key = f" Key: {', '.join(f'`{name}`' for name in table.key)}." if table.key else ""
                 parts += [f"### {table.name}", "", f"{summary}{key}", ""]
                 parts += ["| column | type | meaning |", "|---|---|---|"]
-                for _, name, declared, is_required, *_ in database.execute(f"PRAGMA table_info({table.name})"):
+                for _, name, declared, is_required, *_ in database.execute(
+                    f"PRAGMA table_info({table.name})"
+                ):
                     null = "" if is_required else ", may be NULL"
-                    parts.append(f"| `{name}` | {declared}{null} | {meaning[name].replace('|', chr(92) + '|')} |")
+                    parts.append(
+                        f"| `{name}` | {declared}{null} | {meaning[name].replace('|', chr(92) + '|')} |"
+                    )
                 parts.append("")
     return "\n".join(parts)
 

@@ -66,13 +66,15 @@ class Database:
             OutputError: the file cannot be written; see `opened`.
         """
         with self.writing() as database:
-            for row in rows:
-                values = asdict(row)
-                names, marks = ", ".join(values), ", ".join("?" * len(values))
-                table = self.tables[type(row)].name
-                database.execute(
-                    f"INSERT OR REPLACE INTO {table} ({names}) VALUES ({marks})", [*values.values()]
-                )
+            self.insert(database, rows)
+
+    def insert(self, database: sqlite3.Connection, rows: Sequence[Any]) -> None:
+        """Add rows in a transaction of `writing`; a row with the same key is replaced."""
+        for row in rows:
+            values = asdict(row)
+            names, marks = ", ".join(values), ", ".join("?" * len(values))
+            table = self.tables[type(row)].name
+            database.execute(f"INSERT OR REPLACE INTO {table} ({names}) VALUES ({marks})", [*values.values()])
 
     def read(self, kind: type[Row]) -> tuple[Row, ...]:
         """Return all rows of a class in the order in which they were added; none if there is no file yet.

@@ -284,6 +284,21 @@ class History:
         """
         self.database.add(entries)
 
+    def add_session(self, session: SessionEntry) -> bool:
+        """Add a session unless another session in use has the same content; return whether it was added.
+
+        Raises:
+            OutputError: the history cannot be written.
+        """
+        with self.database.writing() as database:
+            known = database.execute(
+                f"SELECT 1 FROM {TABLES[SessionEntry].name} WHERE sha256 = ? AND name <> ? AND set_aside = ''",
+                (session.sha256, session.name),
+            ).fetchone()
+            if known is None:
+                self.database.insert(database, [session])
+        return known is None
+
     def rename_model(self, before: str, after: str) -> None:
         """Replace the SHA-256 of a model whose folder was upgraded.
 

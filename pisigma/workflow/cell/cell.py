@@ -8,7 +8,7 @@ import datetime
 import os
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +34,7 @@ from pisigma.workflow.cell.sessions import (
     free_path,
     newest_day,
     not_taken_in,
+    save_new,
 )
 from pisigma.workflow.evaluate import Evaluation, evaluate
 from pisigma.workflow.monitor import Monitoring, monitor
@@ -153,8 +154,9 @@ class Cell:
         planned = plan(
             subject, self.file.settings("plan", **changed), self.file.document.surroundings, progress
         )
-        path = free_path(self.folder / PLANS, datetime.date.today().isoformat(), ".csv")
-        planned.save(path, programs)
+        with self.history.database.writing():  # no other process chooses the same name meanwhile
+            path = free_path(self.folder / PLANS, datetime.date.today().isoformat(), ".csv")
+            planned.save(path, programs)
         return planned, path
 
     @cached_property
@@ -197,8 +199,7 @@ class Cell:
         if doubt and not accept_implausible:
             self.history.add(Check("calibrate", "", "", "not_trusted", doubt, None, False, now()))
             return result, None
-        path = free_path(self.folder / MODELS, datetime.date.today().isoformat(), "")
-        result.save(path, accept_implausible=accept_implausible)
+        path = save_new(self.folder / MODELS, partial(result.save, accept_implausible=accept_implausible))
         remark, better = doubt or "not verified yet", False
         if not doubt and (in_use := self.history.in_use) is not None:
             better, remark = is_better(self.sessions, in_use, sessions, settings, progress)
@@ -310,8 +311,7 @@ class Cell:
         result = recalibrate(self.model_folder(parent.name), seen.rows, settings, progress)
         if not (result.trusted or accept_implausible):
             return result, None
-        path = free_path(self.folder / MODELS, datetime.date.today().isoformat(), "")
-        result.save(path, accept_implausible=accept_implausible)
+        path = save_new(self.folder / MODELS, partial(result.save, accept_implausible=accept_implausible))
         remark = result.summary.verdict
         entry = replace(
             self._entry(path, [chosen], remark, None),

@@ -4,7 +4,7 @@ import datetime
 import hashlib
 import os
 import tempfile
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -112,12 +112,16 @@ class Sessions:
                 content = (Path(scratch) / "rows.csv").read_bytes()
         else:
             content = Path(file).read_bytes()
-        if not isinstance(file, Measurements) and Path(file).parent.resolve() == self.folder.resolve():
-            path = Path(file)
-        else:
-            path = write_new(self.folder, day, content, {one.name for one in self.history.sessions()})
+        is_inside = (
+            not isinstance(file, Measurements) and Path(file).parent.resolve() == self.folder.resolve()
+        )
+        names = {one.name for one in self.history.sessions()}
+        path = Path(file) if is_inside else write_new(self.folder, day, content, names)
         entry = replace(entry, name=path.stem, sha256=hashlib.sha256(content).hexdigest())
-        self.history.add(entry)
+        if not self.history.add_session(entry):  # another process was faster
+            if not is_inside:
+                path.unlink()
+            raise _known(rows)
         return entry
 
     def _judged(self, rows: Measurements, day: str, accept_implausible: bool) -> SessionEntry:
@@ -128,9 +132,7 @@ class Sessions:
             values = RowValues.from_rows(self.rows_of([one]).as_fields(), self.robot)
             again |= copies_of_known(rows.as_fields(), self.robot, values)
         if bool(again.all()):
-            raise MeasurementError(
-                "the cell already contains every row", at=Place(rows.source), remedy="import new rows"
-            )
+            raise _known(rows)
         model = self.history.in_use
         if model is None:
             verdict = check_rows(rows, self.robot)
@@ -287,6 +289,13 @@ def newest_day(events: Sequence[Event], kind: str, day: str) -> str:
     return max((one.day for one in events if one.kind == kind and one.day <= day), default="")
 
 
+def _known(rows: Measurements) -> MeasurementError:
+    """Return the refusal of rows that the cell already contains."""
+    return MeasurementError(
+        "the cell already contains every row", at=Place(rows.source), remedy="import new rows"
+    )
+
+
 def _day_of(rows: Measurements) -> str:
     """Return the first day of rows: from the column `date`, else from the name of their file, else today."""
     if rows.date is not None and all(rows.date):
@@ -317,6 +326,26 @@ def free_path(folder: Path, name: str, suffix: str, taken: Collection[str] = ())
         if not path.exists() and stem not in taken:
             return path
     raise OutputError(f"the folder already contains {MAX_NAMES:,} files named after {name}", at=Place(folder))
+
+
+def save_new(folder: Path, save: Callable[[Path], object]) -> Path:
+    """Save a model under a new name, the date of today, even if other processes save models in the same folder.
+
+    Args:
+        folder: folder of the models.
+        save: function that writes the folder of the model, and refuses an existing one.
+
+    Raises:
+        OutputError: the model cannot be written.
+    """
+    while True:
+        path = free_path(folder, datetime.date.today().isoformat(), "")
+        try:
+            save(path)
+            return path
+        except OutputError:
+            if not path.exists():  # else another process took the name
+                raise
 
 
 def write_new(folder: Path, name: str, content: bytes, taken: Collection[str]) -> Path:
