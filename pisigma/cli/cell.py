@@ -195,21 +195,29 @@ def next_lines(cell: "Cell") -> list[str]:
 
 def use(
     cell: CellFolder,
-    model: Annotated[str, typer.Argument(help="Name of the model.")],
-    reason: Reason = "by hand",
+    model: Annotated[str | None, typer.Argument(help="Name of the model, unless --undo.")] = None,
+    undo: Annotated[
+        bool, typer.Option("--undo", help="Put the model into use that was in use before the last change.")
+    ] = False,
+    reason: Reason = "",
     as_json: AsJson = False,
 ) -> None:
-    """Put a model of a cell into use; the previous model is kept, so that this can be undone."""
+    """Put a model of a cell into use, or undo the last change; every change is kept in the history with its reason."""
     from pisigma.workflow.cell.cell import Cell
 
+    if (model is None) is not undo:
+        raise typer.BadParameter("expected either the name of a model or --undo", param_hint="'MODEL'")
     opened = Cell.open(cell)
     before = opened.history.in_use
-    opened.use(model, reason)
-    if as_json:
-        print_json({"model": model, "before": before and before.name})
+    if model is None:
+        model = opened.undo_use(reason)
     else:
-        undo = f" (undo: pisigma use {cell} {before.name})" if before else ""
-        print_lines([f"Model '{model}' is in use{undo}."])
+        opened.use(model, reason)
+    if as_json:
+        print_json({"model": model or None, "before": before and before.name})
+    else:
+        hint = "" if undo else f" (undo: pisigma use {cell} --undo)"
+        print_lines([f"Model '{model}' is in use{hint}." if model else "No model is in use."])
 
 
 def session(

@@ -198,7 +198,11 @@ def test_a_model_is_verified_and_put_into_use_by_name(run, used):
     assert json.loads(verified.stdout)["model"].endswith(first)
     changed = json.loads(run("use", cell, first, "--reason", "a trial", "--json").stdout)
     assert changed == {"model": first, "before": second}
-    assert json.loads(run("use", cell, second, "--json").stdout)["before"] == first
+    assert json.loads(run("use", cell, "--undo", "--json").stdout) == {"model": second, "before": first}
+    assert json.loads(run("use", cell, "--undo", "--reason", "a trial", "--json").stdout)["model"] == first
+    assert json.loads(run("use", cell, "--undo", "--json").stdout) == {"model": None, "before": first}
+    assert run("use", cell, "--undo").exit_code == run("use", cell).exit_code == 2
+    run("use", cell, second, "--json")
 
 
 def test_status_is_printed_again_until_it_is_interrupted(run, cell, monkeypatch):

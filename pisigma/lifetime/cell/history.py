@@ -1,4 +1,4 @@
-"""History in one SQLite file: sessions, events, models, checks, which model was in use when, and monitored sessions.
+"""History in one SQLite file: sessions, events, models, checks, which model was in use when, and more.
 
 A cell has one history; a model outside of a cell has one next to its folder, with monitored sessions only. DuckDB and
 pandas can read the tables directly: `TABLES` maps the classes below to tables, and columns are named after attributes.
@@ -14,14 +14,16 @@ from typing import Literal, get_args
 
 from pisigma.files.errors import MeasurementError, ModelError, OutputError, Place, check_choice
 from pisigma.lifetime.cell.database import Database, Table
+from pisigma.lifetime.cell.exports import ControllerEntry, ExportEntry
 from pisigma.measurement.dates import EXPECTED_DATE, is_date
 
 HISTORY = "history.sqlite"
 """Name of the history of a cell."""
 MODEL_HISTORY = ".history.sqlite"
 """Suffix of the history of a model outside of a cell, after the name of its folder."""
-SCHEMA_VERSION = 2
-"""Version of the schema. Version 1 had no monitored sessions: each model had a file for them, without a version."""
+SCHEMA_VERSION = 3
+"""Version of the schema. Version 1 had no monitored sessions: each model had a file for them, without a version.
+Version 2 had no exports, and changes of the model in use could not be undone."""
 
 EventKind = Literal[
     "instrument", "tool", "mastering", "encoder", "collision", "maintenance", "firmware", "accepted"
@@ -159,11 +161,13 @@ class Use:
         model: name of the model; empty if none was in use.
         since: time from which it was in use (ISO 8601, UTC).
         reason: why it was put into use.
+        undo: whether this change undid the last one that had not been undone.
     """
 
     model: str
     since: str
     reason: str
+    undo: bool = False
 
 
 @dataclass(frozen=True)
@@ -205,8 +209,12 @@ TABLES: dict[type, Table] = {
     ModelEntry: Table("models", ("name",)),
     Check: Table("checks"),
     Use: Table("uses"),
+    ExportEntry: Table("exports"),
+    ControllerEntry: Table("controller"),
     MonitoredSession: Table("monitored_sessions", ("model_sha256", "rows_sha256")),
 }
+Entry = SessionEntry | Event | ModelEntry | Check | Use | ExportEntry | ControllerEntry | MonitoredSession
+"""A row of a table of a history."""
 _SESSIONS_OF_MODEL = """SELECT model, rows, file, date, json_extract(session, '$.rows'), temperature_c,
     CASE WHEN json_array_length(session, '$.moved') THEN 'moved'
          WHEN json_array_length(session, '$.candidates') THEN 'unclear' ELSE 'unchanged' END,
@@ -218,8 +226,8 @@ _OF_MODELS = "models/*.history.sqlite"
 
 
 def now() -> str:
-    """Return the time as stored in a history (ISO 8601, UTC, to the second)."""
-    return datetime.datetime.now(datetime.timezone.utc).isoformat(timespec="seconds")
+    """Return the time as stored in a history (ISO 8601, UTC, to the millisecond)."""
+    return datetime.datetime.now(datetime.timezone.utc).isoformat(timespec="milliseconds")
 
 
 class History:
@@ -260,6 +268,25 @@ class History:
         """Return the changes of the model in use; the last one names the model in use now."""
         return self.database.read(Use)
 
+    def exports(self) -> tuple[ExportEntry, ...]:
+        """Return all exports in the order in which they were written."""
+        return self.database.read(ExportEntry)
+
+    def controller(self) -> tuple[ControllerEntry, ...]:
+        """Return the changes of what is active on the controller, in the order of their days."""
+        return tuple(sorted(self.database.read(ControllerEntry), key=lambda one: (one.day, one.recorded)))
+
+    @property
+    def before_in_use(self) -> str | None:
+        """The model that an undo puts into use, "" for none; None if there is nothing to undo."""
+        states = [""]
+        for one in self.uses():
+            if one.undo:
+                states.pop()
+            elif one.model != states[-1]:
+                states.append(one.model)
+        return states[-2] if len(states) > 1 else None
+
     @property
     def in_use(self) -> ModelEntry | None:
         """The model in use; None if there is none."""
@@ -276,7 +303,7 @@ class History:
         check_choice(ModelError, "model", name, tuple(models), Place(self.path.parent))
         return models[name]
 
-    def add(self, *entries: SessionEntry | Event | ModelEntry | Check | Use | MonitoredSession) -> None:
+    def add(self, *entries: Entry) -> None:
         """Add entries in one transaction; an entry with the same key (see `TABLES`) is replaced.
 
         Raises:

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from pisigma.files.errors import ModelError, Place
-from pisigma.files.model_files import is_model, model_hash
+from pisigma.files.model_files import is_model
 from pisigma.files.progress import Progress
 from pisigma.lifetime.cell.history import HISTORY, Check, History, ModelEntry, SessionEntry, Use, now
 from pisigma.lifetime.cell.layout import MODELS, PLANS, SESSIONS
@@ -25,14 +25,13 @@ from pisigma.model.folder.model_folder import load_model
 from pisigma.robot.description import Robot
 from pisigma.workflow.calibrate import Calibration, calibrate
 from pisigma.workflow.cell.cell_file import CellFile
-from pisigma.workflow.cell.model_choice import check_of, is_better, p95_of
+from pisigma.workflow.cell.model_choice import check_of, entry_of, is_better, p95_of, put_into_use
 from pisigma.workflow.cell.new_cell import write_new_cell
 from pisigma.workflow.cell.sessions import (
     ModelRows,
     Sessions,
     edited_sessions,
     free_path,
-    newest_day,
     not_taken_in,
     save_new,
 )
@@ -203,7 +202,7 @@ class Cell:
         remark, better = doubt or "not verified yet", False
         if not doubt and (in_use := self.history.in_use) is not None:
             better, remark = is_better(self.sessions, in_use, sessions, settings, progress)
-        entry = self._entry(path, sessions, remark, p95_of(result.summary.cross_validation))
+        entry = entry_of(self.history, path, sessions, remark, p95_of(result.summary.cross_validation))
         verdict = "accepted_implausible" if doubt else "trusted"
         check = Check("calibrate", entry.name, "", verdict, doubt, entry.p95_mm, False, now())
         self.history.add(entry, check, *([Use(entry.name, now(), remark)] if better else []))
@@ -314,7 +313,7 @@ class Cell:
         path = save_new(self.folder / MODELS, partial(result.save, accept_implausible=accept_implausible))
         remark = result.summary.verdict
         entry = replace(
-            self._entry(path, [chosen], remark, None),
+            entry_of(self.history, path, [chosen], remark, None),
             sessions=",".join((*parent.sessions.split(","), chosen.name)),
             day=max(parent.day, chosen.day),
             frame_day=parent.frame_day,
@@ -326,7 +325,7 @@ class Cell:
         return result, entry
 
     def use(self, model: str, reason: str) -> None:
-        """Put a model into use by hand; earlier models are kept, so that this can be undone.
+        """Put a model into use by hand; earlier models are kept, see `undo_use`.
 
         Args:
             model: name of the model.
@@ -335,13 +334,25 @@ class Cell:
         Raises:
             ModelError: the cell has no model with this name, or its folder was changed.
         """
-        entry = self.history.model(model)
-        folder = self.folder / MODELS / model
-        if model_hash(folder) != entry.sha256:
-            raise ModelError(
-                "the model was changed after it was made", at=Place(folder), remedy="use another model"
-            )
-        self.history.add(Use(entry.name, now(), reason or "by hand"))
+        put_into_use(self.history, self.history.model(model).name, reason or "by hand")
+
+    def undo_use(self, reason: str) -> str:
+        """Put the model into use that was in use before the last change; repeated calls go further back.
+
+        Args:
+            reason: reason to record in the history.
+
+        Returns:
+            The name of the model; empty if none was in use.
+
+        Raises:
+            ModelError: there is nothing to undo, or the folder of the model was changed.
+        """
+        model = self.history.before_in_use
+        if model is None:
+            raise ModelError("no model was in use before", at=Place(self.folder), option="--undo")
+        put_into_use(self.history, model, reason or "undo", undo=True)
+        return model
 
     def status(self) -> CellStatus:
         """Return the status of the cell and its next step."""
@@ -381,19 +392,3 @@ class Cell:
         entry = self._candidate(model)
         chosen = self.sessions.chosen(entry, session)
         return entry, chosen, self.sessions.rows_for(entry, self.sessions.as_measured(chosen), chosen.day)
-
-    def _entry(
-        self, path: Path, sessions: Sequence[SessionEntry], remark: str, p95_mm: float | None
-    ) -> ModelEntry:
-        events, day = self.history.events(), max(one.day for one in sessions)
-        return ModelEntry(
-            name=path.name,
-            sha256=model_hash(path),
-            made=now(),
-            sessions=",".join(one.name for one in sessions),
-            day=day,
-            frame_day=newest_day(events, "instrument", day),
-            target_day=newest_day(events, "tool", day),
-            p95_mm=p95_mm,
-            remark=remark,
-        )

@@ -1,11 +1,14 @@
-"""Choice between models of a cell with new rows: whether a new calibration is better than the model in use."""
+"""Models of a cell: their entries in the history, which is in use, and whether a new one is better on new rows."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import TypeVar
 
+from pisigma.files.errors import ModelError, Place
+from pisigma.files.model_files import model_hash
 from pisigma.files.progress import Progress
-from pisigma.lifetime.cell.history import Check, ModelEntry, SessionEntry, now
+from pisigma.lifetime.cell.history import Check, History, ModelEntry, SessionEntry, Use, now
 from pisigma.lifetime.cell.layout import MODELS
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.folder.model_folder import load_model
@@ -112,3 +115,41 @@ def check_of(found: Monitoring, entry: ModelEntry, session: SessionEntry) -> Che
 def p95_of(judged: ValidationFigures | None) -> float | None:
     """Return the 95 % quantile of the position errors of held-out rows of the best calibration [mm]."""
     return None if judged is None else list(judged.models.values())[-1].p95_mm
+
+
+def entry_of(
+    history: History, path: Path, sessions: Sequence[SessionEntry], remark: str, p95_mm: float | None
+) -> ModelEntry:
+    """Return the history entry of a new model in a folder that was fitted to sessions."""
+    events, day = history.events(), max(one.day for one in sessions)
+    return ModelEntry(
+        name=path.name,
+        sha256=model_hash(path),
+        made=now(),
+        sessions=",".join(one.name for one in sessions),
+        day=day,
+        frame_day=newest_day(events, "instrument", day),
+        target_day=newest_day(events, "tool", day),
+        p95_mm=p95_mm,
+        remark=remark,
+    )
+
+
+def put_into_use(history: History, model: str, reason: str, undo: bool = False) -> None:
+    """Record that a model is in use from now on.
+
+    Args:
+        history: history of the cell.
+        model: name of a model of the cell; empty if none is in use any more.
+        reason: reason to record.
+        undo: whether this undoes the last change.
+
+    Raises:
+        ModelError: the folder of the model was changed.
+    """
+    folder = history.path.parent / MODELS / model
+    if model and model_hash(folder) != history.model(model).sha256:
+        raise ModelError(
+            "the model was changed after it was made", at=Place(folder), remedy="use another model"
+        )
+    history.add(Use(model, now(), reason, undo))

@@ -20,7 +20,9 @@ from pisigma.lifetime.cell.history import (
     SCHEMA_VERSION,
     TABLES,
     Check,
+    ControllerEntry,
     Event,
+    ExportEntry,
     History,
     ModelEntry,
     SessionEntry,
@@ -33,6 +35,8 @@ MODEL = ModelEntry("a", "def", "2026-01-10T12:00:00+00:00", "2026-01-10", "2026-
 EVENT = Event("2026-02-01", "mastering", "joint 3", "2026-02-01T08:00:00+00:00")
 CHECK = Check("verify", "a", "2026-01-10", "better", "It is better.", None, True, "2026-01-11T08:00:00+00:00")
 USE = Use("a", "2026-01-11T08:00:00+00:00", "verified")
+EXPORT = ExportEntry("dh.csv", "0123", "dh", "kinematics", "a", "2026-01-12T08:00:00+00:00")
+ACTIVE = ControllerEntry("2026-01-13", "0123", "tried at low speed", "2026-01-13T08:00:00+00:00")
 
 
 @pytest.fixture
@@ -47,13 +51,15 @@ def test_nothing_is_known_and_no_file_is_made_before_the_first_entry(history):
 
 
 def test_entries_are_read_as_they_were_written(history):
-    history.add(SESSION, MODEL, EVENT, CHECK, USE)
+    history.add(SESSION, MODEL, EVENT, CHECK, USE, EXPORT, ACTIVE)
     other = History(history.path)
     assert other.sessions() == (SESSION,)
     assert other.models() == (MODEL,)
     assert other.events() == (EVENT,)
     assert other.checks() == (CHECK,)
     assert other.uses() == (USE,)
+    assert other.exports() == (EXPORT,)
+    assert other.controller() == (ACTIVE,)
     assert other.in_use == MODEL
 
 
@@ -79,6 +85,30 @@ def test_the_last_use_counts_and_the_earlier_ones_stay(history):
     history.add(replace(USE, model=""))
     assert history.in_use is None
     assert [one.model for one in history.uses()] == ["a", "b", ""]
+
+
+def test_twelve_changes_of_the_model_in_use_are_undone_one_after_the_other(history):
+    names = [f"{number:02d}" for number in range(12)]
+    history.add(*(replace(MODEL, name=name) for name in names))
+    history.add(*(replace(USE, model=name) for name in names), replace(USE, model=names[-1]))
+    for name in [*reversed(names[:-1]), ""]:
+        assert history.before_in_use == name
+        history.add(replace(USE, model=name, undo=True))
+    assert history.in_use is history.before_in_use is None
+    history.add(USE)
+    assert history.before_in_use == ""
+
+
+def test_an_older_history_gets_the_tables_and_columns_that_it_lacks(history):
+    with sqlite3.connect(history.path) as database:
+        database.execute("CREATE TABLE uses (model TEXT NOT NULL, since TEXT NOT NULL, reason TEXT NOT NULL)")
+        database.execute("INSERT INTO uses VALUES (?, ?, ?)", (USE.model, USE.since, USE.reason))
+        database.execute("PRAGMA user_version = 1")
+    database.close()
+    assert history.uses() == (USE,)
+    assert history.controller() == ()
+    history.add(replace(USE, undo=True))
+    assert [one.undo for one in history.uses()] == [False, True]
 
 
 def test_a_model_that_is_not_there_is_refused_with_the_nearest_name(history):
