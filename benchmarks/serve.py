@@ -30,7 +30,7 @@ import numpy as np
 
 import pisigma
 
-REQUEST, ANSWER = struct.Struct("<4sIQII16d8d"), struct.Struct("<4sIQII8d2d")
+REQUEST, ANSWER = struct.Struct("<4sIQII16d8d"), struct.Struct("<4sIQII8d2d8s")
 CLIENTS, RATE = 2, 1000.0
 """Number of clients, and their requests per second in total."""
 POSES = 1000
@@ -150,7 +150,7 @@ def answer_frame(ik: pisigma.CorrectedIK, message: bytes) -> bytes:
     dof = len(ik.joints)
     solution = ik(np.array(numbers[:16]).reshape(4, 4), near=np.array(numbers[16 : 16 + dof]), throw=False)
     q = (*solution.q, *[0.0] * (8 - dof), solution.position_residual, solution.rotation_residual)
-    return ANSWER.pack(b"PSI1", ANSWER.size, name, int(solution.status), dof, *q)
+    return ANSWER.pack(b"PSI1", ANSWER.size, name, int(solution.status), dof, *q, b"")
 
 
 def answer_line(ik: pisigma.CorrectedIK, message: bytes) -> bytes:

@@ -34,9 +34,10 @@ typedef struct {
     uint64_t id;
     uint32_t status, joints;
     double q[PISIGMA_JOINTS], position_residual, rotation_residual;
+    uint8_t model[8]; /* first bytes of the SHA-256 of the model that answered */
 } pisigma_answer;
 
-_Static_assert(sizeof(pisigma_request) == 216 && sizeof(pisigma_answer) == 104, "frames have no gaps");
+_Static_assert(sizeof(pisigma_request) == 216 && sizeof(pisigma_answer) == 112, "frames have no gaps");
 
 /* Connect; a file descriptor, or -1 with errno. */
 static inline int pisigma_connect(const char *host, int port) {

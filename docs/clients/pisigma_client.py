@@ -45,16 +45,19 @@ class JsonClient:
         self._socket.close()
 
 
-REQUEST, ANSWER = struct.Struct("<4sIQII16d8d"), struct.Struct("<4sIQII8d2d")
+REQUEST, ANSWER = struct.Struct("<4sIQII16d8d"), struct.Struct("<4sIQII8d2d8s")
 
 
 class FrameClient:
-    """Binary frames: `status, q, residuals = FrameClient(port).solve(T)`; metres and radians."""
+    """Binary frames: `status, q, residuals = FrameClient(port).solve(T)`; metres and radians.
+
+    `sha256` has the first 16 digits of the SHA-256 of the model that answered last.
+    """
 
     def __init__(self, port, host="127.0.0.1", token=None, timeout=5.0):
         self._socket = socket.create_connection((host, port), timeout)
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        self._id = 0
+        self._id, self.sha256 = 0, ""
         if token is not None:
             secret = token.encode()
             self._socket.sendall(struct.pack("<4sIQII", b"PSI1", 24 + len(secret), 0, 0, 1) + secret)
@@ -74,9 +77,10 @@ class FrameClient:
         self._socket.sendall(
             REQUEST.pack(b"PSI1", REQUEST.size, self._id, model, 0, *T_base_tool, *near_values)
         )
-        _, _, answered, status, joints, *values = self._receive()
+        _, _, answered, status, joints, *values, model = self._receive()
         if answered != self._id:
             raise ConnectionError(f"an answer to request {answered} came, not to {self._id}")
+        self.sha256 = model.hex()
         return status, values[:joints], values[8:]
 
     def _receive(self):

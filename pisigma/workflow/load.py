@@ -1,20 +1,66 @@
 """Load corrected inverse kinematics from a model folder, or from a cell with the model that is in use there."""
 
 import os
+from pathlib import Path
+from typing import Any
 
-from pisigma.lifetime.cell.layout import model_folder
+from pisigma.lifetime.cell.layout import is_cell, model_folder
+from pisigma.lifetime.cell.model_in_use import ModelInUse
 from pisigma.model.inverse.corrected_ik import CorrectedIK
 from pisigma.model.inverse.corrected_ik import load as load_folder
+from pisigma.model.inverse.solution import Solution
 
 
-def load(folder: str | os.PathLike[str]) -> CorrectedIK:
+class CellIK(CorrectedIK):
+    """Corrected inverse kinematics of the model in use of a cell, which takes over a change of this model.
+
+    Every call, a path included, is answered by one model, which `Solution.model` names. Copies such as those of
+    `for_task` and `under` keep their model. All other attributes are those of `present`.
+
+    Attributes:
+        present: corrected inverse kinematics of the model in use.
+    """
+
+    present: CorrectedIK
+
+    def __init__(self, cell: Path) -> None:
+        """Load the model in use, and look for changes in a background thread.
+
+        Raises:
+            ModelError: no model of the cell is in use, or it cannot be loaded.
+        """
+        self._in_use = ModelInUse(cell, self._load)
+        self._in_use.follow()
+
+    def _load(self, folder: Path) -> None:
+        self.present = load_folder(folder)
+
+    def __call__(self, *arguments: Any, **options: Any) -> Solution:
+        """See `CorrectedIK.__call__`."""
+        return self.present(*arguments, **options)
+
+    @property
+    def warnings(self) -> tuple[str, ...]:  # type: ignore[override]
+        """Warnings of the model, and why a newer model in use could not be loaded."""
+        return self.present.warnings + ((self._in_use.problem,) if self._in_use.problem else ())
+
+    def __getattribute__(self, name: str) -> Any:
+        """Return the attributes that are not of this class from the model in use."""
+        of_self = name in ("present", "warnings", "_in_use", "_load") or name.startswith("__")
+        return object.__getattribute__(self, name) if of_self else getattr(self.present, name)
+
+
+def load(folder: str | os.PathLike[str], pin: bool = False) -> CorrectedIK:
     """Load a model folder, or the model in use of a cell, as corrected inverse kinematics.
 
     Args:
         folder: what `pisigma calibrate`, `pisigma train` or `pisigma new` wrote.
+        pin: of a cell, keep the model that is in use now; else a change is taken over between two calls.
 
     Raises:
-        ModelError: the folder does not hold a whole model (the message says what is wrong with which file), or no
-            model of the cell is in use.
+        ModelError: the folder is not a complete model; the message names the file at fault; or no model of the cell is
+            in use.
     """
+    if is_cell(folder) and not pin:
+        return CellIK(Path(folder))
     return load_folder(model_folder(folder))

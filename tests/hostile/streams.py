@@ -17,7 +17,11 @@ import numpy as np
 from pisigma.model.inverse.corrected_ik import CorrectedIK
 from pisigma.robot.kernels.array_kinematics import transform_of, xyzrpy_of
 
-REQUEST, ANSWER, HEAD = struct.Struct("<4sIQII16d8d"), struct.Struct("<4sIQII8d2d"), struct.Struct("<4sIQII")
+REQUEST, ANSWER, HEAD = (
+    struct.Struct("<4sIQII16d8d"),
+    struct.Struct("<4sIQII8d2d8s"),
+    struct.Struct("<4sIQII"),
+)
 PROTOCOLS = ("json", "binary")
 NEAR = 1e-6
 """Tolerance of the reached position [m]."""

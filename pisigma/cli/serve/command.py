@@ -18,6 +18,7 @@ Model = Annotated[
     Path | None,
     typer.Argument(metavar="[MODEL|CELL]", help="Model folder, or a cell.", autocompletion=complete_model),
 ]
+Pin = Annotated[bool, typer.Option("--pin", help="Keep the model that is in use in the cell at the start.")]
 Models = Annotated[Path | None, typer.Option("--models", help="Folder of model folders to serve by name.")]
 
 
@@ -26,31 +27,41 @@ def serve(
     settings: ServeSettings,
     model: Model = None,
     models: Models = None,
+    pin: Pin = False,
 ) -> None:
     """Answer requests for corrected joint values, paths and poses, until SIGTERM or Ctrl-C.
 
-    Prints one JSON line with its ports when it is ready. SIGHUP reloads models whose folders have changed.
+    Prints one JSON line with its ports when it is ready. SIGHUP reloads models whose folders have changed. If the model
+    in use of a cell changes, the following requests are answered by the new one.
     """
     from pisigma.deployment.serve.server import Server
 
-    served = _load(model, models)
+    def report(line: str) -> None:
+        print_line(line, to_stderr=True)
+
+    served = _load(model, models, pin)
     server = Server(served, settings)
     for problem in served.problems:
-        print_line(problem, to_stderr=True)
+        report(problem)
     for name in (signal.SIGTERM, signal.SIGINT):
         signal.signal(name, lambda *_: server.stop())
     if hasattr(signal, "SIGHUP"):
-        signal.signal(signal.SIGHUP, lambda *_: server.reload(lambda line: print_line(line, to_stderr=True)))
+        signal.signal(signal.SIGHUP, lambda *_: server.reload(report))
     print_json(server.ports)
-    server.run()
+    with served.followed(report):
+        server.run()
 
 
-def _load(model: Path | None, models: Path | None) -> "ServedModels":
-    """Load the model, or those of a folder."""
+def _load(model: Path | None, models: Path | None, pin: bool) -> "ServedModels":
+    """Load the model, that in use of a cell, or those of a folder."""
     from pisigma.deployment.serve.models import ServedModels, model_folders
-    from pisigma.lifetime.cell.layout import model_folder
+    from pisigma.lifetime.cell.layout import is_cell, model_folder
 
+    if pin and (model is None or not is_cell(model)):
+        raise typer.BadParameter("expected a cell", param_hint="'--pin'")
     if model is not None and models is None:
+        if is_cell(model) and not pin:
+            return ServedModels(cell=model)
         return ServedModels([model_folder(model)])
     if models is None or model is not None:
         raise typer.BadParameter(

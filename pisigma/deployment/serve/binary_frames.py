@@ -18,8 +18,9 @@ HEAD = struct.Struct("<4sIQII")
 REQUEST = struct.Struct(f"<4sIQII16d{JOINTS}d")
 """The pose T_base_tool row by row [m], and joint values that the solution should be near [rad or m], NaN for none."""
 _POSE, _NEAR = HEAD.size, HEAD.size + 128
-ANSWER = struct.Struct(f"<4sIQII{JOINTS}d2d")
-"""Joint values [rad or m], NaN after the last joint, and the residuals of position [m] and rotation [rad]."""
+ANSWER = struct.Struct(f"<4sIQII{JOINTS}d2d8s")
+"""Joint values [rad or m], NaN after the last joint, the residuals of position [m] and rotation [rad], and the first
+bytes of the SHA-256 of the model, 0 if no model answered."""
 MAX_TOKEN_BYTES = 1024
 
 TOKEN = 1
@@ -94,7 +95,8 @@ class BinaryFrames(AbstractProtocol):
             row = model.solve(message[_POSE:_NEAR], message[_NEAR : _NEAR + 8 * dof])
             position, rotation, _, status, _ = row[2 * dof :]
             q = *row[:dof], *_NO_JOINTS[dof:]
-            reply = ANSWER.pack(MAGIC, ANSWER.size, name, int(status), dof, *q, position, rotation)
+            numbers = *q, position, rotation
+            reply = ANSWER.pack(MAGIC, ANSWER.size, name, int(status), dof, *numbers, model.short_hash)
         except Exception:
             return self._refuse(name, Refusal.DEFECT, begun)
         self._metrics.count(STATUS_NAMES[status], begun)
@@ -106,4 +108,4 @@ class BinaryFrames(AbstractProtocol):
 
 
 def _refusal(name: int, status: int) -> bytes:
-    return ANSWER.pack(MAGIC, ANSWER.size, name, status, 0, *_NO_JOINTS, math.nan, math.nan)
+    return ANSWER.pack(MAGIC, ANSWER.size, name, status, 0, *_NO_JOINTS, math.nan, math.nan, b"")

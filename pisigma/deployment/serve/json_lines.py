@@ -49,6 +49,11 @@ _PLAIN = {"id", "model", "pose", *_NEAR, "brief"}
 _POSE = struct.Struct("<16d")
 
 _REACHING = frozenset(float(status) for status in Status if status.reaches)
+_NAMES: dict[bool, Callable[[ServedModel], dict[str, Any]]] = {
+    False: lambda model: {"model": model.name},
+    True: lambda model: {"sha256": model.short_hash.hex()},
+}
+"""What names the model in an answer; a brief one has only hexadecimal digits, which no simple parser misreads."""
 _encode = json.JSONEncoder(allow_nan=False, separators=(", ", ": ")).encode
 
 
@@ -162,7 +167,12 @@ class JsonLines(AbstractProtocol):
         model = self._models.find(request.get("model"))
         slow = not model.quick or task == "path" or read_flag(request, "accuracy")
         solve = {"pose": _solve, "path": _follow}.get(task, _forward)
-        return (lambda: solve(model, request)), slow
+
+        def with_name() -> tuple[str, dict[str, Any]]:
+            status, values = solve(model, request)
+            return status, values | _NAMES[read_flag(request, "brief")](model)
+
+        return with_name, slow
 
     def _question(self, request: dict[str, Any]) -> tuple[Callable[[], tuple[str, dict[str, Any]]], bool]:
         """Return the function that answers a question about the server, and whether it is slow.

@@ -1,10 +1,11 @@
 """Models of a server, which can be reloaded without dropping a request."""
 
+import contextlib
 import math
 import struct
 import sys
 import threading
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -13,6 +14,7 @@ import numpy as np
 
 from pisigma.files.errors import ModelError, PisigmaError, Place, RequestError, nearest_choice
 from pisigma.files.model_files import is_model, model_hash
+from pisigma.lifetime.cell.model_in_use import ModelInUse
 from pisigma.model.inverse.compiled_ik import CompiledIK
 from pisigma.model.inverse.corrected_ik import CorrectedIK, load
 from pisigma.model.inverse.solution import Solution
@@ -49,6 +51,11 @@ class ServedModel:
     def name(self) -> str:
         """Name of the model in requests: that of its folder."""
         return self.folder.name
+
+    @cached_property
+    def short_hash(self) -> bytes:
+        """The first eight bytes of `sha256`, which name the model in short answers."""
+        return bytes.fromhex(self.sha256)[:8]
 
     @cached_property
     def per_file_unit(self) -> list[float]:
@@ -142,20 +149,27 @@ class ServedModels:
         problems: with `within`, sentences on folders that could not be loaded and are not served.
     """
 
-    def __init__(self, folders: Iterable[Path], within: Path | None = None) -> None:
+    def __init__(
+        self, folders: Iterable[Path] = (), within: Path | None = None, cell: Path | None = None
+    ) -> None:
         """Load model folders.
 
         Args:
             folders: model folders.
             within: folder that is searched for further models on reload; damaged models in it are left out.
+            cell: cell whose model in use is served instead, also after a change; see `followed`.
 
         Raises:
             ModelError: a folder is not a complete model; with `within`, no folder is one.
         """
         self._within, self._lock = within, threading.Lock()
         self.problems: list[str] = []
+        self._models: Sequence[ServedModel] = ()
+        self._in_use = None if cell is None else ModelInUse(cell, self._replace)
+        if cell is not None:
+            return
         if within is None:
-            self._models: Sequence[ServedModel] = [ServedModel.read(folder) for folder in folders]
+            self._models = [ServedModel.read(folder) for folder in folders]
             return
         self._models = _loadable(folders, self.problems)
         if not self._models:
@@ -195,6 +209,9 @@ class ServedModels:
 
         A model that cannot be reloaded continues to answer as before.
         """
+        if self._in_use is not None:
+            self._in_use.check(always=True)
+            return [self._in_use.problem] if self._in_use.problem else []
         with self._lock:
             problems: list[str] = []
             models = [self._newest(model, problems) for model in self._models]
@@ -206,6 +223,26 @@ class ServedModels:
                 new = []
             self._models = models + _loadable([folder for folder in new if folder not in there], problems)
         return problems
+
+    @contextlib.contextmanager
+    def followed(self, report: Callable[[str], None]) -> Iterator[None]:
+        """Take over changes of the model in use of a cell, between requests, until the block ends.
+
+        Args:
+            report: function that is called with a sentence for every model that could not be loaded.
+        """
+        if self._in_use is not None:
+            self._in_use.follow(report)
+        yield
+        if self._in_use is not None:
+            self._in_use.stop()
+
+    def _replace(self, folder: Path) -> None:
+        """Answer all further requests with the model in a folder, if it is another one."""
+        if not (
+            self._models and (folder, model_hash(folder)) == (self._models[0].folder, self._models[0].sha256)
+        ):
+            self._models = [ServedModel.read(folder)]
 
     @staticmethod
     def _newest(model: ServedModel, problems: list[str]) -> ServedModel:

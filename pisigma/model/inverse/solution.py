@@ -19,6 +19,7 @@ if TYPE_CHECKING:  # a full name, which run-time type checkers resolve without t
 class AbstractInverse(ABC):
     """Interface of corrected inverse kinematics; for the attributes see `CorrectedIK`."""
 
+    name: str
     branches: tuple[str, ...]
     joints: tuple[str, ...]
     order: tuple[int, ...]
@@ -123,6 +124,11 @@ class Solution:
     def correction(self) -> Any:
         """`q - q_nominal` [rad or m]."""
         return self.q - self.q_nominal
+
+    @property
+    def model(self) -> str:
+        """Name of the model that was used; empty if it is not known."""
+        return "" if self.owner is None else self.owner.name
 
     @cached_property
     def accuracy(self) -> Any:

@@ -10,6 +10,7 @@ from testing.closeness import assert_close
 from testing.serving import client, frame_client
 
 import pisigma
+from pisigma.files.model_files import model_hash
 from pisigma.robot.kernels.array_kinematics import transform_of
 
 T = transform_of([0.8, 0.2, 0.6, 0.2, -1.4, 3.0])
@@ -36,7 +37,10 @@ def raw(served):
             stream.shutdown(socket.SHUT_WR)
             with stream.makefile("rb") as file:
                 received = file.read()
-        return [client.ANSWER.unpack_from(received, start) for start in range(0, len(received), 104)]
+        return [
+            client.ANSWER.unpack_from(received, start)
+            for start in range(0, len(received), client.ANSWER.size)
+        ]
 
     return exchange
 
@@ -49,6 +53,7 @@ def test_a_frame_is_answered_with_the_numbers_of_python(frames, repository, inde
     status, q, residuals = frames.solve(pose.ravel(), near, index)
     solution = ik(pose, near=near)
     assert status == solution.status
+    assert frames.sha256 == model_hash(repository / "models" / name)[:16]
     assert_close(q, solution.q)
     assert_close(residuals, [solution.position_residual, solution.rotation_residual])
     assert_close(frames.solve(pose.ravel(), model=index)[1], ik(pose).q)

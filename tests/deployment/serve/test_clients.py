@@ -109,7 +109,7 @@ def test_the_lines_that_they_send_are_requests(name, served):
     with json_client(served) as lines:
         request.pop("id")
         request["pose"] = POSE if len(request["pose"]) == 6 else request["pose"]
-        assert set(lines.ask(**request, model="kiro4")) == {"id", "q_deg", "status"}
+        assert set(lines.ask(**request, model="kiro4")) == {"id", "q_deg", "status", "sha256"}
 
 
 def test_the_channel_of_ethernetkrl_is_that_of_its_program():

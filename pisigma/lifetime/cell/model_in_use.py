@@ -1,0 +1,102 @@
+"""Follow which model of a cell is in use, in a background thread that looks for changes of the history."""
+
+import os
+import threading
+import time
+import weakref
+from collections.abc import Callable
+from pathlib import Path
+
+from pisigma.files.errors import PisigmaError
+from pisigma.lifetime.cell.history import HISTORY
+from pisigma.lifetime.cell.layout import model_folder
+
+INTERVAL = 0.1
+"""[s] Time between two looks at the history: one `os.stat` each."""
+SETTLED = 0.05
+"""[s] Age from which the time of a file's last change is unambiguous, as file systems round it."""
+
+
+class ModelInUse:
+    """The model in use of a cell.
+
+    The history is compared by `os.stat`: opening the file a second time would end SQLite's locks of this process.
+
+    Attributes:
+        cell: folder of the cell.
+        folder: folder of the model that was loaded last.
+        problem: why the model in use is not loaded; empty if it is.
+    """
+
+    def __init__(self, cell: Path, load: Callable[[Path], None]) -> None:
+        """Load the model in use.
+
+        Args:
+            cell: folder of the cell.
+            load: function that loads a model folder and replaces the model that answers. If it raises an error, the
+                model before continues to answer.
+
+        Raises:
+            ModelError: no model is in use, or it cannot be loaded.
+        """
+        self.cell, self._load, self.problem = cell, load, ""
+        self._lock, self._is_followed = threading.Lock(), False
+        self._seen = self._state()
+        self.folder = model_folder(cell)
+        load(self.folder)
+
+    def check(self, always: bool = False) -> None:
+        """Load the model in use if it is another one than before.
+
+        Args:
+            always: also load a model again that could not be loaded before, and the same model if it was changed.
+        """
+        with self._lock:
+            state = self._state()
+            if state == self._seen and not always:
+                return
+            is_settled = state is None or time.time_ns() - state[1] > SETTLED * 1e9
+            self._seen = state if is_settled else None
+            try:
+                folder = model_folder(self.cell)
+                if always or folder != self.folder:
+                    self._load(folder)
+                self.folder, self.problem = folder, ""
+            except (PisigmaError, OSError) as problem:
+                self.problem = str(problem)
+
+    def follow(self, report: Callable[[str], None] = lambda sentence: None) -> None:
+        """Look for changes in a background thread, until `stop` is called or this object is not used any more.
+
+        Args:
+            report: function that is called with a sentence for every model that cannot be loaded.
+        """
+        self._is_followed = True
+        threading.Thread(target=_follow, args=(weakref.ref(self), report), daemon=True).start()
+
+    def stop(self) -> None:
+        """Stop looking for changes."""
+        self._is_followed = False
+
+    def _state(self) -> tuple[int, int, int] | None:
+        """Return what changes with every change of the history; None without a history."""
+        try:
+            found = os.stat(self.cell / HISTORY)
+        except OSError:
+            return None
+        return found.st_ino, found.st_mtime_ns, found.st_size
+
+
+def _follow(followed: "weakref.ref[ModelInUse]", report: Callable[[str], None]) -> None:
+    """Check for changes until the object is stopped or deleted."""
+    reported = ""
+    while True:
+        time.sleep(INTERVAL)
+        model = followed()
+        if model is None or not model._is_followed:
+            return
+        model.check()
+        if model.problem and model.problem != reported:
+            report(model.problem)
+        reported = model.problem
+        del model

@@ -1,0 +1,91 @@
+"""The model in use of a cell is followed: a change is taken over, and a model that cannot be loaded is reported."""
+
+import time
+
+import pytest
+from testing.cell_models import FIRST, SECOND, cell_of_two_models, put_into_use
+from testing.refusals import refused
+
+from pisigma.files.errors import ModelError
+from pisigma.lifetime.cell import model_in_use
+from pisigma.lifetime.cell.model_in_use import ModelInUse
+
+
+@pytest.fixture
+def cell(tmp_path):
+    return cell_of_two_models(tmp_path / "cell")
+
+
+@pytest.fixture
+def loads(cell):
+    """The names of the models that were loaded, the model in use, and what happens while a model is loaded."""
+    names, problems = [], {}
+
+    def load(folder):
+        if folder.name in problems:
+            raise problems[folder.name]
+        names.append(folder.name)
+
+    return names, ModelInUse(cell.folder, load), problems
+
+
+def test_a_change_is_loaded_once(cell, loads):
+    names, in_use, _ = loads
+    in_use.check()
+    put_into_use(cell, SECOND)
+    in_use.check()
+    in_use.check()
+    assert names == [FIRST, SECOND]
+    cell.undo_use("")
+    in_use.check()
+    assert names == [FIRST, SECOND, FIRST]
+
+
+def test_nothing_is_read_while_the_history_does_not_change(cell, loads, monkeypatch):
+    _, in_use, _ = loads
+    time.sleep(2 * model_in_use.SETTLED)
+    in_use.check()
+    monkeypatch.setattr(model_in_use, "model_folder", None)
+    in_use.check()
+
+
+def test_two_changes_within_the_rounding_of_file_times_are_both_seen(cell, loads, monkeypatch):
+    names, in_use, _ = loads
+    put_into_use(cell, SECOND)
+    in_use.check()
+    same = in_use._state()
+    monkeypatch.setattr(ModelInUse, "_state", lambda self: same)
+    put_into_use(cell, FIRST)
+    in_use.check()
+    assert names == [FIRST, SECOND, FIRST]
+
+
+def test_a_model_that_cannot_be_loaded_leaves_the_one_before(cell, loads):
+    names, in_use, problems = loads
+    problems[SECOND] = ModelError("damaged", option=SECOND)
+    reports = []
+    in_use.follow(reports.append)
+    put_into_use(cell, SECOND)
+    until(lambda: reports)
+    time.sleep(3 * model_in_use.INTERVAL)
+    assert (len(reports), names, in_use.folder.name) == (1, [FIRST], FIRST)
+    problems.clear()
+    in_use.check(always=True)
+    assert (names, in_use.problem) == ([FIRST, SECOND], "")
+    in_use.stop()
+
+
+def test_a_cell_without_a_model_in_use_is_refused_at_first_and_reported_later(cell, loads):
+    _, in_use, _ = loads
+    put_into_use(cell, "")
+    in_use.check()
+    assert (in_use.folder.name, bool(in_use.problem)) == (FIRST, True)
+    with refused(ModelError, file=cell.folder):
+        ModelInUse(cell.folder, lambda folder: None)
+
+
+def until(happened, seconds=10.0):
+    end = time.monotonic() + seconds
+    while not happened():
+        assert time.monotonic() < end
+        time.sleep(0.01)
