@@ -49,11 +49,8 @@ _PLAIN = {"id", "model", "pose", *_NEAR, "brief"}
 _POSE = struct.Struct("<16d")
 
 _REACHING = frozenset(float(status) for status in Status if status.reaches)
-_NAMES: dict[bool, Callable[[ServedModel], dict[str, Any]]] = {
-    False: lambda model: {"model": model.name},
-    True: lambda model: {"sha256": model.short_hash.hex()},
-}
-"""What names the model in an answer; a brief one has only hexadecimal digits, which no simple parser misreads."""
+_Job = Callable[[], tuple[str, dict[str, Any]]]
+"""A function that computes status and values of an answer."""
 _encode = json.JSONEncoder(allow_nan=False, separators=(", ", ": ")).encode
 
 
@@ -112,12 +109,12 @@ class JsonLines(AbstractProtocol):
         request: dict[str, Any] = {}
         try:
             request = _read(message)
-            job, slow = self._job(request)
+            job, slow, names = self._job(request)
         except (PisigmaError, ValueError, RecursionError) as problem:
             return self._refuse(request, problem, begun)
         if slow:
-            return lambda: self._carry_out(request, job, begun)
-        return self._carry_out(request, job, begun)
+            return lambda: self._carry_out(request, job, names, begun)
+        return self._carry_out(request, job, names, begun)
 
     def broken(self) -> bytes:
         """Return the answer to bytes that are not a line."""
@@ -146,8 +143,8 @@ class JsonLines(AbstractProtocol):
         )
         return _line({"id": None, "error": str(problem)})
 
-    def _job(self, request: dict[str, Any]) -> tuple[Callable[[], tuple[str, dict[str, Any]]], bool]:
-        """Return the function that computes status and values of an answer, and whether it is slow.
+    def _job(self, request: dict[str, Any]) -> tuple[_Job, bool, dict[str, str]]:
+        """Return the function that computes an answer, whether it is slow, and what names its model in the answer.
 
         Raises:
             RequestError: the request is invalid.
@@ -163,18 +160,14 @@ class JsonLines(AbstractProtocol):
                 remedy=nearest_choice(key, _KEYS[task]),
             )
         if task == "ask":
-            return self._question(request)
+            return *self._question(request), {}
         model = self._models.find(request.get("model"))
         slow = not model.quick or task == "path" or read_flag(request, "accuracy")
         solve = {"pose": _solve, "path": _follow}.get(task, _forward)
+        names = model.short_name if request.get("brief") else model.whole_name
+        return (lambda: solve(model, request)), slow, names
 
-        def with_name() -> tuple[str, dict[str, Any]]:
-            status, values = solve(model, request)
-            return status, values | _NAMES[read_flag(request, "brief")](model)
-
-        return with_name, slow
-
-    def _question(self, request: dict[str, Any]) -> tuple[Callable[[], tuple[str, dict[str, Any]]], bool]:
+    def _question(self, request: dict[str, Any]) -> tuple[_Job, bool]:
         """Return the function that answers a question about the server, and whether it is slow.
 
         Raises:
@@ -189,12 +182,10 @@ class JsonLines(AbstractProtocol):
             return (lambda: ("models", {"models": records})), False
         return (lambda: ("reload", {"problems": self._models.reload(), "models": len(self._models)})), True
 
-    def _carry_out(
-        self, request: dict[str, Any], job: Callable[[], tuple[str, dict[str, Any]]], begun: int
-    ) -> bytes:
+    def _carry_out(self, request: dict[str, Any], job: _Job, names: dict[str, str], begun: int) -> bytes:
         try:
             status, values = job()
-            reply = _line({"id": request.get("id"), **values})
+            reply = _line({"id": request.get("id"), **values, **names})
         except Exception as problem:
             return self._refuse(request, problem, begun)
         self._metrics.count(status, begun)

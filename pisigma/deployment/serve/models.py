@@ -54,8 +54,18 @@ class ServedModel:
 
     @cached_property
     def short_hash(self) -> bytes:
-        """The first eight bytes of `sha256`, which name the model in short answers."""
+        """The first eight bytes of `sha256`, which name the model in frames."""
         return bytes.fromhex(self.sha256)[:8]
+
+    @cached_property
+    def whole_name(self) -> dict[str, str]:
+        """What names the model in answers."""
+        return {"model": self.name}
+
+    @cached_property
+    def short_name(self) -> dict[str, str]:
+        """What names the model in brief answers: hexadecimal digits, which no simple parser takes for a status."""
+        return {"sha256": self.short_hash.hex()}
 
     @cached_property
     def per_file_unit(self) -> list[float]:
