@@ -18,7 +18,7 @@ from pisigma.cli.main import app
 
 REPOSITORY = Path(__file__).parents[2]
 ELSEWHERE = {("train", "--resume"): "tests/cli/test_train_interruption.py"} | dict.fromkeys(
-    (("status", "--watch"), ("use", "--reason"), ("use", "--json"), ("verify", "--model")),
+    (("status", "--watch"), ("verify", "--model")),
     "tests/cli/test_cell_commands.py",
 )
 """Options that need a test of their own, and where it is."""
