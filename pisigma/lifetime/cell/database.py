@@ -191,5 +191,6 @@ def _column(attribute: "Field[Any]") -> str:
     declared = f"{attribute.name} {_SQL_TYPES.get(attribute.type, _SQL_TYPES[str])}"
     if attribute.default in (MISSING, None):
         return declared
-    value = str(attribute.default).replace("'", "''")
+    default = int(attribute.default) if attribute.type is bool else attribute.default
+    value = str(default).replace("'", "''")
     return f"{declared} DEFAULT '{value}'"
