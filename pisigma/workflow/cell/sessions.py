@@ -106,20 +106,18 @@ class Sessions:
         if not is_date(day):
             raise MeasurementError(expected=EXPECTED_DATE, value=day, option="--date")
         entry = self._judged(rows, day, accept_implausible)
+        inside: Path | None = None
         if isinstance(file, Measurements):
             with tempfile.TemporaryDirectory() as scratch:
                 file.write_csv(Path(scratch) / "rows.csv", self.robot)
                 content = (Path(scratch) / "rows.csv").read_bytes()
         else:
             content = Path(file).read_bytes()
-        is_inside = (
-            not isinstance(file, Measurements) and Path(file).parent.resolve() == self.folder.resolve()
-        )
-        names = {one.name for one in self.history.sessions()}
-        path = Path(file) if is_inside else write_new(self.folder, day, content, names)
+            inside = Path(file) if Path(file).parent.resolve() == self.folder.resolve() else None
+        path = inside or write_new(self.folder, day, content, {one.name for one in self.history.sessions()})
         entry = replace(entry, name=path.stem, sha256=hashlib.sha256(content).hexdigest())
         if not self.history.add_session(entry):  # another process was faster
-            if not is_inside:
+            if inside is None:
                 path.unlink()
             raise _known(rows)
         return entry
