@@ -10,7 +10,7 @@ PICTURE = re.compile(r"^!\[[^\]]*\]\([^)]*\)\n\n(?:\*[^*]+\*\n\n)?", re.MULTILIN
 """A picture on a line of its own, with the caption below it."""
 
 LINK = re.compile(r"\[([^\]]+)\]\((?!https?://|#)[^)]+\)")
-"""A link to a file beside the README."""
+"""A link to a file in the folder of the README."""
 
 MARK = re.compile(r"<!--.*?-->\n", re.DOTALL)
 

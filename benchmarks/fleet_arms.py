@@ -59,7 +59,7 @@ class Fleet:
     kind: Any = "position"
 
     @cached_property
-    def drawn(self) -> Robot:
+    def nominal(self) -> Robot:
         """Return the nominal robot."""
         with TemporaryDirectory() as folder:
             with contextlib.chdir(folder):
@@ -94,7 +94,7 @@ class Fleet:
 
     def alone(self, rows: Measurements) -> Any:
         """Return the calibration of an arm without a prior."""
-        return calibrate(self.drawn, rows, CalibrationSettings(folds=0)).result
+        return calibrate(self.nominal, rows, CalibrationSettings(folds=0)).result
 
     def planned(self, prior: CalibratedModel, count: int) -> np.ndarray:
         """Return poses [rad] chosen for the remaining uncertainty of the prior."""
@@ -150,7 +150,7 @@ class Fleet:
         """Return errors after 10 poses with the prior, 10 planned ones, 10 and 30 without, and 30 with it [mm]."""
         arms = [self.arm(number) for number in range(robots)]
         rows = [self.rows(arm, arm.sample(60, number), number) for number, arm in enumerate(arms)]
-        prior = fleet_prior("fleet", self.drawn, rows).model
+        prior = fleet_prior("fleet", self.nominal, rows).model
         chosen, figures = self.planned(prior, 10), []
         for number in range(500, 500 + judged):
             arm = self.arm(number)

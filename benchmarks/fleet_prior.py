@@ -16,7 +16,7 @@ import torch
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
-from testing.fleet_robots import DRAWN, GEARS, NOISE, common_errors, common_gears, rows_of
+from testing.fleet_robots import GEARS, NOISE, NOMINAL, common_errors, common_gears, rows_of
 
 from pisigma.estimation.population import Population
 from pisigma.lifetime.fleet.prior import FleetPrior, fleet_prior, mean_robot
@@ -43,7 +43,7 @@ def rms(predicts: Any, test: Measurements) -> float:
 
 def true_prior(individual: float, gears: float) -> CalibratedModel:
     """Return the distribution that the robots are drawn from, as a prior."""
-    posterior = RobotPosterior.of_robot(DRAWN)
+    posterior = RobotPosterior.of_robot(NOMINAL)
     size = posterior.uncertainty.space.arm_size
     means, deviations = [common_errors().flatten()], [torch.full((size,), individual, dtype=torch.float64)]
     for feature in posterior.uncertainty.features:
@@ -70,7 +70,7 @@ def begun_with(prior: CalibratedModel, rows: Measurements) -> Adaptation:
 
 def alone(rows: Measurements) -> Any:
     """Return the calibration of a robot without a prior."""
-    return calibrate(DRAWN, rows, CalibrationSettings(folds=0)).result
+    return calibrate(NOMINAL, rows, CalibrationSettings(folds=0)).result
 
 
 def fleet_table(fleets: int, robots: int, odd: int, judged: int) -> FleetPrior:
@@ -79,7 +79,7 @@ def fleet_table(fleets: int, robots: int, odd: int, judged: int) -> FleetPrior:
     priors = []
     for individual, gears in FLEETS[:fleets]:
         drawn = partial(rows_of, individual=individual, individual_gears=gears)
-        prior = fleet_prior("fleet", DRAWN, [drawn(k, 60, k, odd=k >= robots - odd) for k in range(robots)])
+        prior = fleet_prior("fleet", NOMINAL, [drawn(k, 60, k, odd=k >= robots - odd) for k in range(robots)])
         exact, figures = true_prior(individual, gears), []
         for number in range(500, 500 + judged):
             test = drawn(number, 400, 9000 + number, noise=0.0)

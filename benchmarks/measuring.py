@@ -46,7 +46,7 @@ def alarms(names: list[str], seeds: range) -> None:
                     began = time.perf_counter()
                     some = changed.select(torch.arange(row + 1))
                     known = torch.cat([trusted, torch.tensor([False])])
-                    trusted = judge_rows(arm.drawn, some, NOISE, known).counts
+                    trusted = judge_rows(arm.nominal, some, NOISE, known).counts
                     at_once.append(not bool(trusted[row]))
                     slowest = max(slowest, time.perf_counter() - began)
                 wrong += [(row, at_once[row], not bool(trusted[row])) for row in at]
@@ -92,7 +92,7 @@ def sessions(names: list[str], seeds: range) -> None:
             errors[how].append(p95)
             seconds = time.perf_counter() - began
             print(
-                f"{arm.drawn.name} {seed} {how:8s} {count:3d} poses, 95 % {p95:.3f} mm, {seconds:.0f} s",
+                f"{arm.nominal.name} {seed} {how:8s} {count:3d} poses, 95 % {p95:.3f} mm, {seconds:.0f} s",
                 flush=True,
             )
     for how in POSES:
@@ -134,7 +134,7 @@ def session(arm: Arm, how: str) -> tuple[int, float]:
             measuring.update()
     rows = measuring.rows
     assert rows is not None
-    errors = fit_where_it_helps(HybridCalibrator(arm.drawn), rows, lambda what: None).errors_of(arm.test)
+    errors = fit_where_it_helps(HybridCalibrator(arm.nominal), rows, lambda what: None).errors_of(arm.test)
     return rows.rows, float(errors["position"].norm(dim=1).quantile(0.95)) * 1e3
 
 

@@ -125,8 +125,8 @@ class Arm:
         with TemporaryDirectory() as folder:
             with contextlib.chdir(folder):
                 sim.write_urdf(name)
-            self.drawn = Robot.load(f"{folder}/{name}.urdf")
-        self.planned = self.drawn.with_geometry(tool=np.array([*self.true.tool, 0.0, 0.0, 0.0]))
+            self.nominal = Robot.load(f"{folder}/{name}.urdf")
+        self.planned = self.nominal.with_geometry(tool=np.array([*self.true.tool, 0.0, 0.0, 0.0]))
         self.seed = seed
         joints = torch.from_numpy(self.true.sample(400, 2000 + seed))
         self.test = self.rows(joints, 0.0)
@@ -143,7 +143,7 @@ class Arm:
 
     def figures(self, q: Tensor, posterior: RobotPosterior) -> Figures:
         """Return the result for measured poses."""
-        result = fit_where_it_helps(HybridCalibrator(self.drawn), self.rows(q), lambda what: None)
+        result = fit_where_it_helps(HybridCalibrator(self.nominal), self.rows(q), lambda what: None)
         assert isinstance(result, HybridResult)
         both = posterior.informed(q), RobotPosterior.of_result(result, posterior.instrument)
         return Figures(rms_mm(result, self.test), *(rms_of(one.tool(self.test.q)) * 1e3 for one in both))

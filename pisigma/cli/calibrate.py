@@ -94,7 +94,7 @@ def calibrate(
         settings.check_unused()
         again = RecalibrationSettings(cameras=settings.cameras)
         return recalibrate_into(
-            context, prior, data, again, out, accept_implausible, overwrite, as_json, verbose, drawn=nominal
+            context, prior, data, again, out, accept_implausible, overwrite, as_json, verbose, nominal=nominal
         )
     with progress_of("calibrate") as progress:
         calibration = workflow.calibrate(nominal, data, settings, progress)

@@ -56,7 +56,7 @@ class Splitting:
         Args:
             measurements: the rows.
             times: see `repeats`.
-            train_rows: number of training rows that are drawn in every fold; None for all.
+            train_rows: number of training rows that are sampled in every fold; None for all.
 
         Raises:
             MeasurementError: the measurements cannot be split in this way.
@@ -206,8 +206,8 @@ def holdout(
     return _train_test(measurements, is_test[group] & (group >= 0))
 
 
-def draw_rows(measurements: Measurements, rows: int, seed: int) -> Int64[Tensor, " _drawn"]:
-    """Draw rows at random; those of equal joint values, or of a pair, are drawn together.
+def draw_rows(measurements: Measurements, rows: int, seed: int) -> Int64[Tensor, " _sampled"]:
+    """Draw rows at random; those of equal joint values, or of a pair, are sampled together.
 
     With the same seed, a smaller draw is a subset of every larger one.
 

@@ -128,7 +128,7 @@ class CalibratedModel:
         return self.calibrated or self.robot if self.hybrid is None else self.hybrid.robot
 
     @property
-    def drawn(self) -> Robot | None:
+    def nominal(self) -> Robot | None:
         """Nominal robot with its own base and tool; None if the model does not come from a hybrid calibration."""
         if self.hybrid is not None:
             return self.hybrid.correction.robot

@@ -99,8 +99,12 @@ def describe(model: CalibratedModel) -> tuple[arrays.Description, tuple[str, ...
 
 def _arms(model: CalibratedModel) -> arrays.Arms:
     nominal, hybrid = model.robot, model.hybrid
-    drawn = nominal if hybrid is None else hybrid.correction.robot
-    arms = (nominal, model.identified, drawn)  # in the order NOMINAL, IDENTIFIED, DRAWN
+    of_correction = nominal if hybrid is None else hybrid.correction.robot
+    arms = (
+        nominal,
+        model.identified,
+        of_correction,
+    )  # in the order NOMINAL, IDENTIFIED, NOMINAL_WITHOUT_BASE
     return arrays.Arms(
         kind=np.array([KINDS[row.type] for row in nominal.rows]),
         rows=np.stack([arm_rows(arm) for arm in arms]),

@@ -47,8 +47,8 @@ class Domain(nn.Module):
     def around(scaled: Float[Tensor, "rows inputs"], generator: torch.Generator) -> "Domain":
         """Make the region around training rows, of which at most `MAX_SAMPLES`, drawn at random, are kept."""
         if scaled.shape[0] > MAX_SAMPLES:
-            drawn = torch.randperm(scaled.shape[0], generator=generator)[:MAX_SAMPLES]
-            scaled = scaled[drawn.to(scaled.device)]
+            sampled = torch.randperm(scaled.shape[0], generator=generator)[:MAX_SAMPLES]
+            scaled = scaled[sampled.to(scaled.device)]
         distances = _distances(scaled, scaled)
         nearest = torch.where(distances > REPEAT, distances, torch.inf).amin(-1)
         spacing = torch.where(torch.isfinite(nearest), nearest, REPEAT).amax()

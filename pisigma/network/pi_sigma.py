@@ -116,8 +116,8 @@ class PiSigma(nn.Module):
 
 def draw_uniform(like: Tensor, spread: float, generator: torch.Generator) -> Tensor:
     """Draw uniform numbers in ±spread of the shape of `like`, in float64 so that they are the same for every dtype."""
-    drawn = torch.rand(like.shape, generator=generator, dtype=torch.float64, device=generator.device)
-    return (spread * (2 * drawn - 1)).to(like)
+    uniform = torch.rand(like.shape, generator=generator, dtype=torch.float64, device=generator.device)
+    return (spread * (2 * uniform - 1)).to(like)
 
 
 def weigh_sums(

@@ -69,7 +69,7 @@ class BoardViews:
         uniform. An arm without a closed form, or with fewer than six joints, comes as near to a view as the numeric
         inverse kinematics does from random joint values.
         """
-        T_board = self._drawn_boards(count, generator)
+        T_board = self._sampled_boards(count, generator)
         T_frame_target = T_board if self.sight.is_fixed else invert(T_board)
         T = self.T_cell_frame @ T_frame_target
         solver = closed_form_solver(arm.robot) if arm.robot.dof == FULL_POSE_DOF else None
@@ -106,7 +106,7 @@ class BoardViews:
         room = torch.minimum(pixels, edge - pixels).amin(-1) * points[..., 2] / self.sight.camera.fx
         return room.amin(1)
 
-    def _drawn_boards(self, count: int, generator: torch.Generator) -> Float64[Tensor, "count 4 4"]:
+    def _sampled_boards(self, count: int, generator: torch.Generator) -> Float64[Tensor, "count 4 4"]:
         """Return T_camera_board of random views [m]."""
         camera = self.sight.camera
         draws = torch.rand(count, 6, generator=generator, dtype=torch.float64)

@@ -101,7 +101,7 @@ def draw_candidates(
         PlanningError: a prismatic joint has no limits.
     """
     generator = torch.Generator().manual_seed(seed)
-    limits = None if views is not None else _drawn_range(arm)
+    limits = None if views is not None else _sampled_range(arm)
     blocks: list[tuple[Tensor, Faults]] = []
     while len(blocks) < MAX_DRAWS and sum(int(faults.allowed.sum()) for _, faults in blocks) < count:
         if views is not None:
@@ -111,7 +111,7 @@ def draw_candidates(
             draws = torch.rand(count, len(limits), generator=generator, dtype=torch.float64)
             q = arm.robot.to_dh(limits[:, 0] + (limits[:, 1] - limits[:, 0]) * draws)
         blocks.append((q, _faults(arm, q, workspace, views)))
-    q = torch.cat([drawn for drawn, _ in blocks])
+    q = torch.cat([sampled for sampled, _ in blocks])
     faults = Faults(blocks[0][1].reasons, torch.cat([one.failed for _, one in blocks]))
     enough = int((faults.allowed.cumsum(0) < count).sum()) + 1  # poses up to the last one that is needed
     candidates = _allowed(q[:enough], replace(faults, failed=faults.failed[:enough]))
@@ -229,7 +229,7 @@ def _allowed(q: Float64[Tensor, "poses dof"], faults: Faults) -> Candidates:
     return Candidates(allowed, faults.allowed.nonzero()[:, 0] + 1, len(q), faults.counts(), allowed)
 
 
-def _drawn_range(arm: ArmInSurroundings) -> Float64[Tensor, "axes 2"]:
+def _sampled_range(arm: ArmInSurroundings) -> Float64[Tensor, "axes 2"]:
     """Return the range of the controller's values that are drawn [rad or m]."""
     limits = arm.limits.clone()
     for index, (joint, (lower, upper)) in enumerate(zip(arm.robot.axes, arm.limits.tolist(), strict=True)):

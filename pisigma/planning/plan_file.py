@@ -138,7 +138,7 @@ class StoredPlan:
         document["cell"] = self.arm.cell.model_dump(mode="json", exclude_none=True)
         points = zip(self.numbers, map(self._in_file_units, self.way_points), strict=True)
         document["way_points"] = [{"before": n, "joints": joints} for n, rows in points for joints in rows]
-        return document | {"robot": robot_document(self.arm.drawn)}
+        return document | {"robot": robot_document(self.arm.nominal)}
 
 
 def joint_columns(robot: Robot) -> list[str]:

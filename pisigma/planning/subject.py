@@ -70,13 +70,13 @@ class Subject:
             if not Path(subject).is_dir():
                 return Subject(Robot.load(subject, base, tip))
             return replace(Subject.load(load_model(Path(subject))), folder=Path(subject))
-        if subject.drawn is None:
+        if subject.nominal is None:
             raise PlanningError(
                 f"model '{subject.name}' does not keep the nominal robot",
                 value=subject.name,
                 remedy="plan for its robot instead",
             )
-        return Subject(subject.drawn, subject)
+        return Subject(subject.nominal, subject)
 
     def arm(self, cell: Surroundings | None) -> ArmInSurroundings:
         """Return the robot in its cell, with target and board as the cell states them, else as in the model."""
@@ -124,8 +124,8 @@ class Subject:
 
         A model that was calibrated with another board, camera or sensor does not determine the pose of these.
         """
-        instrument, drawn = instrument_of(settings), torch.tensor(arm.drawn.base)
-        base = xyzrpy_from_transform(invert(views.T_cell_frame) @ transform_from_xyzrpy(drawn)).numpy()
+        instrument, nominal_base = instrument_of(settings), torch.tensor(arm.nominal.base)
+        base = xyzrpy_from_transform(invert(views.T_cell_frame) @ transform_from_xyzrpy(nominal_base)).numpy()
         tool = arm.robot.tool
         if self.model is None:
             robot = arm.robot.with_geometry(base=_regular(base), tool=_regular(tool))
@@ -144,10 +144,10 @@ class Subject:
     def _from_cell(self) -> Float64[Tensor, "4 4"]:
         """Return the frame of the cell (the nominal robot's base) in the frame of the model's poses [m]."""
         assert self.model is not None
-        drawn, fitted = (
+        nominal_base, fitted = (
             transform_from_xyzrpy(torch.tensor(robot.base)) for robot in (self.robot, self.model.identified)
         )
-        return fitted @ invert(drawn)
+        return fitted @ invert(nominal_base)
 
 
 def _is_same(one: Float64[np.ndarray, " 6"], other: Float64[np.ndarray, " 6"]) -> bool:

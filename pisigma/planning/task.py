@@ -48,8 +48,8 @@ def task_poses(
         PlanningError: a pose cannot be reached; the message names its line.
     """
     if settings.task is not None:
-        drawn = CalibratedModel(arm.drawn.name, "as drawn", arm.drawn, None, None, (), q[:STARTS])
-        q = read_task(settings.task, model or drawn)
+        nominal = CalibratedModel(arm.nominal.name, "nominal", arm.nominal, None, None, (), q[:STARTS])
+        q = read_task(settings.task, model or nominal)
     return q[torch.linspace(0, len(q) - 1, min(len(q), TASK_POSES)).round().long()]
 
 

@@ -62,19 +62,21 @@ def pendant_poses(
     Raises:
         RobotError: the robot cannot be read.
     """
-    drawn = robot if isinstance(robot, Robot) else Robot.load(robot, base, tip)
-    count, (lower, upper) = len(drawn.axes), drawn.axis_limits.T
+    nominal = robot if isinstance(robot, Robot) else Robot.load(robot, base, tip)
+    count, (lower, upper) = len(nominal.axes), nominal.axis_limits.T
     values = np.zeros((count + 1, count))
-    for index, axis in enumerate(drawn.axes):
+    for index, axis in enumerate(nominal.axes):
         step = ROTATION if axis.type == "revolute" else STROKE
         ends = min(step, upper[index]), max(-step, lower[index])
         values[index + 1, index] = ends[0] if abs(ends[0]) >= abs(ends[1]) else ends[1]
     inside = ((values >= lower) & (values <= upper)).all(1)
-    if drawn.coupling is not None:
-        inside &= drawn.coupling.is_inside(drawn.coupling.to_dh(values))
-    moved = zip((None, *drawn.axes), (0.0, *values[1:].diagonal()), drawn.to_dh(values), inside, strict=True)
+    if nominal.coupling is not None:
+        inside &= nominal.coupling.is_inside(nominal.coupling.to_dh(values))
+    moved = zip(
+        (None, *nominal.axes), (0.0, *values[1:].diagonal()), nominal.to_dh(values), inside, strict=True
+    )
     return tuple(
-        PendantPose(axis, float(value), xyzrpy_of(_tool(drawn, joints)), bool(allowed))
+        PendantPose(axis, float(value), xyzrpy_of(_tool(nominal, joints)), bool(allowed))
         for axis, value, joints, allowed in moved
     )
 

@@ -73,8 +73,8 @@ class RowSection(ParameterSection):
         else:
             lower, upper = -np.inf, np.inf
         x, y, z = self.drawn_at_mm
-        drawn_at = x / 1e3, y / 1e3, z / 1e3
-        return Row(self.name, self.type, self.direction, float(lower), float(upper), drawn_at)
+        urdf_origin = x / 1e3, y / 1e3, z / 1e3
+        return Row(self.name, self.type, self.direction, float(lower), float(upper), urdf_origin)
 
 
 class FrameSection(Section):

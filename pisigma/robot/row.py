@@ -55,7 +55,7 @@ class Row:
         direction: +1 or -1, the sign of the controller's values; the joint moves by `direction · q`.
         lower: smallest joint value [rad or m], with the sign of the controller; -inf without a limit.
         upper: largest joint value [rad or m].
-        drawn_at: position of the joint's origin in a URDF file, in the frame before the row [m]; the motion does not
+        urdf_origin: position of the joint's origin in a URDF file, in the frame before the row [m]; the motion does not
             depend on it.
     """
 
@@ -64,7 +64,7 @@ class Row:
     direction: int = 1
     lower: float = -np.inf
     upper: float = np.inf
-    drawn_at: tuple[float, float, float] = field(default=(0.0, 0.0, 0.0), compare=False)
+    urdf_origin: tuple[float, float, float] = field(default=(0.0, 0.0, 0.0), compare=False)
 
     @property
     def file_unit(self) -> str:

@@ -76,7 +76,7 @@ def rows_of_chain(chain: Chain, nearly_parallel: float = NEARLY_PARALLEL) -> Cha
     T_row_tip = inverse(frames[-1]) @ chain.end
     dh.append(_last_row(T_row_tip))
     rows = [
-        Row(j.name, j.type, _direction(j), j.lower, j.upper, _drawn_at(frame))
+        Row(j.name, j.type, _direction(j), j.lower, j.upper, _urdf_origin(frame))
         for j, frame in zip(joints, frames, strict=True)
     ]
     coupled_rows, coupling = coupled(rows, _mimics(joints, rows))
@@ -109,7 +109,7 @@ def _mimics(joints: tuple[ChainJoint, ...], rows: list[Row]) -> list[CoupledJoin
     return sections
 
 
-def _drawn_at(frame: Frame) -> tuple[float, float, float]:
+def _urdf_origin(frame: Frame) -> tuple[float, float, float]:
     """Return the position of a joint's origin [m] in the frame of its row; `frame` is the inverse pose."""
     x, y, z = (clean_length(value) for value in inverse(frame)[:3, 3])
     return x, y, z

@@ -37,7 +37,7 @@ def robot_document(robot: Robot) -> dict[str, object]:
         # Files contain the limits of the controller's values, of which a passive joint has none.
         row = axes.get(joint.name, replace(joint, lower=-np.inf, upper=np.inf))
         entry: dict[str, object] = {"name": row.name, "type": row.type, "direction": row.direction}
-        entry |= {"drawn_at_mm": [value * 1e3 for value in row.drawn_at]} if any(row.drawn_at) else {}
+        entry |= {"drawn_at_mm": [value * 1e3 for value in row.urdf_origin]} if any(row.urdf_origin) else {}
         rows.append(entry | _limits_entry(row) | in_file_units(DH_COLUMNS, parameters))
     document: dict[str, object] = {
         "name": robot.name,

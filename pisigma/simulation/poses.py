@@ -105,15 +105,15 @@ class JointsRandom(Section):
         bounds = torch.from_numpy(self._bounds(robot))
         generator = torch.Generator().manual_seed(self.seed)
 
-        def drawn() -> Tensor:
+        def sample() -> Tensor:
             draws = torch.rand(self.count, len(bounds), generator=generator, dtype=torch.float64)
             q: Tensor = robot.to_dh(bounds[:, 0] + (bounds[:, 1] - bounds[:, 0]) * draws)
             return q
 
-        q = drawn()
+        q = sample()
         if robot.coupling is None or not robot.coupling.stops:
             return q
-        many = torch.cat([q] + [drawn() for _ in range(EXTRA_DRAWS)])
+        many = torch.cat([q] + [sample() for _ in range(EXTRA_DRAWS)])
         kept = many[torch.from_numpy(robot.coupling.is_inside(many.numpy()))]
         if len(kept) < self.count:
             raise RecipeError(

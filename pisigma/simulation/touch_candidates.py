@@ -78,7 +78,7 @@ def check_names(placements: Sequence[JigPlacement]) -> None:
 
 MAX_DRAWS = 20
 """Number of draws after which the search for candidates fails."""
-DRAWN = 8192
+CANDIDATES_PER_DRAW = 8192
 """Number of candidates per draw."""
 MAX_ITERATIONS = 10
 """Iterations of the numeric inverse kinematics to an end of the travel; it needs about five."""
@@ -208,8 +208,8 @@ class TouchCandidatesSection(Section):
         share = {axis: (self.count + len(axes) - 1 - place) // len(axes) for place, axis in enumerate(axes)}
         parts: list[TouchCandidates] = []
         for _ in range(MAX_DRAWS):
-            drawn = self._draw(jig, placement.name, robot.dof, generator)
-            parts.append(self._reachable(robot, jig, placement, drawn))
+            sampled = self._draw(jig, placement.name, robot.dof, generator)
+            parts.append(self._reachable(robot, jig, placement, sampled))
             reachable = TouchCandidates.joined(parts)
             of_axis = {axis: (reachable.axis == axis).nonzero()[:, 0] for axis in axes}
             if all(len(of_axis[axis]) >= share[axis] for axis in axes):
@@ -220,14 +220,14 @@ class TouchCandidatesSection(Section):
         raise RecipeError(
             option="touches",
             expected=f"{share[lacking]} touches of robot '{robot.name}' along {'xyz'[lacking]} of jig "
-            f"'{placement.name}' (of {MAX_DRAWS * DRAWN} drawn)",
+            f"'{placement.name}' (of {MAX_DRAWS * CANDIDATES_PER_DRAW} drawn)",
             value=len(of_axis[lacking]),
             remedy="place the jig nearer, allow more tilt, choose a smaller margin, travel or shaft, or another branch",
         )
 
     def _draw(self, jig: Jig, name: str, dof: int, generator: torch.Generator) -> TouchCandidates:
         """Draw faces, points and torches that are clear of the jig, reachable or not."""
-        u = torch.rand(DRAWN, 7, generator=generator, dtype=torch.float64)
+        u = torch.rand(CANDIDATES_PER_DRAW, 7, generator=generator, dtype=torch.float64)
         face = _draw_faces(jig, u[:, 0])
         lower, upper = (bound[face] for bound in jig.extent)
         point = lower + (upper - lower) * u[:, 1:4]
@@ -237,7 +237,7 @@ class TouchCandidatesSection(Section):
         zero = torch.zeros_like(tilt)
         R = rotation_from_rpy(torch.stack([azimuth, tilt, zero], -1))
         R = R @ rotation_from_rpy(torch.stack([about_wire, zero, zero + torch.pi], -1))
-        drawn = TouchCandidates(
+        sampled = TouchCandidates(
             placements=(name,),
             placement=torch.zeros_like(face),
             face=face,
@@ -245,39 +245,39 @@ class TouchCandidatesSection(Section):
             sign=jig.sign[face],
             coordinate=jig.coordinate[face],
             T_jig_tool=transform(R, point),
-            q=torch.zeros(DRAWN, dof, dtype=torch.float64),
+            q=torch.zeros(CANDIDATES_PER_DRAW, dof, dtype=torch.float64),
         )
-        return drawn.select(self._is_clear(jig, drawn))
+        return sampled.select(self._is_clear(jig, sampled))
 
-    def _is_clear(self, jig: Jig, drawn: TouchCandidates) -> Bool[Tensor, " candidates"]:
+    def _is_clear(self, jig: Jig, sampled: TouchCandidates) -> Bool[Tensor, " candidates"]:
         """Return whether the tip touches the face first, at the touch and during the approach."""
-        point, shaft = drawn.T_jig_tool[:, :3, 3], -drawn.T_jig_tool[:, :3, 2]
-        outward = jig.outward[drawn.face]
+        point, shaft = sampled.T_jig_tool[:, :3, 3], -sampled.T_jig_tool[:, :3, 2]
+        outward = jig.outward[sampled.face]
         lean = torch.arcsin((shaft * outward).sum(-1).clamp(-1, 1))
         clear = torch.rad2deg(lean) >= self.least_lean_deg
-        clear &= jig.on_face(drawn.face, point, self.margin_mm / 1e3)
+        clear &= jig.on_face(sampled.face, point, self.margin_mm / 1e3)
         for distance in (1e-6, self.travel_mm / 1e3):
             tip = point + distance * outward
             clear &= ~jig.is_hit(tip, tip + self.shaft_mm / 1e3 * shaft)
         return clear & ~jig.is_hit(point + 1e-6 * outward, point + self.travel_mm / 1e3 * outward)
 
     def _reachable(
-        self, robot: Robot, jig: Jig, placement: JigPlacement, drawn: TouchCandidates
+        self, robot: Robot, jig: Jig, placement: JigPlacement, sampled: TouchCandidates
     ) -> TouchCandidates:
         """Return the candidates that the nominal robot can reach, with their joint values."""
         T_base_jig = invert(placement.T_jig_base)
-        T = T_base_jig @ drawn.T_jig_tool
+        T = T_base_jig @ sampled.T_jig_tool
         q, reached = self.branch.find(robot, T)
         reached = reached & (singularity_measure(robot, q) >= self.least_singular_value)
-        drawn = replace(drawn, q=q).select(reached)
-        T, outward = T[reached], (T_base_jig[:3, :3] @ jig.outward[drawn.face].mT).mT
+        sampled = replace(sampled, q=q).select(reached)
+        T, outward = T[reached], (T_base_jig[:3, :3] @ jig.outward[sampled.face].mT).mT
         shift = self.travel_mm / 1e3 * torch.stack([outward, -outward])
         Ts_end = transform(T[:, :3, :3].expand(2, -1, 3, 3), T[:, :3, 3] + shift)
-        ends = solve_numeric(robot, Ts_end, drawn.q, tolerance=END_TOLERANCE, max_iterations=MAX_ITERATIONS)
+        ends = solve_numeric(robot, Ts_end, sampled.q, tolerance=END_TOLERANCE, max_iterations=MAX_ITERATIONS)
         ends_reached = ends.status == Status.REACHED
-        ends_reached &= (ends.q - drawn.q).abs().amax(-1) < MAX_JOINT_MOTION
+        ends_reached &= (ends.q - sampled.q).abs().amax(-1) < MAX_JOINT_MOTION
         ends_reached &= singularity_measure(robot, ends.q) >= self.least_singular_value
-        return drawn.select(ends_reached.all(0))
+        return sampled.select(ends_reached.all(0))
 
 
 def _draw_faces(jig: Jig, u: Float64[Tensor, " candidates"]) -> Int64[Tensor, " candidates"]:

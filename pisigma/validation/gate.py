@@ -98,8 +98,8 @@ def check_rows(
         MeasurementError: the model does not have a frame or a target of the rows.
         PoseError: the joint values do not fit the robot.
     """
-    if isinstance(against, CalibratedModel) and against.kind == FLEET_PRIOR and against.drawn is not None:
-        against = against.drawn
+    if isinstance(against, CalibratedModel) and against.kind == FLEET_PRIOR and against.nominal is not None:
+        against = against.nominal
     if isinstance(against, Robot):
         return RowVerdict(_until_implausible(_against_robot(rows, against)))
     judged = RowsUnderModel.from_rows(against, rows, fitted, may_move, nominal)
@@ -145,14 +145,14 @@ def size_of_positions(robot: Robot, rows: Measurements) -> Iterator[Diagnostic]:
     group = largest_group(rows)
     if group.position is None or group.rows < MIN_ROWS:
         return
-    measured, drawn = (
+    measured, nominal = (
         position_spread(group.position),
         position_spread(forward_kinematics(robot, group.q)[:, :3, 3]),
     )
     arm = ARM_SHARE * robot.reach
-    if measured > SCALE * (drawn + arm):
+    if measured > SCALE * (nominal + arm):
         cause, mistake = "mm_named_m", "x, y and z are millimetres that are named metres"
-    elif SCALE * measured < drawn > arm:
+    elif SCALE * measured < nominal > arm:
         cause = "m_named_mm"
         mistake = "x, y and z are metres that are named millimetres, or do not change with the robot"
     else:
@@ -161,10 +161,10 @@ def size_of_positions(robot: Robot, rows: Measurements) -> Iterator[Diagnostic]:
         kind="setup_fault",
         severity="implausible",
         sentence=f"The measured positions are {measured * 1e3:,.1f} mm RMS from their mean, but those of robot "
-        f"'{robot.name}' at these joint values are {drawn * 1e3:,.1f} mm: {mistake}; check the column names and the "
+        f"'{robot.name}' at these joint values are {nominal * 1e3:,.1f} mm: {mistake}; check the column names and the "
         "instrument.",
         cause=cause,
-        values={"measured_mm": measured * 1e3, "nominal_mm": drawn * 1e3},
+        values={"measured_mm": measured * 1e3, "nominal_mm": nominal * 1e3},
     )
 
 

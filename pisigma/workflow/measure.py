@@ -71,7 +71,7 @@ class MeasuringSession:
         self._lock = threading.RLock()
         self._settings = settings
         candidates = find_candidates(plan.settings, plan.arm)
-        subject = Subject(plan.arm.drawn) if plan.model is None else Subject.load(plan.model)
+        subject = Subject(plan.arm.nominal) if plan.model is None else Subject.load(plan.model)
         self._against = subject.model or plan.arm.robot
         self._task = task_poses(plan.arm, plan.settings, candidates.workspace, subject.model)
         self._further = FurtherPoses.from_plan(plan, candidates, self._task)

@@ -100,7 +100,7 @@ def recalibrate(
     data: Measurements | MeasurementFiles,
     settings: RecalibrationSettings = RecalibrationSettings(),
     progress: Progress = lambda what: None,
-    drawn: Robot | None = None,
+    nominal: Robot | None = None,
 ) -> Recalibration:
     """Update a model with new rows, and keep the candidate that predicts held-out rows best.
 
@@ -112,14 +112,14 @@ def recalibrate(
         data: new rows of any sensors, or CSV files of them. Rows of the set "test" are not used.
         settings: see `RecalibrationSettings`.
         progress: called with the current step.
-        drawn: nominal robot; the model then has to be the prior of its fleet. None: any model.
+        nominal: nominal robot; the model then has to be the prior of its fleet. None: any model.
 
     Returns:
         The kept model with its figures; `save` writes it as a model folder.
 
     Raises:
         ModelError: the folder is not that of a model, or the model is of another robot, has no posterior, or is not
-            the prior of a fleet although `drawn` is given.
+            the prior of a fleet although `nominal` is given.
         MeasurementError: the data cannot be read.
         IdentificationError: the rows do not determine a base or a tool.
         PoseError: the joint values do not fit the robot.
@@ -128,18 +128,18 @@ def recalibrate(
     source = model_or_folder(model)
     parent = source if isinstance(source, CalibratedModel) else load_model(source)
     sha256 = "" if isinstance(source, CalibratedModel) else model_hash(source)
-    if drawn is not None:
+    if nominal is not None:
         check_fleet_prior(parent)
     posterior = ModelPosterior.from_model(parent)
-    if drawn is not None and not np.array_equal(drawn.dh, posterior.space.robot.dh):
+    if nominal is not None and not np.array_equal(nominal.dh, posterior.space.robot.dh):
         raise ModelError(
-            f"expected a model of robot '{drawn.name}', got model '{parent.name}' of robot "
+            f"expected a model of robot '{nominal.name}', got model '{parent.name}' of robot "
             f"'{posterior.space.robot.name}'",
             value=parent.name,
             remedy="choose a model of this robot",
         )
-    drawn = posterior.space.robot
-    measurements = read_rows(data, drawn, settings.cameras)
+    nominal = posterior.space.robot
+    measurements = read_rows(data, nominal, settings.cameras)
     rows, again = without_known_rows(parent, posterior.renamed(measurements.split_sets()[0]))
     progress("checking the rows")
     right = WithoutWrongRows(rows) if parent.kind == FLEET_PRIOR else right_rows(settings, parent, rows)
@@ -148,7 +148,7 @@ def recalibrate(
     elsewhere = _moved_frames(parent, posterior, rows, settings)
     every = rows
     rows, adaptation, outliers = _adapted(parent, posterior, rows, elsewhere, right.numbers)
-    calibrator = HybridCalibrator(drawn)
+    calibrator = HybridCalibrator(nominal)
     choice = choose_candidate(
         parent, adaptation, elsewhere, rows, calibrator, stage(progress, "cross-validation")
     )
@@ -156,7 +156,9 @@ def recalibrate(
     odd = consistency is not None and consistency.is_inconsistent
     from_scratch = stage(progress, "from scratch")
     choice, kept = _kept(choice, odd, parent, adaptation, rows, calibrator, from_scratch)
-    moved = significant_movements(adaptation) if consistency is None and _believable(choice, drawn) else None
+    moved = (
+        significant_movements(adaptation) if consistency is None and _believable(choice, nominal) else None
+    )
     wrong = [one.row for one in outliers]
     diagnostics = verdict.implausible or recalibration_diagnostics(parent, choice, every, wrong, moved or ())
     moved = None if diagnostics else moved

@@ -40,7 +40,7 @@ from pisigma.workflow.settings.verification import VerificationSettings
 
 MIN_CONFIGURATIONS = 6
 """Minimum number of different joint vectors for a verdict."""
-MAX_DRAWN = 2 * 10**7
+MAX_RESAMPLED_ROWS = 2 * 10**7
 """Maximum number of random draws for confidence intervals: with many rows, fewer resamples are enough."""
 RESAMPLES = (200, 2000)
 """Minimum and maximum number of resamples."""
@@ -182,7 +182,7 @@ def verify(
     right = without_wrong_rows([loaded], rows, settings.fitted)
     rows = right.rows
     models = _compared_models(loaded, rows.rotation is not None)
-    resamples = int(np.clip(MAX_DRAWN // max(rows.rows, 1), *RESAMPLES))
+    resamples = int(np.clip(MAX_RESAMPLED_ROWS // max(rows.rows, 1), *RESAMPLES))
     bootstrap = Bootstrap(resamples, settings.seed)
     comparison = compare_models(models, rows, bootstrap, settings.fitted, distances)
     gate = check_rows(rows, loaded, settings.fitted, {"joint_zero"}, models[NOMINAL])

@@ -20,9 +20,9 @@ from pisigma.robot.writing import robot_to_urdf
 
 
 @pytest.fixture(scope="module")
-def drawn(tmp_path_factory):
+def urdf(tmp_path_factory):
     """A UR5 as URDF with a camera beside the tool, so that the tool has to be named."""
-    path = tmp_path_factory.mktemp("drawn") / "arm.urdf"
+    path = tmp_path_factory.mktemp("urdf") / "arm.urdf"
     root = etree.fromstring(robot_to_urdf(Robot.load("ur5"), ()).encode())
     elbow = root.findall("joint[@type='revolute']")[2].find("child").get("link")
     root.append(etree.fromstring('<link name="camera"/>'))
@@ -37,9 +37,9 @@ def drawn(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def tip(drawn):
+def tip(urdf):
     """The last link below the last joint."""
-    root = etree.parse(str(drawn)).getroot()
+    root = etree.parse(str(urdf)).getroot()
     parents = {link.get("link") for link in root.iter("parent")}
     return next(
         link.get("name") for link in root.iter("link") if link.get("name") not in {*parents, "camera"}
@@ -47,10 +47,10 @@ def tip(drawn):
 
 
 @pytest.fixture(scope="module")
-def measured(drawn, tip, tmp_path_factory):
+def measured(urdf, tip, tmp_path_factory):
     """A file of measured poses of the true arm, and that arm."""
     rng = np.random.default_rng(3)
-    robot = Robot.load(drawn, tip=tip)
+    robot = Robot.load(urdf, tip=tip)
     true = robot.with_geometry(
         dh=robot.dh + dh_errors(robot, 5e-4, 1e-3, rng),
         base=np.array([0.3, -0.2, 0.1, 0.4, 0.0, -0.2]),
@@ -64,15 +64,15 @@ def measured(drawn, tip, tmp_path_factory):
     return path, true
 
 
-def test_in_calibrated_and_out_again(run, drawn, tip, measured, tmp_path):
+def test_in_calibrated_and_out_again(run, urdf, tip, measured, tmp_path):
     data, true = measured
     folder, out = tmp_path / "arm", tmp_path / "calibrated.urdf"
     options = ("--out", folder, "--model", "geometric", "--folds", 3, "--json")
-    result = run("calibrate", drawn, data, "--tip", tip, *options)
+    result = run("calibrate", urdf, data, "--tip", tip, *options)
     assert result.exit_code == 0, result.output
     assert json.loads(result.stdout)["cross_validation"]["geometric"]["rms_mm"] < 1e-4
     assert f"--tip {tip}" in (folder / "README.md").read_text()
-    exported = run("export", folder, "--format", "urdf", "--like", drawn, "--tip", tip, "--out", out)
+    exported = run("export", folder, "--format", "urdf", "--like", urdf, "--tip", tip, "--out", out)
     assert exported.exit_code == 0, exported.output
     calibrated = load_model(folder).calibrated
     q = draw_joints(calibrated, 200, np.random.default_rng(4))
@@ -85,8 +85,8 @@ def test_in_calibrated_and_out_again(run, drawn, tip, measured, tmp_path):
     assert torch.isfinite(T).all()
 
 
-def test_a_tool_that_is_not_named(refuses, drawn, measured, tmp_path):
-    said = refuses("calibrate", drawn, measured[0], "--out", tmp_path / "arm", error=RobotError)
+def test_a_tool_that_is_not_named(refuses, urdf, measured, tmp_path):
+    said = refuses("calibrate", urdf, measured[0], "--out", tmp_path / "arm", error=RobotError)
     assert "camera, tool0" in said
     assert not (tmp_path / "arm").exists()
 

@@ -66,27 +66,29 @@ def test_urdf(run, geometric, tmp_path):
 
 
 def test_urdf_in_calibrated_and_out_again(run, tmp_path):
-    """A robot from a URDF with other errors than it was drawn with; its file, calibrated, is the true robot's."""
+    """A robot from a URDF with other errors than its nominal ones; its file, calibrated, is the true robot's."""
     nominal, random = Robot.load("ur10"), np.random.default_rng(5)
-    (tmp_path / "drawn.urdf").write_text(robot_to_urdf(nominal))
-    drawn = Robot.load(tmp_path / "drawn.urdf")
-    true = drawn.with_geometry(
-        drawn.dh + random.normal(0, 1e-3, drawn.dh.shape), random.normal(0, 1, 6), random.normal(0, 0.1, 6)
+    (tmp_path / "nominal.urdf").write_text(robot_to_urdf(nominal))
+    described = Robot.load(tmp_path / "nominal.urdf")
+    true = described.with_geometry(
+        described.dh + random.normal(0, 1e-3, described.dh.shape),
+        random.normal(0, 1, 6),
+        random.normal(0, 0.1, 6),
     )
     q = joints_around("ur10", 120, spread=1.5)
     T = forward_kinematics(true, q)
     rows = Measurements(q=q, position=T[:, :3, 3], rotation=T[:, :3, :3])
-    rows.write_csv(tmp_path / "data.csv", drawn)
-    command = ("calibrate", tmp_path / "drawn.urdf", tmp_path / "data.csv", "--out", tmp_path / "model")
+    rows.write_csv(tmp_path / "data.csv", described)
+    command = ("calibrate", tmp_path / "nominal.urdf", tmp_path / "data.csv", "--out", tmp_path / "model")
     assert run(*command, "--folds", "0", "--prior-mm", "0", "--prior-mrad", "0").exit_code == 0
-    assert load_model(tmp_path / "model").robot.joints == drawn.joints
-    out, like = tmp_path / "calibrated.urdf", ("--like", tmp_path / "drawn.urdf", "--tip", "tool0")
+    assert load_model(tmp_path / "model").robot.joints == described.joints
+    out, like = tmp_path / "calibrated.urdf", ("--like", tmp_path / "nominal.urdf", "--tip", "tool0")
     export = ("export", tmp_path / "model", "--format", "urdf", "--out", out)
     assert run(*export).exit_code == 0
     by_default = out.read_text()
     assert run(*export, *like).exit_code == 0
     assert out.read_text() == by_default
-    (tmp_path / "drawn.urdf").rename(tmp_path / "elsewhere.urdf")
+    (tmp_path / "nominal.urdf").rename(tmp_path / "elsewhere.urdf")
     assert run(*export).exit_code == 0
     assert out.read_text() == by_default
     new = joints_around("ur10", 50, seed=1, spread=2.0)
@@ -120,9 +122,9 @@ def test_dh_as_yaml_and_csv(run, geometric, tmp_path):
 def test_offsets(run, geometric, tmp_path):
     result = run("export", geometric, "--format", "offsets", "--out", tmp_path / "o.yaml", "--json")
     told = json.loads(result.stdout)
-    lost, drawn = told["off_the_whole_model"], told["robot_as_drawn"]
+    lost, of_nominal = told["off_the_whole_model"], told["robot_as_drawn"]
     assert 0 < lost["mean_mm"] < lost["p95_mm"] < lost["max_mm"]
-    assert lost["mean_mm"] < drawn["mean_mm"]
+    assert lost["mean_mm"] < of_nominal["mean_mm"]
     text = (tmp_path / "o.yaml").read_text()
     assert f" {lost['mean_mm']:.4g} mm" in text
     written = yaml.safe_load(text)

@@ -13,7 +13,7 @@ from testing.camera_cell import BOARD, CAMERA, camera_cell, corner_lines
 from testing.identified import hybrid_model
 from testing.models import hand_made_model, joints_around, no_type_checker
 from testing.simulated_arm import simulate
-from testing.urdf import DrawnJoint, urdf_text
+from testing.urdf import UrdfJoint, urdf_text
 
 from pisigma.joint_correction.conditions import ConditionFeatures
 from pisigma.joint_correction.fourier_series import FourierSeries
@@ -74,11 +74,11 @@ def _rows(folder: Path) -> None:
     (folder / "one_session.csv").write_text("\n".join([manifest[0], *manifest[1::2]]) + "\n")
     (folder / "nameless.csv").write_text("id,robot,data\ncell0,,cell0_1.csv\n")
     drawn = [
-        DrawnJoint("fixed", (0, 0, 0.1), (0, 0, 0)),
-        DrawnJoint("revolute", (0, 0, 0.3), (0, 0, 0)),
-        DrawnJoint("revolute", (0.4, 0, 0), (0, 0, 0)),
-        DrawnJoint("prismatic", (0.3, 0, 0), (np.pi, 0, 0)),
-        DrawnJoint("fixed", (0, 0, 0.05), (0, 0, 0)),
+        UrdfJoint("fixed", (0, 0, 0.1), (0, 0, 0)),
+        UrdfJoint("revolute", (0, 0, 0.3), (0, 0, 0)),
+        UrdfJoint("revolute", (0.4, 0, 0), (0, 0, 0)),
+        UrdfJoint("prismatic", (0.3, 0, 0), (np.pi, 0, 0)),
+        UrdfJoint("fixed", (0, 0, 0.05), (0, 0, 0)),
     ]
     (folder / "arm.urdf").write_text(urdf_text(drawn))
     box = '<link name="l1"><visual><geometry><box size="0.1 0.1 0.3"/></geometry></visual></link>'

@@ -103,7 +103,7 @@ def wrong_robot(rng: Rng, clean: Clean, folder: Path) -> Case:
     return Case(f"{path.stem}: {what}", calibrate("robot.yaml", str(clean.rows[name].path)), clean.rows[name])
 
 
-def drawn_robot(rng: Rng, clean: Clean, folder: Path) -> Case:
+def robot_file_case(rng: Rng, clean: Clean, folder: Path) -> Case:
     """Write a robot with random rows: one joint or 20, prismatic only, without lengths, with limits reversed."""
     count = one_of(rng, (1, 2, 3, 6, 7, 12, 20, 400))
     rows: list[dict[str, Any]] = []

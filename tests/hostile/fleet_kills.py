@@ -18,7 +18,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 
 import numpy as np
 from hostile.kills import contents
-from testing.fleet_robots import DRAWN, rows_of
+from testing.fleet_robots import NOMINAL, rows_of
 from testing.simulated_arm import simulate
 
 MAX_FILE_SIZE = 12_000
@@ -29,7 +29,7 @@ def _changed(change: Callable[[str], str]) -> Callable[[Path], None]:
     """Return a function that writes a changed file of good rows."""
 
     def write(path: Path) -> None:
-        rows_of(0, 30, 0).write_csv(path, DRAWN)
+        rows_of(0, 30, 0).write_csv(path, NOMINAL)
         path.write_text(change(path.read_text(encoding="utf-8")), encoding="utf-8")
 
     return write
@@ -47,7 +47,7 @@ def _repeated(text: str) -> str:
 
 
 def _other_robot(path: Path) -> None:
-    replace(simulate("ur10", rows=30).measurements, rotation=None).write_csv(path, DRAWN)
+    replace(simulate("ur10", rows=30).measurements, rotation=None).write_csv(path, NOMINAL)
 
 
 BAD: dict[str, tuple[Callable[[Path], None], str]] = {
@@ -76,8 +76,8 @@ def write_plant(folder: Path, robots: int) -> None:
         if number in bad:
             BAD[bad[number]][0](path)
         else:
-            rows_of(number, 30, number).write_csv(path, DRAWN)
-        lines.append(f"{name},{DRAWN.name},{path.name},2026-10-01")
+            rows_of(number, 30, number).write_csv(path, NOMINAL)
+        lines.append(f"{name},{NOMINAL.name},{path.name},2026-10-01")
     (folder / "fleet.csv").write_text("\n".join([*lines, ""]), encoding="utf-8")
 
 

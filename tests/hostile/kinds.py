@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 from hostile.case import Case, Generator
 from hostile.clean import Clean
-from hostile.documents import drawn_robot, wrong_recipe, wrong_robot
+from hostile.documents import robot_file_case, wrong_recipe, wrong_robot
 from hostile.exports import wrong_export
 from hostile.folders import wrong_model
 from hostile.healthy import healthy_robot, measured_robot
@@ -22,7 +22,7 @@ KINDS: dict[str, tuple[Generator, int]] = {
     "another robot": (another_robot, 2),
     "poses": (wrong_poses, 20),
     "robots": (wrong_robot, 7),
-    "drawn robots": (drawn_robot, 3),
+    "robot files": (robot_file_case, 3),
     "urdfs": (wrong_urdf, 32),
     "recipes": (wrong_recipe, 26),
     "models": (wrong_model, 5),

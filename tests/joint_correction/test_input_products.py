@@ -3,7 +3,7 @@
 import pytest
 import torch
 from testing.closeness import assert_close
-from testing.linearised import drawn_joints
+from testing.linearised import random_joints
 from torch import Tensor
 
 from pisigma.joint_correction.feature import unit_inputs
@@ -34,7 +34,7 @@ def weighted(products: InputProducts, weights: Tensor, q: Tensor) -> Tensor:
 def test_columns_are_products_of_inputs_of_different_joints(name: str) -> None:
     """Computed joint by joint; kiro3 has a prismatic joint, whose input is its scaled value."""
     robot = Robot.load(name)
-    products, q = InputProducts(robot), drawn_joints(robot, 5, 0)
+    products, q = InputProducts(robot), random_joints(robot, 5, 0)
     turning = [j for j, turns in enumerate(robot.revolute) if turns]
     owner = [*turning, *turning, *(j for j in range(robot.dof) if j not in turning)]
     phi = unit_inputs(robot, q)
@@ -57,7 +57,7 @@ def test_every_joint_has_its_own_prior_size() -> None:
 
 def test_batches_of_any_shape_have_columns() -> None:
     products = InputProducts(Robot.load("kiro3"))
-    q = drawn_joints(products.robot, 6, 0)
+    q = random_joints(products.robot, 6, 0)
     flat = products.columns(JointState(q))
     assert_close(products.columns(JointState(q.view(2, 3, 4))), flat.view(2, 3, 4, -1))
     assert_close(products.columns(JointState(q[0])), flat[0])
@@ -67,7 +67,7 @@ def test_batches_of_any_shape_have_columns() -> None:
 @pytest.mark.parametrize("name", ["ur5", "panda", "kiro3"])
 def test_product_units_are_equal_to_the_weighted_sum_of_the_columns(name: str, seed: int) -> None:
     robot = Robot.load(name)
-    products, q = InputProducts(robot), drawn_joints(robot, 40, seed)
+    products, q = InputProducts(robot), random_joints(robot, 40, seed)
     weights = 1e-4 * normal(products.used.numel(), seed=seed)
     made = network_of(products, weights)
     assert len(made.orders) < products.inputs
@@ -77,7 +77,7 @@ def test_product_units_are_equal_to_the_weighted_sum_of_the_columns(name: str, s
 def test_one_unit_is_enough_for_one_product_of_two_sums() -> None:
     """For `(r · φ)(s · φ)` with r and s on different joints, which has one eigenvalue of each sign."""
     robot = Robot.load("ur5")
-    products, q = InputProducts(robot), drawn_joints(robot, 30, 0)
+    products, q = InputProducts(robot), random_joints(robot, 30, 0)
     r, s = normal(6, 12, seed=1), normal(6, 12, seed=2)
     first, second = [0, 1, 2, 6, 7, 8], [3, 4, 5, 9, 10, 11]
     r[:, second], s[:, first] = 0.0, 0.0
@@ -92,7 +92,7 @@ def test_one_unit_is_enough_for_one_product_of_two_sums() -> None:
 
 def test_joints_may_have_different_weights_and_none() -> None:
     robot = Robot.load("rb5")
-    products, q = InputProducts(robot), drawn_joints(robot, 10, 3)
+    products, q = InputProducts(robot), random_joints(robot, 10, 3)
     weights = normal(robot.dof, products.count)
     weights[[0, 3]] = 0.0
     made = network_of(products, weights.flatten())
@@ -105,7 +105,7 @@ def test_zero_weights_result_in_no_units() -> None:
     products = InputProducts(Robot.load("ur5"))
     factors = products.factors(torch.zeros(products.used.numel(), dtype=torch.float64))
     assert factors.shape == (6, 0, 12)
-    q = drawn_joints(products.robot, 4, 0)
+    q = random_joints(products.robot, 4, 0)
     assert_close(network_of(products, torch.zeros(products.used.numel()).double())(q), torch.zeros(4, 6))
 
 

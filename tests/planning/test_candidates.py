@@ -78,7 +78,7 @@ def test_a_prismatic_joint_needs_limits():
 
 
 def test_spread_poses_are_farther_apart_than_random_ones():
-    q = draw_candidates(ArmInSurroundings.from_robot(ARM.drawn), 200, 0).q
+    q = draw_candidates(ArmInSurroundings.from_robot(ARM.nominal), 200, 0).q
     chosen = spread(ARM, q[20:], 10, q[:20])
     position = forward_kinematics(ARM.robot, q)[:, :3, 3]
 

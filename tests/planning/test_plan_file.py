@@ -17,12 +17,12 @@ from pisigma.planning.surroundings.arm_in_surroundings import ArmInSurroundings
 from pisigma.robot import Robot
 
 ARM = ArmInSurroundings.from_robot(Robot.load("fanuc_r2000"), CELL)
-DRAWN = draw_candidates(ARM, 6, 0)
+CANDIDATES = draw_candidates(ARM, 6, 0)
 
 
 @pytest.fixture
 def stored(tmp_path: Path) -> StoredPlan:
-    points = (DRAWN.q[:0], DRAWN.q[4:6], *(DRAWN.q[:0] for _ in range(2)))
+    points = (CANDIDATES.q[:0], CANDIDATES.q[4:6], *(CANDIDATES.q[:0] for _ in range(2)))
     settings = PlanSettings(
         count=3,
         check=1,
@@ -31,7 +31,9 @@ def stored(tmp_path: Path) -> StoredPlan:
         measured=str(tmp_path / "rows.csv"),
     )
     check = torch.tensor([False, True, False, False])
-    plan = StoredPlan(ARM, settings, tmp_path / "model", DRAWN.q[:4], check, DRAWN.number[:4], points)
+    plan = StoredPlan(
+        ARM, settings, tmp_path / "model", CANDIDATES.q[:4], check, CANDIDATES.number[:4], points
+    )
     plan.write(tmp_path / "poses.csv")
     return plan
 

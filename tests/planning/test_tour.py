@@ -61,7 +61,7 @@ def test_test_poses_are_distributed_evenly():
 
 def test_every_motion_is_collision_free():
     arm = ArmInSurroundings.from_robot(
-        ARM.drawn, CELL.model_copy(update={"tracker": None, "reflector": None})
+        ARM.nominal, CELL.model_copy(update={"tracker": None, "reflector": None})
     )
     pool = draw_candidates(arm, 60, 0).q
     way = tour(Motions(arm, pool), pool[:5], PACE)

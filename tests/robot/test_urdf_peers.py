@@ -20,16 +20,16 @@ from pisigma.robot.writing import BASE_LINK, TOOL_LINK, robot_to_urdf
 MODULES = {"mujoco": "mujoco", "pinocchio": "pinocchio", "drake": "pydrake"}
 
 
-@pytest.mark.parametrize("drawn", [False, True], ids=["a new file", "the file that it was drawn in"])
+@pytest.mark.parametrize("in_template", [False, True], ids=["a new file", "the file that it was loaded from"])
 @pytest.mark.parametrize("peer", MODULES)
 @pytest.mark.parametrize("name", ["ur5e", "panda", "kiro3", "fanuc_r2000"])
-def test_peers_compute_the_same_tool_pose(peer, name, drawn, tmp_path, repository):
+def test_peers_compute_the_same_tool_pose(peer, name, in_template, tmp_path, repository):
     """They run in the interpreter of PISIGMA_PEERS, so that they need not be compatible with pisigma's packages."""
     python = os.environ.get("PISIGMA_PEERS", sys.executable)
     if subprocess.run([python, "-c", f"import {MODULES[peer]}"], capture_output=True, check=False).returncode:
         pytest.skip(f"{peer} is not installed for {python}; name a Python that has it in PISIGMA_PEERS")
     nominal, file, random = Robot.load(name), tmp_path / "arm.urdf", np.random.default_rng(2)
-    if drawn:  # as many files are: links without masses, joints without effort and velocity
+    if in_template:  # as many files are: links without masses, joints without effort and velocity
         text = re.sub(r"(?s)<inertial>.*?</inertial>", "", robot_to_urdf(nominal))
         file.write_text(text.replace('effort="1000" velocity="10"', 'effort="0" velocity="0"'))
         nominal = Robot.load(file)
@@ -40,8 +40,8 @@ def test_peers_compute_the_same_tool_pose(peer, name, drawn, tmp_path, repositor
     )
     low, high = np.clip(robot.limits, -3.0, 3.0).T
     q = random.uniform(low, high, (100, robot.dof))
-    links = (CALIBRATED_FRAME, CALIBRATED_TOOL) if drawn else (BASE_LINK, TOOL_LINK)
-    file.write_text(robot_into_urdf(robot, nominal, file) if drawn else robot_to_urdf(robot))
+    links = (CALIBRATED_FRAME, CALIBRATED_TOOL) if in_template else (BASE_LINK, TOOL_LINK)
+    file.write_text(robot_into_urdf(robot, nominal, file) if in_template else robot_to_urdf(robot))
     script = Path(repository) / "benchmarks" / "urdf_peers.py"
     run = subprocess.run(
         [python, str(script), peer, str(file), *links],

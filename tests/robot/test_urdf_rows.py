@@ -10,7 +10,7 @@ import torch
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from testing.closeness import assert_close
-from testing.urdf import DrawnJoint, drawn_pose, peer_poses, urdf_text
+from testing.urdf import UrdfJoint, peer_poses, pose_of_chain, urdf_text
 
 from pisigma.robot import Robot, catalogue
 from pisigma.robot.kinematics.closed_form import closed_form_solver
@@ -34,7 +34,7 @@ axes = st.one_of(
     .map(lambda v: tuple(np.array(v) / np.linalg.norm(v))),
 )
 joints = st.builds(
-    DrawnJoint,
+    UrdfJoint,
     st.sampled_from(["revolute", "revolute", "revolute", "continuous", "prismatic", "fixed"]),
     st.tuples(lengths, lengths, lengths),
     st.tuples(angles, angles, angles),
@@ -59,12 +59,12 @@ def joint_values(robot: Robot, count: int = 5) -> torch.Tensor:
 
 @settings(max_examples=120, deadline=None)
 @given(chains)
-@example([DrawnJoint("prismatic", (0.1, 0.2, 0.3), (0, 0, 0), (1, 0, 0))])
-@example([DrawnJoint("revolute", (0.1, 0.2, 0.3), (0.1, math.pi / 2, 0.2), (0.6, 0, 0.8))] * 7)
+@example([UrdfJoint("prismatic", (0.1, 0.2, 0.3), (0, 0, 0), (1, 0, 0))])
+@example([UrdfJoint("revolute", (0.1, 0.2, 0.3), (0.1, math.pi / 2, 0.2), (0.6, 0, 0.8))] * 7)
 def test_any_chain_keeps_its_forward_kinematics(chain):
     robot = load(urdf_text(chain))
     q = joint_values(robot)
-    expected = np.stack([drawn_pose(chain, values) for values in q.tolist()])
+    expected = np.stack([pose_of_chain(chain, values) for values in q.tolist()])
     assert_close(forward_kinematics(robot, q), expected, atol=1e-12)
     again = load(robot_to_urdf(robot))
     assert_close(forward_kinematics(again, q), expected, atol=1e-12)
@@ -85,9 +85,9 @@ def test_no_length_is_much_larger_than_those_of_the_chain(chain):
 @pytest.mark.parametrize("tilt", [0.0, 1e-9, 1e-6, 1e-3, math.pi, math.pi - 1e-6])
 def test_nearly_parallel_axes_get_hayati_rows(tilt):
     chain = [
-        DrawnJoint("revolute", (0, 0, 0.3), (0, 0, 0)),
-        DrawnJoint("revolute", (0.4, 0, 0.1), (0, tilt, 0)),
-        DrawnJoint("fixed", (0.2, 0, 0), (0, 0, 0)),
+        UrdfJoint("revolute", (0, 0, 0.3), (0, 0, 0)),
+        UrdfJoint("revolute", (0.4, 0, 0.1), (0, tilt, 0)),
+        UrdfJoint("fixed", (0.2, 0, 0), (0, 0, 0)),
     ]
     theta, d, a, _, beta = load(urdf_text(chain)).dh[0]
     assert (theta, d) == (0.0, 0.0)
@@ -98,8 +98,8 @@ def test_nearly_parallel_axes_get_hayati_rows(tilt):
 @pytest.mark.parametrize("twist", [0.2, math.pi / 2, -math.pi / 2, 2.0])
 def test_other_axes_get_dh_rows(twist):
     chain = [
-        DrawnJoint("revolute", (0, 0, 0.3), (0, 0, 0)),
-        DrawnJoint("revolute", (0.4, 0, 0.1), (twist, 0, 0)),
+        UrdfJoint("revolute", (0, 0, 0.3), (0, 0, 0)),
+        UrdfJoint("revolute", (0.4, 0, 0.1), (twist, 0, 0)),
     ]
     assert_close(load(urdf_text(chain)).dh[0], [0, 0.4, 0.4, twist, 0], atol=1e-14)
 

@@ -9,7 +9,7 @@ from pisigma.measurement.dataset import Measurements
 from pisigma.robot import Robot
 from pisigma.robot.kinematics.forward import forward_kinematics
 
-DRAWN = Robot.load("rb5")
+NOMINAL = Robot.load("rb5")
 NOISE = 3.5e-5
 """Standard deviation of a coordinate [m]."""
 SHARED, INDIVIDUAL = 1e-3, 2e-4
@@ -21,7 +21,7 @@ GEARS = (2e-4, 1e-4, 0.0)
 def common_errors(seed: int = 5) -> Tensor:
     """Return the geometric errors that all robots of a type share."""
     return (
-        torch.randn(DRAWN.dh.shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+        torch.randn(NOMINAL.dh.shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
         * SHARED
     )
 
@@ -30,7 +30,7 @@ def common_gears() -> Tensor:
     """Return the weights of harmonics of every joint that all robots of a type share."""
     sizes = torch.tensor(GEARS * 2, dtype=torch.float64)
     return (
-        torch.randn(DRAWN.dof, len(sizes), generator=torch.Generator().manual_seed(7), dtype=torch.float64)
+        torch.randn(NOMINAL.dof, len(sizes), generator=torch.Generator().manual_seed(7), dtype=torch.float64)
         * sizes
     )
 
@@ -58,17 +58,17 @@ def rows_of(
     of_robot = torch.Generator().manual_seed(1000 + number)
     errors = common_errors(6 if odd else 5)
     errors = errors + torch.randn(errors.shape, generator=of_robot, dtype=torch.float64) * individual
-    series = FourierSeries(DRAWN, len(GEARS))
+    series = FourierSeries(NOMINAL, len(GEARS))
     sizes = torch.tensor(GEARS * 2, dtype=torch.float64)
-    weights = torch.randn(DRAWN.dof, len(sizes), generator=of_robot, dtype=torch.float64) * sizes
+    weights = torch.randn(NOMINAL.dof, len(sizes), generator=of_robot, dtype=torch.float64) * sizes
     weights = individual_gears**0.5 * weights + (1 - individual_gears) ** 0.5 * common_gears()
-    drawn = torch.Generator().manual_seed(seed)
-    q = 4 * torch.rand(rows, DRAWN.dof, generator=drawn, dtype=torch.float64) - 2
+    generator = torch.Generator().manual_seed(seed)
+    q = 4 * torch.rand(rows, NOMINAL.dof, generator=generator, dtype=torch.float64) - 2
     moved = q + (series.columns(JointState(q)) * weights).sum(-1)
-    base, tool = DRAWN.base.copy(), DRAWN.tool.copy()
+    base, tool = NOMINAL.base.copy(), NOMINAL.tool.copy()
     base[:3], tool[:3] = (1.0, 0.5, 0.2), (0.05, 0.02, 0.15)
-    robot = DRAWN.with_geometry(dh=DRAWN.dh + errors.numpy(), base=base, tool=tool)
+    robot = NOMINAL.with_geometry(dh=NOMINAL.dh + errors.numpy(), base=base, tool=tool)
     position = forward_kinematics(robot, moved)[:, :3, 3]
     return Measurements(
-        q=q, position=position + noise * torch.randn(rows, 3, generator=drawn, dtype=torch.float64)
+        q=q, position=position + noise * torch.randn(rows, 3, generator=generator, dtype=torch.float64)
     )

@@ -31,7 +31,7 @@ TARGETS = torch.tensor(
 """x, y, z [m], roll, pitch, yaw [rad] of two frames in the base and of two targets on the tool."""
 
 
-def drawn_joints(robot: Robot, rows: int, seed: int, widest: float = np.pi) -> Tensor:
+def random_joints(robot: Robot, rows: int, seed: int, widest: float = np.pi) -> Tensor:
     """Draw joint values [rad or m], uniform over the limits, with a maximum angle of revolute joints."""
     most = np.where(robot.revolute, widest, np.inf)[:, None]
     low, high = np.clip(robot.limits, -most, most).T

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import torch
 from testing.dense_regression import DenseRegression
-from testing.linearised import LinearisedArm, drawn_joints, linearised, tracker_data
+from testing.linearised import LinearisedArm, linearised, random_joints, tracker_data
 from testing.sensors import mixed_data, true_robot
 from torch import Tensor
 
@@ -79,7 +79,7 @@ def case_of(
 def poses() -> RegressionCase:
     """Return positions and rotations of an arm with a prismatic joint, with weights and unused columns."""
     robot = Robot.load("kiro3")
-    q = drawn_joints(robot, 30, 0)
+    q = random_joints(robot, 30, 0)
     arm = linearised(robot, tracker_data(robot, q, 1e-4 * (3 * q).sin(), 1e-5, turn_noise=1e-5, several=True))
     weight = torch.linspace(0.5, 2.0, 30, dtype=torch.float64)
     values = tuple(sensor.weighted(weight) for sensor in arm.rows.values)
@@ -92,7 +92,7 @@ def poses() -> RegressionCase:
 def several_targets() -> RegressionCase:
     """Return two targets per configuration, with similar residuals."""
     robot = Robot.load("rb5")
-    q = drawn_joints(robot, 25, 2).repeat_interleave(4, 0)
+    q = random_joints(robot, 25, 2).repeat_interleave(4, 0)
     arm = linearised(robot, tracker_data(robot, q, 3e-4 * (3 * q).sin(), 1e-5, several=True))
     return case_of(arm, (GravityTorques(robot), FourierSeries(robot, 2)), (FourierSeries(robot, 2),))
 
@@ -112,7 +112,7 @@ def all_kinds() -> RegressionCase:
 def few_values() -> RegressionCase:
     """Return far fewer values than unknowns, including products."""
     robot = Robot.load("rb5")
-    q = drawn_joints(robot, 20, 1)
+    q = random_joints(robot, 20, 1)
     arm = linearised(robot, tracker_data(robot, q, 2e-4 * q.sin(), 3e-5))
     features = (GravityTorques(robot), FourierSeries(robot, 4), InputProducts(robot))
     return case_of(arm, features, (features[0], FourierSeries(robot, 3)))

@@ -13,7 +13,7 @@ LIMITS = '<limit lower="-3.0" upper="3.0" effort="1" velocity="1"/>'
 
 
 @dataclass(frozen=True)
-class DrawnJoint:
+class UrdfJoint:
     """A joint of a file; rpy [rad] are rotations about the fixed axes x, y, z."""
 
     type: str
@@ -22,7 +22,7 @@ class DrawnJoint:
     axis: Sequence[float] = (0.0, 0.0, 1.0)
 
 
-def urdf_text(joints: Sequence[DrawnJoint]) -> str:
+def urdf_text(joints: Sequence[UrdfJoint]) -> str:
     """Return a chain of links l0, l1, ... with joints j1, j2, ..."""
     words = ['<robot name="chain"><link name="l0"/>']
     for i, joint in enumerate(joints, 1):
@@ -35,7 +35,7 @@ def urdf_text(joints: Sequence[DrawnJoint]) -> str:
     return "\n".join([*words, "</robot>\n"])
 
 
-def drawn_pose(joints: Sequence[DrawnJoint], q: Sequence[float]) -> np.ndarray:
+def pose_of_chain(joints: Sequence[UrdfJoint], q: Sequence[float]) -> np.ndarray:
     """Compute the pose of the last link by the definition of the format, with scipy's rotations."""
     values, T = iter(q), np.eye(4)
     for joint in joints:

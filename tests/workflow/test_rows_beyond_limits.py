@@ -31,12 +31,12 @@ def narrow(tmp_path_factory) -> tuple[Path, Measurements]:
     model = geometric_model("ur10")
     rows = list(model.robot.rows)
     rows[2] = dataclasses.replace(rows[2], lower=-1.0, upper=1.0)
-    drawn = dataclasses.replace(model.robot, rows=tuple(rows))
+    nominal = dataclasses.replace(model.robot, rows=tuple(rows))
     assert model.calibrated is not None
     calibrated = dataclasses.replace(model.calibrated, rows=tuple(rows))
     folder = tmp_path_factory.mktemp("models") / "narrow"
     folder.mkdir()
-    save_model(dataclasses.replace(model, robot=drawn, calibrated=calibrated), folder)
+    save_model(dataclasses.replace(model, robot=nominal, calibrated=calibrated), folder)
     q = torch.from_numpy(np.random.default_rng(0).uniform(-0.9, 0.9, (30, 6)))
     q[4, 2] = 1.2
     rows = Measurements(q=q, position=forward_kinematics(calibrated, q)[:, :3, 3], source="rows.csv")

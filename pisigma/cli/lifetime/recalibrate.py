@@ -80,7 +80,7 @@ def recalibrate_into(
     overwrite: bool,
     as_json: bool,
     verbose: bool = False,
-    drawn: "Robot | None" = None,
+    nominal: "Robot | None" = None,
 ) -> None:
     """Add rows to a model, write the model that was kept if a folder is stated, and print it.
 
@@ -94,7 +94,7 @@ def recalibrate_into(
         overwrite: replace the model in the folder.
         as_json: print one JSON object.
         verbose: print all tables.
-        drawn: the robot whose fleet the model has to be the prior of; None for any model.
+        nominal: the robot whose fleet the model has to be the prior of; None for any model.
 
     Raises:
         ModelError: the model belongs to another robot, or is not a fleet prior.
@@ -102,7 +102,7 @@ def recalibrate_into(
     from pisigma.workflow import recalibrate as workflow
 
     with progress_of("recalibration") as progress:
-        recalibration = workflow.recalibrate(model, data, settings, progress, drawn)
+        recalibration = workflow.recalibrate(model, data, settings, progress, nominal)
     if out is None:
         _print(recalibration, None, as_json, verbose)
         if not (recalibration.trusted or accept_implausible):

@@ -206,15 +206,15 @@ class Projection:
         )
 
 
-def departure_from_drawn(robot: Robot, drawn: Robot) -> Departure:
+def departure_from_nominal(robot: Robot, nominal: Robot) -> Departure:
     """Compute the deviation of a robot's tool from that of another robot, each with its base and tool.
 
-    It is evaluated at random joint values within the limits of `drawn`, and within 180 deg (3 m).
+    It is evaluated at random joint values within the limits of `nominal`, and within 180 deg (3 m).
     """
-    low, high = torch.from_numpy(drawn.limits.clip(-torch.pi, torch.pi)).unbind(1)
-    share = torch.rand((POSES, drawn.dof), generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    low, high = torch.from_numpy(nominal.limits.clip(-torch.pi, torch.pi)).unbind(1)
+    share = torch.rand((POSES, nominal.dof), generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     q = low + share * (high - low)
-    return Projection(robot, (), q, forward_kinematics(robot, q)).departure(drawn)
+    return Projection(robot, (), q, forward_kinematics(robot, q)).departure(nominal)
 
 
 def project_model(

@@ -53,14 +53,16 @@ def _check(request: ExportRequest) -> None:
 def _write(request: ExportRequest) -> Exported:
     model = request.load()
     chosen = chosen_geometry(model, request.geometry)
-    text = drawn_into(request, chosen.robot, model.robot, chosen.comments) or robot_to_urdf(
+    text = text_in_urdf(request, chosen.robot, model.robot, chosen.comments) or robot_to_urdf(
         chosen.robot, chosen.comments
     )
     facts = model_facts(model) | {"geometry": chosen.name}
     return Exported(text, facts, chosen.comments, warnings=_warnings(request, model.robot, text))
 
 
-def drawn_into(request: ExportRequest, robot: Robot, nominal: Robot, comments: tuple[str, ...]) -> str | None:
+def text_in_urdf(
+    request: ExportRequest, robot: Robot, nominal: Robot, comments: tuple[str, ...]
+) -> str | None:
     """Write a robot into the URDF file of --like, or by default into the one that the model folder includes.
 
     Args:
@@ -72,11 +74,11 @@ def drawn_into(request: ExportRequest, robot: Robot, nominal: Robot, comments: t
     Returns:
         The text; None without such a file.
     """
-    drawn = _SOURCE.search(nominal.source)
+    source = _SOURCE.search(nominal.source)
     like = request.like or (request.model / DRAWING if nominal.urdf else None)
     if like is None:
         return None
-    base, tip = drawn.group("base", "tip") if drawn else (None, None)
+    base, tip = source.group("base", "tip") if source else (None, None)
     return robot_into_urdf(robot, nominal, like, request.tip or tip, comments, base)
 
 
@@ -155,11 +157,11 @@ def robot_into_urdf(
     return f'<?xml version="1.0"?>\n{etree.tostring(root, encoding="unicode")}\n'
 
 
-def _check_same(drawn: RobotFields, nominal: Robot, path: str) -> None:
+def _check_same(described: RobotFields, nominal: Robot, path: str) -> None:
     """Raise an error if a file describes another robot."""
-    kinds, wanted = ([(row.name, row.type, row.direction) for row in r.rows] for r in (drawn, nominal))
+    kinds, wanted = ([(row.name, row.type, row.direction) for row in r.rows] for r in (described, nominal))
     if kinds != wanted:
-        joints, other = (", ".join(row.name for row in r.rows) for r in (drawn, nominal))
+        joints, other = (", ".join(row.name for row in r.rows) for r in (described, nominal))
         raise RobotError(
             f"expected the joints {other} of the model, got {joints}",
             expected=f"the joints {other}",
@@ -168,7 +170,7 @@ def _check_same(drawn: RobotFields, nominal: Robot, path: str) -> None:
             option="--like",
             remedy="give the file that the robot was loaded from, and the same tip",
         )
-    far = float(np.abs(drawn.dh - nominal.dh)[:-1].max(initial=0.0))
+    far = float(np.abs(described.dh - nominal.dh)[:-1].max(initial=0.0))
     if far > SAME:
         raise RobotError(
             f"the nominal geometry differs from that of the model by {far:.2g} m or rad",

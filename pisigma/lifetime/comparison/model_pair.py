@@ -82,11 +82,11 @@ class ModelPair:
     def points(self) -> Float64[Tensor, "points dof"]:
         """Joint values that the models keep of their training rows, half from each [rad or m]."""
         generator = torch.Generator().manual_seed(0)
-        drawn = [
+        sampled = [
             model.starts[torch.randperm(len(model.starts), generator=generator)[: POINTS // 2]]
             for model in (self.first, self.second)
         ]
-        return torch.cat(drawn)
+        return torch.cat(sampled)
 
     @property
     def workspace(self) -> Float64[Tensor, "samples dof"]:
@@ -99,8 +99,10 @@ class ModelPair:
         if bool((low > high).any()):  # the models were measured in different places
             low, high = kept.amin(0), kept.amax(0)
         generator = torch.Generator().manual_seed(0)
-        drawn = torch.rand(max(SAMPLES - len(kept), 0), kept.shape[1], generator=generator, dtype=kept.dtype)
-        return torch.cat([kept[:SAMPLES], low + drawn * (high - low)])
+        sampled = torch.rand(
+            max(SAMPLES - len(kept), 0), kept.shape[1], generator=generator, dtype=kept.dtype
+        )
+        return torch.cat([kept[:SAMPLES], low + sampled * (high - low)])
 
     def poses(
         self, q: Float64[Tensor, "poses dof"]
@@ -142,7 +144,7 @@ def frames_of(
 
 def nominal_robot(model: CalibratedModel) -> Robot:
     """Return the nominal robot of a model."""
-    return model.drawn or model.robot
+    return model.nominal or model.robot
 
 
 def _frame_names(

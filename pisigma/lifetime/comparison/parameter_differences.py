@@ -104,7 +104,7 @@ def parameter_differences(pair: ModelPair, level: float = LEVEL) -> ParameterDif
         level: family-wise significance level.
     """
     parameters = _side_by_side(pair)
-    if any(model.uncertainty is None and not _is_drawn(model) for model in (pair.first, pair.second)):
+    if any(model.uncertainty is None and not _is_nominal(model) for model in (pair.first, pair.second)):
         return ParameterDifferences(parameters, (), (), None, level)
     effects = ParameterEffects(pair)
     threshold = NormalDist().inv_cdf(1 - level / (2 * max(len(effects.tested), 1)))
@@ -162,10 +162,10 @@ def _deviations(model: CalibratedModel, count: int) -> Tensor | None:
     posterior = parameter_posterior(model)
     if posterior is not None:
         return posterior.standard_errors[:count]
-    return torch.zeros(count, dtype=torch.float64) if _is_drawn(model) else None
+    return torch.zeros(count, dtype=torch.float64) if _is_nominal(model) else None
 
 
-def _is_drawn(model: CalibratedModel) -> bool:
+def _is_nominal(model: CalibratedModel) -> bool:
     """Return whether a model is the nominal robot, which has no uncertainty."""
     if model.network is not None or model.hybrid is not None:
         return False

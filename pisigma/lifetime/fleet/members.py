@@ -176,14 +176,14 @@ def _member(path: Path, name: str, rows: Sequence[tuple[int, dict[str, str]]], r
         if len(values) > 1:
             problem = f"robot '{name}' has several different entries"
             raise FleetError(problem, value=name, at=Place(path, first, key), remedy="state one")
-    drawn = next(iter(stated["robot"]), robot)
-    if drawn is None:
+    description = next(iter(stated["robot"]), robot)
+    if description is None:
         at, remedy = Place(path, first, "robot"), "name a robot or a robot file"
         raise FleetError("the field is empty", at=at, remedy=remedy)
-    file = path.parent / drawn
+    file = path.parent / description
     return Member(
         id=name,
-        robot=str(file) if file.is_file() else drawn,
+        robot=str(file) if file.is_file() else description,
         sessions=_ordered(sessions, name, Place(path, first)),
         model=next((path.parent / model for model in stated["model"]), None),
         options=_options(next(iter(stated["options"]), "")),
@@ -234,15 +234,15 @@ def _of_files(entry: Path, name: str, files: Sequence[Path], robot: str | None) 
     Raises:
         FleetError: it has no description, or its sessions cannot be distinguished.
     """
-    drawn = next((str(entry / one) for one in ROBOT_FILES if (entry / one).is_file()), robot)
-    if drawn is None:
+    description = next((str(entry / one) for one in ROBOT_FILES if (entry / one).is_file()), robot)
+    if description is None:
         raise FleetError(
             expected=f"one of {', '.join(ROBOT_FILES)}",
             value="none of them",
             at=Place(entry),
             remedy="add the robot's description, or state one for all robots",
         )
-    return Member(name, drawn, _ordered([_session(file, "") for file in files], name, Place(entry)))
+    return Member(name, description, _ordered([_session(file, "") for file in files], name, Place(entry)))
 
 
 def _check_id(name: str, at: Place) -> None:

@@ -133,28 +133,28 @@ def mean_robot(
         noise: noise of each sensor, see `Adaptation.noise`.
     """
     usual, size = posterior.uncertainty, population.geometric
-    space, drawn = usual.space, usual.space.robot
-    dh = drawn.dh + population.mean[:size].numpy().reshape(drawn.dh.shape)
-    mean = drawn.with_geometry(dh=dh)
-    correction = _correction(drawn, usual.features, population.mean[size:])
+    space, nominal = usual.space, usual.space.robot
+    dh = nominal.dh + population.mean[:size].numpy().reshape(nominal.dh.shape)
+    mean = nominal.with_geometry(dh=dh)
+    correction = _correction(nominal, usual.features, population.mean[size:])
     q = torch.cat([rows.q.cpu() for rows in fleet])
     starts = spread_rows(torch.unique(q, dim=0))
     root = torch.zeros(len(usual.root), len(population.mean), dtype=torch.float64)
     factor = torch.linalg.cholesky(population.covariance)
     root[: space.arm_size], root[len(space.parameters) :] = factor[:size], factor[size:]
-    frames = {"": np.array(drawn.base)}, {"": np.array(drawn.tool)}
+    frames = {"": np.array(nominal.base)}, {"": np.array(nominal.tool)}
     return CalibratedModel(
         name=name,
         kind=FLEET_PRIOR,
-        robot=drawn,
+        robot=nominal,
         network=None,
         domain=None,
-        branches=branches_of(drawn, starts),
+        branches=branches_of(nominal, starts),
         starts=starts,
         calibrated=mean,
         bases=frames[0],
         tools=frames[1],
-        hybrid=HybridArm(mean, correction, JointCoverage.from_joints(drawn, q)),
+        hybrid=HybridArm(mean, correction, JointCoverage.from_joints(nominal, q)),
         hybrid_bases=frames[0],
         hybrid_tools=frames[1],
         uncertainty=PositionUncertainty(
@@ -248,13 +248,13 @@ class FleetConsistency:
         """
         posterior = ModelPosterior.from_model(model)
         root = of_arm(posterior.root, posterior.space)
-        drawn = posterior.space.robot
-        errors = torch.from_numpy(posterior.geometry.robot.dh - drawn.dh)
+        nominal = posterior.space.robot
+        errors = torch.from_numpy(posterior.geometry.robot.dh - nominal.dh)
         mean = torch.cat([errors.flatten(), posterior.weights])
         evidence = evidence_of(model, mean, rows)
         fleet = Population(mean, root @ root.t(), posterior.space.arm_size)
         square, count = fleet.surprise(evidence)
-        gain = fleet.log_evidence(evidence) - class_population(drawn).log_evidence(evidence)
+        gain = fleet.log_evidence(evidence) - class_population(nominal).log_evidence(evidence)
         return FleetConsistency(float(chi2.sf(square, count)), gain)
 
     @property

@@ -44,9 +44,9 @@ def recalibrated_model(model: CalibratedModel, adaptation: Adaptation, rows: Mea
         adaptation: adaptation of the parent to the rows.
         rows: new rows.
     """
-    known, drawn = model.uncertainty, model.drawn
+    known, nominal = model.uncertainty, model.nominal
     assert known is not None
-    assert drawn is not None
+    assert nominal is not None
     solved = adaptation.arm.geometry
     geometry = IdentifiedGeometry(solved.robot, solved.bases, solved.tools, solved.unknowns)
     calibrated, bases, tools = geometry.robot, geometry.bases, geometry.tools
@@ -59,10 +59,10 @@ def recalibrated_model(model: CalibratedModel, adaptation: Adaptation, rows: Mea
         bases = _taken_along(model.bases, model.hybrid_bases, geometry.bases, before=True)
         tools = _taken_along(model.tools, model.hybrid_tools, geometry.tools, before=False)
         dh = model.calibrated.dh + geometry.robot.dh - model.hybrid.robot.dh
-        calibrated = drawn.with_geometry(
+        calibrated = nominal.with_geometry(
             dh=dh, base=next(iter(bases.values())), tool=next(iter(tools.values()))
         )
-    robot = drawn.with_geometry(base=calibrated.base, tool=calibrated.tool)
+    robot = nominal.with_geometry(base=calibrated.base, tool=calibrated.tool)
     root = CovarianceRoot(adaptation.root)
     space = adaptation.problem.design.problem.space
     noise = known.noise.updated(adaptation.noise)
@@ -79,7 +79,7 @@ def recalibrated_model(model: CalibratedModel, adaptation: Adaptation, rows: Mea
         hybrid_bases=geometry.bases if hybrid else {},
         hybrid_tools=geometry.tools if hybrid else {},
         uncertainty=PositionUncertainty(space, geometry, known.features, root, known.prior_scale, noise),
-        made_of=kept_rows(drawn, rows, model.made_of),
+        made_of=kept_rows(nominal, rows, model.made_of),
         provenance=Provenance(
             data_source=rows.file_names,
             data_sha256=rows.content_hash(),
@@ -138,7 +138,7 @@ def recalibration_diagnostics(
         chosen[list(wrong)] = True
         return (many_wrong(rows, chosen),)
     if judged.kept == "scratch" and (
-        implausible := check_rows(rows, parent.drawn or parent.robot).implausible
+        implausible := check_rows(rows, parent.nominal or parent.robot).implausible
     ):
         return implausible
     return (*_left_out(parent, judged, rows), *beyond_wear(parent.robot, moved))

@@ -77,9 +77,9 @@ def hybrid_sections(model: CalibratedModel) -> dict[str, Any]:
 def hybrid_tensors(model: CalibratedModel) -> dict[str, Tensor]:
     """Return the tensors of the weights file that only models of a hybrid calibration have."""
     result: dict[str, Tensor] = {}
-    if (drawn := model.drawn) is not None:
-        result |= _geometry("drawn", drawn)
-        result["drawn.limits"] = torch.from_numpy(drawn.limits[_limited(drawn)])
+    if (nominal := model.nominal) is not None:
+        result |= _geometry("drawn", nominal)
+        result["drawn.limits"] = torch.from_numpy(nominal.limits[_limited(nominal)])
         assert model.calibrated is not None
         result |= _geometry("calibrated", model.calibrated)
     if (arm := model.hybrid) is not None:
@@ -160,9 +160,9 @@ def with_hybrid(
         return model
     if model.calibrated is None:
         raise MisfitError("a hybrid calibration requires the calibrated robot", column="calibrated")
-    drawn = _with_limits(_exact("drawn", model.robot, tensors, ("dh",)), tensors["drawn.limits"])
-    calibrated = _exact("calibrated", replace(model.calibrated, rows=drawn.rows), tensors, _GEOMETRY)
-    robot = drawn.with_geometry(base=calibrated.base, tool=calibrated.tool)
+    nominal = _with_limits(_exact("drawn", model.robot, tensors, ("dh",)), tensors["drawn.limits"])
+    calibrated = _exact("calibrated", replace(model.calibrated, rows=nominal.rows), tensors, _GEOMETRY)
+    robot = nominal.with_geometry(base=calibrated.base, tool=calibrated.tool)
     model = replace(model, robot=robot, calibrated=calibrated)
     place = (calibrated, model.bases, model.tools)
     if learned is not None:
@@ -171,12 +171,12 @@ def with_hybrid(
                 "the frames or targets of the learned part differ from those of the geometric part",
                 column="learned",
             )
-        place = (_exact("learned", drawn, tensors, ()), _frames(learned.bases), _frames(learned.tools))
-        arm = HybridArm(place[0], _correction(learned, drawn, tensors), _coverage(drawn, tensors))
+        place = (_exact("learned", nominal, tensors, ()), _frames(learned.bases), _frames(learned.tools))
+        arm = HybridArm(place[0], _correction(learned, nominal, tensors), _coverage(nominal, tensors))
         model = replace(model, hybrid=arm, hybrid_bases=place[1], hybrid_tools=place[2])
     if known is None:
         return model
-    uncertainty = _uncertainty(known, model.hybrid, drawn, tensors["uncertainty.root"], place)
+    uncertainty = _uncertainty(known, model.hybrid, nominal, tensors["uncertainty.root"], place)
     return replace(model, uncertainty=uncertainty)
 
 
@@ -262,7 +262,7 @@ def _coverage(robot: Robot, tensors: Mapping[str, Tensor]) -> JointCoverage:
 def _uncertainty(
     known: UncertaintySection,
     hybrid: HybridArm | None,
-    drawn: Robot,
+    nominal: Robot,
     root: Tensor,
     place: tuple[Robot, Frames, Frames],
 ) -> PositionUncertainty:
@@ -277,7 +277,7 @@ def _uncertainty(
             column="uncertainty.unknowns",
             value=min(elsewhere),
         )
-    space = ParameterSpace(drawn, tuple(bases), tuple(tools), tuple(groups))
+    space = ParameterSpace(nominal, tuple(bases), tuple(tools), tuple(groups))
     count, free = len(space.parameters), list(known.free)
     if sorted(set(free)) != free or (free and free[-1] >= count):
         raise MisfitError(

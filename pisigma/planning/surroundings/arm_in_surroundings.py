@@ -56,7 +56,7 @@ class ArmInSurroundings:
     """A robot in its cell.
 
     Attributes:
-        drawn: nominal robot; its base is that of the cell.
+        nominal: nominal robot; its base is that of the cell.
         robot: the same with the reflector as its tool.
         cell: surroundings of the robot.
         capsules: capsules along the links.
@@ -67,7 +67,7 @@ class ArmInSurroundings:
         limits: limits of the controller's values including margins [rad or m].
     """
 
-    drawn: Robot
+    nominal: Robot
     robot: Robot
     cell: Surroundings
     capsules: Capsules
@@ -116,7 +116,7 @@ class ArmInSurroundings:
             if self.cell.tool is None
             else self.cell.tool.model_copy(update={"radius_mm": TOOL_RADIUS * 1e3})
         )
-        usual = self.cell.model_copy(update={"links": LinkSection(), "tool": tool}).capsules(self.drawn)
+        usual = self.cell.model_copy(update={"links": LinkSection(), "tool": tool}).capsules(self.nominal)
         looked_at = set(map(tuple, self.pairs.tolist()))
         lost = [
             pair for pair in usual.pairs(self.cell.clearance / 2).tolist() if tuple(pair) not in looked_at
@@ -159,7 +159,7 @@ class ArmInSurroundings:
         for index, row in enumerate(self.robot.rows):
             bounds = [abs(bound) for bound in (row.lower, row.upper) if math.isfinite(bound)]
             strokes[index] = max(bounds, default=0.0) if row.type == "prismatic" else 0.0
-            strokes[index] += float(np.linalg.norm(row.drawn_at))
+            strokes[index] += float(np.linalg.norm(row.urdf_origin))
         lengths = np.append(np.hypot(d + strokes, self.robot.dh[:, 2]), np.linalg.norm(self.robot.tool[:3]))
         beyond = np.cumsum(lengths[::-1])[::-1][list(self.robot.joint_rows)]
         return torch.from_numpy(np.where(self.robot.revolute, beyond, 1.0))

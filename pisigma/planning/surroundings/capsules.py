@@ -151,8 +151,8 @@ class _Piece(NamedTuple):
 
 def _pieces_of_rows(robot: Robot, tip: Float64[np.ndarray, " 3"]) -> Iterator[_Piece]:
     """Yield the pieces from joint to joint and to the tip: straight if joint positions are known, else by d, a."""
-    has_seats = any(any(row.drawn_at) for row in robot.rows)
-    seats = [np.array(row.drawn_at) for row in robot.rows] + [tip if has_seats else np.zeros(3)]
+    has_seats = any(any(row.urdf_origin) for row in robot.rows)
+    seats = [np.array(row.urdf_origin) for row in robot.rows] + [tip if has_seats else np.zeros(3)]
     first = robot.joint_rows[0]
     if has_seats:
         yield _Piece(0, True, (0, 0), (np.zeros(3), seats[0]))

@@ -285,10 +285,10 @@ class Surroundings(Section):
         """Return the robot with the reflector as its tool, where the cell states it."""
         if self.tool is None:
             return robot
-        drawn, reflector = (
+        nominal_tool, reflector = (
             transform_from_xyzrpy(torch.tensor(tool)) for tool in (robot.tool, self.tool.to_si())
         )
-        return robot.with_geometry(tool=xyzrpy_from_transform(drawn @ reflector).numpy())
+        return robot.with_geometry(tool=xyzrpy_from_transform(nominal_tool @ reflector).numpy())
 
     def capsules(self, robot: Robot) -> Capsules:
         """Make capsules along the links of a robot and the bracket of its reflector."""

@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 from pisigma.robot.kernels.forms import KernelForms
 from pisigma.robot.kinematics.status import Status
 
-NOMINAL, IDENTIFIED, DRAWN = 0, 1, 2
+NOMINAL, IDENTIFIED, NOMINAL_WITHOUT_BASE = 0, 1, 2
 """Indices of the arms: nominal, with the identified geometry (of a hybrid the one that belongs to its correction), and
 the nominal one without base, for gravity torques."""
 CORRECTED = 3

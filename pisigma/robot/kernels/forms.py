@@ -23,7 +23,7 @@ class CompiledForm:
         add_slope: adds the derivatives of every joint's correction by its own value to `memory.slope`; None where
             they are small.
         frames: whether `add` reads `memory.frames`: of every joint axis and origin, axes and origin of its row's
-            frame, in the frame of the first row of the arm as drawn.
+            frame, in the frame of the first row of the nominal arm.
     """
 
     add: Callable[..., None]

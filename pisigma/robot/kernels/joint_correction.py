@@ -4,7 +4,7 @@ import math
 from collections.abc import Callable, Iterable
 from typing import Any
 
-from pisigma.robot.kernels.arrays import CORRECTED, DRAWN, FIXED, IDENTIFIED, REVOLUTE
+from pisigma.robot.kernels.arrays import CORRECTED, FIXED, IDENTIFIED, NOMINAL_WITHOUT_BASE, REVOLUTE
 from pisigma.robot.kernels.chain import jacobian, walk
 from pisigma.robot.kernels.forms import FORMS, compiled_plain
 from pisigma.robot.kernels.rows import Array, Record, contracted_kernel, kernel
@@ -64,7 +64,7 @@ def joint_correction(arms: Record, correction: Record, memory: Record, q: Array)
             phi[k] = (q[j] - correction.middle[j]) / correction.half[j]
             k += 1
     if correction.frames:
-        _walk_drawn(arms, q, turning, memory.frames)
+        _walk_nominal(arms, q, turning, memory.frames)
     _add_features(arms, correction, memory, q)
     _add_products(correction, dof, phi, memory.delta)
 
@@ -110,7 +110,7 @@ def _add_products(correction: Record, dof: int, phi: Array, delta: Array) -> Non
 
 
 @contracted_kernel
-def _walk_drawn(arms: Record, q: Array, turning: Array, frames: Array) -> None:
+def _walk_nominal(arms: Record, q: Array, turning: Array, frames: Array) -> None:
     """Write axis and origin of every joint, and axes and origin of its row's frame, of the nominal arm.
 
     All are in the frame of the arm's first row. `frames` is `(dof, 18)`.
@@ -120,7 +120,7 @@ def _walk_drawn(arms: Record, q: Array, turning: Array, frames: Array) -> None:
     cx, cy, cz, cp = 0.0, 0.0, 1.0, 0.0
     joint = 0
     for i in range(arms.rows_used):
-        row, kind = arms.rows[DRAWN, i], arms.kind[i]
+        row, kind = arms.rows[NOMINAL_WITHOUT_BASE, i], arms.kind[i]
         d, cos, sin = row[1], row[7], row[8]
         if kind == REVOLUTE:
             sign = arms.direction[joint]

@@ -75,13 +75,13 @@ def recover(description: Record, memory: Record, branch: int, any_branch: bool) 
     Returns:
         Index of their branch, -1 if nothing was found.
     """
-    form, starts, beside, plausible = description.closed_form, description.starts, memory.others, False
-    all_branches(description.arms, form, memory.level, NEAREST, memory.rounding, memory.wanted, beside)
+    form, starts, branches, plausible = description.closed_form, description.starts, memory.others, False
+    all_branches(description.arms, form, memory.level, NEAREST, memory.rounding, memory.wanted, branches)
     for index in range(form.branches):
-        if _is_near(description, memory, beside[index]):
+        if _is_near(description, memory, branches[index]):
             plausible = True
         else:
-            beside[index, 0] = math.nan
+            branches[index, 0] = math.nan
     if not plausible:
         return -1
     if not any_branch:
@@ -91,10 +91,10 @@ def recover(description: Record, memory: Record, branch: int, any_branch: bool) 
         place = branch if attempt == 0 else attempt - 1
         if attempt > form.branches:
             copy(starts.q[memory.nearest[attempt - 1 - form.branches]], memory.q)
-        elif math.isnan(beside[place, 0]) or (attempt > 0 and place == branch):
+        elif math.isnan(branches[place, 0]) or (attempt > 0 and place == branch):
             continue
         else:
-            copy(beside[place], memory.q)
+            copy(branches[place], memory.q)
         if search(description, memory, memory.pose, memory.q):
             copy(memory.q, memory.solution)
             lies = branch_of(description, memory, memory.q)

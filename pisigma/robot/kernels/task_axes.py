@@ -156,7 +156,7 @@ def elbow_angle(arms: Record, memory: Record) -> float:
 
     See `kinematics.task_axes`. Both refer to the arm whose joint axes are in memory.
     """
-    axes, J, w, n, p, t = memory.axes, memory.J, memory.line, memory.upright, memory.bend, memory.beside
+    axes, J, w, n, p, t = memory.axes, memory.J, memory.line, memory.upright, memory.bend, memory.lateral
     square, along_n, along_p = 0.0, 0.0, 0.0
     for i in range(3):
         w[i], p[i] = axes[5, 3 + i] - axes[1, 3 + i], axes[3, 3 + i] - axes[1, 3 + i]

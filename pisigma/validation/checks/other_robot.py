@@ -32,8 +32,8 @@ class OtherRobotCheck(AbstractCheck):
     def diagnose(self, checked: CheckedCalibration) -> Iterator[Diagnostic]:
         """See `AbstractCheck.diagnose`."""
         robot = checked.robot
-        as_drawn = None if checked.figures is None else checked.figures.nominal
-        stated = None if as_drawn is None else as_drawn.rms_mm
+        nominal = None if checked.figures is None else checked.figures.nominal
+        stated = None if nominal is None else nominal.rms_mm
         if stated is None or stated <= SUSPICIOUS * robot.reach * 1e3:
             return
         others = {
@@ -58,10 +58,10 @@ def other_robot_diagnostics(robot: Robot, rows: Measurements) -> tuple[Diagnosti
     if rows.rows < MIN_ROWS:
         return ()
     try:
-        as_drawn = base_and_tool(calibrator).fit(rows)
+        nominal = base_and_tool(calibrator).fit(rows)
     except IdentificationError:
         return ()
-    checked = CheckedCalibration(calibrator, rows, {"nominal": as_drawn, "geometric": as_drawn})
+    checked = CheckedCalibration(calibrator, rows, {"nominal": nominal, "geometric": nominal})
     return tuple(OtherRobotCheck().diagnose(checked))
 
 

@@ -30,23 +30,23 @@ class UnexplainedCheck(AbstractCheck):
             return
         figures = checked.figures if checked.validation is None else checked.validation.figures()
         errors = {} if figures is None else {name: one.rms_mm for name, one in figures.models.items()}
-        left, drawn = list(errors.values())[-1] if errors else None, errors.get("nominal")
-        if left is None or drawn is None or self._explained(checked, left):
+        left, nominal = list(errors.values())[-1] if errors else None, errors.get("nominal")
+        if left is None or nominal is None or self._explained(checked, left):
             return
         reach = checked.robot.reach * 1e3
         stated = checked.calibrator.robot_class or RobotClass.from_robot(checked.robot).name
         far = left > (FAR_HOBBY if stated == HOBBY.name else FAR) * reach
-        if far or (left > LARGE * reach and drawn < HARDLY * left):
+        if far or (left > LARGE * reach and nominal < HARDLY * left):
             what = "rows of the calibration" if checked.validation is None else "held-out rows"
             yield Diagnostic(
                 kind="unexplained",
                 severity="implausible",
-                sentence=f"The errors of the {what} are {left:.3g} mm RMS ({drawn:.3g} mm for the nominal robot), but "
-                f"robots of this size have less than {LARGE * reach:.2g} mm after a calibration"
+                sentence=f"The errors of the {what} are {left:.3g} mm RMS ({nominal:.3g} mm for the nominal robot), "
+                f"but robots of this size have less than {LARGE * reach:.2g} mm after a calibration"
                 f"{'' if far else ', and calibration hardly helped'}. Mixed populations, a moved frame or tool, joint "
                 "values that were logged too early or rounded, and a scale do not explain them; check what else "
                 "differs between the rows, and the sensor.",
-                values={"rms_mm": left, "nominal_rms_mm": drawn},
+                values={"rms_mm": left, "nominal_rms_mm": nominal},
             )
 
     @staticmethod

@@ -63,10 +63,10 @@ def fit_where_it_helps(calibrator: Calibrator, rows: Measurements, progress: Pro
     geometric = geometric_of(calibrator)
     if not geometric.free or _helps(geometric, geometric_result(result), rows, stage(progress, "few rows")):
         return result
-    drawn = base_and_tool(geometric)
+    nominal = base_and_tool(geometric)
     if isinstance(calibrator, HybridCalibrator):
-        return fit(replace(calibrator, robot=drawn, features=(), products=False), rows, progress)
-    return fit(drawn, rows, progress)
+        return fit(replace(calibrator, robot=nominal, features=(), products=False), rows, progress)
+    return fit(nominal, rows, progress)
 
 
 def _helps(
@@ -93,8 +93,8 @@ def _evident(calibrator: GeometricCalibrator, result: CalibrationResult, rows: M
 
     This is the F test of nested models, with the effective number of parameters under their prior.
     """
-    drawn = base_and_tool(calibrator).fit(rows).noise
-    pairs = list(zip(result.noise, drawn, strict=True))
+    nominal = base_and_tool(calibrator).fit(rows).noise
+    pairs = list(zip(result.noise, nominal, strict=True))
     left = sum(noise.values - noise.used for noise, _ in pairs)
     more = sum(noise.used - before.used for noise, before in pairs)
     before = sum((one.values - one.used) * (one.sigma / noise.sigma) ** 2 for noise, one in pairs)

@@ -68,8 +68,8 @@ def confidence_intervals(
     order = np.argsort(group, kind="stable")
     sizes, errors = np.bincount(group), errors[:, order]
 
-    def of_resample(drawn: Int64[np.ndarray, " groups"]) -> np.ndarray:
-        times = np.bincount(drawn.astype(np.int64), minlength=groups)
+    def of_resample(sampled: Int64[np.ndarray, " groups"]) -> np.ndarray:
+        times = np.bincount(sampled.astype(np.int64), minlength=groups)
         values = statistics(np.repeat(errors, np.repeat(times, sizes), axis=1))
         return np.stack([values, values - values[:, :1]])
 

@@ -103,8 +103,8 @@ def map_of_workspace(model: CalibratedModel) -> ErrorMap:
     if more:
         low, high = q.amin(0), q.amax(0)
         generator = torch.Generator().manual_seed(0)
-        drawn = torch.rand(more, q.shape[1], generator=generator, dtype=torch.float64)
-        q = torch.cat([q, low + drawn * (high - low)])
+        uniform = torch.rand(more, q.shape[1], generator=generator, dtype=torch.float64)
+        q = torch.cat([q, low + uniform * (high - low)])
     frame, target = (next(iter(names), "") for names in (model.bases, model.tools))
     samples = Measurements(q=q, frame=(frame,) * len(q), target=(target,) * len(q), source=model.name)
     moved = model.forward(q)[:, :3, 3] - forward_kinematics(model.robot, q)[:, :3, 3]

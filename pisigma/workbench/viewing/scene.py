@@ -115,8 +115,8 @@ class SessionScene:
         self._begin("/rows")
         if not rows.line:
             return
-        drawn = self._poses(rows.q)[:, :3, 3]
-        position = np.where(np.isfinite(rows.position), rows.position, drawn)
+        nominal = self._poses(rows.q)[:, :3, 3]
+        position = np.where(np.isfinite(rows.position), rows.position, nominal)
         colors = shades(np.linalg.norm(rows.error, axis=1), top)
         colors[rows.alarmed] = ALARM
         if not rows.check.all():
@@ -138,8 +138,8 @@ class SessionScene:
         if not judged.any() or magnification == 0:
             return
         lengths = magnification * np.linalg.norm(rows.error, axis=1, keepdims=True)
-        drawn = magnification * rows.error * np.minimum(1.0, MAX_ARROW * reach / np.maximum(lengths, 1e-12))
-        ends = np.stack([position, position + drawn], axis=1)
+        arrow = magnification * rows.error * np.minimum(1.0, MAX_ARROW * reach / np.maximum(lengths, 1e-12))
+        ends = np.stack([position, position + arrow], axis=1)
         self._scene.add_arrows(
             "/rows/errors",
             ends[judged],

@@ -39,9 +39,9 @@ def write_new_cell(
     try:
         for part in (PLANS, SESSIONS, MODELS):
             (folder / part).mkdir(parents=True, exist_ok=True)
-        if (drawn := robot_file(robot)) is not None:
-            known["robot"] = f"robot{drawn.suffix.lower()}"
-            shutil.copyfile(drawn, folder / known["robot"])
+        if (description := robot_file(robot)) is not None:
+            known["robot"] = f"robot{description.suffix.lower()}"
+            shutil.copyfile(description, folder / known["robot"])
         if cameras is not None:
             known["camera"] = _copied(cameras, folder)
         write_whole(folder / CELL_FILE, template(known))

@@ -138,7 +138,7 @@ def _session_records(
         try:
             if settings.prior is not None and (parent is None or settings.task == "calibrate"):
                 recalibration = recalibrate(
-                    settings.prior, session.data, again, drawn=Robot.load(member.robot)
+                    settings.prior, session.data, again, nominal=Robot.load(member.robot)
                 )
                 record, result = _recalibrated(recalibration, session), recalibration
             elif parent is None or settings.task == "calibrate":

@@ -66,16 +66,16 @@ def estimate_fleet_prior(
     members = read_fleet(source, robot)
     robots, refused = _robots(members)
     readable = [one for one in members if one.id in robots]
-    drawn = _common_robot(robots)
+    nominal = _common_robot(robots)
     progress(f"{len(members)} robots")
     rows: dict[str, Measurements] = {}
     for one in readable:
         try:
-            some = read_rows(one.sessions[0].data, drawn, one.cameras).split_sets()[0]
+            some = read_rows(one.sessions[0].data, nominal, one.cameras).split_sets()[0]
         except MeasurementError as problem:  # one bad file does not stop the others
             refused[one.id] = str(problem)
             continue
-        causes = [cause for cause in setup_diagnostics(drawn, some) if cause.severity == "implausible"]
+        causes = [cause for cause in setup_diagnostics(nominal, some) if cause.severity == "implausible"]
         if causes:  # a wrong unit would count as a large scatter between robots
             refused[one.id] = f"{some.source}: {causes[0].sentence}"
         else:
@@ -86,8 +86,8 @@ def estimate_fleet_prior(
             f"{next(iter(refused.values()))}",
             value=len(rows),
         )
-    remarks = tuple(f"Robot '{one}': {said}" for one in rows for said in row_warnings(drawn, rows[one]))
-    wide = drawn
+    remarks = tuple(f"Robot '{one}': {said}" for one in rows for said in row_warnings(nominal, rows[one]))
+    wide = nominal
     for some in rows.values():
         wide = with_limits_of_rows(wide, some)
     prior = fleet_prior(Path(source).resolve().stem, wide, list(rows.values()))

@@ -211,7 +211,7 @@ def _key(member: Member, settings: FleetSettings, plan: CalibrationSettings | st
     """Return the SHA-256 of all that a robot's results depend on: files, settings and the version of pisigma."""
     from pisigma import __version__
 
-    drawn, model = Path(member.robot), member.model
+    description, model = Path(member.robot), member.model
     stated = {
         "version": __version__,
         "task": settings.task,
@@ -219,7 +219,7 @@ def _key(member: Member, settings: FleetSettings, plan: CalibrationSettings | st
         "prior": None if settings.prior is None else model_hash(settings.prior),
         "plan": repr(plan),
         "plugins": loaded().content(),
-        "robot": _hash_of(drawn) if drawn.is_file() else member.robot,
+        "robot": _hash_of(description) if description.is_file() else member.robot,
         "model": None if model is None else model_hash(model) if is_model(model) else str(model),
         "cameras": [_hash_of(Path(file)) for file in (member.cameras.files if member.cameras else ())],
         "sessions": [(one.name, one.date, one.data.name, _hash_of(one.data)) for one in member.sessions],

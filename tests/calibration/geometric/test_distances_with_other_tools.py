@@ -31,7 +31,7 @@ SOCKETS = {("plate/0", "plate/1"): 0.05, ("low/0", "low/1"): 0.05, ("high/0", "h
 
 
 def with_tool_off(off: float) -> Robot:
-    """The robot as drawn, its tool so far from the true one [m]."""
+    """The nominal robot, its tool so far from the true one [m]."""
     nominal = true_robot().nominal
     tool = nominal.tool.copy()
     tool[:3] += off * np.array([0.6, -0.48, 0.64])
@@ -40,7 +40,7 @@ def with_tool_off(off: float) -> Robot:
 
 @pytest.mark.parametrize("sensor", SENSORS)
 @pytest.mark.parametrize("off", [0.0, 0.137, 0.3])
-def test_a_tool_that_is_not_as_drawn_is_found(sensor: str, off: float) -> None:
+def test_a_tool_that_is_not_nominal_is_found(sensor: str, off: float) -> None:
     result = GeometricCalibrator(with_tool_off(off)).fit(SENSORS[sensor]())
     assert result.status.good
     assert_close(result.robot.tool[2], true_robot().geometric_robot.tool[2], atol=1e-3)

@@ -26,7 +26,7 @@ def groups(**options: object) -> dict[str, int]:
     return dict(zip(problem.space.names, problem.prior_group.tolist(), strict=False))
 
 
-def test_lengths_that_are_drawn_and_that_are_not_have_sizes_of_their_own() -> None:
+def test_zero_and_nonzero_nominal_lengths_have_sizes_of_their_own() -> None:
     found = groups()
     assert {name for name, group in found.items() if group == PriorGroup.LENGTH} == {
         "d_1",
@@ -41,8 +41,8 @@ def test_lengths_that_are_drawn_and_that_are_not_have_sizes_of_their_own() -> No
     assert angles == {PriorGroup.BETWEEN_AXES}
 
 
-def test_a_length_shorter_than_its_tolerance_counts_as_not_drawn() -> None:
-    wide = groups(prior=Prior(d=1e-3, a=0.1))  # a_1 is drawn as 60 mm, a_3 as 80 mm, a_2 as 350 mm
+def test_a_length_shorter_than_its_tolerance_counts_as_zero() -> None:
+    wide = groups(prior=Prior(d=1e-3, a=0.1))  # a_1 is nominally 60 mm, a_3 as 80 mm, a_2 as 350 mm
     assert [wide[name] for name in ("a_1", "a_3", "a_2")] == [
         PriorGroup.NO_LENGTH,
         PriorGroup.NO_LENGTH,
@@ -59,11 +59,11 @@ def test_other_sizes_are_for_angles_and_for_lengths(sizes: str) -> None:
 
 @pytest.mark.parametrize("column", ["base", "tool", "socket", "anchor"])
 def test_parameters_without_a_prior_have_a_group_that_exists(column: str) -> None:
-    assert prior_group_of(column, drawn=True) in set(PriorGroup)
+    assert prior_group_of(column, nonzero=True) in set(PriorGroup)
 
 
 def calibrated(theta: float, length: float) -> list[str]:
-    """Kinds of errors that are unusually large, where theta and the lengths that are drawn have some."""
+    """Kinds of errors that are unusually large, where theta and the nominal lengths that are not 0 have some."""
     rng = np.random.default_rng(3)
     nominal = Robot.load("ur10")
     errors = dh_errors(nominal, length, theta, rng) * (np.abs(nominal.dh) > 0)

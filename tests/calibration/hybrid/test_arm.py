@@ -5,7 +5,7 @@ import math
 import numpy as np
 import torch
 from testing.closeness import assert_close
-from testing.linearised import drawn_joints
+from testing.linearised import random_joints
 from torch import Tensor
 
 from pisigma.calibration.hybrid.arm import HybridArm, JointCoverage
@@ -23,7 +23,7 @@ def line(*ends: tuple[float, float], count: int = 40) -> Tensor:
 def coverage_of(first: Tensor, name: str = "ur5", joint: int = 0) -> JointCoverage:
     """Of a robot whose other joints were measured all over a turn."""
     robot = Robot.load(name)
-    q = drawn_joints(robot, len(first), 0)
+    q = random_joints(robot, len(first), 0)
     columns = [torch.linspace(-np.pi, np.pi, len(first), dtype=torch.float64)] * robot.dof
     q = torch.stack(columns, 1) if all(robot.revolute) else q
     q[:, joint] = first
@@ -103,7 +103,7 @@ def test_the_correction_holds_where_joints_were_measured_and_beyond() -> None:
     geometry = robot.with_geometry(dh=robot.dh + 1e-3)
     correction = JointCorrection(robot, (FourierSeries(robot, 2),)).requires_grad_(False)
     correction.linear[0].fill_(1e-3)
-    inside = drawn_joints(robot, 300, 0, widest=0.8)
+    inside = random_joints(robot, 300, 0, widest=0.8)
     arm = HybridArm(geometry, correction, JointCoverage.from_joints(robot, inside))
     outside = inside[:20] + torch.tensor([0.0, 0, 2.5, 0, 0, 0]).double()
     assert bool(arm.coverage.contains(inside).all())

@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 from testing.closeness import assert_close
-from testing.linearised import LinearisedArm, drawn_joints, linearised, tracker_data
+from testing.linearised import LinearisedArm, linearised, random_joints, tracker_data
 from testing.regression_cases import all_kinds
 
 from pisigma.calibration.hybrid.design import Design
@@ -22,7 +22,7 @@ from pisigma.robot import Robot
 @pytest.fixture(scope="module")
 def arm() -> LinearisedArm:
     robot = Robot.load("kiro3")
-    q = drawn_joints(robot, 60, 0)
+    q = random_joints(robot, 60, 0)
     delta = 1e-4 * torch.sin(3 * q)
     return linearised(robot, tracker_data(robot, q, delta, 1e-5, turn_noise=1e-5, several=True))
 
@@ -50,7 +50,7 @@ def test_the_correction_is_the_weighted_sum_of_the_used_columns(arm: LinearisedA
     robot = arm.rows.problem.space.robot
     design = Design(arm.rows.problem, features(robot, 3))
     x = torch.randn(design.unknowns, generator=torch.Generator().manual_seed(1)).double()
-    q = drawn_joints(robot, 6, 4)
+    q = random_joints(robot, 6, 4)
     made = JointCorrection(robot, design.features).requires_grad_(False)
     for number, chosen in enumerate(design.features):
         made.linear[number][chosen.used] = x[design.weights_of(number)]

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 from testing.closeness import assert_close
-from testing.linearised import drawn_joints, tracker_data
+from testing.linearised import random_joints, tracker_data
 from testing.models import no_type_checker
 from testing.rb5_with_all_errors import NOISE, SimulatedTracker, simulated_tracker
 from testing.refusals import refused
@@ -303,7 +303,7 @@ def test_sockets_alone_with_nothing_but_geometry_are_the_geometric_calibration()
 def test_without_noise_errors_and_their_deviations_vanish(rows: int) -> None:
     """With few rows as with many; the noise is then far too small for the covariance of the values."""
     robot = Robot.load("kiro3")
-    q, test = (drawn_joints(robot, count, seed, widest=2.0) for seed, count in enumerate((rows, 100)))
+    q, test = (random_joints(robot, count, seed, widest=2.0) for seed, count in enumerate((rows, 100)))
     delta = 3e-4 * torch.sin(2 * q), 3e-4 * torch.sin(2 * test)
     with no_type_checker():
         result = HybridCalibrator(robot, harmonics=(8, 24)).fit(tracker_data(robot, q, delta[0]))
@@ -324,7 +324,7 @@ def test_a_single_joint_is_calibrated_without_products(rows: int, tmp_path: Path
     (tmp_path / "table.urdf").write_text(urdf)
     robot = Robot.load(tmp_path / "table.urdf")
     held = robot.with_geometry(tool=np.array([0.5, 0.1, 0.2, 0.0, 0.0, 0.0]))
-    q, test = (drawn_joints(robot, count, seed, widest=1.8) for seed, count in enumerate((rows, 100)))
+    q, test = (random_joints(robot, count, seed, widest=1.8) for seed, count in enumerate((rows, 100)))
     with no_type_checker():
         result = HybridCalibrator(robot, harmonics=(8,)).fit(
             tracker_data(held, q, 2e-4 * torch.sin(3 * q), 3e-5)

@@ -7,7 +7,7 @@ import pytest
 import torch
 from testing.closeness import assert_close
 from testing.dense_regression import DenseRegression
-from testing.linearised import drawn_joints, linearised, tracker_data
+from testing.linearised import linearised, random_joints, tracker_data
 from testing.posteriors import assert_same_posterior
 from testing.regression_cases import CASES, poses, several_targets
 from torch import Tensor
@@ -137,7 +137,7 @@ def test_values_that_are_not_finite_are_refused() -> None:
 def test_first_sizes_say_nearly_what_the_whole_fit_gains() -> None:
     """With the other sizes and the noise held it is a lower bound, and the sizes are those found so."""
     robot = Robot.load("rb5")
-    q = drawn_joints(robot, 120, 0)
+    q = random_joints(robot, 120, 0)
     delta = 6e-5 * q[:, 1:2].sin() * q[:, 2:3].cos() * torch.tensor([1.0, 0.0, 0.0, 1.0, 0.0, 0.0]).double()
     arm = linearised(robot, tracker_data(robot, q, delta, 3e-5))
     products = InputProducts(robot)

@@ -3,7 +3,7 @@
 from dataclasses import replace
 
 import torch
-from testing.linearised import drawn_joints, tracker_data
+from testing.linearised import random_joints, tracker_data
 from testing.models import no_type_checker
 from torch import Tensor
 
@@ -29,7 +29,7 @@ def rms(result: HybridResult, test: Measurements) -> float:
 
 def test_rows_that_a_joint_correction_explains_are_no_outliers() -> None:
     """One row in eight is off by about 30 mm besides; none of the others is taken for wrong, none of those for good."""
-    q = drawn_joints(ROBOT, 200, 0)
+    q = random_joints(ROBOT, 200, 0)
     rows = tracker_data(ROBOT, q, local_error(q), 3e-5)
     assert rows.position is not None
     position = rows.position.clone()
@@ -42,6 +42,6 @@ def test_rows_that_a_joint_correction_explains_are_no_outliers() -> None:
         )
     assert len(result.geometric.outliers) > len(WRONG) + 5
     assert {outlier.row for outlier in result.outliers} == set(WRONG)
-    q = drawn_joints(ROBOT, 300, 5)
+    q = random_joints(ROBOT, 300, 5)
     test = tracker_data(ROBOT, q, local_error(q))
     assert rms(result, test) < 0.3 * rms(HybridCalibrator(ROBOT, features=(), products=False).fit(rows), test)

@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 from testing.closeness import assert_close
-from testing.linearised import drawn_joints, tracker_data
+from testing.linearised import random_joints, tracker_data
 
 from pisigma.calibration.geometric.calibrator import GeometricCalibrator
 from pisigma.calibration.hybrid.calibrator import HybridCalibrator
@@ -24,7 +24,7 @@ ROWS = 260
 @pytest.fixture(scope="module", params=[False, True], ids=["additive", "products"])
 def refined(request: pytest.FixtureRequest) -> Refined:
     """Large joint errors, so that one linearisation is not enough for products, which are chosen last."""
-    q = drawn_joints(ROBOT, ROWS, 0)
+    q = random_joints(ROBOT, ROWS, 0)
     delta = 4e-3 * q.sin() + 3e-3 * (2 * q).cos()
     if request.param:
         delta = delta + 1e-2 * q.sin() * q.cos().roll(1, 1)
@@ -55,7 +55,7 @@ def test_no_row_is_left_worse_than_noise_and_model_allow(refined: Refined) -> No
 
 def test_the_network_predicts_what_the_design_does(refined: Refined) -> None:
     """Products of inputs as product units of order 2, half as many as a joint has inputs at most."""
-    q, design = drawn_joints(ROBOT, 20, 5), refined.design
+    q, design = random_joints(ROBOT, 20, 5), refined.design
     expected = design.correction(refined.posterior.x, JointState(q))
     assert_close(refined.correction(q), expected, atol=1e-13)
     orders, names = refined.correction.orders, [chosen.name for chosen in refined.correction.features]

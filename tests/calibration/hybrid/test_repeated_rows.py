@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import torch
 from testing.closeness import assert_close
-from testing.linearised import drawn_joints, tracker_data
+from testing.linearised import random_joints, tracker_data
 from torch import Tensor
 
 from pisigma.calibration.geometric.calibrator import GeometricCalibrator
@@ -45,7 +45,7 @@ def test_rows_that_do_not_count_are_left_out_and_the_others_weighted() -> None:
 def test_repeats_as_one_row_come_to_the_same_normal_equations() -> None:
     """Of repeats whose derivatives are equal: only what they differ by among themselves is lost."""
     robot = Robot.load("panda")
-    data = tracker_data(robot, drawn_joints(robot, 40, 0), turn_noise=0.0, several=True)
+    data = tracker_data(robot, random_joints(robot, 40, 0), turn_noise=0.0, several=True)
     problem = GeometricCalibrator(robot).build(data).problem.with_active(range(20))
     pose = torch.tensor([2, 0, 2, 1, 2, 0, 3])
     own = values_of(4)
@@ -71,7 +71,7 @@ def test_repeats_as_one_row_come_to_the_same_normal_equations() -> None:
 def test_other_sights_of_a_pose_are_no_repeats() -> None:
     """Touches along three axes, each made twice: six rows of one pose are three."""
     robot = Robot.load("welding")
-    q = drawn_joints(robot, 20, 0)
+    q = random_joints(robot, 20, 0)
     p = forward_kinematics(robot, q)[:, :3, 3].contiguous()
     data = Measurements(
         q=q.repeat_interleave(6, 0),
@@ -120,7 +120,7 @@ def test_three_identical_targets_of_a_configuration_count_as_one() -> None:
 
 def test_identical_targets_come_to_the_regression_of_one() -> None:
     robot = Robot.load("panda")
-    problem = GeometricCalibrator(robot).build(tracker_data(robot, drawn_joints(robot, 24, 0))).problem
+    problem = GeometricCalibrator(robot).build(tracker_data(robot, random_joints(robot, 24, 0))).problem
     problem = problem.with_active(range(2))
     design = Design(problem, ())
     three = alike(3).shared(torch.arange(8).repeat_interleave(3))

@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 from testing.closeness import assert_close
-from testing.linearised import LinearisedArm, drawn_joints, tracker_data
+from testing.linearised import LinearisedArm, random_joints, tracker_data
 from testing.linearised import linearised as linearised_at_solution
 
 from pisigma.calibration.hybrid.design import Design, Rows, weigh
@@ -21,7 +21,7 @@ from pisigma.robot import Robot
 def arm() -> LinearisedArm:
     """40 different joint values, the first 10 of them twice."""
     robot = Robot.load("rb5")
-    q = drawn_joints(robot, 40, 0)
+    q = random_joints(robot, 40, 0)
     data = tracker_data(robot, torch.cat([q, q[:10]]), noise=3e-5, turn_noise=1e-4)
     return linearised_at_solution(robot, data)
 

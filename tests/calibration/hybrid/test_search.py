@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 from testing.closeness import assert_close
-from testing.linearised import LinearisedArm, drawn_joints, linearised, tracker_data
+from testing.linearised import LinearisedArm, linearised, random_joints, tracker_data
 
 from pisigma.calibration.hybrid.search import CLEAR_GAIN, CLEARLY, MAX_USUAL_SHARE, Search
 from pisigma.joint_correction.fourier_series import FourierSeries
@@ -38,14 +38,14 @@ def product(q: torch.Tensor) -> torch.Tensor:
 @pytest.fixture(scope="module")
 def series() -> LinearisedArm:
     """Joints are off by four harmonics."""
-    q = drawn_joints(ROBOT, 120, 0)
+    q = random_joints(ROBOT, 120, 0)
     return rows_of(2e-4 * (4 * q).sin(), q)
 
 
 @pytest.fixture(scope="module")
 def products() -> LinearisedArm:
     """The second joint is off by a product of what two others do."""
-    q = drawn_joints(ROBOT, 150, 0)
+    q = random_joints(ROBOT, 150, 0)
     return rows_of(product(q)[:, None] * (torch.arange(6) == 1), q)
 
 
@@ -105,7 +105,7 @@ def test_products_have_to_gain_more_than_the_scatter(products: LinearisedArm, mo
 
 def test_few_rows_are_fitted_with_all_features_from_usual_sizes() -> None:
     """One after the other they do not stand out from the noise that the others leave."""
-    q = drawn_joints(ROBOT, 26, 7)
+    q = random_joints(ROBOT, 26, 7)
     weights = torch.randn(SMALL.used.shape, generator=torch.Generator().manual_seed(0)) * SMALL.used
     gravity = 2e-4 * (SMALL.columns(JointState(q)) * weights).sum(-1)
     gears = torch.stack([2e-4 * (k * q + torch.arange(6) * k).sin() for k in (1, 2, 6)]).sum(0)
@@ -114,13 +114,13 @@ def test_few_rows_are_fitted_with_all_features_from_usual_sizes() -> None:
     assert best.name == "gravity + series 6"
     assert best.largest_share == MAX_USUAL_SHARE
     *before, together, wider = search.trials
-    assert not wider.kept  # the geometry is as drawn here
+    assert not wider.kept  # the geometry is nominal here
     assert together.log_evidence > max(line.log_evidence for line in before) + CLEARLY
     assert together.left_out < 0.7 * min(line.left_out for line in before if line.kept)
 
 
 def test_what_does_not_help_leaves_the_geometry() -> None:
-    q = drawn_joints(ROBOT, 80, 4)
+    q = random_joints(ROBOT, 80, 4)
     search = search_of(rows_of(torch.zeros_like(q), q))
     best = search.best(SERIES, [SMALL], [PRODUCTS])
     assert best is search.geometry

@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 from testing.closeness import assert_close
-from testing.linearised import drawn_joints, tracker_data, with_directions
+from testing.linearised import random_joints, tracker_data, with_directions
 from testing.sensors import mixed_data, pair_data
 from torch import Tensor
 
@@ -32,7 +32,7 @@ WEIGHTS = ((-4 / 5, 1), (1 / 5, 2), (-4 / 105, 3), (1 / 280, 4))
 def tracker(name: str, directions: tuple[int, ...]) -> tuple[Robot, Measurements]:
     """Poses in two frames with two targets."""
     robot = with_directions(Robot.load(name), directions)
-    return robot, tracker_data(robot, drawn_joints(robot, 40, 0), turn_noise=0.0, several=True)
+    return robot, tracker_data(robot, random_joints(robot, 40, 0), turn_noise=0.0, several=True)
 
 
 def all_kinds() -> tuple[Robot, Measurements]:
@@ -133,7 +133,7 @@ def test_derivatives_are_those_of_the_residuals(name: str, shifted: bool) -> Non
 def test_joint_derivatives_are_those_of_the_forward_kinematics(name: str) -> None:
     """In the frame of the first row, on the nominal robot, whatever the sensors count from."""
     robot, _ = CASES[name]()
-    q = drawn_joints(robot, 30, 5)
+    q = random_joints(robot, 30, 5)
     data = Measurements(q=q, position=forward_kinematics(robot, q)[:, :3, 3].contiguous())
     problem = GeometricCalibrator(robot, base="fixed", tool="fixed").build(data).problem
     (values,) = sensor_values(problem.with_active([0]), problem.nominal)

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 import torch
-from testing.linearised import LinearisedArm, drawn_joints, linearised, tracker_data
+from testing.linearised import LinearisedArm, linearised, random_joints, tracker_data
 
 from pisigma.calibration.hybrid.calibrator import HybridCalibrator
 from pisigma.calibration.hybrid.spectrum import HIGHEST, lines
@@ -37,13 +37,13 @@ def arm_of(q: torch.Tensor, delta: torch.Tensor | float) -> LinearisedArm:
 
 
 def test_lines_of_every_joint_are_found_and_nothing_else() -> None:
-    q = drawn_joints(ROBOT, 400, 0)
+    q = random_joints(ROBOT, 400, 0)
     found = lines_of(arm_of(q, rippled(q)))
     assert tuple(tuple(sorted(of_joint)) for of_joint in found) == ORDERS
 
 
 def test_noise_has_no_lines() -> None:
-    q = drawn_joints(ROBOT, 200, 1)
+    q = random_joints(ROBOT, 200, 1)
     assert not any(
         lines_of(arm_of(q, 3e-5 * torch.from_numpy(np.random.default_rng(0).normal(size=q.shape))))
     )
@@ -51,7 +51,7 @@ def test_noise_has_no_lines() -> None:
 
 @pytest.mark.parametrize("seed", [2, 4])
 def test_a_calibration_keeps_no_orders_that_stand_out_of_noise_by_chance(seed: int) -> None:
-    q = drawn_joints(ROBOT, 300, seed)
+    q = random_joints(ROBOT, 300, seed)
     delta = 3e-5 * torch.from_numpy(np.random.default_rng(seed).normal(size=q.shape))
     delta[:, 1] += 1e-4 * (2 * q[:, 1]).sin()
     calibrator = HybridCalibrator(ROBOT, ("lines", "series"), harmonics=(3,), products=False)
@@ -61,7 +61,7 @@ def test_a_calibration_keeps_no_orders_that_stand_out_of_noise_by_chance(seed: i
 
 
 def test_lines_below_the_first_order_are_left_to_the_series() -> None:
-    q = drawn_joints(ROBOT, 400, 0)
+    q = random_joints(ROBOT, 400, 0)
     assert lines_of(arm_of(q, rippled(q)), 2_021) == ((),) * 6
     assert lines_of(arm_of(q, rippled(q)), HIGHEST + 1) == ((),) * 6
 
@@ -70,14 +70,14 @@ def test_lines_below_the_first_order_are_left_to_the_series() -> None:
 def test_joint_values_on_a_grid_say_nothing_of_orders_beyond_half_of_it(grid: int) -> None:
     """There order k and `grid - k` are the same at all values; the slower of the two is right."""
     step = 2 * math.pi / grid
-    q = (drawn_joints(ROBOT, 300, 2) / step).round() * step
+    q = (random_joints(ROBOT, 300, 2) / step).round() * step
     delta = torch.zeros_like(q)
     delta[:, 1] = 2e-4 * ((grid - 100) * q[:, 1]).sin()
     assert lines_of(arm_of(q, delta)) == ((), (100,), (), (), (), ())
 
 
 def test_a_joint_that_hardly_moves_has_no_lines() -> None:
-    q = drawn_joints(ROBOT, 300, 3)
+    q = random_joints(ROBOT, 300, 3)
     q[:, 1] *= 1e-3
     delta = torch.zeros_like(q)
     delta[:, 1] = 2e-4 * (2_020 * q[:, 1]).sin()
@@ -85,7 +85,7 @@ def test_a_joint_that_hardly_moves_has_no_lines() -> None:
 
 
 def test_a_calibration_keeps_lines_that_predict_left_out_rows() -> None:
-    q = drawn_joints(ROBOT, 360, 4)
+    q = random_joints(ROBOT, 360, 4)
     train, test = torch.arange(300), torch.arange(300, 360)
     data = tracker_data(ROBOT, q, 2 * rippled(q), 3e-5, 1e-4)
     errors = {}

@@ -8,7 +8,7 @@ import pytest
 import torch
 from testing.closeness import assert_close
 from testing.dense_regression import DenseRegression
-from testing.linearised import LinearisedArm, drawn_joints, linearised, tracker_data, with_directions
+from testing.linearised import LinearisedArm, linearised, random_joints, tracker_data, with_directions
 from testing.posteriors import covariance as covariance_of
 from torch import Tensor
 
@@ -96,7 +96,7 @@ def test_errors_as_small_as_predicted_widen_nothing_and_there_is_a_limit() -> No
 def arm() -> LinearisedArm:
     """Poses of a robot with a sliding joint and one that counts backwards, in two frames with two targets."""
     robot = with_directions(Robot.load("kiro3"), (1, -1, -1, 1))
-    q = drawn_joints(robot, 120, 0)
+    q = random_joints(robot, 120, 0)
     return linearised(robot, tracker_data(robot, q, 2e-4 * torch.sin(q), 3e-5, 1e-4, several=True))
 
 
@@ -119,7 +119,7 @@ def test_deviation_is_that_of_the_derivative_by_all_unknowns(arm: LinearisedArm)
     """Taken by finite differences of the prediction, by every parameter and every weight."""
     found, _, correction = uncertainty(arm)
     robot, known = found.geometry.robot, found.geometry
-    test = tracker_data(robot, drawn_joints(robot, 8, 1), several=True)
+    test = tracker_data(robot, random_joints(robot, 8, 1), several=True)
     space = found.space
     dh0 = robot.dh.flatten()
     frames = np.concatenate([*known.bases.values(), *known.tools.values()])
@@ -179,9 +179,9 @@ def test_more_rows_make_it_surer_and_the_widening_is_one_or_more() -> None:
     robot = Robot.load("rb5")
     deviations = []
     for rows in (60, 240):
-        own = linearised(robot, tracker_data(robot, drawn_joints(robot, rows, 2), noise=3e-5))
+        own = linearised(robot, tracker_data(robot, random_joints(robot, rows, 2), noise=3e-5))
         found, _, correction = uncertainty(own)
-        test = tracker_data(robot, drawn_joints(robot, 200, 3))
+        test = tracker_data(robot, random_joints(robot, 200, 3))
         deviations.append(float(found.deviation(test, test.q + correction(test.q)).mean()))
         assert 1.0 <= found.prior_scale < 3.0
     assert 0.3 < deviations[1] / deviations[0] < 0.75
@@ -189,13 +189,13 @@ def test_more_rows_make_it_surer_and_the_widening_is_one_or_more() -> None:
 
 def test_of_many_groups_sizes_and_noise_are_those_of_all_rows(monkeypatch: pytest.MonkeyPatch) -> None:
     robot = Robot.load("rb5")
-    own = linearised(robot, tracker_data(robot, drawn_joints(robot, 80, 2), noise=3e-5))
+    own = linearised(robot, tracker_data(robot, random_joints(robot, 80, 2), noise=3e-5))
     folds = uncertainty(own)[0].prior_scale
     monkeypatch.setattr("pisigma.calibration.hybrid.uncertainty.FEW_GROUPS", 10)
     single = uncertainty(own)[0].prior_scale
     assert 1.0 <= single < 1.5 * folds
     monkeypatch.setattr("pisigma.calibration.hybrid.uncertainty.CHUNK", 3)
-    test = tracker_data(robot, drawn_joints(robot, 10, 3))
+    test = tracker_data(robot, random_joints(robot, 10, 3))
     found = uncertainty(own)[0]
     whole = found.deviation(test, test.q)
     for k in range(10):

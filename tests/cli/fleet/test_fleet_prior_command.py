@@ -3,7 +3,7 @@
 import json
 
 import pytest
-from testing.fleet_robots import DRAWN, rows_of
+from testing.fleet_robots import NOMINAL, rows_of
 from testing.models import REPOSITORY
 from testing.screens import assert_screen
 
@@ -20,14 +20,14 @@ def prior(tmp_path_factory, run):
     folder = tmp_path_factory.mktemp("prior")
     (folder / "in").mkdir()
     for k in range(5):
-        rows_of(k, 30, k).write_csv(folder / "in" / f"r{k}.csv", DRAWN)
+        rows_of(k, 30, k).write_csv(folder / "in" / f"r{k}.csv", NOMINAL)
     (folder / "in" / "bad.csv").write_text("q1_deg,x_mm\n1,2\n", encoding="utf-8")
-    (folder / "in" / "undrawn").mkdir()
-    (folder / "in" / "undrawn" / "robot.yaml").write_text("name: 3\n", encoding="utf-8")
-    (folder / "in" / "undrawn" / "rows.csv").write_text("q1_deg,x_mm\n1,2\n", encoding="utf-8")
+    (folder / "in" / "bad_robot").mkdir()
+    (folder / "in" / "bad_robot" / "robot.yaml").write_text("name: 3\n", encoding="utf-8")
+    (folder / "in" / "bad_robot" / "rows.csv").write_text("q1_deg,x_mm\n1,2\n", encoding="utf-8")
     metres = (folder / "in" / "r0.csv").read_text(encoding="utf-8").replace("_mm", "_m")
     (folder / "in" / "metres.csv").write_text(metres, encoding="utf-8")
-    rows_of(50, 10, 1).write_csv(folder / "few.csv", DRAWN)
+    rows_of(50, 10, 1).write_csv(folder / "few.csv", NOMINAL)
     made = run("fleet", "prior", folder / "in", "--robot", "rb5", "--out", folder / "prior")
     assert made.exit_code == 0, made.output
     return folder, made
@@ -39,7 +39,7 @@ def test_what_the_robots_have_in_common_is_printed_and_kept(prior):
     card = (folder / "prior" / "README.md").read_text(encoding="utf-8")
     assert "5 robots of the type rb5" in card
     assert "| a_2 | mm |" in card
-    for name in ("bad", "undrawn", "metres"):
+    for name in ("bad", "bad_robot", "metres"):
         assert f"Robot '{name}' did not count: " in card
     assert "`pisigma fleet prior in " in card
 

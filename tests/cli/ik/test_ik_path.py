@@ -18,7 +18,7 @@ from pisigma.robot.se3 import xyzrpy_from_transform
 
 @pytest.fixture(scope="module")
 def arm(tmp_path_factory):
-    """A model folder of a UR5 as it is drawn."""
+    """A model folder of a UR5 as nominal."""
     robot = Robot.load("ur5")
     folder = tmp_path_factory.mktemp("models") / "arm"
     folder.mkdir()

@@ -38,7 +38,7 @@ def test_differences_are_printed_and_shown_on_a_page(run, folder):
     assert 'src="http' not in text
 
 
-def test_a_model_is_compared_with_the_robot_as_drawn(run, folder):
+def test_a_model_is_compared_with_the_nominal_robot(run, folder):
     done = run("compare", folder / "before", "nominal", "--program", folder / "poses.csv", "--json")
     assert done.exit_code == 0, done.output
     report = json.loads(done.stdout)

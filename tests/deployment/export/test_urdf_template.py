@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from lxml import etree
 from testing.closeness import assert_close
 from testing.refusals import refused
-from testing.urdf import DrawnJoint, peer_poses, urdf_text
+from testing.urdf import UrdfJoint, peer_poses, urdf_text
 
 from pisigma.deployment.export.urdf import robot_into_urdf
 from pisigma.files.errors import RobotError
@@ -42,10 +42,10 @@ TEXT = """\
 """
 
 
-def calibrated_like(drawn: Robot, seed: int, size: float = 1e-3) -> Robot:
+def calibrated_like(nominal: Robot, seed: int, size: float = 1e-3) -> Robot:
     random = np.random.default_rng(seed)
-    dh = drawn.dh + random.normal(0, size, drawn.dh.shape)
-    return drawn.with_geometry(dh, random.normal(0, 1, 6), random.normal(0, 0.1, 6))
+    dh = nominal.dh + random.normal(0, size, nominal.dh.shape)
+    return nominal.with_geometry(dh, random.normal(0, 1, 6), random.normal(0, 0.1, 6))
 
 
 def joint_values(robot: Robot) -> torch.Tensor:
@@ -61,10 +61,10 @@ def path(tmp_path):
 
 
 def test_only_origins_change(path, tmp_path):
-    drawn = Robot.load(path, tip="tool0")
-    robot = calibrated_like(drawn, 1)
+    nominal = Robot.load(path, tip="tool0")
+    robot = calibrated_like(nominal, 1)
     out = tmp_path / "out.urdf"
-    out.write_text(robot_into_urdf(robot, drawn, path, "tool0", ("said -- once",)))
+    out.write_text(robot_into_urdf(robot, nominal, path, "tool0", ("said -- once",)))
     q = joint_values(robot)
     again = Robot.load(out, base="calibrated_frame", tip="calibrated_tool")
     assert_close(forward_kinematics(again, q), forward_kinematics(robot, q), atol=1e-12)
@@ -93,11 +93,11 @@ def test_only_origins_change(path, tmp_path):
 
 
 def test_the_nominal_robot_changes_nothing(path, tmp_path):
-    drawn = Robot.load(path, tip="tool0")
+    nominal = Robot.load(path, tip="tool0")
     out = tmp_path / "out.urdf"
-    out.write_text(robot_into_urdf(drawn, drawn, path, "tool0"))
+    out.write_text(robot_into_urdf(nominal, nominal, path, "tool0"))
     again = Robot.load(out, tip="tool0", base="world")
-    assert_close(again.dh, drawn.dh, atol=1e-14)
+    assert_close(again.dh, nominal.dh, atol=1e-14)
     for name, origin in (("calibrated_frame_joint", np.zeros(6)), ("calibrated_tool_joint", np.zeros(6))):
         part = etree.fromstring(out.read_text()).find(f"joint[@name='{name}']/origin")
         numbers = [float(word) for key in ("xyz", "rpy") for word in part.get(key).split()]
@@ -109,7 +109,7 @@ def test_the_nominal_robot_changes_nothing(path, tmp_path):
 def test_any_chain(tmp_path_factory, seed, count):
     random = np.random.default_rng(seed)
     chain = [
-        DrawnJoint(
+        UrdfJoint(
             random.choice(["revolute", "continuous", "prismatic", "fixed"]) if i else "revolute",
             random.uniform(-1, 1, 3),
             random.choice([0.0, np.pi / 2, -np.pi / 2, 0.3], 3),
@@ -119,31 +119,31 @@ def test_any_chain(tmp_path_factory, seed, count):
     ]
     path = tmp_path_factory.mktemp("chain") / "chain.urdf"
     path.write_text(urdf_text(chain))
-    drawn = Robot.load(path)
-    robot = calibrated_like(drawn, seed)
-    path.write_text(robot_into_urdf(robot, drawn, path))
+    nominal = Robot.load(path)
+    robot = calibrated_like(nominal, seed)
+    path.write_text(robot_into_urdf(robot, nominal, path))
     q = joint_values(robot)
     assert_close(peer_poses(path, "calibrated_tool", q), forward_kinematics(robot, q), atol=1e-10)
     assert_close(forward_kinematics(Robot.load(path), q), forward_kinematics(robot, q), atol=1e-12)
 
 
 def test_files_of_other_robots_are_refused(path):
-    drawn = Robot.load(path, tip="tool0")
+    nominal = Robot.load(path, tip="tool0")
     with refused(RobotError, option="--like", value="one, two, three"):
         robot_into_urdf(Robot.load("ur10"), Robot.load("ur10"), path, "tool0")
-    longer = drawn.with_geometry(drawn.dh + 0.01)
+    longer = nominal.with_geometry(nominal.dh + 0.01)
     with refused(RobotError, option="--like", expected="the nominal geometry of the model"):
         robot_into_urdf(longer, longer, path, "tool0")
     with pytest.raises(RobotError, match="2"):
-        robot_into_urdf(drawn, drawn, path)
+        robot_into_urdf(nominal, nominal, path)
 
 
 def test_missing_values_that_simulators_require_are_filled_in(path, tmp_path):
     mass = '<inertial><mass value="3"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>'
     text = TEXT.replace('<link name="bracket"/>', f'<link name="bracket">{mass}</link>')
     path.write_text(text.replace('effort="7"', 'effort="0"'))
-    drawn = Robot.load(path, tip="tool0")
-    after = etree.fromstring(robot_into_urdf(drawn, drawn, path, "tool0").encode())
+    nominal = Robot.load(path, tip="tool0")
+    after = etree.fromstring(robot_into_urdf(nominal, nominal, path, "tool0").encode())
     masses = {link.get("name"): link.find("inertial/mass") for link in after.iter("link")}
     stated = {name: mass.get("value") for name, mass in masses.items() if mass is not None}
     assert stated == {"bracket": "3", "b": "1", "c": "1"}  # the bracket is fixed to link a
@@ -152,9 +152,9 @@ def test_missing_values_that_simulators_require_are_filled_in(path, tmp_path):
 
 
 def test_a_base_that_is_not_the_root(path, tmp_path):
-    drawn = Robot.load(path, base="bracket", tip="tool0")
-    robot, out = calibrated_like(drawn, 2), tmp_path / "out.urdf"
-    out.write_text(robot_into_urdf(robot, drawn, path, "tool0", base="bracket"))
+    nominal = Robot.load(path, base="bracket", tip="tool0")
+    robot, out = calibrated_like(nominal, 2), tmp_path / "out.urdf"
+    out.write_text(robot_into_urdf(robot, nominal, path, "tool0", base="bracket"))
     q = joint_values(robot)
     again = Robot.load(out, base="calibrated_frame", tip="calibrated_tool")
     assert_close(forward_kinematics(again, q), forward_kinematics(robot, q), atol=1e-12)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 from scipy.stats import chi2
-from testing.fleet_robots import DRAWN, common_errors, rows_of
+from testing.fleet_robots import NOMINAL, common_errors, rows_of
 from testing.models import no_type_checker
 from testing.refusals import refused
 
@@ -24,7 +24,7 @@ ROBOTS = 8
 def prior():
     """Of eight robots, of which the last is of another type."""
     with no_type_checker():
-        return fleet_prior("fleet", DRAWN, [rows_of(k, 40, k, odd=k == ROBOTS - 1) for k in range(ROBOTS)])
+        return fleet_prior("fleet", NOMINAL, [rows_of(k, 40, k, odd=k == ROBOTS - 1) for k in range(ROBOTS)])
 
 
 def rms(errors):
@@ -50,7 +50,7 @@ def test_the_prior_improves_a_calibration_with_ten_poses(prior):
     few, test = rows_of(50, 10, 1), rows_of(50, 300, 2, noise=0.0)
     with no_type_checker():
         begun = recalibrate(prior.model, few)
-        without = calibrate(DRAWN, few, CalibrationSettings(folds=0)).result
+        without = calibrate(NOMINAL, few, CalibrationSettings(folds=0)).result
     assert begun.gate.kept != "scratch"
     assert begun.moved == ()
     assert rms(begun.adaptation.errors_of(test)) < 0.6 * rms(without.errors_of(test))
@@ -62,7 +62,7 @@ def test_a_robot_of_another_type_is_inconsistent_and_calibrated_from_scratch(pri
         assert FleetConsistency.from_rows(prior.model, few).is_inconsistent
         assert not FleetConsistency.from_rows(prior.model, rows_of(61, 20, 4)).is_inconsistent
         begun = recalibrate(prior.model, few)
-        without = calibrate(DRAWN, few, CalibrationSettings(folds=0))
+        without = calibrate(NOMINAL, few, CalibrationSettings(folds=0))
         fewer = recalibrate(prior.model, few.select(torch.arange(8)))
     assert begun.gate.kept == "scratch"
     assert begun.gate.rms["scratch"] is None
@@ -127,4 +127,4 @@ def test_similar_inconsistent_robots_do_not_mask_each_other(odd):
 
 def test_few_robots_are_refused():
     with refused(FleetError, option="fleet", value=4):
-        fleet_prior("fleet", DRAWN, [rows_of(0, 20, 0)] * 4)
+        fleet_prior("fleet", NOMINAL, [rows_of(0, 20, 0)] * 4)

@@ -39,7 +39,7 @@ def test_derivatives_are_those_of_the_weighted_errors() -> None:
         for sensor in problem.sensors
     ]
     off = residuals(setup.start)[0].norm(dim=0)
-    assert float(off.min()) > 1e-3  # the arm as drawn is far from what was measured
+    assert float(off.min()) > 1e-3  # the nominal arm is far from what was measured
     for i in everything.tolist():
         step = torch.zeros_like(setup.start)
         step[i] = 1e-6

@@ -164,7 +164,7 @@ def registered() -> Iterator[None]:
 
 
 def true_arm() -> tuple[pisigma.Robot, pisigma.Robot]:
-    """A robot as drawn, and with errors."""
+    """A nominal robot, and one with errors."""
     drawn = pisigma.Robot.load("ur5")
     rng = np.random.default_rng(0)
     errors = 5e-4 * rng.standard_normal(drawn.dh.shape)

@@ -152,7 +152,7 @@ def model_with(
         {name: frame + 0.1 * k for k, name in enumerate(names)}
         for names, frame in ((frames, model.robot.base), (targets, model.robot.tool))
     )
-    space = ParameterSpace(model.drawn, tuple(frames), tuple(targets), tuple(groups))
+    space = ParameterSpace(model.nominal, tuple(frames), tuple(targets), tuple(groups))
     unknowns = {
         group.name: {owner: generator.normal(size=len(group.columns)) for owner in group.owners}
         for group in groups

@@ -64,4 +64,6 @@ def test_a_robot_file_keeps_where_its_joints_are(tmp_path: Path):
     (tmp_path / "scara.yaml").write_text(robot_to_yaml(robot))
     again = Robot.load(tmp_path / "scara.yaml")
     for rows in (robot.rows, again.rows):
-        assert_close([row.drawn_at for row in rows], [[0, 0, 0.38], [0, 0, 0.4], [0.2, 0, 0.4]], atol=1e-15)
+        assert_close(
+            [row.urdf_origin for row in rows], [[0, 0, 0.38], [0, 0, 0.4], [0.2, 0, 0.4]], atol=1e-15
+        )

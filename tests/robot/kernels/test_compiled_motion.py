@@ -6,17 +6,17 @@ import torch
 from testing.closeness import assert_close
 
 from pisigma.model.calibrated_model import hybrid_motion
-from pisigma.robot.kernels.arrays import DRAWN, IDENTIFIED, NOMINAL
+from pisigma.robot.kernels.arrays import IDENTIFIED, NOMINAL, NOMINAL_WITHOUT_BASE
 from pisigma.robot.kinematics.jacobian import joint_jacobian
 
 NAMES = ["kiro3", "kiro4", "ur5", "rb5", "panda"]
 
 
 @pytest.mark.parametrize("name", NAMES)
-@pytest.mark.parametrize("arm", [NOMINAL, IDENTIFIED, DRAWN])
+@pytest.mark.parametrize("arm", [NOMINAL, IDENTIFIED, NOMINAL_WITHOUT_BASE])
 def test_poses_and_jacobians_agree_with_torch(name, arm, arms):
     model, q = arms.calibrated(name), arms.draw_joints(arms.calibrated(name).robot, 200, seed=4, share=1.5)
-    robot = {NOMINAL: model.robot, IDENTIFIED: model.hybrid.robot, DRAWN: model.drawn}[arm]
+    robot = {NOMINAL: model.robot, IDENTIFIED: model.hybrid.robot, NOMINAL_WITHOUT_BASE: model.nominal}[arm]
     T, J = joint_jacobian(robot, q)
     found = arms.compiled(name).forward(q.numpy(), arm)
     assert_close(found[0], T, atol=1e-13)

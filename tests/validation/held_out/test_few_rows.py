@@ -1,4 +1,4 @@
-"""Few rows have to show that a fitted arm is better than the drawn one."""
+"""Few rows have to show that a fitted arm is better than the nominal one."""
 
 from dataclasses import replace
 
@@ -21,7 +21,7 @@ def nothing(what: str) -> None:
     """No progress is shown."""
 
 
-def test_few_poses_are_at_most_a_little_worse_than_the_drawn_arm(shared_data):
+def test_few_poses_are_at_most_a_little_worse_than_the_nominal_arm(shared_data):
     """Draws of 6 to 12 poses of a measured UR10, judged on 200 others; of 40 per robot, 38 are at most 1.05 times."""
     rows = Measurements.read_csv(shared_data / "ur10/series_c_train.csv")
     rng, calibrator, ratios = np.random.default_rng(1), GeometricCalibrator(Robot.load("ur10")), []
@@ -37,7 +37,7 @@ def test_few_poses_are_at_most_a_little_worse_than_the_drawn_arm(shared_data):
 
 
 @pytest.mark.parametrize("hybrid", [False, True])
-def test_an_arm_without_errors_stays_as_drawn(hybrid):
+def test_an_arm_without_errors_stays_nominal(hybrid):
     arm = simulate("ur10", rows=7, noise=1e-3, turn_noise=1e-3, length=1e-6, angle=1e-6)
     calibrator = GeometricCalibrator(arm.nominal)
     result = fit_where_it_helps(

@@ -51,7 +51,7 @@ def unseen():
 
 def test_figures_agree_with_numpy(arm, unseen):
     _, model = arm
-    models = {"drawn": nominal_model(model, True), "own": model}
+    models = {"nominal": nominal_model(model, True), "own": model}
     report = compare_models(models, unseen, Bootstrap(50)).to_json()
     assert (report["rows_compared"], report["rows_without_position"]) == (118, 2)
     assert report["configurations"] == 60
@@ -86,18 +86,18 @@ def rms_of(model, rows: Measurements) -> float:
     return float((rows.position - poses_of_rows(model, rows)[:, :3, 3]).square().sum(-1).mean().sqrt())
 
 
-def test_nominal_is_the_drawn_arm_with_base_and_tool_that_suit_it():
+def test_the_nominal_model_is_the_nominal_arm_with_base_and_tool_that_suit_it():
     """Fitted through the model at its training rows it is what a fit to these rows themselves gives, nearly."""
     true = simulate("ur5", rows=1, length=1e-3, angle=2e-3).true
-    drawn = Robot.load("ur5")
+    robot = Robot.load("ur5")
     q = joints_in(true, 80, seed=1, share=0.25)
     noise = 5e-5 * torch.from_numpy(np.random.default_rng(2).normal(size=(80, 3)))
     rows = Measurements(q=q, position=forward_kinematics(true, q)[:, :3, 3] + noise)
-    model = model_of_calibration("ur5", drawn, GeometricCalibrator(drawn).fit(rows), rows)
+    model = model_of_calibration("ur5", robot, GeometricCalibrator(robot).fit(rows), rows)
     nominal = nominal_model(model, False)
-    assert np.array_equal(nominal.calibrated.dh, drawn.dh)
+    assert np.array_equal(nominal.calibrated.dh, robot.dh)
     best = float(
-        (rows.position - forward_kinematics(fit_base_and_tool(drawn, rows).robot, q)[:, :3, 3])
+        (rows.position - forward_kinematics(fit_base_and_tool(robot, rows).robot, q)[:, :3, 3])
         .square()
         .sum(-1)
         .mean()
@@ -109,7 +109,7 @@ def test_nominal_is_the_drawn_arm_with_base_and_tool_that_suit_it():
 
 
 def test_nominal_of_several_frames_and_targets():
-    true, drawn = simulate("kiro4", rows=1).true, Robot.load("kiro4")
+    true, robot = simulate("kiro4", rows=1).true, Robot.load("kiro4")
     q = joints_in(true, 90, seed=1)
     T_wall, T_ball = transform_from_xyzrpy(
         torch.tensor([[0.5, -0.3, 0.2, 0.4, -0.2, 1.0], [0.05, 0.1, -0.04, 0, 0, 0]]).double()
@@ -124,7 +124,7 @@ def test_nominal_of_several_frames_and_targets():
         frame=tuple(("floor", "wall")[k] for k in (number % 2).tolist()),
         target=tuple(("A", "B")[k] for k in (number // 2 % 2).tolist()),
     )
-    model = model_of_calibration("kiro4", drawn, GeometricCalibrator(drawn).fit(rows), rows)
+    model = model_of_calibration("kiro4", robot, GeometricCalibrator(robot).fit(rows), rows)
     nominal = nominal_model(model, False)
     assert (set(nominal.bases), set(nominal.tools)) == ({"floor", "wall"}, {"A", "B"})
     found = compare_models({"nominal": nominal, "geometric": model}, rows, Bootstrap(20))

@@ -1,4 +1,4 @@
-"""Rows of two setups in one file are recognised with the robot as drawn."""
+"""Rows of two setups in one file are recognised with the nominal robot."""
 
 from dataclasses import replace
 

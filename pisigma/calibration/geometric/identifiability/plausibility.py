@@ -73,14 +73,14 @@ def _refuse_ruined_links(problem: CalibrationProblem, point: Tensor, source: str
     """
     robot = problem.space.robot
     is_length = problem.space.is_length.numpy()
-    drawn, fitted = robot.dh.ravel(), point.cpu().numpy()[: problem.space.arm_size]
-    long = is_length[: len(drawn)] & (np.abs(drawn) > LONG_SHARE * robot.reach)
-    ruined = long & (np.abs(fitted - drawn) > RUINED_SHARE * np.abs(drawn))
+    nominal, fitted = robot.dh.ravel(), point.cpu().numpy()[: problem.space.arm_size]
+    long = is_length[: len(nominal)] & (np.abs(nominal) > LONG_SHARE * robot.reach)
+    ruined = long & (np.abs(fitted - nominal) > RUINED_SHARE * np.abs(nominal))
     for number in np.flatnonzero(ruined)[:1].tolist():
         name = problem.space.names[number]
         raise ImplausibleError(
             f"the best fit makes {name} of robot '{robot.name}' {float(fitted[number]) * 1e3:.4g} mm instead of "
-            f"{float(drawn[number]) * 1e3:.4g} mm, which no calibration error explains",
+            f"{float(nominal[number]) * 1e3:.4g} mm, which no calibration error explains",
             value=name,
             at=Place(source),
             remedy="check the units (metres in a _mm column?), stated distances, order and directions of the joints, "

@@ -211,15 +211,15 @@ def _from_sockets(
         rows = (socket >= 0) & (target == number)
         if name in tools or not bool(rows.any()):
             continue
-        drawn = space.robot.tool
+        nominal_tool = space.robot.tool
         T = T_flange[rows]
         position = tool_from_sockets(
             T[:, :3, :3],
             T[:, :3, 3],
             torch.unique(socket[rows], return_inverse=True)[1],
-            torch.from_numpy(drawn[:3].copy()),
+            torch.from_numpy(nominal_tool[:3].copy()),
         )
-        tools[name] = np.concatenate([position.numpy(), drawn[3:]])
+        tools[name] = np.concatenate([position.numpy(), nominal_tool[3:]])
     return tools
 
 

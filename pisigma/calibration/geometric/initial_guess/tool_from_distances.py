@@ -91,15 +91,15 @@ class _Distances:
         return self.measured - length - zero, J
 
     def fitted(
-        self, drawn: Float64[Tensor, " 3"], held: bool, reach: float
+        self, nominal_tool: Float64[Tensor, " 3"], held: bool, reach: float
     ) -> tuple[Float64[Tensor, " 3"], Float64[Tensor, " rows"]]:
         """Fit the tool to the distances, starting near the nominal one, then far off; return it and residuals [m]."""
-        best = self._refined(drawn, drawn, held)
+        best = self._refined(nominal_tool, nominal_tool, held)
         ways = torch.cat([torch.eye(3), -torch.eye(3)]).double() * FAR_START * reach
         for way in () if held else ways:
             if not self.is_doubtful(*best):
                 break
-            other = self._refined(drawn + way, drawn, held)
+            other = self._refined(nominal_tool + way, nominal_tool, held)
             best = min(best, other, key=lambda fit: float(fit[1].abs().median()))
         return best
 
@@ -110,7 +110,7 @@ class _Distances:
         return float(residual.abs().median()) > DOUBTFUL * float(motion)
 
     def _refined(
-        self, start: Float64[Tensor, " 3"], drawn: Float64[Tensor, " 3"], held: bool
+        self, start: Float64[Tensor, " 3"], nominal_tool: Float64[Tensor, " 3"], held: bool
     ) -> tuple[Float64[Tensor, " 3"], Float64[Tensor, " rows"]]:
         """Refine the tool by robust Levenberg-Marquardt steps; return it and the residuals [m]."""
         unknown = self.start(start)
@@ -121,7 +121,7 @@ class _Distances:
             residual, J = self.linearised(unknown)
             limit = OUTLYING * residual.abs().median().clamp(min=1e-9)
             weight = (limit / residual.abs()).clamp(max=1.0)  # Huber's
-            off = torch.cat([unknown[:3] - drawn, torch.zeros_like(unknown[3:])])
+            off = torch.cat([unknown[:3] - nominal_tool, torch.zeros_like(unknown[3:])])
             normal = (J.mT * weight) @ J + torch.diag(pull)
             gradient = (J.mT * weight) @ residual - pull * off
             scale = normal.diagonal().clamp(min=1e-12)
@@ -156,13 +156,13 @@ def tools_from_distances(
     Raises:
         ImplausibleError: distances do not fit with any tool, for example because of a wrong unit.
     """
-    tools, drawn, reach = dict(tools), space.robot.tool, space.robot.reach
+    tools, nominal_tool, reach = dict(tools), space.robot.tool, space.robot.reach
     for name in space.targets:
         distances = _distances_of(measurements, T_flange, name)
         if len(distances.measured) < MIN_DISTANCES:
             continue
         held = name in tools or not free_tool
-        position = torch.from_numpy(tools.get(name, drawn)[:3].copy())
+        position = torch.from_numpy(tools.get(name, nominal_tool)[:3].copy())
         tool, residual = distances.fitted(position, held, reach)
         _refuse_other_units(space.robot, distances, (tool, residual), (position, held), measurements.source)
         off = int((residual.abs() > MAX_NOMINAL_ERROR * reach).sum())
@@ -179,7 +179,7 @@ def tools_from_distances(
         clear = len(residual) >= MANY_TIMES * distances.unknowns and not distances.is_doubtful(tool, residual)
         largest = (MAX_CLEAR_SHIFT if clear else MAX_SHIFT) * reach
         if not held and float((tool - position).norm()) <= largest:
-            tools[name] = np.concatenate([tool.numpy(), drawn[3:]])
+            tools[name] = np.concatenate([tool.numpy(), nominal_tool[3:]])
     return tools
 
 
@@ -187,7 +187,7 @@ def base_from_anchors(
     measurements: Measurements,
     frame: str,
     tip: Float64[Tensor, "rows 3"],
-    drawn: Float64[np.ndarray, " 6"],
+    nominal_base: Float64[np.ndarray, " 6"],
 ) -> Float64[np.ndarray, " 6"]:
     """Compute T_frame_robot from anchors at stated positions, whose positions in the robot's base the wires determine.
 
@@ -195,7 +195,7 @@ def base_from_anchors(
         measurements: the rows.
         frame: name of the frame.
         tip: nominal positions of the tip in the base of the robot [m].
-        drawn: base of the robot, x, y, z [m], roll, pitch, yaw [rad], for what the anchors do not determine.
+        nominal_base: x, y, z [m], roll, pitch, yaw [rad] of the nominal base, for what the anchors do not determine.
     """
     seen, stated = [], []
     for name in names_of(measurements.anchor):
@@ -209,9 +209,9 @@ def base_from_anchors(
             seen.append(anchor_from_distances(tip[rows], measurements.distance.cpu()[rows])[:3])
             stated.append(place.cpu())
     if not seen:
-        return drawn
+        return nominal_base
     R, p = base_by_points(
-        torch.stack(seen), torch.stack(stated), rotation_from_rpy(tip.new_tensor(drawn[3:]))
+        torch.stack(seen), torch.stack(stated), rotation_from_rpy(tip.new_tensor(nominal_base[3:]))
     )
     return torch.cat([p, rpy_from_rotation(R)]).numpy()
 

@@ -168,7 +168,7 @@ class ParameterSpace:
     def prior_groups(self) -> Int64[Tensor, "2 parameters"]:
         """Prior group of every parameter if it is nominally 0, and if not; see `prior_group_of`."""
         others = [int(PriorGroup.JOINT_OFFSET)] * (len(self.parameters) - self.arm_size)
-        of_row = ([prior_group_of(column, drawn) for column in DH_COLUMNS] for drawn in (False, True))
+        of_row = ([prior_group_of(column, nonzero) for column in DH_COLUMNS] for nonzero in (False, True))
         return torch.tensor([groups * len(self.robot.rows) + others for groups in of_row])
 
     @property

@@ -38,15 +38,15 @@ LENGTH_GROUPS = (PriorGroup.LENGTH, PriorGroup.NO_LENGTH)
 """Groups of lengths; the others are of angles."""
 
 
-def prior_group_of(column: str, drawn: bool) -> int:
+def prior_group_of(column: str, nonzero: bool) -> int:
     """Return the group of a parameter.
 
     Args:
         column: "theta", "d", "a", "alpha" or "beta"; others have no prior, so that their group does not matter.
-        drawn: whether its nominal value is larger than its tolerance.
+        nonzero: whether its nominal value is larger than its tolerance.
     """
     if column in ("d", "a"):
-        return PriorGroup.LENGTH if drawn else PriorGroup.NO_LENGTH
+        return PriorGroup.LENGTH if nonzero else PriorGroup.NO_LENGTH
     return PriorGroup.BETWEEN_AXES if column in ("alpha", "beta") else PriorGroup.JOINT_OFFSET
 
 

@@ -127,8 +127,8 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         active = self.active
         if self.prior_sizes != "estimated":
             return self.space.is_length.to(active.device)[active].long()
-        drawn = (self.nominal.square() * self.precision > 1)[active].long()
-        return self.space.prior_groups.to(active.device)[drawn, active]
+        nonzero = (self.nominal.square() * self.precision > 1)[active].long()
+        return self.space.prior_groups.to(active.device)[nonzero, active]
 
     def with_active(self, active: Sequence[int]) -> "CalibrationProblem":
         """Return the problem with other free parameters."""

@@ -138,14 +138,14 @@ class ControllerFile:
         draft, held = FileText(fit.robot, nominal, request), fit.robot
         if self.read is not None:
             held = self.read(self.text(draft), str(request.out), nominal)
-        lost, drawn = fit.departure(held), fit.departure(nominal)
+        lost, of_nominal = fit.departure(held), fit.departure(nominal)
         title = f"{self.contents[0].upper()}{self.contents[1:]} of model {model.name} (robot {nominal.name})."
-        convention = self.convention(model.drawn or nominal)
+        convention = self.convention(model.nominal or nominal)
         sentences = [
             title,
             self.source,
             *convention.remarks,
-            departure_sentence("This file deviates", lost, drawn),
+            departure_sentence("This file deviates", lost, of_nominal),
         ]
         if corrects_joints(model):
             sentences.append(
@@ -153,7 +153,7 @@ class ControllerFile:
                 "whole model."
             )
         sentences += [*self.relies, *condition_remarks(model), *frame_remarks(model)]
-        facts = {"off_the_whole_model": asdict(lost), "robot_as_drawn": asdict(drawn)}
+        facts = {"off_the_whole_model": asdict(lost), "robot_as_drawn": asdict(of_nominal)}
         facts |= {part: in_file_units(FRAME_COLUMNS, getattr(held, part)) for part in ("base", "tool")}
         if convention.frames:
             facts["frames"] = convention.frames.to_json()

@@ -11,7 +11,7 @@ from pisigma.deployment.export.controllers.controller_file import (
     with_frames,
 )
 from pisigma.deployment.export.controllers.offset_table import read_offsets
-from pisigma.deployment.export.projection import Departure, departure_from_drawn
+from pisigma.deployment.export.projection import Departure, departure_from_nominal
 from pisigma.files.errors import Place, RobotError
 from pisigma.files.input_file import read_text
 from pisigma.robot.description import Robot
@@ -83,7 +83,7 @@ def read_controller_file(path: Path, nominal: Robot, max_change: float = MAX_CHA
     convention = file.convention(nominal) if file else Convention(nominal)
     # The base and tool of the file define the frames of its poses and do not count as changes by the calibration.
     there = nominal.with_geometry(base=robot.base, tool=robot.tool)
-    change = departure_from_drawn(robot, with_frames(convention.nominal, text) if file else there)
+    change = departure_from_nominal(robot, with_frames(convention.nominal, text) if file else there)
     if not max(change.mean_mm, LEVER * change.mean_mrad) <= max_change:
         raise RobotError(
             f"expected a calibration that moves the tool by at most {max_change:g} mm and {max_change / LEVER:g} mrad "

@@ -62,16 +62,16 @@ class OwnGeometry:
     Attributes:
             model: the maker's name, for example "UR5e", or the robot's name if it is not in the table.
             robot: nominal parameters, with the names and limits of the description.
-            T_drawn_base: maps the controller's frame `base` into the frame of the description's poses.
+            T_poses_base: maps the controller's frame `base` into the frame of the description's poses.
             T_flange_tool: maps the description's tool into the controller's flange.
-            drawing: robot as described.
+            described: robot as described.
     """
 
     model: str
     robot: Robot
-    T_drawn_base: Frame
+    T_poses_base: Frame
     T_flange_tool: Frame
-    drawing: Robot
+    described: Robot
 
     def origins(self, calibrated: Robot) -> tuple[list[Frame], Robot]:
         """Return the frames of a calibrated robot's joints in the controller's convention, each in the previous one.
@@ -84,7 +84,7 @@ class OwnGeometry:
         Returns:
             The frames, the first in `base`, and the nominal robot with the base and tool that belong to them.
         """
-        T_rows_base = inverse(frame_of(self.drawing.base)) @ self.T_drawn_base
+        T_rows_base = inverse(frame_of(self.described.base)) @ self.T_poses_base
         before, moved = T_rows_base, []
         origins, end = joint_origins(calibrated)
         for origin, screw in zip(origins, self._screws(T_rows_base), strict=True):
@@ -96,29 +96,29 @@ class OwnGeometry:
 
     def _screws(self, T_rows_base: Frame) -> list[Frame]:
         """Return every joint's shift along and about its axis from the description's frame to the controller's."""
-        drawn, own, screws = np.eye(4), T_rows_base, []
-        origins, end = joint_origins(self.drawing)
-        for drawn_origin, own_origin in zip(origins[:-1], joint_origins(self.robot)[0][:-1], strict=True):
-            drawn, own = drawn @ drawn_origin, own @ own_origin
-            screws.append(_screw(inverse(drawn) @ own))
+        described, own, screws = np.eye(4), T_rows_base, []
+        origins, end = joint_origins(self.described)
+        for described_origin, own_origin in zip(origins[:-1], joint_origins(self.robot)[0][:-1], strict=True):
+            described, own = described @ described_origin, own @ own_origin
+            screws.append(_screw(inverse(described) @ own))
         # After the last joint there is only the flange.
-        return [*screws, _screw(end @ frame_of(self.drawing.tool) @ inverse(self.T_flange_tool))]
+        return [*screws, _screw(end @ frame_of(self.described.tool) @ inverse(self.T_flange_tool))]
 
     def frames(self) -> Frames:
         """Return the differences between the description's frames and the controller's."""
-        base, tool = xyzrpy_of(self.T_drawn_base), xyzrpy_of(self.T_flange_tool)
+        base, tool = xyzrpy_of(self.T_poses_base), xyzrpy_of(self.T_flange_tool)
         return Frames(self._sentence(), base, tool)
 
     def _sentence(self) -> str:
-        base, tool = _frame_words(self.T_drawn_base), _frame_words(self.T_flange_tool)
+        base, tool = _frame_words(self.T_poses_base), _frame_words(self.T_flange_tool)
         poses = f"Poses are those of the {self.model}'s flange in the controller's frame 'base'"
         if not base and not tool:
-            return f"{poses}, which are also the frames of robot '{self.drawing.name}'."
+            return f"{poses}, which are also the frames of robot '{self.described.name}'."
         differences = [
             f"'base' is at {base} in the frame of its poses" if base else "",
             f"its tool is at {tool} on the flange" if tool else "",
         ]
-        return f"{poses}; robot '{self.drawing.name}' has other frames: {' and '.join(filter(None, differences))}."
+        return f"{poses}; robot '{self.described.name}' has other frames: {' and '.join(filter(None, differences))}."
 
 
 def _screw(T: Frame) -> Frame:
@@ -137,33 +137,35 @@ def _frame_words(T: Frame) -> str:
     return ", ".join(lengths + turns)
 
 
-def own_geometry(drawing: Robot) -> OwnGeometry:
+def own_geometry(described: Robot) -> OwnGeometry:
     """Identify the model of Universal Robots that a nominal or calibrated robot belongs to, and their relative frames.
 
     Raises:
         RobotError: it is not a known model.
     """
-    check_robot(drawing)
-    candidates = [_placed(model, _robot(drawing, model), drawing) for model in _D_AND_A]
+    check_robot(described)
+    candidates = [_placed(model, _robot(described, model), described) for model in _D_AND_A]
     distance, own = min(candidates, key=lambda candidate: candidate[0])
     if distance <= FARTHEST:
         return own
-    if _drawn_as_own(drawing):
-        plain = drawing.with_geometry(base=np.zeros(6), tool=np.zeros(6))
-        return OwnGeometry(drawing.name, plain, frame_of(drawing.base), frame_of(drawing.tool), drawing)
+    if _has_own_convention(described):
+        plain = described.with_geometry(base=np.zeros(6), tool=np.zeros(6))
+        return OwnGeometry(
+            described.name, plain, frame_of(described.base), frame_of(described.tool), described
+        )
     raise RobotError(
-        f"expected an arm of Universal Robots ({', '.join(_D_AND_A)}), got robot '{drawing.name}', whose tool is on "
+        f"expected an arm of Universal Robots ({', '.join(_D_AND_A)}), got robot '{described.name}', whose tool is on "
         f"average {distance * 1e3:.3g} mm from that of a {own.model}",
         expected="an arm of Universal Robots",
-        value=drawing.name,
+        value=described.name,
         remedy="for another of their arms give a robot file in the maker's DH parameters (theta 0, a negative, "
         "alpha 90, 0, 0, 90, -90, 0 deg)",
     )
 
 
-def convention(drawing: Robot) -> Convention:
+def convention(described: Robot) -> Convention:
     """Return the controller's description of an arm, and the values that its files were tested against."""
-    own = own_geometry(drawing)
+    own = own_geometry(described)
     values = [_USERS[own.model]] if own.model in _USERS else []
     if own.model in _WITH_DEFAULTS:
         values.append(f"the maker's default kinematics and hash of the {own.model} ({_DEFAULTS})")
@@ -179,15 +181,15 @@ def check_robot(robot: Robot) -> None:
     check_plain_joints(robot, "a file of Universal Robots", JOINTS)
 
 
-def _robot(drawing: Robot, model: str) -> Robot:
+def _robot(described: Robot, model: str) -> Robot:
     """Make the nominal robot of a model with the names and limits of a description."""
     (d_1, *wrist), (a_2, a_3) = _D_AND_A[model]
     dh = np.zeros((JOINTS, 5))
     dh[:, 1], dh[:, 2], dh[:, 3] = (d_1, 0, 0, *wrist), (0, -a_2, -a_3, 0, 0, 0), _ALPHA
-    return drawing.with_geometry(dh, np.zeros(6), np.zeros(6))
+    return described.with_geometry(dh, np.zeros(6), np.zeros(6))
 
 
-def _drawn_as_own(robot: Robot) -> bool:
+def _has_own_convention(robot: Robot) -> bool:
     """Return whether a robot is described in the maker's convention, with any lengths."""
     theta, _, a, alpha, beta = robot.dh.T
     return not (theta.any() or beta.any() or a[[0, 3, 4, 5]].any()) and bool(
@@ -195,11 +197,11 @@ def _drawn_as_own(robot: Robot) -> bool:
     )
 
 
-def _placed(model: str, own: Robot, drawing: Robot) -> tuple[float, OwnGeometry]:
+def _placed(model: str, own: Robot, described: Robot) -> tuple[float, OwnGeometry]:
     """Align a model with a description, and return the mean distance [m] of their tools."""
-    base, tool = _by_first_axes(own, drawing)
+    base, tool = _by_first_axes(own, described)
     q = torch.rand((_POSES, JOINTS), generator=torch.Generator().manual_seed(0), dtype=torch.float64) * 6 - 3
-    T = forward_kinematics(drawing, q)
+    T = forward_kinematics(described, q)
 
     def laid(base: Frame, tool: Frame) -> tuple[float, Robot]:
         robot = own.with_geometry(base=xyzrpy_of(base), tool=xyzrpy_of(tool))
@@ -210,12 +212,12 @@ def _placed(model: str, own: Robot, drawing: Robot) -> tuple[float, OwnGeometry]
         robot, _ = solve_projection(ProjectionProblem(robot, q, T, ()))
         base, tool = _right(frame_of(robot.base)), _right(frame_of(robot.tool))
         distance, robot = laid(base, tool)
-    return distance, OwnGeometry(model, own, base, tool, drawing)
+    return distance, OwnGeometry(model, own, base, tool, described)
 
 
-def _by_first_axes(own: Robot, drawing: Robot) -> tuple[Frame, Frame]:
+def _by_first_axes(own: Robot, described: Robot) -> tuple[Frame, Frame]:
     """Determine the controller's base from axes 1 and 2, and the description's tool on the flange at zero."""
-    first, second = _zero_frames(drawing)[:2]
+    first, second = _zero_frames(described)[:2]
     z, across = first[:3, 2], second[:3, 2] - first[:3, 2] * (second[:3, 2] @ first[:3, 2])
     base = np.eye(4)
     if np.linalg.norm(across) > _EXACT:
@@ -227,7 +229,7 @@ def _by_first_axes(own: Robot, drawing: Robot) -> tuple[Frame, Frame]:
     base[:3, 3] = first[:3, 3] + (along - own.dh[0, 1]) * z
     base = _clean(base)
     zero = torch.zeros(1, JOINTS, dtype=torch.float64)
-    ends = [forward_kinematics(robot, zero)[0].numpy() for robot in (own, drawing)]
+    ends = [forward_kinematics(robot, zero)[0].numpy() for robot in (own, described)]
     return base, _clean(inverse(base @ ends[0]) @ ends[1])
 
 

@@ -3,7 +3,7 @@
 import re
 
 from pisigma.deployment.export.controllers.controller_file import ControllerFile, FileText
-from pisigma.deployment.export.urdf import drawn_into
+from pisigma.deployment.export.urdf import text_in_urdf
 from pisigma.files.errors import OutputError
 from pisigma.robot.urdf_file import XACRO
 
@@ -34,7 +34,7 @@ def write_overlay(content: FileText) -> str:
     Raises:
         OutputError: there is no such file.
     """
-    urdf = drawn_into(content.request, content.robot, content.nominal, content.comments)
+    urdf = text_in_urdf(content.request, content.robot, content.nominal, content.comments)
     if urdf is None:
         raise OutputError(
             "--format xacro needs the URDF file of the robot",

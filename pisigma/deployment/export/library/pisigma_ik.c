@@ -116,16 +116,16 @@ static int64_t run(const pisigma_model *model, int64_t task, double *pose, const
 int pisigma_solve(const pisigma_model *model, const double pose[16], const double *near_q, const double *approach,
                   int branch, pisigma_solution *solution) {
     int dof = pisigma_joints(model);
-    double T[16], beside[PISIGMA_MOST_JOINTS], out[2 * PISIGMA_MOST_JOINTS + 5];
+    double T[16], near[PISIGMA_MOST_JOINTS], out[2 * PISIGMA_MOST_JOINTS + 5];
     memcpy(T, pose, sizeof T);
     for (int j = 0; near_q && j < dof; j++) {
         int possible = near_q[j] >= model->head.lowest[j] && near_q[j] <= model->head.highest[j];
-        beside[j] = possible ? near_q[j] : NAN; /* probably in degrees: INVALID_POSE */
+        near[j] = possible ? near_q[j] : NAN; /* probably in degrees: INVALID_POSE */
     }
     for (int j = 0; approach && j < dof; j++)
         if (approach[j] != -1.0 && approach[j] != 0.0 && approach[j] != 1.0) T[0] = NAN;
     if (branch >= pisigma_branches(model) || branch < PISIGMA_ANY_BRANCH) T[0] = NAN, branch = PISIGMA_ANY_BRANCH;
-    run(model, SOLVE, T, near_q ? beside : NULL, approach, branch, out);
+    run(model, SOLVE, T, near_q ? near : NULL, approach, branch, out);
     for (int j = 0; j < PISIGMA_MOST_JOINTS; j++) {
         solution->q[j] = j < dof ? out[j] : NAN;
         solution->q_nominal[j] = j < dof ? out[dof + j] : NAN;

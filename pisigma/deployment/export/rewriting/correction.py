@@ -148,8 +148,8 @@ class ProgramCorrection:
         after = invert(torch.stack([target.T_flange_tool for target in targets])) @ tool
         before, after = (T.repeat_interleave(counts, 0) for T in (before, after))
         solution = self.solver(before @ torch.cat(list(poses)) @ after, branch=self.branch)
-        drawn = forward_kinematics(robot, robot.to_dh(solution.q.detach().to("cpu", torch.float64)))
-        parts = (invert(before) @ drawn @ invert(after), solution.status, solution.branch)
+        nominal_tool = forward_kinematics(robot, robot.to_dh(solution.q.detach().to("cpu", torch.float64)))
+        parts = (invert(before) @ nominal_tool @ invert(after), solution.status, solution.branch)
         split = (part.split(counts.tolist()) for part in parts)
         return [
             CommandedPoses(T, tuple(Status(value) for value in status.tolist()), frozenset(branch.tolist()))
@@ -215,10 +215,12 @@ def _seen_from(end: Target, target: Target) -> Float64[Tensor, "1 4 4"]:
 def _off(T: Float64[Tensor, "points 4 4"], stride: int, circular: bool) -> float:
     """Compute the largest deviation of poses from the lines or arcs between every `stride`-th of them [m]."""
     start, end = T[:-1:stride], T[stride::stride]
-    drawn = _round(start, T[stride // 2 :: stride], end, stride) if circular else _between(start, end, stride)
-    drawn = drawn[:, :-1].flatten(0, 1)
-    turn = rotation_vector(drawn[:, :3, :3].mT @ T[:-1, :3, :3]).norm(dim=-1)
-    return float(((drawn - T[:-1])[:, :3, 3].norm(dim=-1) + LEVER * turn).max())
+    interpolated = (
+        _round(start, T[stride // 2 :: stride], end, stride) if circular else _between(start, end, stride)
+    )
+    interpolated = interpolated[:, :-1].flatten(0, 1)
+    turn = rotation_vector(interpolated[:, :3, :3].mT @ T[:-1, :3, :3]).norm(dim=-1)
+    return float(((interpolated - T[:-1])[:, :3, 3].norm(dim=-1) + LEVER * turn).max())
 
 
 def _steps(start: Float64[Tensor, "1 4 4"], end: Float64[Tensor, "1 4 4"], length: float) -> int:

@@ -61,10 +61,10 @@ def spherical_wrist_branches(form: Any, P: Any, only: int, rounding: float, q: A
     margin = NEAREST_MARGIN if nearest else 0.0
     forearm, side = math.hypot(a[2], d[3]), d[1] + d[2]
     scale = abs(a[0]) + abs(a[1]) + forearm + abs(side)
-    far, azimuth, beside, on_axis = first_joint(
+    far, azimuth, reachable, on_axis = first_joint(
         P, side, scale, form.sign[0] * form.offset[0], rounding, margin
     )
-    if not beside and not nearest:
+    if not reachable and not nearest:
         return
     for pair in range(4):
         if only >= 0 and only // 2 != pair:

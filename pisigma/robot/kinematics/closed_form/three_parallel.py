@@ -71,10 +71,10 @@ def three_parallel_branches(form: Any, P: Any, only: int, rounding: float, q: An
     a, d, margin = form.a, form.d, NEAREST_MARGIN if only < -1 else 0.0
     side = d[1] + d[2] + d[3]
     scale = abs(a[0]) + abs(a[1]) + abs(a[2]) + math.hypot(a[3], d[4]) + abs(side)
-    far, azimuth, beside, on_axis = first_joint(
+    far, azimuth, reachable, on_axis = first_joint(
         P, side, scale, form.sign[0] * form.offset[0], rounding, margin
     )
-    if not beside and margin == 0.0:
+    if not reachable and margin == 0.0:
         return
     for shoulder in range(2):
         if only >= 0 and only // 4 != shoulder:
@@ -149,7 +149,7 @@ class ThreeParallelArm(AbstractClosedForm):
         columns = as_tensors(T)
         p = columns[3]
         zero, side = self.rows.variable_at_zero(0), -sum(self.rows.d[1:4])
-        t_1, ahead, beside = solve_first_joint(p[0], p[1], side, self._scale, shoulder, zero, self.margin)
+        t_1, ahead, reachable = solve_first_joint(p[0], p[1], side, self._scale, shoulder, zero, self.margin)
         t_5, t_6, straight = self._solve_wrist(columns, t_1, wrist)
         x, y = ahead - self.rows.a[0], p[2] - self.rows.d[0]
         upwards = -math.copysign(1.0, self.rows.a[1]) * shoulder * elbow
@@ -161,7 +161,7 @@ class ThreeParallelArm(AbstractClosedForm):
         t_3 = arm.elbow - (math.pi if self.rows.a[2] < 0 else 0.0)
         tolerance = singular_tolerance(x.dtype)
         singular = arm.singular | (ahead.abs() < tolerance * self._scale) | (straight < tolerance)
-        return [t_1, arm.first, t_3, t_234 - arm.first - t_3, t_5, t_6], arm.reached & beside, singular
+        return [t_1, arm.first, t_3, t_234 - arm.first - t_3, t_5, t_6], arm.reached & reachable, singular
 
     def _solve_wrist(self, R: Columns, t_1: Tensor, wrist: Scalar) -> tuple[Tensor, Tensor, Tensor]:
         """Solve joints 5 and 6, and |s_5|: axis 2 in the wanted frame is `(s_5 c_6, -s_5 s_6, c_5)`."""

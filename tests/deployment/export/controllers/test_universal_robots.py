@@ -123,18 +123,20 @@ def test_written_files_agree_with_the_makers_formula(name):
 @pytest.mark.parametrize("name", NOMINAL)
 def test_described_arms_agree_with_the_maker_in_its_frames(name, file):
     """A file of zeros, or the default kinematics, yields the maker's nominal arm in `base` for any description."""
-    drawn, own = Robot.load(name), own_geometry(Robot.load(name))
+    described, own = Robot.load(name), own_geometry(Robot.load(name))
     d, a, calib = NOMINAL[name]
     q = joint_values()
     wanted = makers_formula(q, np.zeros(6), d, a, ALPHA)
-    text = file.text(FileText(drawn, drawn, REQUEST))
+    text = file.text(FileText(described, described, REQUEST))
     assert_close(
-        forward_kinematics(file.read(text, "file", drawn), torch.from_numpy(q)),
-        forward_kinematics(drawn, torch.from_numpy(q)),
+        forward_kinematics(file.read(text, "file", described), torch.from_numpy(q)),
+        forward_kinematics(described, torch.from_numpy(q)),
         atol=1e-9,
     )
     bare = re.sub(r"(?m)^# .*\n", "", text)
-    assert_close(forward_kinematics(file.read(bare, "file", drawn), torch.from_numpy(q)), wanted, atol=1e-9)
+    assert_close(
+        forward_kinematics(file.read(bare, "file", described), torch.from_numpy(q)), wanted, atol=1e-9
+    )
     assert own.model.lower() == name
     turned = name in ("ur3", "ur3e", "ur5e")
     assert_close(own.frames().base, [0, 0, 0, np.pi if turned else 0, 0, 0], atol=1e-12)
@@ -242,8 +244,8 @@ def test_errors_that_a_base_or_tool_could_absorb_are_refused(key, joint, by, tmp
 
 def test_frames_of_a_models_file_are_those_of_the_description(tmp_path):
     """They are not those of the calibration, whose base and tool are stated separately."""
-    drawn = Robot.load("ur5e")
-    model = hybrid_model("ur10", [FourierSeries(drawn, 8)], robot=drawn)
+    described = Robot.load("ur5e")
+    model = hybrid_model("ur10", [FourierSeries(described, 8)], robot=described)
     base, tool = np.array([1.5, -0.8, 0.2, 0.7, 0.1, 0.2]), np.array([0.03, 0.05, 0.1, 0.3, 0.2, 0.1])
     moved = replace(model, robot=model.robot.with_geometry(base=base, tool=tool))
     folder = tmp_path / "arm"

@@ -14,7 +14,7 @@ from pisigma.robot.writing import robot_to_urdf
 
 
 @pytest.fixture
-def drawn(tmp_path):
+def urdf(tmp_path):
     """A URDF file."""
     path = tmp_path / "arm.urdf"
     path.write_text(
@@ -23,10 +23,10 @@ def drawn(tmp_path):
     return path
 
 
-def test_the_robot_is_read_back(drawn, tmp_path):
-    nominal = Robot.load(drawn)
+def test_the_robot_is_read_back(urdf, tmp_path):
+    nominal = Robot.load(urdf)
     calibrated = off_by(nominal)
-    urdf = robot_into_urdf(calibrated, nominal, drawn, comments=("said",))
+    urdf = robot_into_urdf(calibrated, nominal, urdf, comments=("said",))
     overlay = tmp_path / "arm.urdf.xacro"
     overlay.write_text(with_properties(urdf))
     text = overlay.read_text()
@@ -46,9 +46,9 @@ def test_the_robot_is_read_back(drawn, tmp_path):
         ('name="theta_2_xyz"', 'name="other"'),
     ],
 )
-def test_anything_else_of_xacro_is_refused(before, after, drawn, tmp_path):
-    nominal = Robot.load(drawn)
+def test_anything_else_of_xacro_is_refused(before, after, urdf, tmp_path):
+    nominal = Robot.load(urdf)
     overlay = tmp_path / "arm.xacro"
-    overlay.write_text(with_properties(robot_into_urdf(nominal, nominal, drawn)).replace(before, after))
+    overlay.write_text(with_properties(robot_into_urdf(nominal, nominal, urdf)).replace(before, after))
     with pytest.raises(RobotError, match="xacro"):
         Robot.load(overlay, tip=CALIBRATED_TOOL)

@@ -10,7 +10,7 @@ CORNERS = np.array([[30.31, 34.77], [90.0, 31.5]])
 AXES = np.array([[[40.0, 8.0], [6.0, 35.0]], [[30.0, -25.0], [25.0, 30.0]]])
 
 
-def drawn_corners(slope: float) -> np.ndarray:
+def render_corners(slope: float) -> np.ndarray:
     """Return an image of two corners, one per half, blurred by 0.9 px under light with a gradient [1/px]."""
     y, x = np.mgrid[:64, :120].astype(float)
     gray = np.empty_like(x)
@@ -24,13 +24,13 @@ def drawn_corners(slope: float) -> np.ndarray:
 def test_corners_are_found_under_even_and_uneven_light() -> None:
     near = CORNERS + np.array([[0.2, -0.15], [-0.1, 0.25]])
     for slope in (0.0, 2e-3):
-        assert_close(fit_saddles(drawn_corners(slope), near, AXES, 0.4), CORNERS, atol=1e-3)
+        assert_close(fit_saddles(render_corners(slope), near, AXES, 0.4), CORNERS, atol=1e-3)
 
 
 def test_noise_moves_corners_by_some_thousandths_of_a_pixel() -> None:
     rng = np.random.default_rng(0)
     off = [
-        fit_saddles(drawn_corners(0.0) + 2.0 * rng.standard_normal((64, 120)), CORNERS, AXES, 0.4) - CORNERS
+        fit_saddles(render_corners(0.0) + 2.0 * rng.standard_normal((64, 120)), CORNERS, AXES, 0.4) - CORNERS
         for _ in range(10)
     ]
     assert_close(np.sqrt(np.square(off).mean()), 0.004, rtol=0.5)
