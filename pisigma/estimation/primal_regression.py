@@ -67,7 +67,7 @@ class PrimalRegression(AbstractRegression):
         descent: `Σ X^T y` for every sensor.
         square: `Σ y^T y` for every sensor.
         sensors: number of values of every sensor.
-        latest: cache of the last solution, which evidence, left-out values and covariance share.
+        latest: cache of the last solution, which evidence, held-out values and covariance share.
     """
 
     normal: Float64[Tensor, "sensors unknowns unknowns"]

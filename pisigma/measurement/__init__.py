@@ -10,7 +10,7 @@ __getattr__ = lazily(
     __name__,
     {
         "dataset": "Measurements join",
-        "fields": "Kind LeftOut",
+        "fields": "Kind UnusableRow",
         "groups": "groups_of_equal_joints groups_to_keep_whole placements",
         "jig": "Jig",
         "splits": "holdout k_folds",

@@ -1,7 +1,7 @@
 from pisigma.measurement.dataset import Measurements as Measurements
 from pisigma.measurement.dataset import join as join
 from pisigma.measurement.fields import Kind as Kind
-from pisigma.measurement.fields import LeftOut as LeftOut
+from pisigma.measurement.fields import UnusableRow as UnusableRow
 from pisigma.measurement.groups import groups_of_equal_joints as groups_of_equal_joints
 from pisigma.measurement.groups import groups_to_keep_whole as groups_to_keep_whole
 from pisigma.measurement.groups import placements as placements

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Bool, Float64, Int64
 from torch import Tensor
 
-from pisigma.measurement.fields import LeftOut, MeasuredFields
+from pisigma.measurement.fields import MeasuredFields, UnusableRow
 from pisigma.measurement.groups import numbers_of_names
 from pisigma.measurement.readings import READINGS
 from pisigma.robot.description import Robot
@@ -42,7 +42,7 @@ _CHUNK = 1 << 22
 
 
 @dataclass(frozen=True)
-class CopiedRow(LeftOut):
+class CopiedRow(UnusableRow):
     """A row that is left out because another one is the same measurement.
 
     Attributes:
@@ -378,7 +378,7 @@ def places_text(rows: MeasuredFields, chosen: Bool[Tensor, " rows"]) -> str:
     return f"{named} and {len(numbers) - MAX_NAMED} more" if len(numbers) > MAX_NAMED else named
 
 
-def copy_warnings(left_out: Sequence[LeftOut]) -> tuple[str, ...]:
+def copy_warnings(left_out: Sequence[UnusableRow]) -> tuple[str, ...]:
     """Return a warning of the rows that were left out as copies, or nothing."""
     copies = [one for one in left_out if isinstance(one, CopiedRow)]
     if not copies:

@@ -18,7 +18,7 @@ from pisigma.files.errors import MeasurementError, Place
 from pisigma.measurement.csv.reading import read_fields
 from pisigma.measurement.csv.writing import write_fields
 from pisigma.measurement.faults import RowPlace
-from pisigma.measurement.fields import KINDS, Kind, LeftOut, MeasuredFields, OnBadRow, joined_fields
+from pisigma.measurement.fields import KINDS, Kind, MeasuredFields, OnBadRow, UnusableRow, joined_fields
 from pisigma.measurement.readings import READINGS
 from pisigma.measurement.rules import check_fields
 from pisigma.robot import Robot
@@ -93,7 +93,7 @@ class Measurements:
     readings: Mapping[str, Tensor | tuple[str, ...]] = field(default_factory=dict)
     line: tuple[int, ...] = ()
     source: str = "memory"
-    left_out: tuple[LeftOut, ...] = ()
+    left_out: tuple[UnusableRow, ...] = ()
     origin: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:

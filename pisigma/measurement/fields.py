@@ -40,7 +40,7 @@ KINDS = ("pose", "position", "rotation", "touch", "socket", "distance")
 
 
 @dataclass(frozen=True)
-class LeftOut:
+class UnusableRow:
     """A row of a file that could not be used.
 
     Attributes:
@@ -54,9 +54,9 @@ class LeftOut:
     fault: Fault | None = None
 
     @staticmethod
-    def because(line: int, fault: Fault) -> "LeftOut":
+    def because(line: int, fault: Fault) -> "UnusableRow":
         """Return the row with the reason that a fault states."""
-        return LeftOut(line, str(fault), fault)
+        return UnusableRow(line, str(fault), fault)
 
     def error(self, file: str) -> MeasurementError:
         """Return the exception for this row of a file."""
@@ -83,7 +83,7 @@ class MeasuredFields:
     texts: Mapping[str, tuple[str, ...]]
     line: tuple[int, ...]
     source: str
-    left_out: tuple[LeftOut, ...] = field(default=())
+    left_out: tuple[UnusableRow, ...] = field(default=())
     origin: tuple[str, ...] = ()
 
     @property

@@ -14,7 +14,7 @@ from pisigma.measurement.csv.header import read_header
 from pisigma.measurement.csv.reading import sound_rows
 from pisigma.measurement.csv.table import Table, table_of
 from pisigma.measurement.dataset import Measurements
-from pisigma.measurement.fields import LeftOut, MeasuredFields
+from pisigma.measurement.fields import MeasuredFields, UnusableRow
 from pisigma.robot import Robot
 
 _DIGITS = 9
@@ -37,7 +37,7 @@ class Growth:
     """
 
     rows: Measurements | None = None
-    left_out: tuple[LeftOut, ...] = ()
+    left_out: tuple[UnusableRow, ...] = ()
     notices: tuple[str, ...] = ()
     waiting: str = ""
 
@@ -70,7 +70,7 @@ class GrowingFile:
         self._text = ""
         self._waiting = ""
         self._accepted: Counter[str] = Counter()
-        self._refused: set[LeftOut] = set()
+        self._refused: set[UnusableRow] = set()
 
     def read(self, final: bool = False) -> Growth:
         """Read the new rows.

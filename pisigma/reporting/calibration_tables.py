@@ -23,7 +23,7 @@ from pisigma.validation.held_out.validation_figures import (
 )
 
 PARAMETER_COLUMNS = ("parameter", "unit", "nominal", "estimated", "change", "std. error", "remark")
-TRIAL_COLUMNS = ("tried", "unknowns", "log evidence", "left-out error", "seconds", "kept")
+TRIAL_COLUMNS = ("tried", "unknowns", "log evidence", "held-out error", "seconds", "kept")
 SIGNIFICANT = 2.0
 """Standard errors below which a change cannot be distinguished from 0."""
 UNCERTAIN = "not distinguishable from 0"

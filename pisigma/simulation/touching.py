@@ -13,7 +13,7 @@ from pisigma.files.errors import Place, UnreachablePoseError
 from pisigma.files.yaml_file import Section
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.faults import Fault
-from pisigma.measurement.fields import LeftOut
+from pisigma.measurement.fields import UnusableRow
 from pisigma.robot.kinematics.joint_limits import wrap_into_limits
 from pisigma.robot.kinematics.numeric import solve_numeric
 from pisigma.robot.kinematics.status import Status
@@ -92,7 +92,7 @@ def simulate_touches(
     met = met & inside
     source = f"simulation of {robot.nominal.name}"
     missed = (~met).nonzero()[:, 0].tolist()
-    left_out = tuple(LeftOut.because(0, _miss(candidates, row, contact)) for row in missed)
+    left_out = tuple(UnusableRow.because(0, _miss(candidates, row, contact)) for row in missed)
     if left_out and on_miss == "error":
         raise UnreachablePoseError(
             f"{len(left_out)} of {candidates.count} touches miss: {left_out[0].reason}",

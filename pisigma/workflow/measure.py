@@ -17,7 +17,7 @@ from pisigma.deployment.export.programs.planned import planned_program
 from pisigma.files.output_file import write_whole
 from pisigma.files.progress import Progress
 from pisigma.measurement.dataset import Measurements
-from pisigma.measurement.fields import LeftOut
+from pisigma.measurement.fields import UnusableRow
 from pisigma.planning.plan_file import StoredPlan, read_plan
 from pisigma.planning.plan_inputs import find_candidates, with_measured
 from pisigma.planning.session.reached import Reached, cross_validated, expected, reached
@@ -100,7 +100,7 @@ class MeasuringSession:
         """
         return MeasuringSession(read_plan(path), settings)
 
-    def add(self, rows: Measurements | None, left_out: Sequence[LeftOut] = ()) -> tuple[Alarm, ...]:
+    def add(self, rows: Measurements | None, left_out: Sequence[UnusableRow] = ()) -> tuple[Alarm, ...]:
         """Add new rows, and check every row against the others.
 
         Args:

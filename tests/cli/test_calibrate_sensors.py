@@ -41,7 +41,7 @@ def test_touches_on_jigs(run, touches, tmp_path):
     assert figures["geometric"]["rms_mm"] < 0.3 < 1.0 < figures["nominal"]["rms_mm"]  # touch noise is 0.2 mm
 
 
-def test_placements_of_a_real_panda_left_out_in_turn(run, shared_data, tmp_path):
+def test_placements_of_a_real_panda_held_out_once(run, shared_data, tmp_path):
     data = shared_data / "panda_sockets" / "panda_3.csv"
     command = ("calibrate", "panda", data, "--split", "placement", "--socket-distance", "*/0,*/1,50")
     result = run(*command, "--model", "geometric", "--out", tmp_path / "arm", "--json")

@@ -243,7 +243,7 @@ def test_tables_are_never_cut(capsys):
 
 
 def test_tables_fit_80_columns(capsys):
-    columns = ("tried", "unknowns", "log evidence", "left-out error", "seconds", "kept")
+    columns = ("tried", "unknowns", "log evidence", "held-out error", "seconds", "kept")
     name = "gravity + conditions + series 110 + products"
     print_table(
         "title",
@@ -253,7 +253,7 @@ def test_tables_fit_80_columns(capsys):
     lines = capsys.readouterr().out.splitlines()
     assert max(map(len, lines)) == 80
     assert [line.split() for line in lines[1:3]] == [
-        ["log", "left-out"],
+        ["log", "held-out"],
         [*columns[:2], "evidence", "error", *columns[4:]],
     ]
     assert lines[4].split()[-5:] == ["1431", "29288.8", "0.488", "0.5", "yes"]

@@ -8,7 +8,7 @@ from testing.closeness import assert_close
 from testing.refusals import refused
 
 from pisigma.files.errors import MeasurementError
-from pisigma.measurement import LeftOut
+from pisigma.measurement import UnusableRow
 from pisigma.measurement.dataset import Measurements, join
 from pisigma.robot.se3 import rotation_from_quaternion
 
@@ -35,7 +35,7 @@ def make_measurements(rows: int = 4, dof: int = 3, seed: int = 0) -> Measurement
         date=tuple(f"2026-11-{row + 1:02d}" for row in range(rows)),
         line=tuple(range(2, rows + 2)),
         source="tracker.csv",
-        left_out=(LeftOut(9, "column 'x_mm': empty"),),
+        left_out=(UnusableRow(9, "column 'x_mm': empty"),),
     )
 
 

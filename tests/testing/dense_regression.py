@@ -10,7 +10,7 @@ from torch import Tensor
 from pisigma.calibration.hybrid.design import Design, Rows
 from pisigma.calibration.hybrid.design_regression import AbstractDesignRegression
 from pisigma.estimation.covariance_root import CovarianceRoot
-from pisigma.estimation.left_out import LeftOut
+from pisigma.estimation.held_out import HeldOutErrors
 from pisigma.estimation.prior import GaussianPrior
 from pisigma.estimation.regression import Posterior, SensorCount
 
@@ -105,7 +105,7 @@ class DenseRegression(AbstractDesignRegression):
             tuple(replace(one, values=one.values * part) for one, part in counts),
         )
 
-    def left_out(self, posterior: Posterior, folds: Sequence[Tensor]) -> LeftOut:
+    def held_out_errors(self, posterior: Posterior, folds: Sequence[Tensor]) -> HeldOutErrors:
         """Fit again without each fold; directions that the other values do not determine are fitted to the fold."""
         parts = []
         for groups in folds:
@@ -121,8 +121,8 @@ class DenseRegression(AbstractDesignRegression):
             variance = (free @ (torch.eye(len(error)).double() + X @ root @ (X @ root).t()) @ free).diagonal()
             repetition = error.new_tensor([one.repetition for one in self.sensors])[sensor]
             spread = (1 + repetition * (variance - 1).clamp(min=0)).sqrt()
-            parts.append(LeftOut(error * repetition.sqrt(), spread, sensor))
-        return LeftOut.joined(parts)
+            parts.append(HeldOutErrors(error * repetition.sqrt(), spread, sensor))
+        return HeldOutErrors.joined(parts)
 
     def _solution(self, prior: GaussianPrior, noise: Sequence[float]) -> tuple[Tensor, Tensor, Tensor]:
         """Return the unknowns, the root of their covariance, and the undetermined directions."""

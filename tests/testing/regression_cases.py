@@ -11,7 +11,7 @@ from testing.sensors import mixed_data, true_robot
 from torch import Tensor
 
 from pisigma.calibration.hybrid.design import Design, Rows
-from pisigma.estimation.left_out import LeftOut
+from pisigma.estimation.held_out import HeldOutErrors
 from pisigma.estimation.prior import GaussianPrior
 from pisigma.joint_correction.feature import AbstractFeature
 from pisigma.joint_correction.fourier_series import FourierSeries
@@ -55,9 +55,9 @@ class RegressionCase:
         return tuple(torch.cat([large.nonzero()[:, 0], others])[:, None])
 
     @functools.cached_property
-    def refitted(self) -> LeftOut:
+    def refitted(self) -> HeldOutErrors:
         """Values of the folds, predicted without them."""
-        return self.dense.left_out(self.dense.solve(self.prior, self.noise), self.folds)
+        return self.dense.held_out_errors(self.dense.solve(self.prior, self.noise), self.folds)
 
 
 def case_of(

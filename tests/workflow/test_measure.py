@@ -11,7 +11,7 @@ from testing.models import no_type_checker
 from testing.refusals import refused
 
 from pisigma.files.errors import PlanningError
-from pisigma.measurement.fields import LeftOut
+from pisigma.measurement.fields import UnusableRow
 from pisigma.planning.plan_file import read_plan
 from pisigma.planning.session import reached
 from pisigma.workflow.measure import MeasuringSession
@@ -26,7 +26,7 @@ def session():
     session = MeasuringSession(PLAN.stored, MeasureSettings(limit_mm=1e-3, least_gain_mm=0.0))
     rows = with_offset(PLAN.rows(18), 14, (0.003, -0.004, 0.0))
     session.add(rows.select(torch.arange(14)))
-    (alarm,) = session.add(rows.select(torch.tensor([14])), [LeftOut(20, "column 'q1_deg': empty")])[:1]
+    (alarm,) = session.add(rows.select(torch.tensor([14])), [UnusableRow(20, "column 'q1_deg': empty")])[:1]
     assert alarm.line == 16
     assert session.state.advice.action == "repeat"
     session.add(rows.select(torch.arange(15, 18)))

@@ -62,7 +62,7 @@ class HybridCalibrator:
 
     All unknowns have normal priors with nominal means. The prior sizes of weights maximise the evidence; those of
     geometric errors are taken from the geometric calibration. Features that do not raise the evidence, or that increase
-    the leave-out errors, are rejected. The remaining ones must predict rows that are left out of exact fits better than
+    the held-out errors, are rejected. The remaining ones must predict rows that are held out of exact fits better than
     the geometric calibration does; if none remain, the result is the geometric calibration.
 
     Attributes:
@@ -121,7 +121,7 @@ class HybridCalibrator:
         choice = self._chosen(solved, group, progress)
         if not choice.best.design.features:
             return _geometric_alone(solved, choice, _NOTHING_FOUND)
-        progress("predicting left-out rows by exact fits")
+        progress("predicting held-out rows by exact fits")
         serving = delivered(solved, choice, progress)
         if serving is None:
             return _geometric_alone(solved, choice, _NOTHING_HELPS)
@@ -134,14 +134,14 @@ class HybridCalibrator:
         falling = gravity_sentence(self.geometric.robot, choice.best.design.features)
         verdict, trials = " ".join(filter(None, (_kept_sentence(serving), falling))), choice.trials
         learned = self._learned(solved, refined)
-        progress("predicting left-out rows")
+        progress("predicting held-out rows")
         uncertainty = position_uncertainty(
             refined.rows,
             refined.design,
             refined.regression,
             refined.posterior,
             learned.geometry,
-            refined.left_out,
+            refined.held_out,
         )
         return HybridResult(solved.result(), learned, uncertainty, trials, verdict)
 
@@ -261,7 +261,7 @@ def _kept_sentence(serving: Delivered) -> str:
     """Write which correction was kept, and how much better held-out rows are predicted with it."""
     best = serving.choice.best
     return (
-        f"A joint correction was kept ({best.name}): held-out rows are predicted with {serving.left_out:.2f} times the "
+        f"A joint correction was kept ({best.name}): held-out rows are predicted with {serving.held_out:.2f} times the "
         "error of the geometric calibration."
     )
 
@@ -272,6 +272,6 @@ def _geometric_alone(solved: SolvedCalibration, choice: Choice, verdict: str) ->
     first = choice.geometry
     fit = regression(first.design, choice.rows)
     uncertainty = position_uncertainty(
-        choice.rows, first.design, fit, first.posterior, geometry, first.left_out
+        choice.rows, first.design, fit, first.posterior, geometry, first.held_out
     )
     return HybridResult(solved.result(), None, uncertainty, choice.trials, verdict)

@@ -1,4 +1,4 @@
-"""Choice of the final joint correction: the largest part of the selected one that increases no leave-out error."""
+"""Choice of the final joint correction: the largest part of the selected one that increases no held-out error."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -22,46 +22,46 @@ from pisigma.calibration.hybrid.refinement import (
 from pisigma.calibration.hybrid.regression import regression
 from pisigma.calibration.hybrid.search import CLEAR_GAIN, ROUGHLY, Choice, Fitted
 from pisigma.calibration.hybrid.sensor_values import SensorValues, sensor_values
-from pisigma.estimation.left_out import standard_errors
+from pisigma.estimation.held_out import standard_errors
 from pisigma.estimation.regression import Posterior
 from pisigma.joint_correction.feature import AbstractFeature
 from pisigma.measurement.groups import groups_of_equal_joints
 
 FOLDS, FOLDS_OF_FEW, FEW_GROUPS = 4, 8, 60
-"""Folds that are left out, the same for few groups, and the number of groups that are few."""
+"""Folds that are held out, the same for few groups, and the number of groups that are few."""
 MANY_GROUPS = 600
 """Groups up to which noise and prior sizes are updated for every fold."""
 EXACT_GROUPS = 200
-"""Poses or positions up to which left-out rows are predicted by exact fits; those of other sensors always are."""
+"""Poses or positions up to which held-out rows are predicted by exact fits; those of other sensors always are."""
 
 TOLERANCE = 1.005
 """Ratio of RMS errors above which errors count as larger; a smaller difference does not matter in practice."""
 REFITS = 10
-"""Gauss-Newton steps for unknowns that only left-out rows determine, such as the position of their socket."""
+"""Gauss-Newton steps for unknowns that only held-out rows determine, such as the position of their socket."""
 
 
 @dataclass(frozen=True, eq=False)
 class SensorErrors:
-    """Errors of one sensor's rows, in the fit of all rows and left out of it.
+    """Errors of one sensor's rows, in the fit of all rows and in a fit without them.
 
     Attributes:
         group: number of every row's group, see `Rows.group`.
         fitted: lengths of the errors of all rows [m or rad], or in standard deviations if the rows state them.
-        left_out: the same under fits without the row's fold; NaN for rows that were in no fold.
+        held_out: the same under fits without the row's fold; NaN for rows that were in no fold.
         weight: robust weight, 1 for full weight and 0 for rejected rows.
     """
 
     group: Int64[Tensor, " values"]
     fitted: Float64[Tensor, " values"]
-    left_out: Float64[Tensor, " values"]
+    held_out: Float64[Tensor, " values"]
     weight: Float64[Tensor, " values"]
 
     def compare(self, before: "SensorErrors") -> "Comparison":
         """Compare with the errors of the same rows under another fit; rows that either fit uses are compared."""
         weight = torch.maximum(self.weight, before.weight)
-        judged = torch.isfinite(before.left_out)  # a fit without a prediction is worse than any other
+        judged = torch.isfinite(before.held_out)  # a fit without a prediction is worse than any other
         fitted = [(weight * one.fitted.square()).sum() for one in (self, before)]
-        squares = [(weight * one.left_out.square())[judged] for one in (self, before)]
+        squares = [(weight * one.held_out.square())[judged] for one in (self, before)]
         gain = torch.zeros(int(self.group.max()) + 1 if len(self.group) else 0).to(weight)
         gain = gain.index_add(0, self.group[judged], squares[1] - squares[0])
         return Comparison(
@@ -77,21 +77,21 @@ class Comparison:
 
     Attributes:
         fitted: ratio of the RMS errors of all rows.
-        left_out: ratio of the RMS errors of left-out rows.
-        gain: decrease of the left-out squares [standard errors], with independent groups.
+        held_out: ratio of the RMS errors of held-out rows.
+        gain: decrease of the held-out squares [standard errors], with independent groups.
     """
 
     fitted: float
-    left_out: float
+    held_out: float
     gain: float
 
     @property
     def is_worse(self) -> bool:
-        """Whether the errors of rows or left-out rows are larger."""
-        return not (self.fitted <= TOLERANCE and self.left_out <= TOLERANCE)
+        """Whether the errors of rows or held-out rows are larger."""
+        return not (self.fitted <= TOLERANCE and self.held_out <= TOLERANCE)
 
 
-def left_out_rows(
+def held_out_rows(
     design: Design,
     posterior: Posterior,
     group: Int64[Tensor, " rows"],
@@ -100,14 +100,14 @@ def left_out_rows(
 ) -> tuple[SensorErrors | None, ...]:
     """Leave out each fold and predict its rows with an exact fit to the others.
 
-    The fit is linearised again until linearised and true residuals of its rows agree. Unknowns that only left-out rows
+    The fit is linearised again until linearised and true residuals of its rows agree. Unknowns that only held-out rows
     determine are fitted to these.
 
     Args:
         design: the unknowns.
         posterior: posterior by all rows.
         group: see `Rows.group`.
-        folds: groups that are left out together.
+        folds: groups that are held out together.
         updates: updates of noise and prior sizes for every fold.
 
     Returns:
@@ -117,7 +117,7 @@ def left_out_rows(
     weights = weigh(design.problem, values, posterior.effective)
     rows = Rows.linearised(design, posterior.x, values, weights, group)
     fit = regression(design, rows)
-    left_out = [torch.full_like(one.root, torch.nan) for one in values]
+    held_out = [torch.full_like(one.root, torch.nan) for one in values]
     for groups in folds:
         held = torch.isin(group, groups.to(group.device))
         others = torch.unique(group[~held])
@@ -134,12 +134,12 @@ def left_out_rows(
             rest = regression(design, there).without(groups).solve(rest.prior, rest.noise)
             here, x = there, rest.x
         x = _with_own_unknowns(design, x, posterior.x, values, held)
-        for errors, one in zip(left_out, _values(design, x), strict=True):
+        for errors, one in zip(held_out, _values(design, x), strict=True):
             chosen = held[one.row]
             errors[chosen] = (one.residual.norm(dim=1) * one.root)[chosen]
     return tuple(
         None if one.certain else SensorErrors(group[one.row], one.residual.norm(dim=1) * one.root, *errors)
-        for one, *errors in zip(values, left_out, weights, strict=True)
+        for one, *errors in zip(values, held_out, weights, strict=True)
     )
 
 
@@ -157,7 +157,7 @@ def _with_own_unknowns(
     values: Sequence[SensorValues],
     held: Bool[Tensor, " rows"],
 ) -> Float64[Tensor, " unknowns"]:
-    """Fit the unknowns that only left-out rows depend on to these, starting with their values by all rows."""
+    """Fit the unknowns that only held-out rows depend on to these, starting with their values by all rows."""
     moving = torch.zeros(design.active, dtype=torch.bool, device=x.device)
     for one in values:
         if not one.certain:
@@ -191,26 +191,26 @@ Errors = Sequence[SensorErrors | None]
 
 @dataclass(frozen=True, eq=False)
 class Delivered:
-    """A joint correction that reduces leave-out errors.
+    """A joint correction that reduces held-out errors.
 
     Attributes:
         choice: the choice, with the final features as its best.
         refined: the model fitted to the rows of the search.
-        left_out: leave-out RMS error over that of the geometric calibration, for the sensor with the largest gain [1].
+        held_out: held-out RMS error over that of the geometric calibration, for the sensor with the largest gain [1].
     """
 
     choice: Choice
     refined: Refined
-    left_out: float
+    held_out: float
 
 
 def delivered(solved: SolvedCalibration, choice: Choice, progress: Callable[[str], None]) -> Delivered | None:
     """Find the largest part of the selected features that increases no sensor's errors, with exact fits of each part.
 
     Leave-out errors by linearisation are those of an exact fit only if the linearisation is accurate. It is for many
-    poses or positions. For few of them, or for other sensors, the rows of the search are left out again, fold by fold,
-    of exact fits with and without the correction. A part is accepted if it increases the errors and leave-out errors of
-    no sensor, and clearly reduces the leave-out errors of one.
+    poses or positions. For few of them, or for other sensors, the rows of the search are held out again, fold by fold,
+    of exact fits with and without the correction. A part is accepted if it increases the errors and held-out errors of
+    no sensor, and clearly reduces the held-out errors of one.
 
     Returns:
         The accepted part; None if the geometric calibration is to be kept.
@@ -220,23 +220,23 @@ def delivered(solved: SolvedCalibration, choice: Choice, progress: Callable[[str
     group = choice.rows.group if problem.pairs else groups_of_equal_joints(problem.q)
     count = int(group.max()) + 1
     if count > EXACT_GROUPS and set(solved.setup.measurements.kinds) <= {"position", "rotation"}:
-        return Delivered(choice, refine(problem, choice.rows.group, choice), _left_out_of_search(choice))
+        return Delivered(choice, refine(problem, choice.rows.group, choice), _held_out_in_search(choice))
     folds = replace(choice.rows, group=group).folds(FOLDS if count > FEW_GROUPS else FOLDS_OF_FEW, count)
     updates = int(count <= MANY_GROUPS)
-    before = left_out_rows(Design(problem, ()), _geometric_posterior(solved, choice), group, folds, updates)
+    before = held_out_rows(Design(problem, ()), _geometric_posterior(solved, choice), group, folds, updates)
     for part in _parts(choice):
-        progress(f"left-out rows, {part.best.name}")
+        progress(f"held-out rows, {part.best.name}")
         refined = refine(problem, choice.rows.group, part)
-        errors = left_out_rows(refined.design, refined.posterior, group, folds, updates)
+        errors = held_out_rows(refined.design, refined.posterior, group, folds, updates)
         compared = _compared(errors, before)
         if not any(one.is_worse for one in compared) and any(one.gain > CLEAR_GAIN for one in compared):
-            return Delivered(part, refined, min(one.left_out for one in compared))
+            return Delivered(part, refined, min(one.held_out for one in compared))
     return None
 
 
-def _left_out_of_search(choice: Choice) -> float:
-    """Return the ratio of leave-out errors by the search, with linearised rows."""
-    return [trial.left_out for trial in choice.trials if trial.kept][-1]
+def _held_out_in_search(choice: Choice) -> float:
+    """Return the ratio of held-out errors by the search, with linearised rows."""
+    return [trial.held_out for trial in choice.trials if trial.kept][-1]
 
 
 def _compared(errors: Errors, before: Errors) -> list[Comparison]:

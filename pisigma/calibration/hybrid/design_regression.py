@@ -8,7 +8,7 @@ from jaxtyping import Float64, Int64
 from torch import Tensor
 
 from pisigma.calibration.hybrid.design import Design
-from pisigma.estimation.left_out import LeftOut
+from pisigma.estimation.held_out import HeldOutErrors
 from pisigma.estimation.regression import AbstractRegression, Posterior
 from pisigma.joint_correction.feature import AbstractFeature
 
@@ -31,23 +31,25 @@ class AbstractDesignRegression(AbstractRegression):
         """Return the regression without the values of some groups of rows (see `Rows.group`), except certain ones."""
 
     @abstractmethod
-    def left_out(self, posterior: Posterior, folds: Sequence[Int64[Tensor, " _groups"]]) -> LeftOut:
+    def held_out_errors(
+        self, posterior: Posterior, folds: Sequence[Int64[Tensor, " _groups"]]
+    ) -> HeldOutErrors:
         """Leave out each fold and predict it, with the prior sizes and the noise of a posterior.
 
         Args:
             posterior: posterior by all values.
-            folds: groups that are left out together, see `Rows.group`.
+            folds: groups that are held out together, see `Rows.group`.
         """
 
-    def left_out_refitted(
+    def held_out_errors_refitted(
         self, posterior: Posterior, folds: Sequence[Int64[Tensor, " _groups"]], updates: int
-    ) -> LeftOut:
+    ) -> HeldOutErrors:
         """Leave out each fold, with updates of noise and prior sizes, which few rows leave uncertain."""
         parts = []
         for groups in folds:
             rest = self.without(groups).maximise_evidence(posterior.prior, posterior.noise, updates)
-            parts.append(self.left_out(rest, [groups]))
-        return LeftOut.joined(parts)
+            parts.append(self.held_out_errors(rest, [groups]))
+        return HeldOutErrors.joined(parts)
 
     def first_sizes(
         self, posterior: Posterior, design: Design, features: AbstractFeature

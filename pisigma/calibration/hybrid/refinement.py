@@ -16,7 +16,7 @@ from pisigma.calibration.hybrid.design_regression import AbstractDesignRegressio
 from pisigma.calibration.hybrid.regression import regression
 from pisigma.calibration.hybrid.search import Choice
 from pisigma.calibration.hybrid.sensor_values import Shift, sensor_values
-from pisigma.estimation.left_out import LeftOut
+from pisigma.estimation.held_out import HeldOutErrors
 from pisigma.estimation.regression import Posterior
 from pisigma.joint_correction.input_products import InputProducts
 from pisigma.joint_correction.joint_correction import JointCorrection
@@ -43,7 +43,7 @@ class Refined:
         point: all parameters of the problem.
         correction: the network.
         rounds: number of linearisations.
-        left_out: leave-out predictions of the folds of the search; None if the model was fitted again after it.
+        held_out: held-out predictions of the folds of the search; None if the model was fitted again after it.
     """
 
     rows: Rows
@@ -53,7 +53,7 @@ class Refined:
     point: Float64[Tensor, " parameters"]
     correction: JointCorrection
     rounds: int
-    left_out: LeftOut | None = None
+    held_out: HeldOutErrors | None = None
 
 
 def refine(problem: CalibrationProblem, group: Int64[Tensor, " rows"], choice: Choice) -> Refined:
@@ -76,7 +76,7 @@ def refine(problem: CalibrationProblem, group: Int64[Tensor, " rows"], choice: C
         posterior = fit.maximise_evidence(posterior.prior, posterior.noise)
         rounds += 1
     refined = _refined(rows, design, posterior, fit or regression(design, rows), rounds)
-    return replace(refined, left_out=choice.best.left_out) if rounds == 1 else refined
+    return replace(refined, held_out=choice.best.held_out) if rounds == 1 else refined
 
 
 def _refined(

@@ -13,7 +13,7 @@ from pisigma.calibration.hybrid.design_regression import AbstractDesignRegressio
 from pisigma.calibration.hybrid.sensor_values import SensorValues
 from pisigma.estimation.cholesky import BLOCK, blocks, return_free_memory
 from pisigma.estimation.dual_regression import DualRegression, gram, places_of_pairs, stacked
-from pisigma.estimation.left_out import LeftOut
+from pisigma.estimation.held_out import HeldOutErrors
 from pisigma.estimation.primal_regression import PrimalRegression, Solved
 from pisigma.estimation.prior import GaussianPrior
 from pisigma.estimation.regression import Posterior, SensorCount
@@ -97,12 +97,14 @@ class NormalEquations(PrimalRegression, AbstractDesignRegression):
             sensors=tuple(replace(a, values=a.values - b.values) for a, b in counts),
         )
 
-    def left_out(self, posterior: Posterior, folds: Sequence[Int64[Tensor, " _groups"]]) -> LeftOut:
-        """See `AbstractDesignRegression.left_out`."""
+    def held_out_errors(
+        self, posterior: Posterior, folds: Sequence[Int64[Tensor, " _groups"]]
+    ) -> HeldOutErrors:
+        """See `AbstractDesignRegression.held_out_errors`."""
         solved = self.solved_with(posterior.prior, posterior.noise)
-        return LeftOut.joined([self._left_out(groups, solved) for groups in folds])
+        return HeldOutErrors.joined([self._held_out_errors(groups, solved) for groups in folds])
 
-    def _left_out(self, groups: Int64[Tensor, " groups"], solved: Solved) -> LeftOut:
+    def _held_out_errors(self, groups: Int64[Tensor, " groups"], solved: Solved) -> HeldOutErrors:
         """Leave out one fold."""
         return_free_memory(len(solved.x))
         test, x = self.rows.held_out(groups).values, solved.x
@@ -121,7 +123,7 @@ class NormalEquations(PrimalRegression, AbstractDesignRegression):
         for rows in blocks(len(x), BLOCK):
             S = solved.inverse[rows, : rows.stop] @ whitened[:, : rows.stop].t()
             M.addmm_(S.t(), S, alpha=-1)
-        return LeftOut.from_fit(M, torch.cat(r), torch.cat(number), self.sensors)
+        return HeldOutErrors.from_fit(M, torch.cat(r), torch.cat(number), self.sensors)
 
     def first_sizes(
         self, posterior: Posterior, design: Design, features: AbstractFeature
@@ -288,10 +290,12 @@ class ValueCovariance(DualRegression, AbstractDesignRegression):
             sensors=tuple(replace(one, values=one.values * part) for one, part in counts),
         )
 
-    def left_out(self, posterior: Posterior, folds: Sequence[Int64[Tensor, " _groups"]]) -> LeftOut:
-        """See `AbstractDesignRegression.left_out`; `noise² P` is `I - X C X^T`, and `noise² P y` the residual."""
+    def held_out_errors(
+        self, posterior: Posterior, folds: Sequence[Int64[Tensor, " _groups"]]
+    ) -> HeldOutErrors:
+        """See `AbstractDesignRegression.held_out_errors`; `noise² P = I - X C X^T`, and the residual is `noise² P y`."""
         if self.is_ill(posterior.prior, posterior.noise):
-            return self.primal.left_out(posterior, folds)
+            return self.primal.held_out_errors(posterior, folds)
         sigma = self.y.new_tensor(posterior.noise)[self.sensor]
         P = self.projection(posterior.prior, posterior.noise)[0].mul_(sigma).mul_(sigma[:, None])
         residual = P @ (self.y / sigma)
@@ -299,9 +303,11 @@ class ValueCovariance(DualRegression, AbstractDesignRegression):
         for groups in folds:
             chosen = torch.cat([self._values_of_groups[k] for k in groups.tolist()]).sort().values
             parts.append(
-                LeftOut.from_fit(P[chosen][:, chosen], residual[chosen], self.sensor[chosen], self.sensors)
+                HeldOutErrors.from_fit(
+                    P[chosen][:, chosen], residual[chosen], self.sensor[chosen], self.sensors
+                )
             )
-        return LeftOut.joined(parts)
+        return HeldOutErrors.joined(parts)
 
     @cached_property
     def primal(self) -> NormalEquations:

@@ -11,7 +11,7 @@ from torch import Tensor
 from pisigma.calibration.hybrid.design import FOLDS, FOLDS_OF_FEW, MAX_GROUPS, Design, Rows
 from pisigma.calibration.hybrid.design_regression import AbstractDesignRegression
 from pisigma.calibration.hybrid.regression import extended, regression
-from pisigma.estimation.left_out import LeftOut
+from pisigma.estimation.held_out import HeldOutErrors
 from pisigma.estimation.regression import Posterior
 from pisigma.joint_correction.feature import AbstractFeature
 
@@ -59,7 +59,7 @@ class Trial:
         name: features, such as "gravity + series 56 + products".
         unknowns: number of unknowns.
         log_evidence: log evidence up to a constant of the data.
-        left_out: leave-out RMS error over that of the geometric calibration [1].
+        held_out: held-out RMS error over that of the geometric calibration [1].
         seconds: duration [s].
         kept: whether it was better than the best trial before it.
     """
@@ -67,7 +67,7 @@ class Trial:
     name: str
     unknowns: int
     log_evidence: float
-    left_out: float
+    held_out: float
     seconds: float
     kept: bool
 
@@ -80,13 +80,13 @@ class Fitted:
         design: the unknowns.
         posterior: their posterior.
         largest_share: largest allowed effective number of unknowns per value.
-        left_out: leave-out predictions of the folds; None if they were not computed.
+        held_out: held-out predictions of the folds; None if they were not computed.
     """
 
     design: Design
     posterior: Posterior
     largest_share: float = MAX_EFFECTIVE_SHARE
-    left_out: LeftOut | None = None
+    held_out: HeldOutErrors | None = None
 
     @property
     def name(self) -> str:
@@ -94,10 +94,10 @@ class Fitted:
         return " + ".join(chosen.label for chosen in self.design.features) or "geometry"
 
     def gain(self, before: "Fitted") -> float:
-        """Compute by how many standard errors the leave-out squares are smaller than another fit's; 0 without any."""
-        if self.left_out is None or before.left_out is None:
+        """Compute by how many standard errors the held-out squares are smaller than another fit's; 0 without any."""
+        if self.held_out is None or before.held_out is None:
             return 0.0
-        return self.left_out.gain(self.posterior.noise, before.left_out, before.posterior.noise)
+        return self.held_out.gain(self.posterior.noise, before.held_out, before.posterior.noise)
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,7 +162,7 @@ class Search:
             sizes: start values of the last prior sizes.
 
         Returns:
-            The fit, and the leave-out RMS error over the noise of the geometric calibration.
+            The fit, and the held-out RMS error over the noise of the geometric calibration.
         """
         design = Design(self.rows.problem, tuple(features))
         noise, prior = self.noise, design.prior(self.prior_scale)
@@ -172,8 +172,8 @@ class Search:
             prior = replace(prior, sizes=torch.cat([prior.sizes[: -len(sizes)], sizes]))
         chosen = self._regression.select(design)
         posterior = chosen.maximise_evidence(prior, noise, tolerance=ROUGHLY)
-        errors = chosen.left_out(posterior, self._folds)
-        return Fitted(design, posterior, left_out=errors), errors.rms(posterior.noise, self.noise)
+        errors = chosen.held_out_errors(posterior, self._folds)
+        return Fitted(design, posterior, held_out=errors), errors.rms(posterior.noise, self.noise)
 
     def _note(self, tried: Fitted, share: float, began: float, kept: bool) -> None:
         """Add a trial to the table."""
@@ -194,7 +194,7 @@ class Search:
         Args:
             growing: features of one name with increasing sizes.
             others: features that are tried before these, and again after them if they did not help.
-            last: features that are tried at the end; they must clearly reduce the leave-out errors.
+            last: features that are tried at the end; they must clearly reduce the held-out errors.
         """
         best = self.geometry
         for chosen in others:
@@ -245,21 +245,21 @@ class Search:
         odds: float = 0.0,
         least_gain: float = -math.inf,
     ) -> Fitted:
-        """Return the better of new features and the best fit so far, by evidence and leave-out errors."""
+        """Return the better of new features and the best fit so far, by evidence and held-out errors."""
         # In the order of the largest design: its equations need no copy if all of its features are tried.
         features = sorted(features, key=lambda one: self._order.index(one.name))
         self.progress(" + ".join(chosen.label for chosen in features))
         began = time.monotonic()
-        tried, left_out = self.fitted(features, best, sizes)
+        tried, held_out = self.fitted(features, best, sizes)
         better = (
             tried.posterior.log_evidence - best.posterior.log_evidence > CLEARLY + odds
-            and left_out < self._least * LEVEL
+            and held_out < self._least * LEVEL
             and tried.gain(best) > least_gain
             and self._regression.effective_share(tried.posterior) < MAX_EFFECTIVE_SHARE
         )
-        self._note(tried, left_out / self._unit, began, better)
+        self._note(tried, held_out / self._unit, began, better)
         if better:
-            self._least = min(self._least, left_out)
+            self._least = min(self._least, held_out)
         return tried if better else best
 
     def _from_usual_sizes(
@@ -275,16 +275,16 @@ class Search:
         design = Design(self.rows.problem, tuple(features))
         fit = self._regression.select(design)
         posterior = fit.maximise_evidence(design.usual_prior(prior_scale), self.noise, USUAL_UPDATES)
-        errors = fit.left_out(posterior, self._folds)
-        left_out = errors.rms(posterior.noise, self.noise)
+        errors = fit.held_out_errors(posterior, self._folds)
+        held_out = errors.rms(posterior.noise, self.noise)
         better = (
             posterior.log_evidence - best.posterior.log_evidence
             > (STRONGLY if best.design.features else CLEARLY)
-            and left_out < self._least * LEVEL
+            and held_out < self._least * LEVEL
             and fit.effective_share(posterior) < MAX_USUAL_SHARE
         )
         tried = Fitted(design, posterior, MAX_USUAL_SHARE, errors)
-        self._note(tried, left_out / self._unit, began, better)
+        self._note(tried, held_out / self._unit, began, better)
         if better:
-            self._least = min(self._least, left_out)
+            self._least = min(self._least, held_out)
         return tried if better else best

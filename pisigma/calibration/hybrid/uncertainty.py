@@ -13,7 +13,7 @@ from pisigma.calibration.hybrid.design_regression import AbstractDesignRegressio
 from pisigma.calibration.hybrid.noise import CalibrationNoise, stated_sigmas
 from pisigma.calibration.hybrid.sensor_values import joint_columns, weight_columns
 from pisigma.estimation.covariance_root import CovarianceRoot
-from pisigma.estimation.left_out import LeftOut, left_out_scale
+from pisigma.estimation.held_out import HeldOutErrors, held_out_scale
 from pisigma.estimation.regression import Posterior, root_of_sizes
 from pisigma.joint_correction.feature import AbstractFeature
 from pisigma.measurement.conditions import JointState
@@ -24,9 +24,9 @@ from pisigma.robot.kinematics.parameter_jacobian import identification_jacobian
 CHUNK = 128
 """Rows whose columns are in memory at a time."""
 FEW_GROUPS = 600
-"""Groups up to which noise and prior sizes are estimated again for every fold that is left out."""
+"""Groups up to which noise and prior sizes are estimated again for every fold that is held out."""
 VERY_FEW_GROUPS = 60
-"""Groups up to which `FOLDS_OF_FEW` folds are left out: without a quarter of so few rows a calibration is much worse
+"""Groups up to which `FOLDS_OF_FEW` folds are held out: without a quarter of so few rows a calibration is much worse
 than with all of them, so its errors are not representative."""
 FOLD_UPDATES, FEWER_UPDATES, SOME_GROUPS = 3, 1, 150
 """Updates of noise and prior sizes for every fold, the same for more groups, and the number of groups between both.
@@ -43,7 +43,7 @@ class PositionUncertainty:
         geometry: geometry at which the derivative is taken.
         features: features of the weights.
         covariance_root: `R` with `C = R R^T` for all parameters of the space (0 for those that were not free), followed
-            by all weights, scaled so that predicted and observed leave-out errors agree.
+            by all weights, scaled so that predicted and observed held-out errors agree.
         prior_scale: factor on the variances by this scaling.
         noise: noise of the sensors; empty in folders of earlier versions.
     """
@@ -121,9 +121,9 @@ def position_uncertainty(
     fit: AbstractDesignRegression,
     posterior: Posterior,
     geometry: IdentifiedGeometry,
-    left_out: LeftOut | None = None,
+    held_out: HeldOutErrors | None = None,
 ) -> PositionUncertainty:
-    """Compute the uncertainty of positions predicted by a posterior, scaled by leave-out errors.
+    """Compute the uncertainty of positions predicted by a posterior, scaled by held-out errors.
 
     Args:
         rows: linearised values.
@@ -131,16 +131,16 @@ def position_uncertainty(
         fit: regression of the rows on the unknowns.
         posterior: posterior of the unknowns.
         geometry: geometry in the user's coordinates.
-        left_out: leave-out predictions of this fit, if available; used if there are too many groups to estimate noise
+        held_out: held-out predictions of this fit, if available; used if there are too many groups to estimate noise
             and prior sizes again for every fold.
     """
     folds = rows.folds(FOLDS if rows.groups > VERY_FEW_GROUPS else FOLDS_OF_FEW, MAX_GROUPS)
     if rows.groups <= FEW_GROUPS:
         updates = FOLD_UPDATES if rows.groups <= SOME_GROUPS else FEWER_UPDATES
-        missed = fit.left_out_refitted(posterior, folds, updates)
+        missed = fit.held_out_errors_refitted(posterior, folds, updates)
     else:
-        missed = left_out or fit.left_out(posterior, folds)
-    prior_scale = left_out_scale(missed)
+        missed = held_out or fit.held_out_errors(posterior, folds)
+    prior_scale = held_out_scale(missed)
     root = fit.covariance_root(posterior)
     change = geometry.change[:, design.problem.active.cpu()]
     root = root.extended(root_of_sizes(posterior, root), prior_scale**0.5, change)

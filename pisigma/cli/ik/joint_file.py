@@ -16,7 +16,7 @@ from torch import Tensor
 from pisigma.cli.ik.solutions import FAILURES, file_units
 from pisigma.files.output_file import writing_whole
 from pisigma.measurement.csv.poses import CHUNK_ROWS, PoseChunk, read_pose_chunks
-from pisigma.measurement.fields import LeftOut
+from pisigma.measurement.fields import UnusableRow
 from pisigma.model.inverse.corrected_ik import CorrectedIK
 from pisigma.model.inverse.path import PathSwitch
 from pisigma.model.inverse.solution import Solution
@@ -151,7 +151,10 @@ def _solved_rows(
     """Return the first cells of the rows of a chunk, in the order of the file, and count them in the outcome."""
     too_far = _too_far(chunk, solver.model.robot)
     near = [line for line, far in zip(chunk.line, too_far, strict=True) if not far]
-    bad = [*chunk.bad, *(LeftOut(line, far) for line, far in zip(chunk.line, too_far, strict=True) if far)]
+    bad = [
+        *chunk.bad,
+        *(UnusableRow(line, far) for line, far in zip(chunk.line, too_far, strict=True) if far),
+    ]
     rows = [(row.line, [str(row.line), BAD_ROW]) for row in bad]
     failed = [FailedRow(row.line, BAD_ROW, row.reason) for row in bad]
     if near:

@@ -141,10 +141,12 @@ def recalibration_diagnostics(
         implausible := check_rows(rows, parent.nominal or parent.robot).implausible
     ):
         return implausible
-    return (*_left_out(parent, judged, rows), *beyond_wear(parent.robot, moved))
+    return (*_large_errors(parent, judged, rows), *beyond_wear(parent.robot, moved))
 
 
-def _left_out(parent: CalibratedModel, judged: CandidateChoice, rows: Measurements) -> tuple[Diagnostic, ...]:
+def _large_errors(
+    parent: CalibratedModel, judged: CandidateChoice, rows: Measurements
+) -> tuple[Diagnostic, ...]:
     """Return a diagnostic where no candidate predicts the held-out rows."""
     error, limit = judged.rms[judged.kept], PLAUSIBLE_SHARE * parent.robot.reach
     if error is None:

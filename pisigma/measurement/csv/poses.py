@@ -18,7 +18,7 @@ from pisigma.measurement.csv.header import check_separators
 from pisigma.measurement.csv.rows import QUATERNION_TOLERANCE
 from pisigma.measurement.csv.table import content_lines, header_names, split_line
 from pisigma.measurement.faults import Fault
-from pisigma.measurement.fields import LeftOut
+from pisigma.measurement.fields import UnusableRow
 from pisigma.measurement.readings import to_si
 from pisigma.robot.row import MAX_MAGNITUDE
 from pisigma.robot.se3 import rotation_from_quaternion, rotation_from_rpy, transform
@@ -45,7 +45,7 @@ class PoseChunk:
 
     T: Float64[Tensor, "rows 4 4"]
     line: tuple[int, ...]
-    bad: tuple[LeftOut, ...]
+    bad: tuple[UnusableRow, ...]
     share: float
 
 
@@ -98,7 +98,7 @@ def _chunks(file: TextIO, source: str, rows: int) -> Iterator[PoseChunk]:
         yield PoseChunk(
             T=T[sound],
             line=tuple(number for (number, _), good in zip(some, sound.tolist(), strict=True) if good),
-            bad=tuple(LeftOut.because(some[row][0], fault) for row, fault in sorted(faults.items())),
+            bad=tuple(UnusableRow.because(some[row][0], fault) for row, fault in sorted(faults.items())),
             share=file.buffer.tell() / length if length else float("nan"),
         )
     if not any_row:

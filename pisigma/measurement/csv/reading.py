@@ -23,7 +23,7 @@ from pisigma.measurement.csv.columns import (
 from pisigma.measurement.csv.header import Layout, read_header
 from pisigma.measurement.csv.rows import CheckedRows, check_cells
 from pisigma.measurement.csv.table import Table, read_table
-from pisigma.measurement.fields import TEXTS, LeftOut, MeasuredFields, OnBadRow
+from pisigma.measurement.fields import TEXTS, MeasuredFields, OnBadRow, UnusableRow
 from pisigma.measurement.foreign.export_file import read_export
 from pisigma.measurement.foreign.mapping import FileMapping, map_columns
 from pisigma.measurement.foreign.quantities import KEYS
@@ -110,7 +110,9 @@ def _sound_rows(table: Table, layout: Layout, robot: Robot | None) -> MeasuredFi
         numbers["q"] = robot.to_dh(numbers["q"])
         if "approach" in numbers:
             numbers["approach"] = robot.coupling.approach_to_dh(numbers["approach"])
-    left_out = tuple(LeftOut.because(table.lines[row], fault) for row, fault in sorted(faults.by_row.items()))
+    left_out = tuple(
+        UnusableRow.because(table.lines[row], fault) for row, fault in sorted(faults.by_row.items())
+    )
     return replace(sound, numbers=numbers, left_out=left_out)
 
 

@@ -11,7 +11,7 @@ from pisigma.measurement.camera.corner_file import corners_of
 from pisigma.measurement.csv.table import Table
 from pisigma.measurement.dataset import Measurements, join
 from pisigma.measurement.faults import Fault
-from pisigma.measurement.fields import LeftOut, MeasuredFields
+from pisigma.measurement.fields import MeasuredFields, UnusableRow
 from pisigma.measurement.growing_file import GrowingFile
 from pisigma.planning.plan_settings import PlanSettings
 from pisigma.robot.description import Robot
@@ -37,20 +37,20 @@ class ImageReader:
             robot: robot that is measured.
         """
         self._files, self._robot = files, robot
-        self._read: dict[str, Measurements | LeftOut] = {}
+        self._read: dict[str, Measurements | UnusableRow] = {}
 
     def __call__(self, table: Table, final: bool) -> MeasuredFields:
         """Return the poses of the complete images; images that cannot be used are left out."""
         images = list(_images(table))
         read = [self._once(image) for image in (images if final else images[:-1])]
-        left_out = tuple(one for one in read if isinstance(one, LeftOut))
+        left_out = tuple(one for one in read if isinstance(one, UnusableRow))
         rows = [one for one in read if isinstance(one, Measurements)]
         if not rows:
             q = torch.zeros(0, self._robot.dof, dtype=torch.float64)
             return MeasuredFields({"q": q}, {}, (), table.source, left_out)
         return replace(join(rows).as_fields(), left_out=left_out)
 
-    def _once(self, image: Table) -> Measurements | LeftOut:
+    def _once(self, image: Table) -> Measurements | UnusableRow:
         key = repr((image.lines[0], image.records))
         if key not in self._read:
             try:
@@ -78,9 +78,11 @@ def _images(table: Table) -> list[Table]:
     ]
 
 
-def _left_out(problem: MeasurementError, image: Table) -> LeftOut:
+def _left_out(problem: MeasurementError, image: Table) -> UnusableRow:
     """Return the row at fault, the first of the image where the exception states none, and what is wrong with it."""
     line = problem.line or image.lines[0]
     if not problem.expected:
-        return LeftOut(line, str(problem).removesuffix("."))
-    return LeftOut.because(line, Fault("", problem.column, problem.expected, problem.value, problem.remedy))
+        return UnusableRow(line, str(problem).removesuffix("."))
+    return UnusableRow.because(
+        line, Fault("", problem.column, problem.expected, problem.value, problem.remedy)
+    )

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from pisigma.calibration.geometric.prediction import predicted_poses
 from pisigma.measurement.dataset import Measurements
-from pisigma.measurement.fields import LeftOut
+from pisigma.measurement.fields import UnusableRow
 from pisigma.planning.session.row_judgement import FALSE_ALARMS, RowJudgement
 from pisigma.planning.session.state import Alarm
 from pisigma.robot.description import Robot
@@ -25,7 +25,7 @@ AMBIGUOUS_ROWS = 6
 """Number of rows up to which another row may be the wrong one."""
 
 
-def unreadable(row: LeftOut) -> Alarm:
+def unreadable(row: UnusableRow) -> Alarm:
     """Return the alarm on a row that cannot be read."""
     return Alarm(row.line, "unreadable", f"line {row.line}: {row.reason}.", repeat=True)
 

@@ -57,7 +57,7 @@ LINEARISATIONS = 2
 
 
 @dataclass(frozen=True, eq=False)
-class LeftOutRows:
+class LeaveOneOutErrors:
     """Rows that are each predicted from the others.
 
     Attributes:
@@ -153,7 +153,7 @@ class RowModel:
         kept = self.kept[self._row].nonzero()[:, 0]
         return float(self._residual[kept] @ self._projection(kept)[0] @ self._residual[kept])
 
-    def left_out(self) -> LeftOutRows:
+    def leave_one_out(self) -> LeaveOneOutErrors:
         """Predict every kept row from the other kept ones, and all other rows from the kept ones.
 
         A robot may have larger errors than its class: the scale is estimated from the kept rows, so that squared errors
@@ -166,7 +166,7 @@ class RowModel:
         errors = torch.full_like(self._residual, math.nan)
         kept = self.kept[self._row].nonzero()[:, 0]
         P, _, determined = self._projection(kept)
-        self._leave_out(self.kept.nonzero()[:, 0], kept, P, square, count, errors)
+        self._leave_one_out(self.kept.nonzero()[:, 0], kept, P, square, count, errors)
         left = CLASS_VALUES + len(kept) - determined - torch.where(self.kept, count, 0.0)
         misfit = self.misfit
         whole = ((CLASS_VALUES + misfit - torch.where(self.kept, square, 0.0)) / left).clamp(min=1.0)
@@ -174,13 +174,13 @@ class RowModel:
         scale = torch.where(self.kept, whole, whole.clamp(min=each))
         for row in (~self.kept).nonzero()[:, 0]:
             chosen = torch.cat([kept, (self._row == row).nonzero()[:, 0]])
-            self._leave_out(row[None], chosen, self._projection(chosen)[0], square, count, errors)
+            self._leave_one_out(row[None], chosen, self._projection(chosen)[0], square, count, errors)
         ratio = torch.where(count > 0, square / count, torch.nan) / scale
         chance = torch.from_numpy(fdtrc(count.numpy(), left.numpy(), ratio.numpy()))
         total = max(1.0, (CLASS_VALUES + misfit) / (CLASS_VALUES + len(kept) - determined))
-        return LeftOutRows(chance, *self._sizes(errors), total**0.5)
+        return LeaveOneOutErrors(chance, *self._sizes(errors), total**0.5)
 
-    def _leave_out(
+    def _leave_one_out(
         self, rows: Tensor, values: Tensor, P: Tensor, square: Tensor, count: Tensor, errors: Tensor
     ) -> None:
         """Fill in squares, degrees of freedom and errors of rows, each left out of some values with projection P."""
@@ -300,7 +300,7 @@ class RowJudgement:
 
     counts: Bool[Tensor, " rows"]
     model: RowModel | None = None
-    errors: LeftOutRows | None = None
+    errors: LeaveOneOutErrors | None = None
 
     @property
     def judged(self) -> Bool[Tensor, " rows"]:
@@ -324,13 +324,13 @@ def judge_rows(
     counts = torch.ones_like(trusted) if few else trusted.clone()
     try:
         model = RowModel.from_rows(robot, rows, sigma, counts)
-        errors = model.left_out()
+        errors = model.leave_one_out()
         while (wrong := _contradicted(robot, rows, sigma, model, errors, few)) is not None:
             model, errors = wrong
         right = ~(errors.chance < FALSE_ALARMS) & ~model.kept
         if bool(right.any()):
             model = RowModel.from_rows(robot, rows, sigma, model.kept | right)
-            again = model.left_out()
+            again = model.leave_one_out()
             errors = replace(again, chance=errors.chance)
         return RowJudgement(model.kept, model, errors)
     except IdentificationError:  # too few for base and tool
@@ -338,8 +338,13 @@ def judge_rows(
 
 
 def _contradicted(
-    robot: Robot, rows: Measurements, sigma: float | None, model: RowModel, errors: LeftOutRows, few: bool
-) -> tuple[RowModel, LeftOutRows] | None:
+    robot: Robot,
+    rows: Measurements,
+    sigma: float | None,
+    model: RowModel,
+    errors: LeaveOneOutErrors,
+    few: bool,
+) -> tuple[RowModel, LeaveOneOutErrors] | None:
     """Leave out the row that the others contradict; None if there is none.
 
     A wrong row among few moves base and tool so far that it can be distinguished only by leaving out each in turn.
@@ -362,7 +367,7 @@ def _contradicted(
         others = counts.clone()
         others[row] = False
         model = RowModel.from_rows(robot, rows, sigma, others)
-        errors = model.left_out()
+        errors = model.leave_one_out()
         if float(errors.chance[row]) < FALSE_ALARMS:
             return model, errors
     return None

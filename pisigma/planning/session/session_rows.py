@@ -11,7 +11,7 @@ from torch import Tensor
 from pisigma.calibration.geometric.prediction import predicted_poses
 from pisigma.measurement.camera.corner_file import with_one_noise
 from pisigma.measurement.dataset import Measurements, join
-from pisigma.measurement.fields import LeftOut
+from pisigma.measurement.fields import UnusableRow
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.planning.candidates import Candidates
 from pisigma.planning.plan_file import StoredPlan
@@ -83,7 +83,7 @@ class SessionRows:
     def add(
         self,
         new: Measurements | None,
-        left_out: Sequence[LeftOut],
+        left_out: Sequence[UnusableRow],
         planned: Float64[Tensor, "poses dof"],
         names: Sequence[str],
     ) -> list[Alarm]:

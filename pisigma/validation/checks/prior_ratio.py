@@ -43,7 +43,7 @@ class PriorRatioCheck(AbstractCheck):
         usual = _usual_class(checked)
         for ratio in unusual:
             believed = ratio not in large or (
-                possible is not None and (possible is usual or predicts_left_out_rows(checked))
+                possible is not None and (possible is usual or predicts_held_out_rows(checked))
             )
             yield Diagnostic(
                 kind="prior_ratio",
@@ -78,7 +78,7 @@ def class_of(checked: CheckedCalibration, large: Sequence[PriorRatio]) -> RobotC
     return next((one for those in (sizes, at_least) for one in wider if one.allows(those)), None)
 
 
-def predicts_left_out_rows(checked: CheckedCalibration) -> bool:
+def predicts_held_out_rows(checked: CheckedCalibration) -> bool:
     """Say whether held-out rows are predicted far better than by the nominal robot.
 
     Without held-out rows, the errors of the rows of the calibration are used, scaled up for the degrees of freedom of

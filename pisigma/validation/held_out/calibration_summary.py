@@ -124,7 +124,7 @@ class TrialFigures(Section):
         name: name of the trial, such as "gravity + series 56 + products (2, 2)".
         unknowns: number of parameters and weights.
         log_evidence: log evidence up to a constant of the data; None if it was not computed.
-        left_out: leave-out RMS error of training rows over that of the geometric calibration [1].
+        left_out: held-out RMS error of training rows over that of the geometric calibration [1].
         seconds: time it took [s].
         kept: whether it was better than the best trial before it.
     """
@@ -147,7 +147,7 @@ class LearnedFigures(Section):
         effective_parameters: effective number of parameters; the others are determined by the prior.
         linearisations: iterations of the fit.
         noise: noise per sensor.
-        prior_scale: factor on predicted variances that fits the leave-out errors.
+        prior_scale: factor on predicted variances that fits the held-out errors.
     """
 
     features: tuple[dict[str, JsonValue], ...]
@@ -330,8 +330,13 @@ def _noise(sensor: str, sigma: float, unit: str, **counts: Any) -> NoiseFigures:
 
 def _hybrid(result: HybridResult) -> HybridFigures:
     trials = tuple(
-        TrialFigures.model_validate(
-            asdict(trial) | {"log_evidence": _or_none(trial.log_evidence), "seconds": round(trial.seconds, 3)}
+        TrialFigures(
+            name=trial.name,
+            unknowns=trial.unknowns,
+            log_evidence=_or_none(trial.log_evidence),
+            left_out=trial.held_out,
+            seconds=round(trial.seconds, 3),
+            kept=trial.kept,
         )
         for trial in result.trials
     )

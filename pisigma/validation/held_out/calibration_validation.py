@@ -30,8 +30,8 @@ from pisigma.validation.held_out.trained_calibrations import (
     Result,
     distance_figures,
     geometric_of,
+    held_out_of_folds,
     judgeable,
-    left_out_of_folds,
     trained,
     with_frames,
     without_missing,
@@ -130,7 +130,7 @@ class JudgedFold:
         spread: position errors and their predicted standard deviations under the hybrid.
         frames: number of frames that were held out completely.
         sockets: number of sockets that were held out completely.
-        left_out: number of held-out rows that could not be judged.
+        not_judged: number of held-out rows that could not be judged.
     """
 
     test: Int64[Tensor, " rows"]
@@ -139,7 +139,7 @@ class JudgedFold:
     spread: PredictedSpread | None
     frames: int = 0
     sockets: int = 0
-    left_out: int = 0
+    not_judged: int = 0
 
 
 def _joined(measurements: Measurements, judged: Sequence[JudgedFold], folds: int) -> CalibrationValidation:
@@ -155,10 +155,10 @@ def _joined(measurements: Measurements, judged: Sequence[JudgedFold], folds: int
             spread = spread or PredictedSpread.unknown(measurements.rows)
             spread.error[fold.test], spread.sigma[fold.test] = fold.spread.error, fold.spread.sigma
     distances = DistanceErrors.joined([fold.distances for fold in judged])
-    frames, sockets, left_out = (
-        sum(getattr(fold, count) for fold in judged) for count in ("frames", "sockets", "left_out")
+    frames, sockets, not_judged = (
+        sum(getattr(fold, count) for fold in judged) for count in ("frames", "sockets", "not_judged")
     )
-    return CalibrationValidation(folds, errors, spread, distances, frames, sockets, left_out)
+    return CalibrationValidation(folds, errors, spread, distances, frames, sockets, not_judged)
 
 
 def validate(
@@ -219,8 +219,8 @@ def fold_tasks(
         of_repeat = progress
         if len(repeats) > 1:
             of_repeat = stage(progress, f"repeat {number} of {len(repeats)}", ", ")
-        left_out = left_out_of_folds(geometric_of(calibrator).socket_distances, measurements, splits)
-        for fold, (split, without) in enumerate(zip(splits, left_out, strict=True), 1):
+        held_out = held_out_of_folds(geometric_of(calibrator).socket_distances, measurements, splits)
+        for fold, (split, without) in enumerate(zip(splits, held_out, strict=True), 1):
             name = f"fold {fold} of {len(splits)}"
             tasks.append(partial(_judged_fold, calibrator, measurements, name, split, without, of_repeat))
     return tasks
@@ -264,7 +264,7 @@ def _judged_fold(
         test=judged_rows,
         frames=len(set(held_out.frame) - set(training.frame)),
         sockets=len(_sockets(held_out) - _sockets(training)),
-        left_out=len(test) - len(judged_rows),
+        not_judged=len(test) - len(judged_rows),
     )
 
 

@@ -89,7 +89,7 @@ def without_missing(
     calibrator: Calibrator,
     rows: Measurements,
     of: Measurements,
-    left_out: Collection[PairOfSockets] = (),
+    held_out: Collection[PairOfSockets] = (),
 ) -> Calibrator:
     """Remove stated frames and socket distances from a calibrator that some of the rows lack.
 
@@ -97,10 +97,10 @@ def without_missing(
         calibrator: calibrator for all rows.
         rows: the rows that it will be fitted to.
         of: all rows; frames and distances that these lack too are kept, so that the calibrator refuses them.
-        left_out: socket distances to remove in addition.
+        held_out: socket distances to remove in addition.
     """
     if isinstance(calibrator, HybridCalibrator):
-        geometric = without_missing(calibrator.geometric, rows, of, left_out)
+        geometric = without_missing(calibrator.geometric, rows, of, held_out)
         assert isinstance(geometric, GeometricCalibrator)
         return replace(calibrator, robot=geometric)
     no_frame = set(of.frame) - set(rows.frame)
@@ -111,7 +111,7 @@ def without_missing(
         socket_distances={
             pair: distance
             for pair, distance in calibrator.socket_distances.items()
-            if not no_socket & set(pair) and pair not in left_out
+            if not no_socket & set(pair) and pair not in held_out
         },
     )
 
@@ -250,7 +250,7 @@ class DistanceErrors:
         )
 
 
-def left_out_of_folds(
+def held_out_of_folds(
     stated: Mapping[PairOfSockets, float], measurements: Measurements, splits: Sequence[TrainTest]
 ) -> tuple[dict[PairOfSockets, float], ...]:
     """Assign every stated distance to one fold, whose calibration does not use it.

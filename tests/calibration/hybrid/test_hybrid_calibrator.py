@@ -95,8 +95,8 @@ def test_a_kept_correction_is_in_the_table_of_what_was_tried() -> None:
     _, result = fitted()
     assert [trial.name for trial in result.trials[:2]] == ["geometry", "gravity"]
     kept = [trial for trial in result.trials if trial.kept]
-    assert kept[0].left_out == 1.0
-    assert kept[-1].left_out < 0.5
+    assert kept[0].held_out == 1.0
+    assert kept[-1].held_out < 0.5
     assert all(b.log_evidence > a.log_evidence for a, b in itertools.pairwise(kept))
     assert all(b.unknowns > kept[0].unknowns for b in result.trials[1:])
 

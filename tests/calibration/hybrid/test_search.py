@@ -52,7 +52,7 @@ def products() -> LinearisedArm:
 def test_geometry_is_the_first_line_and_the_unit(series: LinearisedArm) -> None:
     search = search_of(series)
     (line,) = search.trials
-    assert (line.name, line.left_out, line.kept) == ("geometry", 1.0, True)
+    assert (line.name, line.held_out, line.kept) == ("geometry", 1.0, True)
     assert search.geometry.name == "geometry"
     assert line.unknowns == search.geometry.design.active
     alone = series.fitted(())
@@ -66,7 +66,7 @@ def test_larger_series_are_tried_until_the_evidence_is_clearly_against_them(seri
     assert best.name.endswith("series 4")
     kept = [line for line in search.trials if line.kept]
     assert kept[-1].name == best.name
-    assert kept[-1].left_out < 0.4
+    assert kept[-1].held_out < 0.4
     assert all(b.log_evidence > a.log_evidence + CLEARLY for a, b in itertools.pairwise(kept))
     assert [line.name for line in search.trials[1:]] == said
 
@@ -76,7 +76,7 @@ def test_products_come_last_and_stay_where_they_help(products: LinearisedArm) ->
     best = search.best(SERIES[:1], [SMALL], [PRODUCTS])
     assert best.name.endswith("products")
     assert search.trials[-1].kept
-    assert search.trials[-1].left_out < 0.6
+    assert search.trials[-1].held_out < 0.6
     moved = best.design.correction(best.posterior.x, search.rows.problem.state)[:, 1]
     q = search.rows.problem.q
     columns = torch.cat(
@@ -116,7 +116,7 @@ def test_few_rows_are_fitted_with_all_features_from_usual_sizes() -> None:
     *before, together, wider = search.trials
     assert not wider.kept  # the geometry is nominal here
     assert together.log_evidence > max(line.log_evidence for line in before) + CLEARLY
-    assert together.left_out < 0.7 * min(line.left_out for line in before if line.kept)
+    assert together.held_out < 0.7 * min(line.held_out for line in before if line.kept)
 
 
 def test_what_does_not_help_leaves_the_geometry() -> None:
@@ -129,9 +129,9 @@ def test_what_does_not_help_leaves_the_geometry() -> None:
 
 def test_a_fit_starts_from_the_sizes_and_the_noise_of_another(series: LinearisedArm) -> None:
     search = search_of(series)
-    near, left_out = search.fitted([SERIES[1]])
-    again, left_out_again = search.fitted([SERIES[1]], near)
-    assert_close(left_out_again, left_out, rtol=0.02)
+    near, held_out = search.fitted([SERIES[1]])
+    again, held_out_again = search.fitted([SERIES[1]], near)
+    assert_close(held_out_again, held_out, rtol=0.02)
     assert abs(again.posterior.log_evidence - near.posterior.log_evidence) < 2.0
     sizes = torch.full((ROBOT.dof,), 1e-6, dtype=torch.float64)
     given, _ = search.fitted([SERIES[1], PRODUCTS], near, sizes)

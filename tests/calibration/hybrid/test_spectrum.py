@@ -84,7 +84,7 @@ def test_a_joint_that_hardly_moves_has_no_lines() -> None:
     assert lines_of(arm_of(q, delta))[1] == ()
 
 
-def test_a_calibration_keeps_lines_that_predict_left_out_rows() -> None:
+def test_a_calibration_keeps_lines_that_predict_held_out_rows() -> None:
     q = random_joints(ROBOT, 360, 4)
     train, test = torch.arange(300), torch.arange(300, 360)
     data = tracker_data(ROBOT, q, 2 * rippled(q), 3e-5, 1e-4)

@@ -17,7 +17,7 @@ from pisigma.calibration.geometric.problem.setup import identified_geometry
 from pisigma.calibration.hybrid.regression import NormalEquations
 from pisigma.calibration.hybrid.search import Fitted
 from pisigma.calibration.hybrid.uncertainty import PositionUncertainty, position_uncertainty
-from pisigma.estimation.left_out import MAX_SCALE, LeftOut, left_out_scale
+from pisigma.estimation.held_out import MAX_SCALE, HeldOutErrors, held_out_scale
 from pisigma.estimation.prior import GaussianPrior
 from pisigma.estimation.regression import MIN_EFFECTIVE, root_of_sizes
 from pisigma.joint_correction.fourier_series import FourierSeries
@@ -72,23 +72,23 @@ def test_sizes_of_unknowns_without_a_prior_add_nothing() -> None:
     assert_close(added, torch.zeros_like(added))
 
 
-def missed(error: Tensor, spread: Tensor) -> LeftOut:
+def missed(error: Tensor, spread: Tensor) -> HeldOutErrors:
     zeros = torch.zeros(len(error), dtype=torch.int64)
-    return LeftOut(error, spread, zeros)
+    return HeldOutErrors(error, spread, zeros)
 
 
-def test_widening_makes_left_out_errors_as_large_as_predicted() -> None:
+def test_widening_makes_held_out_errors_as_large_as_predicted() -> None:
     spread = 1 + normal(500, seed=0).abs()
     error = 3 * spread * normal(500, seed=1)
-    factor = left_out_scale(missed(error, spread))
+    factor = held_out_scale(missed(error, spread))
     assert factor > 2
     assert_close((error.square() / (1 + factor * (spread.square() - 1))).mean(), 1.0, atol=1e-9)
 
 
 def test_errors_as_small_as_predicted_widen_nothing_and_there_is_a_limit() -> None:
     spread = 1 + normal(500, seed=0).abs()
-    assert left_out_scale(missed(0.9 * normal(500, seed=1), spread)) == 1.0
-    hopeless = left_out_scale(missed(100 + spread, torch.ones_like(spread)))
+    assert held_out_scale(missed(0.9 * normal(500, seed=1), spread)) == 1.0
+    hopeless = held_out_scale(missed(100 + spread, torch.ones_like(spread)))
     assert_close(hopeless, MAX_SCALE, rtol=1e-9)
 
 

@@ -99,5 +99,5 @@ def test_noise_that_is_small_beside_the_values_is_left_to_normal_equations() -> 
     assert here.log_evidence == there.log_evidence
     expected = normal.solve(prior, noise)
     assert_close(here.determined, expected.determined, atol=1e-3)
-    errors, wanted = dual.left_out(here, case.folds), normal.left_out(expected, case.folds)
+    errors, wanted = dual.held_out_errors(here, case.folds), normal.held_out_errors(expected, case.folds)
     assert_close(errors.error, wanted.error, rtol=1e-3, atol=1e-3 * float(wanted.error.abs().max()))

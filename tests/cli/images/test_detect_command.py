@@ -59,7 +59,7 @@ def test_corners_with_joint_values_are_written(run, files, tmp_path):
         assert_close(detected, CAMERA.project(BOARD.corners @ R.T + t)[0], atol=0.08)
 
 
-def test_what_is_left_out_is_named(run, files, tmp_path):
+def test_what_is_held_out_is_named(run, files, tmp_path):
     result = run("detect", *options(files), "--out", tmp_path / "corners.csv")
     assert_screen(result.stdout, "2 of 4 images", "image 02", "image 03", "2 warnings")
     whole = run("detect", *options(files), "--out", tmp_path / "corners.csv", "--verbose")

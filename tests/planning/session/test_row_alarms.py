@@ -4,7 +4,7 @@ import torch
 from testing.measured_plans import NOISE, measured_plan, with_offset
 
 from pisigma.measurement.dataset import Measurements, join
-from pisigma.measurement.fields import LeftOut
+from pisigma.measurement.fields import UnusableRow
 from pisigma.planning.session.row_alarms import contradicted, other_joint_values, stale_readings, unreadable
 from pisigma.planning.session.row_judgement import judge_rows
 
@@ -14,7 +14,7 @@ NAMES = [f"pose {number} of the plan" for number in range(1, 25)]
 
 
 def test_an_unreadable_row_has_to_be_measured_again():
-    alarm = unreadable(LeftOut(7, "column 'x_mm': 'abc' is not a finite number; write one such as -12.5"))
+    alarm = unreadable(UnusableRow(7, "column 'x_mm': 'abc' is not a finite number; write one such as -12.5"))
     assert alarm.line == 7
     assert "'abc'" in alarm.sentence
     assert (alarm.kind, alarm.repeat, alarm.counts) == ("unreadable", True, False)

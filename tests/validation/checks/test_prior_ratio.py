@@ -40,7 +40,7 @@ def test_zeros_that_are_far_off_are_believed_within_the_class(zeros):
     assert find_nominal_robot_faults(arm.nominal, arm.measurements) == ()
 
 
-def test_zeros_that_are_far_off_are_not_believed_where_left_out_rows_are_not_predicted():
+def test_zeros_that_are_far_off_are_not_believed_where_held_out_rows_are_not_predicted():
     arm = simulate("ur10", rows=40, noise=5e-5, length=5e-4, angle=5e-4, offset=50e-3)
     rows = arm.measurements
     scattered = rows.position + 0.02 * torch.randn(

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from pisigma.calibration.hybrid.design_regression import AbstractDesignRegression
 from pisigma.calibration.hybrid.regression import NormalEquations, ValueCovariance
-from pisigma.estimation.left_out import LeftOut
+from pisigma.estimation.held_out import HeldOutErrors
 from pisigma.estimation.regression import SensorCount
 
 FORMS = {"normal equations": NormalEquations, "value covariance": ValueCovariance}
@@ -19,10 +19,10 @@ FORMS = {"normal equations": NormalEquations, "value covariance": ValueCovarianc
 @pytest.mark.parametrize("form", FORMS)
 @pytest.mark.parametrize("name", CASES)
 def test_closed_form_equals_fitting_without_every_group(name: str, form: str) -> None:
-    """Where nothing else says where sockets of a placement or an anchor are, that is fitted to the left-out rows."""
+    """Where nothing else says where sockets of a placement or an anchor are, that is fitted to the held-out rows."""
     case = CASES[name]()
     fit: AbstractDesignRegression = FORMS[form].from_rows(case.design, case.rows)
-    found = fit.left_out(fit.solve(case.prior, case.noise), case.folds)
+    found = fit.held_out_errors(fit.solve(case.prior, case.noise), case.folds)
     expected = case.refitted
     assert found.sensor.tolist() == expected.sensor.tolist()
     assert len(found.error) >= len(case.folds)
@@ -31,13 +31,13 @@ def test_closed_form_equals_fitting_without_every_group(name: str, form: str) ->
 
 
 @pytest.mark.parametrize("form", FORMS)
-def test_several_groups_can_be_left_out_together(form: str) -> None:
+def test_several_groups_can_be_held_out_together(form: str) -> None:
     case = poses()
     folds = case.rows.folds(4, 1000)
     assert sorted(torch.cat(folds).tolist()) == list(range(case.rows.groups))
     fit: AbstractDesignRegression = FORMS[form].from_rows(case.design, case.rows)
-    found = fit.left_out(fit.solve(case.prior, case.noise), folds)
-    expected = case.dense.left_out(case.dense.solve(case.prior, case.noise), folds)
+    found = fit.held_out_errors(fit.solve(case.prior, case.noise), folds)
+    expected = case.dense.held_out_errors(case.dense.solve(case.prior, case.noise), folds)
     assert_close(found.error, expected.error, atol=1e-6)
     assert_close(found.spread, expected.spread, rtol=1e-6)
 
@@ -47,11 +47,11 @@ def test_sizes_and_noise_can_be_estimated_anew_for_every_fold(form: str) -> None
     case = poses()
     folds = case.rows.folds(3, 1000)
     fit: AbstractDesignRegression = FORMS[form].from_rows(case.design, case.rows)
-    found = fit.left_out_refitted(fit.solve(case.prior, case.noise), folds, 3)
-    expected = case.dense.left_out_refitted(case.dense.solve(case.prior, case.noise), folds, 3)
+    found = fit.held_out_errors_refitted(fit.solve(case.prior, case.noise), folds, 3)
+    expected = case.dense.held_out_errors_refitted(case.dense.solve(case.prior, case.noise), folds, 3)
     assert_close(found.error, expected.error, atol=1e-4)
     assert_close(found.spread, expected.spread, rtol=1e-4)
-    held = fit.left_out(fit.solve(case.prior, case.noise), folds)
+    held = fit.held_out_errors(fit.solve(case.prior, case.noise), folds)
     assert float((held.error - found.error).abs().max()) > 1e-2
 
 
@@ -66,7 +66,7 @@ def test_the_noise_of_a_sensor_stands_of_which_a_fold_takes_all_values(form: str
     posterior = fit.solve(case.prior, case.noise)
     rest = fit.without(wire).maximise_evidence(posterior.prior, posterior.noise, 2)
     assert rest.noise[number] == case.noise[number]
-    errors = fit.left_out_refitted(posterior, [wire], 2)
+    errors = fit.held_out_errors_refitted(posterior, [wire], 2)
     assert float(errors.error.square().mean()) < 4.0
 
 
@@ -74,14 +74,14 @@ def test_errors_are_larger_than_the_residuals_and_about_as_large_as_predicted() 
     case = few_values()
     fit = ValueCovariance.from_rows(case.design, case.rows)
     posterior = fit.maximise_evidence(case.prior, case.noise)
-    found = fit.left_out(posterior, case.folds)
+    found = fit.held_out_errors(posterior, case.folds)
     residual = sum(m / sigma**2 for m, sigma in zip(posterior.misfit, posterior.noise, strict=True))
     assert float(found.error.square().sum()) > residual
     assert float(found.spread.min()) >= 1.0
     assert 0.5 < float((found.error / found.spread).square().mean()) < 2.0
 
 
-def test_placements_of_sockets_and_anchors_are_among_what_is_left_out() -> None:
+def test_placements_of_sockets_and_anchors_are_among_what_is_held_out() -> None:
     """All values of three placements of two sockets each, and of a wire; of none of what is certain."""
     case = CASES["all kinds"]()
     names = [values.name for values in case.rows.values]
@@ -98,14 +98,14 @@ def residuals(count: int, seed: int = 0) -> tuple[Tensor, Tensor, Tensor]:
     return Z, torch.eye(count).double() + 0.1 * A @ A.t(), torch.randn(count, generator=generator).double()
 
 
-def test_what_only_left_out_values_determine_counts_as_fitted_to_them() -> None:
+def test_what_only_held_out_values_determine_counts_as_fitted_to_them() -> None:
     """By least squares; errors are scaled to what as many values would show that nothing is fitted to."""
     Z, S, y = residuals(8)
     inverse = torch.linalg.inv(S)
     M = inverse - inverse @ Z @ torch.linalg.inv(Z.t() @ inverse @ Z) @ Z.t() @ inverse
     sensor = torch.zeros(8, dtype=torch.int64)
     counts = [SensorCount(8.0, False, False)]
-    found = LeftOut.from_fit(M, M @ y, sensor, counts)
+    found = HeldOutErrors.from_fit(M, M @ y, sensor, counts)
     expected = (y - Z @ torch.linalg.lstsq(Z, y).solution) * (8 / 6) ** 0.5
     assert_close(found.error, expected, atol=1e-9)
     free = torch.eye(8).double() - Z @ torch.linalg.pinv(Z)
@@ -119,8 +119,8 @@ def test_values_that_say_no_more_than_one_err_by_more_than_their_share() -> None
     sensor = torch.tensor([0, 0, 0, 1, 1, 1])
     counts = [SensorCount(3.0, False, False), SensorCount(1.0, False, False, 3.0)]
     M = torch.linalg.inv(S)
-    alone = LeftOut.from_fit(M, M @ y, sensor, [counts[0], replace(counts[1], repetition=1.0)])
-    found = LeftOut.from_fit(M, M @ y, sensor, counts)
+    alone = HeldOutErrors.from_fit(M, M @ y, sensor, [counts[0], replace(counts[1], repetition=1.0)])
+    found = HeldOutErrors.from_fit(M, M @ y, sensor, counts)
     assert_close(alone.error, y, atol=1e-12)
     assert_close(alone.spread, S.diagonal().sqrt(), rtol=1e-12)
     assert_close(found.error[:3], alone.error[:3])
@@ -130,7 +130,7 @@ def test_values_that_say_no_more_than_one_err_by_more_than_their_share() -> None
 
 def test_root_mean_square_can_be_counted_in_another_noise() -> None:
     sensor = torch.tensor([0, 0, 1])
-    errors = LeftOut(torch.tensor([3.0, 4.0, 5.0]).double(), torch.ones(3).double(), sensor)
+    errors = HeldOutErrors(torch.tensor([3.0, 4.0, 5.0]).double(), torch.ones(3).double(), sensor)
     assert_close(errors.rms((1.0, 1.0), (1.0, 1.0)), (50 / 3) ** 0.5, rtol=1e-14)
     assert_close(errors.rms((1.0, 2.0), (1.0, 1.0)), (125 / 3) ** 0.5, rtol=1e-14)
     assert_close(errors.rms((1.0, 2.0), (2.0, 4.0)), (12.5 / 3) ** 0.5, rtol=1e-14)

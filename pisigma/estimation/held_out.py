@@ -1,4 +1,4 @@
-"""Leave-out errors of a linear fit: values that are left out and predicted by the others."""
+"""Held-out errors of a linear fit: values are held out and predicted from the others."""
 
 import math
 from collections.abc import Sequence
@@ -11,14 +11,14 @@ from torch import Tensor
 from pisigma.estimation.regression import SensorCount
 
 SINGULAR = 1e-6
-"""Share of a left-out value's variance below which no other value determines it."""
+"""Share of a held-out value's variance below which no other value determines it."""
 MAX_SCALE = 1e4
 """Largest factor on variances."""
 
 
 @dataclass(frozen=True, eq=False)
-class LeftOut:
-    """Errors of left-out values, in standard deviations of the noise.
+class HeldOutErrors:
+    """Errors of held-out values, in standard deviations of the noise.
 
     Attributes:
         error: measured minus predicted value.
@@ -36,7 +36,7 @@ class LeftOut:
         residual: Float64[Tensor, " values"],
         sensor: Int64[Tensor, " values"],
         counts: Sequence[SensorCount],
-    ) -> "LeftOut":
+    ) -> "HeldOutErrors":
         """Compute the errors of the values of a fold from a fit to all values: `M^-1 r` with the covariance `M^-1`.
 
         If only these values determine an unknown, such as the position of a socket, M is singular. That unknown counts
@@ -59,19 +59,19 @@ class LeftOut:
             inverse = torch.cholesky_inverse(factor)
         repetition = residual.new_tensor([one.repetition for one in counts])[sensor]
         spread = 1 + repetition * (inverse.diagonal() - 1).clamp(min=0)
-        return LeftOut((inverse @ residual) * repetition.sqrt(), spread.sqrt(), sensor)
+        return HeldOutErrors((inverse @ residual) * repetition.sqrt(), spread.sqrt(), sensor)
 
     @staticmethod
-    def joined(parts: "Sequence[LeftOut]") -> "LeftOut":
+    def joined(parts: "Sequence[HeldOutErrors]") -> "HeldOutErrors":
         """Concatenate the errors of several folds."""
         names = ("error", "spread", "sensor")
-        return LeftOut(*(torch.cat([getattr(part, name) for part in parts]) for name in names))
+        return HeldOutErrors(*(torch.cat([getattr(part, name) for part in parts]) for name in names))
 
     def rms(self, noise: Sequence[float], unit: Sequence[float]) -> float:
         """Return the RMS error in units of other standard deviations than the noise, such as those of another model."""
         return float(self._squares(noise, unit).mean().sqrt())
 
-    def gain(self, noise: Sequence[float], before: "LeftOut", noise_before: Sequence[float]) -> float:
+    def gain(self, noise: Sequence[float], before: "HeldOutErrors", noise_before: Sequence[float]) -> float:
         """Return by how many standard errors the squared errors are smaller than those of another fit."""
         return standard_errors(
             before._squares(noise_before, noise_before) - self._squares(noise, noise_before)
@@ -88,8 +88,8 @@ def standard_errors(values: Float64[Tensor, " values"]) -> float:
     return float(values.sum() / scatter) if float(scatter) > 0 else 0.0
 
 
-def left_out_scale(errors: LeftOut) -> float:
-    """Return the factor on the unknowns' covariance for which left-out errors are as large as predicted, at least 1.
+def held_out_scale(errors: HeldOutErrors) -> float:
+    """Return the factor on the unknowns' covariance for which held-out errors are as large as predicted, at least 1.
 
     With errors e and predicted standard deviations s in units of the noise, it solves
     `mean(e² / (1 + f (s² - 1))) = 1`. Effects that the model cannot express make it larger than 1.
