@@ -293,7 +293,7 @@ class ValueCovariance(DualRegression, AbstractDesignRegression):
     def held_out_errors(
         self, posterior: Posterior, folds: Sequence[Int64[Tensor, " _groups"]]
     ) -> HeldOutErrors:
-        """See `AbstractDesignRegression.held_out_errors`; the residual is `noise² P y`, with `noise² P = I - X C X^T`."""
+        """See `AbstractDesignRegression.held_out_errors`; the residual is `noise² P y`, `noise² P = I - X C X^T`."""
         if self.is_ill(posterior.prior, posterior.noise):
             return self.primal.held_out_errors(posterior, folds)
         sigma = self.y.new_tensor(posterior.noise)[self.sensor]
