@@ -110,6 +110,7 @@ def _calibrate_cell(
 ) -> None:
     """Calibrate with the rows of a cell, store the model there, and print it."""
     from pisigma.reporting.calibration_text import calibration_text
+    from pisigma.workflow.calibrate import Calibration
 
     with progress_of("calibrate") as progress:
         calibration, entry = cell.calibrate(
@@ -123,6 +124,7 @@ def _calibrate_cell(
     else:
         remark = [f"Model '{entry.name}': {entry.remark}."] if entry is not None else []
         also = [sentences("the cell", [*remark, *next_lines(cell)])]
+        assert isinstance(calibration, Calibration)  # there is no prior
         print_result(calibration_text(calibration.summary, folder, calibration.seconds, also), verbose)
     if entry is None:
         raise AcceptanceError(

@@ -141,7 +141,7 @@ def _print_status(status: "CellStatus") -> None:
         print_table(f"sessions ({len(facts.sessions)})", ("session", "rows", "sensor", "verdict"), rows)
     print_lines(one.sentence for one in facts.events)
     print_lines(
-        f"sessions/{name} will be added by the next command that reads rows." for name in status.not_taken_in
+        f"sessions/{name} will be added by the next command that reads rows." for name in facts.not_taken_in
     )
     _print_next(status)
 

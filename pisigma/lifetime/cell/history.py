@@ -141,6 +141,8 @@ class Check:
         p95_mm: 95 % quantile of the position errors [mm]; None if it is unknown.
         recalibrate: whether recalibrating with the session is due.
         checked: time of the check (ISO 8601, UTC).
+        rms_mm: RMS position error [mm] of held-out rows or, without a validation, of the rows of a calibration; for
+            `verify` and `monitor` of the session. None if it is unknown.
     """
 
     command: str
@@ -151,6 +153,7 @@ class Check:
     p95_mm: float | None
     recalibrate: bool
     checked: str
+    rms_mm: float | None = None
 
 
 @dataclass(frozen=True)

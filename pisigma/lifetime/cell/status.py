@@ -7,17 +7,32 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from pisigma.lifetime.cell.history import ARM_EVENTS, Check, Event, ModelEntry, SessionEntry
+from pisigma.lifetime.cell.layout import SESSIONS
 
 MAX_DAYS_UNVERIFIED = 92
 """[days] Time without a session after which the model in use has to be verified again: a quarter of a year."""
 VERIFICATION_POSES = 10
 """Number of poses of a session for verification or monitoring."""
 
+COMPUTED = ("calibrate", "verify", "monitor", "recalibrate")
+"""Commands that need neither new rows nor a decision of a person."""
+ATTENTION = (
+    "edited_session",
+    "file_refused",
+    "not_trusted",
+    "session_not_trusted",
+    "verification_failed",
+    "moved",
+    "outside_limit",
+)
+"""States in which a limit is missed, or rows or a model must not be trusted."""
 NOT_TRUSTED = ("implausible", "setup_fault")
 """Verdicts of `verify` and `monitor` after which nothing is concluded from a session."""
 
 State = Literal[
     "edited_session",
+    "not_taken_in",
+    "file_refused",
     "no_plan",
     "not_measured",
     "not_calibrated",
@@ -48,6 +63,12 @@ class Step:
     reason: str
     command: str = ""
 
+    @property
+    def verb(self) -> str | None:
+        """The command to run, if neither rows nor a decision of a person are needed for it; else None."""
+        words = self.command.split()[1:2]
+        return words[0] if words and words[0] in COMPUTED else None
+
     def to_json(self) -> dict[str, Any]:
         """Return the step as plain values."""
         return {"state": self.state, "reason": self.reason, "command": self.command or None}
@@ -68,6 +89,7 @@ class CellFacts:
         in_use: the model in use; None if there is none.
         limit_mm: limit of the 95 % quantile of the position errors [mm]; None if there is none.
         today: day (ISO 8601).
+        not_taken_in: names of the files in `sessions/` that are not in the history yet, by their dates.
     """
 
     folder: str
@@ -80,6 +102,7 @@ class CellFacts:
     in_use: ModelEntry | None
     limit_mm: float | None
     today: str
+    not_taken_in: tuple[str, ...] = ()
 
     @property
     def valid_sessions(self) -> tuple[SessionEntry, ...]:
@@ -97,10 +120,9 @@ class CellFacts:
         """Return a command line for this cell."""
         return shlex.join(["pisigma", verb, self.folder, *words])
 
-    @property
-    def import_command(self) -> str:
-        """The command that adds rows to the cell."""
-        return shlex.join(["pisigma", "import", "ROWS.csv", "--cell", self.folder])
+    def import_command(self, rows: str = "ROWS.csv") -> str:
+        """Return the command that adds rows to the cell."""
+        return shlex.join(["pisigma", "import", rows, "--cell", self.folder])
 
     def checks_of(self, model: str, *commands: str) -> list[Check]:
         """Return the checks of a model by some commands, newest last."""
@@ -135,6 +157,19 @@ def _edited_session(facts: CellFacts) -> Step | None:
     )
 
 
+def _file_to_take_in(facts: CellFacts) -> Step | None:
+    if not facts.not_taken_in:
+        return None
+    name = facts.not_taken_in[0]
+    command = facts.import_command(f"{facts.folder}/{SESSIONS}/{name}")
+    refusals = [
+        one.summary for one in facts.checks if one.command == "import" and f"{one.session}.csv" == name
+    ]
+    if refusals:
+        return Step("file_refused", f"{refusals[-1].rstrip('.')}; correct or remove the file", command)
+    return Step("not_taken_in", f"the file {SESSIONS}/{name} has not been added to the cell", command)
+
+
 def _no_session(facts: CellFacts) -> Step | None:
     if facts.valid_sessions:
         return None
@@ -146,7 +181,7 @@ def _no_session(facts: CellFacts) -> Step | None:
     return Step(
         "not_measured",
         f"plan '{facts.plans[-1]}' has not been measured yet; add the measured columns to its rows",
-        facts.import_command,
+        facts.import_command(),
     )
 
 
@@ -160,7 +195,7 @@ def _not_calibrated(facts: CellFacts) -> Step | None:
         return Step(
             "not_trusted",
             f"the calibration must not be trusted: {calibrations[-1].summary}",
-            facts.import_command,
+            facts.import_command(),
         )
     return Step("not_calibrated", f"there are {rows} measured rows, but no model", facts.command("calibrate"))
 
@@ -170,7 +205,8 @@ def _not_verified(facts: CellFacts) -> Step | None:
         return None
     model = facts.newest_model
     assert model is not None  # else an earlier rule applies
-    verdicts = facts.checks_of(model.name, "verify")
+    aside = {one.name for one in facts.sessions if one.set_aside}
+    verdicts = [one for one in facts.checks_of(model.name, "verify") if one.session not in aside]
     judged = {one.session for one in verdicts}
     new = [one for one in facts.new_sessions(model) if one.name not in judged]
     if new:
@@ -180,7 +216,9 @@ def _not_verified(facts: CellFacts) -> Step | None:
             facts.command("verify"),
         )
     if verdicts and verdicts[-1].verdict != "better":
-        return Step("verification_failed", verdicts[-1].summary, facts.command("calibrate"))
+        return _after_verdict(facts, verdicts[-1]) or Step(
+            "verification_failed", verdicts[-1].summary, facts.command("calibrate")
+        )
     return Step(
         "not_verified",
         f"model '{model.name}' has not been verified with new rows; measure {VERIFICATION_POSES} poses, import them, "
@@ -209,9 +247,10 @@ def _last_verdict(facts: CellFacts) -> Step | None:
     assert model is not None
     aside = {one.name for one in facts.sessions if one.set_aside}
     checks = [one for one in facts.checks_of(model.name, "verify", "monitor") if one.session not in aside]
-    if not checks:
-        return None
-    last = checks[-1]
+    return _after_verdict(facts, checks[-1]) if checks else None
+
+
+def _after_verdict(facts: CellFacts, last: Check) -> Step | None:
     if last.verdict in NOT_TRUSTED:
         return Step(
             "session_not_trusted",
@@ -283,6 +322,7 @@ def _up_to_date(facts: CellFacts) -> Step:
 
 RULES: tuple[Callable[[CellFacts], Step | None], ...] = (
     _edited_session,
+    _file_to_take_in,
     _no_session,
     _not_calibrated,
     _not_verified,
@@ -302,12 +342,10 @@ class CellStatus:
     Attributes:
         facts: facts from which the next step was derived.
         step: the next step.
-        not_taken_in: names of the files in `sessions/` that are not in the history yet.
     """
 
     facts: CellFacts
     step: Step
-    not_taken_in: tuple[str, ...]
 
     def to_json(self) -> dict[str, Any]:
         """Return the status as plain values; `next.command` and `next.reason` are the next step."""
@@ -325,6 +363,6 @@ class CellStatus:
             ],
             "events": [one.to_json() for one in facts.events],
             "models": [{"name": one.name, "remark": one.remark} for one in facts.models],
-            "not_taken_in": list(self.not_taken_in),
+            "not_taken_in": list(facts.not_taken_in),
             "next": self.step.to_json(),
         }

@@ -15,24 +15,30 @@ from typing import Any
 from pisigma.files.errors import ModelError, Place
 from pisigma.files.model_files import is_model
 from pisigma.files.progress import Progress
+from pisigma.lifetime.cell.facts import status_of
 from pisigma.lifetime.cell.history import HISTORY, Check, History, ModelEntry, SessionEntry, Use, now
-from pisigma.lifetime.cell.layout import MODELS, PLANS, SESSIONS
-from pisigma.lifetime.cell.status import CellFacts, CellStatus, next_step
+from pisigma.lifetime.cell.layout import MODELS, PLANS
+from pisigma.lifetime.cell.status import CellStatus
 from pisigma.measurement.camera.camera_files import CameraFiles
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.folder.model_folder import load_model
 from pisigma.robot.description import Robot
-from pisigma.workflow.calibrate import Calibration, calibrate
+from pisigma.workflow.calibrate import Calibration
 from pisigma.workflow.cell.cell_file import CellFile
-from pisigma.workflow.cell.model_choice import check_of, entry_of, is_better, p95_of, put_into_use
+from pisigma.workflow.cell.model_choice import (
+    calibrated,
+    check_of,
+    entry_of,
+    errors_of,
+    is_better,
+    put_into_use,
+)
 from pisigma.workflow.cell.new_cell import write_new_cell
 from pisigma.workflow.cell.sessions import (
     ModelRows,
     Sessions,
-    edited_sessions,
     free_path,
-    not_taken_in,
     save_new,
 )
 from pisigma.workflow.evaluate import Evaluation, evaluate
@@ -170,8 +176,12 @@ class Cell:
         return self.sessions.take_in(file, accept_implausible, day)
 
     def calibrate(
-        self, progress: Progress = lambda what: None, accept_implausible: bool = False, **changed: Any
-    ) -> tuple[Calibration, ModelEntry | None]:
+        self,
+        progress: Progress = lambda what: None,
+        accept_implausible: bool = False,
+        prior: Path | None = None,
+        **changed: Any,
+    ) -> tuple[Calibration | Recalibration, ModelEntry | None]:
         """Calibrate with all rows since the last event that changed the arm, and store the model.
 
         The first model is put into use by `verify`. A later one is put into use if it is better on held-out rows: the
@@ -181,6 +191,7 @@ class Cell:
         Args:
             progress: called with the name of each step.
             accept_implausible: store the model even if it must not be trusted; it is then not put into use.
+            prior: model folder of `pisigma fleet prior` to start from. None: calibrate from scratch.
             **changed: options of `pisigma calibrate` that override `cell.yaml`, by its keys.
 
         Returns:
@@ -191,20 +202,19 @@ class Cell:
         """
         sessions = self.sessions.valid()
         settings: CalibrationSettings = self.file.settings("calibrate", **changed)
-        result = calibrate(
-            self.robot, self.sessions.rows_of(sessions), replace(settings, cameras=None), progress
-        )
+        result = calibrated(self.robot, self.sessions.rows_of(sessions), settings, prior, progress)
         doubt = "" if result.trusted else result.diagnostics[0].sentence
         if doubt and not accept_implausible:
             self.history.add(Check("calibrate", "", "", "not_trusted", doubt, None, False, now()))
             return result, None
         path = save_new(self.folder / MODELS, partial(result.save, accept_implausible=accept_implausible))
         remark, better = doubt or "not verified yet", False
-        if not doubt and (in_use := self.history.in_use) is not None:
+        if not doubt and prior is None and (in_use := self.history.in_use) is not None:
             better, remark = is_better(self.sessions, in_use, sessions, settings, progress)
-        entry = entry_of(self.history, path, sessions, remark, p95_of(result.summary.cross_validation))
+        p95, rms = errors_of(result)
+        entry = entry_of(self.history, path, sessions, remark, p95)
         verdict = "accepted_implausible" if doubt else "trusted"
-        check = Check("calibrate", entry.name, "", verdict, doubt, entry.p95_mm, False, now())
+        check = Check("calibrate", entry.name, "", verdict, doubt, p95, False, now(), rms)
         self.history.add(entry, check, *([Use(entry.name, now(), remark)] if better else []))
         return result, entry
 
@@ -228,11 +238,9 @@ class Cell:
         entry, chosen, seen = self._new_rows(model, session)
         settings = seen.settings_to_fit(self.file.settings("verify", **changed))
         found = verify(self.model_folder(entry.name), seen.rows, settings)
-        p95 = found.comparison.models[-1].position.statistics["p95"]
-        moved = found.verdict == "moved"
-        self.history.add(
-            Check("verify", entry.name, chosen.name, found.verdict, found.sentence, p95, moved, now())
-        )
+        errors, moved = found.comparison.models[-1].position.statistics, found.verdict == "moved"
+        found_by = ("verify", entry.name, chosen.name, found.verdict, found.sentence)
+        self.history.add(Check(*found_by, errors["p95"], moved, now(), errors["rms"]))
         in_use = self.history.in_use
         if found.accepted and (in_use is None or in_use.made < entry.made):
             self.history.add(Use(entry.name, now(), f"verified with session '{chosen.name}'"))
@@ -320,7 +328,8 @@ class Cell:
             target_day=parent.target_day,
             parent=parent.name,
         )
-        check = Check("recalibrate", entry.name, chosen.name, result.summary.kept, remark, None, False, now())
+        of = ("recalibrate", entry.name, chosen.name, result.summary.kept, remark)
+        check = Check(*of, None, False, now(), errors_of(result)[1])
         self.history.add(entry, check, *([Use(entry.name, now(), remark)] if result.trusted else []))
         return result, entry
 
@@ -356,21 +365,7 @@ class Cell:
 
     def status(self) -> CellStatus:
         """Return the status of the cell and its next step."""
-        sessions = self.history.sessions()
-        folder = self.folder / SESSIONS
-        facts = CellFacts(
-            folder=os.fspath(self.folder),
-            plans=tuple(sorted(path.stem for path in (self.folder / PLANS).glob("*.csv"))),
-            sessions=sessions,
-            edited=edited_sessions(folder, sessions),
-            events=self.history.events(),
-            models=self.history.models(),
-            checks=self.history.checks(),
-            in_use=self.history.in_use,
-            limit_mm=self.file.document.limit_mm,
-            today=datetime.date.today().isoformat(),
-        )
-        return CellStatus(facts, next_step(facts), not_taken_in(folder, sessions))
+        return status_of(self.folder)
 
     def _candidate(self, model: str | None) -> ModelEntry:
         """Return the named model, else the model in use, else the newest."""

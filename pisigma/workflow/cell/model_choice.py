@@ -10,15 +10,18 @@ from pisigma.files.model_files import model_hash
 from pisigma.files.progress import Progress
 from pisigma.lifetime.cell.history import Check, History, ModelEntry, SessionEntry, Use, now
 from pisigma.lifetime.cell.layout import MODELS
+from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.folder.model_folder import load_model
-from pisigma.validation.held_out.validation_figures import ValidationFigures
-from pisigma.workflow.calibrate import calibrate
+from pisigma.robot.description import Robot
+from pisigma.workflow.calibrate import Calibration, calibrate
 from pisigma.workflow.cell.sessions import Sessions, newest_day, since
 from pisigma.workflow.evaluate import evaluate
 from pisigma.workflow.monitor import Monitoring
+from pisigma.workflow.recalibrate import Recalibration, recalibrate
 from pisigma.workflow.settings.calibration import CalibrationSettings
 from pisigma.workflow.settings.evaluation import EvaluationSettings
+from pisigma.workflow.settings.recalibration import RecalibrationSettings
 
 MIN_ROWS = 10
 """Minimum number of rows of the newest session, which is held out."""
@@ -107,14 +110,32 @@ def check_of(found: Monitoring, entry: ModelEntry, session: SessionEntry) -> Che
         summary = found.untrusted[0].sentence
         return Check("monitor", entry.name, session.name, "implausible", summary, None, False, now())
     judged = found.sessions[-1].session
-    return Check(
-        "monitor", entry.name, session.name, judged.verdict, judged.sentence, None, judged.recalibrate, now()
-    )
+    found_by = ("monitor", entry.name, session.name, judged.verdict, judged.sentence)
+    return Check(*found_by, None, judged.recalibrate, now(), judged.rms * 1e3)
 
 
-def p95_of(judged: ValidationFigures | None) -> float | None:
-    """Return the 95 % quantile of the position errors of held-out rows of the best calibration [mm]."""
-    return None if judged is None else list(judged.models.values())[-1].p95_mm
+def calibrated(
+    robot: Robot, rows: Measurements, settings: CalibrationSettings, prior: Path | None, progress: Progress
+) -> Calibration | Recalibration:
+    """Calibrate a robot with rows that were read, from scratch or from the prior of a fleet."""
+    if prior is None:
+        return calibrate(robot, rows, replace(settings, cameras=None), progress)
+    settings.check_unused()
+    return recalibrate(prior, rows, RecalibrationSettings(), progress, robot)
+
+
+def errors_of(result: Calibration | Recalibration) -> tuple[float | None, float | None]:
+    """Return the 95 % quantile and the RMS of the position errors [mm]; None if they are unknown.
+
+    Both are of held-out rows; without a validation, the RMS is that of the rows of the calibration.
+    """
+    if isinstance(result, Recalibration):
+        return None, result.summary.cross_validation[result.summary.kept].rms_mm
+    judged, fitted = result.summary.judged, result.summary.calibrated
+    if judged is not None:
+        errors = list(judged.models.values())[-1]
+        return errors.p95_mm, errors.rms_mm
+    return None, None if fitted is None else list(fitted.models.values())[-1].rms_mm
 
 
 def entry_of(

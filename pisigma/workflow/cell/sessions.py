@@ -11,9 +11,17 @@ from typing import Any
 
 import torch
 
-from pisigma.files.errors import AcceptanceError, MeasurementError, OutputError, Place, check_choice
+from pisigma.files.errors import (
+    AcceptanceError,
+    MeasurementError,
+    OutputError,
+    PisigmaError,
+    Place,
+    check_choice,
+)
 from pisigma.files.scratch import FILE, scratch_beside
-from pisigma.lifetime.cell.history import Event, History, ModelEntry, SessionEntry, now
+from pisigma.lifetime.cell.facts import not_taken_in, sha256_of
+from pisigma.lifetime.cell.history import Check, Event, History, ModelEntry, SessionEntry, now
 from pisigma.lifetime.cell.layout import MODELS, SESSIONS
 from pisigma.lifetime.cell.status import valid_sessions
 from pisigma.measurement.camera.camera_files import CameraFiles
@@ -67,10 +75,12 @@ class Sessions:
         robot: the nominal robot.
         cameras: cameras and boards that measure; None without cameras.
         history: history of the cell.
+        one_by_one: whether files in the folder are added by `take_in_next` only, and not by every step.
     """
 
     def __init__(self, cell: Path, robot: Robot, cameras: CameraFiles | None, history: History) -> None:
         self.folder, self.robot, self.cameras, self.history = cell / SESSIONS, robot, cameras, history
+        self.one_by_one = False
 
     def path(self, session: SessionEntry) -> Path:
         """Return the file of a session."""
@@ -121,6 +131,25 @@ class Sessions:
                 path.unlink()
             raise _known(rows)
         return entry
+
+    def take_in_next(self) -> bool:
+        """Add the oldest file in the folder that has not been added yet; return whether there was one.
+
+        Raises:
+            PisigmaError: the rows cannot be used; the history records the reason.
+        """
+        waiting = not_taken_in(self.folder, self.history.sessions())
+        if not waiting:
+            return False
+        try:
+            self.take_in(self.folder / waiting[0])
+        except PisigmaError as refusal:
+            refused = Check("import", "", Path(waiting[0]).stem, "refused", str(refusal), None, False, now())
+            known = {(one.command, one.session, one.summary) for one in self.history.checks()}
+            if (refused.command, refused.session, refused.summary) not in known:
+                self.history.add(refused)
+            raise
+        return True
 
     def _judged(self, rows: Measurements, day: str, accept_implausible: bool) -> SessionEntry:
         """Check rows and return the entry of their session, still without name and hash."""
@@ -176,8 +205,8 @@ class Sessions:
         Raises:
             MeasurementError: there is none.
         """
-        for name in not_taken_in(self.folder, self.history.sessions()):
-            self.take_in(self.folder / name)
+        while not self.one_by_one and self.take_in_next():
+            pass
         sessions = list(valid_sessions(self.history.sessions(), self.history.events()))
         if not sessions:
             raise MeasurementError(
@@ -301,17 +330,6 @@ def _day_of(rows: Measurements) -> str:
     return date_in_name(Path(rows.source).name) or datetime.date.today().isoformat()
 
 
-def sha256_of(path: Path) -> str:
-    """Return the SHA-256 of a file; "" if it is missing."""
-    return hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else ""
-
-
-def not_taken_in(folder: Path, sessions: Sequence[SessionEntry]) -> tuple[str, ...]:
-    """Return the names of the files in the folder of sessions that are not in the history yet."""
-    names = {one.name for one in sessions}
-    return tuple(sorted(path.name for path in folder.glob("*.csv") if path.stem not in names))
-
-
 def free_path(folder: Path, name: str, suffix: str, taken: Collection[str] = ()) -> Path:
     """Return a path in a folder that is not taken: NAME, NAME-2, NAME-3 and so on.
 
@@ -373,9 +391,3 @@ def write_new(folder: Path, name: str, content: bytes, taken: Collection[str]) -
             continue
         except OSError as problem:
             raise OutputError(f"the session cannot be written: {problem.strerror}", at=Place(path)) from None
-
-
-def edited_sessions(folder: Path, sessions: Sequence[SessionEntry]) -> tuple[str, ...]:
-    """Return the names of sessions in use whose files were changed or removed after they were added."""
-    used = [one for one in sessions if not one.set_aside]
-    return tuple(one.name for one in used if sha256_of(folder / f"{one.name}.csv") != one.sha256)

@@ -179,9 +179,11 @@ class CalibrationSettings:
         """Refuse settings that a calibration with the prior of a fleet does not use.
 
         Raises:
-            IdentificationError: a setting other than `cameras` and `jobs` is stated.
+            IdentificationError: a setting other than `cameras`, `jobs` and `folds` of 0 is stated.
         """
-        usual = CalibrationSettings(cameras=self.cameras, jobs=self.jobs)
+        usual = CalibrationSettings(
+            cameras=self.cameras, jobs=self.jobs, folds=0 if self.folds == 0 else None
+        )
         stated = [name for name in self.__dataclass_fields__ if getattr(self, name) != getattr(usual, name)]
         if stated:
             raise IdentificationError(

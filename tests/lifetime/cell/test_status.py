@@ -40,6 +40,15 @@ NEWER = model("b", "2026-01-10,2026-02-10", day="2026-02-10", p95_mm=0.1)
 CASES = {
     "no_plan": (EMPTY, "plan"),
     "not_measured": (PLANNED, "import"),
+    "not_taken_in": (replace(PLANNED, not_taken_in=("2026-01-10.csv",)), "import"),
+    "file_refused": (
+        replace(
+            PLANNED,
+            not_taken_in=("2026-01-10.csv",),
+            checks=(check("import", "", "2026-01-10", "refused"),),
+        ),
+        "import",
+    ),
     "not_calibrated": (MEASURED, "calibrate"),
     "not_trusted": (
         replace(MEASURED, checks=(check("calibrate", "", verdict="not_trusted"),)),
@@ -120,6 +129,17 @@ def test_a_new_session_after_a_calibration_that_failed_is_calibrated_with():
     assert next_step(replace(MEASURED, checks=(failed,))).state == "not_trusted"
     later = replace(MEASURED, sessions=(FIRST, SECOND), checks=(failed,))
     assert next_step(later).state == "not_calibrated"
+
+
+@pytest.mark.parametrize(
+    ("verdict", "state"),
+    [("moved", "moved"), ("setup_fault", "session_not_trusted"), ("undecided", "verification_failed")],
+)
+def test_the_verdict_on_a_model_that_was_not_in_use_yet_leads_to_a_step(verdict, state):
+    judged = check("verify", "a", "2026-02-10", verdict, recalibrate=verdict == "moved")
+    assert next_step(replace(MEASURED_AGAIN, checks=(judged,))).state == state
+    aside = (FIRST, replace(SECOND, set_aside="loose reflector"))
+    assert next_step(replace(MEASURED_AGAIN, sessions=aside, checks=(judged,))).state == "not_verified"
 
 
 @pytest.mark.parametrize(("days", "state"), [(0, "up_to_date"), (1, "verification_due")])

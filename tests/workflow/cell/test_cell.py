@@ -104,7 +104,7 @@ def test_rows_in_inches_are_refused_and_not_stored(year):
     with refused(AcceptanceError):
         cell.take_in(measured(12, 5, scale=1 / 25.4), day=day(1))
     assert cell.history.sessions() == before
-    assert cell.status().not_taken_in == ()
+    assert cell.status().facts.not_taken_in == ()
 
 
 def test_a_file_that_was_edited_is_named_and_not_used(year):
@@ -164,10 +164,10 @@ def test_sessions_before_and_after_an_event_of_the_instrument_are_in_two_frames(
 def test_a_file_in_the_folder_of_sessions_is_taken_in_by_the_next_step(tmp_path):
     cell = Cell.create(tmp_path / "cell", "ur10")
     measured(40, 1).write_csv(cell.folder / "sessions" / "by hand 2026-01-10.csv", ROBOT)
-    assert cell.status().not_taken_in == ("by hand 2026-01-10.csv",)
+    assert cell.status().facts.not_taken_in == ("by hand 2026-01-10.csv",)
     _, entry = cell.calibrate(model="geometric", folds=0)
     assert entry.sessions == "by hand 2026-01-10"
-    assert cell.status().not_taken_in == ()
+    assert cell.status().facts.not_taken_in == ()
     (one,) = cell.history.sessions()
     assert dataclasses.replace(one, sha256="", taken_in="", remark="").day == "2026-01-10"
 

@@ -1,0 +1,75 @@
+"""Read the facts about a cell from its folder, without its robot: the status of many cells is read quickly."""
+
+import datetime
+import hashlib
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from pisigma.files.errors import PlanningError
+from pisigma.files.yaml_file import read_yaml
+from pisigma.lifetime.cell.history import HISTORY, History, SessionEntry
+from pisigma.lifetime.cell.layout import CELL_FILE, PLANS, SESSIONS
+from pisigma.lifetime.cell.status import CellFacts, CellStatus, next_step
+from pisigma.measurement.dates import date_in_name
+
+
+class _Limit(BaseModel):
+    """The limit that `cell.yaml` states; commands that use the other keys check them."""
+
+    model_config = ConfigDict(frozen=True, allow_inf_nan=False)
+    limit_mm: Annotated[float, Field(gt=0)] | None = None
+
+
+def status_of(folder: Path) -> CellStatus:
+    """Return the status of a cell and its next step.
+
+    Args:
+        folder: folder of the cell.
+
+    Raises:
+        PlanningError: `cell.yaml` cannot be read.
+        OutputError: the history cannot be read.
+    """
+    facts = facts_of(folder)
+    return CellStatus(facts, next_step(facts))
+
+
+def facts_of(folder: Path) -> CellFacts:
+    """Read the facts about a cell; see `status_of`."""
+    history = History(folder / HISTORY)
+    sessions = history.sessions()
+    return CellFacts(
+        folder=os.fspath(folder),
+        plans=tuple(sorted(path.stem for path in (folder / PLANS).glob("*.csv"))),
+        sessions=sessions,
+        edited=edited_sessions(folder / SESSIONS, sessions),
+        events=history.events(),
+        models=history.models(),
+        checks=history.checks(),
+        in_use=history.in_use,
+        limit_mm=read_yaml(folder / CELL_FILE, _Limit, PlanningError).limit_mm,
+        today=datetime.date.today().isoformat(),
+        not_taken_in=not_taken_in(folder / SESSIONS, sessions),
+    )
+
+
+def sha256_of(path: Path) -> str:
+    """Return the SHA-256 of a file; "" if it is missing."""
+    return hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else ""
+
+
+def not_taken_in(folder: Path, sessions: Sequence[SessionEntry]) -> tuple[str, ...]:
+    """Return the names of the files in the folder of sessions that are not in the history yet, by their dates."""
+    names = {one.name for one in sessions}
+    found = [path.name for path in folder.glob("*.csv") if path.stem not in names]
+    return tuple(sorted(found, key=lambda name: (date_in_name(name), name)))
+
+
+def edited_sessions(folder: Path, sessions: Sequence[SessionEntry]) -> tuple[str, ...]:
+    """Return the names of sessions in use whose files were changed or removed after they were added."""
+    used = [one for one in sessions if not one.set_aside]
+    return tuple(one.name for one in used if sha256_of(folder / f"{one.name}.csv") != one.sha256)
