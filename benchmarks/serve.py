@@ -238,7 +238,7 @@ def main() -> None:
     )
     parser.add_argument("--awake-us", type=float, default=100.0, help="polling time of the clients [us]")
     options = parser.parse_args()
-    command = [sys.executable, "-m", "pisigma", "serve", options.model, "--poll-ms", str(options.poll_ms)]
+    command = [sys.executable, "-m", "pisigma", "serve", options.model, "--set", f"poll_ms={options.poll_ms}"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as server:
         assert server.stdout is not None
         ports = json.loads(server.stdout.readline())

@@ -58,7 +58,12 @@ def _cells(setting: Setting) -> tuple[str, ...]:
         default = "on" if setting.default else "off"
     elif setting.default not in (None, ""):
         default = f"`{setting.default}`"
-    return f"`{setting.name}`", f"`{setting.field}`", default.removesuffix("]"), meaning.replace("*", "\\*")
+    return (
+        f"`{setting.spelling}`",
+        f"`{setting.field}`",
+        default.removesuffix("]"),
+        meaning.replace("*", "\\*"),
+    )
 
 
 if __name__ == "__main__":

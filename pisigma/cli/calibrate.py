@@ -22,7 +22,7 @@ from pisigma.cli.output import (
 )
 from pisigma.cli.progress import progress_of
 from pisigma.cli.screen import print_result
-from pisigma.cli.settings_options import StatedOptions, takes_settings
+from pisigma.cli.settings_options import StatedSettings, takes_settings
 from pisigma.files.errors import AcceptanceError
 from pisigma.reporting.result_text import sentences
 from pisigma.workflow.settings.calibration import CalibrationSettings
@@ -61,8 +61,7 @@ def calibrate(
     *,
     data: Data = None,
     out: Out = None,
-    settings: CalibrationSettings,
-    stated: StatedOptions,
+    settings: StatedSettings[CalibrationSettings],
     base: Base = None,
     tip: Tip = None,
     prior: Prior = None,
@@ -84,20 +83,21 @@ def calibrate(
 
     if (cell := cell_at(robot)) is not None:
         refuse_with_cell(DATA=data, __out=out, __base=base, __tip=tip, __prior=prior)
-        return _calibrate_cell(cell, stated, accept_implausible, verbose, as_json)
+        return _calibrate_cell(cell, settings, accept_implausible, verbose, as_json)
     if not data or out is None:
         raise typer.BadParameter(f"expected {'--out DIR' if data else 'DATA'}, or a cell instead of a robot")
-    seen_by = settings.cameras.files if settings.cameras else ()
+    chosen = settings.build()
+    seen_by = chosen.cameras.files if chosen.cameras else ()
     check_folder(out, overwrite, inputs=(robot_file(robot), prior, *data, *seen_by))
     nominal = Robot.load(robot, base, tip)
     if prior is not None:
-        settings.check_unused()
-        again = RecalibrationSettings(cameras=settings.cameras)
+        chosen.check_unused()
+        again = RecalibrationSettings(cameras=chosen.cameras)
         return recalibrate_into(
             context, prior, data, again, out, accept_implausible, overwrite, as_json, verbose, nominal=nominal
         )
     with progress_of("calibrate") as progress:
-        calibration = workflow.calibrate(nominal, data, settings, progress)
+        calibration = workflow.calibrate(nominal, data, chosen, progress)
     with saved(calibration, out, accept_implausible, overwrite, command=command_line(context)) as folder:
         if as_json:
             print_json({"model": folder and str(folder), **calibration.to_json()})
@@ -106,7 +106,11 @@ def calibrate(
 
 
 def _calibrate_cell(
-    cell: "Cell", stated: StatedOptions, accept_implausible: bool, verbose: bool, as_json: bool
+    cell: "Cell",
+    settings: StatedSettings[CalibrationSettings],
+    accept_implausible: bool,
+    verbose: bool,
+    as_json: bool,
 ) -> None:
     """Calibrate with the rows of a cell, store the model there, and print it."""
     from pisigma.reporting.calibration_text import calibration_text
@@ -114,7 +118,7 @@ def _calibrate_cell(
 
     with progress_of("calibrate") as progress:
         calibration, entry = cell.calibrate(
-            progress, accept_implausible, **report_overrides(cell, "calibrate", stated)
+            progress, accept_implausible, **report_overrides(cell, "calibrate", settings)
         )
     folder = None if entry is None else cell.model_folder(entry.name)
     if as_json:

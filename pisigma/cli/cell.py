@@ -1,15 +1,16 @@
 """`pisigma new`, `status`, `use`, `session`, `event`, `pack` and `unpack`: the commands of cells."""
 
 import time
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from pisigma.cli.arguments import AsJson, complete_robot
 from pisigma.cli.endings import NOT_ACCEPTED
 from pisigma.cli.output import print_json, print_line, print_lines, print_table
-from pisigma.cli.settings_options import StatedOptions
+from pisigma.cli.settings_options import StatedSettings
 
 if TYPE_CHECKING:
     from pisigma.lifetime.cell.status import CellStatus
@@ -167,11 +168,11 @@ def cell_at(path: str | Path) -> "Cell | None":
     return Cell.open(path)
 
 
-def report_overrides(cell: "Cell", step: str, stated: StatedOptions) -> StatedOptions:
-    """Print to stderr which settings of a step the command line overrides; return `stated`."""
-    for key in sorted(stated.keys() & cell.file.stated(step).keys()):
-        print_line(f"--{key.replace('_', '-')} overrides {key} of {cell.file.path}.", to_stderr=True)
-    return stated
+def report_overrides(cell: "Cell", step: str, settings: StatedSettings[Any]) -> Mapping[str, Any]:
+    """Print to stderr which settings of a step the command line overrides; return what it states, by keys."""
+    for key in sorted(settings.values.keys() & cell.file.stated(step).keys()):
+        print_line(f"The command line overrides {key} of {cell.file.path}.", to_stderr=True)
+    return settings.values
 
 
 def refuse_with_cell(**given: object) -> None:

@@ -9,7 +9,7 @@ from pisigma.cli.cell import cell_at, refuse_with_cell, report_overrides
 from pisigma.cli.output import print_json, screen_width
 from pisigma.cli.progress import progress_of
 from pisigma.cli.screen import print_screen
-from pisigma.cli.settings_options import StatedOptions, takes_settings
+from pisigma.cli.settings_options import StatedSettings, takes_settings
 from pisigma.files.errors import AcceptanceError
 from pisigma.workflow.settings.evaluation import EvaluationSettings
 
@@ -36,8 +36,7 @@ Hashes = Annotated[
 @takes_settings
 def evaluate(
     paths: Paths,
-    settings: EvaluationSettings,
-    stated: StatedOptions,
+    settings: StatedSettings[EvaluationSettings],
     sha256: Hashes = None,
     verbose: Verbose = False,
     as_json: AsJson = False,
@@ -52,9 +51,10 @@ def evaluate(
 
     if len(paths) == 1 and (cell := cell_at(paths[0])) is not None:
         refuse_with_cell(__sha256=sha256)
-        return _tell(cell.evaluate(**report_overrides(cell, "evaluate", stated)), verbose, as_json)
+        return _tell(cell.evaluate(**report_overrides(cell, "evaluate", settings)), verbose, as_json)
     if len(paths) < 2:
         raise typer.BadParameter("expected a model folder and, last, a file of measurements")
+    chosen = settings.build()
     folders = [path for path in paths[:-1] if path not in workflow.REFERENCES]
     if sha256 and len(sha256) != len(folders):
         raise typer.BadParameter(
@@ -65,7 +65,7 @@ def evaluate(
         check_model_hash(folder, expected)
     with progress_of("evaluate") as progress:
         progress("comparing the models")
-        evaluation = workflow.evaluate(paths[:-1], paths[-1], settings)
+        evaluation = workflow.evaluate(paths[:-1], paths[-1], chosen)
     _tell(evaluation, verbose, as_json)
 
 

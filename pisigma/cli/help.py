@@ -1,69 +1,74 @@
-"""Help of commands: `--help` shows the options that are used most, `--help-all` shows every option.
-
-An option that is hidden from `--help` still works, and shells still complete it.
-"""
+"""Help of commands: `--help` shows their options in short, `--help-all` also every key of `--set`."""
 
 import copy
 import json
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Annotated, Any
 
 import typer
 from typer.core import TyperCommand
 
-_OF_ALL_COMMANDS = ("--plugin",)
-_IMAGES = ("--fixed-camera", "--repeatability-mm", "--repeatability-deg", "--intrinsics")
+from pisigma.cli.settings_options import SETTINGS
+from pisigma.files.setting import Setting
 
-RARELY_USED: Mapping[str, tuple[str, ...]] = {
-    "plan": (
-        *_IMAGES[:3], "--sigma-px", "--sigma-mm", "--candidates", "--candidates-from", "--seed", "--speed-deg-s",
-        "--settling-s", "--criterion", "--base", "--tip",
-    ),
-    "calibrate": (
-        *_IMAGES, "--hold-out", "--repeats", "--seed", "--train-rows", "--free", "--robust", "--gravity", "--class",
-        "--features", "--base", "--tip", "--jobs",
-    ),
-    "recalibrate": _IMAGES,
-    "monitor": _IMAGES,
-    "compare": (*_IMAGES, "--level"),
-    "evaluate": (*_IMAGES, "--resamples", "--seed", "--sha256"),
-    "verify": _IMAGES,
-    "report": _IMAGES,
-    "import": ("--decimal", "--within"),
-    "measure": ("--view-host", "--view-port", "--view-urdf"),
-    "ik": ("--elbow-deg", "--tolerance-deg", "--payload-kg", "--temperature-c"),
+_OF_ALL_COMMANDS = ("--plugin",)
+
+RARELY_USED = {
     "export": (
         "--tip", "--geometry", "--config", "--frames", "--tolerance-mm", "--counts-per-turn", "--present-counts",
         "--payload-kg", "--temperature-c",
     ),
 }  # fmt: skip
-"""Options that only `--help-all` shows, by command, in addition to the common ones."""
-
+"""Options of commands without settings that only `--help-all` shows, in addition to the common ones."""
 _SHOWS_ALL = "pisigma.help_all"
 
 
 class ShortHelpCommand(TyperCommand):
-    """A command whose `--help` shows the options that are used most."""
+    """A command whose `--help` shows its options in short, and whose `--help-all` shows the keys of `--set` too."""
+
+    @property
+    def keys(self) -> dict[str, Setting]:
+        """Settings without an option, by their keys."""
+        known: dict[str, Setting] = getattr(self.callback, SETTINGS, {})
+        return {key: one for key, one in known.items() if one.option.is_key}
 
     def format_options(self, ctx: Any, formatter: Any) -> None:
-        """Write the options that are used most, or all of them, and say how many there are."""
+        """Write the options in short and say how many there are, or all of them with the keys of `--set`."""
         if ctx.meta.get(_SHOWS_ALL):
             super().format_options(ctx, formatter)
+            if self.keys:
+                with formatter.section("Keys of --set, in addition to the options without their dashes"):
+                    formatter.write_dl([(key, _explained(one)) for key, one in self.keys.items()])
             return
         hidden = {*_OF_ALL_COMMANDS, *RARELY_USED.get(str(self.name), ())}
         short = copy.copy(self)
         short.params = [_in_a_sentence(one) for one in self.params if hidden.isdisjoint(one.opts)]
         TyperCommand.format_options(short, ctx, formatter)
         count = sum(one.param_type_name == "option" for one in self.get_params(ctx))
+        keys = " and the keys of --set" if self.keys else ""
         formatter.write_paragraph()
-        formatter.write_text(f"--help-all shows all {count} options.")
+        formatter.write_text(f"--help-all shows all {count} options{keys}.")
 
     def make_context(self, info_name: Any, args: Any, parent: Any = None, **extra: Any) -> Any:
         """Parse the arguments; with `--json`, print what is wrong with them as JSON too."""
         with _usage_errors_as_json("--json" in args):
-            return super().make_context(info_name, args, parent, **extra)
+            try:
+                return super().make_context(info_name, args, parent, **extra)
+            except Exception as problem:
+                self._name_key(problem)
+                raise
+
+    def _name_key(self, problem: Any) -> None:
+        """Name the key in the error of an unknown option, if there is a setting of this name without an option."""
+        key = str(getattr(problem, "option_name", "")).removeprefix("--").replace("-", "_")
+        value = "VALUE"
+        if key not in self.keys and key.startswith("no_"):
+            key, value = key.removeprefix("no_"), "false"
+        if hasattr(problem, "possibilities") and key in self.keys:
+            problem.possibilities = []
+            problem.message = f"No such option: {problem.option_name}. Use --set {key}={value}."
 
     def invoke(self, ctx: Any) -> Any:
         """Run the command; with `--json`, print what is wrong with its options as JSON too."""
@@ -92,6 +97,14 @@ def _in_a_sentence(parameter: Any) -> Any:
     short = copy.copy(parameter)
     short.help = re.sub(r"\. (?!\[default).*?(?= \[default|$)", ".", parameter.help or "")
     return short
+
+
+def _explained(setting: Setting) -> str:
+    """Return the meaning of a key, with its default."""
+    default = setting.default
+    if default in (None, "") or "[default: " in setting.help:
+        return setting.help
+    return f"{setting.help} [default: {str(default).lower() if isinstance(default, bool) else default}]"
 
 
 def _show_all(ctx: Any, value: bool) -> bool:

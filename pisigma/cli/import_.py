@@ -10,7 +10,7 @@ from pisigma.cli.arguments import AsJson
 from pisigma.cli.cell import next_lines, report_overrides
 from pisigma.cli.endings import REFUSED, fail
 from pisigma.cli.output import print_json, print_lines, print_table
-from pisigma.cli.settings_options import StatedOptions, takes_settings
+from pisigma.cli.settings_options import StatedSettings, takes_settings
 from pisigma.workflow.settings.importing import ImportSettings
 
 if TYPE_CHECKING:
@@ -26,8 +26,7 @@ SaveMap = Annotated[Path | None, typer.Option(help="Write the mapping to this fi
 @takes_settings
 def import_(
     files: Files,
-    settings: ImportSettings,
-    stated: StatedOptions,
+    settings: StatedSettings[ImportSettings],
     out: Annotated[Path | None, typer.Option(help="Measurement file to write (.csv).")] = None,
     cell: Annotated[Path | None, typer.Option(help="Cell to which the rows are added as a session.")] = None,
     date: Annotated[
@@ -58,10 +57,10 @@ def import_(
         check_output(save_map, (".yaml", ".yml"), "a mapping", [*files, *([] if out is None else [out])])
     if cell is not None:
         opened = Cell.open(cell)
-        settings = opened.file.settings("import", **report_overrides(opened, "import", stated))
+        chosen = opened.file.settings("import", **report_overrides(opened, "import", settings))
         if len(files) == 1 and is_measurement_file(files[0]):
             return _take_in(opened, files[0], date, accept_implausible, as_json)
-    proposal = workflow.propose_import(files, settings)
+    proposal = workflow.propose_import(files, chosen if cell else settings.build())
     _confirm(proposal, yes, as_json)
     rows = workflow.import_rows(proposal)
     if out is not None:

@@ -11,7 +11,7 @@ from pisigma.cli.cell import cell_at, refuse_with_cell, report_overrides
 from pisigma.cli.output import print_json
 from pisigma.cli.progress import progress_of
 from pisigma.cli.screen import print_result
-from pisigma.cli.settings_options import StatedOptions, takes_settings
+from pisigma.cli.settings_options import StatedSettings, takes_settings
 from pisigma.planning.plan_settings import PlanSettings
 
 if TYPE_CHECKING:
@@ -41,8 +41,7 @@ def plan(
     subject: Subject,
     *,
     out: Out = None,
-    settings: PlanSettings,
-    stated: StatedOptions,
+    settings: StatedSettings[PlanSettings],
     cell: CellFile = None,
     program: Programs = None,
     base: Base = None,
@@ -62,13 +61,14 @@ def plan(
 
     if (opened := cell_at(subject)) is not None:
         refuse_with_cell(__out=out, __cell=cell, __base=base, __tip=tip)
-        return _plan_cell(opened, stated, program or [], verbose, as_json)
+        return _plan_cell(opened, settings, program or [], verbose, as_json)
     if out is None:
         raise typer.BadParameter("expected a CSV file", param_hint="'--out'")
+    chosen = settings.build()
     planned_for, programs = PlanningSubject.load(subject, base, tip), program or []
-    workflow.check_files(out, programs, settings, planned_for.robot, (subject, cell))
+    workflow.check_files(out, programs, chosen, planned_for.robot, (subject, cell))
     with progress_of("plan") as progress:
-        planned = workflow.plan(planned_for, settings, cell, progress)
+        planned = workflow.plan(planned_for, chosen, cell, progress)
     planned.save(out, programs)
     if as_json:
         print_json({"file": str(out), **planned.to_json()})
@@ -77,14 +77,18 @@ def plan(
 
 
 def _plan_cell(
-    cell: "OpenedCell", stated: StatedOptions, programs: list[Path], verbose: bool, as_json: bool
+    cell: "OpenedCell",
+    settings: StatedSettings[PlanSettings],
+    programs: list[Path],
+    verbose: bool,
+    as_json: bool,
 ) -> None:
     """Plan for a cell, and store the plan there."""
     from pisigma.planning.plan_file import yaml_of
     from pisigma.workflow.result_texts import plan_text
 
     with progress_of("plan") as progress:
-        planned, out = cell.plan(progress, programs, **report_overrides(cell, "plan", stated))
+        planned, out = cell.plan(progress, programs, **report_overrides(cell, "plan", settings))
     if as_json:
         print_json({"file": str(out), **planned.to_json(), "next": cell.status().step.to_json()})
     else:

@@ -3,69 +3,116 @@
 import functools
 import inspect
 import keyword
-from collections.abc import Callable
-from dataclasses import is_dataclass
-from typing import Annotated, Any, get_args
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, is_dataclass
+from typing import Annotated, Any, Generic, TypeVar, get_args, get_origin
 
 import typer
 
-from pisigma.files.setting import Setting, build_settings, flat_settings
+from pisigma.files.errors import SettingError
+from pisigma.files.setting import Setting, build_settings, by_key, flat_settings
+from pisigma.files.setting_values import read_assignments
 
-_CONTEXT = "context_of_command"
-"""Parameter by which a command gets its context that does not ask for it."""
+SETTINGS = "settings_by_key"
+"""Attribute of a command with its settings by their keys."""
+_CONTEXT, _SET = "context_of_command", "assignments"
+"""Parameters by which a command gets its context and the values of `--set`."""
+
+Group = TypeVar("Group")
 
 
-class StatedOptions(dict[str, Any]):
-    """Options of settings that the command line states, by their keys in `cell.yaml`."""
+@dataclass(frozen=True)
+class StatedSettings(Generic[Group]):
+    """Settings as a command line states them, for commands that may take the others from a cell.
+
+    Attributes:
+        group: class of the settings.
+        values: stated values by their keys.
+    """
+
+    group: type[Group]
+    values: Mapping[str, Any]
+
+    def build(self) -> Group:
+        """Return the settings without a cell: those that are not stated have their defaults.
+
+        Raises:
+            PisigmaError: a value is not valid.
+        """
+        built = build_settings(self.group, self.values)
+        assert isinstance(built, self.group)
+        return built
 
 
 def takes_settings(command: Callable[..., None]) -> Callable[..., None]:
     """Replace every parameter of a command whose type is a class of settings by the options of that class.
 
-    The command is called with the settings; a parameter that may be None is None if none of its options is given. A
-    parameter of type `StatedOptions` gets the options that the command line states.
+    The command is called with the settings; a parameter that may be None is None if none of its settings is stated. A
+    parameter of type `StatedSettings[...]` gets what is stated. If a setting has no option of its own, the command also
+    gets the option `--set`, which states any setting by its key.
     """
     parameters: list[inspect.Parameter] = []
     groups: dict[str, tuple[type, bool]] = {}
-    wants_stated = ""
+    as_stated, end = set(), 0
     for one in inspect.signature(command).parameters.values():
         group, *others = get_args(one.annotation) or (one.annotation,)
-        if group is StatedOptions:
-            wants_stated = one.name
-        elif not is_dataclass(group):
+        if not is_dataclass(group):
             parameters.append(one)
-        else:
-            groups[one.name] = group, bool(others)  # type: ignore[assignment]
-            parameters += map(_parameter, flat_settings(group))  # type: ignore[arg-type]
-    context = next((one.name for one in parameters if one.annotation is typer.Context), None)
-    if wants_stated and context is None:
-        parameters.append(
-            inspect.Parameter(_CONTEXT, inspect.Parameter.KEYWORD_ONLY, annotation=typer.Context)
-        )
+            continue
+        groups[one.name] = group, bool(others)  # type: ignore[assignment]
+        if get_origin(one.annotation) is StatedSettings:
+            as_stated.add(one.name)
+        parameters += [_parameter(one) for one in flat_settings(group) if not one.option.is_key]  # type: ignore[arg-type]
+        end = len(parameters)
+    known = {key: one for group, _ in groups.values() for key, one in by_key(group).items()}
+    context = next((one.name for one in parameters if one.annotation is typer.Context), _CONTEXT)
+    by_name = inspect.Parameter.KEYWORD_ONLY
+    if any(one.option.is_key for one in known.values()):
+        parameters.insert(end, inspect.Parameter(_SET, by_name, default=None, annotation=_Assignments))
+    if context == _CONTEXT:
+        parameters.append(inspect.Parameter(_CONTEXT, by_name, annotation=typer.Context))
 
     @functools.wraps(command)
     def with_options(**values: Any) -> None:
-        options = {option.key: option for group, _ in groups.values() for option in flat_settings(group)}
-        stated = {key: values.pop(_name(option)) for key, option in options.items()}
-        if wants_stated:
-            running = values[context] if context else values.pop(_CONTEXT)
-            values[wants_stated] = StatedOptions(
-                (key, stated[key])
-                for key, option in options.items()
-                if running.get_parameter_source(_name(option)).name == "COMMANDLINE"
+        running = values.pop(_CONTEXT) if context == _CONTEXT else values[context]
+        stated = _stated(values, known, running)
+        for name, (group, is_optional) in groups.items():
+            own = {key: stated[key] for key in by_key(group) if key in stated}
+            values[name] = (
+                StatedSettings(group, own) if name in as_stated else build_settings(group, own, is_optional)
             )
-        chosen = {
-            key: value
-            for key, value in stated.items()
-            if value not in (None, []) and value != options[key].default
-        }
-        built = {name: build_settings(group, chosen, none) for name, (group, none) in groups.items()}
-        command(**values, **built)
+        command(**values)
 
-    by_name = inspect.Parameter.KEYWORD_ONLY
     vars(with_options)["__signature__"] = inspect.Signature([one.replace(kind=by_name) for one in parameters])
+    vars(with_options)[SETTINGS] = known
     with_options.__annotations__ = {one.name: one.annotation for one in parameters}
     return with_options
+
+
+_Assignments = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--set",
+        metavar="KEY=VALUE",
+        help="Set a setting by its key, as in cell.yaml; --help-all lists the keys. May be repeated.",
+    ),
+]
+
+
+def _stated(values: dict[str, Any], known: Mapping[str, Setting], running: Any) -> dict[str, Any]:
+    """Take the options of settings out of the values of a command; return what the command line states, by keys."""
+    stated = read_assignments(values.pop(_SET, None) or (), known)
+    for key, setting in known.items():
+        if setting.option.is_key:
+            continue
+        value = values.pop(_name(setting))
+        if running.get_parameter_source(_name(setting)).name != "COMMANDLINE":
+            continue
+        if key in stated:
+            problem = f"stated twice, by {setting.name} and by --set"
+            raise SettingError(problem, value=stated[key], option=key, remedy="omit one")
+        stated[key] = value
+    return stated
 
 
 def _parameter(setting: Setting) -> inspect.Parameter:

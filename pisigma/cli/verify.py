@@ -10,7 +10,7 @@ from pisigma.cli.cell import cell_at, next_lines, refuse_with_cell, report_overr
 from pisigma.cli.output import print_json, print_lines, screen_width
 from pisigma.cli.progress import progress_of
 from pisigma.cli.screen import print_result
-from pisigma.cli.settings_options import StatedOptions, takes_settings
+from pisigma.cli.settings_options import StatedSettings, takes_settings
 from pisigma.files.errors import AcceptanceError
 from pisigma.workflow.settings.verification import VerificationSettings
 
@@ -40,8 +40,7 @@ def verify(
     model: ModelOrCell,
     *,
     data: Data = None,
-    settings: VerificationSettings,
-    stated: StatedOptions,
+    settings: StatedSettings[VerificationSettings],
     of_model: OfModel = None,
     sha256: Hash = None,
     verbose: Verbose = False,
@@ -60,14 +59,15 @@ def verify(
 
     if (cell := cell_at(model)) is not None:
         refuse_with_cell(DATA=data, __sha256=sha256)
-        return _verify_cell(cell, stated, of_model, verbose, as_json)
+        return _verify_cell(cell, settings, of_model, verbose, as_json)
     if data is None or of_model is not None:
         raise typer.BadParameter("expected DATA" if data is None else "--model names a model of a cell")
+    chosen = settings.build()
     if sha256 is not None:
         check_model_hash(model, sha256)
     with progress_of("verify") as progress:
         progress("comparing the models and looking for setup faults")
-        verification = workflow.verify(model, data, settings)
+        verification = workflow.verify(model, data, chosen)
     if as_json:
         print_json(verification.to_json())
     else:
@@ -77,14 +77,18 @@ def verify(
 
 
 def _verify_cell(
-    cell: "Cell", stated: StatedOptions, model: str | None, verbose: bool, as_json: bool
+    cell: "Cell",
+    settings: StatedSettings[VerificationSettings],
+    model: str | None,
+    verbose: bool,
+    as_json: bool,
 ) -> None:
     """Verify a model of a cell with its newest session."""
     from pisigma.workflow.result_texts import verification_text
 
     with progress_of("verify") as progress:
         progress("comparing the models and looking for setup faults")
-        verification, entry = cell.verify(None, model, **report_overrides(cell, "verify", stated))
+        verification, entry = cell.verify(None, model, **report_overrides(cell, "verify", settings))
     in_use = cell.history.in_use
     if as_json:
         use = None if in_use is None else in_use.name

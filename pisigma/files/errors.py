@@ -178,6 +178,10 @@ class UnknownRobotError(RobotError):
     """A robot is neither in the catalogue nor a file."""
 
 
+class SettingError(PisigmaError, ValueError):
+    """A setting has an unknown name, or a value of the wrong type or out of range."""
+
+
 class RecipeError(PisigmaError, ValueError):
     """A recipe cannot be used."""
 

@@ -26,7 +26,7 @@ class Option:
     """How the command line states a setting, where that does not follow from its name and type.
 
     Attributes:
-        name: name of the option, such as "--class"; None: made from the name of the setting.
+        name: name of the option, such as "--camera"; None: made from the name of the setting.
         kind: type of the command-line value if it differs from that of the setting.
         read: function that converts the command-line value to the setting.
         unit: unit of the command-line value, one of `UNITS`; `read`, if given, has to convert it.
@@ -34,7 +34,8 @@ class Option:
         max: largest value that is accepted.
         metavar: placeholder of the value in the help.
         default: default that the help shows if that of the setting has another type.
-        hidden: whether the setting has no option and can be set in Python only.
+        is_key: whether the setting has no option of its own and is set by its key: in `cell.yaml`, and with `--set`.
+        hidden: whether the setting can be set in Python only.
     """
 
     name: str | None = None
@@ -45,11 +46,14 @@ class Option:
     max: float | int | None = None
     metavar: str | None = None
     default: Any = None
+    is_key: bool = False
     hidden: bool = False
 
 
 HIDDEN = Option(hidden=True)
 """For settings that can be set in Python only."""
+KEY = Option(is_key=True)
+"""For settings that have a key and no option of their own."""
 FILE = Option(kind=Path, read=str)
 """For settings that are a path as text."""
 
@@ -70,7 +74,7 @@ NAMES = Option(kind=str, read=names)
 
 @dataclass(frozen=True)
 class Setting:
-    """A setting of a class, as an option of the command line.
+    """A setting of a class, as an option of the command line or a key of files and of `--set`.
 
     Attributes:
         field: name of the field in Python.
@@ -95,13 +99,18 @@ class Setting:
 
     @property
     def name(self) -> str:
-        """Name of the option, such as "--prior-mm"."""
+        """Name of the option, such as "--limit-mm"; of a key, the name that it would have."""
         return self.option.name or f"--{self.field.replace('_', '-')}"
 
     @property
     def key(self) -> str:
-        """Key in files: the option without leading dashes, such as "prior_mm"."""
+        """Key in files and of `--set`: the option without leading dashes, such as "prior_mm"."""
         return self.name.removeprefix("--").replace("-", "_")
+
+    @property
+    def spelling(self) -> str:
+        """How the command line states the setting, such as "--folds" or "--set seed"."""
+        return f"--set {self.key}" if self.option.is_key else self.name
 
     def read(self, stated: Any) -> Any:
         """Convert a command-line value to the setting."""
@@ -112,7 +121,7 @@ class Setting:
 
 @functools.cache
 def settings_of(group: type) -> tuple[Setting, ...]:
-    """Return the settings of a class that have command-line options.
+    """Return the settings of a class that have command-line options or keys.
 
     A setting whose type cannot be resolved, because it is imported for type checkers only, is read as text.
     """
@@ -139,6 +148,11 @@ def flat_settings(group: type) -> tuple[Setting, ...]:
     return tuple(itertools.chain.from_iterable(parts))
 
 
+def by_key(group: type) -> dict[str, Setting]:
+    """Return the settings of a class by their keys; see `flat_settings`."""
+    return {one.key: one for one in flat_settings(group)}
+
+
 def build_settings(group: type, stated: Mapping[str, Any], is_optional: bool = False) -> Any:
     """Make an instance of a class of settings.
 
@@ -162,12 +176,12 @@ def build_settings(group: type, stated: Mapping[str, Any], is_optional: bool = F
         return None
     needed = [one for one in settings_of(group) if one.is_required]
     missing = [one for one in needed if one.field not in found]
-    names = " and ".join(one.name for one in needed)
+    names = " and ".join(one.spelling for one in needed)
     if missing == needed != []:
-        given = ", ".join(one.name for one in flat_settings(group) if one.key in stated)
+        given = ", ".join(one.spelling for one in flat_settings(group) if one.key in stated)
         raise PisigmaError(f"needs {names}", option=given, expected=names)
     if missing:
-        raise PisigmaError(expected=f"{names} together", option=missing[0].name, remedy="give both")
+        raise PisigmaError(expected=f"{names} together", option=missing[0].spelling, remedy="give both")
     return group(**found)
 
 

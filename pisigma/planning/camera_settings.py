@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Annotated
 
 from pisigma.files.errors import PlanningError
-from pisigma.files.setting import FILE, Option
+from pisigma.files.setting import FILE, KEY, Option
 from pisigma.measurement.camera.camera_files import CameraFiles, Repeatability
 
 MIN_SIGMA_PX, MAX_SIGMA_PX = 1e-3, 100.0
@@ -31,9 +31,9 @@ class CameraSettings:
     camera: Annotated[str, FILE]
     board: Annotated[str, FILE]
     is_fixed: Annotated[bool, Option("--fixed-camera")] = False
-    sigma_px: float = 0.3
-    repeatability_mm: float = 0.02
-    repeatability_deg: float = 0.01
+    sigma_px: Annotated[float, KEY] = 0.3
+    repeatability_mm: Annotated[float, KEY] = 0.02
+    repeatability_deg: Annotated[float, KEY] = 0.01
 
     def __post_init__(self) -> None:
         """Refuse values outside their valid range."""

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, get_args
 
 from pisigma.files.errors import PlanningError, check_choice
-from pisigma.files.setting import FILE, Option
+from pisigma.files.setting import FILE, KEY, Option
 from pisigma.planning.camera_settings import CameraSettings
 
 if TYPE_CHECKING:
@@ -31,7 +31,7 @@ def box(stated: str) -> tuple[float, ...]:
         numbers = ()
     if len(numbers) != 6:
         raise PlanningError(
-            expected="six numbers, such as -500,200,100,500,900,800", value=stated, option="--box"
+            expected="six numbers, such as -500,200,100,500,900,800", value=stated, option="box"
         )
     return numbers
 
@@ -71,17 +71,19 @@ class PlanSettings:
     check: int = 10
     sensor: SensorKind = "position"
     camera: CameraSettings | None = None
-    sigma_mm: float | None = None
-    criterion: Criterion = "I"
+    sigma_mm: Annotated[float | None, KEY] = None
+    criterion: Annotated[Criterion, KEY] = "I"
     limit_mm: float | None = None
-    candidates: int = 5000
-    candidates_from: Annotated[str | None, FILE] = None
-    box_mm: Annotated[Box | None, Option("--box", kind=str, read=box, metavar="X,Y,Z,X,Y,Z")] = None
+    candidates: Annotated[int, KEY] = 5000
+    candidates_from: Annotated[str | None, Option(kind=Path, read=str, is_key=True)] = None
+    box_mm: Annotated[Box | None, Option("--box", kind=str, read=box, metavar="X,Y,Z,X,Y,Z", is_key=True)] = (
+        None
+    )
     task: Annotated[str | None, FILE] = None
     measured: Annotated[str | None, FILE] = None
-    seed: int = 0
-    speed_deg_s: float = 30.0
-    settling_s: float = 3.0
+    seed: Annotated[int, KEY] = 0
+    speed_deg_s: Annotated[float, KEY] = 30.0
+    settling_s: Annotated[float, KEY] = 3.0
 
     def __post_init__(self) -> None:
         """Check choices and ranges."""

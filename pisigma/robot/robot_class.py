@@ -67,7 +67,7 @@ class RobotClass:
     """Prior standard deviations of the errors of a class of robots, and their limits.
 
     Attributes:
-        name: name of the class, as for `--class`.
+        name: name of the class, as for the setting `robot_class`.
         usual: prior standard deviations of geometric errors.
         gravity: prior standard deviation of the weights of `GravityTorques` [rad].
         bands: prior standard deviations of the weights of `FourierSeries` [rad], by band of `BAND_STARTS`.

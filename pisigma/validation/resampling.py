@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import Annotated
 
 from pisigma.files.errors import MeasurementError
-from pisigma.files.setting import HIDDEN, Option
+from pisigma.files.setting import HIDDEN, KEY, Option
 
 MAX_RESAMPLES = 1_000_000
 
@@ -21,8 +21,8 @@ class Bootstrap:
         confidence: confidence level of an interval.
     """
 
-    resamples: Annotated[int, Option(min=2)] = 2000
-    seed: int = 0
+    resamples: Annotated[int, Option(min=2, is_key=True)] = 2000
+    seed: Annotated[int, KEY] = 0
     confidence: Annotated[float, HIDDEN] = 0.95
 
     def __post_init__(self) -> None:

@@ -35,8 +35,8 @@ def cameras(files: Path) -> tuple[object, ...]:
 @pytest.fixture(scope="module")
 def calibrated(run, files: Path) -> tuple[Path, Result]:
     """A model by corners.csv, and what the command printed."""
-    command = ("calibrate", "ur5", files / "corners.csv", *cameras(files), "--prior-mrad", 5)
-    result = run(*command, "--folds", 2, "--repeats", 1, "--out", files / "arm", "--json")
+    command = ("calibrate", "ur5", files / "corners.csv", *cameras(files), "--set", "prior_mrad=5")
+    result = run(*command, "--folds", 2, "--set", "repeats=1", "--out", files / "arm", "--json")
     assert result.exit_code == 0, result.output
     return files / "arm", result
 
@@ -143,16 +143,16 @@ def test_a_file_does_not_count_twice(run, refuses, files, tmp_path):
 
 
 def test_intrinsics_are_one_of_three_choices(refuses, files, tmp_path):
-    command = ("calibrate", "ur5", files / "corners.csv", *cameras(files), "--intrinsics", "loose")
+    command = ("calibrate", "ur5", files / "corners.csv", *cameras(files), "--set", "intrinsics=loose")
     assert "fixed, free, prior" in refuses(*command, "--out", tmp_path / "arm", error=IdentificationError)
     assert not (tmp_path / "arm").exists()
 
 
 def test_options_of_cameras_are_refused_without_one(run, files, tmp_path):
-    command = ("calibrate", "ur5", files / "corners.csv", "--fixed-camera", "--repeatability-mm", 0.1)
+    command = ("calibrate", "ur5", files / "corners.csv", "--fixed-camera", "--set", "repeatability_mm=0.1")
     result = run(*command, "--out", tmp_path / "arm")
     assert result.exit_code == 2
-    for option in ("--fixed-camera", "--repeatability-mm", "--camera", "--board"):
+    for option in ("--fixed-camera", "--set repeatability_mm", "--camera", "--board"):
         assert option in result.stderr
 
 

@@ -67,8 +67,8 @@ def calibrated(run, data, tmp_path_factory):
         "geometric",
         "--folds",
         3,
-        "--class",
-        "hobby",
+        "--set",
+        "class=hobby",
         "--json",
     )
     assert result.exit_code == 0, result.output
@@ -114,7 +114,9 @@ def test_the_card_says_everything(calibrated):
     folder, printed = calibrated
     card = (folder / "README.md").read_text()
     assert card.startswith("# arm\n\nGeometric calibration of robot kiro4 (")
-    assert "`pisigma calibrate kiro4 poses.csv --out arm --model geometric --folds 3 --class hobby`" in card
+    assert (
+        "`pisigma calibrate kiro4 poses.csv --out arm --model geometric --folds 3 --set class=hobby`" in card
+    )
     assert "60 rows of `poses.csv`" in card
     assert "3-fold cross-validation, 3 repeats: each of 60 rows" in card
     assert f"{printed['cross_validation']['geometric']['rms_mm']:.4f}" in card
@@ -165,7 +167,7 @@ def test_a_wrong_scale_of_the_sensor_is_a_warning_where_it_matters(capsys, calib
 @pytest.mark.parametrize("split", ["joints", "time"])
 def test_a_share_is_held_out_instead(run, data, tmp_path, split):
     command = ("calibrate", "kiro4", data, "--out", tmp_path / "arm", "--model", "geometric")
-    arguments = (*command, "--hold-out", 0.25, "--split", split)
+    arguments = (*command, "--set", "hold_out=0.25", "--split", split)
     validation = json.loads(run(*arguments, "--json").stdout)["cross_validation"]
     assert (validation["folds"], validation["rows"]) == (1, 15)
     assert "15 rows" in (tmp_path / "arm" / "README.md").read_text()
@@ -262,7 +264,7 @@ def test_several_targets_and_frames(run, refuses, targets, tmp_path):
     printed = json.loads(
         run(
             *("calibrate", "kiro4", path, "--out", tmp_path / "arm", "--model", "geometric"),
-            *("--repeats", 1, "--json"),
+            *("--set", "repeats=1", "--json"),
         ).stdout
     )
     assert printed["cross_validation"]["geometric"]["rms_mm"] < 0.1
@@ -303,14 +305,14 @@ def test_inverse_calibration_wants_one_frame_and_target(refuses, repository, tar
     [
         (("--split", "tim"), MeasurementError, "tim"),
         (("--folds", "1"), MeasurementError, 1),
-        (("--hold-out", "2"), MeasurementError, 2.0),
-        (("--hold-out", "0.2", "--repeats", "2"), MeasurementError, 2),
-        (("--hold-out", "0.2", "--folds", "5"), MeasurementError, 0.2),
-        (("--split", "time", "--repeats", "2"), MeasurementError, 2),
-        (("--prior-mm", "0"), IdentificationError, (0.0, 0.001)),
-        (("--gravity", "0,1"), IdentificationError, "0,1"),
-        (("--gravity", "0,0,-1"), IdentificationError, (0.0, 0.0, -1.0)),
-        (("--new-frame-at", 500), MeasurementError, 500),
+        (("--set", "hold_out=2"), MeasurementError, 2.0),
+        (("--set", "hold_out=0.2", "--set", "repeats=2"), MeasurementError, 2),
+        (("--set", "hold_out=0.2", "--folds", "5"), MeasurementError, 0.2),
+        (("--split", "time", "--set", "repeats=2"), MeasurementError, 2),
+        (("--set", "prior_mm=0"), IdentificationError, (0.0, 0.001)),
+        (("--set", "gravity=0,1"), IdentificationError, "0,1"),
+        (("--set", "gravity=0,0,-1"), IdentificationError, (0.0, 0.0, -1.0)),
+        (("--set", "new_frame_at=500"), MeasurementError, 500),
     ],
 )
 def test_options_at_fault(refuses, data, tmp_path, arguments, error, value):
@@ -321,17 +323,17 @@ def test_options_at_fault(refuses, data, tmp_path, arguments, error, value):
 
 def test_parameters_and_priors_at_fault(refuses, data, tmp_path):
     command = ("calibrate", "kiro4", data, "--out", tmp_path / "arm", "--model", "geometric")
-    assert "'a_9'" in refuses(*command, "--free", "a_9", error=IdentificationError)
-    assert "nan mm" in refuses(*command, "--prior-mm", "nan", error=IdentificationError)
+    assert "'a_9'" in refuses(*command, "--set", "free=a_9", error=IdentificationError)
+    assert "nan mm" in refuses(*command, "--set", "prior_mm=nan", error=IdentificationError)
     assert not (tmp_path / "arm").exists()
 
 
 def test_a_new_frame_at_a_line(run, data, tmp_path):
     command = ("calibrate", "kiro4", data, "--out", tmp_path / "arm", "--model", "geometric", "--folds", 0)
-    result = run(*command, "--new-frame-at", 20, "--new-frame-at", 40)
+    result = run(*command, "--set", "new_frame_at=20", "--set", "new_frame_at=40")
     assert result.exit_code == 0, result.output
     card = (tmp_path / "arm" / "README.md").read_text()
-    assert "--folds 0 --new-frame-at 20 --new-frame-at 40`" in card
+    assert "--folds 0 --set new_frame_at=20 --set new_frame_at=40`" in card
     assert "base_from line 40_x" in card
 
 

@@ -133,7 +133,15 @@ def test_fewer_training_rows(run, refuses, data, tmp_path):
     command = ("calibrate", "rb5", data, "--out")
     few, many = (
         json.loads(
-            run(*command, tmp_path / str(rows), "--hold-out", 0.3, "--train-rows", rows, "--json").stdout
+            run(
+                *command,
+                tmp_path / str(rows),
+                "--set",
+                "hold_out=0.3",
+                "--set",
+                f"train_rows={rows}",
+                "--json",
+            ).stdout
         )
         for rows in (50, 130)
     )
@@ -141,10 +149,10 @@ def test_fewer_training_rows(run, refuses, data, tmp_path):
     assert few["cross_validation"]["rows"] == many["cross_validation"]["rows"] == 60
     errors = [printed["cross_validation"]["hybrid"]["rms_mm"] for printed in (few, many)]
     assert errors[1] < errors[0] < 1.05 * few["cross_validation"]["geometric"]["rms_mm"]
-    assert "--train-rows 50" in (tmp_path / "50" / "README.md").read_text()
+    assert "--set train_rows=50" in (tmp_path / "50" / "README.md").read_text()
     assert "50 rows of" in (tmp_path / "50" / "README.md").read_text()
     for count in (150, 0):
-        words = (*command, tmp_path / "arm", "--folds", 3, "--train-rows", count)
+        words = (*command, tmp_path / "arm", "--folds", 3, "--set", f"train_rows={count}")
         refuses(*words, error=MeasurementError, file="rows.csv", value=count)
     assert not (tmp_path / "arm").exists()
 
@@ -204,7 +212,7 @@ def test_rows_of_the_test_set_are_judged_with_all_three(run, rows, tmp_path):
 def test_balls_in_sockets_of_a_real_panda(run, shared_data, tmp_path):
     panda = shared_data / "panda_sockets" / "panda_3.csv"
     command = ("calibrate", "panda", panda, "--out", tmp_path / "arm", "--split", "placement", "--folds", 2)
-    result = run(*command, "--socket-distance", "*/0,*/1,50", "--json")
+    result = run(*command, "--set", "socket_distance=*/0,*/1,50", "--json")
     assert result.exit_code == 0, result.output
     figures = json.loads(result.stdout)["cross_validation"]
     assert (figures["folds"], figures["rows"], figures["sockets_held_out"]) == (2, 387, 12)
@@ -214,7 +222,7 @@ def test_balls_in_sockets_of_a_real_panda(run, shared_data, tmp_path):
 
 def test_a_real_ur5(run, shared_data, tmp_path):
     command = ("calibrate", "ur5", shared_data / "ur5" / "grid.csv", "--out", tmp_path / "arm")
-    result = run(*command, "--hold-out", 0.3, "--train-rows", 200, "--json")
+    result = run(*command, "--set", "hold_out=0.3", "--set", "train_rows=200", "--json")
     assert result.exit_code == 0, result.output
     figures = json.loads(result.stdout)["cross_validation"]
     assert figures["rows"] == 300

@@ -43,7 +43,7 @@ def test_touches_on_jigs(run, touches, tmp_path):
 
 def test_placements_of_a_real_panda_held_out_once(run, shared_data, tmp_path):
     data = shared_data / "panda_sockets" / "panda_3.csv"
-    command = ("calibrate", "panda", data, "--split", "placement", "--socket-distance", "*/0,*/1,50")
+    command = ("calibrate", "panda", data, "--split", "placement", "--set", "socket_distance=*/0,*/1,50")
     result = run(*command, "--model", "geometric", "--out", tmp_path / "arm", "--json")
     assert result.exit_code == 0, result.output
     figures = json.loads(result.stdout)["cross_validation"]
@@ -108,8 +108,8 @@ def test_unknown_sockets_are_refused_in_one_line(run, shared_data, tmp_path):
         tmp_path / "arm",
         "--model",
         "geometric",
-        "--socket-distance",
-        "a,b,50",
+        "--set",
+        "socket_distance=a,b,50",
     )
     assert result.exit_code == 2
     assert isinstance(problem_of(result), IdentificationError)
@@ -131,13 +131,13 @@ def test_every_stated_distance_of_sockets_counts(run, shared_data, tmp_path):
         tmp_path / "arm",
         "--json",
     )
-    known = ("--socket-distance", "backcenter/0,backcenter/1,50")
-    result = run(*command, *known, "--socket-distance", "backleft/0,backleft/1,50.1")
+    known = ("--set", "socket_distance=backcenter/0,backcenter/1,50")
+    result = run(*command, *known, "--set", "socket_distance=backleft/0,backleft/1,50.1")
     assert result.exit_code in (0, 3), result.output
     command_of = json.loads(result.stdout)["command"]
     assert "('backcenter/0', 'backcenter/1'): 0.05" in command_of
     assert "('backleft/0', 'backleft/1'): 0.0501" in command_of
-    assert run(*command, *known, "--socket-distance", "backcenter/1,backcenter/0,51").exit_code == 2
+    assert run(*command, *known, "--set", "socket_distance=backcenter/1,backcenter/0,51").exit_code == 2
     assert run(*command, *known, *known).exit_code == 2
 
 
@@ -153,7 +153,7 @@ def test_plates_held_out_of_a_real_arm_are_judged_by_every_stated_distance(run, 
     ]
     command = ["calibrate", folder / "fr3.urdf", folder / "fr3_sockets.csv", "--tip", "ball_link", "--json"]
     command += ["--model", "geometric", "--out", tmp_path / "arm"]
-    command += [word for one in stated for word in ("--socket-distance", one)]
+    command += [word for one in stated for word in ("--set", f"socket_distance={one}")]
     for split in ((), ("--split", "placement")):
         result = run(*command, *split, "--overwrite")
         assert result.exit_code == 0, result.output
@@ -184,9 +184,9 @@ def test_a_plate_of_a_real_arm_is_evaluated_and_verified_by_a_calibration_on_the
         "--model",
         "geometric",
     ]
-    command += [word for one in stated for word in ("--socket-distance", one)]
+    command += [word for one in stated for word in ("--set", f"socket_distance={one}")]
     assert run(*command, "--folds", "0", "--out", tmp_path / "arm").exit_code == 0
-    third = ("--socket-distance", "C/0,C/1,39.93", "--socket-distance", "C/1,C/2,39.96", "--json")
+    third = ("--set", "socket_distance=C/0,C/1,39.93", "--set", "socket_distance=C/1,C/2,39.96", "--json")
     result = run("evaluate", tmp_path / "arm", tmp_path / "third.csv", *third)
     assert result.exit_code == 0, result.output
     found = json.loads(result.stdout)
@@ -197,6 +197,6 @@ def test_a_plate_of_a_real_arm_is_evaluated_and_verified_by_a_calibration_on_the
     result = run("verify", tmp_path / "arm", tmp_path / "third.csv", *third)
     assert result.exit_code == 0, result.output
     assert json.loads(result.stdout)["verdict"] == "better"
-    wrong = ("--socket-distance", "C/0,C/1,45")
+    wrong = ("--set", "socket_distance=C/0,C/1,45")
     assert run("evaluate", tmp_path / "arm", tmp_path / "third.csv", *wrong).exit_code == 3
     assert run("verify", tmp_path / "arm", tmp_path / "third.csv", *wrong).exit_code == 3

@@ -82,7 +82,7 @@ def used(run, tmp_path_factory):
         return result
 
     step("new", "new", "ur10", "--out", cell, "--limit-mm", 0.5)
-    step("plan", "plan", cell, "--count", 12, "--check", 2, "--candidates", 200)
+    step("plan", "plan", cell, "--count", 12, "--check", 2, "--set", "candidates=200")
     step("import", "import", rows_file(folder, day(60), 60, 1), "--cell", cell)
     step("calibrate", "calibrate", cell, "--folds", 0)
     step("import 2", "import", rows_file(folder, "later", 12, 2), "--cell", cell, "--date", day(30))
@@ -137,7 +137,7 @@ def test_an_option_wins_over_the_file_and_says_so(run, used):
     text = path.read_text()
     path.write_text(text.replace("  # count: 40", "  count: 30"))
     try:
-        result = run("plan", cell, "--count", 5, "--check", 0, "--candidates", 100, "--json")
+        result = run("plan", cell, "--count", 5, "--check", 0, "--set", "candidates=100", "--json")
         assert json.loads(result.stdout)["poses"] == 5
         assert "--count" in result.stderr
     finally:
@@ -184,7 +184,7 @@ def test_a_cell_is_evaluated_compared_and_measured(run, used, tmp_path):
     plan = max((cell / "plans").glob("*.csv"), key=lambda path: path.stat().st_mtime)
     measured(4, 5).write_csv(tmp_path / "rows.csv", ROBOT)
     of_plan, of_cell = (
-        run("measure", one, "--rows", tmp_path / "rows.csv", "--no-replan", "--once", "--json")
+        run("measure", one, "--rows", tmp_path / "rows.csv", "--set", "replan=false", "--once", "--json")
         for one in (plan, cell)
     )
     assert of_cell.exit_code == of_plan.exit_code

@@ -36,7 +36,7 @@ def parents(tmp_path_factory):
 def distilled(run, parents):
     """What the command printed, and the folder it wrote."""
     out = parents / "small"
-    result = run("distill", parents / "geometric", "--out", out, *SMALL, "--seed", 3, "--json")
+    result = run("distill", parents / "geometric", "--out", out, *SMALL, "--set", "seed=3", "--json")
     assert result.exit_code == 0, result.output
     return json.loads(result.stdout), out
 
@@ -61,7 +61,7 @@ def test_the_report_says_what_was_lost(distilled):
     assert report["poses"]["held_out"] == 80
     assert [size["orders"] for size in report["sizes"]] == [[1, 2]]
     card = (out / "README.md").read_text()
-    assert "`pisigma distill geometric --out small --poses 200 --seed 3 --orders 1,2`" in card
+    assert "`pisigma distill geometric --out small --poses 200 --set seed=3 --orders 1,2`" in card
     assert report["parent"]["sha256"] in card
     for sentence in report["limitations"]:
         assert sentence in card
@@ -97,7 +97,7 @@ def test_it_can_be_exported(run, distilled, tmp_path):
         (("--orders", "0"), RecipeError, {"option": "--orders", "value": "0"}),
         (("--harmonics", 4), RecipeError, {"option": "--harmonics", "value": None}),
         (("--orders", "1", "--harmonics", 0), RecipeError, {"option": "--harmonics", "value": 0}),
-        (("--seed", -1), RecipeError, {"value": -1}),
+        (("--set", "seed=-1"), RecipeError, {"value": -1}),
         (("--poses", 5), IdentificationError, {"value": 5}),
         (("--region", 1, 0, 0, 1, 0, 1), PoseError, {"option": "--region", "value": "1 0 0 1 0 1"}),
         (("--region", 0, "nan", 0, 1, 0, 1), PoseError, {"option": "--region", "value": "0 nan 0 1 0 1"}),

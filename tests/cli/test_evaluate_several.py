@@ -123,7 +123,7 @@ def test_equal_arguments_give_equal_figures_and_the_seed_gives_others(run, folde
         return json.loads(result.stdout)["models"][1]["intervals"]
 
     assert intervals() == intervals()
-    assert intervals("--seed", "1") != intervals()
+    assert intervals("--set", "seed=1") != intervals()
 
 
 def test_a_single_model_stands_beside_nominal(run, folder):

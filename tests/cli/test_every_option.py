@@ -1,4 +1,4 @@
-"""Every option of the command line is in a call of `tests/gate/options.txt`, with those that pages use together."""
+"""Every option and key of `--set` is in a call of `tests/gate/options.txt`, with those that pages use together."""
 
 import itertools
 import os
@@ -44,7 +44,7 @@ COMMANDS = dict(commands(get_command(app)))
 
 
 def stated(words: tuple[str, ...]) -> tuple[str, frozenset[str]]:
-    """A call's command, and the options that it states, as the command line itself reads it."""
+    """A call's command, and the options and keys that it states, as the command line itself reads it."""
     name = next(name for name in (" ".join(words[:2]), words[0]) if name in COMMANDS)
     context: Context = COMMANDS[name].make_context(
         name, list(words[len(name.split()) :]), resilient_parsing=False
@@ -55,6 +55,8 @@ def stated(words: tuple[str, ...]) -> tuple[str, frozenset[str]]:
         if parameter.param_type_name == "option" and given:
             off = parameter.secondary_opts and context.params.get(str(parameter.name)) is False
             found.add((parameter.secondary_opts if off else parameter.opts)[-1].replace("-y", "--yes"))
+    keys = {one.partition("=")[0] for one in context.params.get("assignments") or ()}
+    found |= {one.spelling for key, one in COMMANDS[name].keys.items() if key in keys}
     return name, frozenset(found)
 
 
@@ -70,6 +72,7 @@ def options() -> Iterator[tuple[str, str]]:
             if parameter.param_type_name == "option":
                 for option in (parameter.opts[-1], *parameter.secondary_opts):
                     yield name, option.replace("-y", "--yes") if option == "-y" else option
+        yield from ((name, one.spelling) for one in command.keys.values())
 
 
 def documented() -> Iterable[tuple[str, tuple[str, ...]]]:

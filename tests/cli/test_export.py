@@ -80,7 +80,7 @@ def test_urdf_in_calibrated_and_out_again(run, tmp_path):
     rows = Measurements(q=q, position=T[:, :3, 3], rotation=T[:, :3, :3])
     rows.write_csv(tmp_path / "data.csv", described)
     command = ("calibrate", tmp_path / "nominal.urdf", tmp_path / "data.csv", "--out", tmp_path / "model")
-    assert run(*command, "--folds", "0", "--prior-mm", "0", "--prior-mrad", "0").exit_code == 0
+    assert run(*command, "--folds", "0", "--set", "prior_mm=0", "--set", "prior_mrad=0").exit_code == 0
     assert load_model(tmp_path / "model").robot.joints == described.joints
     out, like = tmp_path / "calibrated.urdf", ("--like", tmp_path / "nominal.urdf", "--tip", "tool0")
     export = ("export", tmp_path / "model", "--format", "urdf", "--out", out)

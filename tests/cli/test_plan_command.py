@@ -8,7 +8,7 @@ from testing.screens import assert_screen
 
 from pisigma.files.errors import OutputError, PlanningError
 
-SMALL = ("--count", "8", "--check", "2", "--candidates", "40")
+SMALL = ("--count", "8", "--check", "2", "--set", "candidates=40")
 
 
 @pytest.fixture(scope="module")
@@ -48,7 +48,7 @@ def test_people_read_a_table_and_what_stays_uncertain(run, folder):
 
 
 def test_poses_of_a_file_keep_the_number_of_their_row(run, folder, tmp_path):
-    arguments = ("--candidates-from", folder / "poses.csv", "--count", "3", "--check", "1")
+    arguments = ("--set", f"candidates_from={folder / 'poses.csv'}", "--count", "3", "--check", "1")
     result = run("plan", "fanuc_r2000", *arguments, "--out", tmp_path / "some.csv")
     assert result.exit_code == 0, result.output
     _, *rows = (folder / "poses.csv").read_text().splitlines()
@@ -61,14 +61,14 @@ def test_poses_of_a_file_keep_the_number_of_their_row(run, folder, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "fields"),
     [
-        (("--box", "1,2,3"), {"option": "--box", "value": "1,2,3"}),
-        (("--criterion", "A"), {"option": "criterion", "value": "A"}),
+        (("--set", "box=1,2,3"), {"option": "box", "value": "1,2,3"}),
+        (("--set", "criterion=A"), {"option": "criterion", "value": "A"}),
         (("--sensor", "distance"), {"option": "--cell"}),
         (("--program", "poses.txt"), {}),
         (("--program", "class-1.src"), {}),
         (("--camera", "wrist.yaml"), {}),
         (("--cell", "missing.yaml"), {"file": "missing.yaml"}),
-        (("--box", "5000,5000,5000,6000,6000,6000"), {"value": 0}),
+        (("--set", "box=5000,5000,5000,6000,6000,6000"), {"value": 0}),
     ],
 )
 def test_invalid_options_are_refused(refuses, tmp_path, monkeypatch, arguments, fields):
@@ -79,9 +79,9 @@ def test_invalid_options_are_refused(refuses, tmp_path, monkeypatch, arguments, 
 
 
 def test_options_of_cameras_are_refused_without_one(run, tmp_path):
-    result = run("plan", "fanuc_r2000", *SMALL, "--sigma-px", "0.2", "--out", tmp_path / "poses.csv")
+    result = run("plan", "fanuc_r2000", *SMALL, "--set", "sigma_px=0.2", "--out", tmp_path / "poses.csv")
     assert result.exit_code == 2
-    assert all(option in result.stderr for option in ("--sigma-px", "--camera", "--board"))
+    assert all(option in result.stderr for option in ("--set sigma_px", "--camera", "--board"))
     assert not list(tmp_path.iterdir())
 
 
@@ -91,8 +91,8 @@ def test_nothing_is_written_over_what_is_read(refuses, folder):
         "plan",
         "fanuc_r2000",
         *SMALL,
-        "--candidates-from",
-        poses,
+        "--set",
+        f"candidates_from={poses}",
         "--out",
         poses,
         error=OutputError,

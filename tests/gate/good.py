@@ -26,7 +26,7 @@ MEASURED = (
     ("ur10", "ur10/series_b.csv", (), 30),
     ("ur5", "ur5/grid.csv", (), 30),
     ("fanuc_r2000", "fanuc_r2000/positions.csv", (), 0),
-    ("panda", "panda_sockets/panda_3.csv", ("--socket-distance", "*/0,*/1,50"), 0),
+    ("panda", "panda_sockets/panda_3.csv", ("--set", "socket_distance=*/0,*/1,50"), 0),
 )
 """Robot, file, options, and number of random subsets of rows; 0 for the whole file."""
 SUBSET_ROWS = (30, 40, 60, 100)

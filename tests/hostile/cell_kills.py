@@ -60,7 +60,7 @@ class KilledCell:
         elif name == "event":
             words += ("firmware",)
         elif name == "plan":
-            words += ("--count", "5", "--check", "0", "--candidates", "100")
+            words += ("--count", "5", "--check", "0", "--set", "candidates=100")
         self._before, self._entries = self.files(), self.entries()
         return start(words, self.folder)
 

@@ -23,7 +23,7 @@ _FILES = (
 )
 _OPTIONS = (
     (), (), (), ("--unit", "mm,deg"), ("--unit", "m,rad"), ("--rotation", "staubli"), ("--rotation", "none"),
-    ("--decimal", "comma"), ("--join", "point"), ("--join", "time", "--within", "0.2s"), ("--join", "order"),
+    ("--set", "decimal=comma"), ("--join", "point"), ("--join", "time", "--within", "0.2s"), ("--join", "order"),
     ("--map", "X=x_mm"), ("--map", "1=q1_deg,2=-"), ("--map", "=,=,="), ("--map", "A1=q1_\x1b"), ("--json",),
     ("--save-map", "map.yaml"), ("--within", "1e9s"), ("--unit", "°,µm"),
 )  # fmt: skip

@@ -24,7 +24,7 @@ def wrong_model(rng: Rng, clean: Clean, folder: Path) -> Case:
     change(rng, file, one_of(rng, models))
     commands = (
         ("ik", "model", "--pose", "300", "200", "400", "0", "0", "0"),
-        ("evaluate", "model", str(clean.models[source]), "--resamples", "20"),
+        ("evaluate", "model", str(clean.models[source]), "--set", "resamples=20"),
         ("verify", "model", str(clean.models[source])),
         ("export", "model", "--format", "offsets", "--poses", str(clean.poses), "--out", "offsets.csv"),
         ("export", "model", "--format", "dh", "--out", "dh.csv"),

@@ -16,12 +16,12 @@ _WORDS = tuple(text for text in (*NUMBERS, *TEXTS) if "\x00" not in text)
 _COUNTS = ("0", "-1", "1", "1e9", "1000000000", "9" * 30, "2.5", "x", "", "nan")
 _NUMBERS = ("0", "-1", "nan", "inf", "1e300", "1e-300", "x", "", "1,5", "-0")
 _CALIBRATE = {
-    "--folds": _COUNTS, "--hold-out": (*_NUMBERS, "0.5", "1", "0.999"),
-    "--split": (*_WORDS, "time", "space", "placement"), "--repeats": _COUNTS,
-    "--seed": (*_COUNTS, "-9223372036854775809"), "--train-rows": (*_COUNTS, "5"), "--prior-mm": _NUMBERS,
-    "--prior-mrad": _NUMBERS, "--free": (*_WORDS, "a_2,a_2", "a_99", ",", "theta_1"), "--model": _WORDS,
-    "--base": _WORDS, "--socket-distance": (*_WORDS, "a,b", "a,b,-1", "*,*,50", "a,b,nan", "*/0,*/1,1e300", "(,),1"),
-    "--tip": _WORDS,
+    "--folds": _COUNTS, "--set=hold_out": (*_NUMBERS, "0.5", "1", "0.999"),
+    "--split": (*_WORDS, "time", "space", "placement"), "--set=repeats": _COUNTS,
+    "--set=seed": (*_COUNTS, "-9223372036854775809"), "--set=train_rows": (*_COUNTS, "5"), "--set=prior_mm": _NUMBERS,
+    "--set=prior_mrad": _NUMBERS, "--set=free": (*_WORDS, "a_2,a_2", "a_99", ",", "theta_1"), "--model": _WORDS,
+    "--set=socket_distance": (*_WORDS, "a,b", "a,b,-1", "*,*,50", "a,b,nan", "*/0,*/1,1e300", "(,),1"),
+    "--base": _WORDS, "--tip": _WORDS, "--set": (*_WORDS, "fold=3", "=", "seed=1", "folds=0"),
 }  # fmt: skip
 
 
@@ -53,10 +53,10 @@ def wrong_calibrate(rng: Rng, clean: Clean, folder: Path) -> Case:
             for word in calibrate("ur5", "rows.csv")
             if option != "--folds" or word not in ("--folds", "0")
         )
-        if option in ("--hold-out", "--repeats"):
+        if option in ("--set=hold_out", "--set=repeats"):
             arguments = ("calibrate", "ur5", "rows.csv", "--out", "out", "--model", "geometric")
-        elif option == "--seed":
-            arguments = (*arguments, "--folds", "2", "--repeats", "1")
+        elif option == "--set=seed":
+            arguments = (*arguments, "--folds", "2", "--set", "repeats=1")
         arguments = (*arguments, f"{option}={value}")
     return Case(f"{option} {arguments[-1][:30]!r}", arguments)
 
@@ -107,21 +107,29 @@ def wrong_judging(rng: Rng, clean: Clean, folder: Path) -> Case:
     path = one_of(rng, _INPUTS)
     others = [name for name in _OUTPUTS if name != "rows.csv"]  # which an export may replace
     commands = (
-        ("evaluate", str(model), "rows.csv", "--resamples=20", f"--max-mean-mm={one_of(rng, _NUMBERS)}"),
         (
             "evaluate",
             str(model),
             "rows.csv",
-            f"--resamples={one_of(rng, ('0', '1', '-1', '2', '10000000000', 'x'))}",
+            "--set",
+            "resamples=20",
+            f"--max-mean-mm={one_of(rng, _NUMBERS)}",
         ),
-        ("evaluate", str(model), "rows.csv", f"--seed={one_of(rng, _COUNTS)}", "--resamples=2"),
+        (
+            "evaluate",
+            str(model),
+            "rows.csv",
+            "--set",
+            f"resamples={one_of(rng, ('0', '1', '-1', '2', '10000000000', 'x'))}",
+        ),
+        ("evaluate", str(model), "rows.csv", "--set", f"seed={one_of(rng, _COUNTS)}", "--set", "resamples=2"),
         (
             "evaluate",
             str(model),
             *one_of(rng, (("nominal",), (str(model), "rows.csv"), (path, "rows.csv"), (path,))),
         ),
         ("evaluate", "nominal", "rows.csv"),
-        ("evaluate", str(model), "geometric", "rows.csv", "--resamples=20"),
+        ("evaluate", str(model), "geometric", "rows.csv", "--set", "resamples=20"),
         ("verify", str(model), path),
         ("verify", path, "rows.csv"),
         ("export", str(model), "--format", one_of(rng, _WORDS), "--out", "x.csv"),

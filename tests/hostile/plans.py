@@ -14,8 +14,8 @@ from pisigma.planning.plan_file import read_plan
 _VALUES = {
     "--count": ("0", "-1", "3", "19", "21", "100000", "9" * 30, "x"),
     "--check": ("0", "-1", "18", "100000", "x"),
-    "--candidates": ("0", "1", "-5", "30", "1e9", "x"),
-    "--box": (
+    "--set=candidates": ("0", "1", "-5", "30", "1e9", "x"),
+    "--set=box": (
         "1,2,3",
         "0,0,0,1,1,1",
         "-9e9,-9e9,-9e9,9e9,9e9,9e9",
@@ -24,16 +24,16 @@ _VALUES = {
         "a,b,c,d,e,f",
     ),
     "--sensor": ("pose", "distance", "camera", ""),
-    "--sigma-mm": ("0", "-1", "nan", "1e-300", "1e300", "0.5"),
-    "--criterion": ("I", "D", "E", ""),
+    "--set=sigma_mm": ("0", "-1", "nan", "1e-300", "1e300", "0.5"),
+    "--set=criterion": ("I", "D", "E", ""),
     "--limit-mm": ("0", "nan", "1e-300", "1e300", "inf"),
-    "--speed-deg-s": ("0", "-3", "inf", "nan", "1e-300"),
-    "--settling-s": ("-1", "nan", "inf", "0"),
+    "--set=speed_deg_s": ("0", "-3", "inf", "nan", "1e-300"),
+    "--set=settling_s": ("-1", "nan", "inf", "0"),
     "--program": ("rows.csv", "x.src", "class.src", "x" * 300 + ".ls", ".script", "no/x.mod", "poses.csv"),
     "--task": ("rows.csv", "missing.csv", "cell.yaml", "/dev/zero", ""),
     "--measured": ("rows.csv", "missing.csv", "cell.yaml"),
-    "--candidates-from": ("rows.csv", "missing.csv", "cell.yaml", "poses.csv"),
-    "--seed": ("-1", "9" * 30, "0.5"),
+    "--set=candidates_from": ("rows.csv", "missing.csv", "cell.yaml", "poses.csv"),
+    "--set=seed": ("-1", "9" * 30, "0.5"),
     "--out": ("", ".", "cell.yaml", "no/poses.csv", "poses.txt", "/dev/full", "a" * 400 + ".csv"),
 }
 
@@ -50,7 +50,7 @@ def wrong_plan(rng: Rng, clean: Clean, folder: Path) -> Case:
     stated = {
         "--count": "2",
         "--check": "1",
-        "--candidates": "20",
+        "--set=candidates": "20",
         "--out": "poses.csv",
         "--cell": "cell.yaml",
     }

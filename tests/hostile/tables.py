@@ -254,7 +254,7 @@ def damaged_measurements(rng: Rng, clean: Clean, folder: Path) -> Case:
         explained: one_of(
             rng,
             (
-                ("evaluate", str(model), "rows.csv", "--resamples", "20"),
+                ("evaluate", str(model), "rows.csv", "--set", "resamples=20"),
                 ("verify", str(model), "rows.csv", "--json"),
             ),
         ),
@@ -281,7 +281,15 @@ def wrong_measurements(rng: Rng, clean: Clean, folder: Path) -> Case:
 
 def _option(rng: Rng) -> tuple[str, ...]:
     return one_of(
-        rng, ((), (), (), ("--json",), ("--free", "joint_offsets"), ("--prior-mm", "0", "--prior-mrad", "0"))
+        rng,
+        (
+            (),
+            (),
+            (),
+            ("--json",),
+            ("--set", "free=joint_offsets"),
+            ("--set", "prior_mm=0", "--set", "prior_mrad=0"),
+        ),
     )
 
 

@@ -122,7 +122,7 @@ def test_known_distances_between_sockets():
 
 
 def test_a_pair_of_sockets_has_one_distance():
-    with refused(IdentificationError, option="--socket-distance", value="left/0,left/1,60"):
+    with refused(IdentificationError, option="socket_distance", value="left/0,left/1,60"):
         distances("left/0,left/1,50", "left/0,left/1,60")
 
 
@@ -130,7 +130,7 @@ def test_a_pair_of_sockets_has_one_distance():
     "stated", ["", "left/0,left/1", "left/0,left/1,far", "a,b,-1", "a,b,0", "a,b,inf", "a,b,1,2"]
 )
 def test_distances_in_another_form_are_refused(stated):
-    with refused(IdentificationError, option="--socket-distance", value=stated):
+    with refused(IdentificationError, option="socket_distance", value=stated):
         distances(stated)
 
 

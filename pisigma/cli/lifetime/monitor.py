@@ -11,7 +11,7 @@ from pisigma.cli.endings import NOT_ACCEPTED
 from pisigma.cli.output import print_json, print_lines
 from pisigma.cli.progress import progress_of
 from pisigma.cli.screen import print_screen
-from pisigma.cli.settings_options import StatedOptions, takes_settings
+from pisigma.cli.settings_options import StatedSettings, takes_settings
 from pisigma.reporting.result_text import sentences, table
 from pisigma.reporting.verdict import Verdict, counted, rounded, uncapitalised
 from pisigma.workflow.settings.monitoring import MonitorSettings
@@ -38,8 +38,7 @@ def monitor(
     model: ModelOrCell,
     *,
     sessions: Sessions = None,
-    settings: MonitorSettings,
-    stated: StatedOptions,
+    settings: StatedSettings[MonitorSettings],
     page: Page = None,
     verbose: Verbose = False,
     as_json: AsJson = False,
@@ -55,13 +54,14 @@ def monitor(
 
     if (cell := cell_at(model)) is not None:
         refuse_with_cell(SESSION=sessions)
-        return _monitor_cell(cell, stated, page, as_json, verbose)
+        return _monitor_cell(cell, settings, page, as_json, verbose)
     if not sessions:
         raise typer.BadParameter("expected SESSION..., or a cell instead of a model")
+    chosen = settings.build()
     if page is not None:
-        check_page(page, (model, *sessions, *(settings.cameras.files if settings.cameras else ())))
+        check_page(page, (model, *sessions, *(chosen.cameras.files if chosen.cameras else ())))
     with progress_of("monitor") as progress:
-        monitoring = workflow.monitor(model, sessions, settings, progress)
+        monitoring = workflow.monitor(model, sessions, chosen, progress)
         if page is not None:
             monitoring.save_page(page)
     _print(monitoring, page, as_json, verbose)
@@ -70,7 +70,7 @@ def monitor(
 
 
 def _monitor_cell(
-    cell: "Cell", stated: StatedOptions, page: Path | None, as_json: bool, verbose: bool
+    cell: "Cell", settings: StatedSettings[MonitorSettings], page: Path | None, as_json: bool, verbose: bool
 ) -> None:
     """Judge the sessions of a cell that its model in use was not made of."""
     from pisigma.files.output_file import check_page
@@ -78,7 +78,7 @@ def _monitor_cell(
     if page is not None:
         check_page(page, (cell.folder,))
     with progress_of("monitor") as progress:
-        monitoring = cell.monitor(progress, **report_overrides(cell, "monitor", stated))
+        monitoring = cell.monitor(progress, **report_overrides(cell, "monitor", settings))
         if page is not None:
             monitoring.save_page(page)
     _print(monitoring, page, as_json, verbose)

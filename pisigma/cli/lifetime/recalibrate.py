@@ -11,7 +11,7 @@ from pisigma.cli.cell import cell_at, next_lines, refuse_with_cell, report_overr
 from pisigma.cli.output import command_line, print_json, print_lines, saved
 from pisigma.cli.progress import progress_of
 from pisigma.cli.screen import print_screen
-from pisigma.cli.settings_options import StatedOptions, takes_settings
+from pisigma.cli.settings_options import StatedSettings, takes_settings
 from pisigma.files.errors import AcceptanceError
 from pisigma.reporting.result_text import sentences, table
 from pisigma.reporting.verdict import Verdict, counted, rounded, uncapitalised
@@ -41,8 +41,7 @@ def recalibrate(
     model: ModelOrCell,
     *,
     data: Data = None,
-    settings: RecalibrationSettings,
-    stated: StatedOptions,
+    settings: StatedSettings[RecalibrationSettings],
     out: Out = None,
     dry_run: DryRun = False,
     accept_implausible: AcceptImplausible = False,
@@ -59,15 +58,16 @@ def recalibrate(
 
     if (cell := cell_at(model)) is not None:
         refuse_with_cell(ROWS=data, __out=out, __dry_run=dry_run, __overwrite=overwrite)
-        return _recalibrate_cell(cell, stated, accept_implausible, as_json, verbose)
+        return _recalibrate_cell(cell, settings, accept_implausible, as_json, verbose)
     if not data:
         raise typer.BadParameter("expected ROWS..., or a cell instead of a model")
     if (out is None) is not dry_run:
         raise typer.BadParameter("expected either --out DIR or --dry-run", param_hint="'--out'")
+    chosen = settings.build()
     if out is not None:
-        seen_by = settings.cameras.files if settings.cameras else ()
+        seen_by = chosen.cameras.files if chosen.cameras else ()
         check_folder(out, overwrite, inputs=(model, *data, *seen_by))
-    recalibrate_into(context, model, data, settings, out, accept_implausible, overwrite, as_json, verbose)
+    recalibrate_into(context, model, data, chosen, out, accept_implausible, overwrite, as_json, verbose)
 
 
 def recalibrate_into(
@@ -115,12 +115,17 @@ def recalibrate_into(
 
 
 def _recalibrate_cell(
-    cell: "Cell", stated: StatedOptions, accept_implausible: bool, as_json: bool, verbose: bool
+    cell: "Cell",
+    settings: StatedSettings[RecalibrationSettings],
+    accept_implausible: bool,
+    as_json: bool,
+    verbose: bool,
 ) -> None:
     """Recalibrate the model in use of a cell with its newest session."""
-    report_overrides(cell, "recalibrate", stated)
     with progress_of("recalibration") as progress:
-        recalibration, entry = cell.recalibrate(None, progress, accept_implausible, **stated)
+        recalibration, entry = cell.recalibrate(
+            None, progress, accept_implausible, **report_overrides(cell, "recalibrate", settings)
+        )
     folder = None if entry is None else cell.model_folder(entry.name)
     _print(recalibration, folder, as_json, verbose)
     if entry is None:

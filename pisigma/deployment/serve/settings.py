@@ -40,4 +40,4 @@ class ServeSettings:
     zmq_port: Annotated[int | None, Option(min=0, max=LAST_PORT)] = None
     token: Annotated[str | None, Option("--token-file", kind=Path, read=token_in)] = None
     client_timeout: Annotated[float, HIDDEN] = CLIENT_TIMEOUT
-    polling: Annotated[float, Option("--poll-ms", unit="ms", min=0, max=100)] = POLL_DURATION
+    polling: Annotated[float, Option("--poll-ms", unit="ms", min=0, max=100, is_key=True)] = POLL_DURATION

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Annotated, Literal, get_args
 
 from pisigma.files.errors import IdentificationError, MeasurementError, check_choice
-from pisigma.files.setting import Option, texts
+from pisigma.files.setting import KEY, Option, texts
 
 IntrinsicsChoice = Literal["fixed", "prior", "free"]
 MAX_REPEATABILITY = 0.01, 0.105
@@ -22,8 +22,8 @@ class Repeatability:
         angle: standard deviation of the robot's orientation repeatability, per axis [rad], for images.
     """
 
-    length: Annotated[float, Option("--repeatability-mm", unit="mm")] = 2e-5
-    angle: Annotated[float, Option("--repeatability-deg", unit="deg")] = math.radians(0.01)
+    length: Annotated[float, Option("--repeatability-mm", unit="mm", is_key=True)] = 2e-5
+    angle: Annotated[float, Option("--repeatability-deg", unit="deg", is_key=True)] = math.radians(0.01)
 
     def __post_init__(self) -> None:
         """Check both standard deviations."""
@@ -59,7 +59,7 @@ class CameraFiles:
     boards: Annotated[tuple[str, ...], Option("--board", kind=list[Path], read=texts)]
     is_fixed: Annotated[bool, Option("--fixed-camera")] = False
     repeatability: Repeatability = field(default_factory=Repeatability)
-    intrinsics: IntrinsicsChoice = "prior"
+    intrinsics: Annotated[IntrinsicsChoice, KEY] = "prior"
 
     def __post_init__(self) -> None:
         """Refuse unknown choices of intrinsics, cameras without boards, and boards without cameras."""
@@ -82,9 +82,9 @@ class CameraFiles:
         words += [word for path in self.boards for word in ("--board", path)]
         usual, stated = Repeatability(), self.repeatability
         words += ["--fixed-camera"] if self.is_fixed else []
-        words += ["--intrinsics", self.intrinsics] if self.intrinsics != "prior" else []
+        words += ["--set", f"intrinsics={self.intrinsics}"] if self.intrinsics != "prior" else []
         if stated.length != usual.length:
-            words += ["--repeatability-mm", f"{stated.length * 1e3:g}"]
+            words += ["--set", f"repeatability_mm={stated.length * 1e3:g}"]
         if stated.angle != usual.angle:
-            words += ["--repeatability-deg", f"{math.degrees(stated.angle):g}"]
+            words += ["--set", f"repeatability_deg={math.degrees(stated.angle):g}"]
         return words

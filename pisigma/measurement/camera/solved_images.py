@@ -126,7 +126,7 @@ def solve_images(
         value=camera.name,
         at=Place(source),
         remedy="take images up to 40 deg oblique in which the board fills the whole frame, or keep the intrinsics "
-        "nearer to a calibration (--intrinsics prior)",
+        "nearer to a calibration (--set intrinsics=prior)",
     )
 
 

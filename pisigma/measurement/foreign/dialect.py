@@ -211,7 +211,7 @@ def _check_decimal(dialect: Dialect, rows: Sequence[tuple[int, list[str]]], sour
         f"'{cell}' may have decimals or a group of thousands",
         at=Place(source, number, k + 1),
         value=cell,
-        remedy="state --decimal point or --decimal comma",
+        remedy="state --set decimal=point or --set decimal=comma",
     )
 
 

@@ -77,12 +77,12 @@ def _sentence(motion: Motion, rows: Measurements) -> str:
         return (
             f"{rows.source}: the {what} moved slowly while the rows were measured, by up to {amount}; {errors}. Let "
             "the instrument warm up, fasten its stand and the tool, and measure again, or start new frames at several "
-            "lines (--new-frame-at)."
+            "lines (--set new_frame_at=LINE)."
         )
     row = int(motion.rows[motion.first])
     remedy = "name another target in them (column 'target')"
     if motion.moved == "frame":
-        remedy = f"give them another frame (--new-frame-at {rows.line[row] or 'LINE'})"
+        remedy = f"give them another frame (--set new_frame_at={rows.line[row] or 'LINE'})"
     return (
         f"{rows.place(row)}: the {what} moved before this row by {amount}; {errors}. Leave out this row and the later "
         f"ones, or {remedy}."

@@ -117,7 +117,7 @@ def new_setup(robot: Robot, measurements: Measurements) -> IdentificationError |
                 "the instrument or the tool was moved before this row: the rows before it fit the nominal robot "
                 f"'{robot.name}' to {length_text(fits[0])} and the others to {length_text(fits[1])}, but not together",
                 at=measurements.at(row),
-                remedy=f"give this row and the later ones another frame (--new-frame-at "
+                remedy=f"give this row and the later ones another frame (--set new_frame_at="
                 f"{measurements.line[row] or 'LINE'}) and, if the tool was changed, another target",
             )
     return None

@@ -156,7 +156,7 @@ def _no_positions(measurements: Measurements) -> MeasurementError:
         value=kinds or "none",
         at=Place(measurements.source),
         remedy="give x, y and z, use `pisigma evaluate` or `pisigma verify`, which accept such rows, or hold rows out "
-        "with `pisigma calibrate --hold-out`"
+        "with `pisigma calibrate --set hold_out=0.2`"
         if kinds
         else "give x, y and z",
     )

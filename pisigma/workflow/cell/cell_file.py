@@ -8,10 +8,11 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar, get_args
 
 import yaml
-from pydantic import Field, TypeAdapter, ValidationError
+from pydantic import Field
 
-from pisigma.files.errors import PisigmaError, Place, PlanningError, nearest_choice
-from pisigma.files.setting import build_settings, flat_settings
+from pisigma.files.errors import PisigmaError, Place, PlanningError
+from pisigma.files.setting import build_settings, by_key, flat_settings
+from pisigma.files.setting_values import checked_values
 from pisigma.files.yaml_file import Section, place_of_key, read_yaml
 from pisigma.lifetime.cell.layout import CELL_FILE
 from pisigma.planning.plan_settings import PlanSettings
@@ -134,7 +135,7 @@ class CellFile:
             if step not in ("plan", "import"):
                 read.settings(step)
             else:
-                list(_checked(STEPS[step], read.stated(step), read._place(step)))
+                list(checked_values(read.stated(step), by_key(STEPS[step]), read._place(step).place_of))
         return read
 
     @property
@@ -146,7 +147,7 @@ class CellFile:
     def stated(self, step: str) -> dict[str, Any]:
         """Return the values that the file states for a step, by its keys, including the shared keys that it uses."""
         section = dict(getattr(self.document, {"import": "import_"}.get(step, step)) or {})
-        known = {one.key for one in flat_settings(STEPS[step])}
+        known = by_key(STEPS[step])
         shared: dict[str, Any] = {}
         if (
             self.document.limit_mm is not None and step == "plan"
@@ -207,7 +208,9 @@ def settings_from(
     Raises:
         PisigmaError: a key is unknown, or a value has the wrong type or is not valid.
     """
-    values = dict(_checked(group, stated, places))
+    values = dict(
+        checked_values(stated, by_key(group), lambda key: None if key in outside else places.place_of(key))
+    )
     try:
         built = build_settings(group, dict(_with_paths(group, values, folder, outside)))
     except PisigmaError as problem:  # the class of the settings refuses a value
@@ -219,44 +222,15 @@ def settings_from(
     return built
 
 
-_TYPES = {bool: "true or false", int: "an integer", float: "a number", str: "a text", Path: "a path"}
-"""Names of the types of options in messages."""
-
-
-def _checked(group: type, stated: Mapping[str, Any], places: _Places) -> Iterator[tuple[str, Any]]:
-    """Yield keys and values, after converting every value to the type of its option."""
-    known = {one.key: one for one in flat_settings(group)}
-    for key, value in stated.items():
-        if key not in known:
-            raise PlanningError(
-                f"unknown key '{key}'", at=places.place_of(key), remedy=nearest_choice(key, known)
-            )
-        kind = known[key].kind
-        try:
-            yield key, TypeAdapter(kind).validate_python(_listed(value, kind))
-        except ValidationError:
-            raise PlanningError(
-                expected=_TYPES.get(kind, "a list"), value=value, at=places.place_of(key)
-            ) from None
-
-
-def _listed(value: Any, kind: Any) -> Any:
-    """Return a single value as a list if the option may be repeated, else a list of one value as this value."""
-    is_list, is_repeated = isinstance(value, list | tuple), getattr(kind, "__origin__", None) is list
-    if is_list and not is_repeated and len(value) == 1:
-        return value[0]
-    return [value] if is_repeated and not is_list else value
-
-
 def _with_paths(
     group: type, values: Mapping[str, Any], folder: Path, outside: Collection[str]
 ) -> Iterator[tuple[str, Any]]:
     """Yield keys and values, with the full paths of files inside the cell."""
-    kinds = {one.key: one.kind for one in flat_settings(group)}
+    known = by_key(group)
     for key, value in values.items():
-        if key not in outside and kinds[key] is Path:
+        if key not in outside and known[key].kind is Path:
             yield key, inside(folder, value)
-        elif key not in outside and get_args(kinds[key]) == (Path,):
+        elif key not in outside and get_args(known[key].kind) == (Path,):
             yield key, [inside(folder, one) for one in value]
         else:
             yield key, value

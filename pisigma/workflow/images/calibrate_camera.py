@@ -86,8 +86,8 @@ class CameraCalibration:
         if calibration.disagrees:
             warnings.append(
                 f"Images disagree on the camera by {calibration.disagreement:.2f} times the noise of corners: the "
-                "board is not flat, or the lens needs --k3. Standard deviations are enlarged by this factor, not for "
-                "errors that all images share; glue the board onto something flat."
+                "board is not flat, or the lens needs --set k3=true. Standard deviations are enlarged by this factor, "
+                "not for errors that all images share; glue the board onto something flat."
             )
         if len(calibration.tilts) < MIN_IMAGES:
             warnings.append(

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Annotated, Literal, get_args
 
 from pisigma.files.errors import IdentificationError, MeasurementError, check_choice
-from pisigma.files.setting import NAMES, Option, names
+from pisigma.files.setting import KEY, NAMES, Option, names
 from pisigma.measurement.camera.camera_files import CameraFiles
 
 if TYPE_CHECKING:
@@ -31,7 +31,7 @@ def direction(stated: str) -> tuple[float, ...]:
         numbers = ()
     if len(numbers) != 3:
         raise IdentificationError(
-            expected="three numbers X,Y,Z, such as 0,0,-1", value=stated, option="--gravity"
+            expected="three numbers X,Y,Z, such as 0,0,-1", value=stated, option="gravity"
         )
     return numbers
 
@@ -45,7 +45,7 @@ def socket_distances(stated: Iterable[str]) -> dict[tuple[str, str], float]:
             raise IdentificationError(
                 f"expected one distance between the sockets {' and '.join(sockets)}, got a second one, '{one}'",
                 value=one,
-                option="--socket-distance",
+                option="socket_distance",
                 remedy="remove one of them",
             )
         distances[sockets] = distance
@@ -62,14 +62,16 @@ def _socket_distance(stated: str) -> tuple[tuple[str, str], float]:
         raise IdentificationError(
             expected="A,B,MM with a distance > 0 mm, such as */0,*/1,50",
             value=stated,
-            option="--socket-distance",
+            option="socket_distance",
         )
     return (words[0], words[1]), distance / 1e3
 
 
 SocketDistances = Annotated[
     Mapping[tuple[str, str], float],
-    Option("--socket-distance", kind=list[str], read=socket_distances, unit="mm", metavar="A,B,MM"),
+    Option(
+        "--socket-distance", kind=list[str], read=socket_distances, unit="mm", metavar="A,B,MM", is_key=True
+    ),
 ]
 
 
@@ -110,22 +112,25 @@ class CalibrationSettings:
 
     model: ModelKind = "hybrid"
     folds: Annotated[int | None, Option(min=0)] = None
-    hold_out: float | None = None
+    hold_out: Annotated[float | None, KEY] = None
     split: "SplitBy" = "joints"
-    repeats: Annotated[int | None, Option(min=1)] = None
+    repeats: Annotated[int | None, Option(min=1, is_key=True)] = None
     jobs: int | None = None
-    seed: int = 0
-    train_rows: int | None = None
+    seed: Annotated[int, KEY] = 0
+    train_rows: Annotated[int | None, KEY] = None
     free: Annotated[
-        Literal["identifiable", "joint_offsets"] | tuple[str, ...], Option(kind=str, read=free_parameters)
+        Literal["identifiable", "joint_offsets"] | tuple[str, ...],
+        Option(kind=str, read=free_parameters, is_key=True),
     ] = "identifiable"
-    prior_length: Annotated[float, Option("--prior-mm", unit="mm")] = 1e-3
-    prior_angle: Annotated[float, Option("--prior-mrad", unit="mrad")] = 1e-3
-    robot_class: Annotated["ClassName | None", Option("--class", kind=str)] = None
-    robust: bool = True
+    prior_length: Annotated[float, Option("--prior-mm", unit="mm", is_key=True)] = 1e-3
+    prior_angle: Annotated[float, Option("--prior-mrad", unit="mrad", is_key=True)] = 1e-3
+    robot_class: Annotated["ClassName | None", Option("--class", kind=str, is_key=True)] = None
+    robust: Annotated[bool, KEY] = True
     features: Annotated[tuple[str, ...] | None, NAMES] = None
-    gravity: Annotated[tuple[float, float, float] | None, Option(kind=str, read=direction)] = None
-    new_frame_at: Annotated[tuple[int, ...], Option(metavar="LINE")] = ()
+    gravity: Annotated[tuple[float, float, float] | None, Option(kind=str, read=direction, is_key=True)] = (
+        None
+    )
+    new_frame_at: Annotated[tuple[int, ...], Option(metavar="LINE", is_key=True)] = ()
     socket_distances: SocketDistances = field(default_factory=dict)
     cameras: CameraFiles | None = None
 

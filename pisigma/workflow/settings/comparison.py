@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Annotated, get_args
 
 from pisigma.files.errors import IdentificationError, check_choice
-from pisigma.files.setting import HIDDEN, Option
+from pisigma.files.setting import HIDDEN, KEY, Option
 from pisigma.measurement.camera.camera_files import CameraFiles
 from pisigma.validation.resampling import Bootstrap
 
@@ -31,7 +31,7 @@ class ComparisonSettings:
     """
 
     frames: Annotated["FrameChoice", Option("--fixed-frames", kind=bool, read=_FRAMES.get)] = "fitted"
-    level: float = 0.01
+    level: Annotated[float, KEY] = 0.01
     bootstrap: Annotated[Bootstrap, HIDDEN] = field(default_factory=Bootstrap)
     cameras: CameraFiles | None = None
 

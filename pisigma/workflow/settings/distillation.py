@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated
 
 from pisigma.files.errors import RecipeError
-from pisigma.files.setting import HIDDEN
+from pisigma.files.setting import HIDDEN, KEY
 
 if TYPE_CHECKING:
     from pisigma.workflow.distilled_network import Size
@@ -29,10 +29,10 @@ class DistillationSettings:
     region: Annotated["Region | None", HIDDEN] = None
     poses: int = 5000
     size: Annotated["Size | None", HIDDEN] = None
-    seed: int = 0
+    seed: Annotated[int, KEY] = 0
     epochs: Annotated[int, HIDDEN] = 80
 
     def __post_init__(self) -> None:
         """Check the seed."""
         if not 0 <= self.seed < 2**63:
-            raise RecipeError(expected="an integer from 0 to 2^63 - 1", value=self.seed, option="--seed")
+            raise RecipeError(expected="an integer from 0 to 2^63 - 1", value=self.seed, option="seed")

@@ -3,9 +3,9 @@
 from dataclasses import dataclass
 from typing import Annotated
 
-from pisigma.files.setting import Option
+from pisigma.files.setting import KEY, Option
 
-MostBlur = Annotated[float, Option("--most-blur-px", min=0.0)]
+MostBlur = Annotated[float, Option("--most-blur-px", min=0.0, is_key=True)]
 
 
 @dataclass(frozen=True)
@@ -18,7 +18,7 @@ class DetectionSettings:
     """
 
     most_blur: MostBlur = 3.0
-    within: float = 0.2
+    within: Annotated[float, KEY] = 0.2
 
 
 @dataclass(frozen=True)
@@ -32,5 +32,5 @@ class IntrinsicsSettings:
     """
 
     name: str = "camera"
-    free_k3: Annotated[bool, Option("--k3")] = False
+    free_k3: Annotated[bool, Option("--k3", is_key=True)] = False
     most_blur: MostBlur = 3.0

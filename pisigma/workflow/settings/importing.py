@@ -54,7 +54,9 @@ class ImportSettings:
     maps: Annotated[Sequence[Mapping[str, str]], Option("--map", kind=str, read=stated_map)] = ()
     units: Annotated[str, Option("--unit")] = ""
     rotation: str | None = None
-    decimal: Annotated["Decimal | None", Option(kind=Literal["point", "comma"], read=_SIGNS.get)] = None
+    decimal: Annotated[
+        "Decimal | None", Option(kind=Literal["point", "comma"], read=_SIGNS.get, is_key=True)
+    ] = None
     join: Annotated["JoinBy | None", Option(kind=str)] = None
     within: Annotated[float, Option(kind=str, read=seconds, default="0.2s")] = 0.2
 

@@ -2,8 +2,10 @@
 
 import math
 from dataclasses import dataclass
+from typing import Annotated
 
 from pisigma.files.errors import PlanningError
+from pisigma.files.setting import KEY
 
 
 @dataclass(frozen=True)
@@ -21,9 +23,9 @@ class MeasureSettings:
     """
 
     limit_mm: float | None = None
-    least_gain_mm: float = 0.005
-    every: int = 3
-    replan: bool = True
+    least_gain_mm: Annotated[float, KEY] = 0.005
+    every: Annotated[int, KEY] = 3
+    replan: Annotated[bool, KEY] = True
 
     def __post_init__(self) -> None:
         """Check ranges."""

@@ -51,4 +51,4 @@ def test_inputs_at_fault_are_refused(refuses, folder):
     both = ("compare", folder / "before", folder / "after")
     refuses("compare", folder / "before", folder / "before", error=ModelError)
     refuses(*both, "--page", folder / "page.pdf", error=OutputError, file="page.pdf", value=".pdf")
-    refuses(*both, "--level", "2", error=IdentificationError, value=2.0)
+    refuses(*both, "--set", "level=2", error=IdentificationError, value=2.0)

@@ -59,7 +59,7 @@ def test_a_fault_of_all_rows_ends_with_3(run, folder, tmp_path):
 
 
 def test_json_is_one_object_and_sentences_go_to_stderr(run, folder):
-    arguments = ("--rows", folder / "rows.csv", "--once", "--json", "--no-replan")
+    arguments = ("--rows", folder / "rows.csv", "--once", "--json", "--set", "replan=false")
     result = run("measure", folder / "poses.plan.yaml", *arguments)
     assert result.exit_code == 0, result.output
     figures = json.loads(result.stdout)
@@ -76,7 +76,7 @@ def test_ctrl_c_ends_with_the_summary(run, folder, monkeypatch):
         raise KeyboardInterrupt
 
     monkeypatch.setattr("pisigma.workflow.follow.time.sleep", interrupt)
-    result = run("measure", folder / "poses.csv", "--rows", folder / "rows.csv", "--every", "100")
+    result = run("measure", folder / "poses.csv", "--rows", folder / "rows.csv", "--set", "every=100")
     assert result.exit_code == 0, result.output
     assert "Trust: 11 rows counted, 1 left out" in result.stdout
 

@@ -3,7 +3,7 @@
 import pytest
 from testing.refusals import refused
 
-from pisigma.files.errors import PisigmaError, PlanningError
+from pisigma.files.errors import PisigmaError, PlanningError, SettingError
 from pisigma.files.setting import flat_settings
 from pisigma.lifetime.cell.layout import CELL_FILE
 from pisigma.workflow.cell.cell_file import (
@@ -70,18 +70,32 @@ def test_a_camera_is_stated_once_with_paths_inside_the_cell(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("text", "fields"),
+    ("text", "error", "fields"),
     [
-        ("robot: ur10\ncalibrate:\n  fold: 3\n", {"line": 3, "column": "calibrate.fold"}),
-        ("robot: ur10\ncalibrate:\n  folds: x\n", {"line": 3, "column": "calibrate.folds", "value": "x"}),
-        ("robot: ur10\nimport:\n  wuthin: 3\n", {"line": 3, "column": "import.wuthin"}),
-        ("robot: ur10\nplan:\n  count: 1.5\n", {"line": 3, "column": "plan.count", "value": 1.5}),
-        ("robot: ur10\nplan:\n  task: ../secret.csv\n", {"value": "../secret.csv"}),
-        ("robot: ur10\nverify:\n  fit_frame: maybe\n", {"line": 3, "expected": "true or false"}),
+        ("robot: ur10\ncalibrate:\n  fold: 3\n", SettingError, {"line": 3, "column": "calibrate.fold"}),
+        (
+            "robot: ur10\ncalibrate:\n  folds: x\n",
+            SettingError,
+            {"line": 3, "column": "calibrate.folds", "value": "x"},
+        ),
+        ("robot: ur10\nimport:\n  wuthin: 3\n", SettingError, {"line": 3, "column": "import.wuthin"}),
+        (
+            "robot: ur10\nplan:\n  count: 1.5\n",
+            SettingError,
+            {"line": 3, "column": "plan.count", "value": 1.5},
+        ),
+        ("robot: ur10\nplan:\n  task: ../secret.csv\n", PlanningError, {"value": "../secret.csv"}),
+        ("robot: ur10\nimport:\n  decimal: dot\n", SettingError, {"line": 3, "expected": "point or comma"}),
+        ("robot: ur10\ncalibrate:\n  folds: -1\n", SettingError, {"line": 3, "value": -1}),
+        (
+            "robot: ur10\nverify:\n  fit_frame: maybe\n",
+            SettingError,
+            {"line": 3, "expected": "true or false"},
+        ),
     ],
 )
-def test_a_fault_is_refused_with_its_line_and_key(tmp_path, text, fields):
-    with refused(PlanningError, file=CELL_FILE, **fields):
+def test_a_fault_is_refused_with_its_line_and_key(tmp_path, text, error, fields):
+    with refused(error, file=CELL_FILE, **fields):
         cell_file(tmp_path, text).settings("plan")
 
 

@@ -1,0 +1,88 @@
+"""Values of settings by their keys, from a section of `cell.yaml` or from the option `--set`, with the same errors."""
+
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import Any, Literal, get_args, get_origin
+
+from pisigma.files.errors import Place, SettingError, nearest_choice
+from pisigma.files.setting import Setting
+
+_TYPES = {bool: "true or false", int: "an integer", float: "a number", str: "a text", Path: "a path"}
+"""Names of the types of settings in messages."""
+
+
+def read_assignments(assignments: Iterable[str], known: Mapping[str, Setting]) -> dict[str, Any]:
+    """Return the values of "KEY=VALUE" by their keys; a key that appears again adds to its list.
+
+    Args:
+        assignments: values of the option `--set`.
+        known: settings by their keys.
+
+    Raises:
+        SettingError: a text has another form, a key is unknown, or a value has the wrong type or is out of range.
+    """
+    stated: dict[str, list[str]] = {}
+    for one in assignments:
+        key, sign, value = one.partition("=")
+        if not sign:
+            raise SettingError(expected="KEY=VALUE, such as seed=1", value=one, option="--set")
+        stated.setdefault(key.strip(), []).append(value)
+    return dict(checked_values(stated, known, lambda key: None))
+
+
+def checked_values(
+    stated: Mapping[str, Any], known: Mapping[str, Setting], place_of: Callable[[str], Place | None]
+) -> Iterator[tuple[str, Any]]:
+    """Yield keys and values, after converting every value to the type of its setting.
+
+    Args:
+        stated: values by their keys, in the units of the command line.
+        known: settings by their keys.
+        place_of: returns the place of a key in its file; None for values of a command line.
+
+    Raises:
+        SettingError: a key is unknown, or a value has the wrong type or is out of range.
+    """
+    from pydantic import TypeAdapter, ValidationError
+
+    def refused(key: str, value: Any, expected: str, **texts: str) -> SettingError:
+        at = place_of(key)
+        return SettingError(expected=expected, value=value, at=at, option="" if at else key, **texts)
+
+    for key, value in stated.items():
+        if key not in known:
+            problem, remedy = f"unknown key '{key}'", nearest_choice(key, known)
+            raise refused(key, value, f"one of {', '.join(known)}", problem=problem, remedy=remedy)
+        kind = known[key].kind
+        single = _listed(value, kind)
+        try:
+            converted = TypeAdapter(kind).validate_python(single)
+        except ValidationError:
+            raise refused(key, single, _type_text(kind)) from None
+        if missed := _missed_bounds(known[key], converted):
+            raise refused(key, single, missed)
+        yield key, converted
+
+
+def _listed(value: Any, kind: Any) -> Any:
+    """Return a single value as a list if the setting may be repeated, else a list of one value as this value."""
+    is_list, is_repeated = isinstance(value, list | tuple), get_origin(kind) is list
+    if is_list and not is_repeated and len(value) == 1:
+        return value[0]
+    return [value] if is_repeated and not is_list else value
+
+
+def _type_text(kind: Any) -> str:
+    """Name the type of a setting in a message."""
+    if get_origin(kind) is Literal:
+        return " or ".join(get_args(kind))
+    return _TYPES.get(kind) or f"a list, each {_TYPES[get_args(kind)[0]]}"
+
+
+def _missed_bounds(setting: Setting, value: Any) -> str:
+    """Return the range of a setting if a value is outside of it; "" otherwise."""
+    least, most = setting.option.min, setting.option.max
+    if (least is None or value >= least) and (most is None or value <= most):
+        return ""
+    bounds = [f"{sign} {bound:g}" for sign, bound in ((">=", least), ("<=", most)) if bound is not None]
+    return f"{_TYPES[setting.kind]} {' and '.join(bounds)}"
