@@ -135,11 +135,11 @@ def test_an_option_wins_over_the_file_and_says_so(run, used):
     cell, _ = used
     path = cell / "cell.yaml"
     text = path.read_text()
-    path.write_text(text.replace("  # count: 40", "  count: 30"))
+    path.write_text(text.replace("  # count: 40", "  count: 30\n  candidates: 150"))
     try:
         result = run("plan", cell, "--count", 5, "--check", 0, "--set", "candidates=100", "--json")
         assert json.loads(result.stdout)["poses"] == 5
-        assert "--count" in result.stderr
+        assert {"count", "candidates"} <= set(result.stderr.split())
     finally:
         path.write_text(text)
 
