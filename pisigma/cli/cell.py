@@ -10,7 +10,7 @@ import typer
 from pisigma.cli.arguments import AsJson, complete_robot
 from pisigma.cli.endings import NOT_ACCEPTED
 from pisigma.cli.output import print_json, print_line, print_lines, print_table
-from pisigma.cli.settings_options import StatedSettings
+from pisigma.cli.settings_options import Group, StatedSettings
 
 if TYPE_CHECKING:
     from pisigma.lifetime.cell.status import CellStatus
@@ -173,6 +173,15 @@ def report_overrides(cell: "Cell", step: str, settings: StatedSettings[Any]) -> 
     for key in sorted(settings.values.keys() & cell.file.stated(step).keys()):
         print_line(f"The command line overrides {key} of {cell.file.path}.", to_stderr=True)
     return settings.values
+
+
+def settings_at(path: str | Path, step: str, settings: StatedSettings[Group]) -> Group:
+    """Return the settings of the command line, for a cell in addition to those of its file."""
+    cell = cell_at(path)
+    if cell is None:
+        return settings.build()
+    chosen: Group = cell.file.settings(step, **report_overrides(cell, step, settings))
+    return chosen
 
 
 def refuse_with_cell(**given: object) -> None:

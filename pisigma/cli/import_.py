@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from pisigma.cli.arguments import AsJson
-from pisigma.cli.cell import next_lines, report_overrides
+from pisigma.cli.cell import next_lines, settings_at
 from pisigma.cli.endings import REFUSED, fail
 from pisigma.cli.output import print_json, print_lines, print_table
 from pisigma.cli.settings_options import StatedSettings, takes_settings
@@ -55,12 +55,12 @@ def import_(
         check_output(out, (".csv",), "a measurement file", files)
     if save_map is not None:
         check_output(save_map, (".yaml", ".yml"), "a mapping", [*files, *([] if out is None else [out])])
+    chosen = settings.build() if cell is None else settings_at(cell, "import", settings)
     if cell is not None:
         opened = Cell.open(cell)
-        chosen = opened.file.settings("import", **report_overrides(opened, "import", settings))
         if len(files) == 1 and is_measurement_file(files[0]):
             return _take_in(opened, files[0], date, accept_implausible, as_json)
-    proposal = workflow.propose_import(files, chosen if cell else settings.build())
+    proposal = workflow.propose_import(files, chosen)
     _confirm(proposal, yes, as_json)
     rows = workflow.import_rows(proposal)
     if out is not None:

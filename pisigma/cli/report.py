@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from pisigma.cli.arguments import AsJson, ModelOrCell
+from pisigma.cli.cell import cell_at
 from pisigma.cli.output import print_json
 from pisigma.cli.progress import progress_of
 from pisigma.cli.screen import print_screen
@@ -40,6 +41,8 @@ def report(
     from pisigma.lifetime.cell.layout import model_folder
     from pisigma.workflow import report as workflow
 
+    if cameras is None and (cell := cell_at(model)) is not None:
+        cameras = cell.cameras
     model = model_folder(model)
     workflow.check_report_outputs(out, figures, inputs=(model, data, *(cameras.files if cameras else ())))
     with progress_of("report") as progress:

@@ -52,7 +52,7 @@ def checked_values(
     for key, value in stated.items():
         if key not in known:
             problem, remedy = f"unknown key '{key}'", nearest_choice(key, known)
-            raise refused(key, value, f"one of {', '.join(known)}", problem=problem, remedy=remedy)
+            raise refused(key, key, f"one of {', '.join(known)}", problem=problem, remedy=remedy)
         kind = known[key].kind
         single = _listed(value, kind)
         try:

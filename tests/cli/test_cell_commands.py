@@ -171,7 +171,14 @@ def test_what_a_cell_knows_is_not_stated_again_and_what_is_missing_is(run, cell,
 
 def test_a_cell_is_evaluated_compared_and_measured(run, used, tmp_path):
     cell, printed = used
+    path = cell / "cell.yaml"
+    path.write_text(
+        path.read_text()
+        .replace("  # level: 0.01", "  level: 0.02")
+        .replace("  # replan: true", "  replan: false")
+    )
     compared = json.loads(run("compare", cell, "--json").stdout)
+    assert compared["level"] == 0.02
     assert [one["name"] for one in compared["models"]] == [
         printed[name]["model"].rpartition("/")[2] for name in ("calibrate", "recalibrate")
     ]
@@ -184,8 +191,8 @@ def test_a_cell_is_evaluated_compared_and_measured(run, used, tmp_path):
     plan = max((cell / "plans").glob("*.csv"), key=lambda path: path.stat().st_mtime)
     measured(4, 5).write_csv(tmp_path / "rows.csv", ROBOT)
     of_plan, of_cell = (
-        run("measure", one, "--rows", tmp_path / "rows.csv", "--set", "replan=false", "--once", "--json")
-        for one in (plan, cell)
+        run("measure", one, "--rows", tmp_path / "rows.csv", *stated, "--once", "--json")
+        for one, stated in ((plan, ("--set", "replan=false", "--limit-mm", 0.5)), (cell, ()))
     )
     assert of_cell.exit_code == of_plan.exit_code
     assert json.loads(of_cell.stdout) == json.loads(of_plan.stdout)

@@ -87,6 +87,14 @@ def test_help_imports_nothing_heavy():
     assert done.stdout.strip() == "none"
 
 
+def test_a_key_at_fault_is_json_too(run):
+    result = run("calibrate", "ur5", "rows.csv", "--out", "m", "--set", "seed=x", "--json")
+    assert result.exit_code == 2
+    fields = json.loads(result.stdout)["error"]
+    assert fields["class"] == "SettingError"
+    assert (fields["option"], fields["value"], fields["expected"]) == ("seed", "x", "an integer")
+
+
 @pytest.mark.parametrize(
     ("words", "error", "option"),
     [

@@ -14,8 +14,8 @@ from typer.testing import CliRunner
 
 from pisigma.cli.settings_options import takes_settings
 from pisigma.deployment.serve import settings as serve_settings
-from pisigma.files.errors import PisigmaError
-from pisigma.files.setting import FILE, Option, settings_of
+from pisigma.files.errors import PisigmaError, SettingError
+from pisigma.files.setting import FILE, KEY, Option, settings_of
 from pisigma.planning import plan_settings
 from pisigma.workflow import settings as of_commands
 
@@ -28,11 +28,13 @@ class Lens:
         file: where it is.
         sheet: what it sees.
         width: how wide it is [m].
+        depth: how deep it is [m].
     """
 
     file: Annotated[str, FILE]
     sheet: Annotated[str, FILE]
     width: Annotated[float, Option("--width-mm", unit="mm")] = 1e-3
+    depth: Annotated[float, Option("--depth-mm", unit="mm", min=0, is_key=True)] = 2e-3
 
 
 @dataclass(frozen=True)
@@ -45,6 +47,8 @@ class Settings:
         bright: on where nothing is stated.
         marks: several numbers.
         lens: that sees.
+        lines: several more.
+        quick: whether to hurry.
     """
 
     count: Annotated[int, Option(min=1)] = 5
@@ -52,6 +56,8 @@ class Settings:
     bright: bool = True
     marks: tuple[int, ...] = ()
     lens: Lens | None = None
+    lines: Annotated[tuple[int, ...], KEY] = ()
+    quick: Annotated[bool, KEY] = False
 
 
 @pytest.fixture
@@ -92,8 +98,43 @@ def test_what_needs_something_else_is_refused(built):
         built("--file", "a.yaml")
     with refused(PisigmaError, option="--width-mm", expected="--file and --sheet"):
         built("--width-mm", "2")
+    with refused(PisigmaError, option="--set depth_mm", expected="--file and --sheet"):
+        built("--set", "depth_mm=2")
     with pytest.raises(AssertionError, match="--count"):
         built("--count", "0")
+
+
+def test_keys_are_settings(built):
+    def with_keys(*assignments: str) -> Settings:
+        return built(*(word for one in assignments for word in ("--set", one)))
+
+    assert with_keys("count=2", "class=x", "bright=false", "marks=1", "marks=2") == Settings(
+        2, "x", False, (1, 2)
+    )
+    assert with_keys("lines=3") == Settings(lines=(3,))
+    assert with_keys("lines=3", "lines=4", "quick=true") == Settings(lines=(3, 4), quick=True)
+    lens = built("--file", "a.yaml", "--set", "sheet=b=c.yaml", "--set", "depth_mm=0").lens
+    assert lens == Lens("a.yaml", "b=c.yaml", depth=0.0)
+
+
+@pytest.mark.parametrize(
+    ("words", "fields"),
+    [
+        (("--set", "line=3"), {"option": "line", "value": "line"}),
+        (("--set", "lines"), {"option": "--set", "value": "lines", "expected": "KEY=VALUE, such as seed=1"}),
+        (("--set", "lines=x"), {"option": "lines", "value": ["x"], "expected": "a list, each an integer"}),
+        (("--set", "quick=maybe"), {"option": "quick", "value": "maybe", "expected": "true or false"}),
+        (("--set", "count=2.5"), {"option": "count", "value": "2.5", "expected": "an integer"}),
+        (("--set", "count="), {"option": "count", "value": "", "expected": "an integer"}),
+        (("--set", "count=0"), {"option": "count", "value": "0", "expected": "an integer >= 1"}),
+        (("--set", "depth_mm=nan"), {"option": "depth_mm", "value": "nan", "expected": "a number >= 0"}),
+        (("--set", "count=2", "--set", "count=3"), {"option": "count", "value": ["2", "3"]}),
+        (("--count", "2", "--set", "count=2"), {"option": "count", "value": 2}),
+    ],
+)
+def test_a_key_at_fault_is_refused(built, words, fields):
+    with refused(SettingError, **fields):
+        built(*words)
 
 
 def settings_classes() -> list[type]:

@@ -6,10 +6,11 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from pisigma.cli.arguments import AsJson, Verbose, complete_model
+from pisigma.cli.cell import settings_at
 from pisigma.cli.output import print_json, screen_width
 from pisigma.cli.progress import progress_of
 from pisigma.cli.screen import print_screen
-from pisigma.cli.settings_options import takes_settings
+from pisigma.cli.settings_options import StatedSettings, takes_settings
 from pisigma.files.errors import AcceptanceError
 from pisigma.reporting.result_text import sentences, table
 from pisigma.reporting.verdict import Verdict, counted, rounded
@@ -49,7 +50,7 @@ def compare(
     first: First,
     *,
     second: Second = None,
-    settings: ComparisonSettings,
+    settings: StatedSettings[ComparisonSettings],
     rows: Rows = None,
     program: Program = None,
     page: Page = None,
@@ -64,16 +65,17 @@ def compare(
     from pisigma.lifetime.cell.layout import is_cell, previous_and_current_model
     from pisigma.workflow import compare as workflow
 
+    chosen = settings_at(first, "compare", settings)
     if second is None and is_cell(first):
         first, second = map(str, previous_and_current_model(first))
     if second is None:
         raise typer.BadParameter("expected two models, or a cell")
     if page is not None:
-        stated = settings.cameras.files if settings.cameras else ()
+        stated = chosen.cameras.files if chosen.cameras else ()
         check_page(page, (Path(first), Path(second), rows, program, *stated))
     with progress_of("compare") as progress:
         progress("parameters, workspace and rows of both models")
-        compared = workflow.compare(first, second, rows, program, settings)
+        compared = workflow.compare(first, second, rows, program, chosen)
         if page is not None:
             compared.save_page(page)
     if as_json:

@@ -11,10 +11,11 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from pisigma.cli.arguments import AsJson
+from pisigma.cli.cell import settings_at
 from pisigma.cli.endings import NOT_ACCEPTED
 from pisigma.cli.output import print_json, print_line
 from pisigma.cli.screen import print_screen
-from pisigma.cli.settings_options import takes_settings
+from pisigma.cli.settings_options import StatedSettings, takes_settings
 from pisigma.files.setting import Option
 from pisigma.workflow.settings.measuring import MeasureSettings
 
@@ -115,7 +116,7 @@ def shown_in_browser(
 def measure(
     plan: PlanFile,
     rows: RowsFile,
-    settings: MeasureSettings,
+    settings: StatedSettings[MeasureSettings],
     page: PageOptions,
     rest: RestFile = None,
     program: Programs = None,
@@ -134,15 +135,16 @@ def measure(
     from pisigma.workflow.follow import check_programs, follow, rest_file
     from pisigma.workflow.measure import MeasuringSession
 
+    chosen = settings_at(plan, "measure", settings)
     plan = newest_plan(plan)
-    session = MeasuringSession.read(plan, settings)
+    session = MeasuringSession.read(plan, chosen)
     growing = growing_file(rows, session.plan.arm.robot, session.plan.settings)
     rest = rest_file(plan, rows, rest)
     check_programs(program or [], session.plan.arm.robot, (plan, rows, rest))
     try:
         with (
             shown_in_browser(
-                session.plan.arm, settings.limit_mm, page if view else None, session.plan.settings.camera
+                session.plan.arm, chosen.limit_mm, page if view else None, session.plan.settings.camera
             ) as show_page,
             _printer(session, f"measure {plan}", as_json) as show,
         ):

@@ -23,12 +23,14 @@ from pisigma.workflow.settings.calibration import CalibrationSettings
 from pisigma.workflow.settings.comparison import ComparisonSettings
 from pisigma.workflow.settings.evaluation import EvaluationSettings
 from pisigma.workflow.settings.importing import ImportSettings
+from pisigma.workflow.settings.measuring import MeasureSettings
 from pisigma.workflow.settings.monitoring import MonitorSettings
 from pisigma.workflow.settings.recalibration import RecalibrationSettings
 from pisigma.workflow.settings.verification import VerificationSettings
 
 STEPS: dict[str, type] = {
     "plan": PlanSettings,
+    "measure": MeasureSettings,
     "import": ImportSettings,
     "calibrate": CalibrationSettings,
     "verify": VerificationSettings,
@@ -39,8 +41,8 @@ STEPS: dict[str, type] = {
 }
 """Class of the settings of every step, by its section of `cell.yaml`, which has the name of the command."""
 CAMERA_KEYS = ("camera", "board", "fixed_camera", "intrinsics", "repeatability_mm", "repeatability_deg")
-STATED_ABOVE = {"plan": ("limit_mm", "sensor")}
-"""Keys of a step whose values are those of the cell, in addition to `CAMERA_KEYS`."""
+STATED_ABOVE = {"plan": ("limit_mm", "sensor"), "measure": ("limit_mm",)}
+"""Keys of a step whose values are those of the cell, in addition to `CAMERA_KEYS`. `monitor` has another limit."""
 MAX_WIDTH = 100
 
 SensorName = Literal["tracker", "camera", "sockets", "draw-wire", "touch"]
@@ -82,7 +84,8 @@ class CellDocument(Section):
         limit_mm: limit of the 95 % quantile of the position errors [mm]; None for no limit.
         camera: cameras and boards; None without cameras.
         surroundings: obstacles around the robot and limits of its motion; None for none.
-        plan: settings of `pisigma plan`, by the names of its options.
+        plan: settings of `pisigma plan`, by the keys of its option `--set`.
+        measure: settings of `pisigma measure`.
         import_: settings of `pisigma import`.
         calibrate: settings of `pisigma calibrate`.
         verify: settings of `pisigma verify`.
@@ -100,6 +103,7 @@ class CellDocument(Section):
     camera: CameraSection | None = None
     surroundings: Surroundings | None = None
     plan: _Steps = None
+    measure: _Steps = None
     import_: _Steps = Field(default=None, alias="import")
     calibrate: _Steps = None
     verify: _Steps = None
@@ -149,9 +153,7 @@ class CellFile:
         section = dict(getattr(self.document, {"import": "import_"}.get(step, step)) or {})
         known = by_key(STEPS[step])
         shared: dict[str, Any] = {}
-        if (
-            self.document.limit_mm is not None and step == "plan"
-        ):  # the limit of `monitor` is of the RMS error
+        if self.document.limit_mm is not None and "limit_mm" in STATED_ABOVE.get(step, ()):
             shared["limit_mm"] = self.document.limit_mm
         sensor = PLANNED_SENSORS.get(self.document.sensor, "position")
         if self.document.camera is not None and (step != "plan" or sensor == "camera"):
@@ -276,7 +278,7 @@ def template(document: Mapping[str, Any]) -> str:
         "# surroundings:  # floor, boxes, tracker, joint margins: see the documentation of `pisigma plan`"
     )
     for step, group in STEPS.items():
-        lines += ["", f"{step}:  # options of `pisigma {step}`"]
+        lines += ["", f"{step}:  # keys of `pisigma {step} --set`"]
         for setting in flat_settings(group):
             key = setting.key
             if key in (*CAMERA_KEYS, *STATED_ABOVE.get(step, ())):

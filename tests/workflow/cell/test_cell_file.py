@@ -50,8 +50,29 @@ def test_values_have_the_units_and_forms_of_the_command_line(tmp_path):
 def test_what_is_stated_once_counts_for_every_step_and_a_step_may_state_another(tmp_path):
     file = cell_file(tmp_path, "robot: ur10\nlimit_mm: 0.3\nplan:\n  limit_mm: 0.5\n")
     assert file.settings("plan").limit_mm == 0.5
+    assert file.settings("measure").limit_mm == 0.3
     assert file.settings("plan", limit_mm=0.4).limit_mm == 0.4
     assert cell_file(tmp_path, "robot: ur10\nlimit_mm: 0.3\n").settings("plan").limit_mm == 0.3
+
+
+def test_the_defaults_of_a_new_file_are_those_of_the_settings(tmp_path):
+    """Every line of a setting, without its #, is read as the default of the setting."""
+    text = template({"robot": "ur10"})
+    for step, group in STEPS.items():
+        for setting in flat_settings(group):
+            if (
+                setting.default not in (None, "")
+                and f"  # {setting.key}: " in text.partition(f"\n{step}:")[2]
+            ):
+                head, mark, section = text.partition(f"\n{step}:")
+                of_step, mark_2, tail = section.partition("\n\n")
+                lines = [
+                    line.replace("# ", "", 1) if line.startswith(f"  # {setting.key}: ") else line
+                    for line in of_step.splitlines()
+                ]
+                file = cell_file(tmp_path, head + mark + "\n".join(lines) + mark_2 + tail)
+                value = file.stated(step).get(setting.key)
+                assert value == setting.default, (step, setting.key)
 
 
 def test_the_limit_of_95_percent_is_not_taken_for_one_of_the_rms(tmp_path):
