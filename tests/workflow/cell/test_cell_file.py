@@ -88,6 +88,7 @@ def test_a_camera_is_stated_once_with_paths_inside_the_cell(tmp_path):
         cameras = file.settings(step).cameras
         assert cameras.cameras == (str(tmp_path / "camera.yaml"),)
         assert cameras.is_fixed
+        assert file.settings(step, repeatability_mm=0.05).cameras.repeatability.length == pytest.approx(5e-5)
 
 
 @pytest.mark.parametrize(
