@@ -19,12 +19,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from scipy.spatial.transform import Rotation
+from simulated_arm import import_simulator, position_error
 
 from pisigma.files.errors import PisigmaError
-from pisigma.measurement.dataset import Measurements
-from pisigma.model.calibrated_model import CalibratedModel, poses_of_rows
+from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.workflow.calibrate import calibrate
 from pisigma.workflow.cell.cell import Cell
 from pisigma.workflow.recalibrate import recalibrate
@@ -42,6 +41,8 @@ class Year:
         """Calibrate and verify."""
         self.sim, self.true, self.folder = sim, sim.True_(arm, seed=seed), folder
         self.tool: tuple[float, ...] | None = None
+        self.judged = self.true.sample(300, 99)
+        self.wrong_steps = 0
         self.cell = Cell.create(folder / "cell", sim_folder(sim) / f"{arm}.urdf", limit_mm=0.5)
         today = datetime.date.today()
         self.days = [
@@ -64,17 +65,8 @@ class Year:
 
     def error(self, model: CalibratedModel) -> float:
         """RMS position error of a model at other poses, after a rigid fit [mm]."""
-        q = self.true.sample(300, 99)
-        x, _ = self.true.tip(q, self.tool)
-        names = {
-            "frame": (([*model.bases] or [""])[-1],) * len(q),
-            "target": (([*model.tools] or [""])[-1],) * len(q),
-        }
-        rows = Measurements(q=torch.from_numpy(q), position=torch.from_numpy(x), **names)
-        poses = poses_of_rows(model, rows)[:, :3, 3].numpy()
-        a, b = poses - poses.mean(0), x - x.mean(0)
-        turn, _ = Rotation.align_vectors(b, a)
-        return float(np.sqrt(((turn.apply(a) - b) ** 2).sum(1).mean()) * 1e3)
+        x, _ = self.true.tip(self.judged, self.tool)
+        return position_error(model, self.judged, x)
 
     def happen(self, month: int) -> None:
         """Change the arm and its set-up as the month has it."""
@@ -97,12 +89,14 @@ class Year:
         assert before is not None
         entry = self.cell.take_in(rows, day=self.days[month])
         self.since.append(entry.day)
+        self.wrong_steps += self.cell.status().step.state != "session_not_judged"
         found = self.cell.monitor().sessions[-1]
         named = {one["what"] for one in found.to_json()["moved"]}
         others = [self.error(before)]
         others += [self.error(recalibrate(before, self.cell.sessions.as_measured(entry)).model)]
-        if self.cell.status().step.state == "moved":
+        if self.cell.status().step.state in ("moved", "older_than_evidence"):
             self.cell.recalibrate()
+        self.wrong_steps += self.cell.status().step.state != "up_to_date"
         sessions = [one for one in self.cell.history.sessions() if one.day in self.since]
         if sum(one.rows for one in sessions) >= 30:
             others.append(
@@ -134,12 +128,12 @@ def main() -> None:
     parser.add_argument("folder", type=Path)
     parser.add_argument("--arm", default="irb120")
     parser.add_argument("--seeds", type=int, default=20)
+    parser.add_argument("--first", type=int, default=0, help="First seed.")
+    parser.add_argument("--months", action="store_true", help="Print every month.")
     stated = parser.parse_args()
-    sys.path.insert(0, str(stated.folder.resolve()))
-    import sim  # type: ignore[import-not-found]
-
-    named, refused, ratios, alarms = dict.fromkeys(WANTED, 0), 0, [], 0
-    for seed in range(stated.seeds):
+    sim = import_simulator(stated.folder)
+    named, refused, ratios, alarms, wrong = dict.fromkeys(WANTED, 0), 0, [], 0, 0
+    for seed in range(stated.first, stated.first + stated.seeds):
         with tempfile.TemporaryDirectory() as folder:
             year = Year(sim, stated.arm, seed, Path(folder))
             for month in range(1, 13):
@@ -148,13 +142,21 @@ def main() -> None:
                     named[month] += WANTED[month] in found
                 alarms += len(found - {"joint 2", WANTED.get(month, "joint 2"), "base", "tool"})
                 ratios.append(error / min(others))
+                if stated.months:
+                    judged = ", ".join(f"{one:.3f}" for one in (error, *others))
+                    print(
+                        f"  month {month:2}: {','.join(sorted(found)) or 'nothing'}; RMS {judged} mm",
+                        file=sys.stderr,
+                    )
                 if month == 4:
                     other = sim.True_("kr10" if stated.arm != "kr10" else "irb120", seed=seed)
                     refused += year.refuses(year.rows(10, 500, of=other), year.days[month])
                 if month == 6:
                     refused += year.refuses(year.rows(10, 501, 1 / 25.4), year.days[month])
+            wrong += year.wrong_steps
         print(
-            f"seed {seed}: named {named}, refused {refused}, ratio {np.median(ratios):.2f}", file=sys.stderr
+            f"seed {seed}: named {named}, refused {refused}, wrong steps {wrong}, ratio {np.median(ratios):.2f}",
+            file=sys.stderr,
         )
     for month, what in WANTED.items():
         print(f"month {month}, {what}: named in {named[month]} of {stated.seeds} years")

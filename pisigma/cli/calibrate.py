@@ -19,12 +19,12 @@ from pisigma.cli.output import (
     command_line,
     print_json,
     saved,
+    wrapped,
 )
 from pisigma.cli.progress import progress_of
 from pisigma.cli.screen import print_result
 from pisigma.cli.settings_options import StatedSettings, takes_settings
 from pisigma.files.errors import AcceptanceError
-from pisigma.reporting.result_text import sentences
 from pisigma.workflow.settings.calibration import CalibrationSettings
 from pisigma.workflow.settings.recalibration import RecalibrationSettings
 
@@ -126,10 +126,12 @@ def _calibrate_cell(
             {"model": folder and str(folder), **calibration.to_json(), "next": cell.status().step.to_json()}
         )
     else:
-        remark = [f"Model '{entry.name}': {entry.remark}."] if entry is not None else []
-        also = [sentences("the cell", [*remark, *next_lines(cell)])]
+        remark = []
+        if entry is not None and cell.history.in_use is not None:
+            remark = [f"Model '{entry.name}': {entry.remark}."]
         assert isinstance(calibration, Calibration)  # there is no prior
-        print_result(calibration_text(calibration.summary, folder, calibration.seconds, also), verbose)
+        text = calibration_text(calibration.summary, folder, calibration.seconds)
+        print_result(text, verbose, [*wrapped(remark), *next_lines(cell.status())])
     if entry is None:
         raise AcceptanceError(
             "no model was stored, because the result must not be trusted, for the reasons above."

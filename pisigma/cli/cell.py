@@ -9,11 +9,11 @@ import typer
 
 from pisigma.cli.arguments import AsJson, complete_robot
 from pisigma.cli.endings import NOT_ACCEPTED
-from pisigma.cli.output import print_json, print_line, print_lines, print_table
+from pisigma.cli.output import print_json, print_line, print_lines, print_table, wrapped
 from pisigma.cli.settings_options import Group, StatedSettings
 
 if TYPE_CHECKING:
-    from pisigma.lifetime.cell.status import CellStatus
+    from pisigma.lifetime.cell.facts import CellStatus
     from pisigma.workflow.cell.cell import Cell
 
 CellFolder = Annotated[Path, typer.Argument(metavar="CELL", help="Folder of a cell.")]
@@ -62,7 +62,7 @@ def new(
         print_json({"cell": str(out), **cell.status().to_json()})
         return
     print_lines([f"Cell written to {out}; its cell.yaml states every setting with its default."])
-    _print_next(cell.status())
+    print_next(cell.status())
 
 
 def status(
@@ -144,17 +144,7 @@ def _print_status(status: "CellStatus") -> None:
     print_lines(
         f"sessions/{name} will be added by the next command that reads rows." for name in facts.not_taken_in
     )
-    _print_next(status)
-
-
-def _print_next(status: "CellStatus") -> None:
-    """Print the next step and, on a line of its own, its command."""
-    reason = status.step.reason.rstrip(".")
-    if status.step.command:
-        print_lines([f"Next step, because {reason}:"])
-        print_line(f"  {status.step.command}")
-    else:
-        print_lines([f"Nothing to do: {reason}."])
+    print_next(status)
 
 
 def cell_at(path: str | Path) -> "Cell | None":
@@ -197,10 +187,18 @@ def refuse_with_cell(**given: object) -> None:
             )
 
 
-def next_lines(cell: "Cell") -> list[str]:
-    """Return the line that names the next step of a cell."""
-    step = cell.status().step
-    return [f"Next step: {step.command}" if step.command else f"Nothing to do: {step.reason}."]
+def next_lines(status: "CellStatus") -> list[str]:
+    """Return the lines that state the next step of a cell, its command on a line of its own."""
+    reason = status.step.reason.rstrip(".")
+    if not status.step.command:
+        return wrapped([f"Nothing to do: {reason}."])
+    return [*wrapped([f"Next step, because {reason}:"]), f"  {status.step.command}"]
+
+
+def print_next(status: "CellStatus") -> None:
+    """Print the next step of a cell."""
+    for line in next_lines(status):
+        print_line(line)
 
 
 def use(
@@ -245,7 +243,7 @@ def session(
         print_json({"session": name, "set_aside": set_aside})
     else:
         print_lines([f"Session '{name}' is set aside."])
-        _print_next(opened.status())
+        print_next(opened.status())
 
 
 def event(
@@ -278,7 +276,7 @@ def event(
         print_json(recorded.to_json())
     else:
         print_lines([f"Recorded: {recorded.sentence}"])
-        _print_next(opened.status())
+        print_next(opened.status())
 
 
 def pack(
@@ -310,4 +308,4 @@ def unpack(
         print_json({"cell": str(out), **opened.status().to_json()})
     else:
         print_lines([f"Cell written to {out}."])
-        _print_next(opened.status())
+        print_next(opened.status())

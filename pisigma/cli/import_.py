@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from pisigma.cli.arguments import AsJson
-from pisigma.cli.cell import next_lines, settings_at
+from pisigma.cli.cell import print_next, settings_at
 from pisigma.cli.endings import REFUSED, fail
 from pisigma.cli.output import print_json, print_lines, print_table
 from pisigma.cli.settings_options import StatedSettings, takes_settings
@@ -93,7 +93,8 @@ def _take_in(
         )
         return
     remark = [f"Warning: {entry.remark}"] if entry.remark else []
-    print_lines([f"{entry.rows} rows taken in as session '{entry.name}'.", *remark, *next_lines(cell)])
+    print_lines([f"{entry.rows} rows taken in as session '{entry.name}'.", *remark])
+    print_next(cell.status())
 
 
 def _confirm(proposal: "ImportProposal", yes: bool, as_json: bool) -> None:

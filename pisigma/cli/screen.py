@@ -4,6 +4,7 @@ Nothing is lost by that: `--verbose` prints everything, and so do cards and page
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import typer
 
@@ -24,6 +25,7 @@ def print_screen(
     details: Sequence[Block] = (),
     closing: Sequence[str] = (),
     verbose: bool = False,
+    next_step: Sequence[str] = (),
 ) -> None:
     """Print a result, and repeat the accuracy at its end where that has left the screen.
 
@@ -34,7 +36,9 @@ def print_screen(
         details: printed with `verbose` alone.
         closing: what was written where.
         verbose: print everything.
+        next_step: last lines, which state the next step of a cell instead of that of the verdict.
     """
+    verdict = replace(verdict, next_step="") if next_step else verdict
     head = [line for label, text in verdict.lines if text for line in wrapped([f"{label}: {text}"], "  ")]
     cautions = wrapped((f"Warning: {one}" for one in together(warnings)), "  ")
     end = wrapped(closing)
@@ -58,7 +62,7 @@ def print_screen(
     ]
     if len(lines) > SHORT:
         lines += wrapped([verdict.short], "  ")
-    typer.echo("\n".join(lines))
+    typer.echo("\n".join([*lines, *next_step]))
 
 
 def _lines(block: Block) -> list[str]:
@@ -68,6 +72,8 @@ def _lines(block: Block) -> list[str]:
     return wrapped(block.sentences, block.indent)
 
 
-def print_result(result: ResultText, verbose: bool) -> None:
+def print_result(result: ResultText, verbose: bool, next_step: Sequence[str] = ()) -> None:
     """Print a result; see `print_screen`."""
-    print_screen(result.verdict, result.warnings, result.blocks, result.details, result.closing, verbose)
+    print_screen(
+        result.verdict, result.warnings, result.blocks, result.details, result.closing, verbose, next_step
+    )

@@ -7,7 +7,7 @@ import typer
 
 from pisigma.cli.arguments import AsJson, ModelOrCell, Verbose
 from pisigma.cli.cell import cell_at, next_lines, refuse_with_cell, report_overrides
-from pisigma.cli.output import print_json, print_lines, screen_width
+from pisigma.cli.output import print_json, screen_width
 from pisigma.cli.progress import progress_of
 from pisigma.cli.screen import print_result
 from pisigma.cli.settings_options import StatedSettings, takes_settings
@@ -94,10 +94,10 @@ def _verify_cell(
         use = None if in_use is None else in_use.name
         print_json({**verification.to_json(), "in_use": use, "next": cell.status().step.to_json()})
     else:
-        print_result(verification_text(verification, screen_width(), verbose), verbose)
-        used = (
+        lines = (
             [f"Model '{entry.name}' is in use."] if in_use is not None and in_use.name == entry.name else []
         )
-        print_lines([*used, *next_lines(cell)])
+        text = verification_text(verification, screen_width(), verbose)
+        print_result(text, verbose, [*lines, *next_lines(cell.status())])
     if not verification.accepted:
         raise AcceptanceError(verification.sentence)

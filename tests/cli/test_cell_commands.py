@@ -104,6 +104,8 @@ def test_every_step_names_the_next(used):
         "import 2": "not_verified",
         "verify": "up_to_date",
         "import 3": "session_not_judged",
+        "monitor": "moved",
+        "recalibrate": "up_to_date",
     }
     assert printed["verify"]["in_use"] == printed["calibrate"]["model"].rpartition("/")[2]
     assert [one["what"] for one in printed["monitor"]["sessions"][-1]["moved"]] == ["joint 3"]
@@ -128,7 +130,7 @@ def test_status_shows_sessions_and_the_model_in_use(run, used):
     status = json.loads(run("status", cell, "--json").stdout)
     assert status["model"] == printed["recalibrate"]["model"].rpartition("/")[2]
     assert [one["rows"] for one in status["sessions"]] == [60, 12, 12]
-    assert status["next"]["state"] == "verification_due"  # the limit is not confirmed yet
+    assert status["next"]["state"] == "up_to_date"  # held-out rows confirm the limit
 
 
 def test_an_option_wins_over_the_file_and_says_so(run, used):

@@ -8,7 +8,7 @@ import typer
 from pisigma.cli.arguments import AsJson, ModelOrCell, Verbose
 from pisigma.cli.cell import cell_at, next_lines, refuse_with_cell, report_overrides
 from pisigma.cli.endings import NOT_ACCEPTED
-from pisigma.cli.output import print_json, print_lines
+from pisigma.cli.output import print_json
 from pisigma.cli.progress import progress_of
 from pisigma.cli.screen import print_screen
 from pisigma.cli.settings_options import StatedSettings, takes_settings
@@ -17,6 +17,7 @@ from pisigma.reporting.verdict import Verdict, counted, rounded, uncapitalised
 from pisigma.workflow.settings.monitoring import MonitorSettings
 
 if TYPE_CHECKING:
+    from pisigma.lifetime.cell.facts import CellStatus
     from pisigma.workflow.cell.cell import Cell
     from pisigma.workflow.monitor import Monitoring
 
@@ -81,19 +82,23 @@ def _monitor_cell(
         monitoring = cell.monitor(progress, **report_overrides(cell, "monitor", settings))
         if page is not None:
             monitoring.save_page(page)
-    _print(monitoring, page, as_json, verbose)
-    if not as_json:
-        print_lines(next_lines(cell))
+    _print(monitoring, page, as_json, verbose, cell.status())
     if monitoring.action:
         raise typer.Exit(NOT_ACCEPTED)
 
 
-def _print(monitoring: "Monitoring", page: Path | None, as_json: bool, verbose: bool) -> None:
-    """Print the verdict, a line for every session, and what the sessions say together."""
+def _print(
+    monitoring: "Monitoring",
+    page: Path | None,
+    as_json: bool,
+    verbose: bool,
+    status: "CellStatus | None" = None,
+) -> None:
+    """Print the verdict, a line for every session, and what the sessions say together; `status`: of a cell."""
     from pisigma.reporting.monitoring_tables import chart_table, session_table
 
     if as_json:
-        print_json(monitoring.to_json())
+        print_json(monitoring.to_json() | ({} if status is None else {"next": status.step.to_json()}))
         return
     sessions = monitoring.sessions
     said = [f"{one.date}: {one.session.sentence}" for one in sessions if one.session.verdict != "unchanged"]
@@ -119,6 +124,7 @@ def _print(monitoring: "Monitoring", page: Path | None, as_json: bool, verbose: 
         else [],
         [] if page is None else [f"Page written to {page}."],
         verbose,
+        [] if status is None else next_lines(status),
     )
 
 

@@ -8,7 +8,7 @@ import typer
 
 from pisigma.cli.arguments import AcceptImplausible, AsJson, ModelOrCell, Overwrite, Verbose
 from pisigma.cli.cell import cell_at, next_lines, refuse_with_cell, report_overrides
-from pisigma.cli.output import command_line, print_json, print_lines, saved
+from pisigma.cli.output import command_line, print_json, saved
 from pisigma.cli.progress import progress_of
 from pisigma.cli.screen import print_screen
 from pisigma.cli.settings_options import StatedSettings, takes_settings
@@ -127,22 +127,30 @@ def _recalibrate_cell(
             None, progress, accept_implausible, **report_overrides(cell, "recalibrate", settings)
         )
     folder = None if entry is None else cell.model_folder(entry.name)
-    _print(recalibration, folder, as_json, verbose)
+    _print(recalibration, folder, as_json, verbose, cell)
     if entry is None:
         raise AcceptanceError(
             "no model was stored, because the result must not be trusted, for the reasons above."
         )
-    if not as_json:
-        print_lines([f"Model '{entry.name}' is in use.", *next_lines(cell)])
 
 
-def _print(recalibration: "Recalibration", folder: Path | None, as_json: bool, verbose: bool) -> None:
-    """Print the verdict, what has moved, and the models that were candidates."""
+def _print(
+    recalibration: "Recalibration",
+    folder: Path | None,
+    as_json: bool,
+    verbose: bool,
+    cell: "Cell | None" = None,
+) -> None:
+    """Print the verdict, what has moved, the models that were candidates, and the next step of a cell."""
     from pisigma.reporting.recalibration_card import candidate_table
 
     if as_json:
-        print_json({"model": folder and str(folder), **recalibration.to_json()})
+        then = {} if cell is None else {"next": cell.status().step.to_json()}
+        print_json({"model": folder and str(folder), **recalibration.to_json(), **then})
         return
+    lines: list[str] = []
+    if cell is not None and (in_use := cell.history.in_use) is not None:
+        lines = [f"Model '{in_use.name}' is in use.", *next_lines(cell.status())]
     summary = recalibration.summary
     warnings = [*(one.sentence for one in summary.diagnostics[1:]), *summary.warnings]
     print_screen(
@@ -156,6 +164,7 @@ def _print(recalibration: "Recalibration", folder: Path | None, as_json: bool, v
         if folder is None
         else [f"Model written to {folder} in {recalibration.seconds:.1f} s; its README.md has all figures."],
         verbose=verbose,
+        next_step=lines,
     )
 
 

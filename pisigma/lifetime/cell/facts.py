@@ -4,8 +4,9 @@ import datetime
 import hashlib
 import os
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -13,8 +14,41 @@ from pisigma.files.errors import PlanningError
 from pisigma.files.yaml_file import read_yaml
 from pisigma.lifetime.cell.history import HISTORY, History, SessionEntry
 from pisigma.lifetime.cell.layout import CELL_FILE, PLANS, SESSIONS
-from pisigma.lifetime.cell.status import CellFacts, CellStatus, next_step
+from pisigma.lifetime.cell.status import CellFacts, Step, next_step
 from pisigma.measurement.dates import date_in_name
+
+
+@dataclass(frozen=True)
+class CellStatus:
+    """Status of a cell.
+
+    Attributes:
+        facts: facts from which the next step was derived.
+        step: the next step.
+    """
+
+    facts: CellFacts
+    step: Step
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the status as plain values; `next.command` and `next.reason` are the next step."""
+        facts, model = self.facts, self.facts.in_use
+        return {
+            "cell": facts.folder,
+            "model": None if model is None else model.name,
+            "made_of": [] if model is None else model.sessions.split(","),
+            "p95_mm": None if model is None else model.p95_mm,
+            "limit_mm": facts.limit_mm,
+            "plans": list(facts.plans),
+            "sessions": [
+                {"name": one.name, "day": one.day, "rows": one.rows, "set_aside": one.set_aside or None}
+                for one in facts.sessions
+            ],
+            "events": [one.to_json() for one in facts.events],
+            "models": [{"name": one.name, "remark": one.remark} for one in facts.models],
+            "not_taken_in": list(facts.not_taken_in),
+            "next": self.step.to_json(),
+        }
 
 
 class _Limit(BaseModel):

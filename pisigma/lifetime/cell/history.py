@@ -133,7 +133,7 @@ class Check:
     """Verdict of a command on a model and a session.
 
     Attributes:
-        command: "calibrate", "verify", "monitor" or "recalibrate".
+        command: "plan", "import", "calibrate", "verify", "monitor" or "recalibrate".
         model: name of the model; empty if none was written.
         session: name of the session; empty if all valid sessions were used.
         verdict: verdict in one word; the result class of the command lists them.

@@ -26,8 +26,8 @@ ATTENTION = (
     "outside_limit",
 )
 """States in which a limit is missed, or rows or a model must not be trusted."""
-NOT_TRUSTED = ("implausible", "setup_fault")
-"""Verdicts of `verify` and `monitor` after which nothing is concluded from a session."""
+NOT_TRUSTED = ("implausible", "setup_fault", "not_trusted")
+"""Verdicts of `verify`, `monitor` and `recalibrate` after which nothing is concluded from a session."""
 
 State = Literal[
     "edited_session",
@@ -42,6 +42,7 @@ State = Literal[
     "session_not_judged",
     "session_not_trusted",
     "moved",
+    "older_than_evidence",
     "outside_limit",
     "better_model",
     "verification_due",
@@ -116,6 +117,13 @@ class CellFacts:
         made = [one for one in self.models if valid.issuperset(one.sessions.split(","))]
         return made[-1] if made else None
 
+    @property
+    def unmeasured_plan(self) -> str:
+        """What the newest plan contains, if no session was added after it was made; else ""."""
+        planned = [one for one in self.checks if one.command == "plan"]
+        newest = max((one.taken_in for one in self.sessions), default="")
+        return planned[-1].summary if planned and planned[-1].checked > newest else ""
+
     def command(self, verb: str, *words: str) -> str:
         """Return a command line for this cell."""
         return shlex.join(["pisigma", verb, self.folder, *words])
@@ -125,8 +133,10 @@ class CellFacts:
         return shlex.join(["pisigma", "import", rows, "--cell", self.folder])
 
     def checks_of(self, model: str, *commands: str) -> list[Check]:
-        """Return the checks of a model by some commands, newest last."""
-        return [one for one in self.checks if one.model == model and one.command in commands]
+        """Return the checks of a model by some commands, newest last, without those of sessions that were set aside."""
+        aside = {one.name for one in self.sessions if one.set_aside}
+        checks = [one for one in self.checks if one.model == model and one.command in commands]
+        return [one for one in checks if one.session not in aside]
 
     def new_sessions(self, model: ModelEntry) -> list[SessionEntry]:
         """Return the valid sessions that a model was not fitted to, measured on its newest day or later."""
@@ -141,8 +151,29 @@ def valid_sessions(sessions: tuple[SessionEntry, ...], events: tuple[Event, ...]
 
 
 def next_step(facts: CellFacts) -> Step:
-    """Return the step of the first rule that applies, in the order of `RULES`."""
+    """Return the step of the first rule that applies, in the order of `RULES`; a plan is measured before the next."""
+    step = due_step(facts)
+    if step.command == facts.command("plan") and facts.unmeasured_plan:
+        return _to_measure(facts, facts.unmeasured_plan)
+    return step
+
+
+def due_step(facts: CellFacts) -> Step:
+    """Return the step of the first rule that applies, as if every plan had been measured."""
     return next(step for rule in RULES if (step := rule(facts)) is not None)
+
+
+def plans_check(facts: CellFacts) -> bool:
+    """Return whether a few poses are due that check the present model, instead of those of a calibration."""
+    return bool(facts.models) and due_step(facts).state != "outside_limit"
+
+
+def _to_measure(facts: CellFacts, plan: str) -> Step:
+    return Step(
+        "not_measured",
+        f"{plan} has not been measured yet; measure its poses, add the measured columns to its rows, and import them",
+        facts.import_command(),
+    )
 
 
 def _edited_session(facts: CellFacts) -> Step | None:
@@ -176,19 +207,19 @@ def _no_session(facts: CellFacts) -> Step | None:
     ended = [one for one in facts.events if one.kind in ARM_EVENTS] if facts.sessions else []
     why = f"{ended[-1].kind} on {ended[-1].day} ended the validity of all sessions" if ended else ""
     if not facts.plans or why:
-        few = () if facts.in_use is None else ("--count", str(VERIFICATION_POSES), "--check", "0")
-        return Step("no_plan", why or "there is no plan and no session", facts.command("plan", *few))
-    return Step(
-        "not_measured",
-        f"plan '{facts.plans[-1]}' has not been measured yet; add the measured columns to its rows",
-        facts.import_command(),
-    )
+        return Step("no_plan", why or "there is no plan and no session", facts.command("plan"))
+    return _to_measure(facts, f"plan '{facts.plans[-1]}'")
 
 
 def _not_calibrated(facts: CellFacts) -> Step | None:
     if facts.newest_model is not None or facts.in_use is not None:
         return None
     rows = sum(one.rows for one in facts.valid_sessions)
+    return _calibrate(facts, "not_calibrated", f"there are {rows} measured rows, but no model")
+
+
+def _calibrate(facts: CellFacts, state: State, reason: str) -> Step:
+    """Return the step "calibrate"; more rows are measured instead if these must not be trusted."""
     calibrations = [one for one in facts.checks if one.command == "calibrate"]
     newest = max(one.taken_in for one in facts.valid_sessions)
     if calibrations and calibrations[-1].verdict == "not_trusted" and calibrations[-1].checked >= newest:
@@ -197,7 +228,7 @@ def _not_calibrated(facts: CellFacts) -> Step | None:
             f"the calibration must not be trusted: {calibrations[-1].summary}",
             facts.import_command(),
         )
-    return Step("not_calibrated", f"there are {rows} measured rows, but no model", facts.command("calibrate"))
+    return Step(state, reason, facts.command("calibrate"))
 
 
 def _not_verified(facts: CellFacts) -> Step | None:
@@ -205,8 +236,7 @@ def _not_verified(facts: CellFacts) -> Step | None:
         return None
     model = facts.newest_model
     assert model is not None  # else an earlier rule applies
-    aside = {one.name for one in facts.sessions if one.set_aside}
-    verdicts = [one for one in facts.checks_of(model.name, "verify") if one.session not in aside]
+    verdicts = facts.checks_of(model.name, "verify", "recalibrate")
     judged = {one.session for one in verdicts}
     new = [one for one in facts.new_sessions(model) if one.name not in judged]
     if new:
@@ -215,16 +245,30 @@ def _not_verified(facts: CellFacts) -> Step | None:
             f"model '{model.name}' is not in use; session '{new[-1].name}', to which it was not fitted, can verify it",
             facts.command("verify"),
         )
-    if verdicts and verdicts[-1].verdict != "better":
-        return _after_verdict(facts, verdicts[-1]) or Step(
-            "verification_failed", verdicts[-1].summary, facts.command("calibrate")
-        )
+    if verdicts and (step := _after(facts, verdicts[-1], ("not_better", "undecided"))):
+        return step
     return Step(
         "not_verified",
         f"model '{model.name}' has not been verified with new rows; measure {VERIFICATION_POSES} poses, import them, "
         f"and run `{facts.command('verify')}`",
-        facts.command("plan", "--count", str(VERIFICATION_POSES), "--check", "0"),
+        facts.command("plan"),
     )
+
+
+def _after(facts: CellFacts, last: Check, failed: tuple[str, ...]) -> Step | None:
+    """Return the step that follows from the last check of a model; `failed`: verdicts that ask for a calibration."""
+    if last.verdict in NOT_TRUSTED:
+        return Step(
+            "session_not_trusted",
+            f"nothing can be concluded from session '{last.session}': {last.summary}",
+            facts.command("session", last.session, "--set-aside", last.verdict),
+        )
+    if last.recalibrate:
+        state: State = "older_than_evidence" if last.verdict == "unchanged" else "moved"
+        return Step(state, last.summary, facts.command("recalibrate"))
+    if last.verdict in failed and not any(one.made >= last.checked for one in facts.models):
+        return _calibrate(facts, "verification_failed", last.summary)
+    return None
 
 
 def _session_not_judged(facts: CellFacts) -> Step | None:
@@ -234,10 +278,11 @@ def _session_not_judged(facts: CellFacts) -> Step | None:
     new = [one for one in facts.new_sessions(model) if one.name not in judged]
     if not new:
         return None
+    verb = "verify" if facts.limit_mm is not None and _p95(facts, model) is None else "monitor"
     return Step(
         "session_not_judged",
         f"session '{new[-1].name}' has not been compared with model '{model.name}'",
-        facts.command("monitor"),
+        facts.command(verb),
     )
 
 
@@ -245,21 +290,8 @@ def _last_verdict(facts: CellFacts) -> Step | None:
     """Return the step that follows from the last session that was compared with the model in use."""
     model = facts.in_use
     assert model is not None
-    aside = {one.name for one in facts.sessions if one.set_aside}
-    checks = [one for one in facts.checks_of(model.name, "verify", "monitor") if one.session not in aside]
-    return _after_verdict(facts, checks[-1]) if checks else None
-
-
-def _after_verdict(facts: CellFacts, last: Check) -> Step | None:
-    if last.verdict in NOT_TRUSTED:
-        return Step(
-            "session_not_trusted",
-            f"nothing can be concluded from session '{last.session}': {last.summary}",
-            facts.command("session", last.session, "--set-aside", last.verdict),
-        )
-    if last.verdict == "not_better":
-        return Step("verification_failed", last.summary, facts.command("calibrate"))
-    return Step("moved", last.summary, facts.command("recalibrate")) if last.recalibrate else None
+    checks = facts.checks_of(model.name, "verify", "monitor", "recalibrate")
+    return _after(facts, checks[-1], ("not_better",)) if checks else None
 
 
 def _better_model(facts: CellFacts) -> Step | None:
@@ -278,11 +310,16 @@ def _better_model(facts: CellFacts) -> Step | None:
     )
 
 
+def _p95(facts: CellFacts, model: ModelEntry) -> float | None:
+    """Return the last known 95 % quantile of the position errors of a model [mm]; None if it is unknown."""
+    found = [one.p95_mm for one in facts.checks_of(model.name, "verify") if one.p95_mm is not None]
+    return found[-1] if found else model.p95_mm
+
+
 def _outside_limit(facts: CellFacts) -> Step | None:
     model, limit = facts.in_use, facts.limit_mm
     assert model is not None
-    found = [one.p95_mm for one in facts.checks_of(model.name, "verify") if one.p95_mm is not None]
-    p95 = found[-1] if found else model.p95_mm
+    p95 = _p95(facts, model)
     if limit is None or (p95 is not None and p95 <= limit):
         return None
     if p95 is None:
@@ -290,7 +327,7 @@ def _outside_limit(facts: CellFacts) -> Step | None:
             "verification_due",
             f"it is not known whether model '{model.name}' meets the limit of {limit:g} mm; measure "
             f"{VERIFICATION_POSES} poses, import them, and run `{facts.command('verify')}`",
-            facts.command("plan", "--count", str(VERIFICATION_POSES), "--check", "0"),
+            facts.command("plan"),
         )
     return Step(
         "outside_limit",
@@ -311,13 +348,19 @@ def _verification_due(facts: CellFacts) -> Step | None:
         "verification_due",
         f"the last session is {age} days old; measure {VERIFICATION_POSES} poses and run "
         f"`{facts.command('monitor')}`",
-        facts.command("plan", "--count", str(VERIFICATION_POSES), "--check", "0"),
+        facts.command("plan"),
     )
 
 
 def _up_to_date(facts: CellFacts) -> Step:
     assert facts.in_use is not None
-    return Step("up_to_date", f"model '{facts.in_use.name}' is in use, and no rule asks for more")
+    newest = datetime.date.fromisoformat(max(one.day for one in facts.sessions))
+    due = newest + datetime.timedelta(days=MAX_DAYS_UNVERIFIED)
+    return Step(
+        "up_to_date",
+        f"model '{facts.in_use.name}' is in use (`{facts.command('serve')}`, `ik` or `export`); measure again by "
+        f"{due}",
+    )
 
 
 RULES: tuple[Callable[[CellFacts], Step | None], ...] = (
@@ -333,36 +376,3 @@ RULES: tuple[Callable[[CellFacts], Step | None], ...] = (
     _verification_due,
     _up_to_date,
 )
-
-
-@dataclass(frozen=True)
-class CellStatus:
-    """Status of a cell.
-
-    Attributes:
-        facts: facts from which the next step was derived.
-        step: the next step.
-    """
-
-    facts: CellFacts
-    step: Step
-
-    def to_json(self) -> dict[str, Any]:
-        """Return the status as plain values; `next.command` and `next.reason` are the next step."""
-        facts, model = self.facts, self.facts.in_use
-        return {
-            "cell": facts.folder,
-            "model": None if model is None else model.name,
-            "made_of": [] if model is None else model.sessions.split(","),
-            "p95_mm": None if model is None else model.p95_mm,
-            "limit_mm": facts.limit_mm,
-            "plans": list(facts.plans),
-            "sessions": [
-                {"name": one.name, "day": one.day, "rows": one.rows, "set_aside": one.set_aside or None}
-                for one in facts.sessions
-            ],
-            "events": [one.to_json() for one in facts.events],
-            "models": [{"name": one.name, "remark": one.remark} for one in facts.models],
-            "not_taken_in": list(facts.not_taken_in),
-            "next": self.step.to_json(),
-        }

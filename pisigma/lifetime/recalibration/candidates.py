@@ -50,13 +50,21 @@ class CandidateChoice:
         kept: "recalibrated", unless another candidate is better by more than 5 % and by more than chance.
         rms: RMS error of held-out rows under each candidate [m]; None if the rows are too few for it.
         rows: number of held-out rows that count.
+        p95: 95 % quantile of the same errors [m].
         names: names of the candidates, at the start of a sentence.
     """
 
     kept: Kept
     rms: Mapping[Kept, float | None]
     rows: int
+    p95: Mapping[Kept, float | None] = field(default_factory=dict)
     names: Mapping[Kept, str] = field(default_factory=lambda: NAMES)
+
+    @property
+    def updates(self) -> bool:
+        """Whether the recalibrated model predicts held-out rows better than the old one, by more than 5 %."""
+        old, new = self.rms["old"], self.rms["recalibrated"]
+        return old is not None and new is not None and self.kept != "old" and old > MIN_RATIO * new
 
     @property
     def with_least_error(self) -> "CandidateChoice":
@@ -130,17 +138,18 @@ def _decided(errors: Mapping[Kept, Float64[Tensor, " rows"]]) -> CandidateChoice
     counted = (
         judged & (smallest <= OUTLIER_FACTOR * smallest[judged].median()) if bool(judged.any()) else judged
     )
-    rms: dict[Kept, float | None] = {}
+    rms, p95 = dict[Kept, float | None](), dict[Kept, float | None]()
     for name, lengths in errors.items():
-        size = float(lengths[counted].square().mean().sqrt()) if bool(counted.any()) else float("inf")
-        rms[name] = size if size < float("inf") else None
+        known = bool(counted.any()) and bool(torch.isfinite(lengths[counted]).all())
+        rms[name] = float(lengths[counted].square().mean().sqrt()) if known else None
+        p95[name] = float(lengths[counted].quantile(0.95)) if known else None
     first = errors["recalibrated"][counted]
     better = [
         (size, name)
         for name, size in rms.items()
         if size is not None and _clearly_better(errors[name][counted], first)
     ]
-    return CandidateChoice(min(better)[1] if better else "recalibrated", rms, int(counted.sum()))
+    return CandidateChoice(min(better)[1] if better else "recalibrated", rms, int(counted.sum()), p95)
 
 
 def _clearly_better(errors: Float64[Tensor, " rows"], than: Float64[Tensor, " rows"]) -> bool:

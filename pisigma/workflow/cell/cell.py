@@ -15,10 +15,9 @@ from typing import Any
 from pisigma.files.errors import ModelError, Place
 from pisigma.files.model_files import is_model
 from pisigma.files.progress import Progress
-from pisigma.lifetime.cell.facts import status_of
-from pisigma.lifetime.cell.history import HISTORY, Check, History, ModelEntry, SessionEntry, Use, now
+from pisigma.lifetime.cell.facts import CellStatus, status_of
+from pisigma.lifetime.cell.history import HISTORY, Check, Entry, History, ModelEntry, SessionEntry, Use, now
 from pisigma.lifetime.cell.layout import MODELS, PLANS
-from pisigma.lifetime.cell.status import CellStatus
 from pisigma.measurement.camera.camera_files import CameraFiles
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel
@@ -31,6 +30,7 @@ from pisigma.workflow.cell.model_choice import (
     check_of,
     entry_of,
     errors_of,
+    found_events,
     is_better,
     put_into_use,
 )
@@ -144,7 +144,10 @@ class Cell:
     def plan(
         self, progress: Progress = lambda what: None, programs: Sequence[Path] = (), **changed: Any
     ) -> tuple[Plan, Path]:
-        """Plan which poses to measure, for the model in use or, if there is none, for the nominal robot.
+        """Plan which poses to measure, different ones in every plan of a cell.
+
+        Without a model these are the poses of a calibration. With a model these are a few poses that verify or monitor
+        it, or, if its errors are above the limit, the poses that reduce them most.
 
         Args:
             progress: called with the name of each step.
@@ -154,14 +157,16 @@ class Cell:
         Returns:
             The plan, and the CSV file in `plans/` to which it was written.
         """
-        entry = self.history.in_use
+        facts = self.status().facts
+        entry, settings = facts.in_use or facts.newest_model, self.file.plan_settings(facts, **changed)
         subject = self.robot if entry is None else self.model_folder(entry.name)
-        planned = plan(
-            subject, self.file.settings("plan", **changed), self.file.document.surroundings, progress
-        )
+        planned = plan(subject, settings, self.file.document.surroundings, progress)
         with self.history.database.writing():  # no other process chooses the same name meanwhile
             path = free_path(self.folder / PLANS, datetime.date.today().isoformat(), ".csv")
             planned.save(path, programs)
+        made = f"plan '{path.stem}' of {planned.poses + planned.checks} poses"
+        of = "" if entry is None else entry.name
+        self.history.add(Check("plan", of, "", "planned", made, None, False, now()))
         return planned, path
 
     @cached_property
@@ -271,7 +276,7 @@ class Cell:
             )
             rows = replace(seen.rows, date=None)
             found = monitor(self.model_folder(entry.name), [rows], settings, progress)
-            self.history.add(check_of(found, entry, one))
+            self.history.add(check_of(found, entry, one, seen, self.file.settings("recalibrate")))
         assert found is not None  # there is a session
         return found
 
@@ -298,6 +303,8 @@ class Cell:
     ) -> tuple[Recalibration, ModelEntry | None]:
         """Recalibrate the model in use with the newest session; put the result into use if it can be trusted.
 
+        A move of the instrument or the tool that was found and not recorded becomes an event on the day of the session.
+
         Args:
             session: name of the session. None: the newest to which the model was not fitted.
             progress: called with the name of each step.
@@ -317,11 +324,15 @@ class Cell:
             settings = replace(settings, moved=seen.moved)
         result = recalibrate(self.model_folder(parent.name), seen.rows, settings, progress)
         if not (result.trusted or accept_implausible):
+            doubt = result.diagnostics[0].sentence
+            self.history.add(
+                Check("recalibrate", parent.name, chosen.name, "not_trusted", doubt, None, False, now())
+            )
             return result, None
         path = save_new(self.folder / MODELS, partial(result.save, accept_implausible=accept_implausible))
-        remark = result.summary.verdict
+        remark, (p95, rms) = result.summary.verdict, errors_of(result)
         entry = replace(
-            entry_of(self.history, path, [chosen], remark, None),
+            entry_of(self.history, path, [chosen], remark, p95),
             sessions=",".join((*parent.sessions.split(","), chosen.name)),
             day=max(parent.day, chosen.day),
             frame_day=parent.frame_day,
@@ -329,8 +340,11 @@ class Cell:
             parent=parent.name,
         )
         of = ("recalibrate", entry.name, chosen.name, result.summary.kept, remark)
-        check = Check(*of, None, False, now(), errors_of(result)[1])
-        self.history.add(entry, check, *([Use(entry.name, now(), remark)] if result.trusted else []))
+        added: list[Entry] = [entry, Check(*of, p95, False, now(), rms)]
+        if result.trusted:
+            events = found_events(result, chosen, seen.moved, self.sessions.valid())
+            added += [Use(entry.name, now(), remark), *events]
+        self.history.add(*added)
         return result, entry
 
     def use(self, model: str, reason: str) -> None:
@@ -371,16 +385,12 @@ class Cell:
         """Return the named model, else the model in use, else the newest."""
         if model is not None:
             return self.history.model(model)
-        models = self.history.models()
         if (entry := self.history.in_use) is not None:
             return entry
-        if not models:
-            raise ModelError(
-                "the cell has no model",
-                at=Place(self.folder),
-                remedy=f"run `pisigma calibrate {self.folder}` first",
-            )
-        return models[-1]
+        if models := self.history.models():
+            return models[-1]
+        remedy = f"run `pisigma calibrate {self.folder}` first"
+        raise ModelError("the cell has no model", at=Place(self.folder), remedy=remedy)
 
     def _new_rows(self, model: str | None, session: str | None) -> tuple[ModelEntry, SessionEntry, ModelRows]:
         """Return a model, a session (by default the newest to which it was not fitted), and its rows with its names."""

@@ -3,7 +3,7 @@
 import os
 import textwrap
 from collections.abc import Collection, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar, get_args
 
@@ -15,6 +15,7 @@ from pisigma.files.setting import build_settings, by_key, flat_settings
 from pisigma.files.setting_values import checked_values
 from pisigma.files.yaml_file import Section, place_of_key, read_yaml
 from pisigma.lifetime.cell.layout import CELL_FILE
+from pisigma.lifetime.cell.status import VERIFICATION_POSES, CellFacts, plans_check
 from pisigma.planning.plan_settings import PlanSettings
 from pisigma.planning.surroundings.surroundings import Surroundings
 from pisigma.robot.robot_file import robot_file
@@ -175,6 +176,20 @@ class CellFile:
         return settings_from(
             STEPS[step], self.stated(step) | changed, self._place(step), self.path.parent, frozenset(changed)
         )
+
+    def plan_settings(self, facts: CellFacts, **changed: Any) -> PlanSettings:
+        """Return the settings of the next plan: a few poses if a model has to be checked, other ones in every plan.
+
+        Args:
+            facts: facts about the cell.
+            **changed: values that override the file, by its keys.
+        """
+        settings: PlanSettings = self.settings("plan", **changed)
+        stated = self.stated("plan").keys() | changed.keys()
+        default: dict[str, Any] = {"seed": settings.seed + len(facts.plans)}
+        if plans_check(facts):
+            default |= {"count": VERIFICATION_POSES, "check": 0}
+        return replace(settings, **{key: value for key, value in default.items() if key not in stated})
 
     def _place(self, step: str) -> "_Places":
         return _Places(self.path, step)

@@ -1,6 +1,6 @@
 """Models of a cell: their entries in the history, which is in use, and whether a new one is better on new rows."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TypeVar
@@ -8,14 +8,14 @@ from typing import TypeVar
 from pisigma.files.errors import ModelError, Place
 from pisigma.files.model_files import model_hash
 from pisigma.files.progress import Progress
-from pisigma.lifetime.cell.history import Check, History, ModelEntry, SessionEntry, Use, now
+from pisigma.lifetime.cell.history import Check, Event, EventKind, History, ModelEntry, SessionEntry, Use, now
 from pisigma.lifetime.cell.layout import MODELS
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.folder.model_folder import load_model
 from pisigma.robot.description import Robot
 from pisigma.workflow.calibrate import Calibration, calibrate
-from pisigma.workflow.cell.sessions import Sessions, newest_day, since
+from pisigma.workflow.cell.sessions import ModelRows, Sessions, newest_day, since
 from pisigma.workflow.evaluate import evaluate
 from pisigma.workflow.monitor import Monitoring
 from pisigma.workflow.recalibrate import Recalibration, recalibrate
@@ -104,14 +104,62 @@ def _of_day(values: Mapping[str, Value], day: str) -> dict[str, Value]:
     }
 
 
-def check_of(found: Monitoring, entry: ModelEntry, session: SessionEntry) -> Check:
-    """Return the history entry of a session's monitoring result."""
+def check_of(
+    found: Monitoring,
+    entry: ModelEntry,
+    session: SessionEntry,
+    seen: ModelRows,
+    settings: RecalibrationSettings,
+) -> Check:
+    """Return the history entry of a session's monitoring result.
+
+    Recalibrating is due if something moved, or if the recalibrated model predicts held-out rows better.
+
+    Args:
+        found: result of the session.
+        entry: the model that the session was compared with.
+        session: the session.
+        seen: rows of the session with the names of the model.
+        settings: settings of the recalibration.
+    """
+    check = Check("monitor", entry.name, session.name, "implausible", "", None, False, now())
     if found.untrusted:
-        summary = found.untrusted[0].sentence
-        return Check("monitor", entry.name, session.name, "implausible", summary, None, False, now())
+        return replace(check, summary=found.untrusted[0].sentence)
     judged = found.sessions[-1].session
-    found_by = ("monitor", entry.name, session.name, judged.verdict, judged.sentence)
-    return Check(*found_by, None, judged.recalibrate, now(), judged.rms * 1e3)
+    check = replace(check, verdict=judged.verdict, summary=judged.sentence, rms_mm=judged.rms * 1e3)
+    if judged.recalibrate or judged.verdict == "moved":
+        return replace(check, recalibrate=True)
+    if session.rows < MIN_ROWS:
+        return check
+    tried = recalibrate(found.model, seen.rows, replace(settings, cameras=None, moved=seen.moved or None))
+    if not (tried.trusted and tried.gate.updates):
+        return check
+    return replace(check, recalibrate=True, summary=f"{judged.sentence} {tried.gate.sentence}")
+
+
+def found_events(
+    result: Recalibration, session: SessionEntry, recorded: Collection[str], valid: Sequence[SessionEntry]
+) -> list[Event]:
+    """Return the changes of instrument and tool that a recalibration found, and that nobody has recorded.
+
+    None is returned if another session was measured on the same day, maybe before the change.
+
+    Args:
+        result: the recalibration.
+        session: the session that it was made with.
+        recorded: "base" or "tool" or both, if events since the parent record that they were changed.
+        valid: all valid sessions.
+    """
+    if [one.day for one in valid].count(session.day) > 1:
+        return []
+    moved = {one.split()[0] for one in (*result.summary.elsewhere, *(part.what for part in result.moved))}
+    kinds: dict[str, EventKind] = {"base": "instrument", "tool": "tool"}
+    note = f"found by the recalibration with session '{session.name}'"
+    return [
+        Event(session.day, kind, note, now())
+        for what, kind in kinds.items()
+        if what in moved and what not in recorded
+    ]
 
 
 def calibrated(
@@ -130,7 +178,8 @@ def errors_of(result: Calibration | Recalibration) -> tuple[float | None, float 
     Both are of held-out rows; without a validation, the RMS is that of the rows of the calibration.
     """
     if isinstance(result, Recalibration):
-        return None, result.summary.cross_validation[result.summary.kept].rms_mm
+        p95 = result.gate.p95.get(result.gate.kept)
+        return None if p95 is None else p95 * 1e3, result.summary.cross_validation[result.summary.kept].rms_mm
     judged, fitted = result.summary.judged, result.summary.calibrated
     if judged is not None:
         errors = list(judged.models.values())[-1]

@@ -6,7 +6,14 @@ from typing import get_args
 import pytest
 
 from pisigma.lifetime.cell.history import ARM_EVENTS, Check, Event, ModelEntry, SessionEntry
-from pisigma.lifetime.cell.status import MAX_DAYS_UNVERIFIED, CellFacts, State, next_step, valid_sessions
+from pisigma.lifetime.cell.status import (
+    MAX_DAYS_UNVERIFIED,
+    CellFacts,
+    State,
+    next_step,
+    plans_check,
+    valid_sessions,
+)
 
 
 def session(name, rows=40, **changed):
@@ -67,6 +74,13 @@ CASES = {
         ),
         "recalibrate",
     ),
+    "older_than_evidence": (
+        replace(
+            MONITORED,
+            checks=(*VERIFIED.checks, check("monitor", "a", "2026-03-10", "unchanged", recalibrate=True)),
+        ),
+        "recalibrate",
+    ),
     "session_not_trusted": (
         replace(MONITORED, checks=(*VERIFIED.checks, check("monitor", "a", "2026-03-10", "implausible"))),
         "session",
@@ -98,6 +112,37 @@ def test_facts_lead_to_their_state_and_its_command(state):
     assert step.command.split()[:2] == (["pisigma", verb] if verb else [])
     assert "cell" in step.command.split() or not verb
     assert step.to_json() == {"state": state, "reason": step.reason, "command": step.command or None}
+
+
+@pytest.mark.parametrize(
+    ("facts", "checks_model"),
+    [
+        (EMPTY, False),
+        (CALIBRATED, True),
+        (CASES["verification_due"][0], True),
+        (CASES["outside_limit"][0], False),
+    ],
+)
+def test_a_plan_that_was_made_is_measured_before_another_is_due(facts, checks_model):
+    assert next_step(facts).command.split()[1:] == ["plan", "cell"]
+    assert plans_check(facts) is checks_model
+    made = check("plan", "", verdict="planned", at="2026-09-01T10:00:00+00:00")
+    assert next_step(replace(facts, checks=(*facts.checks, made))).state == "not_measured"
+    earlier = replace(made, checked="2026-01-01T10:00:00+00:00")
+    if facts.sessions:
+        assert next_step(replace(facts, checks=(*facts.checks, earlier))) == next_step(facts)
+
+
+def test_a_step_that_failed_is_not_named_again():
+    failed = check("calibrate", "", verdict="not_trusted", at="2026-02-12T00:00:00+00:00")
+    facts, _ = CASES["verification_failed"]
+    assert next_step(replace(facts, checks=(*facts.checks, failed))).state == "not_trusted"
+    again = check("recalibrate", "a", "2026-03-10", "not_trusted")
+    facts, _ = CASES["moved"]
+    assert next_step(replace(facts, checks=(*facts.checks, again))).state == "session_not_trusted"
+    later = model("c", "2026-01-10,2026-02-10,2026-03-10", day="2026-03-10")
+    checks = (*VERIFIED.checks, check("verify", "a", "2026-03-10", "not_better"))
+    assert next_step(replace(MONITORED, checks=checks, models=(MODEL, later))).state == "up_to_date"
 
 
 @pytest.mark.parametrize("kind", ["instrument", "tool", "firmware", *sorted(ARM_EVENTS)])

@@ -81,10 +81,35 @@ def test_a_move_is_found_and_recalibrated(year):
     assert result.trusted
     assert cell.history.in_use == entry
     assert entry.parent == cell.history.models()[0].name
-    assert cell.status().step.state == "verification_due"  # the limit is not confirmed yet
+    assert cell.status().step.state == "up_to_date"  # held-out rows of the session confirm the limit
+    assert 0 < entry.p95_mm < 0.5
     cell.use(entry.parent, "try")
     assert cell.history.in_use.name == entry.parent
     cell.use(entry.name, "back")
+
+
+def test_rows_that_improve_the_model_are_used_without_a_move_and_a_moved_tracker_becomes_an_event(year):
+    cell, *_ = year
+    cell.take_in(measured(12, 11, zero=0.088), day=day(1))
+    cell.monitor()
+    assert cell.status().step.state in ("moved", "older_than_evidence")
+    cell.recalibrate()
+    cell.take_in(measured(12, 12, zero=0.088, base=np.add(BASE, [0.5, 0.2, 0, 0.3, 0, 0])), day=day(0))
+    cell.monitor()
+    assert cell.status().step.state == "moved"
+    assert cell.recalibrate()[0].trusted
+    assert [(one.kind, one.day) for one in cell.history.events()] == [("instrument", day(0))]
+    assert cell.status().step.state == "up_to_date"
+
+
+def test_a_plan_for_a_model_has_few_and_other_poses_and_is_measured_next(year):
+    cell, *_ = year
+    planned, path = cell.plan(candidates=200)
+    assert (planned.poses, planned.checks) == (10, 0)
+    assert cell.status().step.state in ("up_to_date", "session_not_judged")  # no plan was due
+    settings = cell.file.plan_settings(cell.status().facts, count=12)
+    assert (settings.count, settings.check, settings.seed) == (12, 0, 2)
+    path.unlink()
 
 
 @pytest.mark.parametrize("again", ["same", "file"])
