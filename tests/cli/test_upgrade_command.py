@@ -24,6 +24,7 @@ def test_what_is_new_already_is_said(run, models):
 
 def test_a_folder_without_a_model_is_refused(refuses, tmp_path):
     refuses("upgrade", tmp_path)
+    refuses("upgrade", "/")
 
 
 @pytest.fixture

@@ -77,4 +77,4 @@ def history_of_model(folder: str | os.PathLike[str]) -> History:
     cell = model.parent.parent
     if model.parent.name == MODELS and is_cell(cell):
         return History(cell / HISTORY)
-    return History(model.with_name(model.name + MODEL_HISTORY))
+    return History(model.parent / f"{model.name}{MODEL_HISTORY}")
