@@ -68,7 +68,7 @@ def takes_settings(command: Callable[..., None]) -> Callable[..., None]:
     context = next((one.name for one in parameters if one.annotation is typer.Context), _CONTEXT)
     by_name = inspect.Parameter.KEYWORD_ONLY
     if any(one.option.is_key for one in known.values()):
-        parameters.insert(end, inspect.Parameter(_SET, by_name, default=None, annotation=_Assignments))
+        parameters.insert(end, _assignments(known))
     if context == _CONTEXT:
         parameters.append(inspect.Parameter(_CONTEXT, by_name, annotation=typer.Context))
 
@@ -89,14 +89,16 @@ def takes_settings(command: Callable[..., None]) -> Callable[..., None]:
     return with_options
 
 
-_Assignments = Annotated[
-    list[str] | None,
-    typer.Option(
+def _assignments(known: Mapping[str, Setting]) -> inspect.Parameter:
+    """Return the parameter of the option `--set`, with the completion of its keys."""
+    option = typer.Option(
         "--set",
         metavar="KEY=VALUE",
         help="Set a setting by its key, as in cell.yaml; --help-all lists the keys. May be repeated.",
-    ),
-]
+        autocompletion=lambda incomplete: [f"{key}=" for key in known if key.startswith(incomplete)],
+    )
+    kind = Annotated[list[str] | None, option]
+    return inspect.Parameter(_SET, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=kind)
 
 
 def _stated(values: dict[str, Any], known: Mapping[str, Setting], running: Any) -> dict[str, Any]:

@@ -12,6 +12,7 @@ import typer
 from testing.refusals import refused
 from typer.testing import CliRunner
 
+from pisigma.cli.main import app
 from pisigma.cli.settings_options import takes_settings
 from pisigma.deployment.serve import settings as serve_settings
 from pisigma.files.errors import PisigmaError, SettingError
@@ -69,11 +70,11 @@ def built():
     def command(data: Path, settings: Settings, plain: bool = False) -> None:
         seen.append(settings)
 
-    app = typer.Typer()
-    app.command()(command)
+    small = typer.Typer()
+    small.command()(command)
 
     def run(*words: str) -> Settings:
-        result = CliRunner().invoke(app, ["rows.csv", *words])
+        result = CliRunner().invoke(small, ["rows.csv", *words])
         if isinstance(result.exception, PisigmaError):
             raise result.exception
         assert result.exit_code == 0, result.output
@@ -115,6 +116,15 @@ def test_keys_are_settings(built):
     assert with_keys("lines=3", "lines=4", "quick=true") == Settings(lines=(3, 4), quick=True)
     lens = built("--file", "a.yaml", "--set", "sheet=b=c.yaml", "--set", "depth_mm=0").lens
     assert lens == Lens("a.yaml", "b=c.yaml", depth=0.0)
+
+
+def test_shells_complete_keys():
+    shell = {
+        "_PISIGMA_COMPLETE": "complete_bash",
+        "COMP_WORDS": "pisigma calibrate --set so",
+        "COMP_CWORD": "3",
+    }
+    assert CliRunner().invoke(app, [], prog_name="pisigma", env=shell).output.split() == ["socket_distance="]
 
 
 @pytest.mark.parametrize(
