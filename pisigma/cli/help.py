@@ -5,7 +5,7 @@ import json
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Annotated, Any
+from typing import Annotated, Any, get_args
 
 import typer
 from typer.core import TyperCommand
@@ -40,7 +40,7 @@ class ShortHelpCommand(TyperCommand):
             super().format_options(ctx, formatter)
             if self.keys:
                 with formatter.section("Keys of --set, in addition to the options without their dashes"):
-                    formatter.write_dl([(key, _explained(one)) for key, one in self.keys.items()])
+                    formatter.write_dl([(_assignment(one), _explained(one)) for one in self.keys.values()])
             return
         hidden = {*_OF_ALL_COMMANDS, *RARELY_USED.get(str(self.name), ())}
         short = copy.copy(self)
@@ -97,6 +97,13 @@ def _in_a_sentence(parameter: Any) -> Any:
     short = copy.copy(parameter)
     short.help = re.sub(r"\. (?!\[default).*?(?= \[default|$)", ".", parameter.help or "")
     return short
+
+
+def _assignment(setting: Setting) -> str:
+    """Return how a key is assigned, such as "seed=INT"."""
+    kinds = get_args(setting.kind) or (setting.kind,)
+    names = [one if isinstance(one, str) else one.__name__.upper() for one in kinds]
+    return f"{setting.key}={setting.option.metavar or '|'.join(names)}"
 
 
 def _explained(setting: Setting) -> str:
