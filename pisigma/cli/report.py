@@ -13,10 +13,13 @@ from pisigma.cli.screen import print_screen
 from pisigma.cli.settings_options import takes_settings
 from pisigma.files.errors import AcceptanceError
 from pisigma.measurement.camera.camera_files import CameraFiles
-from pisigma.reporting.result_text import sentences
+from pisigma.reporting.acceptance_tables import acceptance_sentences, budget_table, contradiction
+from pisigma.reporting.result_text import sentences, table
 from pisigma.reporting.verdict import Verdict, uncapitalised
 
 if TYPE_CHECKING:
+    from pisigma.lifetime.cell.acceptance import Acceptance
+    from pisigma.workflow.cell.cell import Cell
     from pisigma.workflow.report import Report
 
 
@@ -36,25 +39,38 @@ def report(
 ) -> None:
     """Write a report as one HTML page: accuracy, where it is worst, what limits it, what to measure next.
 
-    Exits with status 3 if the rows must not be trusted; the page says why.
+    The report of a cell also has what its acceptance needs: instrument, uncertainty budget, measured errors, and who
+    accepted the model. Exits with status 3 if the rows must not be trusted, or the measured errors are larger than the
+    budget explains; the page says why.
     """
     from pisigma.lifetime.cell.layout import model_folder
     from pisigma.workflow import report as workflow
 
-    if cameras is None and (cell := cell_at(model)) is not None:
+    cell, model = cell_at(model), model_folder(model)
+    if cameras is None and cell is not None:
         cameras = cell.cameras
-    model = model_folder(model)
     workflow.check_report_outputs(out, figures, inputs=(model, data, *(cameras.files if cameras else ())))
     with progress_of("report") as progress:
-        result = workflow.report(model, data, progress, cameras)
+        result = workflow.report(model, data, progress, cameras, _acceptance(cell))
         written = result.save(out, figures)
     if as_json:
         print_json({"report": str(out), "figures": [str(path) for path in written]} | result.to_json())
     else:
         also = f", {len(written)} figures to {figures}" if written else ""
         _print(result, [f"Report written to {out}{also}."])
+    if result.acceptance is not None and result.acceptance.contradicted:
+        raise AcceptanceError(contradiction(result.acceptance))
     if result.diagnostics:
         raise AcceptanceError(" ".join(one.sentence for one in result.diagnostics))
+
+
+def _acceptance(cell: "Cell | None") -> "Acceptance | None":
+    """Collect the acceptance of a cell; None without a cell."""
+    if cell is None:
+        return None
+    from pisigma.workflow.cell.acceptance import acceptance_of
+
+    return acceptance_of(cell)
 
 
 def _print(result: "Report", closing: list[str]) -> None:
@@ -68,4 +84,13 @@ def _print(result: "Report", closing: list[str]) -> None:
     first, *others = content.advice or ("read the page.",)
     verdict = Verdict(result.verdict, trust, uncapitalised(first))
     blocks = [sentences("further advice", (f"- {one}" for one in others), "  ")]
+    if (accepted := result.acceptance) is not None:
+        columns, rows = budget_table(accepted)
+        lacking = ", ".join(dict.fromkeys(line.partition(":")[0] for line in accepted.not_stated))
+        blocks += [
+            sentences(
+                "acceptance", (*acceptance_sentences(accepted), f"Not stated: {lacking}; see the page."), "  "
+            ),
+            table("Uncertainty budget of one coordinate", columns[:-1], [row[:-1] for row in rows]),
+        ]
     print_screen(verdict, [one.sentence for one in wrong[1:]], blocks, closing=closing)

@@ -124,3 +124,14 @@ def _shifted(robot: Robot, shift: Float64[Tensor, " dof"]) -> Robot:
     ):
         dh[row, 0 if is_revolute else 1] += direction * value
     return robot.with_geometry(dh=dh)
+
+
+def learned_range(model: CalibratedModel, condition: str) -> tuple[float, float] | None:
+    """Return the lowest and the highest calibrated value of a condition whose effect a model corrects; None if none.
+
+    Args:
+        model: model of any kind; only a hybrid learns the effect of conditions.
+        condition: a name in `CONDITIONS`.
+    """
+    learned = _learned(model)
+    return None if learned is None else dict(zip(learned.names, learned.measured, strict=True)).get(condition)

@@ -10,6 +10,7 @@ from typing import Any
 from pisigma.files.conflicts import Input
 from pisigma.files.output_file import check_output, write_whole
 from pisigma.files.progress import Progress
+from pisigma.lifetime.cell.acceptance import Acceptance
 from pisigma.measurement.camera.camera_files import CameraFiles
 from pisigma.measurement.camera.corner_file import MeasurementFiles, read_rows
 from pisigma.measurement.dataset import Measurements
@@ -33,12 +34,14 @@ class Report:
         figures: drawn figures.
         diagnostics: why the rows must not be trusted; see `pisigma.validation.gate`.
         seconds: computing time [s].
+        acceptance: statements by which the robot of a cell is accepted; None without a cell.
     """
 
     content: ReportContent
     figures: ReportFigures
     diagnostics: tuple[Diagnostic, ...]
     seconds: float
+    acceptance: Acceptance | None = None
 
     @property
     def verdict(self) -> str:
@@ -48,7 +51,8 @@ class Report:
     def to_json(self) -> dict[str, Any]:
         """Return numbers and sentences as plain values, without the single rows."""
         diagnostics = [one.model_dump() for one in self.diagnostics]
-        return self.content.to_json() | {"diagnostics": diagnostics, "seconds": self.seconds}
+        accepted = {} if self.acceptance is None else {"acceptance": self.acceptance.to_json()}
+        return self.content.to_json() | {"diagnostics": diagnostics, "seconds": self.seconds} | accepted
 
     def save(
         self, page: str | os.PathLike[str], figures: str | os.PathLike[str] | None = None
@@ -66,7 +70,7 @@ class Report:
             OutputError: a file cannot be written.
         """
         check_report_outputs(page, figures)
-        write_whole(Path(page), render_page(self.content, self.figures))
+        write_whole(Path(page), render_page(self.content, self.figures, self.acceptance))
         return () if figures is None else tuple(write_figures(self.figures.all, Path(figures)))
 
 
@@ -95,6 +99,7 @@ def report(
     data: MeasurementFiles | Measurements | None = None,
     progress: Progress = lambda what: None,
     cameras: CameraFiles | None = None,
+    acceptance: Acceptance | None = None,
 ) -> Report:
     """Report on a calibration: its accuracy, where it is worst, what limits it and what to measure next.
 
@@ -104,6 +109,7 @@ def report(
             of the folder.
         progress: called with the current step.
         cameras: cameras and boards, for files of detected board corners.
+        acceptance: statements of a cell that the report contains, see `pisigma.workflow.cell.acceptance`.
 
     Raises:
         ModelError: the folder cannot be used.
@@ -120,7 +126,7 @@ def report(
     content = report_content(loaded, Path(model), rows, remarks, diagnostics)
     progress("drawing")
     figures = draw_figures(content)
-    return Report(content, figures, diagnostics, time.perf_counter() - started)
+    return Report(content, figures, diagnostics, time.perf_counter() - started, acceptance)
 
 
 def _right_rows(model: CalibratedModel, rows: Measurements) -> tuple[Measurements, tuple[str, ...]]:

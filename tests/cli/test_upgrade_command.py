@@ -1,10 +1,9 @@
 """`pisigma upgrade`."""
 
 import json
-import zipfile
-from pathlib import Path
 
 import pytest
+from testing.cell_before import cell_of_schema_1
 
 from pisigma.lifetime.cell.history import HISTORY, SCHEMA_VERSION, History
 from pisigma.model.folder.model_document import FORMAT
@@ -30,10 +29,7 @@ def test_a_folder_without_a_model_is_refused(refuses, tmp_path):
 @pytest.fixture
 def older(tmp_path):
     """A cell of schema version 1."""
-    packed = Path(__file__).parents[1] / "lifetime" / "cell" / "cell_of_schema_1.zip"
-    with zipfile.ZipFile(packed) as archive:
-        archive.extractall(tmp_path / "cell")
-    return tmp_path / "cell"
+    return cell_of_schema_1(tmp_path)
 
 
 def test_a_cell_of_an_earlier_version_is_upgraded_with_its_models(run, older):

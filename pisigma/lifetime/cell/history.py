@@ -86,10 +86,10 @@ class Event:
 
     @property
     def sentence(self) -> str:
-        """Day, kind, model and person, with the note, as one line."""
-        model = f" model '{self.model}'" if self.model else ""
+        """Day, kind and person, with the note, as one line."""
+        what = f"model '{self.model}' was accepted" if self.kind == "accepted" else self.kind
         by, note = f" by {self.person}" if self.person else "", f" ({self.note})" if self.note else ""
-        return f"{self.day}: {self.kind}{model}{by}{note}."
+        return f"{self.day}: {what}{by}{note}."
 
     def to_json(self) -> dict[str, str]:
         """Return the event as plain values, without the time at which it was recorded."""

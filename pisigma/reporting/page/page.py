@@ -8,7 +8,15 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup
 
+from pisigma.lifetime.cell.acceptance import Acceptance
 from pisigma.measurement.groups import numbers_of_names
+from pisigma.reporting.acceptance_tables import (
+    acceptance_sentences,
+    budget_table,
+    comparison_table,
+    iso_table,
+    statement_table,
+)
 from pisigma.reporting.calibration_tables import parameter_table
 from pisigma.reporting.page.content import ReportContent
 from pisigma.reporting.page.figures import Drawing, ReportFigures
@@ -29,10 +37,17 @@ _ESCAPED = {ord(mark): f"\\u{ord(mark):04x}" for mark in "<>&\u2028\u2029"}
 _PACKAGE = "pisigma.reporting.page"
 
 
-def render_page(content: ReportContent, figures: ReportFigures) -> str:
-    """Render the report as HTML; texts are escaped."""
+def render_page(content: ReportContent, figures: ReportFigures, acceptance: Acceptance | None = None) -> str:
+    """Render the report as HTML; texts are escaped.
+
+    Args:
+        content: findings of the report.
+        figures: its figures.
+        acceptance: statements by which the robot of a cell is accepted; None without a cell.
+    """
     return render(
         "page.html.j2",
+        **({} if acceptance is None else _acceptance(acceptance)),
         c=content,
         figures=figures,
         labels=MODEL_LABELS,
@@ -47,6 +62,18 @@ def render_page(content: ReportContent, figures: ReportFigures) -> str:
         style=Markup(resource("style.css")),  # ours
         script=Markup(resource("viewer.js")),
     )
+
+
+def _acceptance(acceptance: Acceptance) -> dict[str, Any]:
+    """Return the values of the template of the acceptance."""
+    return {
+        "a": acceptance,
+        "a_sentences": acceptance_sentences(acceptance),
+        "a_statements": statement_table(acceptance),
+        "a_budget": budget_table(acceptance),
+        "a_comparison": comparison_table(acceptance),
+        "a_iso": iso_table(acceptance.repeats) if acceptance.repeats else None,
+    }
 
 
 def script_json(value: Any) -> Markup:

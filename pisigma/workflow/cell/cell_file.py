@@ -11,7 +11,7 @@ import yaml
 from pydantic import Field
 
 from pisigma.files.errors import PisigmaError, Place, PlanningError
-from pisigma.files.setting import build_settings, by_key, flat_settings
+from pisigma.files.setting import attributes_of, build_settings, by_key, flat_settings
 from pisigma.files.setting_values import checked_values
 from pisigma.files.yaml_file import Section, place_of_key, read_yaml
 from pisigma.lifetime.cell.layout import CELL_FILE
@@ -20,6 +20,7 @@ from pisigma.planning.plan_settings import PlanSettings
 from pisigma.planning.surroundings.surroundings import Surroundings
 from pisigma.robot.robot_file import robot_file
 from pisigma.robot.row import Bounded
+from pisigma.validation.uncertainty.instrument import Instrument
 from pisigma.workflow.settings.calibration import CalibrationSettings
 from pisigma.workflow.settings.comparison import ComparisonSettings
 from pisigma.workflow.settings.evaluation import EvaluationSettings
@@ -45,6 +46,7 @@ CAMERA_KEYS = ("camera", "board", "fixed_camera", "intrinsics", "repeatability_m
 STATED_ABOVE = {"plan": ("limit_mm", "sensor"), "measure": ("limit_mm",)}
 """Keys of a step whose values are those of the cell, in addition to `CAMERA_KEYS`. `monitor` has another limit."""
 MAX_WIDTH = 100
+_COMMENT: Mapping[str, Any] = {"initial_indent": "# ", "subsequent_indent": "# "}
 
 SensorName = Literal["tracker", "camera", "sockets", "draw-wire", "touch"]
 PLANNED_SENSORS: dict[SensorName, str] = {"camera": "camera", "draw-wire": "distance"}
@@ -83,6 +85,11 @@ class CellDocument(Section):
         tip: link of the URDF file that is the tool; None for its only end.
         sensor: sensor that measures the robot.
         limit_mm: limit of the 95 % quantile of the position errors [mm]; None for no limit.
+        instrument: measuring instrument and its calibration certificate; None if it is not stated.
+        pose_repeatability_mm: pose repeatability RP after ISO 9283 that the maker of the robot states [mm]; None if it
+            is not stated.
+        expansion_per_k: coefficient of linear expansion of the arm [1/K], about 1.2e-5 for steel and 2.3e-5 for
+            aluminium; None if it is not stated.
         camera: cameras and boards; None without cameras.
         surroundings: obstacles around the robot and limits of its motion; None for none.
         plan: settings of `pisigma plan`, by the keys of its option `--set`.
@@ -101,6 +108,9 @@ class CellDocument(Section):
     tip: str | None = None
     sensor: SensorName = "tracker"
     limit_mm: Annotated[Bounded, Field(gt=0)] | None = None
+    instrument: Instrument | None = None
+    pose_repeatability_mm: Annotated[Bounded, Field(gt=0)] | None = None
+    expansion_per_k: Annotated[Bounded, Field(ge=0, le=1e-3)] | None = None
     camera: CameraSection | None = None
     surroundings: Surroundings | None = None
     plan: _Steps = None
@@ -277,16 +287,15 @@ def template(document: Mapping[str, Any]) -> str:
         document: known values by the keys of `CellDocument`.
     """
     lines = ["# A cell: one robot on its mount, and its sensor. Lines that begin with # state defaults."]
-    optional = {
-        "base": "link of the URDF file in whose frame poses are given",
-        "tip": "link of the URDF file that is the tool",
-        "limit_mm": "limit of the 95 % quantile of the position errors [mm]",
-    }
-    for key in ("robot", "base", "tip", "sensor", "limit_mm"):
+    meaning = {key: text.partition("; None")[0] for key, text in attributes_of(CellDocument).items()}
+    for key in ("robot", "base", "tip", "sensor", "limit_mm", "pose_repeatability_mm", "expansion_per_k"):
         if document.get(key) is not None:
             lines.append(f"{key}: {_yaml(document[key])}")
-        elif key in optional:
-            lines.append(f"# {key}:  # {optional[key]}")
+        else:
+            lines += textwrap.wrap(f"{key}:  # {meaning[key]}", MAX_WIDTH, **_COMMENT)
+    lines.append("# instrument:  # for the uncertainty budget of `pisigma report`; texts in quotation marks")
+    for key, text in attributes_of(Instrument).items():
+        lines.append(f"#   {key}:  # {text}")
     if document.get("camera") is not None:
         lines += ["camera:", *(f"  {key}: {_yaml(value)}" for key, value in document["camera"].items())]
     lines.append(

@@ -5,12 +5,11 @@ import os
 import sqlite3
 import subprocess
 import sys
-import zipfile
 from contextlib import closing
 from dataclasses import astuple, fields, replace
-from pathlib import Path
 
 import pytest
+from testing.cell_before import cell_of_schema_1
 from testing.closeness import assert_close
 from testing.refusals import refused
 
@@ -233,9 +232,7 @@ def test_texts_with_quotes_are_kept(history):
 @pytest.fixture
 def older(tmp_path):
     """A cell that a version before schema version 2 wrote, with the history of its model."""
-    with zipfile.ZipFile(Path(__file__).with_name("cell_of_schema_1.zip")) as archive:
-        archive.extractall(tmp_path / "cell")
-    return tmp_path / "cell"
+    return cell_of_schema_1(tmp_path)
 
 
 def test_a_cell_of_schema_1_keeps_every_entry_and_the_monitored_sessions_of_its_models(older):

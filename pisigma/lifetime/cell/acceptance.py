@@ -1,0 +1,155 @@
+"""What the acceptance of a cell's robot needs: instrument, uncertainty budget, measured errors, who accepted it."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from pisigma.lifetime.cell.history import Event
+from pisigma.validation.held_out.model_comparison import QuantityErrors
+from pisigma.validation.iso9283.repeats import CYCLES, RepeatedPose
+from pisigma.validation.uncertainty.budget import UncertaintyBudget
+from pisigma.validation.uncertainty.instrument import Instrument
+
+EXPLAINED = 0.999
+"""Probability with which errors that the budget explains are found to be explained by it."""
+MAX_FREEDOM = 1e9
+"""Degrees of freedom that count as infinite."""
+NO_PATHS = "AT and RT: the sessions of a cell contain no measured paths."
+
+
+@dataclass(frozen=True)
+class MeasuredAccuracy:
+    """Errors of the model in use on a session that it was not fitted to.
+
+    Attributes:
+        session: name of the session.
+        day: its day (ISO 8601).
+        rows: number of rows.
+        fitted: "base" or "tool" or both, if they were changed after the calibration and therefore fitted to the rows.
+        errors: position errors of the model in use [mm].
+        doubt: why the rows must not be trusted; empty if they can be.
+    """
+
+    session: str
+    day: str
+    rows: int
+    fitted: tuple[str, ...]
+    errors: QuantityErrors
+    doubt: str = ""
+
+    @property
+    def coordinate_p95_mm(self) -> float:
+        """Largest 95 % quantile of the absolute errors along one axis [mm]."""
+        return max(axis["p95"] for axis in self.errors.axes.values())
+
+    def to_json(self) -> dict[str, Any]:
+        """Return plain values, lengths in mm."""
+        return {
+            "session": self.session,
+            "day": self.day,
+            "rows": self.rows,
+            "fitted": list(self.fitted),
+            "position_mm": dict(self.errors.statistics),
+            "axes_mm": {name: dict(axis) for name, axis in self.errors.axes.items()},
+            "doubt": self.doubt,
+        }
+
+
+@dataclass(frozen=True)
+class Acceptance:
+    """Statements by which the robot of a cell is accepted.
+
+    Attributes:
+        model: name of the model in use.
+        limit_mm: limit of the 95 % quantile of the position errors [mm]; None if the cell has none.
+        instrument: the instrument, as far as it is stated.
+        repeatability_mm: pose repeatability RP that the maker of the robot states [mm]; None if it is not stated.
+        temperatures: mean temperature of every valid session [deg C], by its name; None where it is not known.
+        budget: uncertainty budget.
+        measured: errors on the newest session that the model was not fitted to; None if there is none.
+        repeats: ISO 9283 figures of the poses that were measured more than once, of all valid sessions.
+        accepted: acceptances of models of this cell, the newest last.
+        missing: what is not stated, one sentence each, apart from components of the budget.
+    """
+
+    model: str
+    limit_mm: float | None
+    instrument: Instrument
+    repeatability_mm: float | None
+    temperatures: Mapping[str, float | None]
+    budget: UncertaintyBudget
+    measured: MeasuredAccuracy | None
+    repeats: tuple[RepeatedPose, ...]
+    accepted: tuple[Event, ...]
+    missing: tuple[str, ...]
+
+    @property
+    def temperature_span(self) -> tuple[float, float] | None:
+        """Lowest and highest mean temperature of a session [deg C]; None if no session states it."""
+        known = [value for value in self.temperatures.values() if value is not None]
+        return (min(known), max(known)) if known else None
+
+    @property
+    def contradicted(self) -> bool:
+        """Whether the measured errors are larger than the budget explains, beyond chance.
+
+        The mean square of the measured coordinates over `u_c²` then exceeds the quantile `EXPLAINED` of the F
+        distribution. Its degrees of freedom are the number of rows, as the coordinates of a row may be correlated, and
+        those of the budget.
+        """
+        if self.measured is None or not self.budget.components:
+            return False
+        from scipy import stats
+
+        square = (self.measured.errors.statistics["rms"] / 1e3) ** 2 / 3
+        freedom = min(self.budget.effective_degrees_of_freedom, MAX_FREEDOM)
+        limit = float(stats.f.ppf(EXPLAINED, self.measured.rows, freedom))
+        return square > limit * self.budget.combined**2
+
+    @property
+    def not_stated(self) -> tuple[str, ...]:
+        """Everything that is not stated, one sentence each."""
+        return (*self.budget.missing, *self.missing)
+
+    def to_json(self) -> dict[str, Any]:
+        """Return plain values, lengths in mm."""
+        span = self.temperature_span
+        return {
+            "model": self.model,
+            "limit_mm": self.limit_mm,
+            "instrument": self.instrument.model_dump(),
+            "repeatability_mm": self.repeatability_mm,
+            "temperature_c": None if span is None else list(span),
+            "budget": self.budget.to_json(),
+            "contradicted": self.contradicted,
+            "measured": None if self.measured is None else self.measured.to_json(),
+            "iso9283": [one.to_json() for one in self.repeats],
+            "accepted": [one.to_json() for one in self.accepted],
+            "not_stated": list(self.not_stated),
+        }
+
+
+def missing_statements(
+    instrument: Instrument, repeatability_mm: float | None, measured: str, repeats: tuple[RepeatedPose, ...]
+) -> tuple[str, ...]:
+    """List what an acceptance lacks.
+
+    Args:
+        instrument: the instrument.
+        repeatability_mm: pose repeatability that the maker states [mm]; None if it is not stated.
+        measured: why there are no measured errors; empty if there are some.
+        repeats: figures of repeated poses.
+    """
+    names = ("name", "serial", "certificate", "calibrated")
+    lines = [
+        f"instrument: instrument.{name} in cell.yaml." for name in names if not getattr(instrument, name)
+    ]
+    if repeatability_mm is None:
+        lines.append("pose repeatability of the maker: pose_repeatability_mm in cell.yaml.")
+    if measured:
+        lines.append(f"measured errors: {measured}")
+    if not repeats:
+        lines.append("AP and RP: no pose was measured more than once.")
+    elif (fewest := min(one.rows for one in repeats)) < CYCLES:
+        lines.append(f"AP and RP of {CYCLES} cycles, as ISO 9283 asks for: one pose has {fewest}.")
+    return (*lines, NO_PATHS)

@@ -1,0 +1,158 @@
+"""Acceptance of the robot of a cell as sentences and tables."""
+
+import math
+from collections.abc import Sequence
+
+from pisigma.lifetime.cell.acceptance import Acceptance
+from pisigma.reporting.tables import Table, figure_text
+from pisigma.validation.iso9283.repeats import RepeatedPose
+from pisigma.validation.uncertainty.budget import COVERAGE
+
+NOT_STATED = "not stated"
+_SHARE = f"{100 * COVERAGE:.0f} %"
+
+
+def acceptance_sentences(acceptance: Acceptance) -> tuple[str, ...]:
+    """Say what the budget predicts, what was measured, what the limit is, and who accepted the model."""
+    budget, measured, lines = acceptance.budget, acceptance.measured, list[str]()
+    if budget.components:
+        start = f"With the stated components alone, {_SHARE}" if budget.missing else _SHARE
+        U, k, radius = budget.expanded * 1e3, budget.coverage_factor, budget.radius * 1e3
+        lines.append(
+            f"{start} of the positions are expected within {radius:.3f} mm of the commanded ones; the expanded "
+            f"uncertainty of a coordinate is U = {U:.3f} mm (k = {k:.2f})."
+        )
+    if measured is not None:
+        lines.append(
+            f"{_SHARE} of the {measured.rows} measured positions of session {measured.session} were within "
+            f"{measured.errors.statistics['p95']:.3f} mm."
+        )
+    if acceptance.limit_mm is not None:
+        lines.append(f"The limit is {acceptance.limit_mm:g} mm.")
+    if measured is not None and measured.fitted:
+        lines.append(f"The {' and the '.join(measured.fitted)} was fitted to these rows, as it was changed.")
+    if measured is not None and measured.doubt:
+        lines.append(measured.doubt)
+    if acceptance.contradicted:
+        lines.append(contradiction(acceptance))
+    of_model = [one for one in acceptance.accepted if one.model == acceptance.model]
+    lines.append(
+        of_model[-1].sentence if of_model else f"Nobody has accepted model '{acceptance.model}' yet."
+    )
+    return tuple(lines)
+
+
+def contradiction(acceptance: Acceptance) -> str:
+    """Say that the measured errors are larger than the budget explains."""
+    session = "" if acceptance.measured is None else f" of session {acceptance.measured.session}"
+    return (
+        f"The measured errors{session} are larger than the budget explains: a component is missing in it, or the robot "
+        "has changed since its calibration."
+    )
+
+
+def statement_table(acceptance: Acceptance) -> tuple[tuple[str, str], ...]:
+    """Return what is stated about instrument, robot and temperatures, by name."""
+    instrument, span = acceptance.instrument, acceptance.temperature_span
+    U, k = instrument.expanded_uncertainty_mm, instrument.coverage_factor
+    maker = acceptance.repeatability_mm
+    return (
+        ("instrument", instrument.name or NOT_STATED),
+        ("serial number", instrument.serial or NOT_STATED),
+        ("certificate", instrument.certificate or NOT_STATED),
+        ("calibrated on", instrument.calibrated or NOT_STATED),
+        (
+            "uncertainty of a coordinate",
+            f"U = {NOT_STATED if U is None else f'{U:g} mm'}, k = {NOT_STATED if k is None else f'{k:g}'}",
+        ),
+        ("repeatability RP of the maker", NOT_STATED if maker is None else f"{maker:g} mm"),
+        (
+            "temperatures of the sessions",
+            NOT_STATED if span is None else f"{span[0]:.1f} to {span[1]:.1f} deg C",
+        ),
+    )
+
+
+def budget_table(acceptance: Acceptance) -> Table:
+    """Return the components of the budget with their standard uncertainties, and the combined figures below them."""
+    budget = acceptance.budget
+    rows: list[tuple[str, ...]] = [
+        (
+            one.name,
+            one.evaluation,
+            figure_text(one.standard_uncertainty * 1e3),
+            _freedom(one.degrees_of_freedom),
+            one.source,
+        )
+        for one in budget.components
+    ]
+    rows += [(line.partition(":")[0], "", NOT_STATED, "", line.partition(": ")[2]) for line in budget.missing]
+    if budget.components:
+        freedom, k = budget.effective_degrees_of_freedom, budget.coverage_factor
+        rows += [
+            (
+                "combined",
+                "",
+                figure_text(budget.combined * 1e3),
+                _freedom(freedom),
+                "root of the sum of squares",
+            ),
+            ("expanded", "", figure_text(budget.expanded * 1e3), "", f"k = {k:.3f} for {_SHARE}"),
+        ]
+    return Table(
+        ("component", "type", "standard uncertainty [mm]", "degrees of freedom", "source"), tuple(rows)
+    )
+
+
+def comparison_table(acceptance: Acceptance) -> Table:
+    """Return predicted figures beside those measured on a session that the model was not fitted to [mm]."""
+    budget, measured = acceptance.budget, acceptance.measured
+    predicted: Sequence[float] = (math.nan,) * 3
+    if budget.components:
+        predicted = [1e3 * value for value in (budget.combined, budget.expanded, budget.radius)]
+    found: Sequence[float] = (math.nan,) * 4
+    if measured is not None:
+        statistics = measured.errors.statistics
+        found = (
+            statistics["rms"] / math.sqrt(3),
+            measured.coordinate_p95_mm,
+            statistics["p95"],
+            statistics["max"],
+        )
+    names = (
+        "one coordinate, RMS",
+        "one coordinate, 95 % within",
+        "position, 95 % within",
+        "position, largest",
+    )
+    return Table(
+        ("error [mm]", "budget", "measured"),
+        tuple(
+            (name, _figure(here), _figure(there))
+            for name, here, there in zip(names, (*predicted, math.nan), found, strict=True)
+        ),
+    )
+
+
+def iso_table(repeats: Sequence[RepeatedPose]) -> Table:
+    """Return pose accuracy and repeatability of the poses that were measured more than once [mm]."""
+    accuracies = [one.accuracy * 1e3 for one in repeats if one.accuracy is not None]
+    repeatabilities = [one.repeatability * 1e3 for one in repeats]
+    cycles = sorted({one.rows for one in repeats})
+    counts = f"{cycles[0]} to {cycles[-1]}" if len(cycles) > 1 else f"{cycles[0]}"
+    rows = []
+    for name, values in (("pose accuracy AP", accuracies), ("pose repeatability RP", repeatabilities)):
+        if values:
+            mean = sum(values) / len(values)
+            rows.append((name, str(len(values)), counts, figure_text(mean), figure_text(max(values))))
+    return Table(("ISO 9283:1998", "poses", "cycles", "mean [mm]", "largest [mm]"), tuple(rows))
+
+
+def _freedom(value: float | None) -> str:
+    if value is None:
+        return "not known"
+    return "infinite" if math.isinf(value) else f"{value:.0f}"
+
+
+def _figure(value: float) -> str:
+    return "" if math.isnan(value) else figure_text(value)

@@ -1,0 +1,99 @@
+"""Collect the statements by which the robot of a cell is accepted."""
+
+from jaxtyping import Float64
+from torch import Tensor
+
+from pisigma.files.errors import PisigmaError
+from pisigma.lifetime.cell.acceptance import Acceptance, MeasuredAccuracy, missing_statements
+from pisigma.lifetime.cell.history import ModelEntry, SessionEntry
+from pisigma.lifetime.cell.status import valid_sessions
+from pisigma.measurement.dataset import Measurements
+from pisigma.model.calibrated_model import CalibratedModel, poses_of_rows
+from pisigma.model.folder.model_folder import load_model
+from pisigma.validation.iso9283.repeats import repeated_poses
+from pisigma.validation.uncertainty.components import uncertainty_budget
+from pisigma.validation.uncertainty.instrument import Instrument
+from pisigma.workflow.cell.cell import Cell
+from pisigma.workflow.cell.sessions import ModelRows
+from pisigma.workflow.evaluate import evaluate
+
+NO_SESSION = "no session that the model was not fitted to was measured since its calibration."
+
+
+def acceptance_of(cell: Cell) -> Acceptance:
+    """Collect instrument, uncertainty budget, measured figures and acceptances of the model in use.
+
+    The measured figures and the poses of the budget are those of the newest valid session that the model was not fitted
+    to; without one, the budget is that of the poses of the calibration.
+
+    Args:
+        cell: the cell; nothing is added to it.
+
+    Raises:
+        ModelError: no model is in use.
+        MeasurementError: the file of a session was changed.
+    """
+    model = load_model(folder := cell.model_folder())
+    entry = cell.history.model(folder.name)
+    document = cell.file.document
+    sessions = valid_sessions(cell.history.sessions(), cell.history.events())
+    made_of = entry.sessions.split(",")
+    later = [one for one in sessions if one.name not in made_of and one.day >= entry.day]
+    new = (later or [one for one in cell.history.sessions() if one.name == made_of[-1]])[-1]
+    seen = cell.sessions.rows_for(entry, cell.sessions.as_measured(new), new.day)
+    measured, problem = _measured(cell, entry, new, seen) if later else (None, NO_SESSION)
+    instrument = document.instrument or Instrument()
+    repeats = tuple(
+        pose
+        for one in sessions
+        for pose in repeated_poses(*_attained(cell, model, one, seen if one == new else None))
+    )
+    temperatures = {
+        one.name: one.temperature_c
+        for one in cell.history.sessions()
+        if one in sessions or one.name in made_of
+    }
+    budget = uncertainty_budget(
+        model,
+        seen.rows,
+        f"session {new.name}",
+        instrument,
+        temperatures,
+        made_of,
+        document.expansion_per_k,
+    )
+    return Acceptance(
+        model=entry.name,
+        limit_mm=document.limit_mm,
+        instrument=instrument,
+        repeatability_mm=document.pose_repeatability_mm,
+        temperatures=temperatures,
+        budget=budget,
+        measured=measured,
+        repeats=repeats,
+        accepted=tuple(one for one in cell.history.events() if one.kind == "accepted"),
+        missing=missing_statements(instrument, document.pose_repeatability_mm, problem, repeats),
+    )
+
+
+def _measured(
+    cell: Cell, entry: ModelEntry, session: SessionEntry, seen: ModelRows
+) -> tuple[MeasuredAccuracy | None, str]:
+    """Evaluate the model on a session; return a reason if that is not possible."""
+    settings = seen.settings_to_fit(cell.file.settings("evaluate"))
+    try:
+        found = evaluate(cell.model_folder(entry.name), seen.rows, settings)
+    except PisigmaError as problem:
+        return None, str(problem)
+    errors = found.comparison.models[-1].position
+    doubt = "" if not found.diagnostics else found.diagnostics[0].sentence
+    return MeasuredAccuracy(session.name, session.day, found.rows, seen.moved, errors, doubt), ""
+
+
+def _attained(
+    cell: Cell, model: CalibratedModel, session: SessionEntry, seen: ModelRows | None
+) -> tuple[Measurements, Float64[Tensor, "rows 3"] | None]:
+    """Return the rows of a session and the commanded positions; None if the frames may have changed."""
+    if seen is None or seen.moved:
+        return cell.sessions.as_measured(session), None
+    return seen.rows, poses_of_rows(model, seen.rows)[:, :3, 3]

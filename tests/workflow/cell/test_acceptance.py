@@ -1,0 +1,75 @@
+"""The report of a cell has what its acceptance needs: statements, budget, measured errors, and who accepted it."""
+
+import math
+
+import pytest
+from testing.cell_before import cell_of_schema_1
+from testing.closeness import assert_close
+from testing.refusals import refused
+
+from pisigma.files.errors import PlanningError
+from pisigma.workflow.cell.acceptance import acceptance_of
+from pisigma.workflow.cell.cell import Cell
+
+STATED = """
+pose_repeatability_mm: 0.05
+expansion_per_k: 1.2e-5
+instrument:
+  name: Tracker 7
+  serial: "0012"
+  certificate: K-1
+  calibrated: 2026-02-14
+  expanded_uncertainty_mm: 0.03
+  coverage_factor: 2
+"""
+
+
+@pytest.fixture
+def cell(tmp_path):
+    return Cell.open(cell_of_schema_1(tmp_path))
+
+
+def _stated(cell, text=STATED):
+    path = cell.folder / "cell.yaml"
+    path.write_text(path.read_text(encoding="utf-8") + text, encoding="utf-8")
+    return Cell.open(cell.folder)
+
+
+def test_what_is_not_stated_is_named(cell):
+    found = acceptance_of(cell)
+    assert [one.evaluation for one in found.budget.components] == ["A", "A"]
+    names = [line.partition(":")[0] for line in found.not_stated]
+    assert names.count("instrument") == 5
+    assert {"thermal expansion", "pose repeatability of the maker", "AP and RP", "AT and RT"} < set(names)
+    assert found.temperature_span is None
+
+
+def test_what_is_stated_is_in_the_budget(cell):
+    cell = _stated(cell)
+    cell.sessions.set_aside("2026-08-01", "joint 3 had slipped")
+    found = acceptance_of(cell)
+    assert found.instrument.serial == "0012"
+    u = [one.standard_uncertainty for one in found.budget.components]
+    assert_close(u[2], 0.015e-3, rtol=1e-12)
+    assert_close(found.budget.combined, math.sqrt(sum(one**2 for one in u)))
+    assert (found.measured.session, found.measured.rows) == ("2026-06-01", 10)
+    assert found.measured.errors.statistics["p95"] < found.budget.radius * 1e3
+    assert not found.contradicted
+
+
+def test_errors_that_the_budget_does_not_explain_are_found(cell):
+    assert acceptance_of(_stated(cell)).contradicted
+
+
+@pytest.mark.parametrize(
+    ("key", "text"),
+    [
+        ("instrument.coverage_factor", "instrument: {coverage_factor: 0.5}"),
+        ("instrument.serial", "instrument: {serial: 12}"),
+        ("instrument.calibrated", "instrument: {calibrated: 2126-01-01}"),
+        ("expansion_per_k", "expansion_per_k: -1"),
+    ],
+)
+def test_wrong_statements_are_refused(cell, key, text):
+    with refused(PlanningError, file="cell.yaml", column=key):
+        _stated(cell, f"\n{text}\n")
