@@ -11,14 +11,14 @@ from pathlib import Path
 from recipe_tables import page_with
 
 from pisigma.files.setting import attributes_of
-from pisigma.lifetime.cell.history import HISTORY, TABLES, History
+from pisigma.lifetime.cell.history import HISTORY, SCHEMA_VERSION, TABLES, History
 
 PAGE = Path(__file__).parent.parent / "reference" / "history.md"
 
 
 def tables() -> str:
     """Return every table of a new history, with the types of its columns and the meaning of its attributes."""
-    parts = []
+    parts = [f"This is version {SCHEMA_VERSION} of the schema.", ""]
     with tempfile.TemporaryDirectory() as folder:
         history = History(Path(folder) / HISTORY)
         history.database.upgrade()

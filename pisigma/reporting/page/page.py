@@ -47,8 +47,9 @@ def render_page(content: ReportContent, figures: ReportFigures, acceptance: Acce
     """
     return render(
         "page.html.j2",
-        **({} if acceptance is None else _acceptance(acceptance)),
         c=content,
+        a=acceptance,
+        accepted={} if acceptance is None else _acceptance(acceptance),
         figures=figures,
         labels=MODEL_LABELS,
         titles=TITLES,
@@ -65,14 +66,13 @@ def render_page(content: ReportContent, figures: ReportFigures, acceptance: Acce
 
 
 def _acceptance(acceptance: Acceptance) -> dict[str, Any]:
-    """Return the values of the template of the acceptance."""
+    """Return the sentences and tables of an acceptance."""
     return {
-        "a": acceptance,
-        "a_sentences": acceptance_sentences(acceptance),
-        "a_statements": statement_table(acceptance),
-        "a_budget": budget_table(acceptance),
-        "a_comparison": comparison_table(acceptance),
-        "a_iso": iso_table(acceptance.repeats) if acceptance.repeats else None,
+        "sentences": acceptance_sentences(acceptance),
+        "statements": statement_table(acceptance),
+        "budget": budget_table(acceptance),
+        "comparison": comparison_table(acceptance),
+        "iso": iso_table(acceptance.repeats) if acceptance.repeats else None,
     }
 
 
