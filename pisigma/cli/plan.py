@@ -26,7 +26,10 @@ Subject = Annotated[
     ),
 ]
 Out = Annotated[Path | None, typer.Option(help="CSV file of poses to write, with a .plan.yaml next to it.")]
-CellFile = Annotated[Path | None, typer.Option("--cell", help="Obstacles around the robot (YAML).")]
+SurroundingsFile = Annotated[
+    Path | None,
+    typer.Option("--surroundings", help="Obstacles around the robot and limits of its motion (YAML)."),
+]
 Programs = Annotated[
     list[Path] | None,
     typer.Option(
@@ -42,7 +45,7 @@ def plan(
     *,
     out: Out = None,
     settings: StatedSettings[PlanSettings],
-    cell: CellFile = None,
+    surroundings: SurroundingsFile = None,
     program: Programs = None,
     base: Base = None,
     tip: Tip = None,
@@ -60,15 +63,15 @@ def plan(
     from pisigma.workflow.result_texts import plan_text
 
     if (opened := cell_at(subject)) is not None:
-        refuse_with_cell(__out=out, __cell=cell, __base=base, __tip=tip)
+        refuse_with_cell(__out=out, __surroundings=surroundings, __base=base, __tip=tip)
         return _plan_cell(opened, settings, program or [], verbose, as_json)
     if out is None:
         raise typer.BadParameter("expected a CSV file", param_hint="'--out'")
     chosen = settings.build()
     planned_for, programs = PlanningSubject.load(subject, base, tip), program or []
-    workflow.check_files(out, programs, chosen, planned_for.robot, (subject, cell))
+    workflow.check_files(out, programs, chosen, planned_for.robot, (subject, surroundings))
     with progress_of("plan") as progress:
-        planned = workflow.plan(planned_for, chosen, cell, progress)
+        planned = workflow.plan(planned_for, chosen, surroundings, progress)
     planned.save(out, programs)
     if as_json:
         print_json({"file": str(out), **planned.to_json()})

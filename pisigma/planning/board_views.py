@@ -36,7 +36,7 @@ class BoardViews:
 
     Attributes:
         sight: camera and board.
-        T_cell_frame: pose of the measuring frame (the board, or the fixed camera) in the frame of the cell [m].
+        T_cell_frame: pose of the measuring frame (the board, or the fixed camera) in the frame of the nominal base [m].
         nearest: smallest depth of a corner in front of the camera [m].
         farthest: largest depth of a corner [m].
         oblique: largest angle between the normal of the board and the line of sight to its centre [rad].
@@ -54,7 +54,7 @@ class BoardViews:
     def from_sight(
         sight: BoardSight, T_cell_frame: Float64[Tensor, "4 4"], view: ViewSection
     ) -> "BoardViews":
-        """Read the conditions from the section `view` of a cell."""
+        """Read the conditions from the section `view` of the surroundings."""
         nearest, farthest = view.depths(sight.camera.fx)
         return BoardViews(
             sight, T_cell_frame, nearest, farthest, math.radians(view.oblique_deg), view.margin_px

@@ -1,4 +1,4 @@
-"""Candidate poses for a measurement: drawn within the joint limits or read from a file, and allowed by the cell."""
+"""Candidate poses for a measurement: drawn within the joint limits or read from a file, and possible there."""
 
 import math
 import os
@@ -44,8 +44,8 @@ class Candidates:
         looked_at: number of poses that were drawn or read.
         refused: number of refused poses by reason.
         workspace: joint values where the robot shall be accurate, and that may be way points [rad or m]: the candidates
-            themselves; with a camera, which sees its board from a small part of the workspace only, poses that the cell
-            allows.
+            themselves; with a camera, which sees its board from a small part of the workspace only, poses that the
+            surroundings allow.
     """
 
     q: Float64[Tensor, "candidates dof"]
@@ -73,7 +73,7 @@ class Candidates:
                 f"expected {count:,} candidates or more, but {self.sentence.removesuffix('.')}",
                 expected=f"{count:,} candidates or more",
                 value=len(self.q),
-                remedy="plan fewer poses, give more candidates or enlarge the cell",
+                remedy="plan fewer poses, give more candidates or relax the limits of the surroundings",
             )
 
 
@@ -91,7 +91,7 @@ def draw_candidates(
     camera has to see a board, views are drawn instead.
 
     Args:
-        arm: the robot in its cell.
+        arm: the robot in its surroundings.
         count: number of candidates.
         seed: random seed.
         workspace: box in which the reflector has to be; None for anywhere.
@@ -125,7 +125,7 @@ def with_workspace(arm: ArmInSurroundings, candidates: Candidates, others: Candi
     other angles: between values on both sides of ±180 deg there would be no free motion.
 
     Args:
-        arm: the robot in its cell.
+        arm: the robot in its surroundings.
         candidates: candidates.
         others: poses in the whole workspace.
     """
@@ -153,7 +153,7 @@ def read_candidates(
     """Read candidates from the joint values of a file; repeated joint values count once.
 
     Args:
-        arm: the robot in its cell.
+        arm: the robot in its surroundings.
         path: CSV file with joint values, of measurements or without.
         workspace: box in which the reflector has to be; None for anywhere.
         views: conditions under which the camera sees its board; None without a camera.
@@ -210,7 +210,7 @@ def _faults(
     workspace: Workspace | None,
     views: BoardViews | None,
 ) -> Faults:
-    """Return why poses are not allowed by the cell, the workspace, or the camera."""
+    """Return why poses are not allowed by the surroundings, the workspace, or the camera."""
     failed = {} if views is None else {UNREACHED: q.isnan().any(1)}
     q = q.nan_to_num()
     faults = arm.faults(q)
@@ -240,6 +240,6 @@ def _sampled_range(arm: ArmInSurroundings) -> Float64[Tensor, "axes 2"]:
             raise PlanningError(
                 f"prismatic joint '{joint.name}' of robot '{arm.robot.name}' has no limits",
                 value=joint.name,
-                remedy="state them in the cell (joints: limits_mm), or give candidates in a file",
+                remedy="state them in the surroundings (joints: limits_mm), or give candidates in a file",
             )
     return limits

@@ -147,7 +147,7 @@ class CameraProspects:
         more_images: RMS error with `MORE_IMAGES` more images [m].
         exact_corners: RMS error with corners without noise [m].
         exact_robot: RMS error with a robot that repeats exactly [m].
-        room: distance that the board may be from its place in the cell before it leaves an image [m].
+        room: distance that the board may be from its place in the surroundings before it leaves an image [m].
         unidentifiable: parameters of the arm that images cannot identify, one sentence each.
     """
 
@@ -175,7 +175,7 @@ class CameraProspects:
             chosen: indices of the planned ones.
             task: joint values where the robot shall be accurate [rad or m].
             views: conditions under which the camera sees the board.
-            arm: the robot in its cell.
+            arm: the robot in its surroundings.
         """
         q, sight = candidates.q[chosen], views.sight
 
@@ -228,7 +228,7 @@ class CameraProspects:
             "The scale comes from the board alone: squares 0.1 % too large make the robot 0.1 % too large, which only "
             "a known distance reveals.",
             f"The board leaves the first image if it or the camera is {self.room * 1e3:.0f} mm from its place in the "
-            "cell; a larger margin_px allows more.",
+            "surroundings; a larger margin_px allows more.",
         )
 
 

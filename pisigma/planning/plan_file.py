@@ -64,10 +64,10 @@ class PlanDocument(Section):
 
 @dataclass(frozen=True, eq=False)
 class StoredPlan:
-    """Poses in the order of measurement, with the settings, robot and cell of the plan.
+    """Poses in the order of measurement, with the settings, robot and surroundings of the plan.
 
     Attributes:
-        arm: the robot in its cell.
+        arm: the robot in its surroundings.
         settings: settings of the plan, with paths relative to the working directory.
         model: folder of the model that was planned for; None for a nominal robot.
         q: joint values [rad or m].
@@ -135,7 +135,7 @@ class StoredPlan:
         document: dict[str, Any] = {"poses": path.name, "settings": settings}
         if self.model is not None:
             document["model"] = os.path.relpath(self.model, folder)
-        document["cell"] = self.arm.cell.model_dump(mode="json", exclude_none=True)
+        document["cell"] = self.arm.surroundings.model_dump(mode="json", exclude_none=True)
         points = zip(self.numbers, map(self._in_file_units, self.way_points), strict=True)
         document["way_points"] = [{"before": n, "joints": joints} for n, rows in points for joints in rows]
         return document | {"robot": robot_document(self.arm.nominal)}

@@ -48,8 +48,8 @@ def instrument_of(settings: PlanSettings, anchor: Float64[Tensor, " 3"] | None =
         raise PlanningError(
             "the origin of the measured distances is not stated",
             expected="the origin of the measured distances",
-            option="--cell",
-            remedy="state it as the tracker of the cell",
+            option="--surroundings",
+            remedy="state it as tracker in the surroundings",
         )
     stated: dict[str, Any] = {} if settings.sigma_mm is None else {"sigma": settings.sigma_mm / 1e3}
     stated |= {} if anchor is None else {"anchor": tuple(anchor.tolist())}
@@ -104,19 +104,19 @@ def views_of(settings: PlanSettings, arm: ArmInSurroundings) -> BoardViews | Non
     """Return the conditions under which the camera sees its board; None without a camera.
 
     Raises:
-        PlanningError: the cell does not state them.
+        PlanningError: the surroundings do not state them.
     """
     if settings.camera is None:
         return None
-    view = arm.cell.view
+    view = arm.surroundings.view
     if view is None or view.T_cell_frame is None:
         frame, target = ("camera", "board") if settings.camera.is_fixed else ("board", "camera")
         raise PlanningError(
-            f"the cell does not state where the {frame} is and at which depths images are sharp",
+            f"the surroundings do not state where the {frame} is and at which depths images are sharp",
             expected=f"the pose of the {frame} and the depths at which images are sharp",
-            option="--cell",
-            remedy="state them in the cell, as view: {frame: {x_mm: 400, z_mm: 50, yaw_deg: 180}, near_mm: 300, "
-            f"far_mm: 700}}, and the pose of the {target} on the flange as tool",
+            option="--surroundings",
+            remedy="state them as view: {frame: {x_mm: 400, z_mm: 50, yaw_deg: 180}, near_mm: 300, far_mm: 700}, and "
+            f"the pose of the {target} on the flange as tool",
         )
     return BoardViews.from_sight(sight_of(settings.camera), view.T_cell_frame, view)
 

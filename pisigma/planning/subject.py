@@ -78,19 +78,26 @@ class Subject:
             )
         return Subject(subject.nominal, subject)
 
-    def arm(self, cell: Surroundings | None) -> ArmInSurroundings:
-        """Return the robot in its cell, with target and board as the cell states them, else as in the model."""
+    def arm(self, surroundings: Surroundings | None) -> ArmInSurroundings:
+        """Return the robot in its surroundings, which state target and board, or leave them to the model."""
         if self.model is None:
-            return ArmInSurroundings.from_robot(self.robot, cell)
-        if cell is not None and cell.view is not None and cell.view.frame is None and self._saw_board:
+            return ArmInSurroundings.from_robot(self.robot, surroundings)
+        if (
+            surroundings is not None
+            and surroundings.view is not None
+            and surroundings.view.frame is None
+            and self._saw_board
+        ):
             x, y, z, *angles = xyzrpy_from_transform(invert(self._from_cell())).tolist()
             lengths = {f"{name}_mm": value * 1e3 for name, value in zip("xyz", (x, y, z), strict=True)}
             names = ("roll_deg", "pitch_deg", "yaw_deg")
             frame = FrameSection(**lengths, **dict(zip(names, map(math.degrees, angles), strict=True)))
-            cell = cell.model_copy(update={"view": cell.view.model_copy(update={"frame": frame})})
-        has_tool = cell is not None and cell.tool is not None
+            surroundings = surroundings.model_copy(
+                update={"view": surroundings.view.model_copy(update={"frame": frame})}
+            )
+        has_tool = surroundings is not None and surroundings.tool is not None
         robot = self.robot if has_tool else self.robot.with_geometry(tool=self.model.identified.tool)
-        return ArmInSurroundings.from_robot(robot, cell)
+        return ArmInSurroundings.from_robot(robot, surroundings)
 
     def posterior(self, arm: ArmInSurroundings, settings: PlanSettings) -> RobotPosterior:
         """Return the distribution of the unknowns before the first pose of the plan is measured.
@@ -104,7 +111,7 @@ class Subject:
         if views is not None:
             posterior = self._seen_by_camera(arm, settings, views)
         else:
-            tracker = arm.cell.tracker
+            tracker = arm.surroundings.tracker
             anchor = None if tracker is None else tracker.position
             if self.model is not None:
                 T = self._from_cell()
@@ -142,7 +149,7 @@ class Subject:
         return uncertainty is not None and "corner" in uncertainty.noise.value
 
     def _from_cell(self) -> Float64[Tensor, "4 4"]:
-        """Return the frame of the cell (the nominal robot's base) in the frame of the model's poses [m]."""
+        """Return the frame of the nominal base in the frame of the model's poses [m]."""
         assert self.model is not None
         nominal_base, fitted = (
             transform_from_xyzrpy(torch.tensor(robot.base)) for robot in (self.robot, self.model.identified)

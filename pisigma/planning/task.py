@@ -38,7 +38,7 @@ def task_poses(
     """Return joint values [rad or m] where the robot has to be accurate: of the task file, else of the workspace.
 
     Args:
-        arm: the robot in its cell.
+        arm: the robot in its surroundings.
         settings: settings that name the task file.
         q: joint values of the workspace [rad or m].
         model: model of the robot, if there is one.

@@ -92,7 +92,7 @@ def tour(
     Blocked motions are made expensive and the order is improved again; those that remain get way points.
 
     Args:
-        motions: motions of the robot in its cell, which keep the results of earlier tours.
+        motions: motions of the robot in its surroundings, which keep the results of earlier tours.
         q: joint values of the poses, all of them free [rad or m].
         pace: speeds and settling time.
         start: current joint values of the robot [rad or m]; None for any.

@@ -171,7 +171,7 @@ def check_files(
 def plan(
     subject: Robot | CalibratedModel | HasModel | Subject | str | os.PathLike[str],
     settings: PlanSettings | None = None,
-    cell: Surroundings | str | os.PathLike[str] | None = None,
+    surroundings: Surroundings | str | os.PathLike[str] | None = None,
     progress: Progress = lambda what: None,
 ) -> Plan:
     """Plan which poses to measure and in which order, and predict the accuracy of a calibration with them.
@@ -180,7 +180,7 @@ def plan(
         subject: the nominal robot (a robot, a catalogue name, a robot file in YAML or URDF), or a model of it (a model,
             an object that contains one, such as a `CorrectedIK` or a `Calibration`, or a folder).
         settings: see `PlanSettings`. None: the defaults.
-        cell: surroundings of the robot, or their YAML file. None: no obstacles.
+        surroundings: surroundings of the robot, or their YAML file. None: no obstacles.
         progress: called with the current step.
 
     Raises:
@@ -189,13 +189,13 @@ def plan(
         MeasurementError: a file of joint values or of measurements cannot be used, or a fault of the setup explains
             the measurements.
         IdentificationError: no calibration error explains the measurements.
-        PlanningError: the cell cannot be used, or too few poses are possible in it.
+        PlanningError: the surroundings cannot be used, or too few poses are possible in them.
     """
     started, settings = time.perf_counter(), settings or PlanSettings()
     subject = subject if isinstance(subject, Subject) else Subject.load(subject)
-    if cell is not None and not isinstance(cell, Surroundings):
-        cell = read_surroundings(cell, subject.robot)
-    arm = with_measured(settings, subject.arm(cell))
+    if surroundings is not None and not isinstance(surroundings, Surroundings):
+        surroundings = read_surroundings(surroundings, subject.robot)
+    arm = with_measured(settings, subject.arm(surroundings))
     progress("candidates")
     candidates = find_candidates(settings, arm)
     candidates.check_count(settings.count + settings.check)
@@ -228,12 +228,12 @@ def plan(
 
 @dataclass(frozen=True, eq=False)
 class _Problem:
-    """The planning problem: robot, cell, candidates, task and prior posterior.
+    """The planning problem: robot, surroundings, candidates, task and prior posterior.
 
     Attributes:
         subject: the robot or the model.
         settings: settings of the plan.
-        arm: the robot in its cell.
+        arm: the robot in its surroundings.
         candidates: poses to choose from.
         posterior: distribution of the unknowns before the first pose is measured.
         task: joint values [rad or m] where the robot has to be accurate.

@@ -63,11 +63,11 @@ def test_poses_of_a_file_keep_the_number_of_their_row(run, folder, tmp_path):
     [
         (("--set", "box=1,2,3"), {"option": "box", "value": "1,2,3"}),
         (("--set", "criterion=A"), {"option": "criterion", "value": "A"}),
-        (("--sensor", "distance"), {"option": "--cell"}),
+        (("--sensor", "distance"), {"option": "--surroundings"}),
         (("--program", "poses.txt"), {}),
         (("--program", "class-1.src"), {}),
         (("--camera", "wrist.yaml"), {}),
-        (("--cell", "missing.yaml"), {"file": "missing.yaml"}),
+        (("--surroundings", "missing.yaml"), {"file": "missing.yaml"}),
         (("--set", "box=5000,5000,5000,6000,6000,6000"), {"value": 0}),
     ],
 )

@@ -205,7 +205,7 @@ def test_no_file_that_others_may_have_sent_names_a_plug_in(run, tmp_path, reposi
     for arguments in (
         ("simulate", tmp_path / "recipe.yaml", "--out", tmp_path / "x.csv"),
         ("robots", "--check", tmp_path / "robot.yaml"),
-        ("plan", "kiro4", "--out", tmp_path / "p.csv", "--cell", tmp_path / "cell.yaml"),
+        ("plan", "kiro4", "--out", tmp_path / "p.csv", "--surroundings", tmp_path / "cell.yaml"),
         ("fleet", "run", tmp_path / "fleet.csv", "--out", tmp_path / "fleet"),
         ("evaluate", model, tmp_path / "rows.csv"),
     ):

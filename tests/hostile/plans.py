@@ -52,7 +52,7 @@ def wrong_plan(rng: Rng, clean: Clean, folder: Path) -> Case:
         "--check": "1",
         "--set=candidates": "20",
         "--out": "poses.csv",
-        "--cell": "cell.yaml",
+        "--surroundings": "cell.yaml",
     }
     if rng.random() < 0.6:
         what, content = written(rng, cell)

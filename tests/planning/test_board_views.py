@@ -111,7 +111,7 @@ def test_depths_are_stated_once():
 
 
 def test_a_camera_needs_to_know_where_the_board_is(settings: PlanSettings):
-    with refused(PlanningError, option="--cell"):
+    with refused(PlanningError, option="--surroundings"):
         views_of(settings, ArmInSurroundings.from_robot(Robot.load("ur5")))
     with refused(PlanningError, option="sensor", value="camera"):
         PlanSettings(sensor="camera")

@@ -42,7 +42,7 @@ def stored(tmp_path: Path) -> StoredPlan:
 def test_a_plan_is_the_same_after_writing_and_reading(stored: StoredPlan, tmp_path: Path, name: str):
     read = read_plan(tmp_path / name)
     assert read.settings == stored.settings
-    assert read.arm.cell == stored.arm.cell
+    assert read.arm.surroundings == stored.arm.surroundings
     assert read.model == stored.model
     assert_close(read.arm.robot.dh, ARM.robot.dh, atol=1e-12)
     assert_close(read.q, stored.q, atol=1e-8)
@@ -99,5 +99,5 @@ def test_invalid_settings_are_refused(stated: dict[str, object], option: str, va
 
 
 def test_the_origin_of_distances_has_to_be_stated():
-    with refused(PlanningError, option="--cell"):
+    with refused(PlanningError, option="--surroundings"):
         instrument_of(PlanSettings(sensor="distance"))

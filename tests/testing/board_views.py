@@ -56,8 +56,11 @@ def arm_before_board(robot: Robot | None = None) -> ArmInSurroundings:
 def sees_board(arm: ArmInSurroundings, settings: CameraSettings, q: np.ndarray, radius: np.ndarray) -> bool:
     """Whether the whole printed sheet is in the image, sharp, near enough to frontal, and not behind a link."""
     camera, board = Camera.load(settings.camera), Board.load(settings.board)
-    assert arm.cell.view is not None
-    frame, target = arm.cell.view.T_cell_frame, forward_kinematics(arm.robot, torch.from_numpy(q)[None])[0]
+    assert arm.surroundings.view is not None
+    frame, target = (
+        arm.surroundings.view.T_cell_frame,
+        forward_kinematics(arm.robot, torch.from_numpy(q)[None])[0],
+    )
     T_board, T_camera = (one.numpy() for one in ((target, frame) if settings.is_fixed else (frame, target)))
     x, y = np.meshgrid(np.linspace(-1.5, board.columns + 0.5, 7), np.linspace(-1.5, board.rows + 0.5, 5))
     points = board.square * np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], 1)
@@ -72,7 +75,7 @@ def sees_board(arm: ArmInSurroundings, settings: CameraSettings, q: np.ndarray, 
     shares = np.linspace(0.1, 0.8, 20)[:, None, None]
     sight = (T_camera[:3, 3] + shares * (in_cell - T_camera[:3, 3])).reshape(-1, 3)
     free = all(
-        _distance(sight, *segments[piece]) > radius[piece] + arm.cell.clearance - 1e-3
+        _distance(sight, *segments[piece]) > radius[piece] + arm.surroundings.clearance - 1e-3
         for piece in arm.beam_blockers.tolist()
     )
     return bool(inside and sharp and angle <= OBLIQUE and free)

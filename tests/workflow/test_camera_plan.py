@@ -51,7 +51,7 @@ def test_a_plan_is_read_with_its_camera(planned: Plan, settings: PlanSettings, t
     assert replace(stored.settings, camera=None, sensor="pose") == replace(
         settings, camera=None, sensor="pose"
     )
-    assert stored.arm.cell == CELL
+    assert stored.arm.surroundings == CELL
     assert_close(stored.q, planned.stored.q, atol=1e-7)
     assert (tmp_path / "poses.script").read_text().count("sleep(3.0)") == len(stored.q)
     assert not np.isnan(stored.q.numpy()).any()

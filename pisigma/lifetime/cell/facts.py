@@ -12,7 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from pisigma.files.errors import PlanningError
 from pisigma.files.yaml_file import read_yaml
-from pisigma.lifetime.cell.history import HISTORY, History, SessionEntry
+from pisigma.lifetime.cell.history import HISTORY, History, ModelEntry, SessionEntry
 from pisigma.lifetime.cell.layout import CELL_FILE, PLANS, SESSIONS
 from pisigma.lifetime.cell.status import CellFacts, Step, next_step
 from pisigma.measurement.dates import date_in_name
@@ -51,11 +51,24 @@ class CellStatus:
         }
 
 
-class _Limit(BaseModel):
-    """The limit that `cell.yaml` states; commands that use the other keys check them."""
+class _Stated(BaseModel):
+    """Keys of `cell.yaml` from which the next step follows; commands that use the other keys check them."""
 
     model_config = ConfigDict(frozen=True, allow_inf_nan=False)
+    sensor: str = "tracker"
     limit_mm: Annotated[float, Field(gt=0)] | None = None
+    surroundings: dict[str, Any] | None = None
+
+    def plans_nothing(self, model: ModelEntry | None) -> str:
+        """Return why no poses can be planned; "" if they can.
+
+        Args:
+            model: the model in use, which states the pose of the board; None without a model.
+        """
+        view = (self.surroundings or {}).get("view")
+        if self.sensor != "camera" or (view and (model is not None or "frame" in view)):
+            return ""
+        return f"{CELL_FILE} does not state where the board is (surroundings, view)"
 
 
 def status_of(folder: Path) -> CellStatus:
@@ -76,6 +89,7 @@ def facts_of(folder: Path) -> CellFacts:
     """Read the facts about a cell; see `status_of`."""
     history = History(folder / HISTORY)
     sessions = history.sessions()
+    stated, in_use = read_yaml(folder / CELL_FILE, _Stated, PlanningError), history.in_use
     return CellFacts(
         folder=os.fspath(folder),
         plans=tuple(sorted(path.stem for path in (folder / PLANS).glob("*.csv"))),
@@ -84,10 +98,11 @@ def facts_of(folder: Path) -> CellFacts:
         events=history.events(),
         models=history.models(),
         checks=history.checks(),
-        in_use=history.in_use,
-        limit_mm=read_yaml(folder / CELL_FILE, _Limit, PlanningError).limit_mm,
+        in_use=in_use,
+        limit_mm=stated.limit_mm,
         today=datetime.date.today().isoformat(),
         not_taken_in=not_taken_in(folder / SESSIONS, sessions),
+        plans_nothing=stated.plans_nothing(in_use),
     )
 
 

@@ -3,7 +3,7 @@
 import datetime
 import shlex
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 from pisigma.lifetime.cell.history import ARM_EVENTS, Check, Event, ModelEntry, SessionEntry
@@ -91,6 +91,7 @@ class CellFacts:
         limit_mm: limit of the 95 % quantile of the position errors [mm]; None if there is none.
         today: day (ISO 8601).
         not_taken_in: names of the files in `sessions/` that are not in the history yet, by their dates.
+        plans_nothing: why no poses can be planned; "" if they can.
     """
 
     folder: str
@@ -104,6 +105,7 @@ class CellFacts:
     limit_mm: float | None
     today: str
     not_taken_in: tuple[str, ...] = ()
+    plans_nothing: str = ""
 
     @property
     def valid_sessions(self) -> tuple[SessionEntry, ...]:
@@ -153,8 +155,13 @@ def valid_sessions(sessions: tuple[SessionEntry, ...], events: tuple[Event, ...]
 def next_step(facts: CellFacts) -> Step:
     """Return the step of the first rule that applies, in the order of `RULES`; a plan is measured before the next."""
     step = due_step(facts)
-    if step.command == facts.command("plan") and facts.unmeasured_plan:
+    if step.command != facts.command("plan"):
+        return step
+    if facts.unmeasured_plan:
         return _to_measure(facts, facts.unmeasured_plan)
+    if facts.plans_nothing:
+        reason = f"{step.reason}; {facts.plans_nothing}, so measure poses that you choose and import them"
+        return replace(step, reason=reason, command=facts.import_command())
     return step
 
 

@@ -1,1 +1,1 @@
-"""The cell around a robot: which poses and motions are collision-free, and which poses are visible."""
+"""Surroundings of a robot: which poses and motions are collision-free, and which poses are visible."""

@@ -1,4 +1,4 @@
-"""A robot in its cell: which joint values are within the limits, free of collisions, and visible to the tracker."""
+"""A robot in its surroundings: joint values within the limits, free of collisions, and visible to the tracker."""
 
 import math
 from collections import Counter
@@ -53,12 +53,12 @@ class Faults:
 
 @dataclass(frozen=True, eq=False)
 class ArmInSurroundings:
-    """A robot in its cell.
+    """A robot in its surroundings.
 
     Attributes:
-        nominal: nominal robot; its base is that of the cell.
+        nominal: nominal robot; its base is that of the surroundings.
         robot: the same with the reflector as its tool.
-        cell: surroundings of the robot.
+        surroundings: surroundings of the robot.
         capsules: capsules along the links.
         pairs: pairs of capsules that may touch each other.
         room: distance that the capsules of each pair have to keep [m].
@@ -69,7 +69,7 @@ class ArmInSurroundings:
 
     nominal: Robot
     robot: Robot
-    cell: Surroundings
+    surroundings: Surroundings
     capsules: Capsules
     pairs: Int64[Tensor, "pairs 2"]
     room: Float64[Tensor, " pairs"]
@@ -77,20 +77,20 @@ class ArmInSurroundings:
     limits: Float64[Tensor, "axes 2"]
 
     @staticmethod
-    def from_robot(robot: Robot, cell: Surroundings | None = None) -> "ArmInSurroundings":
-        """Put a robot into its cell; with None, only limits and self-collision are checked."""
-        cell = cell or Surroundings()
-        capsules = cell.capsules(robot)
-        pairs = capsules.pairs(cell.clearance / 2)
+    def from_robot(robot: Robot, surroundings: Surroundings | None = None) -> "ArmInSurroundings":
+        """Put a robot into its surroundings; with None, only limits and self-collision are checked."""
+        surroundings = surroundings or Surroundings()
+        capsules = surroundings.capsules(robot)
+        pairs = capsules.pairs(surroundings.clearance / 2)
         return ArmInSurroundings(
             robot,
             capsules.robot,
-            cell,
+            surroundings,
             capsules,
             pairs,
-            torch.full((len(pairs),), cell.clearance / 2, dtype=torch.float64),
-            _beam_blockers(capsules, cell.clearance),
-            cell.joints.limits(robot),
+            torch.full((len(pairs),), surroundings.clearance / 2, dtype=torch.float64),
+            _beam_blockers(capsules, surroundings.clearance),
+            surroundings.joints.limits(robot),
         )
 
     def with_measured(self, q: Float64[Tensor, "poses dof"]) -> "ArmInSurroundings":
@@ -113,13 +113,17 @@ class ArmInSurroundings:
         """
         tool = (
             None
-            if self.cell.tool is None
-            else self.cell.tool.model_copy(update={"radius_mm": TOOL_RADIUS * 1e3})
+            if self.surroundings.tool is None
+            else self.surroundings.tool.model_copy(update={"radius_mm": TOOL_RADIUS * 1e3})
         )
-        usual = self.cell.model_copy(update={"links": LinkSection(), "tool": tool}).capsules(self.nominal)
+        usual = self.surroundings.model_copy(update={"links": LinkSection(), "tool": tool}).capsules(
+            self.nominal
+        )
         looked_at = set(map(tuple, self.pairs.tolist()))
         lost = [
-            pair for pair in usual.pairs(self.cell.clearance / 2).tolist() if tuple(pair) not in looked_at
+            pair
+            for pair in usual.pairs(self.surroundings.clearance / 2).tolist()
+            if tuple(pair) not in looked_at
         ]
         links = {tuple(self.capsules.link[pair].tolist()) for pair in lost}
         if not links:
@@ -128,7 +132,7 @@ class ArmInSurroundings:
         text = ", ".join(f"{names[one]} and {names[other]}" for one, other in sorted(links))
         return (
             f"With the stated radii, {text} touch in more than half of all poses and are therefore not checked for "
-            "collision; unless they touch by construction, state smaller radii [mm] of links or tool in the cell file.",
+            "collision; unless they touch by construction, state smaller radii [mm] of links or tool.",
         )
 
     def faults(self, q: Float64[Tensor, "poses dof"]) -> Faults:
@@ -172,23 +176,23 @@ class ArmInSurroundings:
             outside |= ~torch.from_numpy(self.robot.coupling.is_inside(q.numpy()))[:, None]
         faults = {"a joint is outside its limits or their margin": outside.any(-1)}
         faults |= {reason: gap < 0 for reason, gap in self._gaps(segments).items()}
-        if self.cell.tracker is not None:
+        if self.surroundings.tracker is not None:
             T = forward_kinematics(self.robot, q)
-            beam = torch.stack([self.cell.tracker.position.expand_as(T[:, :3, 3]), T[:, :3, 3]], -2)
+            beam = torch.stack([self.surroundings.tracker.position.expand_as(T[:, :3, 3]), T[:, :3, 3]], -2)
             faults |= self._hidden(segments, beam[:, None], "the reflector from the tracker")
             faults |= self._turned_away(T, beam)
         return faults
 
     def _gaps(self, segments: Float64[Tensor, "poses pieces 2 3"]) -> dict[str, Float64[Tensor, " poses"]]:
         """Compute distances between the links and all that they must not touch, minus the clearance [m]."""
-        clearance, radius = self.cell.clearance, self.capsules.radius
+        clearance, radius = self.surroundings.clearance, self.capsules.radius
         infinite = segments.new_full((len(segments), 1), torch.inf)
         gaps = {"links of the robot touch each other": _least(self._apart(segments) - self.room, infinite)}
         moving = ~self.capsules.carrier
-        if self.cell.floor_mm is not None:
-            height = segments[:, moving, 1, 2] - radius[moving] - self.cell.floor_mm / 1e3
+        if self.surroundings.floor_mm is not None:
+            height = segments[:, moving, 1, 2] - radius[moving] - self.surroundings.floor_mm / 1e3
             gaps["the robot touches the floor"] = _least(height, infinite) - clearance
-        for box in self.cell.boxes:
+        for box in self.surroundings.boxes:
             distance = box_distance(box.within(segments[:, moving]), box.half_size) - radius[moving]
             gaps[f"the robot touches the box '{box.name}'"] = _least(distance, infinite) - clearance
         return gaps
@@ -206,7 +210,7 @@ class ArmInSurroundings:
 
         Args:
             q: joint values [rad or m].
-            lines: both ends of the lines in the frame of the cell [m].
+            lines: both ends of the lines in the frame of the nominal base [m].
             what: what would be hidden, such as "the reflector from the tracker".
         """
         return self._hidden(self.capsules.segments(q), lines, what)
@@ -218,14 +222,14 @@ class ArmInSurroundings:
         what: str,
     ) -> dict[str, Bool[Tensor, " poses"]]:
         """Find the poses in which a line of sight is nearer to something than the clearance."""
-        clearance = self.cell.clearance
+        clearance = self.surroundings.clearance
         infinite = lines.new_full((len(lines), 1), torch.inf)
         distance = (
             segment_distance(lines[:, :, None], segments[:, None, self.beam_blockers])
             - self.capsules.radius[self.beam_blockers]
         )
         hidden = {f"a link hides {what}": _least(distance.flatten(1), infinite) < clearance}
-        for box in self.cell.boxes:
+        for box in self.surroundings.boxes:
             distance = box_distance(box.within(lines), box.half_size)
             hidden[f"the box '{box.name}' hides {what}"] = distance.amin(1) < clearance
         return hidden
@@ -234,7 +238,7 @@ class ArmInSurroundings:
         self, T: Float64[Tensor, "poses 4 4"], beam: Float64[Tensor, "poses 2 3"]
     ) -> dict[str, Bool[Tensor, " poses"]]:
         """Find the poses in which the tracker is outside the acceptance cone of the reflector."""
-        reflector = self.cell.reflector
+        reflector = self.surroundings.reflector
         if reflector is None:
             return {}
         axis = torch.nn.functional.normalize(torch.tensor(reflector.axis, dtype=torch.float64), dim=0)

@@ -20,7 +20,7 @@ class Motions:
     """Straight joint motions between poses, each of which is checked only once.
 
     Attributes:
-        arm: the robot in its cell.
+        arm: the robot in its surroundings.
         pool: joint values of free poses that can be way points [rad or m].
     """
 
@@ -68,13 +68,13 @@ def is_free(
     to its ends; other pieces are halved (Schwarzer, Saha and Latombe 2005, IEEE Trans. Robotics 21(3), section IV).
 
     Args:
-        arm: the robot in its cell.
+        arm: the robot in its surroundings.
         start: joint values at the start [rad or m].
         end: joint values at the end [rad or m].
     """
     free = torch.ones(len(start), dtype=torch.bool)
     travel = (end - start).abs() @ arm.lever
-    finest = max(MIN_STEP, arm.cell.clearance / 2)
+    finest = max(MIN_STEP, arm.surroundings.clearance / 2)
     motion, middle, half = torch.arange(len(start)), torch.full((len(start),), 0.5), 0.5
     middle = middle.double()
     while len(motion):
@@ -96,7 +96,7 @@ def way_points(
     """Find one or two way points that make a motion collision-free, the shortest way among those that are tried.
 
     Args:
-        arm: the robot in its cell.
+        arm: the robot in its surroundings.
         start: joint values at the start [rad or m].
         end: joint values at the end [rad or m].
         pool: joint values of free poses that can be way points [rad or m].

@@ -24,7 +24,7 @@ Point = tuple[Bounded, Bounded, Bounded]
 
 
 class JointSection(Section):
-    """Joint limits in this cell.
+    """Joint limits in these surroundings.
 
     Attributes:
         margin_deg: margin of revolute joints to their limits [deg].
@@ -223,7 +223,7 @@ class ViewSection(Section):
 
     @property
     def T_cell_frame(self) -> Float64[Tensor, "4 4"] | None:
-        """Pose of the measuring frame in the frame of the cell [m]; None if it is not stated."""
+        """Pose of the measuring frame in the frame of the nominal base [m]; None if it is not stated."""
         return None if self.frame is None else transform_from_xyzrpy(torch.from_numpy(self.frame.to_si()))
 
     def depths(self, f: float) -> tuple[float, float]:
@@ -282,7 +282,7 @@ class Surroundings(Section):
         return self.clearance_mm / 1e3
 
     def robot_with_tool(self, robot: Robot) -> Robot:
-        """Return the robot with the reflector as its tool, where the cell states it."""
+        """Return the robot with the reflector as its tool, where the surroundings state it."""
         if self.tool is None:
             return robot
         nominal_tool, reflector = (
@@ -305,18 +305,18 @@ class Surroundings(Section):
 
 
 def read_surroundings(path: str | os.PathLike[str], robot: Robot) -> Surroundings:
-    """Read a cell file.
+    """Read a file of surroundings.
 
     Args:
         path: the YAML file.
-        robot: robot in the cell.
+        robot: robot in the surroundings.
 
     Raises:
         PlanningError: the file cannot be used, or it names links or joints that the robot does not have.
     """
-    cell = read_yaml(path, Surroundings, PlanningError)
+    surroundings = read_yaml(path, Surroundings, PlanningError)
     names = [row.name for row in robot.rows]
-    for name in cell.links.radii_mm:
+    for name in surroundings.links.radii_mm:
         if name not in names:
             raise PlanningError(
                 f"robot '{robot.name}' has no row '{name}'",
@@ -325,7 +325,7 @@ def read_surroundings(path: str | os.PathLike[str], robot: Robot) -> Surrounding
                 remedy=nearest_choice(name, names),
             )
     try:
-        cell.joints.limits(robot)
+        surroundings.joints.limits(robot)
     except (RecipeError, PlanningError) as problem:
         raise problem.located(place_of_key(path, ("joints",)), PlanningError) from None
-    return cell
+    return surroundings

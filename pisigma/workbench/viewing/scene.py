@@ -1,4 +1,4 @@
-"""Three-dimensional scene of the robot, its cell and the rows so far, in the robot's base frame [m]."""
+"""Three-dimensional scene of the robot, its surroundings and the rows so far, in the robot's base frame [m]."""
 
 from typing import TYPE_CHECKING, Literal
 
@@ -56,11 +56,11 @@ class SessionScene:
         body: AbstractBody,
         sight: BoardSight | None = None,
     ) -> None:
-        """Draw the cell.
+        """Draw the surroundings.
 
         Args:
             scene: scene to draw in.
-            arm: the robot in its cell.
+            arm: the robot in its surroundings.
             body: appearance of the robot.
             sight: camera and board; None without a camera.
         """
@@ -71,7 +71,7 @@ class SessionScene:
         scene.set_up_direction("+z")
         axes = AXES * arm.robot.reach
         scene.add_frame("/base", axes_length=axes, axes_radius=axes / 20)
-        draw_cell(scene, arm.cell, arm.robot.reach)
+        draw_surroundings(scene, arm.surroundings, arm.robot.reach)
 
     def show_robot(self, state: SessionState) -> None:
         """Draw the robot at the last row and as a ghost at the next pose."""
@@ -83,7 +83,7 @@ class SessionScene:
             pose, T = state.next_pose, self._poses(state.next_pose.q)
             self._body.draw(self._scene, "/ghost/robot", pose.q, NEXT, GHOST)
             self._label("/next/label", f"next: pose {pose.number}", T[:3, 3])
-            draw_sight(self._scene, "/next", self._arm.cell, T, self._robot.reach)
+            draw_sight(self._scene, "/next", self._arm.surroundings, T, self._robot.reach)
             if self._sight is not None and self._sight.is_fixed:
                 self._scene.add_frame("/next/board", show_axes=False, wxyz=_quaternion(T), position=T[:3, 3])
                 draw_board(self._scene, "/next/board", self._sight.board)
@@ -101,7 +101,7 @@ class SessionScene:
             self._label("/sensor/label", "camera" if self._sight.is_fixed else "board", np.zeros(3))
             if not self._sight.is_fixed:
                 draw_board(self._scene, "/sensor", self._sight.board)
-        elif self._arm.cell.tracker is None:
+        elif self._arm.surroundings.tracker is None:
             self._label("/sensor/label", "frame of the sensor", np.zeros(3))
 
     def show_rows(self, rows: RowsSoFar, top: float, magnification: float) -> None:
@@ -199,26 +199,30 @@ def draw_board(scene: "viser.SceneApi", name: str, board: Board) -> None:
     scene.add_point_cloud(f"{name}/corners", board.corners, PRINT, point_size=size, precision="float32")
 
 
-def draw_cell(scene: "viser.SceneApi", cell: Surroundings, reach: float) -> None:
+def draw_surroundings(scene: "viser.SceneApi", surroundings: Surroundings, reach: float) -> None:
     """Draw floor, boxes and tracker.
 
     Args:
         scene: scene to draw in, in the robot's base frame.
-        cell: cell to draw; without a floor the grid is at the height of the robot's base.
+        surroundings: surroundings to draw; without a floor the grid is at the height of the robot's base.
         reach: reach of the robot [m].
     """
     edge = FLOOR * reach
-    height = 0.0 if cell.floor_mm is None else cell.floor_mm / 1e3
+    height = 0.0 if surroundings.floor_mm is None else surroundings.floor_mm / 1e3
     scene.add_grid("/floor", edge, edge, cell_size=0.25, section_size=1.0, position=(0.0, 0.0, height))
-    for number, box in enumerate(cell.boxes):
+    for number, box in enumerate(surroundings.boxes):
         name, center, edges = f"/boxes/{number}", box.center.numpy(), 2 * box.half_size.numpy()
         half = np.deg2rad(box.yaw_deg) / 2
         turned = (np.cos(half), 0.0, 0.0, np.sin(half))
         scene.add_box(name, FORBIDDEN, edges, opacity=0.35, position=center, wxyz=turned, cast_shadow=False)
         top = center + np.array([0.0, 0.0, edges[2] / 2])
         scene.add_label(f"{name}_label", box.name, position=top, anchor="bottom-center")
-    if cell.tracker is not None:
-        head, size, up = cell.tracker.position.numpy(), TRACKER_HEAD * reach, np.array([0.0, 0.0, 1.0])
+    if surroundings.tracker is not None:
+        head, size, up = (
+            surroundings.tracker.position.numpy(),
+            TRACKER_HEAD * reach,
+            np.array([0.0, 0.0, 1.0]),
+        )
         scene.add_icosphere("/tracker", size, TRACKER, position=head)
         if (stand := float(head[2] - height)) > 0:
             scene.add_cylinder("/tracker/stand", size / 3, stand, TRACKER, position=-stand / 2 * up)
@@ -228,7 +232,7 @@ def draw_cell(scene: "viser.SceneApi", cell: Surroundings, reach: float) -> None
 def draw_sight(
     scene: "viser.SceneApi",
     name: str,
-    cell: Surroundings,
+    surroundings: Surroundings,
     T_base_tool: Float64[np.ndarray, "4 4"],
     reach: float,
 ) -> None:
@@ -237,16 +241,18 @@ def draw_sight(
     Args:
         scene: scene to draw in.
         name: name of the parent node.
-        cell: cell with tracker and reflector; nothing is drawn without a tracker.
+        surroundings: surroundings with tracker and reflector; nothing is drawn without a tracker.
         T_base_tool: pose of the reflector [m].
         reach: reach of the robot [m].
     """
-    if cell.tracker is None:
+    if surroundings.tracker is None:
         return
-    beam = np.stack([cell.tracker.position.numpy(), T_base_tool[:3, 3]])
+    beam = np.stack([surroundings.tracker.position.numpy(), T_base_tool[:3, 3]])
     scene.add_line_segments(f"{name}/beam", beam[None], SIGHT, thickness=BEAM * reach)
-    if cell.reflector is not None:
-        cone = acceptance_cone(cell.reflector, CONE * reach).moved(T_base_tool[:3, :3], T_base_tool[:3, 3])
+    if surroundings.reflector is not None:
+        cone = acceptance_cone(surroundings.reflector, CONE * reach).moved(
+            T_base_tool[:3, :3], T_base_tool[:3, 3]
+        )
         scene.add_mesh_simple(
             f"{name}/cone",
             cone.points,

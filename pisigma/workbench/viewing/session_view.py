@@ -132,7 +132,7 @@ class SessionView:
 
 def first_view(arm: ArmInSurroundings) -> tuple[Float64[np.ndarray, " 3"], Float64[np.ndarray, " 3"]]:
     """Return camera position and target of a view with robot and tracker side by side [m]."""
-    tracker = np.zeros(3) if arm.cell.tracker is None else arm.cell.tracker.position.numpy()
+    tracker = np.zeros(3) if arm.surroundings.tracker is None else arm.surroundings.tracker.position.numpy()
     around = AROUND_ROBOT * arm.robot.reach
     low, high = np.minimum(tracker, (-around, -around, 0.0)), np.maximum(tracker, around)
     middle, radius = (low + high) / 2, float(np.linalg.norm(high - low)) / 2

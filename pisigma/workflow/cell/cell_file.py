@@ -301,6 +301,8 @@ def template(document: Mapping[str, Any]) -> str:
     lines.append(
         "# surroundings:  # floor, boxes, tracker, joint margins: see the documentation of `pisigma plan`"
     )
+    if document.get("sensor") == "camera":
+        lines += _VIEW
     for step, group in STEPS.items():
         lines += ["", f"{step}:  # keys of `pisigma {step} --set`"]
         for setting in flat_settings(group):
@@ -310,6 +312,13 @@ def template(document: Mapping[str, Any]) -> str:
             lines += textwrap.wrap(setting.help, MAX_WIDTH, initial_indent="  # ", subsequent_indent="  # ")
             lines.append(f"  # {key}: {_yaml(setting.default)}".rstrip())
     return "\n".join([*lines, ""])
+
+
+_VIEW = (
+    "#   tool: {x_mm: 30, y_mm: 20, z_mm: 60}  # camera on the flange (if it is fixed: the board)",
+    "#   view: {frame: {x_mm: 420, z_mm: 50, yaw_deg: 180}, near_mm: 300, far_mm: 700}  # board (if fixed: the camera)",
+)
+"""Comments on keys that a plan with a camera needs."""
 
 
 def _yaml(value: Any) -> str:

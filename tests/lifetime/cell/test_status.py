@@ -104,6 +104,13 @@ def test_every_state_is_a_case():
     assert set(CASES) == set(get_args(State))
 
 
+@pytest.mark.parametrize("state", ["no_plan", "verification_due", "outside_limit"])
+def test_poses_are_measured_without_a_plan_where_none_can_be_made(state):
+    step = next_step(replace(CASES[state][0], plans_nothing="no board"))
+    assert step.state == state
+    assert step.command.split()[:2] == ["pisigma", "import"]
+
+
 @pytest.mark.parametrize("state", CASES)
 def test_facts_lead_to_their_state_and_its_command(state):
     facts, verb = CASES[state]

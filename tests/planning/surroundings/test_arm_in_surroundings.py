@@ -73,7 +73,7 @@ def test_a_motion_is_free_where_all_poses_on_it_are():
     assert 0 < int(free.sum()) < len(free)
     steps = torch.linspace(0, 1, 100, dtype=torch.float64)[:, None, None]
     least = ARM.gap((start + steps * (end - start)).reshape(-1, 6)).reshape(100, -1).min(0).values
-    assert bool((least[free] > -ARM.cell.clearance / 2).all())
+    assert bool((least[free] > -ARM.surroundings.clearance / 2).all())
     assert bool((least[~free] < 0).all())
 
 

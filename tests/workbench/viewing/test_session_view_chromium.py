@@ -99,7 +99,7 @@ def test_the_colour_scale_covers_the_rows_that_count():
 def test_the_first_view_holds_robot_and_tracker():
     arm = arm_beside_tracker()
     position, middle = first_view(arm)
-    tracker = arm.cell.tracker.position.numpy()
+    tracker = arm.surroundings.tracker.position.numpy()
     for point in (tracker, 0 * tracker):
         toward = (point - position) / (((point - position) ** 2).sum()) ** 0.5
         ahead = (middle - position) / (((middle - position) ** 2).sum()) ** 0.5
