@@ -49,9 +49,7 @@ Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace the model 
 
 PayloadKg = Annotated[
     float | None,
-    typer.Option(
-        help="Payload of the robot [kg], for models that learned its effect. [default: the mean of its rows]"
-    ),
+    typer.Option(help="Payload [kg], for models that learned its effect. [default: the mean of its rows]"),
 ]
 TemperatureC = Annotated[
     float | None,

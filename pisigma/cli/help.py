@@ -13,15 +13,13 @@ from typer.core import TyperCommand
 from pisigma.cli.settings_options import SETTINGS
 from pisigma.files.setting import Setting
 
-_OF_ALL_COMMANDS = ("--plugin",)
-
 RARELY_USED = {
     "export": (
         "--tip", "--geometry", "--config", "--frames", "--tolerance-mm", "--counts-per-turn", "--present-counts",
         "--payload-kg", "--temperature-c",
     ),
 }  # fmt: skip
-"""Options of commands without settings that only `--help-all` shows, in addition to the common ones."""
+"""Options of commands without settings that only `--help-all` shows."""
 _SHOWS_ALL = "pisigma.help_all"
 
 
@@ -42,7 +40,7 @@ class ShortHelpCommand(TyperCommand):
                 with formatter.section("Keys of --set, in addition to the options without their dashes"):
                     formatter.write_dl([(_assignment(one), _explained(one)) for one in self.keys.values()])
             return
-        hidden = {*_OF_ALL_COMMANDS, *RARELY_USED.get(str(self.name), ())}
+        hidden = set(RARELY_USED.get(str(self.name), ()))
         short = copy.copy(self)
         short.params = [_in_a_sentence(one) for one in self.params if hidden.isdisjoint(one.opts)]
         TyperCommand.format_options(short, ctx, formatter)
