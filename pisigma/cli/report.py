@@ -13,7 +13,6 @@ from pisigma.cli.screen import print_screen
 from pisigma.cli.settings_options import takes_settings
 from pisigma.files.errors import AcceptanceError
 from pisigma.measurement.camera.camera_files import CameraFiles
-from pisigma.reporting.acceptance_tables import acceptance_sentences, budget_table, contradiction
 from pisigma.reporting.result_text import sentences, table
 from pisigma.reporting.verdict import Verdict, uncapitalised
 
@@ -59,6 +58,8 @@ def report(
         also = f", {len(written)} figures to {figures}" if written else ""
         _print(result, [f"Report written to {out}{also}."])
     if result.acceptance is not None and result.acceptance.contradicted:
+        from pisigma.reporting.acceptance_tables import contradiction
+
         raise AcceptanceError(contradiction(result.acceptance))
     if result.diagnostics:
         raise AcceptanceError(" ".join(one.sentence for one in result.diagnostics))
@@ -75,6 +76,8 @@ def _acceptance(cell: "Cell | None") -> "Acceptance | None":
 
 def _print(result: "Report", closing: list[str]) -> None:
     """Print the verdict of the page, and what it advises to measure."""
+    from pisigma.reporting.acceptance_tables import acceptance_sentences, budget_table
+
     content, wrong = result.content, result.diagnostics
     trust = "yes: these rows were held out."
     if wrong:
