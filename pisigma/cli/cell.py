@@ -141,10 +141,17 @@ def _print_status(status: "CellStatus") -> None:
     if rows:
         print_table(f"sessions ({len(facts.sessions)})", ("session", "rows", "sensor", "verdict"), rows)
     print_lines(one.sentence for one in facts.events)
+    print_lines(_controller_lines(status))
     print_lines(
         f"sessions/{name} will be added by the next command that reads rows." for name in facts.not_taken_in
     )
     print_next(status)
+
+
+def _controller_lines(status: "CellStatus") -> list[str]:
+    """Return a line for every export that is active on the controller."""
+    active = status.facts.controller.active().values()
+    return [f"{one.export.contains.replace('_', ' ')} on the controller: {one}." for one in active]
 
 
 def cell_at(path: str | Path) -> "Cell | None":
@@ -217,15 +224,13 @@ def use(
         raise typer.BadParameter("expected either the name of a model or --undo", param_hint="'MODEL'")
     opened = Cell.open(cell)
     before = opened.history.in_use
-    if model is None:
-        model = opened.undo_use(reason)
-    else:
-        opened.use(model, reason)
+    warnings, now = opened.use(model, reason), opened.history.in_use
     if as_json:
-        print_json({"model": model or None, "before": before and before.name})
+        names = {"model": now and now.name, "before": before and before.name}
+        print_json({**names, "warnings": list(warnings)})
     else:
         hint = "" if undo else f" (undo: pisigma use {cell} --undo)"
-        print_lines([f"Model '{model}' is in use{hint}." if model else "No model is in use."])
+        print_lines([f"Model '{now.name}' is in use{hint}." if now else "No model is in use.", *warnings])
 
 
 def session(
@@ -251,8 +256,8 @@ def event(
     kind: Annotated[
         str,
         typer.Argument(
-            help="What was changed: instrument, tool, mastering, encoder, collision, maintenance or firmware; or "
-            "accepted, if a person accepted the model in use."
+            help="What was changed: instrument, tool, mastering, encoder, collision, maintenance or firmware; "
+            "accepted, if a person accepted the model in use; or controller, with --export."
         ),
     ],
     date: Annotated[str, typer.Option(help="Day of the event, such as 2026-11-22. [default: today]")] = "",
@@ -260,23 +265,41 @@ def event(
     by: Annotated[
         str, typer.Option(help="Name of the person who accepted the model or reports the change.")
     ] = "",
+    export: Annotated[
+        Path | None,
+        typer.Option(
+            help="With controller, file of `pisigma export CELL` that is active on the controller from that day on, "
+            "or none."
+        ),
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Record that the instrument, the tool or the arm was changed, or that a person accepted the model in use.
+    """Record what was changed, that a person accepted the model in use, or what is active on the controller.
 
     Events determine which sessions remain valid. Rows measured after an instrument or tool event have a new frame or
     target. Sessions from before a mastering, encoder, collision or maintenance event are no longer used for
-    calibration.
+    calibration, nor those that were measured with other joint zeros of the controller.
     """
     from pisigma.workflow.cell.cell import Cell
+    from pisigma.workflow.cell.exports import set_controller
 
+    if (kind == "controller") is (export is None) or (export is not None and by):
+        raise typer.BadParameter(
+            "expected --export FILE or none with controller only", param_hint="'--export'"
+        )
     opened = Cell.open(cell)
-    recorded = opened.history.record(kind, date, note, by)
-    if as_json:
-        print_json(recorded.to_json())
+    if export is not None:
+        changed = set_controller(opened, export, date, note)
+        record, line = {"day": changed.day, "kind": kind, "note": note}, f"controller on {changed.day}."
     else:
-        print_lines([f"Recorded: {recorded.sentence}"])
-        print_next(opened.status())
+        recorded = opened.history.record(kind, date, note, by)
+        record, line = recorded.to_json(), recorded.sentence
+    status = opened.status()
+    if as_json:
+        print_json(record if export is None else {**record, "active": status.to_json()["controller"]})
+    else:
+        print_lines([f"Recorded: {line}", *_controller_lines(status)])
+        print_next(status)
 
 
 def pack(

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from pisigma.cli.arguments import AsJson, ModelOrCell, PayloadKg, TemperatureC, complete_export
+from pisigma.cli.cell import cell_at
 from pisigma.cli.endings import NOT_ACCEPTED, fail
 from pisigma.cli.output import print_json, print_line
 from pisigma.deployment.export.registry import BUILT_IN
@@ -121,10 +122,10 @@ def export(
     """
     from pisigma.deployment.export.export_format import ExportRequest
     from pisigma.deployment.export.registry import export_format, export_model
-    from pisigma.lifetime.cell.layout import model_folder
+    from pisigma.workflow.cell.exports import export_from_cell
 
     request = ExportRequest(
-        model=model_folder(model),
+        model=model,
         out=out,
         like=like,
         tip=tip,
@@ -141,7 +142,8 @@ def export(
         payload_kg=payload_kg,
         temperature_c=temperature_c,
     )
-    exported = export_model(form, request)
+    cell = cell_at(model)
+    exported = export_model(form, request) if cell is None else export_from_cell(cell, form, request)
     _print(exported, form, out, export_format(form).contents, as_json)
 
 

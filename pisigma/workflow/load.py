@@ -4,7 +4,8 @@ import os
 from pathlib import Path
 from typing import Any
 
-from pisigma.lifetime.cell.layout import is_cell, model_folder
+from pisigma.lifetime.cell.controller import checked_model_folder
+from pisigma.lifetime.cell.layout import is_cell
 from pisigma.lifetime.cell.model_in_use import ModelInUse
 from pisigma.model.inverse.corrected_ik import CorrectedIK
 from pisigma.model.inverse.corrected_ik import load as load_folder
@@ -17,23 +18,30 @@ class CellIK(CorrectedIK):
     Every call, a path included, is answered by one model, which `Solution.model` names. Copies such as those of
     `for_task` and `under` keep their model. All other attributes are those of `present`.
 
-    Attributes:
-        present: corrected inverse kinematics of the model in use.
     """
-
-    present: CorrectedIK
 
     def __init__(self, cell: Path) -> None:
         """Load the model in use, and look for changes in a background thread.
 
         Raises:
-            ModelError: no model of the cell is in use, or it cannot be loaded.
+            ModelError: no model of the cell is in use, it cannot be loaded, or it must not be used with what is active
+                on the controller.
         """
-        self._in_use = ModelInUse(cell, self._load)
+        self._in_use = ModelInUse(cell, "load", self._load)
         self._in_use.follow()
 
     def _load(self, folder: Path) -> None:
-        self.present = load_folder(folder)
+        self._loaded = load_folder(folder)
+
+    @property
+    def present(self) -> CorrectedIK:
+        """Corrected inverse kinematics of the model in use.
+
+        Raises:
+            ModelError: the model must not be used with what is active on the controller.
+        """
+        self._in_use.findings.accepted(self._in_use.cell)
+        return self._loaded
 
     def __call__(self, *arguments: Any, **options: Any) -> Solution:
         """See `CorrectedIK.__call__`."""
@@ -41,12 +49,12 @@ class CellIK(CorrectedIK):
 
     @property
     def warnings(self) -> tuple[str, ...]:  # type: ignore[override]
-        """Warnings of the model, and why a newer model in use could not be loaded."""
-        return self.present.warnings + ((self._in_use.problem,) if self._in_use.problem else ())
+        """Warnings of the model, and why it must be used with care or a newer one could not be loaded."""
+        return (*self._loaded.warnings, *self._in_use.warnings)
 
     def __getattribute__(self, name: str) -> Any:
         """Return the attributes that are not of this class from the model in use."""
-        of_self = name in ("present", "warnings", "_in_use", "_load") or name.startswith("__")
+        of_self = name in ("present", "warnings", "_in_use", "_load", "_loaded") or name.startswith("__")
         return object.__getattribute__(self, name) if of_self else getattr(self.present, name)
 
 
@@ -59,8 +67,11 @@ def load(folder: str | os.PathLike[str], pin: bool = False) -> CorrectedIK:
 
     Raises:
         ModelError: the folder is not a complete model; the message names the file at fault; or no model of the cell is
-            in use.
+            in use, or it must not be used with what is active on the controller.
     """
     if is_cell(folder) and not pin:
         return CellIK(Path(folder))
-    return load_folder(model_folder(folder))
+    path, warnings = checked_model_folder(Path(folder), "load")
+    ik = load_folder(path)
+    ik.warnings += warnings
+    return ik

@@ -1,11 +1,17 @@
 """Commands of a cell: what they print as JSON, and the exit status of what has to be done."""
 
+import hashlib
 import json
+import shutil
+from dataclasses import replace
 
 import pytest
 from testing.cell_rows import ROBOT, day, measured
+from typer.main import get_command
 
+from pisigma.cli.main import app
 from pisigma.files.errors import MeasurementError, ModelError, PlanningError
+from pisigma.lifetime.cell.history import HISTORY, TABLES, History, SessionEntry
 
 
 @pytest.fixture
@@ -207,12 +213,108 @@ def test_a_model_is_verified_and_put_into_use_by_name(run, used):
     verified = run("verify", cell, "--model", first, "--json")
     assert json.loads(verified.stdout)["model"].endswith(first)
     changed = json.loads(run("use", cell, first, "--reason", "a trial", "--json").stdout)
-    assert changed == {"model": first, "before": second}
-    assert json.loads(run("use", cell, "--undo", "--json").stdout) == {"model": second, "before": first}
+    assert changed == {"model": first, "before": second, "warnings": []}
+    undone = json.loads(run("use", cell, "--undo", "--json").stdout)
+    assert undone == {"model": second, "before": first, "warnings": []}
     assert json.loads(run("use", cell, "--undo", "--reason", "a trial", "--json").stdout)["model"] == first
-    assert json.loads(run("use", cell, "--undo", "--json").stdout) == {"model": None, "before": first}
+    assert json.loads(run("use", cell, "--undo", "--json").stdout)["model"] is None
     assert run("use", cell, "--undo").exit_code == run("use", cell).exit_code == 2
     run("use", cell, second, "--json")
+
+
+def test_what_is_active_on_the_controller_is_recorded(run, refuses, used, tmp_path):
+    cell, _ = used
+    file = tmp_path / "dh.csv"
+    exported = run("export", cell, "--format", "dh", "--out", file, "--json")
+    assert json.loads(exported.stdout)["file"] == str(file)
+    recorded = json.loads(
+        run("event", cell, "controller", "--export", file, "--note", "slow", "--json").stdout
+    )
+    (active,) = recorded["active"]
+    assert (recorded["day"], recorded["note"], active["file"]) == (day(0), "slow", "dh.csv")
+    assert "dh.csv" in run("status", cell).stdout
+    assert "dh.csv" in run("ik", cell, "--pose", 700, 200, 500, 0, 0, 180).stderr
+    out = tmp_path / "offsets.csv"
+    refuses("export", cell, "--format", "offsets", "--out", out, error=ModelError, file=cell)
+    assert not out.exists()
+    assert json.loads(run("event", cell, "controller", "--export", "none", "--json").stdout)["active"] == []
+    for arguments in (
+        ("controller",),
+        ("tool", "--export", file),
+        ("controller", "--export", file, "--by", "Ada"),
+    ):
+        assert run("event", cell, *arguments).exit_code == 2
+
+
+CELL_COMMANDS = {
+    "new": (),  # refuses a folder that is not empty
+    "unpack": (),
+    "status": ("{cell}",),
+    "plan": ("{cell}", "--count", 4, "--check", 0, "--candidates", 100),
+    "measure": ("{cell}", "--rows", "{rows}", "--no-replan", "--once"),
+    "import": ("{more}", "--cell", "{cell}", "--date", day(1)),
+    "calibrate": ("{cell}", "--folds", 0, "--model", "geometric"),
+    "verify": ("{cell}",),
+    "monitor": ("{cell}",),
+    "evaluate": ("{cell}",),
+    "recalibrate": ("{cell}",),
+    "compare": ("{cell}",),
+    "report": ("{cell}", "--out", "{out}/page.html"),
+    "ik": ("{cell}", "--pose", 700, 200, 500, 0, 0, 180),
+    "export": ("{cell}", "--format", "dh", "--out", "{out}/dh.csv"),
+    "event": ("{cell}", "firmware"),
+    "use": ("{cell}", "--undo"),
+    "session": ("{cell}", day(30), "--set-aside", "a trial"),
+    "upgrade": ("{cell}",),
+    "pack": ("{cell}", "--out", "{out}/cell.zip"),
+}
+"""Arguments of every command that takes a cell; `serve` only reads it."""
+
+
+def held(cell):
+    """Hashes of all files of a cell except its settings and history, and all rows of its history."""
+    files = {
+        path.relative_to(cell): hashlib.sha256(path.read_bytes()).hexdigest()
+        for path in cell.rglob("*")
+        if path.is_file() and path.name not in ("cell.yaml", HISTORY)
+    }
+    history, rows = History(cell / HISTORY), set[object]()
+    for kind in TABLES:
+        rows.update(
+            (replace(one, set_aside="") if kind is SessionEntry else one)
+            for one in history.database.read(kind)
+        )
+    return files, rows
+
+
+def test_no_command_loses_anything(run, used, tmp_path):
+    takes_cell = {
+        name
+        for name, command in get_command(app).commands.items()
+        for one in getattr(command, "params", ())
+        if "CELL" in str(one.metavar or one.name) or (one.name == "cell" and name != "plan")
+    }
+    assert takes_cell - {"serve", "distill"} - set(CELL_COMMANDS) == set()
+    cell = tmp_path / "cell"
+    shutil.copytree(used[0], cell)
+    names = {
+        "cell": cell,
+        "out": tmp_path,
+        "rows": rows_file(tmp_path, "rows", 4, 5),
+        "more": rows_file(tmp_path, "more", 12, 8, zero=0.08),
+    }
+    for name, arguments in CELL_COMMANDS.items():
+        files, rows = held(cell)
+        if arguments:
+            words = [one.format(**names) if isinstance(one, str) else one for one in arguments]
+            result = run(name, *words, "--json")
+            assert result.exit_code in (0, 3), (name, result.output)
+        after_files, after_rows = held(cell)
+        assert files.items() <= after_files.items(), name
+        assert rows <= after_rows, name
+    again = tmp_path / "again"
+    assert run("unpack", tmp_path / "cell.zip", "--out", again, "--json").exit_code == 0
+    assert held(again) == held(cell)
 
 
 def test_status_is_printed_again_until_it_is_interrupted(run, cell, monkeypatch):

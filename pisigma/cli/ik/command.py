@@ -8,7 +8,7 @@ import typer
 
 from pisigma.cli.arguments import AsJson, ModelOrCell, PayloadKg, TemperatureC
 from pisigma.cli.endings import fail
-from pisigma.cli.output import print_json, print_lines
+from pisigma.cli.output import print_json, print_line, print_lines
 from pisigma.cli.progress import progress_of
 from pisigma.reporting.result_text import together
 
@@ -80,12 +80,15 @@ def ik(
         if given and poses is None:
             raise typer.BadParameter("use it with --poses", param_hint=f"'{name}'")
     from pisigma.files.output_file import check_output
-    from pisigma.lifetime.cell.layout import model_folder
+    from pisigma.lifetime.cell.controller import checked_model_folder
     from pisigma.model.inverse.corrected_ik import load
 
     if out is not None:
         check_output(out, inputs=(model, poses))
-    solver = load(model_folder(model))
+    folder, warnings = checked_model_folder(model, "ik")
+    for sentence in warnings:
+        print_line(f"pisigma: {sentence}", to_stderr=True)
+    solver = load(folder)
     stated = {"payload_kg": payload_kg, "temperature_c": temperature_c}
     if conditions := {name: value for name, value in stated.items() if value is not None}:
         solver = solver.under(**conditions)

@@ -130,11 +130,14 @@ def measure(
     again are written to --rest. With --json, progress goes to stderr and one JSON object to stdout at the end. Exits
     with status 3 while all rows have the same fault.
     """
+    from pisigma.lifetime.cell.controller import checked_in_use
     from pisigma.lifetime.cell.layout import newest_plan
     from pisigma.planning.session.growing_images import growing_file
     from pisigma.workflow.follow import check_programs, follow, rest_file
     from pisigma.workflow.measure import MeasuringSession
 
+    for sentence in checked_in_use(plan, "measure"):
+        print_line(f"pisigma: {sentence}", to_stderr=True)
     chosen = settings_at(plan, "measure", settings)
     plan = newest_plan(plan)
     session = MeasuringSession.read(plan, chosen)

@@ -55,14 +55,18 @@ def serve(
 def _load(model: Path | None, models: Path | None, pin: bool) -> "ServedModels":
     """Load the model, that in use of a cell, or those of a folder."""
     from pisigma.deployment.serve.models import ServedModels, model_folders
-    from pisigma.lifetime.cell.layout import is_cell, model_folder
+    from pisigma.lifetime.cell.controller import checked_model_folder
+    from pisigma.lifetime.cell.layout import is_cell
 
     if pin and (model is None or not is_cell(model)):
         raise typer.BadParameter("expected a cell", param_hint="'--pin'")
     if model is not None and models is None:
         if is_cell(model) and not pin:
             return ServedModels(cell=model)
-        return ServedModels([model_folder(model)])
+        folder, warnings = checked_model_folder(model, "serve")
+        served = ServedModels([folder])
+        served.problems.extend(warnings)
+        return served
     if models is None or model is not None:
         raise typer.BadParameter(
             "expected either a model folder or --models", param_hint="'MODEL' / '--models'"

@@ -87,4 +87,6 @@ def _write(request: ExportRequest) -> Exported:
     )
 
 
-FORMAT = ExportFormat("dh", "a DH table", TABLE_SUFFIXES, _write, frozenset(("geometry",)), check_geometry)
+FORMAT = ExportFormat(
+    "dh", "a DH table", TABLE_SUFFIXES, _write, frozenset(("geometry",)), check_geometry, "kinematics"
+)

@@ -5,6 +5,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from pisigma.lifetime.cell.exports import Contents
+
 if TYPE_CHECKING:
     from pisigma.model.calibrated_model import CalibratedModel
 
@@ -135,6 +137,7 @@ class ExportFormat:
         write: function that returns the content of a file, or raises a `PisigmaError`.
         options: those of `OPTIONS` that it accepts.
         check: function that raises a `PisigmaError` for invalid requests before anything is loaded.
+        contains: what its files contain, which says whether a correction would be applied twice on a controller.
     """
 
     name: str
@@ -143,6 +146,12 @@ class ExportFormat:
     write: Callable[[ExportRequest], Exported]
     options: frozenset[str] = field(default_factory=frozenset)
     check: Callable[[ExportRequest], None] = lambda request: None
+    contains: Contents = "description"
+
+    def contains_for(self, request: ExportRequest) -> Contents:
+        """Return what the file of a request contains; targets of programs may be poses instead of joint values."""
+        is_pose = request.program is not None or request.targets == "cartesian"
+        return "poses" if is_pose else self.contains
 
 
 def model_facts(model: "CalibratedModel") -> dict[str, object]:

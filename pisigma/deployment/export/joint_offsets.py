@@ -149,5 +149,10 @@ def _write(request: ExportRequest) -> Exported:
 
 
 FORMAT = ExportFormat(
-    "offsets", "a table of joint offsets", TABLE_SUFFIXES, _write, frozenset(("payload_kg", "temperature_c"))
+    "offsets",
+    "a table of joint offsets",
+    TABLE_SUFFIXES,
+    _write,
+    frozenset(("payload_kg", "temperature_c")),
+    contains="joint_zeros",
 )

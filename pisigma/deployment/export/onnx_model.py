@@ -295,4 +295,4 @@ def _write(request: ExportRequest) -> Exported:
     return Exported(content, model_facts(model), onnx_remarks(model))
 
 
-FORMAT = ExportFormat("onnx", "an ONNX graph", (".onnx",), _write)
+FORMAT = ExportFormat("onnx", "an ONNX graph", (".onnx",), _write, contains="joint_values")

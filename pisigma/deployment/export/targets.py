@@ -158,4 +158,5 @@ FORMAT = ExportFormat(
         )
     ),
     _check,
+    contains="joint_values",
 )

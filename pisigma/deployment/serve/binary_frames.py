@@ -35,6 +35,7 @@ class Refusal(enum.IntEnum):
     BROKEN_FRAME = 102
     WRONG_TOKEN = 103
     DEFECT = 104
+    MODEL_REFUSED = 105
 
 
 _NO_JOINTS = (math.nan,) * JOINTS
@@ -72,7 +73,8 @@ class BinaryFrames(AbstractProtocol):
         try:
             model = self._models.find(index)
         except RequestError:
-            return self._refuse(name, Refusal.NO_SUCH_MODEL, begun)
+            why = Refusal.MODEL_REFUSED if self._models.is_refused else Refusal.NO_SUCH_MODEL
+            return self._refuse(name, why, begun)
         if model.quick:
             return self._solve(model, message, name, begun)
         return lambda: self._solve(model, message, name, begun)

@@ -156,7 +156,8 @@ class ServedModels:
     """Models by index and by name; an index keeps referring to its model while the server runs.
 
     Attributes:
-        problems: with `within`, sentences on folders that could not be loaded and are not served.
+        problems: with `within`, sentences on folders that could not be loaded and are not served; of a cell,
+            warnings.
     """
 
     def __init__(
@@ -175,8 +176,9 @@ class ServedModels:
         self._within, self._lock = within, threading.Lock()
         self.problems: list[str] = []
         self._models: Sequence[ServedModel] = ()
-        self._in_use = None if cell is None else ModelInUse(cell, self._replace)
-        if cell is not None:
+        self._in_use = None if cell is None else ModelInUse(cell, "serve", self._replace)
+        if self._in_use is not None:
+            self.problems.extend(self._in_use.warnings)
             return
         if within is None:
             self._models = [ServedModel.read(folder) for folder in folders]
@@ -193,12 +195,20 @@ class ServedModels:
     def __getitem__(self, index: int) -> ServedModel:
         return self._models[index]
 
+    @property
+    def is_refused(self) -> bool:
+        """Whether no model must be used with what is active on the controller of the cell."""
+        return self._in_use is not None and bool(self._in_use.findings.refusal)
+
     def find(self, name: object) -> ServedModel:
         """Return the model with a name or an index; None stands for the only model.
 
         Raises:
-            RequestError: there is no such model, or None is given and there are several.
+            RequestError: there is no such model, None is given and there are several, or the model must not be used
+                with what is active on the controller.
         """
+        if self.is_refused and self._in_use is not None:
+            raise RequestError(self._in_use.findings.refusal)
         models = self._models
         if name is None and len(models) == 1:
             return models[0]
@@ -221,7 +231,7 @@ class ServedModels:
         """
         if self._in_use is not None:
             self._in_use.check(always=True)
-            return [self._in_use.problem] if self._in_use.problem else []
+            return list(self._in_use.warnings)
         with self._lock:
             problems: list[str] = []
             models = [self._newest(model, problems) for model in self._models]
@@ -239,7 +249,7 @@ class ServedModels:
         """Take over changes of the model in use of a cell, between requests, until the block ends.
 
         Args:
-            report: function that is called with a sentence for every model that could not be loaded.
+            report: function that is called with warnings, and with a sentence for every model that could not be loaded.
         """
         if self._in_use is not None:
             self._in_use.follow(report)

@@ -3,9 +3,12 @@
 from dataclasses import dataclass
 from typing import Literal
 
-Changes = Literal["joint_zeros", "kinematics", "nothing"]
-"""What an exported file changes on a controller: what its joint values mean, the kinematics with which it converts
-joint values to poses, or nothing, because robot programs or other programs use the file."""
+Contents = Literal["joint_values", "poses", "description", "kinematics", "joint_zeros"]
+"""What an exported file contains: corrected joint values (or the means to compute them), corrected poses for a
+controller that computes with the nominal robot, a description of the robot for other programs, the kinematics with
+which a controller converts joint values to poses, or the zeros of the joints on a controller."""
+ON_CONTROLLER: tuple[Contents, ...] = ("kinematics", "joint_zeros")
+"""Contents that are active on a controller from the moment at which they are entered."""
 
 
 @dataclass(frozen=True)
@@ -13,10 +16,10 @@ class ExportEntry:
     """A file that was exported from a model.
 
     Attributes:
-        file: path to which it was written.
+        file: name of the file.
         sha256: SHA-256 of the file.
         format: its `--format`.
-        changes: what it changes on a controller.
+        contains: what it contains, see `Contents`.
         model: name of the model.
         exported: time at which it was written (ISO 8601, UTC).
     """
@@ -24,14 +27,14 @@ class ExportEntry:
     file: str
     sha256: str
     format: str
-    changes: Changes
+    contains: Contents
     model: str
     exported: str
 
 
 @dataclass(frozen=True)
 class ControllerEntry:
-    """A change of the export that is active on the controller.
+    """A change of the exports that are active on the controller.
 
     Attributes:
         day: day from which it is active (ISO 8601).

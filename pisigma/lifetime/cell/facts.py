@@ -12,6 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from pisigma.files.errors import PlanningError
 from pisigma.files.yaml_file import read_yaml
+from pisigma.lifetime.cell.controller import Controller, records
 from pisigma.lifetime.cell.history import HISTORY, History, ModelEntry, SessionEntry
 from pisigma.lifetime.cell.layout import CELL_FILE, PLANS, SESSIONS
 from pisigma.lifetime.cell.status import CellFacts, Step, next_step
@@ -39,9 +40,16 @@ class CellStatus:
             "made_of": [] if model is None else model.sessions.split(","),
             "p95_mm": None if model is None else model.p95_mm,
             "limit_mm": facts.limit_mm,
+            "controller": records(facts.controller.active()),
             "plans": list(facts.plans),
             "sessions": [
-                {"name": one.name, "day": one.day, "rows": one.rows, "set_aside": one.set_aside or None}
+                {
+                    "name": one.name,
+                    "day": one.day,
+                    "rows": one.rows,
+                    "set_aside": one.set_aside or None,
+                    "controller": records(facts.controller.during(one)),
+                }
                 for one in facts.sessions
             ],
             "events": [one.to_json() for one in facts.events],
@@ -103,6 +111,7 @@ def facts_of(folder: Path) -> CellFacts:
         today=datetime.date.today().isoformat(),
         not_taken_in=not_taken_in(folder / SESSIONS, sessions),
         plans_nothing=stated.plans_nothing(in_use),
+        controller=Controller.from_history(history),
     )
 
 

@@ -8,7 +8,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 from pisigma.files.errors import PisigmaError
-from pisigma.lifetime.cell.history import HISTORY
+from pisigma.lifetime.cell.controller import Findings, findings
+from pisigma.lifetime.cell.history import HISTORY, History
 from pisigma.lifetime.cell.layout import model_folder
 
 INTERVAL = 0.1
@@ -26,23 +27,28 @@ class ModelInUse:
         cell: folder of the cell.
         folder: folder of the model that was loaded last.
         problem: why the model in use is not loaded; empty if it is.
+        findings: what follows from what is active on the controller; with a refusal no model must be used.
     """
 
-    def __init__(self, cell: Path, load: Callable[[Path], None]) -> None:
+    def __init__(self, cell: Path, command: str, load: Callable[[Path], None]) -> None:
         """Load the model in use.
 
         Args:
             cell: folder of the cell.
+            command: what uses the model, a key of `controller.RULES`.
             load: function that loads a model folder and replaces the model that answers. If it raises an error, the
                 model before continues to answer.
 
         Raises:
-            ModelError: no model is in use, or it cannot be loaded.
+            ModelError: no model is in use, it cannot be loaded, or it must not be used with what is active on the
+                controller.
         """
-        self.cell, self._load, self.problem = cell, load, ""
+        self.cell, self._command, self._load, self.problem = cell, command, load, ""
         self._lock, self._is_followed = threading.Lock(), False
         self._seen = self._state()
         self.folder = model_folder(cell)
+        self.findings = self._find()
+        self.findings.accepted(cell)
         load(self.folder)
 
     def check(self, always: bool = False) -> None:
@@ -58,6 +64,7 @@ class ModelInUse:
             is_settled = state is None or time.time_ns() - state[1] > SETTLED * 1e9
             self._seen = state if is_settled else None
             try:
+                self.findings = self._find()
                 folder = model_folder(self.cell)
                 if always or folder != self.folder:
                     self._load(folder)
@@ -69,7 +76,7 @@ class ModelInUse:
         """Look for changes in a background thread, until `stop` is called or this object is not used any more.
 
         Args:
-            report: function that is called with a sentence for every model that cannot be loaded.
+            report: function that is called with every new sentence of `warnings`.
         """
         self._is_followed = True
         threading.Thread(target=_follow, args=(weakref.ref(self), report), daemon=True).start()
@@ -77,6 +84,16 @@ class ModelInUse:
     def stop(self) -> None:
         """Stop looking for changes."""
         self._is_followed = False
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What a user has to know: that the model is refused, why it is not loaded, and warnings."""
+        return tuple(filter(None, (self.findings.refusal, self.problem, *self.findings.warnings)))
+
+    def _find(self) -> Findings:
+        """Return what follows for the model in use from what is active on the controller."""
+        history = History(self.cell / HISTORY)
+        return findings(history, self._command, history.in_use)
 
     def _state(self) -> tuple[int, int, int] | None:
         """Return what changes with every change of the history; None without a history."""
@@ -89,14 +106,15 @@ class ModelInUse:
 
 def _follow(followed: "weakref.ref[ModelInUse]", report: Callable[[str], None]) -> None:
     """Check for changes until the object is stopped or deleted."""
-    reported = ""
+    reported: tuple[str, ...] = ()
     while True:
         time.sleep(INTERVAL)
         model = followed()
         if model is None or not model._is_followed:
             return
         model.check()
-        if model.problem and model.problem != reported:
-            report(model.problem)
-        reported = model.problem
+        for sentence in model.warnings:
+            if sentence not in reported:
+                report(sentence)
+        reported = model.warnings
         del model

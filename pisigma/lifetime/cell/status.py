@@ -3,9 +3,10 @@
 import datetime
 import shlex
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
+from pisigma.lifetime.cell.controller import Controller
 from pisigma.lifetime.cell.history import ARM_EVENTS, Check, Event, ModelEntry, SessionEntry
 from pisigma.lifetime.cell.layout import SESSIONS
 
@@ -92,6 +93,7 @@ class CellFacts:
         today: day (ISO 8601).
         not_taken_in: names of the files in `sessions/` that are not in the history yet, by their dates.
         plans_nothing: why no poses can be planned; "" if they can.
+        controller: what was active on the controller when.
     """
 
     folder: str
@@ -106,11 +108,12 @@ class CellFacts:
     today: str
     not_taken_in: tuple[str, ...] = ()
     plans_nothing: str = ""
+    controller: Controller = field(default_factory=Controller)
 
     @property
     def valid_sessions(self) -> tuple[SessionEntry, ...]:
-        """Sessions that describe the present arm: not set aside, and measured since the arm was last changed."""
-        return valid_sessions(self.sessions, self.events)
+        """Sessions that describe the present arm; see `valid_sessions`."""
+        return valid_sessions(self.sessions, self.events, self.controller)
 
     @property
     def newest_model(self) -> ModelEntry | None:
@@ -146,10 +149,17 @@ class CellFacts:
         return [one for one in self.valid_sessions if one.name not in made_of and one.day >= model.day]
 
 
-def valid_sessions(sessions: tuple[SessionEntry, ...], events: tuple[Event, ...]) -> tuple[SessionEntry, ...]:
-    """Return the sessions that are not set aside and were measured since the last event that changed the arm."""
+def valid_sessions(
+    sessions: tuple[SessionEntry, ...], events: tuple[Event, ...], controller: Controller
+) -> tuple[SessionEntry, ...]:
+    """Return the sessions that describe the present arm.
+
+    They are not set aside, and were measured since the last event that changed the arm, with the joint zeros that are
+    active on the controller now.
+    """
     since = max((one.day for one in events if one.kind in ARM_EVENTS), default="")
-    return tuple(one for one in sessions if not one.set_aside and one.day >= since)
+    present = [one for one in sessions if not one.set_aside and one.day >= since]
+    return tuple(one for one in present if controller.is_present(one))
 
 
 def next_step(facts: CellFacts) -> Step:
@@ -213,6 +223,10 @@ def _no_session(facts: CellFacts) -> Step | None:
         return None
     ended = [one for one in facts.events if one.kind in ARM_EVENTS] if facts.sessions else []
     why = f"{ended[-1].kind} on {ended[-1].day} ended the validity of all sessions" if ended else ""
+    if any(not one.set_aside and not facts.controller.is_present(one) for one in facts.sessions):
+        zeros = facts.controller.active().get("joint_zeros")
+        now = "no exported joint zeros are" if zeros is None else f"those of {zeros} are"
+        why = f"all sessions were measured with other joint zeros of the controller; {now} active now"
     if not facts.plans or why:
         return Step("no_plan", why or "there is no plan and no session", facts.command("plan"))
     return _to_measure(facts, f"plan '{facts.plans[-1]}'")

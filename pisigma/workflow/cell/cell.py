@@ -15,6 +15,7 @@ from typing import Any
 from pisigma.files.errors import ModelError, Place
 from pisigma.files.model_files import is_model
 from pisigma.files.progress import Progress
+from pisigma.lifetime.cell.controller import findings
 from pisigma.lifetime.cell.facts import CellStatus, status_of
 from pisigma.lifetime.cell.history import HISTORY, Check, Entry, History, ModelEntry, SessionEntry, Use, now
 from pisigma.lifetime.cell.layout import MODELS, PLANS
@@ -33,6 +34,7 @@ from pisigma.workflow.cell.model_choice import (
     found_events,
     is_better,
     put_into_use,
+    with_warnings,
 )
 from pisigma.workflow.cell.new_cell import write_new_cell
 from pisigma.workflow.cell.sessions import (
@@ -205,9 +207,10 @@ class Cell:
         Raises:
             MeasurementError: there are no valid sessions.
         """
-        sessions = self.sessions.valid()
+        sessions, warnings = self.sessions.valid(), self.on_controller("calibrate", None)
         settings: CalibrationSettings = self.file.settings("calibrate", **changed)
         result = calibrated(self.robot, self.sessions.rows_of(sessions), settings, prior, progress)
+        result = with_warnings(result, warnings)
         doubt = "" if result.trusted else result.diagnostics[0].sentence
         if doubt and not accept_implausible:
             self.history.add(Check("calibrate", "", "", "not_trusted", doubt, None, False, now()))
@@ -240,7 +243,7 @@ class Cell:
             ModelError: there is no model.
             MeasurementError: there is no session with this name, or none to which the model was not fitted.
         """
-        entry, chosen, seen = self._new_rows(model, session)
+        entry, chosen, seen = self._new_rows("verify", model, session)
         settings = seen.settings_to_fit(self.file.settings("verify", **changed))
         found = verify(self.model_folder(entry.name), seen.rows, settings)
         errors, moved = found.comparison.models[-1].position.statistics, found.verdict == "moved"
@@ -266,7 +269,7 @@ class Cell:
             MeasurementError: no session is newer than the model.
         """
         entry = self._candidate(None)
-        sessions = self.sessions.new_to(entry)
+        warnings, sessions = self.on_controller("monitor", entry), self.sessions.new_to(entry)
         found: Monitoring | None = None
         for one in sessions:
             seen = self.sessions.rows_for(entry, self.sessions.as_measured(one), one.day)
@@ -278,7 +281,7 @@ class Cell:
             found = monitor(self.model_folder(entry.name), [rows], settings, progress)
             self.history.add(check_of(found, entry, one, seen, self.file.settings("recalibrate")))
         assert found is not None  # there is a session
-        return found
+        return replace(found, warnings=(*warnings, *found.warnings))
 
     def evaluate(self, **changed: Any) -> Evaluation:
         """Compare the model in use with the nominal robot on the newest session to which it was not fitted.
@@ -290,7 +293,7 @@ class Cell:
             ModelError: there is no model.
             MeasurementError: there is no session to which the model was not fitted.
         """
-        entry, _, seen = self._new_rows(None, None)
+        entry, _, seen = self._new_rows("evaluate", None, None)
         settings = seen.settings_to_fit(self.file.settings("evaluate", **changed))
         return evaluate(self.model_folder(entry.name), seen.rows, settings)
 
@@ -318,16 +321,16 @@ class Cell:
             ModelError: there is no model.
             MeasurementError: there is no session with this name, or none to which the model was not fitted.
         """
-        parent, chosen, seen = self._new_rows(None, session)
+        parent, chosen, seen = self._new_rows("recalibrate", None, session)
         settings = replace(self.file.settings("recalibrate", **changed), cameras=None)
         if seen.moved and settings.moved is None:
             settings = replace(settings, moved=seen.moved)
         result = recalibrate(self.model_folder(parent.name), seen.rows, settings, progress)
+        result = with_warnings(result, self.on_controller("recalibrate", parent))
         if not (result.trusted or accept_implausible):
             doubt = result.diagnostics[0].sentence
-            self.history.add(
-                Check("recalibrate", parent.name, chosen.name, "not_trusted", doubt, None, False, now())
-            )
+            refused = ("recalibrate", parent.name, chosen.name, "not_trusted", doubt)
+            self.history.add(Check(*refused, None, False, now()))
             return result, None
         path = save_new(self.folder / MODELS, partial(result.save, accept_implausible=accept_implausible))
         remark, (p95, rms) = result.summary.verdict, errors_of(result)
@@ -347,39 +350,33 @@ class Cell:
         self.history.add(*added)
         return result, entry
 
-    def use(self, model: str, reason: str) -> None:
-        """Put a model into use by hand; earlier models are kept, see `undo_use`.
+    def use(self, model: str | None, reason: str) -> tuple[str, ...]:
+        """Put a model into use by hand, or undo the last change of the model in use; all models are kept.
 
         Args:
-            model: name of the model.
-            reason: reason to record in the history.
-
-        Raises:
-            ModelError: the cell has no model with this name, or its folder was changed.
-        """
-        put_into_use(self.history, self.history.model(model).name, reason or "by hand")
-
-    def undo_use(self, reason: str) -> str:
-        """Put the model into use that was in use before the last change; repeated calls go further back.
-
-        Args:
+            model: name of the model. None: the one before the last change; repeated calls go further back.
             reason: reason to record in the history.
 
         Returns:
-            The name of the model; empty if none was in use.
+            Warnings.
 
         Raises:
-            ModelError: there is nothing to undo, or the folder of the model was changed.
+            ModelError: the cell has no model with this name, its folder was changed, or there is nothing to undo.
         """
-        model = self.history.before_in_use
-        if model is None:
+        name = self.history.before_in_use if model is None else self.history.model(model).name
+        if name is None:
             raise ModelError("no model was in use before", at=Place(self.folder), option="--undo")
-        put_into_use(self.history, model, reason or "undo", undo=True)
-        return model
+        warnings = self.on_controller("use", self.history.model(name)) if name else ()
+        put_into_use(self.history, name, reason or ("undo" if model is None else "by hand"), model is None)
+        return warnings
 
     def status(self) -> CellStatus:
         """Return the status of the cell and its next step."""
         return status_of(self.folder)
+
+    def on_controller(self, command: str, model: ModelEntry | None) -> tuple[str, ...]:
+        """Return warnings because of what is active on the controller, or raise a ModelError; see `controller.RULES`."""
+        return findings(self.history, command, model).accepted(self.folder)
 
     def _candidate(self, model: str | None) -> ModelEntry:
         """Return the named model, else the model in use, else the newest."""
@@ -392,8 +389,11 @@ class Cell:
         remedy = f"run `pisigma calibrate {self.folder}` first"
         raise ModelError("the cell has no model", at=Place(self.folder), remedy=remedy)
 
-    def _new_rows(self, model: str | None, session: str | None) -> tuple[ModelEntry, SessionEntry, ModelRows]:
+    def _new_rows(
+        self, command: str, model: str | None, session: str | None
+    ) -> tuple[ModelEntry, SessionEntry, ModelRows]:
         """Return a model, a session (by default the newest to which it was not fitted), and its rows with its names."""
         entry = self._candidate(model)
+        self.on_controller(command, entry)
         chosen = self.sessions.chosen(entry, session)
         return entry, chosen, self.sessions.rows_for(entry, self.sessions.as_measured(chosen), chosen.day)

@@ -26,6 +26,7 @@ from pisigma.workflow.settings.recalibration import RecalibrationSettings
 MIN_ROWS = 10
 """Minimum number of rows of the newest session, which is held out."""
 Value = TypeVar("Value")
+Result = TypeVar("Result", bound=Calibration | Recalibration)
 
 
 def is_better(
@@ -223,3 +224,11 @@ def put_into_use(history: History, model: str, reason: str, undo: bool = False) 
             "the model was changed after it was made", at=Place(folder), remedy="use another model"
         )
     history.add(Use(model, now(), reason, undo))
+
+
+def with_warnings(result: Result, warnings: tuple[str, ...]) -> Result:
+    """Return a calibration or a recalibration with further warnings, which its card states too."""
+    if not warnings:
+        return result
+    summary = result.summary.model_copy(update={"warnings": (*warnings, *result.summary.warnings)})
+    return replace(result, summary=summary)  # type: ignore[arg-type]  # that of the same class

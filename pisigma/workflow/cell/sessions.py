@@ -20,6 +20,7 @@ from pisigma.files.errors import (
     check_choice,
 )
 from pisigma.files.scratch import FILE, scratch_beside
+from pisigma.lifetime.cell.controller import Controller
 from pisigma.lifetime.cell.facts import not_taken_in, sha256_of
 from pisigma.lifetime.cell.history import Check, Event, History, ModelEntry, SessionEntry, now
 from pisigma.lifetime.cell.layout import MODELS, SESSIONS
@@ -160,9 +161,11 @@ class Sessions:
             again |= copies_of_known(rows.as_fields(), self.robot, values)
         if bool(again.all()):
             raise _known(rows)
-        model = self.history.in_use
-        if model is None:
-            verdict = check_rows(rows, self.robot)
+        model, controller = self.history.in_use, Controller.from_history(self.history)
+        at = controller.active(day, now())
+        found = controller.findings("import", model, self.history.sessions(), at).accepted(self.folder.parent)
+        if model is None or found:  # with other joint zeros, the model does not describe the arm
+            model, verdict = None, check_rows(rows, self.robot)
         else:
             seen = self.rows_for(model, rows, day)
             stated = RecalibrationSettings(seen.moved or None)
@@ -184,7 +187,7 @@ class Sessions:
             sensor=",".join(sorted(rows.kinds)),
             temperature_c=temperature,
             judged_by="robot" if model is None else model.name,
-            remark=" ".join(one.sentence for one in verdict.diagnostics),
+            remark=" ".join((*found, *(one.sentence for one in verdict.diagnostics))),
         )
 
     def set_aside(self, session: str, reason: str) -> None:
@@ -207,10 +210,11 @@ class Sessions:
         """
         while not self.one_by_one and self.take_in_next():
             pass
-        sessions = list(valid_sessions(self.history.sessions(), self.history.events()))
+        controller = Controller.from_history(self.history)
+        sessions = list(valid_sessions(self.history.sessions(), self.history.events(), controller))
         if not sessions:
             raise MeasurementError(
-                "the cell has no session since the arm was last changed",
+                "the cell has no session since the arm or its joint zeros were last changed",
                 at=Place(self.folder),
                 remedy="measure rows and import them",
             )
@@ -275,11 +279,12 @@ class Sessions:
             )
         rows = read_rows(path, self.robot, self.cameras)
         last = max(rows.date or (session.day,))
-        if spanned := [one for one in self.history.events() if session.day < one.day <= last]:
+        changes: list[tuple[str, str]] = [(one.day, one.kind) for one in self.history.events()]
+        changes += [(one.day, "controller") for one in Controller.from_history(self.history).zero_changes]
+        if spanned := [kind for day, kind in changes if session.day < day <= last]:
             raise MeasurementError(
-                f"rows of session '{session.name}' were measured before and after the event '{spanned[0].kind}' of "
-                f"{spanned[0].day}",
-                value=spanned[0].kind,
+                f"rows of session '{session.name}' were measured before and after an event '{spanned[0]}'",
+                value=spanned[0],
                 at=Place(path),
                 remedy="set the session aside, and import its rows as one session before and one after the event",
             )

@@ -26,7 +26,7 @@ def loads(cell):
             raise problems[folder.name]
         names.append(folder.name)
 
-    return names, ModelInUse(cell.folder, load), problems
+    return names, ModelInUse(cell.folder, "serve", load), problems
 
 
 def test_a_change_is_loaded_once(cell, loads):
@@ -36,7 +36,7 @@ def test_a_change_is_loaded_once(cell, loads):
     in_use.check()
     in_use.check()
     assert names == [FIRST, SECOND]
-    cell.undo_use("")
+    cell.use(None, "")
     in_use.check()
     assert names == [FIRST, SECOND, FIRST]
 
@@ -81,7 +81,7 @@ def test_a_cell_without_a_model_in_use_is_refused_at_first_and_reported_later(ce
     in_use.check()
     assert (in_use.folder.name, bool(in_use.problem)) == (FIRST, True)
     with refused(ModelError, file=cell.folder):
-        ModelInUse(cell.folder, lambda folder: None)
+        ModelInUse(cell.folder, "serve", lambda folder: None)
 
 
 def until(happened, seconds=10.0):

@@ -5,6 +5,7 @@ from typing import get_args
 
 import pytest
 
+from pisigma.lifetime.cell.controller import Controller
 from pisigma.lifetime.cell.history import ARM_EVENTS, Check, Event, ModelEntry, SessionEntry
 from pisigma.lifetime.cell.status import (
     MAX_DAYS_UNVERIFIED,
@@ -155,13 +156,13 @@ def test_a_step_that_failed_is_not_named_again():
 @pytest.mark.parametrize("kind", ["instrument", "tool", "firmware", *sorted(ARM_EVENTS)])
 def test_only_events_of_the_arm_end_the_validity_of_sessions(kind):
     event = Event("2026-02-01", kind, "", "2026-02-01T08:00:00+00:00")
-    valid = valid_sessions((FIRST, SECOND), (event,))
+    valid = valid_sessions((FIRST, SECOND), (event,), Controller())
     assert valid == ((SECOND,) if kind in ARM_EVENTS else (FIRST, SECOND))
 
 
 def test_a_session_of_the_day_of_an_event_was_measured_after_it():
     event = Event("2026-02-10", "mastering", "", "2026-02-10T08:00:00+00:00")
-    assert valid_sessions((FIRST, SECOND), (event,)) == (SECOND,)
+    assert valid_sessions((FIRST, SECOND), (event,), Controller()) == (SECOND,)
     assert next_step(replace(VERIFIED, events=(event,), in_use=None)).state == "not_calibrated"
     # a model in use is recalibrated, which takes fewer poses than a calibration
     assert (
@@ -173,7 +174,7 @@ def test_a_session_of_the_day_of_an_event_was_measured_after_it():
 def test_a_session_that_was_set_aside_counts_no_more():
     aside = replace(SECOND, set_aside="wrong tool")
     assert next_step(replace(MEASURED_AGAIN, sessions=(FIRST, aside))).state == "not_verified"
-    assert valid_sessions((FIRST, aside), ()) == (FIRST,)
+    assert valid_sessions((FIRST, aside), (), Controller()) == (FIRST,)
 
 
 def test_a_new_session_after_a_calibration_that_failed_is_calibrated_with():

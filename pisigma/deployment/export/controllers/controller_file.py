@@ -12,6 +12,7 @@ from pisigma.deployment.export.geometry import condition_remarks, corrects_joint
 from pisigma.deployment.export.joint_offsets import departure_sentence
 from pisigma.deployment.export.projection import project_model, whole_geometry
 from pisigma.files.errors import RobotError
+from pisigma.lifetime.cell.exports import Contents
 from pisigma.robot.description import Robot
 from pisigma.robot.row import FRAME_COLUMNS, in_file_units
 
@@ -101,6 +102,7 @@ class ControllerFile:
         parameters: function for the indices into the flattened `Robot.dh` that the file includes.
         options: those of `OPTIONS` that the format accepts.
         refuse: function that raises a `PisigmaError` for invalid requests before anything is loaded.
+        contains: what a file contains.
     """
 
     name: str
@@ -115,11 +117,18 @@ class ControllerFile:
     parameters: Callable[[Robot], Sequence[int]] = whole_geometry
     options: frozenset[str] = field(default_factory=frozenset)
     refuse: Callable[[ExportRequest], None] = lambda request: None
+    contains: Contents = "kinematics"
 
     def export_format(self) -> ExportFormat:
         """Return the format of `pisigma export`."""
         return ExportFormat(
-            self.name, self.contents, self.suffixes, self.write, self.options | CONDITIONS, self.refuse
+            self.name,
+            self.contents,
+            self.suffixes,
+            self.write,
+            self.options | CONDITIONS,
+            self.refuse,
+            self.contains,
         )
 
     def write(self, request: ExportRequest) -> Exported:

@@ -129,6 +129,7 @@ def _file(name: str, contents: str, source: str, meaning: str) -> ControllerFile
         parameters=joint_offsets,
         options=frozenset(("counts_per_turn", "present_counts")),
         refuse=_refuse,
+        contains="joint_zeros",
     )
 
 

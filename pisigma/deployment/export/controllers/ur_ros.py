@@ -160,5 +160,6 @@ FILE = ControllerFile(
     read=read_kinematics,
     check=check_robot,
     convention=convention,
+    contains="description",
 )
 FORMAT = FILE.export_format()

@@ -57,5 +57,6 @@ FILE = ControllerFile(
     read=None,
     check=lambda robot: None,
     options=frozenset(("like", "tip")),
+    contains="description",
 )
 FORMAT = FILE.export_format()

@@ -87,7 +87,9 @@ def _write(request: ExportRequest) -> Exported:
     return Exported(content, {**model_facts(model), "files": sorted(content)}, remarks)
 
 
-FORMAT = ExportFormat("library", "a C library", (), _write, frozenset(("payload_kg", "temperature_c")))
+FORMAT = ExportFormat(
+    "library", "a C library", (), _write, frozenset(("payload_kg", "temperature_c")), contains="joint_values"
+)
 
 
 def layout_key() -> int:

@@ -1,0 +1,299 @@
+"""What is active on the controller of a cell, and what this means for every command.
+
+Two kinds of exports are active on a controller. Its *kinematics* convert joint values to poses; the joint values of the
+arm keep their meaning, so measured rows do not depend on them. Its *joint zeros* change what joint values mean: a model
+describes the arm with those zeros that were active when its rows were measured, and corrects twice, or not at all, with
+any others. All other exports contain corrected values or are used by other programs, and are not active there.
+"""
+
+import datetime
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, get_args
+
+from pisigma.files.errors import MeasurementError, ModelError, Place
+from pisigma.lifetime.cell.exports import ON_CONTROLLER, Contents, ControllerEntry, ExportEntry
+from pisigma.lifetime.cell.history import HISTORY, History, ModelEntry, SessionEntry, now
+from pisigma.lifetime.cell.layout import is_cell, model_folder
+from pisigma.measurement.dates import EXPECTED_DATE, is_date
+
+Situation = Literal["kinematics", "same_zeros", "other_zeros"]
+"""The controller computes with exported kinematics; exported joint zeros are active, with which the rows of the model
+were measured; other joint zeros are active than those with which the rows of the model were measured."""
+Effect = Literal["allow", "warn", "refuse"]
+
+RULES: dict[str, tuple[Effect, Effect, Effect]] = {
+    # command               kinematics  same_zeros  other_zeros
+    "serve": ("warn", "allow", "refuse"),
+    "load": ("warn", "allow", "refuse"),
+    "ik": ("warn", "allow", "refuse"),
+    "export joint_values": ("warn", "allow", "refuse"),
+    "export poses": ("refuse", "allow", "refuse"),
+    "export description": ("allow", "allow", "refuse"),
+    "export kinematics": ("allow", "allow", "refuse"),
+    "export joint_zeros": ("refuse", "warn", "refuse"),
+    "verify": ("allow", "allow", "refuse"),
+    "evaluate": ("allow", "allow", "refuse"),
+    "measure": ("allow", "allow", "warn"),
+    "import": ("allow", "allow", "warn"),
+    "monitor": ("allow", "allow", "warn"),
+    "recalibrate": ("allow", "allow", "warn"),
+    "use": ("allow", "allow", "warn"),
+    "calibrate": ("allow", "warn", "allow"),
+}
+"""Effect of every situation on a command. `calibrate` uses only sessions measured with the present joint zeros."""
+
+_TWICE = "a correction would be applied twice"
+_MEANING = {
+    (
+        "export poses",
+        "kinematics",
+    ): f"{_TWICE}, as the poses are for a controller that computes with the nominal robot",
+    (
+        "export joint_zeros",
+        "kinematics",
+    ): f"{_TWICE}, as these kinematics already contain the offsets of the joints",
+    ("export joint_zeros", "same_zeros"): "the exported offsets are to be added to these",
+    ("calibrate", "same_zeros"): "the model is valid only while they are active",
+    ("measure", "other_zeros"): "the rows will differ from the model by these joint zeros",
+    ("import", "other_zeros"): "the rows differ from the model by these joint zeros",
+    ("monitor", "other_zeros"): "the motion that is found includes the change of the joint zeros",
+    ("recalibrate", "other_zeros"): "the motion that is found includes the change of the joint zeros",
+}
+_ELSE: dict[Situation, str] = {
+    "kinematics": "command the joint values as joint motions; if a pose is computed from them and commanded, "
+    + _TWICE.replace("would be", "is"),
+    "same_zeros": "the model describes the arm with these joint zeros",
+    "other_zeros": "a correction would be applied twice or not at all",
+}
+
+
+@dataclass(frozen=True)
+class Active:
+    """An export that is active on a controller.
+
+    Attributes:
+        export: the export.
+        since: day from which it is active (ISO 8601).
+    """
+
+    export: ExportEntry
+    since: str
+
+    def __str__(self) -> str:
+        """Return how messages name it."""
+        one = self.export
+        return f"'{one.file}' ({one.format} of model '{one.model}', active since {self.since})"
+
+    def to_json(self) -> dict[str, str]:
+        """Return it as plain values."""
+        one = self.export
+        return {
+            "contains": one.contains,
+            "format": one.format,
+            "file": one.file,
+            "sha256": one.sha256,
+            "model": one.model,
+            "since": self.since,
+        }
+
+
+@dataclass(frozen=True)
+class Controller:
+    """What was active on a controller when.
+
+    Attributes:
+        changes: all changes in the order of their days.
+        exports: all exports.
+    """
+
+    changes: tuple[ControllerEntry, ...] = ()
+    exports: tuple[ExportEntry, ...] = ()
+
+    @staticmethod
+    def from_history(history: History) -> "Controller":
+        """Return the controller of a cell."""
+        return Controller(history.controller(), history.exports())
+
+    def active(self, day: str = "9999", time: str = "") -> dict[Contents, Active]:
+        """Return what was active after a day, by what it contains.
+
+        Args:
+            day: the day (ISO 8601).
+            time: time (ISO 8601, UTC): a change of this day counts only if it was recorded until then.
+        """
+        exports, found = {one.sha256: one for one in self.exports}, dict[Contents, Active]()
+        for one in self.changes:
+            if one.day > day or (one.day == day and one.recorded > time):
+                break
+            if not one.sha256:
+                found.clear()
+            elif one.sha256 in exports:
+                export = exports[one.sha256]
+                found[export.contains] = Active(export, one.day)
+        return found
+
+    def during(self, session: SessionEntry) -> dict[Contents, Active]:
+        """Return what was active during a session: of a change of its day, what was recorded before it was added."""
+        return self.active(session.day, session.taken_in)
+
+    @property
+    def zero_changes(self) -> tuple[ControllerEntry, ...]:
+        """Changes of the joint zeros."""
+        hashes = [_hash(self.active(one.day, one.recorded)) for one in self.changes]
+        pairs = zip(self.changes, ["", *hashes], hashes, strict=False)
+        return tuple(one for one, before, after in pairs if before != after)
+
+    def is_present(self, session: SessionEntry) -> bool:
+        """Return whether a session was measured with the joint zeros that are active now."""
+        return _hash(self.during(session)) == _hash(self.active())
+
+    def behind(self, model: ModelEntry, sessions: tuple[SessionEntry, ...]) -> dict[Contents, Active]:
+        """Return what was active when the newest rows of a model were measured."""
+        newest = [one for one in sessions if one.name == model.sessions.split(",")[-1]]
+        return self.during(newest[0]) if newest else self.active(model.day or model.made[:10], model.made)
+
+    def findings(
+        self,
+        command: str,
+        model: ModelEntry | None,
+        sessions: tuple[SessionEntry, ...],
+        at: dict[Contents, Active] | None = None,
+    ) -> "Findings":
+        """Apply `RULES` to a command.
+
+        Args:
+            command: a key of `RULES`.
+            model: the model that the command uses; None if it uses none.
+            sessions: all sessions of the cell.
+            at: what was active when the rows were measured; None: what is active now.
+        """
+        present = self.active() if at is None else at
+        behind = present if model is None else self.behind(model, sessions)
+        which: dict[Situation, str] = {}
+        if "kinematics" in present:
+            which["kinematics"] = f"the controller computes poses with {present['kinematics']}"
+        zeros = present.get("joint_zeros")
+        if _hash(behind) != _hash(present):
+            then = behind.get("joint_zeros")
+            assert model is not None  # else they are the same
+            which["other_zeros"] = (
+                f"the rows of model '{model.name}' were measured "
+                f"{'without exported joint zeros' if then is None else f'with the joint zeros of {then}'}, "
+                f"and now {'none are active' if zeros is None else f'those of {zeros} are active'}"
+            )
+        elif zeros is not None:
+            which["same_zeros"] = f"the joint zeros of {zeros} are active"
+        effects = dict(zip(get_args(Situation), RULES[command], strict=True))
+        said: dict[Effect, list[str]] = {"allow": [], "warn": [], "refuse": []}
+        for one, what in which.items():
+            said[effects[one]].append(f"{what}: {_MEANING.get((command, one), _ELSE[one])}")
+        return Findings(
+            "; ".join(said["refuse"]), tuple(f"{one[0].upper()}{one[1:]}." for one in said["warn"])
+        )
+
+
+@dataclass(frozen=True)
+class Findings:
+    """What follows for a command from what is active on the controller.
+
+    Attributes:
+        refusal: why the command is refused; empty if it is not.
+        warnings: warnings, one sentence each.
+    """
+
+    refusal: str
+    warnings: tuple[str, ...]
+
+    def accepted(self, cell: Path) -> tuple[str, ...]:
+        """Return the warnings.
+
+        Raises:
+            ModelError: the command is refused.
+        """
+        if self.refusal:
+            raise ModelError(
+                self.refusal,
+                at=Place(cell),
+                remedy="measure rows and recalibrate, or record what is active with `pisigma event "
+                f"{cell} controller --export FILE|none`",
+            )
+        return self.warnings
+
+
+def _hash(active: dict[Contents, Active]) -> str:
+    """Return what identifies joint zeros; empty if none are active."""
+    return active["joint_zeros"].export.sha256 if "joint_zeros" in active else ""
+
+
+def records(active: dict[Contents, Active]) -> list[dict[str, str]]:
+    """Return what is active as plain values."""
+    return [one.to_json() for one in active.values()]
+
+
+def findings(history: History, command: str, model: ModelEntry | None) -> Findings:
+    """Apply `RULES` to a command on a cell that uses a model; see `Controller.findings`."""
+    return Controller.from_history(history).findings(command, model, history.sessions())
+
+
+def checked_model_folder(path: Path, command: str) -> tuple[Path, tuple[str, ...]]:
+    """Return the folder of a cell's model in use, and warnings; a path that is not a cell is returned unchanged.
+
+    Raises:
+        ModelError: no model of the cell is in use, or the command is refused because of what is active on the
+            controller.
+    """
+    return model_folder(path), checked_in_use(path, command)
+
+
+def checked_in_use(path: Path, command: str) -> tuple[str, ...]:
+    """Return warnings for a command on the model in use of a cell, if there is one; () for a path that is not a cell.
+
+    Raises:
+        ModelError: the command is refused because of what is active on the controller.
+    """
+    if not is_cell(path):
+        return ()
+    history = History(path / HISTORY)
+    return findings(history, command, history.in_use).accepted(path)
+
+
+def record_controller(history: History, sha256: str, day: str, note: str) -> ControllerEntry:
+    """Record which export is active on the controller, in addition to an active one with other contents.
+
+    Args:
+        history: history of the cell.
+        sha256: SHA-256 of the exported file; empty: no export is active any more.
+        day: day from which it is active (ISO 8601). "": today.
+        note: free text.
+
+    Raises:
+        MeasurementError: the day is not valid, or no export of the cell that is active on a controller has this hash.
+    """
+    today = datetime.date.today().isoformat()
+    day, exports = day or today, {one.sha256: one for one in history.exports()}
+    if not is_date(day):
+        raise MeasurementError(expected=EXPECTED_DATE, value=day, option="--date")
+    if day > today:
+        raise MeasurementError(expected=f"a day until {today}", value=day, option="--date")
+    if sha256 and sha256 not in exports:
+        raise MeasurementError(
+            expected="a file as `pisigma export CELL` wrote it, or none",
+            value=f"SHA-256 {sha256[:16]}",
+            option="--export",
+            remedy="export it again",
+        )
+    if sha256 and exports[sha256].contains not in ON_CONTROLLER:
+        raise MeasurementError(
+            expected="kinematics or joint zeros of a controller",
+            value=f"a file of --format {exports[sha256].format}",
+            option="--export",
+            remedy="record only what the controller computes with, not what programs use",
+        )
+    first = min((one.exported[:10] for one in history.exports() if one.sha256 == sha256), default="")
+    if day < first:
+        expected = f"a day since {first}, when the file was exported"
+        raise MeasurementError(expected=expected, value=day, option="--date")
+    entry = ControllerEntry(day, sha256, note, now())
+    history.add(entry)
+    return entry
