@@ -250,8 +250,8 @@ CELL_COMMANDS = {
     "new": (),  # refuses a folder that is not empty
     "unpack": (),
     "status": ("{cell}",),
-    "plan": ("{cell}", "--count", 4, "--check", 0, "--candidates", 100),
-    "measure": ("{cell}", "--rows", "{rows}", "--no-replan", "--once"),
+    "plan": ("{cell}", "--count", 4, "--check", 0, "--set", "candidates=100"),
+    "measure": ("{cell}", "--rows", "{rows}", "--set", "replan=false", "--once"),
     "import": ("{more}", "--cell", "{cell}", "--date", day(1)),
     "calibrate": ("{cell}", "--folds", 0, "--model", "geometric"),
     "verify": ("{cell}",),

@@ -6,7 +6,6 @@ from torch import Tensor
 from pisigma.files.errors import PisigmaError
 from pisigma.lifetime.cell.acceptance import Acceptance, MeasuredAccuracy, missing_statements
 from pisigma.lifetime.cell.history import ModelEntry, SessionEntry
-from pisigma.lifetime.cell.status import valid_sessions
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel, poses_of_rows
 from pisigma.model.folder.model_folder import load_model
@@ -36,7 +35,7 @@ def acceptance_of(cell: Cell) -> Acceptance:
     model = load_model(folder := cell.model_folder())
     entry = cell.history.model(folder.name)
     document = cell.file.document
-    sessions = valid_sessions(cell.history.sessions(), cell.history.events())
+    sessions = cell.status().facts.valid_sessions
     made_of = entry.sessions.split(",")
     later = [one for one in sessions if one.name not in made_of and one.day >= entry.day]
     new = (later or [one for one in cell.history.sessions() if one.name == made_of[-1]])[-1]

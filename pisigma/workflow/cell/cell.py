@@ -375,7 +375,7 @@ class Cell:
         return status_of(self.folder)
 
     def on_controller(self, command: str, model: ModelEntry | None) -> tuple[str, ...]:
-        """Return warnings because of what is active on the controller, or raise a ModelError; see `controller.RULES`."""
+        """Return warnings because of what is active on the controller; raise a ModelError if a rule refuses it."""
         return findings(self.history, command, model).accepted(self.folder)
 
     def _candidate(self, model: str | None) -> ModelEntry:

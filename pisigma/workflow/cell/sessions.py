@@ -21,10 +21,9 @@ from pisigma.files.errors import (
 )
 from pisigma.files.scratch import FILE, scratch_beside
 from pisigma.lifetime.cell.controller import Controller
-from pisigma.lifetime.cell.facts import not_taken_in, sha256_of
+from pisigma.lifetime.cell.facts import facts_of, not_taken_in, sha256_of
 from pisigma.lifetime.cell.history import Check, Event, History, ModelEntry, SessionEntry, now
 from pisigma.lifetime.cell.layout import MODELS, SESSIONS
-from pisigma.lifetime.cell.status import valid_sessions
 from pisigma.measurement.camera.camera_files import CameraFiles
 from pisigma.measurement.camera.corner_file import read_rows
 from pisigma.measurement.copies import RowValues, copies_of_known
@@ -210,8 +209,7 @@ class Sessions:
         """
         while not self.one_by_one and self.take_in_next():
             pass
-        controller = Controller.from_history(self.history)
-        sessions = list(valid_sessions(self.history.sessions(), self.history.events(), controller))
+        sessions = list(facts_of(self.folder.parent).valid_sessions)
         if not sessions:
             raise MeasurementError(
                 "the cell has no session since the arm or its joint zeros were last changed",

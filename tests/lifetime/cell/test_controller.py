@@ -45,6 +45,21 @@ def test_the_table_has_every_situation_and_every_content():
     assert {name.split()[1] for name in RULES if name.startswith("export ")} == set(get_args(Contents))
 
 
+def test_the_documentation_has_the_same_table(repository):
+    page = (
+        (repository / "docs" / "how-to" / "cell.md")
+        .read_text()
+        .split("## What is active on the controller")[1]
+    )
+    lines = [
+        line.strip("| ").split(" | ")
+        for line in page.split("\n## ")[0].splitlines()
+        if line.startswith("| `")
+    ]
+    documented = {name.strip("` "): tuple(effects) for names, *effects in lines for name in names.split(", ")}
+    assert documented == RULES
+
+
 @pytest.mark.parametrize("situation", SITUATIONS)
 @pytest.mark.parametrize("command", RULES)
 def test_every_rule_of_the_table(command, situation, tmp_path):
