@@ -17,18 +17,7 @@ import time
 import cv2
 import numpy as np
 import torch
-from camera import (
-    ANGLE,
-    BOARD,
-    CAMERA,
-    LENGTH,
-    NOISE,
-    PRIOR,
-    Cell,
-    Draw,
-    aligned_error,
-    positions,
-)
+from camera import ANGLE, BOARD, CAMERA, LENGTH, NOISE, PRIOR, Cell, Draw, aligned_error, positions
 from scipy.optimize import least_squares
 from scipy.sparse import csr_matrix, lil_matrix
 

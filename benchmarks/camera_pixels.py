@@ -24,14 +24,13 @@ from pisigma.measurement.camera.detection.detector import detect_checkerboard
 from pisigma.measurement.camera.image_rows import image_measurements
 from pisigma.robot import Robot
 from pisigma.robot.se3 import invert, transform_from_xyzrpy, xyzrpy_from_transform
-from pisigma.simulation.camera.rendering import Exposure, render_image
+from pisigma.simulation.camera.rendering import Exposure, TrueBoard, render_image
 from pisigma.simulation.camera.simulated_images import (
     RandomViews,
     draw_board_poses,
     images_of,
     project_corners,
 )
-from pisigma.simulation.camera.true_board import TrueBoard
 
 LENS = replace(CAMERA, k1=-0.1, k2=0.05, p1=1e-4, p2=-2e-4)
 IN_BASE = torch.tensor([0.42, 0.08, 0.05, 0.0, 0.0, np.pi], dtype=torch.float64)

@@ -26,8 +26,9 @@ from pisigma.reporting.cards import CardTexts, write_calibration_card
 from pisigma.robot.description import Robot
 from pisigma.validation.checks.check import CheckedCalibration
 from pisigma.validation.checks.registry import diagnostics_of
+from pisigma.validation.checks.row_order import explained
 from pisigma.validation.checks.scale import scale_figures
-from pisigma.validation.checks.setup_fault import explained, setup_diagnostics
+from pisigma.validation.checks.setup_fault import setup_diagnostics
 from pisigma.validation.held_out.calibration_summary import CalibrationSummary, summarise
 from pisigma.validation.held_out.calibration_validation import CalibrationValidation, joined_repeats, judge
 from pisigma.validation.held_out.few_rows import fit_with_folds

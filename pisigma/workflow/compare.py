@@ -23,18 +23,12 @@ from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.model_source import HasModel, ModelSource, model_or_folder
 from pisigma.model.training_rows import training_row_warnings
 from pisigma.planning.task import read_task
-from pisigma.validation.checks.rows.wrong_rows import without_wrong_rows
+from pisigma.validation.checks.wrong_rows import without_wrong_rows
 from pisigma.validation.gate import check_rows
 from pisigma.validation.held_out.diagnostic import Diagnostic
 from pisigma.validation.held_out.frames.fitted_frames import fitted_kinds
 from pisigma.validation.held_out.model_comparison import Difference, ModelComparison, compare_models
-from pisigma.workflow.evaluate import (
-    REFERENCES,
-    labelled,
-    load_models,
-    test_rows,
-    with_references,
-)
+from pisigma.workflow.evaluate import REFERENCES, labelled, load_models, test_rows, with_references
 from pisigma.workflow.settings.comparison import ComparisonSettings
 
 

@@ -22,7 +22,7 @@ from pisigma.model.domain import Domain
 from pisigma.model.folder.model_folder import load_model
 from pisigma.model.inverse.corrected_ik import CorrectedIK
 from pisigma.model.stored_starts import spread_rows
-from pisigma.reporting.distilled_card import write_distilled_card
+from pisigma.reporting.derived_cards import write_distilled_card
 from pisigma.robot.description import Robot
 from pisigma.robot.kinematics.closed_form import closed_form_solver
 from pisigma.robot.kinematics.status import Status

@@ -18,8 +18,8 @@ from pisigma.model.folder.model_folder import load_model
 from pisigma.model.model_source import HasModel, ModelSource, model_or_folder
 from pisigma.model.stated_conditions import condition_warnings
 from pisigma.model.training_rows import training_row_warnings
-from pisigma.validation.checks.rows.other_sensors import missed_distances
-from pisigma.validation.checks.rows.wrong_rows import without_wrong_rows
+from pisigma.validation.checks.other_sensors import missed_distances
+from pisigma.validation.checks.wrong_rows import without_wrong_rows
 from pisigma.validation.gate import check_rows
 from pisigma.validation.held_out.diagnostic import Diagnostic
 from pisigma.validation.held_out.frames.fitted_frames import FrameKind, fitted_remark
@@ -281,7 +281,7 @@ def _diagnostics(
     nominal = nominal_model(model, rows.rotation is not None) if implausible else None
     found = check_rows(rows, model, fitted, nominal=nominal).implausible
     if implausible and not found:
-        found = (Diagnostic(kind="implausible_errors", severity="implausible", sentence=unexplained(model)),)
+        found = (unexplained(model),)
     for one in found:
         yield one.model_copy(update={"sentence": f"{figures.name}: {one.sentence}"})
 

@@ -22,7 +22,7 @@ from pisigma.planning.plan_file import StoredPlan, read_plan
 from pisigma.planning.plan_inputs import find_candidates, with_measured
 from pisigma.planning.session.reached import Reached, cross_validated, expected, reached
 from pisigma.planning.session.row_alarms import NEAR_POSE, joint_differences, of_all_rows
-from pisigma.planning.session.session_rows import FurtherPoses, SessionRows, setup_sentence
+from pisigma.planning.session.session_rows import FurtherPoses, SessionRows, advice, setup_sentence
 from pisigma.planning.session.state import (
     AccuracyPoint,
     Advice,
@@ -32,7 +32,6 @@ from pisigma.planning.session.state import (
     SessionState,
     coverage,
 )
-from pisigma.planning.session.stopping import advice
 from pisigma.planning.subject import Subject
 from pisigma.planning.task import task_poses
 from pisigma.robot.se3 import transform_from_xyzrpy

@@ -44,7 +44,7 @@ from pisigma.planning.task import task_poses
 from pisigma.planning.tour import Tour, order_of_use, stages_of, tour
 from pisigma.robot.description import Robot
 from pisigma.validation.checks.camera import view_warnings
-from pisigma.validation.checks.rows.row_check import MOVES
+from pisigma.validation.checks.check import MOVES
 from pisigma.validation.gate import check_rows
 
 STEP = 10

@@ -41,10 +41,10 @@ from pisigma.model.model_posterior import FLEET_PRIOR, ModelPosterior, check_fle
 from pisigma.model.model_source import HasModel, ModelSource, model_or_folder
 from pisigma.model.stated_conditions import condition_warnings
 from pisigma.model.training_rows import with_wide_limits, without_known_rows
-from pisigma.reporting.recalibration_card import write_recalibration_card
+from pisigma.reporting.derived_cards import write_recalibration_card
 from pisigma.robot.description import Robot
-from pisigma.validation.checks.rows.row_check import MOVES, Move
-from pisigma.validation.checks.rows.wrong_rows import WithoutWrongRows, without_wrong_rows
+from pisigma.validation.checks.check import MOVES, Move
+from pisigma.validation.checks.wrong_rows import WithoutWrongRows, without_wrong_rows
 from pisigma.validation.gate import check_rows
 from pisigma.validation.held_out.calibration_validation import errors_under
 from pisigma.validation.held_out.distillation_summary import ParentFigures

@@ -20,7 +20,7 @@ from pisigma.model.folder.model_folder import load_model
 from pisigma.reporting.page.content import ReportContent, report_content
 from pisigma.reporting.page.figures import ReportFigures, check_figures, draw_figures, write_figures
 from pisigma.reporting.page.page import render_page
-from pisigma.validation.checks.rows.wrong_rows import without_wrong_rows
+from pisigma.validation.checks.wrong_rows import without_wrong_rows
 from pisigma.validation.gate import check_rows
 from pisigma.validation.held_out.diagnostic import Diagnostic
 

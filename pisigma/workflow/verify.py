@@ -21,8 +21,8 @@ from pisigma.model.model_source import HasModel, ModelSource, model_or_folder
 from pisigma.model.stated_conditions import condition_warnings
 from pisigma.model.training_rows import training_row_warnings
 from pisigma.robot.row import Row
-from pisigma.validation.checks.rows.other_sensors import missed_distances
-from pisigma.validation.checks.rows.wrong_rows import without_wrong_rows
+from pisigma.validation.checks.other_sensors import missed_distances
+from pisigma.validation.checks.wrong_rows import without_wrong_rows
 from pisigma.validation.gate import check_rows
 from pisigma.validation.held_out.diagnostic import Diagnostic
 from pisigma.validation.held_out.frames.fitted_frames import FrameKind, fitted_remark
@@ -349,5 +349,5 @@ def _warnings(
             "are left out."
         )
     if not faults and motion is None and is_implausible(corrected, model):
-        warnings.append(unexplained(model))
+        warnings.append(unexplained(model).sentence)
     return warnings

@@ -5,8 +5,7 @@ import pytest
 import torch
 from testing.closeness import assert_close
 
-from pisigma.estimation.drift import Drift, DriftGroup, LinearValues
-from pisigma.estimation.posterior_update import MAX_DIRECTIONS, PosteriorUpdate
+from pisigma.estimation.drift import MAX_DIRECTIONS, Drift, DriftGroup, LinearValues, PosteriorUpdate
 from pisigma.estimation.regression import SensorCount
 
 UNKNOWNS, DIRECTIONS, NOISE = 30, 32, 0.3

@@ -9,7 +9,7 @@ from gate.commands import COMMANDS
 from gate.table import MISTAKES, MOVES, Mistake, right_rows
 from testing.aged import model_before
 
-from pisigma.validation.checks.rows import row_check
+from pisigma.validation.checks import check as row_check
 from pisigma.validation.gate import check_rows
 
 pytestmark = pytest.mark.usefixtures("without_type_checker")

@@ -5,12 +5,7 @@ import torch
 from testing.closeness import assert_close
 
 from pisigma.measurement.dataset import Measurements
-from pisigma.robot.frame_fits import (
-    MeasuredPoses,
-    best_base,
-    best_base_and_tool,
-    best_tool,
-)
+from pisigma.robot.frame_fits import MeasuredPoses, best_base, best_base_and_tool, best_tool
 from pisigma.robot.se3 import rotation_from_vector, transform, transform_from_xyzrpy
 
 BASE = transform_from_xyzrpy(torch.tensor([0.3, -0.2, 0.1, 0.5, 0.2, -0.3], dtype=torch.float64))

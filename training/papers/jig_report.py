@@ -9,15 +9,7 @@ import numpy as np
 import torch
 from jaxtyping import Float64
 
-from jig_accuracy import (
-    DEFINITIONS,
-    Accuracy,
-    Bench,
-    accuracy_figures,
-    deviation,
-    measure_accuracy,
-    rms,
-)
+from jig_accuracy import DEFINITIONS, Accuracy, Bench, accuracy_figures, deviation, measure_accuracy, rms
 from jig_recipe import JigCalibration, JigRecipe, calibrate_on, nominal_calibration
 from pisigma.files.errors import RecipeError
 from pisigma.measurement.dataset import Measurements

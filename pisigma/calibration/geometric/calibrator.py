@@ -26,11 +26,7 @@ from pisigma.calibration.geometric.identifiability.sufficiency import (
 )
 from pisigma.calibration.geometric.initial_guess.initial_guess import chosen_rows
 from pisigma.calibration.geometric.problem.information import information
-from pisigma.calibration.geometric.problem.least_squares import (
-    SHORTEST_STEP,
-    Solution,
-    levenberg_marquardt,
-)
+from pisigma.calibration.geometric.problem.least_squares import SHORTEST_STEP, Solution, levenberg_marquardt
 from pisigma.calibration.geometric.problem.noise import view_of
 from pisigma.calibration.geometric.problem.parameters import ParameterSpace, Prior
 from pisigma.calibration.geometric.problem.setup import (

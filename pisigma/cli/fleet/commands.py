@@ -157,7 +157,7 @@ def status(
 
 def _print_prior(result: "FleetPriorResult", out: Path, verbose: bool) -> None:
     """Print what robots have in common."""
-    from pisigma.reporting.fleet_prior_card import UNDETERMINED, common_table, spectrum_table
+    from pisigma.reporting.derived_cards import UNDETERMINED, common_table, spectrum_table
     from pisigma.reporting.verdict import Verdict, counted
 
     summary = result.summary
@@ -215,7 +215,7 @@ def _print_run(result: "FleetRun") -> None:
 
 def _print_status(seen: "FleetStatus", page: Path | None, verbose: bool) -> None:
     """Print how many robots are in each state, the worst, and what is to be done."""
-    from pisigma.reporting.fleet_tables import ERRORS_NOTE, not_compared, robot_table, state_table
+    from pisigma.reporting.lifetime_tables import ERRORS_NOTE, not_compared, robot_table, state_table
 
     count, worst = len(seen.robots), seen.worst_first
     title = f"{count} robot{'' if count == 1 else 's'}, as of {seen.today}"

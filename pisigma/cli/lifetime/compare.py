@@ -89,7 +89,7 @@ def compare(
 def _print(compared: "ComparedModels", page: Path | None, verbose: bool) -> None:
     """Print what differs, distances of the tool, and the parameters of both models."""
     from pisigma.reporting.comparison_tables import comparison_blocks
-    from pisigma.reporting.difference_tables import difference_table
+    from pisigma.reporting.lifetime_tables import difference_table
     from pisigma.reporting.tables import pose_rows
 
     first, second = compared.models

@@ -95,7 +95,7 @@ def _print(
     status: "CellStatus | None" = None,
 ) -> None:
     """Print the verdict, a line for every session, and what the sessions say together; `status`: of a cell."""
-    from pisigma.reporting.monitoring_tables import chart_table, session_table
+    from pisigma.reporting.lifetime_tables import chart_table, session_table
 
     if as_json:
         print_json(monitoring.to_json() | ({} if status is None else {"next": status.step.to_json()}))

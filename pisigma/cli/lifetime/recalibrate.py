@@ -142,7 +142,7 @@ def _print(
     cell: "Cell | None" = None,
 ) -> None:
     """Print the verdict, what has moved, the models that were candidates, and the next step of a cell."""
-    from pisigma.reporting.recalibration_card import candidate_table
+    from pisigma.reporting.derived_cards import candidate_table
 
     if as_json:
         then = {} if cell is None else {"next": cell.status().step.to_json()}
@@ -170,7 +170,7 @@ def _print(
 
 def _verdict(recalibration: "Recalibration", folder: Path | None) -> Verdict:
     """Judge a recalibration."""
-    from pisigma.reporting.recalibration_card import candidate_names
+    from pisigma.reporting.derived_cards import candidate_names
 
     summary, names = recalibration.summary, candidate_names(recalibration.summary)
     errors = {name: one.rms_mm for name, one in summary.cross_validation.items() if one.rms_mm is not None}

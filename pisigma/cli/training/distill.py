@@ -122,7 +122,7 @@ def _region(model: Path, box: Box | None, joints: Path | None) -> "Region | None
 
 def _print(distillation: "Distillation", out: Path, as_json: bool, verbose: bool) -> None:
     """Print how well the model follows the full solution."""
-    from pisigma.reporting.distilled_card import correction_table, size_table
+    from pisigma.reporting.derived_cards import correction_table, size_table
     from pisigma.reporting.tables import pose_rows
 
     if as_json:

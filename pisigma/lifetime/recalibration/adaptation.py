@@ -14,8 +14,7 @@ from pisigma.calibration.geometric.problem.setup import IdentifiedGeometry, iden
 from pisigma.calibration.hybrid.design import Rows
 from pisigma.calibration.hybrid.noise import CalibrationNoise, stated_sigmas
 from pisigma.calibration.hybrid.refinement import linearised, network
-from pisigma.estimation.drift import Drift, DriftGroup, DriftSearch, LinearValues
-from pisigma.estimation.posterior_update import PosteriorUpdate
+from pisigma.estimation.drift import Drift, DriftGroup, DriftSearch, LinearValues, PosteriorUpdate
 from pisigma.estimation.wrong_rows import Explained, with_wrong_rows
 from pisigma.joint_correction.joint_correction import JointCorrection
 from pisigma.lifetime.recalibration.recalibration_problem import RecalibrationProblem

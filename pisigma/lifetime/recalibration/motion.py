@@ -1,6 +1,7 @@
-"""Movements since a model was made, for models that keep a posterior."""
+"""Movements since a model was made, for models that keep a posterior, and why they must not be trusted."""
 
-from collections.abc import Collection
+import math
+from collections.abc import Collection, Sequence
 from contextlib import suppress
 from dataclasses import replace
 
@@ -8,12 +9,14 @@ import torch
 
 from pisigma.files.errors import IdentificationError, ModelError
 from pisigma.lifetime.monitoring.session import Session, is_frame, judge_session, shown_probability
+from pisigma.lifetime.recalibration.movement import Movement
 from pisigma.lifetime.recalibration.recalibration_problem import frame_keys
-from pisigma.lifetime.recalibration.wear import beyond_wear
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.model_posterior import ModelPosterior
-from pisigma.validation.checks.rows.mixed_rows import MIN_WRONG_SHARE, many_wrong
+from pisigma.robot.description import Robot
+from pisigma.robot.robot_class import ChangeLimits, RobotClass
+from pisigma.validation.checks.mixed_rows import MIN_WRONG_SHARE, many_wrong
 from pisigma.validation.held_out.diagnostic import Diagnostic
 from pisigma.validation.held_out.frames.fitted_frames import FrameKind
 from pisigma.validation.held_out.model_comparison import ModelComparison
@@ -116,3 +119,34 @@ def _subject(what: str) -> str:
     if is_frame(what):
         return f"the {what} has moved"
     return f"the parameter {what} has changed" if "_" in what else f"{what} has moved"
+
+
+def beyond_wear(robot: Robot, moved: Sequence[Movement]) -> tuple[Diagnostic, ...]:
+    """Return a diagnostic of changes larger than wear or a collision causes.
+
+    Bases, tools and the zero of a single joint may move by any amount.
+
+    Args:
+        robot: robot, whose class has the limits; see `RobotClass.change`.
+        moved: movements that were found.
+    """
+    of_class = RobotClass.from_robot(robot)
+    far = [one for one in moved if not is_frame(one.what) and _is_beyond(one, of_class.change)]
+    if not far or (len(far) == 1 and far[0].what.startswith("joint ")):
+        return ()
+    changes = joined(f"{one.what} by {one.size}" for one in far)
+    return (
+        Diagnostic(
+            kind="beyond_wear",
+            severity="implausible",
+            sentence=f"The rows imply changes that neither wear nor a collision causes in a robot of class "
+            f"'{of_class.name}': {changes}. Check units and scale, the order and signs of the columns, and whether "
+            "this robot was measured.",
+        ),
+    )
+
+
+def _is_beyond(one: Movement, limits: ChangeLimits) -> bool:
+    if one.unit == "mm":
+        return abs(one.shift) > limits.length * 1e3
+    return abs(one.shift) > math.degrees(limits.joint_zero if one.what.startswith("joint ") else limits.angle)

@@ -13,8 +13,8 @@ from pisigma.calibration.hybrid.uncertainty import PositionUncertainty
 from pisigma.estimation.covariance_root import CovarianceRoot
 from pisigma.lifetime.recalibration.adaptation import Adaptation
 from pisigma.lifetime.recalibration.candidates import CandidateChoice
+from pisigma.lifetime.recalibration.motion import beyond_wear
 from pisigma.lifetime.recalibration.movement import Movement
-from pisigma.lifetime.recalibration.wear import beyond_wear
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel, Frames, Provenance
 from pisigma.model.geometric_model import branches_of
@@ -22,7 +22,7 @@ from pisigma.model.model_posterior import FLEET_PRIOR
 from pisigma.model.stored_starts import spread_rows
 from pisigma.model.training_rows import kept_rows
 from pisigma.robot.se3 import invert, transform_from_xyzrpy, xyzrpy_from_transform
-from pisigma.validation.checks.rows.mixed_rows import MIN_WRONG_SHARE, many_wrong
+from pisigma.validation.checks.mixed_rows import MIN_WRONG_SHARE, many_wrong
 from pisigma.validation.gate import check_rows
 from pisigma.validation.held_out.diagnostic import Diagnostic
 from pisigma.validation.held_out.pose_statistics import image_deviation

@@ -16,9 +16,16 @@ from pisigma.lifetime.monitoring.history import Record
 from pisigma.lifetime.recalibration.movement import NORMAL_95
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.reporting.comparison_tables import comparison_tables
-from pisigma.reporting.difference_tables import difference_table
-from pisigma.reporting.fleet_tables import ERRORS_NOTE, STATES, not_compared, robot_table, state_table
-from pisigma.reporting.monitoring_tables import chart_table, session_table
+from pisigma.reporting.lifetime_tables import (
+    ERRORS_NOTE,
+    STATES,
+    chart_table,
+    difference_table,
+    not_compared,
+    robot_table,
+    session_table,
+    state_table,
+)
 from pisigma.reporting.page.figures import AFTER, BEFORE, OTHER, Drawing, draw_map, drawing_style, panel
 from pisigma.reporting.page.page import image, resource
 from pisigma.reporting.rendering import render

@@ -1,4 +1,4 @@
-"""Render images of a board pixel by pixel with the camera model."""
+"""Bent and warped boards, and images of them."""
 
 from dataclasses import dataclass
 
@@ -6,9 +6,9 @@ import numpy as np
 from jaxtyping import Float, Float64, UInt8
 from scipy.ndimage import gaussian_filter
 
+from pisigma.measurement.camera.board import Board
 from pisigma.measurement.camera.camera import Camera
-from pisigma.measurement.camera.pattern import Pattern
-from pisigma.simulation.camera.true_board import TrueBoard
+from pisigma.measurement.camera.pattern import Pattern, board_pattern
 
 NODE_STEP = 16
 """[px] Distance of the nodes at which rays are undistorted; the cubic spline between them is accurate to 1e-4 px."""
@@ -26,6 +26,43 @@ FAR = 1e6
 """[m] Depth of rays that do not meet the board."""
 OUTLINE = 20
 """Number of points per edge of the sheet, whose pixels bound the image of the board."""
+
+
+@dataclass(frozen=True)
+class TrueBoard:
+    """A printed board that differs from the given one.
+
+    Its surface is `z = bow · r² / R²` with r the distance from the centre of the corners and R that of the farthest.
+
+    Attributes:
+        stated: the given board.
+        scale: true lengths relative to given ones.
+        bow: height of the farthest corners above the plane at the centre [m], along z.
+    """
+
+    stated: Board
+    scale: float = 1.0
+    bow: float = 0.0
+
+    @property
+    def corners(self) -> Float64[np.ndarray, "corners 3"]:
+        """True positions of the corners in the board's frame [m]."""
+        flat = self.scale * self.stated.corners[:, :2]
+        return np.concatenate([flat, self.height(flat)[:, None]], 1)
+
+    @property
+    def pattern(self) -> Pattern:
+        """The printed pattern, at its true size."""
+        stated = board_pattern(self.stated)
+        return Pattern(self.scale * stated.black, self.scale * stated.sheet)
+
+    def height(self, xy: Float64[np.ndarray, "*batch 2"]) -> Float64[np.ndarray, "*batch"]:
+        """Return z of the surface [m] at points of the plane [m]."""
+        corners = self.scale * self.stated.corners[:, :2]
+        middle = corners.mean(0)
+        farthest = np.square(corners - middle).sum(1).max()
+        z: np.ndarray = self.bow * np.square(xy - middle).sum(-1) / farthest
+        return z
 
 
 @dataclass(frozen=True)

@@ -25,8 +25,7 @@ from pisigma.robot.kinematics.closed_form import AbstractClosedForm, closed_form
 from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.robot.kinematics.status import Status
 from pisigma.robot.se3 import invert, rotation_from_rpy, rotation_from_vector, transform
-from pisigma.simulation.camera.rendering import Exposure, render_image
-from pisigma.simulation.camera.true_board import TrueBoard
+from pisigma.simulation.camera.rendering import Exposure, TrueBoard, render_image
 from pisigma.simulation.true_robot import TrueRobot
 
 CANDIDATES = 8

@@ -21,7 +21,7 @@ from pisigma.model.stored_starts import nearest_branch
 from pisigma.robot.description import Robot
 from pisigma.robot.kinematics.closed_form import closed_form_solver
 from pisigma.robot.kinematics.parameter_jacobian import identification_jacobian
-from pisigma.validation.checks.check import AbstractCheck, CheckedCalibration
+from pisigma.validation.checks.check import CheckedCalibration
 from pisigma.validation.held_out.diagnostic import Diagnostic
 
 FRONTAL = np.deg2rad(12.0)
@@ -38,20 +38,17 @@ POSTURES = 200
 """Random joint vectors at which the error over the joint space is predicted."""
 
 
-class CameraCheck(AbstractCheck):
-    """Reports which known weaknesses of camera calibrations this one has; `benchmarks/camera.py` measures them."""
-
-    def diagnose(self, checked: CheckedCalibration) -> Iterator[Diagnostic]:
-        """See `AbstractCheck.diagnose`."""
-        by_corners = checked.rows.measured("corner")
-        if not bool(by_corners.any()):
-            return
-        images, result = checked.rows.select(by_corners), checked.geometric
-        yield from view_warnings(images.T[:, 2, 2].abs().clamp(max=1.0).acos().cpu(), images.q, checked.robot)
-        yield from _intrinsics(images, result)
-        yield from _tool(images, checked.rows, result)
-        if bool(by_corners.all()):  # with other sensors, the camera need not be the limit
-            yield from _limit(images, result)
+def check_camera(checked: CheckedCalibration) -> Iterator[Diagnostic]:
+    """Report which known weaknesses of camera calibrations this one has; `benchmarks/camera.py` measures them."""
+    by_corners = checked.rows.measured("corner")
+    if not bool(by_corners.any()):
+        return
+    images, result = checked.rows.select(by_corners), checked.geometric
+    yield from view_warnings(images.T[:, 2, 2].abs().clamp(max=1.0).acos().cpu(), images.q, checked.robot)
+    yield from _intrinsics(images, result)
+    yield from _tool(images, checked.rows, result)
+    if bool(by_corners.all()):  # with other sensors, the camera need not be the limit
+        yield from _limit(images, result)
 
 
 def _warning(cause: str, sentence: str, **values: float | str) -> Diagnostic:

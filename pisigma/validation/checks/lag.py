@@ -9,12 +9,10 @@ from jaxtyping import Float64
 
 from pisigma.calibration.hybrid.search import CLEARLY
 from pisigma.measurement.dataset import Measurements
-from pisigma.validation.checks.check import AbstractCheck, CheckedCalibration
+from pisigma.validation.checks.check import CheckedCalibration
 from pisigma.validation.held_out.diagnostic import Diagnostic
 from pisigma.validation.setup_faults.ordered_rows import OrderedRows
 
-CAP = 3.0
-"""Residuals are clipped at this multiple of the upper quartile of their lengths."""
 MIN_ROWS = 12
 LIKELY = CLEARLY + math.log(100.0)
 """Log Bayes factor above which a lag is reported."""
@@ -39,29 +37,26 @@ class Lag:
     log_bayes_factor: float
 
 
-class LagCheck(AbstractCheck):
-    """Tests the residuals for a share λ of the motions between the rows: `r = X x + λ J Δq + e`.
+def check_lag(checked: CheckedCalibration) -> Iterator[Diagnostic]:
+    """Test the residuals for a share λ of the motions between the rows: `r = X x + λ J Δq + e`.
 
     `J Δq` is the change of a row's values by the motion from the previous row, or to the next one.
     """
-
-    def diagnose(self, checked: CheckedCalibration) -> Iterator[Diagnostic]:
-        """See `AbstractCheck.diagnose`."""
-        rows = OrderedRows.from_result(checked.geometric)
-        lag = None if rows is None else find_lag(rows, checked.rows)
-        if lag is None or lag.log_bayes_factor < LIKELY or lag.factor < NOTICED:
-            return
-        when = "before the robot had arrived" if lag.before else "after the robot had left"
-        motion = "from the previous row" if lag.before else "to the next row"
-        yield Diagnostic(
-            kind="lag",
-            severity="implausible" if lag.factor > LARGE else "warning",
-            sentence=f"The joint values were logged {when}: they differ from those at the measurement by "
-            f"{abs(lag.share):.2g} of the motion {motion}, which makes the errors {lag.factor:.3g} times as large; log "
-            "them when the robot has stopped.",
-            cause="before_arrival" if lag.before else "after_departure",
-            values={"share": lag.share, "factor": lag.factor},
-        )
+    rows = OrderedRows.from_result(checked.geometric)
+    lag = None if rows is None else find_lag(rows, checked.rows)
+    if lag is None or lag.log_bayes_factor < LIKELY or lag.factor < NOTICED:
+        return
+    when = "before the robot had arrived" if lag.before else "after the robot had left"
+    motion = "from the previous row" if lag.before else "to the next row"
+    yield Diagnostic(
+        kind="lag",
+        severity="implausible" if lag.factor > LARGE else "warning",
+        sentence=f"The joint values were logged {when}: they differ from those at the measurement by "
+        f"{abs(lag.share):.2g} of the motion {motion}, which makes the errors {lag.factor:.3g} times as large; log "
+        "them when the robot has stopped.",
+        cause="before_arrival" if lag.before else "after_departure",
+        values={"share": lag.share, "factor": lag.factor},
+    )
 
 
 def find_lag(rows: OrderedRows, measurements: Measurements) -> Lag | None:
@@ -73,9 +68,7 @@ def find_lag(rows: OrderedRows, measurements: Measurements) -> Lag | None:
     """
     if len(rows.residual) < MIN_ROWS:
         return None
-    lengths = np.linalg.norm(rows.residual, axis=1)
-    longest = CAP * np.quantile(lengths, 0.75)
-    r = (rows.residual * np.minimum(1.0, longest / np.maximum(lengths, 1e-300))[:, None]).ravel()
+    r = rows.clipped.ravel()
     X = rows.X.reshape(len(r), -1)
     covariance, spare = rows.covariance, max(rows.values - rows.used, 1.0)
     left = r - X @ (covariance @ (X.T @ r))

@@ -10,7 +10,7 @@ from pisigma.files.errors import IdentificationError
 from pisigma.measurement.dataset import Measurements
 from pisigma.robot.description import Robot
 from pisigma.robot.robot_file import catalogue
-from pisigma.validation.checks.check import AbstractCheck, CheckedCalibration
+from pisigma.validation.checks.check import CheckedCalibration, RowsUnderModel
 from pisigma.validation.held_out.calibration_validation import errors_under
 from pisigma.validation.held_out.diagnostic import Diagnostic
 from pisigma.validation.held_out.trained_calibrations import base_and_tool
@@ -26,30 +26,31 @@ MAX_ROWS = 200
 """Rows that suffice to distinguish robots."""
 
 
-class OtherRobotCheck(AbstractCheck):
-    """Fits base and tool of all other robots of the catalogue if the nominal robot has large errors."""
+def check_other_robot(checked: CheckedCalibration) -> Iterator[Diagnostic]:
+    """Fit base and tool of all other robots of the catalogue if the nominal robot has large errors."""
+    robot = checked.robot
+    nominal = None if checked.figures is None else checked.figures.nominal
+    stated = None if nominal is None else nominal.rms_mm
+    if stated is None or stated <= SUSPICIOUS * robot.reach * 1e3:
+        return
+    others = {name: size for name in catalogue() if (size := _rms_mm(checked, Robot.load(name))) is not None}
+    name = min(others, key=lambda other: others[other], default=None)
+    if name is not None and others[name] < NEARER * stated:
+        yield Diagnostic(
+            kind="other_robot",
+            severity="implausible",
+            sentence=f"Robot '{name}' of the catalogue fits these rows far better: with base and tool fitted, its "
+            f"errors are {others[name]:.3g} mm RMS, those of robot '{robot.name}' {stated:.3g} mm; check which "
+            "robot was measured.",
+            cause=name,
+            values={"rms_mm": others[name], "nominal_rms_mm": stated},
+        )
 
-    def diagnose(self, checked: CheckedCalibration) -> Iterator[Diagnostic]:
-        """See `AbstractCheck.diagnose`."""
-        robot = checked.robot
-        nominal = None if checked.figures is None else checked.figures.nominal
-        stated = None if nominal is None else nominal.rms_mm
-        if stated is None or stated <= SUSPICIOUS * robot.reach * 1e3:
-            return
-        others = {
-            name: size for name in catalogue() if (size := _rms_mm(checked, Robot.load(name))) is not None
-        }
-        name = min(others, key=lambda other: others[other], default=None)
-        if name is not None and others[name] < NEARER * stated:
-            yield Diagnostic(
-                kind="other_robot",
-                severity="implausible",
-                sentence=f"Robot '{name}' of the catalogue fits these rows far better: with base and tool fitted, its "
-                f"errors are {others[name]:.3g} mm RMS, those of robot '{robot.name}' {stated:.3g} mm; check which "
-                "robot was measured.",
-                cause=name,
-                values={"rms_mm": others[name], "nominal_rms_mm": stated},
-            )
+
+def check_other_robot_of_rows(judged: RowsUnderModel) -> Iterator[Diagnostic]:
+    """Look for another robot of the catalogue that fits rows with large errors better."""
+    if judged.large and not judged.setup_faults:
+        yield from other_robot_diagnostics(judged.model.robot, judged.rows)
 
 
 def other_robot_diagnostics(robot: Robot, rows: Measurements) -> tuple[Diagnostic, ...]:
@@ -62,7 +63,7 @@ def other_robot_diagnostics(robot: Robot, rows: Measurements) -> tuple[Diagnosti
     except IdentificationError:
         return ()
     checked = CheckedCalibration(calibrator, rows, {"nominal": nominal, "geometric": nominal})
-    return tuple(OtherRobotCheck().diagnose(checked))
+    return tuple(check_other_robot(checked))
 
 
 def _rms_mm(checked: CheckedCalibration, other: Robot) -> float | None:

@@ -6,7 +6,8 @@ from collections.abc import Iterator, Sequence
 from pisigma.calibration.geometric.prior_ratio import PriorRatio
 from pisigma.calibration.geometric.problem.prior_sizes import PriorGroup
 from pisigma.robot.robot_class import CLASSES, RobotClass
-from pisigma.validation.checks.check import AbstractCheck, CheckedCalibration
+from pisigma.validation.checks.check import CheckedCalibration
+from pisigma.validation.checks.setup_fault import setup_diagnostics
 from pisigma.validation.held_out.diagnostic import Diagnostic
 
 UNUSUAL = 4.0
@@ -27,32 +28,29 @@ NAMES = {
 }
 
 
-class PriorRatioCheck(AbstractCheck):
-    """Compares the estimated sizes of the geometric errors with the prior and with the limits of the robot's class.
+def check_prior_ratio(checked: CheckedCalibration) -> Iterator[Diagnostic]:
+    """Compare the estimated sizes of the geometric errors with the prior and with the limits of the robot's class.
 
     If the class is not stated, it is the narrowest one, starting from that of the manufacturer, in which joint zeros
     of these sizes are possible. Joint zeros beyond the manufacturer's class are accepted if held-out rows are predicted
     well.
     """
-
-    def diagnose(self, checked: CheckedCalibration) -> Iterator[Diagnostic]:
-        """See `AbstractCheck.diagnose`."""
-        unusual = [ratio for ratio in checked.geometric.prior_ratios if ratio.at_least > UNUSUAL]
-        large = [ratio for ratio in unusual if ratio.at_least > IMPLAUSIBLE]
-        possible = class_of(checked, large)
-        usual = _usual_class(checked)
-        for ratio in unusual:
-            believed = ratio not in large or (
-                possible is not None and (possible is usual or predicts_held_out_rows(checked))
-            )
-            yield Diagnostic(
-                kind="prior_ratio",
-                severity="warning" if believed else "implausible",
-                sentence=f"The {NAMES[ratio.group]} are off by about {_size(ratio)}, {ratio.value:.2g} times their "
-                f"prior standard deviation, {_consequence(ratio, usual, possible, believed)}.",
-                cause=ratio.group.name.lower(),
-                values={"ratio": ratio.value},
-            )
+    unusual = [ratio for ratio in checked.geometric.prior_ratios if ratio.at_least > UNUSUAL]
+    large = [ratio for ratio in unusual if ratio.at_least > IMPLAUSIBLE]
+    possible = class_of(checked, large)
+    usual = _usual_class(checked)
+    for ratio in unusual:
+        believed = ratio not in large or (
+            possible is not None and (possible is usual or predicts_held_out_rows(checked))
+        )
+        yield Diagnostic(
+            kind="prior_ratio",
+            severity="warning" if believed else "implausible",
+            sentence=f"The {NAMES[ratio.group]} are off by about {_size(ratio)}, {ratio.value:.2g} times their "
+            f"prior standard deviation, {_consequence(ratio, usual, possible, believed)}.",
+            cause=ratio.group.name.lower(),
+            values={"ratio": ratio.value},
+        )
 
 
 def class_of(checked: CheckedCalibration, large: Sequence[PriorRatio]) -> RobotClass | None:
@@ -131,3 +129,32 @@ def _consequence(ratio: PriorRatio, usual: RobotClass, possible: RobotClass | No
         f"which is usual for robots of class {possible.name}, but held-out rows are not predicted well; check that "
         "this robot was measured, the units, and the order and directions of the joints, or measure more rows"
     )
+
+
+FAR = 8e-3
+"""[rad] Healthy industrial robots and cobots have joint zeros within 3 mrad of the nominal ones."""
+CERTAIN = 3.0
+"""[standard errors] Margin above `FAR`."""
+
+
+def check_joint_zero(checked: CheckedCalibration) -> Iterator[Diagnostic]:
+    """Warn of single joint zeros that are far off: a calibration cannot distinguish a wrong zero from a wrong log.
+
+    Large ones are found as a setup fault with the nominal robot. If the poses cover little of the workspace, base and
+    tool absorb most of their effect, and only the estimated parameters show them.
+    """
+    if setup_diagnostics(checked.robot, checked.rows):
+        return
+    for one in checked.geometric.parameters:
+        joint = one.name.removeprefix("theta_")
+        if joint == one.name or not one.free or abs(one.change) - CERTAIN * one.standard_error < FAR:
+            continue
+        yield Diagnostic(
+            kind="joint_zero",
+            severity="warning",
+            sentence=f"The zero of joint {joint} is estimated {math.degrees(one.change):.3g} deg away from the "
+            f"nominal one (standard error {math.degrees(one.standard_error):.2g} deg), which is more than robots "
+            f"usually have; check the zero of joint {joint} and how its values were logged (the calibration is "
+            "valid for joint values that are logged in the same way).",
+            values={"joint": joint, "change_deg": math.degrees(one.change)},
+        )

@@ -3,57 +3,49 @@
 from pisigma.calibration.geometric.calibrator import GeometricCalibrator
 from pisigma.files.errors import IdentificationError, ImplausibleError
 from pisigma.measurement.dataset import Measurements
-from pisigma.validation.checks.camera import CameraCheck
-from pisigma.validation.checks.check import AbstractCheck, CheckedCalibration
-from pisigma.validation.checks.few_rows import FewRowsCheck
-from pisigma.validation.checks.joint_zero import JointZeroCheck
-from pisigma.validation.checks.lag import LagCheck
-from pisigma.validation.checks.other_robot import OtherRobotCheck
-from pisigma.validation.checks.prior_ratio import PriorRatioCheck
-from pisigma.validation.checks.residual import ResidualCheck
-from pisigma.validation.checks.rounding import RoundingCheck
-from pisigma.validation.checks.row_order import RowOrderCheck
-from pisigma.validation.checks.rows.mixed_rows import MixedRowsCheck
-from pisigma.validation.checks.rows.row_check import AbstractRowCheck
-from pisigma.validation.checks.rows.scale import ScaleOfRowsCheck
-from pisigma.validation.checks.rows.setup import OtherRobotOfRowsCheck, SetupOfRowsCheck
-from pisigma.validation.checks.rows.unexplained import UnexplainedRowsCheck
-from pisigma.validation.checks.scale import ScaleCheck
-from pisigma.validation.checks.search import SearchCheck
-from pisigma.validation.checks.setup_fault import SetupFaultCheck
-from pisigma.validation.checks.stated_noise import StatedNoiseCheck
-from pisigma.validation.checks.temperature import TemperatureCheck
-from pisigma.validation.checks.two_populations import TwoPopulationsCheck
-from pisigma.validation.checks.unexplained import UnexplainedCheck
+from pisigma.validation.checks.camera import check_camera
+from pisigma.validation.checks.check import Check, CheckedCalibration, RowCheck
+from pisigma.validation.checks.lag import check_lag
+from pisigma.validation.checks.mixed_rows import check_mixed_rows, check_two_populations
+from pisigma.validation.checks.other_robot import check_other_robot, check_other_robot_of_rows
+from pisigma.validation.checks.prior_ratio import check_joint_zero, check_prior_ratio
+from pisigma.validation.checks.rounding import check_rounding
+from pisigma.validation.checks.row_order import check_row_order
+from pisigma.validation.checks.scale import check_scale, check_scale_of_rows
+from pisigma.validation.checks.search import check_few_rows, check_search
+from pisigma.validation.checks.setup_fault import check_setup_fault, check_setup_of_rows
+from pisigma.validation.checks.stated_noise import check_stated_noise
+from pisigma.validation.checks.temperature import check_temperature
+from pisigma.validation.checks.unexplained import check_residual, check_unexplained, check_unexplained_rows
 from pisigma.validation.held_out.diagnostic import Diagnostic
 from pisigma.validation.held_out.trained_calibrations import trained
 
-CHECKS: tuple[AbstractCheck, ...] = (
-    OtherRobotCheck(),
-    SetupFaultCheck(),
-    JointZeroCheck(),
-    RowOrderCheck(),
-    LagCheck(),
-    RoundingCheck(),
-    ResidualCheck(),
-    ScaleCheck(),
-    PriorRatioCheck(),
-    SearchCheck(),
-    StatedNoiseCheck(),
-    TwoPopulationsCheck(),
-    UnexplainedCheck(),
-    FewRowsCheck(),
-    TemperatureCheck(),
-    CameraCheck(),
+CHECKS: tuple[Check, ...] = (
+    check_other_robot,
+    check_setup_fault,
+    check_joint_zero,
+    check_row_order,
+    check_lag,
+    check_rounding,
+    check_residual,
+    check_scale,
+    check_prior_ratio,
+    check_search,
+    check_stated_noise,
+    check_two_populations,
+    check_unexplained,
+    check_few_rows,
+    check_temperature,
+    check_camera,
 )
 """Checks of a calibration, in the order in which their findings are printed."""
 
-ROW_CHECKS: tuple[AbstractRowCheck, ...] = (
-    SetupOfRowsCheck(),
-    MixedRowsCheck(),
-    OtherRobotOfRowsCheck(),
-    ScaleOfRowsCheck(),
-    UnexplainedRowsCheck(),
+ROW_CHECKS: tuple[RowCheck, ...] = (
+    check_setup_of_rows,
+    check_mixed_rows,
+    check_other_robot_of_rows,
+    check_scale_of_rows,
+    check_unexplained_rows,
 )
 """Checks of rows against a model, in order; `pisigma.validation.gate` runs them for every command."""
 
@@ -64,7 +56,7 @@ def diagnostics_of(checked: CheckedCalibration) -> tuple[Diagnostic, ...]:
     Raises:
         IdentificationError: the measurements cannot belong to this robot.
     """
-    diagnostics = [diagnostic for check in CHECKS for diagnostic in check.diagnose(checked)]
+    diagnostics = [diagnostic for check in CHECKS for diagnostic in check(checked)]
     return tuple(sorted(diagnostics, key=lambda diagnostic: diagnostic.severity != "implausible"))
 
 

@@ -10,7 +10,7 @@ from jaxtyping import Float64
 from pisigma.calibration.geometric.result import CalibrationResult
 from pisigma.measurement.dataset import Measurements
 from pisigma.robot.description import Robot
-from pisigma.validation.checks.check import AbstractCheck, CheckedCalibration
+from pisigma.validation.checks.check import CheckedCalibration
 from pisigma.validation.held_out.diagnostic import Diagnostic
 from pisigma.validation.setup_faults.cause import joints_text, length_text
 from pisigma.validation.setup_faults.ordered_rows import OrderedRows
@@ -45,47 +45,42 @@ class Rounding:
     share: float
 
 
-class RoundingCheck(AbstractCheck):
-    """Compares the errors that rounding causes with those of the rows.
+def check_rounding(checked: CheckedCalibration) -> Iterator[Diagnostic]:
+    """Compare the errors that rounding causes with those of the rows.
 
     Joints that were commanded to whole degrees have round values without an error. Therefore the directions of the
     errors must agree with rounded joint values too: they must be large where a joint moves the tool far.
     """
-
-    def diagnose(self, checked: CheckedCalibration) -> Iterator[Diagnostic]:
-        """See `AbstractCheck.diagnose`."""
-        rounding = joint_rounding(checked.geometric, checked.rows)
-        if rounding is not None:
+    rounding = joint_rounding(checked.geometric, checked.rows)
+    if rounding is not None:
+        yield Diagnostic(
+            kind="rounding",
+            severity="warning",
+            sentence=f"The joint values are rounded to {_steps_text(checked.robot, rounding.steps)}: this alone "
+            f"causes position errors of {length_text(rounding.error)} RMS, {rounding.share:.0%} of the squared "
+            "errors of the rows; log them with more decimals.",
+            cause="joint_values",
+            values={"error_mm": rounding.error * 1e3, "share": rounding.share},
+        )
+    step = (
+        _common_step(checked.rows.position.cpu().numpy() * 1e3) if checked.rows.position is not None else 0.0
+    )
+    errors = checked.errors["geometric"].get("position")
+    if step and errors is not None:
+        made, rms = (
+            step * 1e-3 / 2,
+            float(errors.square().sum(1).nanmean().sqrt()),
+        )  # sqrt(3) step / sqrt(12)
+        if made**2 > MIN_SHARE * rms**2:
             yield Diagnostic(
                 kind="rounding",
                 severity="warning",
-                sentence=f"The joint values are rounded to {_steps_text(checked.robot, rounding.steps)}: this alone "
-                f"causes position errors of {length_text(rounding.error)} RMS, {rounding.share:.0%} of the squared "
-                "errors of the rows; log them with more decimals.",
-                cause="joint_values",
-                values={"error_mm": rounding.error * 1e3, "share": rounding.share},
+                sentence=f"The positions are rounded to {step:g} mm: this alone causes errors of "
+                f"{length_text(made)} RMS, while those of the rows are {length_text(rms)}; write the positions "
+                "with more decimals.",
+                cause="positions",
+                values={"step_mm": step, "error_mm": made * 1e3},
             )
-        step = (
-            _common_step(checked.rows.position.cpu().numpy() * 1e3)
-            if checked.rows.position is not None
-            else 0.0
-        )
-        errors = checked.errors["geometric"].get("position")
-        if step and errors is not None:
-            made, rms = (
-                step * 1e-3 / 2,
-                float(errors.square().sum(1).nanmean().sqrt()),
-            )  # sqrt(3) step / sqrt(12)
-            if made**2 > MIN_SHARE * rms**2:
-                yield Diagnostic(
-                    kind="rounding",
-                    severity="warning",
-                    sentence=f"The positions are rounded to {step:g} mm: this alone causes errors of "
-                    f"{length_text(made)} RMS, while those of the rows are {length_text(rms)}; write the positions "
-                    "with more decimals.",
-                    cause="positions",
-                    values={"step_mm": step, "error_mm": made * 1e3},
-                )
 
 
 def joint_rounding(result: CalibrationResult, measurements: Measurements) -> Rounding | None:

@@ -1,11 +1,20 @@
-"""Whether the measuring frame or the tool moved while the rows were measured."""
+"""Whether the measuring frame or the tool moved while the rows were measured, before and after a calibration."""
 
 import math
 from collections.abc import Iterator
 
+import numpy as np
+import torch
+from jaxtyping import Float64
+
+from pisigma.calibration.geometric.initial_guess.base_and_tool import fit_base_and_tool
 from pisigma.calibration.hybrid.search import CLEARLY
+from pisigma.files.errors import IdentificationError, Place
 from pisigma.measurement.dataset import Measurements
-from pisigma.validation.checks.check import AbstractCheck, CheckedCalibration
+from pisigma.robot.description import Robot
+from pisigma.robot.kinematics.forward import forward_kinematics
+from pisigma.validation.checks.check import CheckedCalibration
+from pisigma.validation.checks.setup_fault import setup_diagnostics
 from pisigma.validation.held_out.diagnostic import Diagnostic
 from pisigma.validation.setup_faults.cause import length_text
 from pisigma.validation.setup_faults.row_order import Motion, find_motion
@@ -16,39 +25,44 @@ CERTAIN = CLEARLY + math.log(1e6)
 """Log Bayes factor above which a motion can make a calibration implausible: at most 1 healthy one in a million is."""
 LARGE = 1.5
 """Errors over those without the motion above which noise and robot cannot be their only cause."""
+MIN_ROWS = 12
+"""Rows of a setup: 36 values for the 9 parameters of base and tool of positions."""
+FITS_SHARE = 5e-3
+"""Errors of the nominal robot as a share of its reach; geometric errors make less."""
+FAR = 5.0
+"""Errors over those of the rows of one setup above which a row belongs to another setup."""
+MAX_WRONG_SHARE = 0.1
+"""Share of the rows of a setup that may be far off without contradicting it."""
 
 
-class RowOrderCheck(AbstractCheck):
-    """Tests the residuals for a motion of a frame or the tool at some row, or a slow one over all rows.
+def check_row_order(checked: CheckedCalibration) -> Iterator[Diagnostic]:
+    """Test the residuals for a motion of a frame or the tool at some row, or a slow one over all rows.
 
     A motion is reported if it is `LIKELY`. It makes the calibration implausible if it is `CERTAIN` and its factor on
     the residuals is `LARGE`. A hybrid has smaller residuals, so smaller motions show; but it absorbs a part of large
     ones, so both calibrations are tested. A tool that seems to have moved exactly where the rows of another frame start
     is an effect of what the frames do not explain, unless the factor is `LARGE`.
     """
-
-    def diagnose(self, checked: CheckedCalibration) -> Iterator[Diagnostic]:
-        """See `AbstractCheck.diagnose`."""
-        motions = [find_motion(checked.geometric)]
-        if checked.hybrid is not None and checked.hybrid.learned is not None:
-            motions.append(find_motion(checked.hybrid))
-        likely = [
-            motion
-            for motion in motions
-            if motion
-            and motion.log_bayes_factor > LIKELY
-            and not (motion.begins_frame and motion.factor <= LARGE)
-        ]
-        if likely:
-            motion = max(likely, key=lambda motion: motion.factor)
-            certain = motion.log_bayes_factor > CERTAIN and motion.factor > LARGE
-            yield Diagnostic(
-                kind="row_order",
-                severity="implausible" if certain else "warning",
-                sentence=_sentence(motion, checked.rows),
-                cause=motion.moved,
-                values=_values(motion, checked.rows),
-            )
+    motions = [find_motion(checked.geometric)]
+    if checked.hybrid is not None and checked.hybrid.learned is not None:
+        motions.append(find_motion(checked.hybrid))
+    likely = [
+        motion
+        for motion in motions
+        if motion
+        and motion.log_bayes_factor > LIKELY
+        and not (motion.begins_frame and motion.factor <= LARGE)
+    ]
+    if likely:
+        motion = max(likely, key=lambda motion: motion.factor)
+        certain = motion.log_bayes_factor > CERTAIN and motion.factor > LARGE
+        yield Diagnostic(
+            kind="row_order",
+            severity="implausible" if certain else "warning",
+            sentence=_sentence(motion, checked.rows),
+            cause=motion.moved,
+            values=_values(motion, checked.rows),
+        )
 
 
 def _values(motion: Motion, rows: Measurements) -> dict[str, float | int | str]:
@@ -87,3 +101,71 @@ def _sentence(motion: Motion, rows: Measurements) -> str:
         f"{rows.place(row)}: the {what} moved before this row by {amount}; {errors}. Leave out this row and the later "
         f"ones, or {remedy}."
     )
+
+
+def explained(refusal: IdentificationError, robot: Robot, rows: Measurements) -> IdentificationError:
+    """Replace a refusal by one that names the setup fault, if one explains the errors; else return it unchanged."""
+    if moved := new_setup(robot, rows):
+        return moved
+    causes = setup_diagnostics(robot, rows)
+    if not causes:
+        return refusal
+    return IdentificationError(causes[0].sentence.removesuffix("."), at=Place(rows.source))
+
+
+def new_setup(robot: Robot, measurements: Measurements) -> IdentificationError | None:
+    """Find the row before which the instrument was moved, for motions so large that no calibration of all rows works.
+
+    Base and tool are fitted to the first and to the last third of the rows. The row is the one up to (or after) which
+    the other rows agree with that fit. The rows on both sides must fit the nominal robot on their own.
+
+    Args:
+        robot: the nominal robot.
+        measurements: rows of one frame and one target with positions; others are not tested.
+
+    Returns:
+        The error to raise, with file and line of the row; None if there is no such row.
+    """
+    one = len(set(measurements.frame)) == len(set(measurements.target)) == 1
+    if not one or measurements.position is None or not bool(torch.isfinite(measurements.position).all()):
+        return None
+    order = np.argsort(np.array(measurements.line), kind="stable")
+    third = max(len(order) // 3, MIN_ROWS)
+    if len(order) < 2 * MIN_ROWS + 1:
+        return None
+    for backwards in (False, True):
+        along = order[::-1] if backwards else order
+        errors = _errors(robot, measurements, along[:third])[along]
+        of_setup = errors < FAR * max(float(np.median(errors[:third])), 1e-4)
+        # The sum of +1 (agrees) and -1 (does not) peaks at the last row of the setup, despite single wrong rows.
+        agreeing = np.cumsum(np.where(of_setup, 1, -1))
+        count = int(agreeing.argmax()) + 1
+        first = len(order) - count if backwards else count
+        parts = order[:first], order[first:]
+        if min(map(len, parts)) < MIN_ROWS:
+            continue
+        if of_setup[:count].mean() < 1 - MAX_WRONG_SHARE or of_setup[count:].mean() > MAX_WRONG_SHARE:
+            continue
+        fits = [float(np.median(_errors(robot, measurements, part)[part])) for part in parts]
+        if max(fits) < FITS_SHARE * robot.reach:
+            row = int(order[first])
+            return IdentificationError(
+                "the instrument or the tool was moved before this row: the rows before it fit the nominal robot "
+                f"'{robot.name}' to {length_text(fits[0])} and the others to {length_text(fits[1])}, but not together",
+                at=measurements.at(row),
+                remedy=f"give this row and the later ones another frame (--set new_frame_at="
+                f"{measurements.line[row] or 'LINE'}) and, if the tool was changed, another target",
+            )
+    return None
+
+
+def _errors(robot: Robot, measurements: Measurements, rows: np.ndarray) -> Float64[np.ndarray, " rows"]:
+    """Compute all position errors [m] with base and tool fitted to some rows; infinite if these do not determine it."""
+    try:
+        fitted = fit_base_and_tool(robot, measurements.select(torch.from_numpy(rows.copy()))).robot
+    except IdentificationError:
+        return np.full(measurements.rows, np.inf)
+    assert measurements.position is not None
+    errors = measurements.position - forward_kinematics(fitted, measurements.q)[:, :3, 3]
+    lengths: np.ndarray = errors.norm(dim=1).cpu().numpy()
+    return lengths

@@ -6,14 +6,19 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from jaxtyping import Float64
 from scipy.special import logsumexp
+from torch import Tensor
 
 from pisigma.calibration.geometric.problem.noise import UNDETERMINED, view_of
 from pisigma.calibration.geometric.problem.parameters import USUAL_LENGTH
 from pisigma.calibration.geometric.result import CalibrationResult
-from pisigma.validation.checks.check import AbstractCheck, CheckedCalibration
+from pisigma.robot.frame_fits import best_base_and_tool
+from pisigma.robot.se3 import skew
+from pisigma.validation.checks.check import FITTED, CheckedCalibration, RowsUnderModel
 from pisigma.validation.held_out.calibration_summary import ScaleFigures
 from pisigma.validation.held_out.diagnostic import Diagnostic
+from pisigma.validation.setup_faults.cause import length_text
 
 SCALE_SIGMAS = (0.003, 0.1)
 """Prior standard deviations of a common factor on the lengths, with equal probability: of instruments and heat, and of
@@ -57,28 +62,25 @@ class CommonScale:
         return math.exp(min(self.log_bayes_factor, math.log(MAX_ODDS)))
 
 
-class ScaleCheck(AbstractCheck):
-    """Looks for a common factor on all lengths, in addition to independent errors of each."""
-
-    def diagnose(self, checked: CheckedCalibration) -> Iterator[Diagnostic]:
-        """See `AbstractCheck.diagnose`."""
-        scale = common_scale(checked.geometric)
-        if scale is None or scale.log_bayes_factor < STRONG:
-            return
-        implausible = abs(scale.factor - 1) > IMPLAUSIBLE
-        lengths = (
-            "lengths of the board, and that the intrinsics belong to the camera of these images"
-            if "corner" in checked.rows.kinds
-            else "unit of the position columns, the scale of the instrument and stated distances"
-        )
-        yield Diagnostic(
-            kind="scale",
-            severity="implausible" if implausible else "warning",
-            sentence=f"All lengths of the arm are estimated {scale.factor:.5g} times as large as nominal (standard "
-            f"deviation {scale.sigma:.1g}), which indicates a wrong unit or scale of the measurements: this is "
-            f"{scale.odds:.2g} times as likely as independent errors of the links; check the {lengths}.",
-            values={"factor": scale.factor, "sigma": scale.sigma, "odds": scale.odds},
-        )
+def check_scale(checked: CheckedCalibration) -> Iterator[Diagnostic]:
+    """Look for a common factor on all lengths, in addition to independent errors of each."""
+    scale = common_scale(checked.geometric)
+    if scale is None or scale.log_bayes_factor < STRONG:
+        return
+    implausible = abs(scale.factor - 1) > IMPLAUSIBLE
+    lengths = (
+        "lengths of the board, and that the intrinsics belong to the camera of these images"
+        if "corner" in checked.rows.kinds
+        else "unit of the position columns, the scale of the instrument and stated distances"
+    )
+    yield Diagnostic(
+        kind="scale",
+        severity="implausible" if implausible else "warning",
+        sentence=f"All lengths of the arm are estimated {scale.factor:.5g} times as large as nominal (standard "
+        f"deviation {scale.sigma:.1g}), which indicates a wrong unit or scale of the measurements: this is "
+        f"{scale.odds:.2g} times as likely as independent errors of the links; check the {lengths}.",
+        values={"factor": scale.factor, "sigma": scale.sigma, "odds": scale.odds},
+    )
 
 
 def scale_figures(checked: CheckedCalibration) -> ScaleFigures | None:
@@ -153,3 +155,68 @@ def common_scale(result: CalibrationResult) -> CommonScale | None:
         sigma=float(information[best] ** -0.5),
         log_bayes_factor=float(logsumexp(scaled) - logsumexp(plain) - math.log(len(SCALE_SIGMAS))),
     )
+
+
+MIN_CHANGE = 5e-4
+"""Factors nearer to 1 come from heat: 20 K stretch an aluminium arm by 0.05 %."""
+UNUSUAL = 2.0
+"""Errors over the expected ones below which no explanation is needed."""
+EXPLAINED_BY_SCALE = 0.6
+"""Share of the errors that may remain after correcting the factor."""
+AS_GOOD_AS_SCALE = 1.3
+"""Errors under any other explanation must be larger by this factor."""
+MIN_DEVIATIONS = 5.0
+"""[standard deviations] Difference of the factor from 1 above which it is reported."""
+
+
+def check_scale_of_rows(judged: RowsUnderModel) -> Iterator[Diagnostic]:
+    """Fit a factor on the measured positions together with base and tool, and compares it with moved joint zeros."""
+    usual = float(judged.usual.square().mean().sqrt())
+    single = len(set(judged.rows.frame)) == len(set(judged.rows.target)) == 1
+    if not single or 3 * judged.rows.rows < 2 * FITTED or not usual > 0:
+        return
+    base, tool = best_base_and_tool(judged.unfitted, judged.measured)
+    T = base @ judged.unfitted @ tool
+    error = (judged.measured.position - T[:, :3, 3]).flatten()
+    before, _, _ = _fit(_frames(T), error)
+    if not before > UNUSUAL * usual:
+        return
+    position = (judged.measured.position - judged.measured.position.mean(0)).flatten()
+    after, factor, deviation = _fit(torch.cat([_frames(T), position[:, None]], 1), error)
+    zeros = (base @ judged.zero_columns()[1] @ tool)[..., :3, 3].flatten(1)
+    others = (_fit(torch.cat([_frames(T), one[:, None]], 1), error)[0] for one in zeros)
+    if (
+        abs(factor) > max(MIN_CHANGE, MIN_DEVIATIONS * deviation)
+        and after < EXPLAINED_BY_SCALE * before
+        and min(others) > AS_GOOD_AS_SCALE * after
+    ):
+        yield Diagnostic(
+            kind="scale",
+            severity="implausible",
+            sentence=f"All measured lengths are {1 / (1 - factor):.5g} times as large as the model predicts "
+            f"(standard deviation {deviation:.1g}); with this factor corrected, the errors fall from "
+            f"{length_text(before)} to {length_text(after)} RMS; check the unit and the scale of the instrument, "
+            "its temperature and that of the robot.",
+            values={"factor": 1 / (1 - factor), "sigma": deviation},
+        )
+
+
+def _frames(T: Float64[Tensor, "rows 4 4"]) -> Float64[Tensor, "values numbers"]:
+    """Differentiate positions by small motions of the base and by shifts of the tool."""
+    eye = torch.eye(3).to(T).expand(len(T), 3, 3)
+    return torch.cat([eye, -skew(T[:, :3, 3]), T[:, :3, :3]], 2).flatten(0, 1)
+
+
+def _fit(
+    A: Float64[Tensor, "values numbers"], error: Float64[Tensor, " values"]
+) -> tuple[float, float, float]:
+    """Solve least squares; return the RMS length of the residuals [m], the last unknown, and its standard deviation."""
+    scale = A.norm(dim=0).clamp(min=1e-300)
+    U, size, V = torch.linalg.svd(A / scale, full_matrices=False)
+    certain = size > 1e-6 * size[0]
+    U, size, V = U[:, certain], size[certain], V[certain]
+    x = V.t() @ (U.t() @ error / size)
+    spare = max(len(error) - len(size), 1)
+    variance = float((error - U @ (U.t() @ error)).square().sum()) / spare
+    deviation = (variance * float((V[:, -1] / size).square().sum())) ** 0.5
+    return (3 * variance) ** 0.5, float(x[-1] / scale[-1]), deviation / float(scale[-1])

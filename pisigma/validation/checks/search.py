@@ -1,23 +1,34 @@
-"""Whether the search for the parameters ended at a minimum."""
+"""Whether the search for the parameters ended at a minimum, and whether the arm was calibrated at all."""
 
 from collections.abc import Iterator
 
 from pisigma.calibration.geometric.problem.least_squares import SolutionStatus
-from pisigma.validation.checks.check import AbstractCheck, CheckedCalibration
+from pisigma.validation.checks.check import CheckedCalibration
 from pisigma.validation.held_out.diagnostic import Diagnostic
 
 
-class SearchCheck(AbstractCheck):
-    """Rejects a search that was stopped at the iteration limit, and warns of one that stalled near the minimum."""
+def check_search(checked: CheckedCalibration) -> Iterator[Diagnostic]:
+    """Reject a search that was stopped at the iteration limit, and warns of one that stalled near the minimum."""
+    status = checked.geometric.status
+    if not status.good:
+        stopped = status is SolutionStatus.ITERATION_LIMIT
+        yield Diagnostic(
+            kind="search",
+            severity="implausible" if stopped else "warning",
+            sentence=f"The search {status.value}.",
+            cause=status.name.lower(),
+        )
 
-    def diagnose(self, checked: CheckedCalibration) -> Iterator[Diagnostic]:
-        """See `AbstractCheck.diagnose`."""
-        status = checked.geometric.status
-        if not status.good:
-            stopped = status is SolutionStatus.ITERATION_LIMIT
-            yield Diagnostic(
-                kind="search",
-                severity="implausible" if stopped else "warning",
-                sentence=f"The search {status.value}.",
-                cause=status.name.lower(),
-            )
+
+def check_few_rows(checked: CheckedCalibration) -> Iterator[Diagnostic]:
+    """Warn if parameters of the arm were to be estimated, but none was."""
+    problem = checked.geometric.solved.problem
+    if checked.calibrator.free and not bool((problem.active < problem.space.arm_size).any()):
+        yield Diagnostic(
+            kind="few_rows",
+            severity="warning",
+            sentence="The arm keeps its nominal geometry, and only base and tool were fitted: with the "
+            f"{checked.rows.rows} rows, no other geometry predicts held-out rows better; measure more poses in "
+            "which all joints move.",
+            values={"rows": checked.rows.rows},
+        )

@@ -3,63 +3,60 @@
 from collections.abc import Iterator
 from functools import lru_cache
 
-import numpy as np
-import torch
 from jaxtyping import Float64
+from torch import Tensor
 
-from pisigma.calibration.geometric.initial_guess.base_and_tool import fit_base_and_tool
-from pisigma.files.errors import IdentificationError, Place
 from pisigma.measurement.dataset import Measurements
 from pisigma.robot.description import Robot
+from pisigma.robot.frame_fits import MeasuredPoses, best_base_and_tool
 from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.robot.robot_class import HOBBY
-from pisigma.validation.checks.check import AbstractCheck, CheckedCalibration
+from pisigma.validation.checks.check import FITTED, CheckedCalibration, RowsUnderModel
 from pisigma.validation.held_out.diagnostic import Diagnostic, Severity
-from pisigma.validation.setup_faults.cause import length_text
-from pisigma.validation.setup_faults.nominal_robot_faults import are_unrelated, find_nominal_robot_faults
-from pisigma.validation.setup_faults.setup_fault import either
+from pisigma.validation.setup_faults.explanations import position_spread
+from pisigma.validation.setup_faults.hypothesis import COLLAPSED
+from pisigma.validation.setup_faults.joint_faults import joint_causes, signs_and_exchanges
+from pisigma.validation.setup_faults.nominal_robot_faults import (
+    MIN_ROWS_NOMINAL,
+    are_unrelated,
+    find_nominal_robot_faults,
+    largest_group,
+    usual_error,
+)
+from pisigma.validation.setup_faults.setup_fault import either, fault_of_cause
 
 UNRELATED = (
     "The measured positions are unrelated to the joint values of their rows, so the joint values and positions of "
     "different rows belong together; check whether one of them was sorted or comes from another program."
 )
-MIN_ROWS = 12
-"""Rows of a setup: 36 values for the 9 parameters of base and tool of positions."""
-FITS_SHARE = 5e-3
-"""Errors of the nominal robot as a share of its reach; geometric errors make less."""
-FAR = 5.0
-"""Errors over those of the rows of one setup above which a row belongs to another setup."""
-MAX_WRONG_SHARE = 0.1
-"""Share of the rows of a setup that may be far off without contradicting it."""
+MIN_ROWS_OF_SIZE = 4
+"""With fewer rows, the positions may be near each other by chance."""
+SCALE = 30.0
+"""Spread of the measured over that of the nominal positions above which (or below whose inverse) the unit is wrong."""
+ARM_SHARE = 0.3
+"""Spread of positions caused by a tool that the nominal robot lacks, and smallest spread of usual poses, as a share of
+the reach."""
+MIN_ROWS_FOR_JOINTS = 8
+"""Rows that distinguish columns of joints: 24 values, of which base and tool take 9."""
 
 
-class SetupFaultCheck(AbstractCheck):
-    """Looks for setup faults that explain the errors of the nominal robot; see `find_nominal_robot_faults`.
+def check_setup_fault(checked: CheckedCalibration) -> Iterator[Diagnostic]:
+    """Look for setup faults that explain the errors of the nominal robot; see `find_nominal_robot_faults`.
 
     A fault makes the calibration implausible, because parameters may absorb it and are then wrong at other poses. A
     joint zero is a parameter: a calibration estimates it correctly, so it is a warning up to the size that is possible
     in any class of robots.
     """
-
-    def diagnose(self, checked: CheckedCalibration) -> Iterator[Diagnostic]:
-        """See `AbstractCheck.diagnose`."""
-        yield from setup_diagnostics(checked.robot, checked.rows)
+    yield from setup_diagnostics(checked.robot, checked.rows)
 
 
 @lru_cache(maxsize=1)  # the same rows are checked before and after a calibration
 def setup_diagnostics(robot: Robot, rows: Measurements) -> tuple[Diagnostic, ...]:
-    """Report the setup faults that explain the errors of the nominal robot; see `SetupFaultCheck`."""
+    """Report the setup faults that explain the errors of the nominal robot; see `check_setup_fault`."""
     if faults := find_nominal_robot_faults(robot, rows):
         fault = either(faults)
         severity: Severity = "implausible" if fault.moved > HOBBY.largest.joint_offset else "warning"
-        found = Diagnostic(
-            kind="setup_fault",
-            severity=severity,
-            sentence=fault.sentence,
-            cause=fault.cause,
-            values=fault.values,
-        )
-        return (found,)
+        return (fault.diagnostic(severity),)
     if are_unrelated(robot, rows):
         return (
             Diagnostic(kind="setup_fault", severity="implausible", sentence=UNRELATED, cause="unrelated"),
@@ -67,69 +64,76 @@ def setup_diagnostics(robot: Robot, rows: Measurements) -> tuple[Diagnostic, ...
     return ()
 
 
-def explained(refusal: IdentificationError, robot: Robot, rows: Measurements) -> IdentificationError:
-    """Replace a refusal by one that names the setup fault, if one explains the errors; else return it unchanged."""
-    if moved := new_setup(robot, rows):
-        return moved
-    causes = setup_diagnostics(robot, rows)
-    if not causes:
-        return refusal
-    return IdentificationError(causes[0].sentence.removesuffix("."), at=Place(rows.source))
+def check_setup_of_rows(judged: RowsUnderModel) -> Iterator[Diagnostic]:
+    """Look for setup faults that explain the errors of a model; see `find_setup_faults`.
 
-
-def new_setup(robot: Robot, measurements: Measurements) -> IdentificationError | None:
-    """Find the row before which the instrument was moved, for motions so large that no calibration of all rows works.
-
-    Base and tool are fitted to the first and to the last third of the rows. The row is the one up to (or after) which
-    the other rows agree with that fit. The rows on both sides must fit the nominal robot on their own.
-
-    Args:
-        robot: the nominal robot.
-        measurements: rows of one frame and one target with positions; others are not tested.
-
-    Returns:
-        The error to raise, with file and line of the row; None if there is no such row.
+    A moved base, tool or zero of one joint is not a fault if it may have moved. If base and tool may not have moved,
+    their motion is reported even if it is small.
     """
-    one = len(set(measurements.frame)) == len(set(measurements.target)) == 1
-    if not one or measurements.position is None or not bool(torch.isfinite(measurements.position).all()):
-        return None
-    order = np.argsort(np.array(measurements.line), kind="stable")
-    third = max(len(order) // 3, MIN_ROWS)
-    if len(order) < 2 * MIN_ROWS + 1:
-        return None
-    for backwards in (False, True):
-        along = order[::-1] if backwards else order
-        errors = _errors(robot, measurements, along[:third])[along]
-        of_setup = errors < FAR * max(float(np.median(errors[:third])), 1e-4)
-        # The sum of +1 (agrees) and -1 (does not) peaks at the last row of the setup, despite single wrong rows.
-        agreeing = np.cumsum(np.where(of_setup, 1, -1))
-        count = int(agreeing.argmax()) + 1
-        first = len(order) - count if backwards else count
-        parts = order[:first], order[first:]
-        if min(map(len, parts)) < MIN_ROWS:
-            continue
-        if of_setup[:count].mean() < 1 - MAX_WRONG_SHARE or of_setup[count:].mean() > MAX_WRONG_SHARE:
-            continue
-        fits = [float(np.median(_errors(robot, measurements, part)[part])) for part in parts]
-        if max(fits) < FITS_SHARE * robot.reach:
-            row = int(order[first])
-            return IdentificationError(
-                "the instrument or the tool was moved before this row: the rows before it fit the nominal robot "
-                f"'{robot.name}' to {length_text(fits[0])} and the others to {length_text(fits[1])}, but not together",
-                at=measurements.at(row),
-                remedy=f"give this row and the later ones another frame (--set new_frame_at="
-                f"{measurements.line[row] or 'LINE'}) and, if the tool was changed, another target",
-            )
-    return None
+    if judged.large:
+        faults = judged.setup_faults
+    else:
+        faults = () if {"frame", "tool"} <= judged.may_move else judged.moved_frames
+    if faults and not any(map(judged.is_move, faults)):
+        yield either(faults).diagnostic()
 
 
-def _errors(robot: Robot, measurements: Measurements, rows: np.ndarray) -> Float64[np.ndarray, " rows"]:
-    """Compute all position errors [m] with base and tool fitted to some rows; infinite if these do not determine it."""
-    try:
-        fitted = fit_base_and_tool(robot, measurements.select(torch.from_numpy(rows.copy()))).robot
-    except IdentificationError:
-        return np.full(measurements.rows, np.inf)
-    assert measurements.position is not None
-    errors = measurements.position - forward_kinematics(fitted, measurements.q)[:, :3, 3]
-    lengths: np.ndarray = errors.norm(dim=1).cpu().numpy()
-    return lengths
+def size_of_positions(robot: Robot, rows: Measurements) -> Iterator[Diagnostic]:
+    """Compare the spread of the measured positions with that of the nominal robot's."""
+    group = largest_group(rows)
+    if group.position is None or group.rows < MIN_ROWS_OF_SIZE:
+        return
+    measured, nominal = (
+        position_spread(group.position),
+        position_spread(forward_kinematics(robot, group.q)[:, :3, 3]),
+    )
+    arm = ARM_SHARE * robot.reach
+    if measured > SCALE * (nominal + arm):
+        cause, mistake = "mm_named_m", "x, y and z are millimetres that are named metres"
+    elif SCALE * measured < nominal > arm:
+        cause = "m_named_mm"
+        mistake = "x, y and z are metres that are named millimetres, or do not change with the robot"
+    else:
+        return
+    yield Diagnostic(
+        kind="setup_fault",
+        severity="implausible",
+        sentence=f"The measured positions are {measured * 1e3:,.1f} mm RMS from their mean, but those of robot "
+        f"'{robot.name}' at these joint values are {nominal * 1e3:,.1f} mm: {mistake}; check the column names and the "
+        "instrument.",
+        cause=cause,
+        values={"measured_mm": measured * 1e3, "nominal_mm": nominal * 1e3},
+    )
+
+
+def joint_columns(robot: Robot, rows: Measurements) -> Iterator[Diagnostic]:
+    """Try a reversed sign of every joint and an exchange of two neighbours, with base and tool fitted each time.
+
+    With at least `MIN_ROWS_NOMINAL` rows, `find_nominal_robot_faults` tries many more hypotheses instead.
+    """
+    group = largest_group(rows)
+    if not MIN_ROWS_FOR_JOINTS <= group.rows < MIN_ROWS_NOMINAL:
+        return
+    here, usual = _errors(robot, group, group.q[None])[0], usual_error(robot, group.q)
+    if not here > usual:
+        return
+    maps = signs_and_exchanges(robot.dof)
+    found = [
+        (left, joint_causes(maps, number, robot)[0])
+        for number, left in enumerate(_errors(robot, group, maps.apply(group.q)))
+        if left <= min(usual, COLLAPSED * here)
+    ]
+    if found:
+        left, cause = min(found, key=lambda one: one[0])
+        yield fault_of_cause(cause, here, left).diagnostic()
+
+
+def _errors(robot: Robot, rows: Measurements, q: Float64[Tensor, "maps rows dof"]) -> list[float]:
+    """Compute RMS position errors [m] with base and tool fitted, corrected for the degrees of freedom."""
+    measured = MeasuredPoses.from_tensors(rows.position, None, 0.0)
+    errors = []
+    for T in forward_kinematics(robot, q):
+        base, tool = best_base_and_tool(T, measured)
+        square = measured.squares(base @ T @ tool).mean()
+        errors.append(float((square * 3 * rows.rows / (3 * rows.rows - FITTED)).sqrt()))
+    return errors

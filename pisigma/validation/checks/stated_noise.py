@@ -6,7 +6,7 @@ from dataclasses import replace
 
 from pisigma.calibration.geometric.problem.noise import view_of
 from pisigma.files.errors import IdentificationError
-from pisigma.validation.checks.check import AbstractCheck, CheckedCalibration
+from pisigma.validation.checks.check import CheckedCalibration
 from pisigma.validation.held_out.calibration_validation import errors_under
 from pisigma.validation.held_out.diagnostic import Diagnostic
 
@@ -19,51 +19,49 @@ HELD_BACK = 0.5
 """Residuals without over those with the stated noise below which the stated noise impaired the calibration."""
 
 
-class StatedNoiseCheck(AbstractCheck):
-    """Compares the median residual with the standard deviations stated in the rows.
+def check_stated_noise(checked: CheckedCalibration) -> Iterator[Diagnostic]:
+    """Compare the median residual with the standard deviations stated in the rows.
 
     The median of n values has a relative standard deviation of about `1 / sqrt(n)`; the tolerance is three of these.
     """
+    solved = checked.geometric.solved
+    learned = None if checked.hybrid is None else checked.hybrid.learned
+    for sensor, sums in zip(solved.problem.sensors, view_of(solved.refined).sums, strict=True):
+        if sensor.sigma is None or sensor.certain or sensor.components not in CHI_MEDIAN:
+            continue
+        distance = sums.distance[sensor.present]
+        ratio = float(distance.median()) / CHI_MEDIAN[sensor.components]
+        margin = math.exp(3 / math.sqrt(len(distance)))
+        larger = ratio if learned is None else learned.noise[sensor.name]
+        if larger > DISAGREEING * margin:
+            yield Diagnostic(
+                kind="stated_noise",
+                severity="warning",
+                sentence=f"The residuals of {sensor.name} are {larger:.3g} times as large as the standard "
+                "deviations stated in the rows, which were multiplied by this factor; check their unit, and "
+                "whether the model lacks something.",
+                cause=sensor.name,
+                values={"residual_over_stated": larger},
+            )
+        elif ratio * margin < 1 / DISAGREEING:
+            yield _too_large(checked, sensor.name, 1 / max(ratio, 1e-9))
 
-    def diagnose(self, checked: CheckedCalibration) -> Iterator[Diagnostic]:
-        """See `AbstractCheck.diagnose`."""
-        solved = checked.geometric.solved
-        learned = None if checked.hybrid is None else checked.hybrid.learned
-        for sensor, sums in zip(solved.problem.sensors, view_of(solved.refined).sums, strict=True):
-            if sensor.sigma is None or sensor.certain or sensor.components not in CHI_MEDIAN:
-                continue
-            distance = sums.distance[sensor.present]
-            ratio = float(distance.median()) / CHI_MEDIAN[sensor.components]
-            margin = math.exp(3 / math.sqrt(len(distance)))
-            larger = ratio if learned is None else learned.noise[sensor.name]
-            if larger > DISAGREEING * margin:
-                yield Diagnostic(
-                    kind="stated_noise",
-                    severity="warning",
-                    sentence=f"The residuals of {sensor.name} are {larger:.3g} times as large as the standard "
-                    "deviations stated in the rows, which were multiplied by this factor; check their unit, and "
-                    "whether the model lacks something.",
-                    cause=sensor.name,
-                    values={"residual_over_stated": larger},
-                )
-            elif ratio * margin < 1 / DISAGREEING:
-                yield self._too_large(checked, sensor.name, 1 / max(ratio, 1e-9))
 
-    def _too_large(self, checked: CheckedCalibration, sensor: str, factor: float) -> Diagnostic:
-        held_back = _share_without(checked) < HELD_BACK
-        consequence = (
-            "and the arm is fitted far better without them, so they impaired the calibration;"
-            if held_back
-            else "so all predicted intervals are too wide;"
-        )
-        return Diagnostic(
-            kind="stated_noise",
-            severity="implausible" if held_back else "warning",
-            sentence=f"The standard deviations stated in the rows for {sensor} are {factor:.3g} times as large as the "
-            f"residuals, {consequence} check the unit of the column, or omit it.",
-            cause=sensor,
-            values={"residual_over_stated": 1 / factor},
-        )
+def _too_large(checked: CheckedCalibration, sensor: str, factor: float) -> Diagnostic:
+    held_back = _share_without(checked) < HELD_BACK
+    consequence = (
+        "and the arm is fitted far better without them, so they impaired the calibration;"
+        if held_back
+        else "so all predicted intervals are too wide;"
+    )
+    return Diagnostic(
+        kind="stated_noise",
+        severity="implausible" if held_back else "warning",
+        sentence=f"The standard deviations stated in the rows for {sensor} are {factor:.3g} times as large as the "
+        f"residuals, {consequence} check the unit of the column, or omit it.",
+        cause=sensor,
+        values={"residual_over_stated": 1 / factor},
+    )
 
 
 def _share_without(checked: CheckedCalibration) -> float:

@@ -1,11 +1,22 @@
 """Whether the errors of held-out rows are far larger than those of calibrated robots."""
 
+import math
 from collections.abc import Iterator
 
+import torch
+from jaxtyping import Float64
+from torch import Tensor
+
+from pisigma.calibration.geometric.identifiability.plausibility import IMPLAUSIBLE_SHARE
+from pisigma.measurement.dataset import Measurements
+from pisigma.measurement.sensors.registry import SENSORS
+from pisigma.robot.frame_fits import best_base_and_tool
 from pisigma.robot.robot_class import HOBBY, RobotClass
-from pisigma.validation.checks.check import AbstractCheck, CheckedCalibration
+from pisigma.validation.checks.check import FITTED, CheckedCalibration, RowsUnderModel
 from pisigma.validation.checks.rounding import joint_rounding
 from pisigma.validation.held_out.diagnostic import Diagnostic
+from pisigma.validation.setup_faults.explanations import PLAUSIBLE_SHARE
+from pisigma.validation.setup_faults.setup_faults import unexplained
 
 FAR, FAR_HOBBY = 2.5e-3, 7.5e-3
 """Errors as a share of the reach above which a calibrated robot is implausible: industrial arms and cobots, others."""
@@ -18,40 +29,124 @@ NOISE = 0.5
 """Share of the errors above which the stated noise of the sensor explains them."""
 
 
-class UnexplainedCheck(AbstractCheck):
-    """Compares the errors of held-out positions, or else those of the calibration, with those of calibrated robots.
+def check_unexplained(checked: CheckedCalibration) -> Iterator[Diagnostic]:
+    """Compare the errors of held-out positions, or else those of the calibration, with those of calibrated robots.
 
     Errors that other checks explain are not reported again: rounded joint values are errors of the rows, not the robot.
     """
+    if not set(checked.rows.kinds) <= {"position", "rotation"}:
+        return
+    figures = checked.figures if checked.validation is None else checked.validation.figures()
+    errors = {} if figures is None else {name: one.rms_mm for name, one in figures.models.items()}
+    left, nominal = list(errors.values())[-1] if errors else None, errors.get("nominal")
+    if left is None or nominal is None or _explained(checked, left):
+        return
+    reach = checked.robot.reach * 1e3
+    stated = checked.calibrator.robot_class or RobotClass.from_robot(checked.robot).name
+    far = left > (FAR_HOBBY if stated == HOBBY.name else FAR) * reach
+    if far or (left > LARGE * reach and nominal < HARDLY * left):
+        what = "rows of the calibration" if checked.validation is None else "held-out rows"
+        yield Diagnostic(
+            kind="unexplained",
+            severity="implausible",
+            sentence=f"The errors of the {what} are {left:.3g} mm RMS ({nominal:.3g} mm for the nominal robot), but "
+            f"robots of this size have less than {LARGE * reach:.2g} mm after a calibration"
+            f"{'' if far else ', and calibration hardly helped'}. Mixed populations, a moved frame or tool, joint "
+            "values that were logged too early or rounded, and a scale do not explain them; check what else "
+            "differs between the rows, and the sensor.",
+            values={"rms_mm": left, "nominal_rms_mm": nominal},
+        )
 
-    def diagnose(self, checked: CheckedCalibration) -> Iterator[Diagnostic]:
-        """See `AbstractCheck.diagnose`."""
-        if not set(checked.rows.kinds) <= {"position", "rotation"}:
-            return
-        figures = checked.figures if checked.validation is None else checked.validation.figures()
-        errors = {} if figures is None else {name: one.rms_mm for name, one in figures.models.items()}
-        left, nominal = list(errors.values())[-1] if errors else None, errors.get("nominal")
-        if left is None or nominal is None or self._explained(checked, left):
-            return
-        reach = checked.robot.reach * 1e3
-        stated = checked.calibrator.robot_class or RobotClass.from_robot(checked.robot).name
-        far = left > (FAR_HOBBY if stated == HOBBY.name else FAR) * reach
-        if far or (left > LARGE * reach and nominal < HARDLY * left):
-            what = "rows of the calibration" if checked.validation is None else "held-out rows"
+
+def _explained(checked: CheckedCalibration, left: float) -> bool:
+    """Say whether rounding or the stated noise of the sensor makes errors of this size [mm]."""
+    sigma = checked.rows.sigma_position
+    noise = 0.0 if sigma is None else 3**0.5 * float(sigma.nanmedian()) * 1e3
+    return noise > NOISE * left or joint_rounding(checked.geometric, checked.rows) is not None
+
+
+MAX_ITERATIONS = 8
+MAX_STEP = 0.3
+"""[rad, or share of the reach] Largest step of a joint zero in an iteration."""
+
+
+def check_unexplained_rows(judged: RowsUnderModel) -> Iterator[Diagnostic]:
+    """Fit all joint zeros, a base and a tool to rows whose errors are too large for a calibrated robot."""
+    limit = PLAUSIBLE_SHARE * judged.model.robot.reach
+    if judged.large and not judged.setup_faults and _left(judged) > limit:
+        yield unexplained(judged.model)
+
+
+def _left(judged: RowsUnderModel) -> float:
+    """Compute the RMS residual after the fit [m], corrected for its degrees of freedom."""
+    known, robot = judged.known, judged.model.robot
+    zeros = torch.zeros(known.dof, dtype=torch.float64)
+    largest = (
+        MAX_STEP * torch.tensor([1.0 if revolute else robot.reach for revolute in robot.revolute]).double()
+    )
+    moves = "joint_zero" in judged.may_move
+    least = float("inf")
+    for _ in range(MAX_ITERATIONS if moves else 1):
+        T, derivative = judged.zero_columns(zeros)
+        # Base and tool have a closed form for given zeros; a Gauss-Newton step of the zeros follows.
+        base, tool = best_base_and_tool(T, judged.measured)
+        error = judged.measured.position - (base @ T @ tool)[:, :3, 3]
+        least = min(least, float(error.square().sum(1).mean().sqrt()))
+        J = (base @ derivative @ tool)[..., :3, 3].flatten(1).t()
+        step = torch.linalg.lstsq(J, error.flatten(), driver="gelsd").solution
+        zeros = zeros + step.clamp(-largest, largest)
+    values = 3 * known.rows
+    spare = max(values - FITTED - (known.dof if moves else 0), 1)
+    return least * math.sqrt(values / spare)
+
+
+UNRELATED_SHARE = 0.5
+"""Residuals over the spread of the positions above which the joints explain less than three quarters of the variance.
+For a healthy robot the ratio is below 0.01."""
+
+
+def check_residual(checked: CheckedCalibration) -> Iterator[Diagnostic]:
+    """Compare the residuals of every sensor with the reach of the robot, and those of positions with their spread.
+
+    Half of the measured lengths must be within 1 % of the reach per axis, and half of the measured angles within
+    0.01 rad, which moves a point at the distance of the reach equally far. No calibration error is this large.
+    """
+    robot, by_images = checked.robot, "corner" in checked.rows.kinds
+    rows = "images and joint values" if by_images else "rows and positions"
+    for sensor, errors in checked.final_errors.items():
+        typical = _typical(errors)
+        if SENSORS[sensor].unit == "rad":
+            limit, size = IMPLAUSIBLE_SHARE, f"{typical:.3g} rad"
+        else:
+            limit, size = IMPLAUSIBLE_SHARE * robot.reach, f"{typical * 1e3:.3g} mm"
+            if sensor == "position":
+                limit = min(limit, UNRELATED_SHARE * _spread(checked.rows))
+        if typical > limit > 0:
+            before = _typical(checked.errors["nominal"][sensor]) / typical
             yield Diagnostic(
-                kind="unexplained",
+                kind="residual",
                 severity="implausible",
-                sentence=f"The errors of the {what} are {left:.3g} mm RMS ({nominal:.3g} mm for the nominal robot), "
-                f"but robots of this size have less than {LARGE * reach:.2g} mm after a calibration"
-                f"{'' if far else ', and calibration hardly helped'}. Mixed populations, a moved frame or tool, joint "
-                "values that were logged too early or rounded, and a scale do not explain them; check what else "
-                "differs between the rows, and the sensor.",
-                values={"rms_mm": left, "nominal_rms_mm": nominal},
+                sentence=f"With the best fit, the median residual of {sensor} is still {size} per axis "
+                f"({before:.3g} times as large for the nominal robot '{robot.name}'), which no calibration error "
+                f"explains; check units, order, signs and zeros of the joint columns, whether {rows} belong "
+                f"together, {'the lengths of the board, ' if by_images else ''}and whether this robot was "
+                "measured.",
+                cause=sensor,
+                values={f"residual_{SENSORS[sensor].unit}": typical},
             )
 
-    @staticmethod
-    def _explained(checked: CheckedCalibration, left: float) -> bool:
-        """Say whether rounding or the stated noise of the sensor makes errors of this size [mm]."""
-        sigma = checked.rows.sigma_position
-        noise = 0.0 if sigma is None else 3**0.5 * float(sigma.nanmedian()) * 1e3
-        return noise > NOISE * left or joint_rounding(checked.geometric, checked.rows) is not None
+
+def _typical(errors: Float64[Tensor, "rows components"]) -> float:
+    """Compute the median length of the errors per component [m or rad]."""
+    length: float = errors.norm(dim=-1).nanmedian().item()
+    return length / math.sqrt(errors.shape[-1])
+
+
+def _spread(rows: Measurements) -> float:
+    """Compute the standard deviation of the coordinates of the positions about their mean in each frame [m]."""
+    assert rows.position is not None
+    squares = []
+    for name in dict.fromkeys(rows.frame):
+        position = rows.position[torch.tensor([frame == name for frame in rows.frame])]
+        squares.append((position - position.nanmean(0)).square())
+    return float(torch.cat(squares).nanmean().sqrt())

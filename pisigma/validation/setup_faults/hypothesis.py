@@ -155,12 +155,12 @@ class Hypothesis:
 
 
 def shifted_rows(
-    arm: PredictingArm, rows: Measurements, chosen: Int64[Tensor, " chosen"], measured: MeasuredPoses
+    robot: Robot, rows: Measurements, chosen: Int64[Tensor, " chosen"], measured: MeasuredPoses
 ) -> Iterator[tuple[Float64[Tensor, "chosen dof"], MeasuredPoses, Cause]]:
     """Yield hypotheses of joint values or orientations shifted by rows, in all rows or on one side of some row.
 
     Args:
-        arm: the predicting arm.
+        robot: the nominal robot.
         rows: rows in the order of the file.
         chosen: numbers of the rows to judge, at least `MARGIN` from both ends.
         measured: their measured poses.
@@ -182,11 +182,11 @@ def shifted_rows(
             rotations = replace(rotations, has_rotation=there & measured.has_rotation)
             clause = f"the orientations are shifted by {_count(shift)} relative to the positions"
             yield q, rotations, Cause("rows", clause, _ADVICE, 1.0)
-    yield from _shifted_from_a_row(arm, rows, chosen)
+    yield from _shifted_from_a_row(robot, rows, chosen)
 
 
 def _shifted_from_a_row(
-    arm: PredictingArm, rows: Measurements, chosen: Int64[Tensor, " chosen"]
+    robot: Robot, rows: Measurements, chosen: Int64[Tensor, " chosen"]
 ) -> Iterator[tuple[Float64[Tensor, "chosen dof"], MeasuredPoses, Cause]]:
     """Find the row after (or before) which a shift explains most, with base and tool fitted to the other side.
 
@@ -194,8 +194,8 @@ def _shifted_from_a_row(
     """
     inner = torch.arange(MARGIN, rows.rows - MARGIN)
     among = rows.select(inner)
-    measured = MeasuredPoses.from_tensors(among.position, among.rotation, LEVER_SHARE * arm.robot.reach)
-    T = {shift: arm.poses(replace(rows, q=rows.q.roll(-shift, 0)))[inner] for shift in (0, *SHIFTS)}
+    measured = MeasuredPoses.from_tensors(among.position, among.rotation, LEVER_SHARE * robot.reach)
+    T = {shift: forward_kinematics(robot, rows.q.roll(-shift, 0))[inner] for shift in (0, *SHIFTS)}
     third = len(chosen) // ENDS
     for at_start, end in ((True, chosen[:third] - MARGIN), (False, chosen[-third:] - MARGIN)):
         base, tool = best_base_and_tool(T[0][end], measured.select(end))
@@ -218,7 +218,7 @@ def _count(shift: int) -> str:
 
 
 def freed_joints(
-    arm: PredictingArm, rows: Measurements, measured: MeasuredPoses
+    robot: Robot, rows: Measurements, measured: MeasuredPoses
 ) -> list[tuple[Float64[Tensor, "rows dof"], Cause]]:
     """Estimate the values of each revolute joint, with those of the others as logged.
 
@@ -227,30 +227,30 @@ def freed_joints(
     position, or five per pose, remain as a test of the hypothesis.
 
     Args:
-        arm: the predicting arm.
+        robot: the nominal robot.
         rows: rows with positions, of one frame and target.
         measured: their measured poses.
     """
     return [
-        (_freed(arm, rows, measured, joint), _cause(arm.robot, rows.q, joint))
-        for joint, revolute in enumerate(arm.robot.revolute)
+        (_freed(robot, rows, measured, joint), _cause(robot, rows.q, joint))
+        for joint, revolute in enumerate(robot.revolute)
         if revolute
     ]
 
 
 def _freed(
-    arm: PredictingArm, rows: Measurements, measured: MeasuredPoses, joint: int
+    robot: Robot, rows: Measurements, measured: MeasuredPoses, joint: int
 ) -> Float64[Tensor, "rows dof"]:
     """Estimate the values of one joint together with base and tool by the Levenberg-Marquardt method."""
     q = rows.q.clone()
     if _copied(q, joint) is not None:
         q[:, joint] = q[:, joint].median()
-    frames = best_base_and_tool(arm.poses(replace(rows, q=q)), measured)
+    frames = best_base_and_tool(forward_kinematics(robot, q), measured)
     cost, damping = torch.tensor(torch.inf).double(), torch.tensor(1e-3).double()
     tried, first = (q, frames), cost
     for number in range(MAX_ITERATIONS):
-        turned, free = _turned(arm, rows, joint, tried[0], tried[1], measured)
-        T = arm.poses(replace(rows, q=turned))
+        turned, free = _turned(robot, rows, joint, tried[0], tried[1], measured)
+        T = forward_kinematics(robot, turned)
         error = measured.squares(tried[1][0] @ T @ tried[1][1]).sum()
         if error < cost:
             settled = bool(cost - error < CONVERGENCE_TOLERANCE * cost)
@@ -269,7 +269,7 @@ def _freed(
 
 
 def _turned(
-    arm: PredictingArm,
+    robot: Robot,
     rows: Measurements,
     joint: int,
     q: Float64[Tensor, "rows dof"],
@@ -287,8 +287,8 @@ def _turned(
         measuring frame.
     """
     base, tool = frames
-    T = arm.poses(replace(rows, q=q))
-    J = joint_jacobian(arm.robot, q)[1]
+    T = forward_kinematics(robot, q)
+    J = joint_jacobian(robot, q)[1]
     axis = J[:, 3:, joint]
     foot = T[:, :3, 3] + torch.linalg.cross(axis, J[:, :3, joint])
     tip, R = T @ tool, base[:3, :3]

@@ -15,12 +15,7 @@ from pisigma.files.errors import IdentificationError
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.groups import numbers_of_names
 from pisigma.robot.description import Robot
-from pisigma.robot.frame_fits import (
-    LEVER_SHARE,
-    MeasuredPoses,
-    affine_error,
-    best_base_and_tool,
-)
+from pisigma.robot.frame_fits import LEVER_SHARE, MeasuredPoses, affine_error, best_base_and_tool
 from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.robot.kinematics.parameter_jacobian import identification_jacobian
 from pisigma.robot.robot_class import HOBBY
@@ -99,11 +94,11 @@ def find_nominal_robot_faults(robot: Robot, measurements: Measurements) -> tuple
     most = largest_explained(here, robot.reach)
     tried = [
         *hypotheses(arm, some, raw, most),
-        *_with_joints(arm, shifted_rows(arm, rows, chosen, measured), most),
+        *_with_joints(arm, shifted_rows(robot, rows, chosen, measured), most),
     ]
     faults = simplest(tried, most)
     if not faults and not are_unrelated(robot, rows):
-        freed = ((q, measured, cause) for q, cause in freed_joints(arm, some, measured))
+        freed = ((q, measured, cause) for q, cause in freed_joints(robot, some, measured))
         faults = simplest(_with_joints(arm, freed, most, values=1) + _labelled(some, raw.T, measured), most)
     if faults:
         faults = _better_than_zeros(faults, _error_with_zeros(robot, some, measured), usual)

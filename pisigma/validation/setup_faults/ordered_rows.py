@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Literal
 
 import numpy as np
 import torch
@@ -18,6 +19,8 @@ MAX_ROWS = 4_000
 """Rows that are used, drawn from all of them."""
 SENSORS = ("position", "rotation")
 """Sensors whose values depend on frame and tool directly, without other unknowns."""
+CAP = 3.0
+"""Residuals are clipped at this multiple of the upper quartile of their lengths while a fault is sought."""
 HARMONICS, JOINT_ERROR = 3, 3e-4
 """Harmonics of a series of the joint values, and prior standard deviation of its weights [rad]. The series is fitted
 together with the parameters, because in rows ordered by a joint's values, slow errors of its gear look like a slow
@@ -86,6 +89,31 @@ class OrderedRows:
             return None
         flat = (np.concatenate(residuals, 1), np.concatenate(derivatives, 1))
         return OrderedRows(geometric, problem, rows[some].numpy(), *flat, values, np.array(noise))
+
+    @cached_property
+    def clipped(self) -> Float64[np.ndarray, "rows values"]:
+        """Residuals, those of far rows shortened, so that they do not decide where a fault is sought."""
+        lengths = np.linalg.norm(self.residual, axis=1)
+        longest = CAP * np.quantile(lengths, 0.75)
+        shortened: np.ndarray = (
+            self.residual * np.minimum(1.0, longest / np.maximum(lengths, 1e-300))[:, None]
+        )
+        return shortened
+
+    def by_motion(
+        self, kind: Literal["frame", "target"]
+    ) -> tuple[Int64[np.ndarray, " rows"], Float64[np.ndarray, "rows values motion"]]:
+        """Return the frame or target of every row, and the derivative of its values by their shift and rotation.
+
+        Positions do not depend on the rotation of a target.
+        """
+        space = self.problem.space
+        group = (self.problem.frame if kind == "frame" else self.problem.target).cpu().numpy()
+        columns = (
+            space.indices_of("base" if kind == "frame" else "tool").start + 6 * group[:, None] + np.arange(6)
+        )
+        Z = np.take_along_axis(self.derivative, columns[:, None], 2)
+        return group, Z if kind == "frame" or self.residual.shape[1] > 3 else Z[:, :, :3]
 
     @cached_property
     def by_joints(self) -> Float64[np.ndarray, "rows values dof"]:

@@ -1,4 +1,4 @@
-"""Mixtures of two populations of rows in one calibration: two arms, two tools or two frames under one name."""
+"""Mixtures of two populations of rows in one calibration: two arms, tools or frames, or two sizes of errors."""
 
 import math
 from collections.abc import Iterator
@@ -28,6 +28,12 @@ ALTERNATING = 0.95
 """Share of the rows that must alternate: 1 in 20 may be predicted equally well by both populations."""
 DIFFERENCE = 2.0
 """Variance of the difference of two arms over that of the difference of one arm and the nominal one."""
+APART = 4.0
+"""Distance of a population over the scatter of the other above which it is separate. Residuals of healthy robots are a
+mixture with ratios of up to 2.5, because the unexplained errors depend on the pose."""
+NORMAL_ITERATIONS = 200
+FLOOR = 1e-6
+"""Smallest standard deviation, as a share of the largest residual."""
 _Differing = Literal["arm", "frame", "tool"]
 
 
@@ -124,14 +130,13 @@ def _differences(
     rows: OrderedRows,
 ) -> Iterator[tuple[_Differing, Float64[np.ndarray, "rows values numbers"], Float64[np.ndarray, " numbers"]]]:
     """Yield the derivatives by each thing that may differ, with the precision of the prior of its difference."""
-    space = rows.problem.space
-    for kind, group in (("tool", rows.problem.target), ("frame", rows.problem.frame)):
-        first = space.indices_of("base" if kind == "frame" else "tool").start
-        columns = first + 6 * group.cpu().numpy()[:, None] + np.arange(6)
-        Z = np.take_along_axis(rows.derivative, columns[:, None], 2)
-        turning = kind == "frame" or rows.residual.shape[1] > 3
-        Z = Z if turning else Z[:, :, :3]
-        yield ("tool" if kind == "tool" else "frame"), Z, np.zeros(Z.shape[2])
+    kinds: tuple[tuple[_Differing, Literal["frame", "target"]], ...] = (
+        ("tool", "target"),
+        ("frame", "frame"),
+    )
+    for differing, kind in kinds:
+        Z = rows.by_motion(kind)[1]
+        yield differing, Z, np.zeros(Z.shape[2])
     active = len(rows.problem.active)
     yield "arm", rows.X[:, :, :active], rows.precision[:active] / DIFFERENCE
 
@@ -277,3 +282,65 @@ class _Em:
         logs = logs + np.log([1 - share, share])[:, None]
         odds = (logs[0] - logs[1]).clip(-500, 500)
         return 1 / (1 + np.exp(odds)), float(np.logaddexp(*logs).sum()) - self.r.size / 2 * math.log(variance)
+
+
+@dataclass(frozen=True)
+class Mixture:
+    """Mixture of two normal populations of residuals.
+
+    Attributes:
+        share: share of the population with the larger scatter, or of the smaller one if both scatter equally [1].
+        off: RMS distance of that population from the mean of the other one, per component [m or rad].
+        scatter: RMS distance of the other one from its mean, per component [m or rad].
+        log_bayes_factor: logarithm of the odds against one population, by the Bayesian information criterion (Schwarz
+            1978, Annals of Statistics 6, 461-464).
+    """
+
+    share: float
+    off: float
+    scatter: float
+    log_bayes_factor: float
+
+    @property
+    def are_distinct(self) -> bool:
+        """Whether these are two populations, and not the shape of a single one."""
+        return (
+            self.log_bayes_factor > math.log(100.0)
+            and min(self.share, 1 - self.share) >= MIN_SHARE
+            and self.off > APART * self.scatter
+        )
+
+
+def two_populations(residuals: Float64[np.ndarray, "rows components"]) -> Mixture:
+    """Fit a mixture of two normal populations by expectation maximisation.
+
+    Args:
+        residuals: residuals of one sensor [m or rad].
+    """
+    rows, components = residuals.shape
+    centred = residuals - residuals.mean(0)
+    floor = (FLOOR * np.abs(centred).max() + 1e-15) ** 2 * np.eye(components)
+    # Start with the two halves along the first principal axis: two clusters separate along it.
+    key = centred @ np.linalg.svd(centred, full_matrices=False)[2][0]
+    weight = (key > np.median(key)).astype(float)
+    for _ in range(NORMAL_ITERATIONS):
+        members = np.stack([1 - weight, weight])
+        counts = members.sum(1).clip(1e-9)
+        means = members @ residuals / counts[:, None]
+        off = residuals - means[:, None]
+        covariances = np.einsum("kn,kni,knj->kij", members, off, off) / counts[:, None, None] + floor
+        squares = np.einsum("kni,kij,knj->kn", off, np.linalg.inv(covariances), off)
+        determinants = np.linalg.slogdet(covariances)[1]
+        logs = (np.log(counts / rows) - determinants / 2)[:, None] - squares / 2
+        weight = 1 / (1 + np.exp((logs[0] - logs[1]).clip(-500, 500)))
+    # Log likelihoods of both models without their common constant; the BIC counts mean, covariance and share below.
+    alone = np.linalg.slogdet(centred.T @ centred / rows + floor)[1]
+    gain = np.logaddexp(*logs).sum() + rows / 2 * (alone + components)
+    alike = abs(determinants[1] - determinants[0]) < 2 * components * math.log(2.0)
+    far = int(np.argmin(counts) if alike else np.argmax(determinants))
+    return Mixture(
+        share=float(counts[far] / rows),
+        off=float(np.average(np.square(off[1 - far]).mean(1), weights=members[far])) ** 0.5,
+        scatter=float(np.trace(covariances[1 - far]) / components) ** 0.5,
+        log_bayes_factor=float(gain) - (components + 1) * (components + 2) / 4 * math.log(rows),
+    )

@@ -25,8 +25,6 @@ DEGREES = (1, 3, 6)
 """Degrees of the polynomials of slow motions, as functions of the share of the rows measured so far."""
 AS_LIKELY = 0.5
 """Share of the largest log Bayes factor above which a motion at the start of a frame explains the residuals too."""
-CAP = 3.0
-"""Residuals are clipped at this multiple of the upper quartile of their lengths while the row of a motion is sought."""
 MAX_ITERATIONS = 6
 """Iterations of the reweighting."""
 CONVERGENCE_TOLERANCE = 1e-2
@@ -181,13 +179,10 @@ class _Search:
 
     def candidates(self) -> Iterator[_Candidate]:
         """Yield everything that may have moved, suddenly at the best row or slowly."""
-        lengths = np.linalg.norm(self.rows.residual, axis=1)
-        longest = CAP * np.quantile(lengths, 0.75)
-        cut = self.rows.residual * np.minimum(1.0, longest / np.maximum(lengths, 1e-300))[:, None]
         for candidate in self._rigid():
             count = len(candidate.index)
             if count > 2 * MIN_ROWS:
-                yield candidate.from_row(self._best_step(cut, candidate))
+                yield candidate.from_row(self._best_step(self.rows.clipped, candidate))
                 time = (2 * np.arange(count) + 1) / count - 1
                 for degree in DEGREES:
                     yield replace(candidate, course=legvander(time, degree)[:, 1:])
@@ -203,20 +198,12 @@ class _Search:
         """Yield frames, targets (if there are several), and the tool with all targets."""
         space = self.rows.problem.space
         tool: _Moved = "target" if len(space.targets) > 1 else "tool"
-        kinds: tuple[tuple[_Moved, torch.Tensor, tuple[str, ...]], ...] = (
-            ("frame", self.rows.problem.frame, space.frames),
-            (tool, self.rows.problem.target, space.targets),
-        )
-        for kind, groups, names in kinds:
-            group = groups.cpu().numpy()
-            first = space.indices_of("base" if kind == "frame" else "tool").start
-            columns = first + 6 * group[:, None] + np.arange(6)
-            Z = np.take_along_axis(self.rows.derivative, columns[:, None], 2)
-            turning = kind == "frame" or self.rows.residual.shape[1] > 3
-            for number in range(len(names)):
+        kinds: tuple[tuple[_Moved, Literal["frame", "target"]], ...] = (("frame", "frame"), (tool, "target"))
+        for moved, kind in kinds:
+            group, Z = self.rows.by_motion(kind)
+            for number in range(int(group.max()) + 1):
                 index = np.flatnonzero(group == number)
-                own = Z[index] if turning else Z[index][:, :, :3]
-                yield _Candidate(kind, number, index, own, np.ones((len(index), 1)))
+                yield _Candidate(moved, number, index, Z[index], np.ones((len(index), 1)))
         if len(space.targets) > 1:
             arms = space.split(self.rows.result.solved.refined.point)[2][:, :3].cpu().numpy()[group]
             lever = np.cross(np.eye(3)[:, None], arms)  # e_k × p, (3, rows, 3)

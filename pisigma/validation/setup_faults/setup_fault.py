@@ -6,7 +6,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pisigma.validation.setup_faults.cause import length_text
+from pisigma.validation.held_out.diagnostic import Diagnostic, Severity
+from pisigma.validation.setup_faults.cause import Cause, length_text
 from pisigma.validation.setup_faults.hypothesis import COLLAPSED, Hypothesis
 
 
@@ -59,6 +60,16 @@ class SetupFault:
             fall += f" (those of the nominal robot to {length_text(self.after_nominal)})"
         return f"{clause}: with this corrected, the errors fall {fall}; {self.advice}."
 
+    def diagnostic(self, severity: Severity = "implausible") -> Diagnostic:
+        """Report the fault."""
+        return Diagnostic(
+            kind="setup_fault",
+            severity=severity,
+            sentence=self.sentence,
+            cause=self.cause,
+            values=self.values,
+        )
+
     @property
     def cause(self) -> str:
         """The kinds of its causes in one word, such as "joint_sign" or "frame+tool"; see `Diagnostic.cause`."""
@@ -90,6 +101,14 @@ def either(faults: Sequence[SetupFault]) -> SetupFault:
     advice = dict.fromkeys(fault.advice for fault in faults)
     return replace(
         faults[0], clause=", or ".join(clauses), advice="; ".join(advice), moved=max(f.moved for f in faults)
+    )
+
+
+def fault_of_cause(cause: Cause, before: float, after: float) -> SetupFault:
+    """Make the fault of a single cause, with the RMS position errors before and after its correction [m]."""
+    nan = math.nan
+    return SetupFault(
+        (cause.kind,), cause.clause, cause.advice, before, after, nan, nan, nan, joints=cause.joints
     )
 
 

@@ -10,6 +10,7 @@ from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel, poses_of_rows
 from pisigma.robot.frame_fits import LEVER_SHARE, MeasuredPoses
 from pisigma.validation.held_out.calibration_summary import has_orientation
+from pisigma.validation.held_out.diagnostic import Diagnostic
 from pisigma.validation.held_out.frames.fitted_frames import FrameKind, fit_frames, with_names_of
 from pisigma.validation.held_out.model_comparison import ModelFigures
 from pisigma.validation.setup_faults.explanations import (
@@ -122,12 +123,14 @@ def is_implausible(figures: ModelFigures, model: CalibratedModel) -> bool:
     return figures.position.statistics["rms"] * 1e-3 > PLAUSIBLE_SHARE * reach > 0 or turn > PLAUSIBLE_TURN
 
 
-def unexplained(model: CalibratedModel) -> str:
-    """Write that no setup fault explains implausible errors of a model, and what to check."""
+def unexplained(model: CalibratedModel) -> Diagnostic:
+    """Report that no setup fault explains implausible errors of a model, and what to check."""
     limit, turn = PLAUSIBLE_SHARE * model.robot.reach * 1e3, np.rad2deg(PLAUSIBLE_TURN)
-    return (
-        f"Errors of more than {limit:.3g} mm or {turn:.2g} deg are not calibration errors, but no usual setup fault "
-        "(frame, tool, units, conventions of orientations, shifted rows, order, signs and zeros of the joints, "
+    return Diagnostic(
+        kind="implausible_errors",
+        severity="implausible",
+        sentence=f"Errors of more than {limit:.3g} mm or {turn:.2g} deg are not calibration errors, but no usual setup "
+        "fault (frame, tool, units, conventions of orientations, shifted rows, order, signs and zeros of the joints, "
         "correction applied twice or not at all) explains them; check whether this robot was measured, and whether the "
-        "joint values and measurements of each row belong together."
+        "joint values and measurements of each row belong together.",
     )

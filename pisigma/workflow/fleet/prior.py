@@ -19,7 +19,7 @@ from pisigma.measurement.camera.corner_file import read_rows
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.joint_range import row_warnings, with_limits_of_rows
 from pisigma.model.calibrated_model import CalibratedModel
-from pisigma.reporting.fleet_prior_card import write_fleet_prior_card
+from pisigma.reporting.derived_cards import write_fleet_prior_card
 from pisigma.robot.description import Robot
 from pisigma.validation.checks.setup_fault import setup_diagnostics
 from pisigma.workflow.result import AbstractModelResult

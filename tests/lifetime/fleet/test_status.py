@@ -4,7 +4,7 @@ import datetime
 
 from pisigma.lifetime.fleet.record import RobotRecord, SessionRecord
 from pisigma.lifetime.fleet.status import FleetStatus
-from pisigma.reporting.fleet_tables import not_compared, robot_table, state_table
+from pisigma.reporting.lifetime_tables import not_compared, robot_table, state_table
 
 TODAY = datetime.date(2026, 11, 22)
 

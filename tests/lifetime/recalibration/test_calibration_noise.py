@@ -13,7 +13,7 @@ from testing.refusals import refused
 from pisigma.calibration.hybrid.noise import CalibrationNoise
 from pisigma.files.errors import MeasurementError
 from pisigma.model.folder.model_folder import load_model, save_model
-from pisigma.validation.checks.rows.row_check import RowsUnderModel
+from pisigma.validation.checks.check import RowsUnderModel
 from pisigma.workflow.calibrate import calibrate
 from pisigma.workflow.monitor import monitor
 from pisigma.workflow.recalibrate import recalibrate

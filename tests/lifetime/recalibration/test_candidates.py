@@ -9,12 +9,7 @@ from testing.closeness import assert_close
 
 from pisigma.calibration.hybrid.calibrator import HybridCalibrator
 from pisigma.lifetime.recalibration.adaptation import adapt
-from pisigma.lifetime.recalibration.candidates import (
-    MIN_RATIO,
-    CandidateChoice,
-    _decided,
-    choose_candidate,
-)
+from pisigma.lifetime.recalibration.candidates import MIN_RATIO, CandidateChoice, _decided, choose_candidate
 from pisigma.lifetime.recalibration.recalibration_problem import recalibration_problem
 from pisigma.model.model_posterior import ModelPosterior
 

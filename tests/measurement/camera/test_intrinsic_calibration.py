@@ -16,7 +16,7 @@ from pisigma.measurement.camera.solved_images import (
     initial_camera,
 )
 from pisigma.robot.se3 import rotation_from_rpy
-from pisigma.simulation.camera.true_board import TrueBoard
+from pisigma.simulation.camera.rendering import TrueBoard
 
 SIZE = (1920, 1200)
 TRUE = Camera("wrist", *SIZE, 1400.0, 1405.0, 980.0, 590.0, -0.3, 0.08, 1e-3, -5e-4)

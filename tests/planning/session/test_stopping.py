@@ -1,7 +1,7 @@
 """Stopping rule of measuring sessions."""
 
+from pisigma.planning.session.session_rows import advice
 from pisigma.planning.session.state import AccuracyPoint
-from pisigma.planning.session.stopping import advice
 
 
 def point(poses: int, p95_mm: float) -> AccuracyPoint:

@@ -10,8 +10,7 @@ from testing.closeness import assert_close
 from pisigma.measurement.camera.board import Board
 from pisigma.measurement.camera.camera import Camera
 from pisigma.robot.se3 import rotation_from_rpy
-from pisigma.simulation.camera.rendering import Exposure, render_image
-from pisigma.simulation.camera.true_board import TrueBoard
+from pisigma.simulation.camera.rendering import Exposure, TrueBoard, render_image
 
 CAMERA = Camera("small", 640, 400, 500.0, 500.0, 319.5, 199.5, -0.1, 0.05, 1e-4, -2e-4, 0.01)
 BOARD = Board("board", 4, 5, 0.03)

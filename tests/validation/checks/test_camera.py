@@ -18,7 +18,7 @@ from pisigma.measurement.dataset import Measurements
 from pisigma.model.stored_starts import nearest_branch
 from pisigma.robot import Robot
 from pisigma.robot.kinematics.closed_form import closed_form_solver
-from pisigma.validation.checks.camera import CameraCheck
+from pisigma.validation.checks.camera import check_camera
 from pisigma.validation.checks.check import CheckedCalibration
 from pisigma.validation.held_out.diagnostic import Diagnostic
 
@@ -43,7 +43,7 @@ def calibrated(
 def found(checked: Measurements, result: CalibrationResult) -> dict[str, Diagnostic]:
     """Findings of the check for some of the rows of a calibration, by cause."""
     check = CheckedCalibration(CALIBRATOR, checked, {"geometric": result})
-    return {one.cause: one for one in CameraCheck().diagnose(check)}
+    return {one.cause: one for one in check_camera(check)}
 
 
 @pytest.mark.parametrize(

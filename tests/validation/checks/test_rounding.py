@@ -12,12 +12,12 @@ from testing.outside_arm import ARMS, OutsideArm
 from pisigma.calibration.geometric.calibrator import GeometricCalibrator
 from pisigma.measurement.dataset import Measurements
 from pisigma.robot import Robot
-from pisigma.validation.checks.rounding import RoundingCheck, joint_rounding
+from pisigma.validation.checks.rounding import check_rounding, joint_rounding
 from pisigma.validation.held_out.diagnostic import Diagnostic
 
 
 def found(robot: Robot, rows: Measurements) -> list[Diagnostic]:
-    return list(RoundingCheck().diagnose(checked(GeometricCalibrator(robot), rows)))
+    return list(check_rounding(checked(GeometricCalibrator(robot), rows)))
 
 
 def rounded(arm: OutsideArm, degrees: float) -> np.ndarray:

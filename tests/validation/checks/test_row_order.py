@@ -17,7 +17,7 @@ from pisigma.measurement.dataset import Measurements, with_new_frames
 from pisigma.robot import Robot
 from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.robot.se3 import rotation_from_vector
-from pisigma.validation.checks.row_order import RowOrderCheck
+from pisigma.validation.checks.row_order import check_row_order
 from pisigma.validation.held_out.diagnostic import Diagnostic
 from pisigma.validation.setup_faults.row_order import find_motion
 
@@ -63,7 +63,7 @@ def drifting(rows: Measurements, share: torch.Tensor) -> Measurements:
 
 
 def found(robot: Robot, rows: Measurements) -> list[Diagnostic]:
-    return list(RowOrderCheck().diagnose(checked(GeometricCalibrator(robot), rows)))
+    return list(check_row_order(checked(GeometricCalibrator(robot), rows)))
 
 
 @pytest.mark.parametrize("turned", [False, True])

@@ -11,7 +11,7 @@ from testing.simulated_arm import simulate
 from pisigma.calibration.geometric.calibrator import GeometricCalibrator
 from pisigma.measurement.dataset import Measurements
 from pisigma.robot import Robot
-from pisigma.validation.checks.scale import ScaleCheck, common_scale, scale_figures
+from pisigma.validation.checks.scale import check_scale, common_scale, scale_figures
 from pisigma.validation.held_out.diagnostic import Diagnostic
 
 MEASURED = [
@@ -29,12 +29,12 @@ def test_scaled_measurements_are_recognised(shared_data, robot, file, factor, se
     rows = Measurements.read_csv(shared_data / file)
     rows = rows.select(torch.arange(0, rows.rows, 15))
     calibrator = GeometricCalibrator(Robot.load(robot))
-    diagnostics: list[Diagnostic] = list(ScaleCheck().diagnose(checked(calibrator, rows)))
+    diagnostics: list[Diagnostic] = list(check_scale(checked(calibrator, rows)))
     assert diagnostics == []
     rows = replace(rows, position=rows.position * factor)
     scale = common_scale(calibrator.fit(rows))
     assert_close(scale.factor, factor, atol=1.5e-3)
-    (diagnostic,) = ScaleCheck().diagnose(checked(calibrator, rows))
+    (diagnostic,) = check_scale(checked(calibrator, rows))
     assert (diagnostic.kind, diagnostic.severity) == ("scale", severity)
 
 
@@ -43,7 +43,7 @@ def test_a_thousandth_is_recognised_where_links_are_long_for_their_errors(shared
     rows = Measurements.read_csv(shared_data / file)
     rows = rows.select(torch.arange(0, rows.rows, 15))
     rows = replace(rows, position=rows.position * 1.001)
-    (diagnostic,) = ScaleCheck().diagnose(checked(GeometricCalibrator(Robot.load(robot)), rows))
+    (diagnostic,) = check_scale(checked(GeometricCalibrator(Robot.load(robot)), rows))
     assert (diagnostic.kind, diagnostic.severity) == ("scale", "warning")
 
 

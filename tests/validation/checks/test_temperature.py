@@ -8,7 +8,7 @@ from testing.checked import checked
 from testing.simulated_arm import simulate
 
 from pisigma.calibration.geometric.calibrator import GeometricCalibrator
-from pisigma.validation.checks.temperature import TemperatureCheck
+from pisigma.validation.checks.temperature import check_temperature
 
 
 @pytest.mark.parametrize(("hottest", "findings"), [(35.0, 0), (70.0, 1)])
@@ -17,7 +17,7 @@ def test_hot_rows_are_warned_of(hottest: float, findings: int) -> None:
     temperature = torch.linspace(20, hottest, 30, dtype=torch.float64)
     temperature[0] = torch.nan
     rows = replace(simulated.measurements, temperature=temperature)
-    found = list(TemperatureCheck().diagnose(checked(GeometricCalibrator(simulated.nominal), rows)))
+    found = list(check_temperature(checked(GeometricCalibrator(simulated.nominal), rows)))
     assert len(found) == findings
     for diagnostic in found:
         assert diagnostic.severity == "warning"

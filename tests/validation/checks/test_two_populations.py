@@ -13,8 +13,9 @@ from testing.simulated_arm import simulate
 from pisigma.calibration.geometric.calibrator import GeometricCalibrator
 from pisigma.measurement.dataset import Measurements
 from pisigma.robot.description import Robot
-from pisigma.validation.checks.two_populations import TwoPopulationsCheck, two_populations
+from pisigma.validation.checks.mixed_rows import check_two_populations
 from pisigma.validation.held_out.diagnostic import Diagnostic
+from pisigma.validation.setup_faults.populations import two_populations
 
 
 @pytest.mark.parametrize("components", [1, 3])
@@ -45,7 +46,7 @@ def test_wrong_rows_are_distinguished_from_correct_ones(same):
 
 
 def populations(robot: Robot, rows: Measurements) -> list[Diagnostic]:
-    return list(TwoPopulationsCheck().diagnose(checked(GeometricCalibrator(robot), rows)))
+    return list(check_two_populations(checked(GeometricCalibrator(robot), rows)))
 
 
 @pytest.mark.parametrize("name", ARMS)

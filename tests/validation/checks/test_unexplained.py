@@ -11,8 +11,8 @@ from testing.outside_arm import ARMS, OutsideArm
 from pisigma.calibration.geometric.calibrator import GeometricCalibrator
 from pisigma.measurement.dataset import Measurements
 from pisigma.robot import Robot
-from pisigma.validation.checks.joint_zero import JointZeroCheck
-from pisigma.validation.checks.unexplained import UnexplainedCheck
+from pisigma.validation.checks.prior_ratio import check_joint_zero
+from pisigma.validation.checks.unexplained import check_unexplained
 
 
 @pytest.mark.parametrize("name", ARMS)
@@ -21,9 +21,9 @@ def test_errors_of_unknown_cause_are_implausible(name):
     off = np.random.default_rng(0).normal(0, 3e-3, arm.q.shape) * arm.robot.reach
     rows = arm.measured(logged=arm.q + off)
     check = checked(GeometricCalibrator(arm.robot), rows)
-    assert [one.severity for one in UnexplainedCheck().diagnose(check)] == ["implausible"]
+    assert [one.severity for one in check_unexplained(check)] == ["implausible"]
     stated = replace(rows, sigma_position=torch.full((100,), 5e-3 * arm.robot.reach, dtype=torch.float64))
-    assert list(UnexplainedCheck().diagnose(checked(GeometricCalibrator(arm.robot), stated))) == []
+    assert list(check_unexplained(checked(GeometricCalibrator(arm.robot), stated))) == []
 
 
 @pytest.mark.parametrize("name", ARMS)
@@ -31,7 +31,7 @@ def test_errors_of_unknown_cause_are_implausible(name):
 def test_healthy_arms_are_plausible(name, rows):
     arm = OutsideArm(name, 6, rows)
     check = checked(GeometricCalibrator(arm.robot), arm.measured())
-    assert [*UnexplainedCheck().diagnose(check), *JointZeroCheck().diagnose(check)] == []
+    assert [*check_unexplained(check), *check_joint_zero(check)] == []
 
 
 @pytest.mark.parametrize(("degrees", "joints"), [(0.0, []), (1.0, [2]), (-1.0, [2])])
@@ -41,6 +41,6 @@ def test_a_joint_whose_zero_is_off_is_named_where_base_and_tool_hide_it(shared_d
     rows = rows.select(torch.arange(0, rows.rows, 10))
     q = rows.q.clone()
     q[:, 1] += np.deg2rad(degrees)
-    found = list(JointZeroCheck().diagnose(checked(GeometricCalibrator(robot), replace(rows, q=q))))
+    found = list(check_joint_zero(checked(GeometricCalibrator(robot), replace(rows, q=q))))
     assert [one.severity for one in found] == ["warning"] * len(joints)
     assert [one.values["joint"] for one in found] == [str(joint) for joint in joints]

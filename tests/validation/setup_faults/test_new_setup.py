@@ -13,7 +13,7 @@ from pisigma.files.errors import IdentificationError
 from pisigma.measurement.dataset import Measurements, with_new_frames
 from pisigma.robot import Robot
 from pisigma.robot.se3 import transform_from_xyzrpy
-from pisigma.validation.checks.setup_fault import new_setup
+from pisigma.validation.checks.row_order import new_setup
 from pisigma.workflow.calibrate import calibrate
 from pisigma.workflow.settings.calibration import CalibrationSettings
 

@@ -5,8 +5,8 @@ from dataclasses import replace
 
 import pytest
 
+from pisigma.lifetime.recalibration.motion import beyond_wear
 from pisigma.lifetime.recalibration.movement import Movement
-from pisigma.lifetime.recalibration.wear import beyond_wear
 from pisigma.robot.description import Robot
 from pisigma.robot.robot_class import CLASSES, RobotClass
 

@@ -9,7 +9,7 @@ from testing.simulated_arm import simulate
 from pisigma.calibration.geometric.calibrator import GeometricCalibrator
 from pisigma.model.geometric_model import model_of_calibration
 from pisigma.robot.se3 import rotation_from_vector
-from pisigma.validation.checks.rows.wrong_rows import without_wrong_rows
+from pisigma.validation.checks.wrong_rows import without_wrong_rows
 
 pytestmark = pytest.mark.usefixtures("without_type_checker")
 WRONG = 7

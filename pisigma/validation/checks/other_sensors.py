@@ -13,7 +13,7 @@ from pisigma.files.errors import IdentificationError
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel, poses_of_rows
 from pisigma.robot.se3 import transform
-from pisigma.validation.checks.rows.row_check import LARGE_SHARE, MIN_ROWS, Move, kinds_to_fit
+from pisigma.validation.checks.check import LARGE_SHARE, MIN_ROWS_OF_MODEL, Move, kinds_to_fit
 from pisigma.validation.held_out.diagnostic import Diagnostic
 from pisigma.validation.held_out.frames.fitted_frames import FrameKind, with_names_of
 from pisigma.validation.held_out.frames.row_errors import errors_of_rows
@@ -22,7 +22,7 @@ from pisigma.validation.setup_faults.cause import Cause, length_text
 from pisigma.validation.setup_faults.explanations import PLAUSIBLE_SHARE
 from pisigma.validation.setup_faults.hypothesis import COLLAPSED
 from pisigma.validation.setup_faults.joint_faults import joint_causes, signs_and_exchanges
-from pisigma.validation.setup_faults.setup_fault import SetupFault
+from pisigma.validation.setup_faults.setup_fault import SetupFault, fault_of_cause
 from pisigma.validation.setup_faults.setup_faults import unexplained
 
 FAR, STRETCHED = 3.0, 0.01
@@ -86,7 +86,10 @@ def diagnosed_lengths(
     known, reach = with_names_of(model, rows, kinds), model.robot.reach
     with suppress(IdentificationError):
         errors = _errors(model, known)
-        if int(torch.isfinite(errors).all(-1).sum()) < MIN_ROWS or not _rms(errors) > LARGE_SHARE * reach:
+        if (
+            int(torch.isfinite(errors).all(-1).sum()) < MIN_ROWS_OF_MODEL
+            or not _rms(errors) > LARGE_SHARE * reach
+        ):
             return (), ()
         fault = _fault(model, known, free)
         faults = () if fault is None else (fault,)
@@ -94,17 +97,9 @@ def diagnosed_lengths(
         if left <= min(COLLAPSED * _rms(errors), PLAUSIBLE_SHARE * reach):
             return (), faults
         if fault is not None and not moves.issuperset(fault.kinds):
-            why = Diagnostic(
-                kind="setup_fault",
-                severity="implausible",
-                sentence=fault.sentence,
-                cause=fault.cause,
-                values=fault.values,
-            )
-            return (why,), faults
+            return (fault.diagnostic(),), faults
         if left > PLAUSIBLE_SHARE * reach:
-            why = Diagnostic(kind="implausible_errors", severity="implausible", sentence=unexplained(model))
-            return (why,), faults
+            return (unexplained(model),), faults
         return (), faults
     return (), ()
 
@@ -121,18 +116,7 @@ def _fault(model: CalibratedModel, rows: Measurements, free: Collection[str]) ->
     after, cause = min(found, key=lambda one: one[0])
     if not after <= COLLAPSED * before:
         return None
-    nowhere = float("nan")
-    return SetupFault(
-        (cause.kind,),
-        cause.clause,
-        cause.advice,
-        before,
-        after,
-        nowhere,
-        nowhere,
-        nowhere,
-        joints=cause.joints,
-    )
+    return fault_of_cause(cause, before, after)
 
 
 def _moved_most(model: CalibratedModel, rows: Measurements, free: Collection[str]) -> tuple[float, Cause]:

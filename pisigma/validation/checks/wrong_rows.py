@@ -10,7 +10,7 @@ from torch import Tensor
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel, poses_of_rows
 from pisigma.robot.se3 import rotation_vector
-from pisigma.validation.checks.rows.row_check import RowsUnderModel
+from pisigma.validation.checks.check import RowsUnderModel
 from pisigma.validation.held_out.frames.fitted_frames import FrameKind, fit_frames
 from pisigma.validation.held_out.frames.row_errors import errors_of_rows
 from pisigma.validation.setup_faults.cause import length_text

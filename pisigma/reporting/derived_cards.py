@@ -1,0 +1,141 @@
+"""Cards of models that are made from other models (recalibrated, distilled, fleet prior), and their tables."""
+
+from pathlib import Path
+
+from pisigma.lifetime.fleet.prior_summary import FleetPriorSummary
+from pisigma.lifetime.recalibration.summary import RecalibrationSummary
+from pisigma.model.calibrated_model import CalibratedModel
+from pisigma.model.model_posterior import FLEET_PRIOR
+from pisigma.reporting.rendering import write_card
+from pisigma.reporting.tables import Table, figure_text
+from pisigma.reporting.verdict import rounded
+from pisigma.validation.held_out.distillation_summary import DistillationSummary
+
+CANDIDATES = {
+    "recalibrated": "recalibrated",
+    "old": "old, with base and tool of these rows",
+    "scratch": "from scratch",
+}
+OF_FLEET = CANDIDATES | {"recalibrated": "fleet and these rows", "old": "mean robot of the fleet"}
+
+
+def write_recalibration_card(model: CalibratedModel, summary: RecalibrationSummary, folder: Path) -> None:
+    """Write the card into a model folder.
+
+    Args:
+        model: model of the folder.
+        summary: figures of the recalibration.
+        folder: model folder.
+    """
+    write_card(
+        folder, "recalibration_card.md.j2", model=model, summary=summary, candidates=candidate_table(summary)
+    )
+
+
+def candidate_names(summary: RecalibrationSummary) -> dict[str, str]:
+    """Name the candidates, by their keys in the figures."""
+    return OF_FLEET if summary.parent.kind == FLEET_PRIOR else CANDIDATES
+
+
+def candidate_table(summary: RecalibrationSummary) -> Table:
+    """Make a table of the candidates: RMS error of held-out rows, and which was kept."""
+    names = candidate_names(summary)
+    rows = (
+        (
+            names[name],
+            "too few rows" if errors.rms_mm is None else rounded(errors.rms_mm, summary.left_out),
+            "yes" if name == summary.kept else "no",
+        )
+        for name, errors in summary.cross_validation.items()
+    )
+    return Table(("model", "held-out rows, RMS [mm]", "kept"), tuple(rows))
+
+
+_SIZES = ("orders", "harmonics", "unknowns per joint", "tool, RMS [mm]", "kept")
+_STATISTICS = (("mean", "mean"), ("rms", "RMS"), ("max", "max"))
+
+
+def write_distilled_card(model: CalibratedModel, summary: DistillationSummary, folder: Path) -> None:
+    """Write the card into a model folder.
+
+    Args:
+        model: distilled model.
+        summary: figures of the model.
+        folder: model folder.
+    """
+    tables = {
+        "sizes": size_table(summary),
+        "corrections": correction_table(summary),
+        "ranges": _range_table(summary),
+    }
+    write_card(folder, "distilled_card.md.j2", model=model, summary=summary, **tables)
+
+
+def size_table(summary: DistillationSummary) -> Table:
+    """Make a table of the network sizes that were tried."""
+    rows = (
+        (
+            ", ".join(map(str, size.orders)),
+            str(size.harmonics),
+            str(size.unknowns),
+            figure_text(size.rms_mm),
+            "yes" if size.kept else "no",
+        )
+        for size in summary.sizes
+    )
+    return Table(_SIZES, tuple(rows))
+
+
+def correction_table(summary: DistillationSummary) -> Table:
+    """Make a table of the joints: corrections, and errors of the network."""
+    head = [f"{what}: {label}" for what in ("correction", "error") for _, label in _STATISTICS]
+    rows = []
+    for joint in summary.joints:
+        figures = [getattr(part, name) for part in (joint.correction, joint.error) for name, _ in _STATISTICS]
+        rows.append((joint.name, joint.unit, *(figure_text(value) for value in figures)))
+    return Table(("joint", "unit", *head), tuple(rows))
+
+
+def _range_table(summary: DistillationSummary) -> Table:
+    """Make a table of the joints: smallest and largest nominal value among the poses."""
+    joints = summary.region.joints
+    rows = ((joint.name, joint.unit, figure_text(joint.lower), figure_text(joint.upper)) for joint in joints)
+    return Table(("joint", "unit", "lowest", "highest"), tuple(rows))
+
+
+UNDETERMINED = (
+    "A parameter that the rows do not determine, such as the position of the first axis in the base, has mean 0 and "
+    "the usual standard deviation of the robot's class."
+)
+
+
+def write_fleet_prior_card(model: CalibratedModel, summary: FleetPriorSummary, folder: Path) -> None:
+    """Write the card into a model folder.
+
+    Args:
+        model: mean robot.
+        summary: figures of the prior.
+        folder: model folder.
+    """
+    write_card(
+        folder,
+        "fleet_prior_card.md.j2",
+        model=model,
+        summary=summary,
+        parameters=common_table(summary),
+        undetermined=UNDETERMINED,
+        spectrum=spectrum_table(summary),
+    )
+
+
+def common_table(summary: FleetPriorSummary) -> Table:
+    """Make a table of the mean and the standard deviation between robots of every geometric parameter."""
+    rows = ((one.name, one.unit, f"{one.mean:z.4f}", f"{one.deviation:.4f}") for one in summary.parameters)
+    return Table(("parameter", "unit", "mean", "between robots"), tuple(rows))
+
+
+def spectrum_table(summary: FleetPriorSummary) -> Table:
+    """Make a table of the standard deviation between robots of the joint correction's weights, by group."""
+    return Table(
+        ("weights", "between robots [deg]"), tuple((one.group, f"{one.deg:.5f}") for one in summary.spectrum)
+    )

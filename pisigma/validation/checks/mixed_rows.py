@@ -1,0 +1,320 @@
+"""Whether only some of the rows agree with a model, and the others belong to another setup."""
+
+import itertools
+import math
+from collections.abc import Iterator, Sequence
+from typing import Literal, NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float64
+from torch import Tensor
+
+from pisigma.measurement.dataset import Measurements
+from pisigma.measurement.sensors.registry import SENSORS
+from pisigma.robot.frame_fits import best_base, best_tool
+from pisigma.validation.checks.check import CheckedCalibration, RowsUnderModel
+from pisigma.validation.held_out.diagnostic import Diagnostic
+from pisigma.validation.setup_faults.cause import joined, length_text
+from pisigma.validation.setup_faults.ordered_rows import OrderedRows
+from pisigma.validation.setup_faults.populations import MIN_ROWS as MIN_ROWS_OF_TWO
+from pisigma.validation.setup_faults.populations import (
+    MIN_SHARE,
+    Populations,
+    find_populations,
+    two_populations,
+)
+from pisigma.validation.setup_faults.setup_fault import either
+from pisigma.validation.setup_faults.setup_faults import find_setup_faults
+
+MIN_WRONG_SHARE = 0.25
+"""Share of the rows above which it is not known which of them are wrong."""
+MIN_AGREEING_SHARE = 0.35
+"""Share of the rows that must agree with the model."""
+AGREES = 3.5
+"""Error over the expected one (model and sensor) up to which a row agrees with a model."""
+APART = 2.0
+"""Multiple of the limit `AGREES` above which a row belongs to another setup."""
+FAR_APART = 6.0
+"""Ratio of the median errors of both groups."""
+BETWEEN = 0.15
+"""Share of the rows that may be neither near nor far."""
+DRAWS, SAMPLE = 100, 4
+"""Number and size of the random samples that a base or a tool is fitted to, as are halves and every second row."""
+SPARE_ROWS = 3
+"""Rows that must agree with a fit in addition to those of its sample."""
+ADVICE = " No result is computed from all of them; measure again, or give each group its own file or frame."
+EXPLAINED = 2.5
+"""Error over the expected one up to which moved joint zeros explain all rows."""
+
+
+def check_mixed_rows(judged: RowsUnderModel) -> Iterator[Diagnostic]:
+    """Look for the largest set of rows that agrees with the model, with its base or tool as they are or fitted.
+
+    Bases and tools are fitted to random samples of rows (RANSAC: Fischler and Bolles 1981, Communications of the ACM
+    24(6)). If more than a quarter of the rows are far off while the others agree to the noise, rows of two setups are
+    mixed, or it is not known which are wrong. Moved joint zeros cause errors of all sizes, so they are fitted to all
+    rows first.
+    """
+    if not bool(torch.isfinite(judged.usual).all()):
+        return
+    found = [one for one in (_apart(judged, T) for T in _agreements(judged)) if one is not None]
+    if found and not _joints_explain(judged):
+        yield mixed_rows(judged, min(found, key=lambda far: int(far.sum())))
+
+
+def mixed_rows(judged: RowsUnderModel, wrong: Bool[Tensor, " rows"]) -> Diagnostic:
+    """Report that some rows do not agree with the others, what distinguishes them, and what explains them."""
+    found = many_wrong(judged.rows, wrong)
+    sentence = f"{found.sentence.removesuffix(ADVICE)}{_cause(judged, wrong)}{ADVICE}"
+    return found.model_copy(update={"sentence": sentence})
+
+
+def many_wrong(rows: Measurements, wrong: Bool[Tensor, " rows"]) -> Diagnostic:
+    """Report that more rows are wrong than can be left out."""
+    distinction = what_distinguishes(rows, wrong)
+    return Diagnostic(
+        kind="mixed_rows",
+        severity="implausible",
+        sentence=f"{int(wrong.sum())} of {rows.rows} rows do not agree with the others: "
+        f"{distinction.clause}.{ADVICE}",
+        rows=tuple(rows.place(row) for row in wrong.nonzero()[:, 0].tolist()),
+        values={"distinguished_by": distinction.by},
+    )
+
+
+def _cause(judged: RowsUnderModel, wrong: Bool[Tensor, " rows"]) -> str:
+    """Say what explains the wrong rows; empty if nothing does."""
+    faults = find_setup_faults(judged.model, None, judged.rows.select(wrong), judged.fitted)
+    if not faults:
+        return ""
+    fault = either(faults)
+    fall = joined(length_text(error) for error in (fault.before, fault.after))
+    return f" In these rows, {fault.clause} (errors without and with this correction: {fall})."
+
+
+def _agreements(judged: RowsUnderModel) -> Iterator[Float64[Tensor, "rows 4 4"]]:
+    """Yield the predicted poses, and those with a base or a tool that agrees with as many rows as possible."""
+    if not judged.fitted:
+        yield judged.unfitted
+    if len(set(judged.rows.frame)) > 1 or len(set(judged.rows.target)) > 1:
+        return
+    limit = AGREES * judged.usual
+    samples = list(_samples(judged.rows.rows))
+    for kind in ("base", "tool"):
+        best, most = None, SAMPLE + SPARE_ROWS - 1
+        for sample in samples:
+            chosen = sample
+            for _ in range(3):  # local optimisation: refit to all rows that agree
+                T = _fitted(judged, kind, chosen)
+                agreeing = judged.lengths(T) <= limit
+                chosen = agreeing.nonzero()[:, 0]
+                if len(chosen) < SAMPLE:
+                    break
+            if int(agreeing.sum()) > most:
+                best, most = T, int(agreeing.sum())
+        if best is not None:
+            yield best
+
+
+def _samples(rows: int) -> Iterator[Tensor]:
+    """Yield halves of the file, every second row, and small random samples."""
+    every, draw = torch.arange(rows), torch.Generator().manual_seed(0)
+    yield from (every[: rows // 2], every[rows // 2 :], every[::2], every[1::2])
+    for _ in range(DRAWS):
+        yield torch.randperm(rows, generator=draw)[:SAMPLE]
+
+
+def _fitted(judged: RowsUnderModel, kind: str, chosen: Tensor) -> Float64[Tensor, "rows 4 4"]:
+    """Predict the poses with the base or the tool fitted to some rows."""
+    some, measured = judged.unfitted[chosen], judged.measured.select(chosen)
+    if kind == "base":
+        return best_base(some, measured) @ judged.unfitted
+    return judged.unfitted @ best_tool(some, measured)
+
+
+def _apart(judged: RowsUnderModel, T: Float64[Tensor, "rows 4 4"]) -> Bool[Tensor, " rows"] | None:
+    """Find the rows that are far from what the others agree on; None if these are few or not clearly separated."""
+    ratio = judged.lengths(T) / (AGREES * judged.usual)
+    near, far = ratio <= 1, ratio > APART
+    count = judged.rows.rows
+    if not int(far.sum()) > MIN_WRONG_SHARE * count or not int(near.sum()) >= MIN_AGREEING_SHARE * count:
+        return None
+    if int((~near & ~far).sum()) > BETWEEN * count:
+        return None
+    return far if float(ratio[far].median()) > FAR_APART * float(ratio[near].median()) else None
+
+
+def _joints_explain(judged: RowsUnderModel) -> bool:
+    """Say whether moved joint zeros explain all rows (linearised at the fitted poses)."""
+    error = judged.measured.position - judged.predicted[:, :3, 3]
+    J = judged.zero_columns()[1][..., :3, 3].flatten(1).t()
+    solution = torch.linalg.lstsq(J, error.flatten(), driver="gelsd").solution
+    left = (error.flatten() - J @ solution).view(-1, 3).norm(dim=-1)
+    return float((left / judged.usual).square().mean().sqrt()) <= EXPLAINED
+
+
+CERTAIN = 30.0
+"""Log Bayes factor above which rows differ. For one arm, unmodelled gear errors and sag give factors of up to 90 with
+frames, and of up to 30 otherwise, but small differences."""
+LARGE = {"tool": 1.6, "frame": 2.2, "arm": 2.2}
+"""Errors over those without the difference above which there are two populations. For one arm (simulated with gear
+errors and sag, and measured: UR5, UR10, FANUC R-2000iC) the ratio is 1.3, 1.9 and 1.9 at most."""
+HARDLY_USED = 0.38
+"""Share of the values used up by parameters above which the ratios of one arm grow, because the best of many ways to
+split the rows overfits: 24 sets of 60 positions (share 0.35) have 1.7 at most, of 40 positions (0.5) 2.9, and arms of 7
+joints (0.63) 3.1."""
+IMPLAUSIBLE = 5.0
+"""The same ratio for a tool or a frame above which the calibration is wrong; for two arms it always is."""
+
+
+def check_two_populations(checked: CheckedCalibration) -> Iterator[Diagnostic]:
+    """Look for rows of another arm, tool or frame; if there are none, for two sizes of errors.
+
+    Up to a tenth of wrong rows are outliers, which the robust loss gives no weight; more need not be. A hybrid has
+    smaller residuals, so smaller differences show; but it absorbs a part of large ones, so both calibrations are
+    tested.
+    """
+    learned = checked.hybrid if checked.hybrid is not None and checked.hybrid.learned is not None else None
+    for result in (checked.geometric, learned):
+        ordered = None if result is None else OrderedRows.from_result(result)
+        found = None if ordered is None else find_populations(ordered, checked.rows.rows)
+        if found is not None and _differ(found):
+            yield _two_populations(checked.rows, found)
+            return
+    yield from _two_sizes(checked)
+
+
+def _two_sizes(checked: CheckedCalibration) -> Iterator[Diagnostic]:
+    """Report sensors whose residuals come from two normal populations."""
+    for sensor, errors in checked.final_errors.items():
+        residuals = np.asarray(errors)
+        residuals = residuals[np.isfinite(residuals).all(1)]
+        if len(residuals) < MIN_ROWS_OF_TWO or not (fit := two_populations(residuals)).are_distinct:
+            continue
+        unit = "mm" if SENSORS[sensor].unit == "m" else "mrad"
+        size, scatter = fit.off * 1e3, fit.scatter * 1e3
+        yield Diagnostic(
+            kind="two_populations",
+            severity="warning",
+            sentence=f"{fit.share:.0%} of the values of {sensor} are off by about {size:.2g} {unit}, while the "
+            f"others scatter by {scatter:.2g} {unit} per axis: many rows are wrong, or were measured under "
+            "different conditions; check whether a target or an instrument was moved or hit.",
+            cause="sizes",
+            values={"sensor": sensor, "share": fit.share},
+        )
+
+
+def _differ(found: Populations) -> bool:
+    """Say whether these are two populations, and not what unmodelled errors of one arm look like."""
+    return (
+        found.log_bayes_factor > CERTAIN
+        and found.factor > LARGE[found.differing] * max((1 - HARDLY_USED) / (1 - found.used), 1.0)
+        and int(found.second.sum()) >= MIN_SHARE * found.tried
+    )
+
+
+def _two_populations(rows: Measurements, found: Populations) -> Diagnostic:
+    """Report the rows of the smaller population, and how they differ from the others."""
+    second = torch.from_numpy(found.second)
+    distinction = what_distinguishes(rows, second)
+    size, moved = int(second.sum()), f"{length_text(math.hypot(*found.difference[:3]))}"
+    difference, advice = {
+        "arm": ("belong to another arm than the others", "Calibrate each robot with its own rows"),
+        "tool": (
+            f"belong to another target than the others, {moved} away on the tool",
+            "Name another target in these rows (column 'target'), or leave them out",
+        ),
+        "frame": (
+            "are in another frame than the others, because the instrument or the robot was moved",
+            "Name another frame in these rows (column 'frame'), or leave them out",
+        ),
+    }[found.differing]
+    implausible = found.differing == "arm" or found.factor > IMPLAUSIBLE
+    return Diagnostic(
+        kind="two_populations",
+        severity="implausible" if implausible else "warning",
+        sentence=f"Two populations are mixed: {size} of {found.tried} rows {difference} ({distinction.clause}); the "
+        f"errors of all rows together are {found.factor:.2g} times as large as separately. {advice}.",
+        rows=tuple(rows.place(row) for row in second.nonzero()[:, 0].tolist()),
+        cause=found.differing,
+        values={"factor": found.factor, "distinguished_by": distinction.by},
+    )
+
+
+MAX_PLACES = 8
+"""Rows that are listed one by one."""
+
+
+class Distinction(NamedTuple):
+    """What distinguishes some rows from the others.
+
+    Attributes:
+        by: "name", "range" (of the file), "period" (every n-th row), "value", or "nothing" if the rows are scattered.
+        clause: such as "all rows after rows.csv, line 8".
+    """
+
+    by: Literal["name", "range", "period", "value", "nothing"]
+    clause: str
+
+
+def what_distinguishes(rows: Measurements, some: Bool[Tensor, " rows"]) -> Distinction:
+    """Find a property that some rows have and all others do not."""
+    for distinction in (*_by_name(rows, some), *_by_order(rows, some), *_by_value(rows, some)):
+        return distinction
+    numbers = some.nonzero()[:, 0].tolist()
+    listed = joined(rows.place(number) for number in numbers[:MAX_PLACES])
+    more = f" and {len(numbers) - MAX_PLACES} more" if len(numbers) > MAX_PLACES else ""
+    return Distinction("nothing", f"{listed}{more}, which are scattered among the others")
+
+
+def _by_name(rows: Measurements, some: Bool[Tensor, " rows"]) -> Iterator[Distinction]:
+    """Compare the files, frames, targets and dates of the rows with those of the others."""
+    named: tuple[tuple[str, Sequence[str] | None], ...] = (
+        ("file", rows.origin),
+        ("frame", rows.frame),
+        ("target", rows.target),
+        ("date", rows.date),
+    )
+    for what, names in named:
+        if not names:
+            continue
+        here = {name for name, one in zip(names, some.tolist(), strict=True) if one}
+        there = {name for name, one in zip(names, some.tolist(), strict=True) if not one}
+        if here and there and not here & there:
+            yield Distinction("name", f"all rows of {what} {joined(sorted(here))}")
+
+
+def _by_order(rows: Measurements, some: Bool[Tensor, " rows"]) -> Iterator[Distinction]:
+    """Test whether the rows are a range of the file, or every n-th row."""
+    numbers = some.nonzero()[:, 0].tolist()
+    first, last = numbers[0], numbers[-1]
+    if last - first + 1 == len(numbers) and len(numbers) > 1:
+        if last == rows.rows - 1:
+            yield Distinction("range", f"{rows.place(first)} and all later rows")
+        elif first == 0:
+            yield Distinction("range", f"all rows up to {rows.place(last)}")
+        else:
+            yield Distinction("range", f"all rows from {rows.place(first)} to {rows.place(last)}")
+    steps = {later - earlier for earlier, later in itertools.pairwise(numbers)}
+    if len(steps) == 1 and len(numbers) > 2 and (step := steps.pop()) > 1 and first < step:
+        ordinal = {2: "second", 3: "third"}.get(step, f"{step}th")
+        if last + step >= rows.rows:
+            yield Distinction("period", f"every {ordinal} row, starting at {rows.place(first)}")
+
+
+def _by_value(rows: Measurements, some: Bool[Tensor, " rows"]) -> Iterator[Distinction]:
+    """Look for a temperature, a payload or a joint value that separates these rows from all others."""
+    columns: list[tuple[str, Tensor]] = []
+    if rows.temperature is not None:
+        columns.append(("a temperature", rows.temperature))
+    if rows.payload is not None:
+        columns.append(("a payload", rows.payload))
+    columns += [(f"joint {number}", one) for number, one in enumerate(rows.q.t(), 1)]
+    for what, values in columns:
+        here, there = values[some], values[~some]
+        if len(here) < 3 or len(there) < 3 or not bool(torch.isfinite(values).all()):
+            continue
+        for side, beyond in (("above", here.min() > there.max()), ("below", here.max() < there.min())):
+            if bool(beyond):
+                yield Distinction("value", f"all rows with {what} {side} that of the others")
