@@ -301,8 +301,10 @@ class PosteriorUpdate:
         deviation = torch.cat([group.deviation for group in drifted] or [values.y[:0]])
         self._index, self._deviation = index, deviation
         noise = values.deviation(drift.noise)
+        # Old uncertainty and drift are independent, so their roots are joined as columns.
         A = torch.cat([values.X @ root, values.X[:, index] * deviation], 1) / noise[:, None]
         y = values.y / noise
+        # Work in the smaller of both spaces: values (A A^T) or directions (A^T A).
         self._few = 2 * len(y) <= A.shape[1]
         if self._few:
             self._eigenvalues, U = torch.linalg.eigh(A @ A.t())
@@ -317,6 +319,7 @@ class PosteriorUpdate:
             z = torch.cholesky_solve((A.t() @ y)[:, None], self._L)[:, 0]
             self.effective = len(M) - float(torch.cholesky_inverse(self._L).trace())
         directions = root.shape[1]
+        # z is in units of the roots: the first part moves old unknowns, the second drifted ones.
         self.shift = root @ z[:directions]
         self.shift.index_add_(0, index, deviation * z[directions:])
 
@@ -332,6 +335,7 @@ class PosteriorUpdate:
             t = 1 + self._eigenvalues
             shrink = -1 / (t.sqrt() * (1 + t.sqrt()))
             root = R.addmm_((R @ self._along) * shrink, self._along.t())
+        # Every update adds columns; many of them are compressed to a triangle with the same product.
         if root.shape[1] <= MAX_DIRECTIONS * len(root):
             return root
         scale, factor = factored(lambda: root @ root.t())

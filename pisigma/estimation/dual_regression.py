@@ -57,6 +57,7 @@ class DualRegression(AbstractRegression):
         P, parameters, covariance, log_det = self.projection(prior, noise)
         active, precision = self.active, prior.precision
         variance = self.y.new_tensor(noise).square()[self.sensor]
+        # alpha = V^-1 (y - G parameters): weights and residuals both are products with it.
         alpha = P @ self.y
         x = torch.cat([parameters, (self.X.t() @ alpha)[active:] / precision[active:]])
         square = prior.of_groups(x.square() * prior.base)
@@ -64,12 +65,14 @@ class DualRegression(AbstractRegression):
         held = torch.zeros_like(x)
         held[:active] = 1 - precision[:active] * covariance.diagonal()
         determined = prior.of_groups(held)
+        # Both matrices are symmetric, so the trace of their product needs only one triangle.
         traces = self.K @ (P.flatten().index_select(0, self._pairs) * self._counts)
         determined[prior.classes :] = prior.sizes[prior.classes :].square() * traces
         stated = precision[:active]
         evidence = float(self.y @ alpha) + log_det - float(stated[stated > 0].log().sum())
         evidence += log_noise(self.sensors, noise) - float(variance.log().sum())
         misfit = self._by_sensor((variance * alpha).square())
+        # Residuals are variance · alpha; the leverage of a value is 1 - variance · P_ii.
         used = self._by_sensor(1 - variance * P.diagonal())
         return Posterior(x, -0.5 * evidence, prior, noise, square, determined, misfit, used)
 
@@ -84,6 +87,7 @@ class DualRegression(AbstractRegression):
         V = Z @ Z.t()
         V.diagonal().add_(1.0)
         factor = torch.linalg.cholesky(V)
+        # Parameters first, with the weights integrated out (V); then the weights, which follow the parameters.
         inner = torch.linalg.solve_triangular(factor, G, upper=False)
         normal = inner.t() @ inner
         normal.diagonal().add_(precision[:active])
@@ -142,6 +146,7 @@ class DualRegression(AbstractRegression):
         normal = G.t() @ along
         normal.diagonal().add_(prior.precision[:active])
         factor = factored(normal.clone)
+        # Determinant lemma: |V + G Λ^-1 G^T| |Λ| = |V| |G^T V^-1 G + Λ|.
         log_det += log_determinant(*factor)
         covariance = inverted(*factor)
         parameters = covariance @ (along.t() @ self.y)

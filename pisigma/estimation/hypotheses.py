@@ -180,22 +180,27 @@ class SessionEvidence:
             K = K + one.size**2 * Z @ Z.t()
         evidence = torch.empty(len(NOISE_FACTORS), dtype=torch.float64)
         raised = torch.empty(len(NOISE_FACTORS), len(self._groups), len(TRIED), dtype=torch.float64)
+        # One triangular solve per noise factor whitens values and all hypotheses at once.
         columns = torch.cat([self.values.y[:, None], *self._Z], 1)
         for row, noise_factor in enumerate(NOISE_FACTORS.tolist()):
             factor = covariance_factor(K + self._noise(noise_factor).square().diag())
             whitened = torch.linalg.solve_triangular(factor, columns, upper=False)
             evidence[row] = -0.5 * whitened[:, 0].square().sum() - factor.diagonal().log().sum()
+            # Log-normal prior of the noise factor: few sessions have noise far from that of the calibration.
             evidence[row] -= 0.5 * (math.log(noise_factor) / NOISE_SPREAD) ** 2
             raised[row] = self._raised(whitened[:, 0], whitened[:, 1:])
         joint = evidence[:, None, None] + raised
         nothing = evidence.logsumexp(0)
+        # Average over noise factors and sizes: a hypothesis must not win by a size chosen afterwards.
         log_odds = joint.logsumexp((0, 2)) - math.log(len(TRIED)) - nothing
         log_odds -= torch.tensor([group.log_prior_penalty for group in self._groups], dtype=torch.float64)
+        # What is known to have moved is not a further hypothesis.
         log_odds[[self._groups.index(one.group) for one in motions]] = -math.inf
         log_odds = torch.cat([log_odds, log_odds.new_zeros(1)])
         *probability, unchanged = log_odds.softmax(0).tolist()
         sizes = TRIED[joint.logsumexp(0).argmax(1)].tolist()
         compared = [Motion(*one) for one in zip(self._groups, sizes, probability, strict=True)]
+        # The noise factor of the explanation: without further motion if none is needed, else with all of them.
         likely = evidence if unchanged >= CERTAIN else joint.logsumexp((1, 2))
         return Explanation(
             motions=tuple(motions),
@@ -211,6 +216,7 @@ class SessionEvidence:
         """Return the gain of log evidence for every group and size; columns in the metric of all other variances."""
         raised = torch.empty(len(self._groups), len(TRIED), dtype=torch.float64)
         widths = torch.tensor([Z.shape[1] for Z in self._Z])
+        # Groups of one unknown are all evaluated in one product; the others need an eigendecomposition each.
         single = widths == 1
         columns = W[:, single.repeat_interleave(widths)]
         eigenvalues = columns.square().sum(0)

@@ -72,6 +72,7 @@ class Population:
         """
         root = torch.linalg.cholesky(self.covariance)
         information, axes = torch.linalg.eigh(root.t() @ robot.normal @ root)
+        # Directions that the rows of this robot hardly determine say nothing about it.
         identified = information > 0.1
         along = axes.t() @ (root.t() @ (robot.descent - robot.normal @ self.mean))
         squares = along.square() / (information + information.square())
@@ -80,6 +81,7 @@ class Population:
     def log_evidence(self, robot: Information) -> float:
         """Return the log probability of a robot's rows, up to a constant of the robot."""
         root = torch.linalg.cholesky(self.covariance)
+        # In units of the population, prior and information add up without inverting the covariance.
         factor = torch.linalg.cholesky(torch.eye(len(root)).to(root) + root.t() @ robot.normal @ root)
         at_mean = robot.normal @ self.mean
         right = torch.linalg.solve_triangular(
@@ -111,6 +113,7 @@ def without_outliers(
         population = expectation_maximisation(chosen, start, usual, SEARCH_CLASS_ROBOTS, SEARCH_STEPS)
         surprises = [population.surprise(one) for one in evidence]
         ratios = sorted(square / max(count, 1) for square, count in surprises)
+        # The chosen half scatters less than all robots, so the median robot sets the unit.
         unit = max(ratios[len(ratios) // 2], 1.0)
         now = [
             number
@@ -130,6 +133,7 @@ def _nearest_to_median(evidence: Sequence[Information], start: Population) -> li
     inverses = torch.linalg.inv(torch.stack([one.normal for one in evidence]) + precision)
     x = torch.einsum("rij,rj->ri", inverses, torch.stack([one.descent for one in evidence]))
     median = x.median(0).values
+    # Scatter by the median deviation, which outliers do not move, plus what the rows leave undetermined.
     scatter = (x - median).abs().median(0).values.square() + inverses.diagonal(dim1=1, dim2=2).mean(0)
     population = Population(median, scatter.diag(), start.geometric)
     distances = [square / max(count, 1) for square, count in map(population.surprise, evidence)]

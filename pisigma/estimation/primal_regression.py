@@ -111,6 +111,7 @@ class PrimalRegression(AbstractRegression):
 
         if not self.latest or self.latest[0].prior is not prior or self.latest[0].noise != noise:
             return_free_memory(len(prior.base))
+            # The matrix may take gigabytes, so the memory of the previous factor is used again.
             memory = self.latest.pop().inverse.mT if self.latest else torch.empty_like(self.normal[0])
             descent = torch.zeros_like(self.descent[0])
             for b, sigma in zip(self.descent, noise, strict=True):

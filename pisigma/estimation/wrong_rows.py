@@ -83,6 +83,7 @@ def _suspects(explained: Explained[What]) -> list[dict[int, float]]:
         if number in values.wrong or not bool(chosen.any()):
             continue
         sigma = explained.deviation[chosen]
+        # The block of V^-1 is the precision of these values given all others: they are judged as if left out.
         eigenvalues, U = torch.linalg.eigh(inverse[chosen][:, chosen] * sigma * sigma[:, None])
         squares = (U.t() @ (a[chosen] * sigma)).square() / eigenvalues.clamp(min=1e-300)
         raised = gains(FACTORS, eigenvalues.clamp(min=0.0), squares)

@@ -48,11 +48,13 @@ class BoardSight:
         in_camera = corners @ T[:, :3, :3].mT + T[:, None, :3, 3]
         by_point = torch.from_numpy(self.camera.project(in_camera.numpy())[1])
         origin = T_frame_target[:, None, :3, 3]
+        # A camera on the flange moves against the board, so the sign and the axes change.
         if self.is_fixed:
             by_shift, lever = by_point, in_camera - origin
         else:
             by_shift, lever = -by_point @ T[:, None, :3, :3], corners - origin
         J = torch.cat([by_shift, -by_shift @ skew(lever)], -1)
+        # Cramér-Rao bound of the pose from all corners; the repeatability of the robot is independent of it.
         covariance = self.corner_noise**2 * torch.linalg.inv(torch.einsum("ncki,nckj->nij", J, J))
         variances = [self.repeatability.length**2] * 3 + [self.repeatability.angle**2] * 3
         lower = torch.linalg.cholesky(covariance + torch.diag(covariance.new_tensor(variances)))

@@ -207,6 +207,7 @@ class PoseSelection:
         rows = self._B[self.chosen].flatten(0, 1)
         information = torch.eye(rows.shape[1]).to(rows) + rows.t() @ rows
         self._C = torch.cholesky_inverse(torch.linalg.cholesky(information))
+        # C is the covariance of the unknowns; S is what every candidate would still learn.
         along = self._B @ self._C
         self._S = along @ self._B.mT  # covariance of the values of every candidate
         self._X = along @ self._goal.t() if self._criterion == "I" else self._B[..., :0]  # with the task
@@ -215,6 +216,7 @@ class PoseSelection:
     def _change(self, number: int, sign: float) -> _Change | None:
         """Compute the effect of adding (+1) or removing (-1) a candidate; None if removing it loses all digits."""
         G = self._C @ self._B[number].t()
+        # Woodbury: a pose changes C by rank k only, the number of its values.
         here = torch.eye(G.shape[1]).to(G) + sign * self._B[number] @ G
         lower, failed = torch.linalg.cholesky_ex(here)
         if sign < 0 and (int(failed) or float(lower.diagonal().min()) < MIN_REMAINING):

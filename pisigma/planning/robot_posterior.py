@@ -198,6 +198,7 @@ class RobotPosterior:
             away = forward_kinematics(geometry.robot, self.moved(q))[:, :3, 3] - q.new_tensor(
                 instrument.anchor
             )
+            # A wire measures the motion along its direction only.
             columns = (away / away.norm(dim=1, keepdim=True))[:, None] @ columns[:, :3] / instrument.sigma
         elif instrument.kind == "position":
             columns = columns[:, :3] / instrument.sigma
@@ -226,6 +227,7 @@ class RobotPosterior:
         wide = torch.diag(torch.tensor(WIDE_PRIOR, dtype=torch.float64))
         blank = arm.new_zeros(len(wide), arm.shape[1])
         zeros = [rows.new_zeros(len(rows), len(wide)) for rows in (arm, weights)]
+        # The new base and tool are independent of the arm: their wide prior is added as a diagonal block.
         rows = [torch.cat(pair, 1) for pair in ((arm, zeros[0]), (blank, wide), (weights, zeros[1]))]
         root = CovarianceRoot(torch.cat(rows))
         return replace(
@@ -263,6 +265,7 @@ class RobotPosterior:
             turned = rotation_vector(rows.rotation @ T[:, :3, :3].mT) / instrument.sigma_rotation
             r = torch.cat([r, turned], 1)
         B = self.measured(rows.q)[:, : r.shape[1]]
+        # Predictive covariance of a row: uncertainty of the model plus noise, in units of the noise.
         lower = torch.linalg.cholesky(B @ B.mT + torch.eye(r.shape[1]).to(r))
         white = torch.linalg.solve_triangular(lower, r[..., None], upper=False)[..., 0]
         surprise: Tensor = white.square().mean(1).sqrt()

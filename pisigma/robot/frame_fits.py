@@ -144,6 +144,7 @@ def best_base_and_tool(
         measured: measured poses.
     """
     base, tool = _affine_base_and_tool(T, measured)
+    # The closed form minimises another norm than the errors, so a few steps of Levenberg-Marquardt follow.
     damping = torch.full_like(T[..., 0, 0, 0], INITIAL_DAMPING)
     cost = measured.squares(base[..., None, :, :] @ T @ tool[..., None, :, :]).sum(-1)
     for _ in range(MAX_ITERATIONS):
@@ -152,6 +153,7 @@ def best_base_and_tool(
         new_cost = measured.squares(new_base[..., None, :, :] @ T @ new_tool[..., None, :, :]).sum(-1)
         better = new_cost < cost
         converged = bool(((cost - new_cost).abs() <= CONVERGENCE_TOLERANCE * cost).all())
+        # Every batch accepts or rejects its own step.
         base = torch.where(better[..., None, None], new_base, base)
         tool = torch.where(better[..., None, None], new_tool, tool)
         cost, damping = torch.minimum(cost, new_cost), torch.where(better, damping / 10, damping * 10)
@@ -228,6 +230,7 @@ def _affine_base_and_tool(
     else:
         R_base = best_base(T, measured)[..., :3, :3]
     eye = torch.eye(3).to(T).expand(R.shape)
+    # With both rotations known, the two translations are a linear problem.
     J = torch.cat([eye, R_base[..., None, :, :] @ R], -1).flatten(-3, -2)
     wanted = (position - p @ R_base.mT).flatten(-2)[..., None]
     # Base and tool translations are not separable if all orientations are equal.

@@ -139,9 +139,11 @@ class NormalEquations(PrimalRegression, AbstractDesignRegression):
         normal = sum(N[new] * sigma**-2 for N, sigma in zip(self.normal, posterior.noise, strict=True))
         descent = sum(b * sigma**-2 for b, sigma in zip(self.descent, posterior.noise, strict=True))
         square = sum(total / sigma**2 for total, sigma in zip(self.square, posterior.noise, strict=True))
+        # Schur complement: what remains of the new columns after fitting the old ones.
         cross = normal[:, old]
         root = solved.inverse @ (cross * solved.scale).t()
         rest = square - float(descent[old] @ solved.x)
+        # The remaining square counts once with unit noise, because sensors were already weighted by their noise.
         alone = PrimalRegression(
             normal=(normal[:, new] - root.t() @ root)[None],
             descent=(descent[new] - cross @ solved.x)[None],
@@ -172,6 +174,7 @@ def _add_sums(design: Design, sensor: SensorValues, N: Tensor, b: Tensor) -> flo
         square += float((y.square() * w[:, None]).sum())
         sides = [(_feature_columns(design, row[rows]), joints[rows]) for row, joints in sensor.sides if count]
         for f, J in sides:
+            # A weight moves joint j by the feature f, so its column is f · J_j: all blocks are products of f and J.
             Jw = J * w[:, None, None]
             along, pull = Jw.mT @ G, torch.einsum("rcj,rc->rj", Jw, y)
             for g, other in sides:
@@ -184,6 +187,7 @@ def _add_sums(design: Design, sensor: SensorValues, N: Tensor, b: Tensor) -> flo
                 block = slice(active + j * count, active + (j + 1) * count)
                 normal[:active, block].addmm_(along[:, j].t(), f[:, j])
                 descent[block].addmv_(f[:, j].t(), pull[:, j])
+    # Not every joint uses every feature: unused weights are computed with the blocks and left out here.
     order = torch.cat([torch.arange(active), active + _places(design, dof, count)])
     for rows in chunks(size):
         corner = normal[rows, rows]

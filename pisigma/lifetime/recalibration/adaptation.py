@@ -138,10 +138,12 @@ def adapt(
         rounds += 1
         rows = linearised(design, x, effective, group)
         values = replace(linear_values(problem, rows), wrong=wrong)
+        # Sizes of the drift and wrong rows first: both decide how far the posterior may follow the values.
         search = _searched(problem, values, drift, usual)
         drift, wrong = search.drift, search.values.wrong
         values = replace(values, wrong=wrong)
         update = PosteriorUpdate(problem.root, values, drift)
+        # Convergence is judged by predicted values, as badly determined unknowns may still wander.
         step = values.X @ (mean + update.shift - x) / values.deviation(drift.noise)
         x, effective = mean + update.shift, update.effective
         if float(step.square().mean().sqrt()) < CONVERGENCE_TOLERANCE:

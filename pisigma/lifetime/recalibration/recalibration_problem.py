@@ -121,7 +121,9 @@ def recalibration_problem(
     parameters = len(posterior.space.parameters)
     root[posterior.positions_in(space)] = posterior.root[:parameters]
     for group, name in new & known:
+        # The posterior says nothing on a frame that was moved; a wide drift group replaces it.
         root[frame_slice(space, group, name)] = 0.0
+    # The stored posterior is in the user's coordinates, the problem in those of its anchors.
     root[: len(start)] = torch.linalg.pinv(change) @ root[: len(start)]
     root[len(start) :] = posterior.root[parameters:]
     mean = torch.cat([torch.zeros_like(start), posterior.weights])

@@ -160,6 +160,7 @@ class ControllerValues:
         )
         allowed = ~excluded & np.isfinite(every).all(-1)
         if near is None:
+            # Without a previous posture, the order of the branches of the model decides.
             cost = np.argsort(self.ik.order)[None].astype(float)
         else:
             cost = np.abs(every - np.broadcast_to(near, q.shape)[outside].reshape(-1, 1, q.shape[-1])).sum(-1)
@@ -228,14 +229,17 @@ def solve(motion: Motion, T: Float64[np.ndarray, "rows 4 4"], start: Values) -> 
     """
     q = start.copy()
     weight = np.ones(6)
+    # Fewer than six axes cannot set the tilt; a small weight only keeps the arm from tilting freely.
     weight[3:5] = 1.0 if q.shape[1] >= 6 else IGNORED_WEIGHT
     error, J = _errors(motion, T, q)
     for _ in range(tolerances.MAX_ITERATIONS):
         A, b = J * weight[:, None], error * weight
         normal = A.mT @ A
+        # Damping vanishes with the error, so convergence is quadratic near the solution.
         damping = 1e-3 * (b * b).sum(-1) + 1e-15
         normal += damping[:, None, None] * np.eye(q.shape[1])
         step = np.linalg.solve(normal, (A.mT @ b[..., None]))[..., 0]
+        # Long steps leave the region in which the linearisation is valid.
         q = q + np.clip(step, -0.5, 0.5)
         error, J = _errors(motion, T, q)
         if np.abs(step).max(initial=0.0) < 1e-13:

@@ -76,6 +76,8 @@ class NumericArm:
         The joint values are wrapped near the starts. Poses that cannot be reached exactly are solved within the
         tolerances of the axes.
         """
+        # The first Jacobian neglects the derivative of the correction, which suffices for most poses and is cheaper;
+        # the exact one finishes those that came near.
         q, reached = start, torch.zeros(len(T), dtype=torch.bool)
         near, rounds = ~reached, tolerances.MAX_ITERATIONS
         for motion in self.motions:

@@ -167,9 +167,11 @@ class RowModel:
         kept = self.kept[self._row].nonzero()[:, 0]
         P, _, determined = self._projection(kept)
         self._leave_one_out(self.kept.nonzero()[:, 0], kept, P, square, count, errors)
+        # The row itself must not enter the scale that it is compared with.
         left = CLASS_VALUES + len(kept) - determined - torch.where(self.kept, count, 0.0)
         misfit = self.misfit
         whole = ((CLASS_VALUES + misfit - torch.where(self.kept, square, 0.0)) / left).clamp(min=1.0)
+        # For rows that do not count, the scale is at least the one that left-out errors of the kept rows show.
         each = float((CLASS_VALUES + square.sum()) / (CLASS_VALUES + count.sum()))
         scale = torch.where(self.kept, whole, whole.clamp(min=each))
         for row in (~self.kept).nonzero()[:, 0]:
@@ -188,6 +190,7 @@ class RowModel:
         for row in rows.tolist():
             chosen = (self._row[values] == row).nonzero()[:, 0]
             sigma = self.sigma[values[chosen]]  # makes lengths and angles comparable
+            # P_ii is singular in directions that only this row determines; these cannot be judged.
             strength, axes = torch.linalg.eigh(P[chosen][:, chosen] * sigma * sigma[:, None])
             certain = strength > DETERMINED
             along = axes.t() @ (sigma * pull[chosen])

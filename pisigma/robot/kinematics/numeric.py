@@ -338,8 +338,10 @@ def approach_preferred(
         if not active.any():
             break
         error, J = task.errors(T, best)
+        # Where the joints would go without the pose; a joint at its limit (scale 0) no longer moves.
         pull = torch.where(scale > 0, share * (preferred - best), 0.0)
         A = rows[:, None] * J * scale[:, None]
+        # What the pull changes at the tool is undone by the smallest scaled motion that reaches the pose.
         left = rows * (error - (J @ pull[..., None])[..., 0])
         small = A @ A.mT
         floor = 4 * torch.finfo(A.dtype).eps * small.diagonal(dim1=-2, dim2=-1).sum(-1)

@@ -32,6 +32,7 @@ def base_and_tool_starts(robot: Robot, problem: BaseToolProblem) -> Iterator[Bas
     like = problem.position
     R_tool, R_base = (rotation_from_rpy(like.new_tensor(frame[3:])) for frame in (robot.tool, robot.base))
     point, p_base = like.new_tensor(robot.tool[:3]), like.new_tensor(robot.base[:3])
+    # Rows with a rotation determine both frames; positions of several targets share a base only, so one target is used.
     rows = problem.rotated if problem.has_rotations else problem.target == problem.target.mode().values
     R_flange, p_flange = problem.R_flange[rows], problem.p_flange[rows]
     position, rotation = problem.position[rows], problem.rotation[rows]
@@ -47,6 +48,7 @@ def base_and_tool_starts(robot: Robot, problem: BaseToolProblem) -> Iterator[Bas
             ]
         )
     elif not problem.free_tool:
+        # With a known tool, the base is a rigid transform between two sets of points (Procrustes).
         arm = p_flange + R_flange @ point
         R_fitted = _procrustes(arm, position)
         if problem.has_rotations:
@@ -84,6 +86,7 @@ def start_from_poses(
         R_base, p_base [m], R_tool, p_tool [m].
     """
     rows = R_flange.shape[0]
+    # K maps the flattened inverse rotation of the tool to the flattened rotation of the base.
     K = torch.einsum("nab,ncd->acbd", rotation, R_flange).reshape(9, 9) / rows
     _, singular, Vh = torch.linalg.svd(K)
     leading = Vh[0].reshape(3, 3)
@@ -99,6 +102,7 @@ def start_from_poses(
         agreement = ((R_base.reshape(-1, 9) @ K) * Z.reshape(-1, 9)).sum(-1)
         if (agreement - before).abs().max() < 1e-12:
             break
+    # The first of the equally good ones: the nominal tool comes first, then the singular vectors.
     best = int((agreement > agreement.max() - 1e-9).nonzero()[0, 0])
     p_base, p_tool = _translations(R_base[best], R_flange, p_flange, position)
     return R_base[best], p_base, Z[best].mT, p_tool

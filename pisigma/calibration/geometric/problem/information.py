@@ -72,6 +72,7 @@ class Information:
         if not nuisance and not silent:
             return self
         taken = self.jacobian[:, [*nuisance, *silent]]
+        # Columns have different units, so they are scaled before their rank is decided.
         lengths = np.linalg.norm(taken, axis=0)
         U, singular, _ = np.linalg.svd(taken / np.where(lengths > 0, lengths, 1.0), full_matrices=False)
         U = U[:, singular > DEPENDENT * singular.max(initial=0.0)]
@@ -80,6 +81,7 @@ class Information:
         sizes = np.linalg.norm(rest, axis=0)
         for _ in range(2):  # twice is enough: one projection leaves rounding errors of the size of the column
             rest = rest - U @ (U.T @ rest)
+        # What is left of a dependent column is rounding, which must not look identifiable.
         rest[:, np.linalg.norm(rest, axis=0) <= DEPENDENT * sizes] = 0.0
         rest[:, [kept.index(column) for column in silent]] = 0.0
         root: np.ndarray = np.linalg.qr(rest, mode="r")  # type: ignore[assignment]
@@ -117,11 +119,13 @@ def information(
             if not problem.measured_everywhere[k]:
                 present = sensor.present[rows]
                 J, r, weight = J[..., present], r[:, present], weight[present]
+            # Residual and weight are two more columns, so that R contains misfit and weighted means as well.
             block = r.new_empty((len(candidates) + 2, *r.shape))
             torch.mul(J, weight, out=block[:-2])
             torch.mul(r, weight, out=block[-2])
             block[-1] = weight
             blocks.append(block.flatten(1))
+        # R has the same J^T J as all rows so far and replaces them: memory does not grow with the rows.
         blocks = [torch.linalg.qr(torch.cat(blocks, 1).t(), mode="r").R.t()]
     usual = np.append(problem.space.usual_errors[candidates], (1.0, 1.0))
     present = torch.stack([sensor.present for sensor in problem.sensors]).any(0)

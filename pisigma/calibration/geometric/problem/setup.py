@@ -346,6 +346,7 @@ def coordinate_change(
     change = torch.eye(len(point), dtype=point.dtype)
     for k, anchor in enumerate(anchors.bases.cpu()):
         first = space.indices_of("base").start + 6 * k
+        # Shifts of a base are in the axes of its anchor.
         change[first : first + 3, first : first + 3] = anchor[:3, :3]
         # Angular velocities agree in both coordinates up to the anchor; the axes convert them from and to rpy.
         back = torch.linalg.pinv(turning_axes(user_bases[k, 3:]), rtol=1e-9)
