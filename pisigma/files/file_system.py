@@ -54,7 +54,7 @@ def check_local(folder: Path) -> None:
             expected="a folder on a local disk, because locks of network file systems cannot protect a history",
             value=kind,
             at=Place(folder),
-            remedy="move it to a local disk; `pisigma pack` and `pisigma unpack` copy a cell",
+            remedy="copy it to a local disk",
         )
 
 

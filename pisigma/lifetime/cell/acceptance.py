@@ -8,6 +8,7 @@ from pisigma.lifetime.cell.history import Event
 from pisigma.validation.held_out.model_comparison import QuantityErrors
 from pisigma.validation.iso9283.repeats import CYCLES, RepeatedPose
 from pisigma.validation.uncertainty.budget import UncertaintyBudget
+from pisigma.validation.uncertainty.components import SCATTER
 from pisigma.validation.uncertainty.instrument import Instrument
 
 EXPLAINED = 0.999
@@ -93,11 +94,11 @@ class Acceptance:
     def contradicted(self) -> bool:
         """Whether the measured errors are larger than the budget explains, beyond chance.
 
-        The mean square of the measured coordinates over `u_c²` then exceeds the quantile `EXPLAINED` of the F
-        distribution. Its degrees of freedom are the number of rows, as the coordinates of a row may be correlated, and
-        those of the budget.
+        It is False for a budget without the scatter of the calibration. Otherwise the mean square of the measured
+        coordinates over `u_c²` is compared with the quantile `EXPLAINED` of the F distribution. Its degrees of freedom
+        are the number of rows, as the coordinates of a row may be correlated, and those of the budget.
         """
-        if self.measured is None or not self.budget.components:
+        if self.measured is None or all(one.name != SCATTER for one in self.budget.components):
             return False
         from scipy import stats
 

@@ -16,6 +16,8 @@ from pisigma.validation.held_out.calibration_summary import CalibrationSummary, 
 from pisigma.validation.uncertainty.budget import Component, UncertaintyBudget
 from pisigma.validation.uncertainty.instrument import Instrument
 
+SCATTER = "scatter that the model leaves"
+"""Name of the component that makes a budget comparable with measured errors."""
 POSITION = "position"
 """Sensor whose residuals are coordinates."""
 
@@ -25,9 +27,10 @@ def uncertainty_budget(
     poses: Measurements | None,
     where: str,
     instrument: Instrument,
-    temperatures: "Mapping[str, float | None]",
+    temperatures: Mapping[str, float | None],
     made_of: Sequence[str],
     expansion_per_k: float | None,
+    repeatability_mm: float | None = None,
 ) -> UncertaintyBudget:
     """Compose the budget of one coordinate of the tool's position, with the correction active.
 
@@ -43,10 +46,14 @@ def uncertainty_budget(
         temperatures: mean temperature of every session [deg C], by its name; None where the rows do not state it.
         made_of: names of the sessions that the model was fitted to.
         expansion_per_k: coefficient of linear expansion of the arm [1/K]; None if it is not stated.
+        repeatability_mm: pose repeatability RP of the maker [mm], which counts where the scatter is not known; None if
+            it is not stated.
     """
+    scatter = scatter_component(model)
     found = (
         parameter_component(model, poses, where),
-        scatter_component(model),
+        scatter,
+        *([repeatability_component(repeatability_mm)] if isinstance(scatter, str) else []),
         instrument_component(instrument),
         thermal_component(model, temperatures, made_of, expansion_per_k),
     )
@@ -85,11 +92,28 @@ def scatter_component(model: CalibratedModel) -> Component | str:
     """
     sigma = math.nan if model.uncertainty is None else model.uncertainty.noise.absolute(POSITION)
     if math.isnan(sigma):
-        return "scatter: the calibration did not estimate the standard deviation of a coordinate."
+        return f"{SCATTER}: the calibration did not estimate the standard deviation of a coordinate."
     noise = _noise(model)
     values = "" if noise is None else f" of {noise.values} coordinates"
     source = f"residuals{values} of the calibration; repeatability and noise of the instrument included"
-    return Component("scatter that the model leaves", "A", sigma, _freedom(model), source)
+    return Component(SCATTER, "A", sigma, _freedom(model), source)
+
+
+def repeatability_component(repeatability_mm: float | None) -> Component | str:
+    """Evaluate the repeatability that the maker states, where no residuals of coordinates contain it.
+
+    Distances l from the barycentre of independent normal errors with the standard deviation σ along every axis have the
+    mean `σ √(8/π)` and the variance `σ² (3 - 8/π)`, so that `RP = l̄ + 3 S_l` of ISO 9283:1998, 7.2.2 is `3.62 σ`.
+
+    Args:
+        repeatability_mm: pose repeatability RP [mm]; None if it is not stated.
+    """
+    if repeatability_mm is None:
+        return "repeatability: pose_repeatability_mm in cell.yaml."
+    u = repeatability_mm / 1e3 / (math.sqrt(8 / math.pi) + 3 * math.sqrt(3 - 8 / math.pi))
+    return Component(
+        "repeatability", "B", u, math.inf, f"RP = {repeatability_mm:g} mm of the maker, cell.yaml"
+    )
 
 
 def instrument_component(instrument: Instrument) -> Component | str:

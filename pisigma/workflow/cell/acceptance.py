@@ -16,6 +16,8 @@ from pisigma.workflow.cell.cell import Cell
 from pisigma.workflow.cell.sessions import ModelRows
 from pisigma.workflow.evaluate import evaluate
 
+JUDGED = frozenset(("position", "rotation", "pose", "corner"))
+"""Kinds of readings that give positions."""
 NO_SESSION = "no session that the model was not fitted to was measured since its calibration."
 
 
@@ -60,6 +62,7 @@ def acceptance_of(cell: Cell) -> Acceptance:
         temperatures,
         made_of,
         document.expansion_per_k,
+        document.pose_repeatability_mm,
     )
     return Acceptance(
         model=entry.name,
@@ -79,6 +82,8 @@ def _measured(
     cell: Cell, entry: ModelEntry, session: SessionEntry, seen: ModelRows
 ) -> tuple[MeasuredAccuracy | None, str]:
     """Evaluate the model on a session; return a reason if that is not possible."""
+    if others := seen.rows.kinds - JUDGED:
+        return None, f"session {session.name} has readings without a position ({', '.join(sorted(others))})."
     settings = seen.settings_to_fit(cell.file.settings("evaluate"))
     try:
         found = evaluate(cell.model_folder(entry.name), seen.rows, settings)

@@ -15,10 +15,12 @@ from pisigma.measurement.dataset import Measurements
 from pisigma.model.accuracy import deviation_of_rows
 from pisigma.model.calibrated_model import poses_of_rows
 from pisigma.robot.kinematics.forward import forward_kinematics
+from pisigma.validation.iso9283.pose import position_repeatability
 from pisigma.validation.uncertainty.budget import Component
 from pisigma.validation.uncertainty.components import (
     instrument_component,
     parameter_component,
+    repeatability_component,
     thermal_component,
     uncertainty_budget,
 )
@@ -63,6 +65,14 @@ def test_thermal_expansion_is_that_of_the_reach(temperatures, kelvin):
 )
 def test_thermal_expansion_is_not_guessed(temperatures, expansion):
     assert isinstance(thermal_component(model_before(), temperatures, ("a",), expansion), str)
+
+
+def test_the_repeatability_of_the_maker_is_that_of_its_axes():
+    errors = 0.02 * torch.randn(200_000, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    found = repeatability_component(float(position_repeatability(errors)))
+    assert_close(found.standard_uncertainty, 0.02e-3, rtol=0.005)
+    assert found.evaluation == "B"
+    assert isinstance(repeatability_component(None), str)
 
 
 def test_the_parameters_are_those_of_the_posterior():
