@@ -16,13 +16,13 @@ from torch import Tensor
 
 from pisigma.calibration.geometric.calibrator import GeometricCalibrator
 from pisigma.calibration.geometric.prediction import predicted_poses
-from pisigma.calibration.geometric.problem.noise import view_of
+from pisigma.calibration.geometric.problem.noise import sensor_view_of
 from pisigma.calibration.geometric.problem.setup import identified_geometry
 from pisigma.calibration.geometric.result import SolvedCalibration
 from pisigma.calibration.hybrid.calibrator import HybridCalibrator
 from pisigma.calibration.hybrid.design import Design
-from pisigma.calibration.hybrid.refinement import Refined, linearised, network
-from pisigma.calibration.hybrid.regression import regression
+from pisigma.calibration.hybrid.refinement import Refined, linearise_rows, network
+from pisigma.calibration.hybrid.regression import build_regression
 from pisigma.estimation.prior import GaussianPrior
 from pisigma.joint_correction.feature import AbstractFeature
 from pisigma.joint_correction.input_products import InputProducts
@@ -56,21 +56,21 @@ def fitted(
 ) -> Refined:
     """Return the hybrid with some features, with prior sizes estimated or given."""
     problem, group = solved.problem, held_out_groups(solved.setup.measurements)
-    view, design = view_of(solved.solution.linearisation), Design(problem, features)
+    view, design = sensor_view_of(solved.solution.linearisation), Design(problem, features)
     x = torch.zeros(design.unknowns, dtype=torch.float64)
     x[: design.active] = (solved.solution.linearisation.point - problem.nominal)[problem.active]
     noise, sizes = tuple(view.noise.tolist()), prior or design.prior(view.prior_scale.tolist())
     effective = float(design.active)
     for _ in range(ROUNDS):
-        fit = regression(design, linearised(design, x, effective, group))
+        fit = build_regression(design, linearise_rows(design, x, effective, group))
         if prior is None:
             posterior = fit.maximise_evidence(sizes, noise)
         else:
             posterior = fit.solve(prior, noise)
             posterior = fit.solve(prior, fit.updated_noise(posterior))
         x, sizes, noise, effective = posterior.x, posterior.prior, posterior.noise, posterior.effective
-    rows = linearised(design, posterior.x, posterior.effective, group)
-    fit = regression(design, rows)
+    rows = linearise_rows(design, posterior.x, posterior.effective, group)
+    fit = build_regression(design, rows)
     there = fit.solve(posterior.prior, posterior.noise)
     there = fit.solve(posterior.prior, fit.updated_noise(there))
     point = problem.nominal.index_add(0, problem.active, there.x[: design.active])
@@ -98,7 +98,7 @@ def error(solved: SolvedCalibration, refined: Refined, rows: Measurements) -> fl
     geometry = identified_geometry(solved.setup, refined.point)
     rows = named(rows, "c")
     with torch.no_grad():
-        moved = replace(rows, q=rows.q + refined.correction.of_rows(rows))
+        moved = replace(rows, q=rows.q + refined.correction.for_rows(rows))
     T: Tensor = predicted_poses(geometry.robot, geometry.bases, geometry.tools, moved)
     measured = MeasuredPoses.from_tensors(rows.position, rows.rotation, LEVER_SHARE * geometry.robot.reach)
     T, _ = fit_frames(T, measured, rows, ("base", "tool"))

@@ -102,7 +102,7 @@ class Fleet:
         q, task = (torch.from_numpy(arm.sample(many, 4242 + many)) for many in (1000, 200))
         base = np.array([*arm.base[1], *np.deg2rad([130.0, 2.0, 1.0])])
         tool = np.array([*arm.tool, 0.0, 0.0, 0.0])
-        posterior = RobotPosterior.of_model(prior, self.instrument).with_unknown_base_and_tool(base, tool)
+        posterior = RobotPosterior.from_model(prior, self.instrument).with_unknown_base_and_tool(base, tool)
         chosen: Tensor = q[select_poses(posterior.measured(q), posterior.tool(task), count)]
         return chosen.numpy()
 

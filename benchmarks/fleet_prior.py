@@ -43,7 +43,7 @@ def rms(predicts: Any, test: Measurements) -> float:
 
 def true_prior(individual: float, gears: float) -> CalibratedModel:
     """Return the distribution that the robots are drawn from, as a prior."""
-    posterior = RobotPosterior.of_robot(NOMINAL)
+    posterior = RobotPosterior.from_robot(NOMINAL)
     size = posterior.uncertainty.space.arm_size
     means, deviations = [common_errors().flatten()], [torch.full((size,), individual, dtype=torch.float64)]
     for feature in posterior.uncertainty.features:
@@ -103,7 +103,7 @@ def gated(prior: FleetPrior, number: int, odd: bool) -> list[float]:
             "scratch": lambda result=without: result,
             "recalibrated": lambda result=begun: result.adaptation,
             "old": lambda result=begun: adapt(
-                result.adaptation.problem.without_arm(), result.adaptation.noise
+                result.adaptation.problem.with_fixed_arm(), result.adaptation.noise
             ),
         }
         figures += [rms(kept[begun.gate.kept](), test), rms(without, test)]

@@ -83,7 +83,7 @@ class Bench:
         base = xyzrpy_from_transform(invert(views.T_cell_frame)).numpy()
         robot = arm.robot.with_geometry(base=base)
         posterior = {
-            name: RobotPosterior.of_robot(robot, instrument, hybrid=name == "hybrid")
+            name: RobotPosterior.from_robot(robot, instrument, hybrid=name == "hybrid")
             for name in ("geometric", "hybrid")
         }
         camera, board = views.sight.camera, views.sight.board

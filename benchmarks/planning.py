@@ -72,7 +72,7 @@ def measured(
 ) -> None:
     """Compare random rows of a pool with chosen ones."""
     robot = Robot.load(name)
-    posterior = RobotPosterior.of_robot(robot, hybrid=hybrid)
+    posterior = RobotPosterior.from_robot(robot, hybrid=hybrid)
     calibrator: Calibrator = HybridCalibrator(robot) if hybrid else GeometricCalibrator(robot)
     table: dict[tuple[int, str], list[float]] = {}
     for pool, test in pools(name, draws):
@@ -93,7 +93,7 @@ def sequential(name: str, counts: tuple[int, ...], draws: range) -> None:
     robot = Robot.load(name)
     table: dict[tuple[int, str], list[float]] = {}
     for pool, test in pools(name, draws):
-        posterior, chosen = RobotPosterior.of_robot(robot), torch.arange(0)
+        posterior, chosen = RobotPosterior.from_robot(robot), torch.arange(0)
         for count in counts:
             free = torch.arange(POOL)[~torch.isin(torch.arange(POOL), chosen)]
             more = select_poses(
@@ -101,7 +101,7 @@ def sequential(name: str, counts: tuple[int, ...], draws: range) -> None:
             )
             chosen = torch.cat([chosen, free[more]])
             result = HybridCalibrator(robot).fit(pool.select(chosen))
-            posterior = RobotPosterior.of_result(result, posterior.instrument)
+            posterior = RobotPosterior.from_result(result, posterior.instrument)
             table.setdefault((count, "rounds"), []).append(rms_mm(result, test))
     show(name, table)
 
@@ -145,7 +145,7 @@ class Arm:
         """Return the result for measured poses."""
         result = fit_where_it_helps(HybridCalibrator(self.nominal), self.rows(q), lambda what: None)
         assert isinstance(result, HybridResult)
-        both = posterior.informed(q), RobotPosterior.of_result(result, posterior.instrument)
+        both = posterior.informed(q), RobotPosterior.from_result(result, posterior.instrument)
         return Figures(rms_mm(result, self.test), *(rms_of(one.tool(self.test.q)) * 1e3 for one in both))
 
 
@@ -154,7 +154,7 @@ def predicted(seeds: range) -> None:
     ratios: dict[tuple[int, str], list[float]] = {}
     for seed in seeds:
         arm = Arm(ARMS[seed % len(ARMS)], seed)
-        posterior, q = RobotPosterior.of_robot(arm.planned, Instrument(sigma=NOISE)), arm.candidates(1000)
+        posterior, q = RobotPosterior.from_robot(arm.planned, Instrument(sigma=NOISE)), arm.candidates(1000)
         for count in (15, 30, 60):
             chosen = q[select_poses(posterior.measured(q), posterior.tool(q[:300]), count, "I")]
             one = arm.figures(chosen, posterior)
@@ -174,7 +174,10 @@ def needed(seeds: range) -> None:
     for name in ARMS:
         for seed in seeds:
             arm = Arm(name, seed)
-            posterior, q = RobotPosterior.of_robot(arm.planned, Instrument(sigma=NOISE)), arm.candidates(1000)
+            posterior, q = (
+                RobotPosterior.from_robot(arm.planned, Instrument(sigma=NOISE)),
+                arm.candidates(1000),
+            )
             order = select_poses(posterior.measured(q), posterior.tool(q[:300]), STEPS[-1], "I")
             poses = [first(arm, rows, posterior) for rows in (q, q[order])]
             ratios.append(poses[1] / poses[0])
@@ -201,7 +204,7 @@ def speed() -> None:
     robot = Robot.load("ur10")
     generator = torch.Generator().manual_seed(0)
     q = (torch.rand(5000, robot.dof, generator=generator, dtype=torch.float64) * 2 - 1) * np.pi
-    posterior = RobotPosterior.of_robot(robot)
+    posterior = RobotPosterior.from_robot(robot)
     for criterion in ("D", "I"):
         began = time.perf_counter()
         select_poses(posterior.measured(q), posterior.tool(q[:300]), 100, criterion)  # type: ignore[arg-type]

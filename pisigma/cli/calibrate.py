@@ -18,7 +18,7 @@ from pisigma.cli.lifetime.recalibrate import recalibrate_into
 from pisigma.cli.output import (
     command_line,
     print_json,
-    saved,
+    saved_model_folder,
     wrapped,
 )
 from pisigma.cli.progress import progress_of
@@ -98,7 +98,9 @@ def calibrate(
         )
     with progress_of("calibrate") as progress:
         calibration = workflow.calibrate(nominal, data, chosen, progress)
-    with saved(calibration, out, accept_implausible, overwrite, command=command_line(context)) as folder:
+    with saved_model_folder(
+        calibration, out, accept_implausible, overwrite, command=command_line(context)
+    ) as folder:
         if as_json:
             print_json({"model": folder and str(folder), **calibration.to_json()})
         else:

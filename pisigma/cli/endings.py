@@ -45,10 +45,10 @@ PluginFiles = Annotated[
 ]
 
 
-def tell_problems(command: Callable[..., None]) -> Callable[..., None]:
+def report_problems(command: Callable[..., None]) -> Callable[..., None]:
     """Make a command load plug-ins, show its whole help, and end problems with a message and an exit status.
 
-    It gets the options `--plugin` and `--help-all`. See `end_with` for the status.
+    It gets the options `--plugin` and `--help-all`. See `exit_with_problem` for the status.
     """
 
     @functools.wraps(command)
@@ -60,7 +60,7 @@ def tell_problems(command: Callable[..., None]) -> Callable[..., None]:
         except (typer.BadParameter, typer.Exit):
             raise  # the command line itself reports these
         except (Exception, KeyboardInterrupt) as problem:
-            end_with(problem, as_json=bool(values.get("as_json")))
+            exit_with_problem(problem, as_json=bool(values.get("as_json")))
 
     keyword = inspect.Parameter.KEYWORD_ONLY
     parameters = [
@@ -73,7 +73,7 @@ def tell_problems(command: Callable[..., None]) -> Callable[..., None]:
     return guarded
 
 
-def end_with(problem: BaseException, as_json: bool = False) -> None:
+def exit_with_problem(problem: BaseException, as_json: bool = False) -> None:
     """Say what is wrong and end with an exit status.
 
     The status is 2 if the user's input is at fault, 3 if a model does not meet its limits, 130 after an interruption,
@@ -85,30 +85,30 @@ def end_with(problem: BaseException, as_json: bool = False) -> None:
             result of a model that does not meet its limits is there already.
     """
     if isinstance(problem, AcceptanceError):
-        fail(str(problem), NOT_ACCEPTED)
+        exit_with_error(str(problem), NOT_ACCEPTED)
     if isinstance(problem, PisigmaError):
         if as_json:
             print_json({"error": problem.fields()})
-        fail(str(problem))
+        exit_with_error(str(problem))
     if isinstance(problem, ImportError) and (missing := missing_extra(problem)) is not None:
-        fail(str(missing))
+        exit_with_error(str(missing))
     if isinstance(problem, KeyboardInterrupt):
-        fail("interrupted; nothing was left half written.", _INTERRUPTED)
+        exit_with_error("interrupted; nothing was left half written.", _INTERRUPTED)
     if isinstance(problem, OSError) and problem.filename is not None:
-        fail(f"{problem.filename}: cannot be used ({problem.strerror}); check the path.")
+        exit_with_error(f"{problem.filename}: cannot be used ({problem.strerror}); check the path.")
     if isinstance(problem, OSError) and problem.errno in (errno.EPIPE, errno.ENOSPC, errno.EIO, errno.EFBIG):
         _print_no_more()
         if problem.errno == errno.EPIPE:
             raise typer.Exit(_NO_READER)
-        fail(f"the standard output cannot be written ({problem.strerror}); print to another file.")
+        exit_with_error(f"the standard output cannot be written ({problem.strerror}); print to another file.")
     if isinstance(problem, MemoryError):
-        fail("there is not enough memory; give fewer or smaller inputs.")
+        exit_with_error("there is not enough memory; give fewer or smaller inputs.")
     if os.environ.get(TRACEBACK):
         raise problem
-    fail(_defect(problem), DEFECT)
+    exit_with_error(_defect(problem), DEFECT)
 
 
-def fail(sentence: str, status: int = REFUSED) -> NoReturn:
+def exit_with_error(sentence: str, status: int = REFUSED) -> NoReturn:
     """Say what is wrong on stderr and end with an exit status: in one line, which a terminal shows wrapped."""
     line = f"pisigma: {printable(' '.join(sentence.split()))}"
     if sys.stderr.isatty():

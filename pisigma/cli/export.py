@@ -7,7 +7,7 @@ import typer
 
 from pisigma.cli.arguments import AsJson, ModelOrCell, PayloadKg, TemperatureC, complete_export
 from pisigma.cli.cell import cell_at
-from pisigma.cli.endings import NOT_ACCEPTED, fail
+from pisigma.cli.endings import NOT_ACCEPTED, exit_with_error
 from pisigma.cli.output import print_json, print_line
 from pisigma.deployment.export.registry import BUILT_IN
 
@@ -160,6 +160,6 @@ def _print(exported: "Exported", form: str, out: Path, contents: str, as_json: b
         what = exported.summary or contents[0].upper() + contents[1:]
         print_line(f"{what} written to {out}{exported.details}.")
     if exported.failure:
-        fail(exported.failure)
+        exit_with_error(exported.failure)
     if exported.shortfall:
-        fail(exported.shortfall, NOT_ACCEPTED)
+        exit_with_error(exported.shortfall, NOT_ACCEPTED)

@@ -8,7 +8,7 @@ import typer
 
 from pisigma.cli.arguments import AsJson
 from pisigma.cli.cell import print_next, settings_at
-from pisigma.cli.endings import REFUSED, fail
+from pisigma.cli.endings import REFUSED, exit_with_error
 from pisigma.cli.output import print_json, print_lines, print_table
 from pisigma.cli.settings_options import StatedSettings, takes_settings
 from pisigma.workflow.settings.importing import ImportSettings
@@ -112,7 +112,7 @@ def _confirm(proposal: "ImportProposal", yes: bool, as_json: bool) -> None:
         print_json({"file": None, "columns": proposal.columns_json()})
     elif _is_asked() and typer.confirm("Import these columns?"):
         return
-    fail("nothing was imported: accept the mapping with --yes, or change it with --map.", REFUSED)
+    exit_with_error("nothing was imported: accept the mapping with --yes, or change it with --map.", REFUSED)
 
 
 def _is_asked() -> bool:

@@ -10,7 +10,7 @@ import typer
 from pisigma import __version__
 from pisigma.cli.calibrate import calibrate
 from pisigma.cli.cell import event, new, pack, session, status, unpack, use
-from pisigma.cli.endings import end_with, tell_problems
+from pisigma.cli.endings import exit_with_problem, report_problems
 from pisigma.cli.evaluate import evaluate
 from pisigma.cli.export import export
 from pisigma.cli.fleet.commands import fleet
@@ -69,7 +69,7 @@ for command in (
     pack,
     unpack,
 ):
-    app.command(command.__name__.rstrip("_"), cls=ShortHelpCommand)(tell_problems(command))
+    app.command(command.__name__.rstrip("_"), cls=ShortHelpCommand)(report_problems(command))
 app.add_typer(fleet)
 
 
@@ -102,6 +102,6 @@ def run() -> None:
         try:
             app()
         except Exception as problem:  # of the command line itself, or of its help
-            end_with(problem)
+            exit_with_problem(problem)
     except typer.Exit as end:
         sys.exit(end.exit_code)

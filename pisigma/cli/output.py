@@ -92,7 +92,7 @@ def table_lines(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]
 
 
 @contextmanager
-def saved(
+def saved_model_folder(
     result: "AbstractModelResult", folder: Path, accept_implausible: bool, overwrite: bool, **texts: str
 ) -> Iterator[Path | None]:
     """Write a result as a model folder, and yield the folder for printing; None if it was not written.

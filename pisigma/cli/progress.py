@@ -34,9 +34,9 @@ def progress_of(title: str) -> Iterator[Callable[[str], None]]:
     console = Console(stderr=True)
     shown = _Shown(title, console.status(printable(title)) if console.is_terminal else None)
     try:
-        yield shown.tell
+        yield shown.show_step
     finally:
-        shown.end()
+        shown.hide()
 
 
 def share_done(what: str) -> float | None:
@@ -49,7 +49,7 @@ def share_done(what: str) -> float | None:
     return share if steps else None
 
 
-def step_of(what: str) -> str:
+def step_name(what: str) -> str:
     """Return the step of what is being done, without its details."""
     last = max((match.end() for match in _STEP.finditer(what)), default=0)
     return what[:last] if last else what.partition(": ")[0]
@@ -66,7 +66,7 @@ class _Shown:
         self.what = self.step = ""
         self.timer: threading.Timer | None = None
 
-    def tell(self, what: str) -> None:
+    def show_step(self, what: str) -> None:
         """Show what is being done now."""
         self.what = what
         if self.status is not None:
@@ -80,15 +80,15 @@ class _Shown:
         is_due = now - self.printed >= QUIET_S or (
             share_done(what) is not None and now - self.begun >= QUIET_S
         )
-        if step_of(what) != self.step and is_due:
+        if step_name(what) != self.step and is_due:
             self._print()
-        elif step_of(what) != self.step:
+        elif step_name(what) != self.step:
             self._line(what)  # which starts the clock of the steps
             self.timer = threading.Timer(QUIET_S - (now - self.printed), self._print)
             self.timer.daemon = True
             self.timer.start()
 
-    def end(self) -> None:
+    def hide(self) -> None:
         """Stop showing it."""
         self._stop_timer()
         if self.status is not None:
@@ -100,7 +100,7 @@ class _Shown:
             self.timer = None
 
     def _print(self) -> None:
-        self.printed, self.step = time.monotonic(), step_of(self.what)
+        self.printed, self.step = time.monotonic(), step_name(self.what)
         typer.echo(self._line(self.step), err=True)
 
     def _line(self, what: str) -> str:

@@ -13,7 +13,7 @@ from pisigma.cli.screen import print_screen
 from pisigma.cli.settings_options import takes_settings
 from pisigma.files.errors import AcceptanceError
 from pisigma.measurement.camera.camera_files import CameraFiles
-from pisigma.reporting.result_text import sentences, table
+from pisigma.reporting.result_text import sentences, table_block
 from pisigma.reporting.verdict import Verdict, uncapitalised
 
 if TYPE_CHECKING:
@@ -94,6 +94,6 @@ def _print(result: "Report", closing: list[str]) -> None:
             sentences(
                 "acceptance", (*acceptance_sentences(accepted), f"Not stated: {lacking}; see the page."), "  "
             ),
-            table("Uncertainty budget of one coordinate", columns[:-1], [row[:-1] for row in rows]),
+            table_block("Uncertainty budget of one coordinate", columns[:-1], [row[:-1] for row in rows]),
         ]
     print_screen(verdict, [one.sentence for one in wrong[1:]], blocks, closing=closing)

@@ -9,7 +9,7 @@ from dataclasses import replace
 import typer
 
 from pisigma.cli.output import table_lines, wrapped
-from pisigma.reporting.result_text import Block, ResultText, together
+from pisigma.reporting.result_text import Block, ResultText, merge_alike_warnings
 from pisigma.reporting.verdict import Verdict
 
 MAX_LINES = 40
@@ -40,7 +40,7 @@ def print_screen(
     """
     verdict = replace(verdict, next_step="") if next_step else verdict
     head = [line for label, text in verdict.lines if text for line in wrapped([f"{label}: {text}"], "  ")]
-    cautions = wrapped((f"Warning: {one}" for one in together(warnings)), "  ")
+    cautions = wrapped((f"Warning: {one}" for one in merge_alike_warnings(warnings)), "  ")
     end = wrapped(closing)
     room = MAX_LINES - len(head) - len(cautions) - len(end) - 5
     shown, left_out = list[str](), list[str]()

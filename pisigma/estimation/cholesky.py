@@ -16,7 +16,7 @@ MANY_UNKNOWNS = 1_000
 """Number of unknowns above which free memory is returned before a matrix is allocated."""
 
 
-def factored(matrix: Callable[[], Float64[Tensor, "unknowns unknowns"]]) -> tuple[Tensor, Tensor]:
+def scaled_cholesky(matrix: Callable[[], Float64[Tensor, "unknowns unknowns"]]) -> tuple[Tensor, Tensor]:
     """Return the column scale and the Cholesky factor of the scaled symmetric matrix.
 
     Args:
@@ -56,12 +56,12 @@ def covariance_factor(V: Float64[Tensor, "values values"]) -> Float64[Tensor, "v
 
 
 def log_determinant(scale: Tensor, factor: Tensor) -> float:
-    """Return the log determinant of a matrix from the results of `factored`."""
+    """Return the log determinant of a matrix from the results of `scaled_cholesky`."""
     return 2 * float(factor.diagonal().log().sum()) - 2 * float(scale.log().sum())
 
 
-def inverted(scale: Tensor, factor: Tensor) -> Float64[Tensor, "unknowns unknowns"]:
-    """Return the inverse of a matrix from the results of `factored`, in the memory of the factor."""
+def invert_from_factor(scale: Tensor, factor: Tensor) -> Float64[Tensor, "unknowns unknowns"]:
+    """Return the inverse of a matrix from the results of `scaled_cholesky`, in the memory of the factor."""
     inverse: Tensor = torch.cholesky_inverse(factor, out=factor).mT  # symmetric, so this is row-major
     return inverse.mul_(scale).mul_(scale[:, None])
 

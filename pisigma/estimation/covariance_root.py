@@ -9,7 +9,7 @@ from torch import Tensor
 
 
 @dataclass(frozen=True, eq=False)
-class FewValues:
+class ImplicitCovarianceRoot:
     """Covariance root of the weights after n values: `D (I - Z^T L^-T (L + 1)^-1 Z)` with `L L^T = Z Z^T + 1`.
 
     Its product with its transpose is `D (Z^T Z + 1)^-1 D`: the update of Andrews 1968 (AIAA Journal 6(6), 1165-1166)
@@ -25,7 +25,7 @@ class FewValues:
     Z: Float64[Tensor, "values weights"]
     factor: Float64[Tensor, "values values"]
 
-    def along(self, columns: Float64[Tensor, "*batch weights"]) -> Float64[Tensor, "*batch weights"]:
+    def left_multiply(self, columns: Float64[Tensor, "*batch weights"]) -> Float64[Tensor, "*batch weights"]:
         """Return `columns @ root`."""
         scaled = columns.flatten(0, -2) * self.size
         once = self.factor + torch.eye(len(self.factor)).to(self.factor)
@@ -34,7 +34,9 @@ class FewValues:
         result: Tensor = scaled - inner.t() @ self.Z
         return result.reshape(columns.shape)
 
-    def times(self, matrix: Float64[Tensor, "weights columns"]) -> Float64[Tensor, "weights columns"]:
+    def right_multiply(
+        self, matrix: Float64[Tensor, "weights columns"]
+    ) -> Float64[Tensor, "weights columns"]:
         """Return `root @ matrix`."""
         once = self.factor + torch.eye(len(self.factor)).to(self.factor)
         inner = torch.linalg.solve_triangular(once, self.Z @ matrix, upper=False)
@@ -43,7 +45,7 @@ class FewValues:
         return result
 
 
-def after_values(
+def multiply_updated_root(
     along: Float64[Tensor, "*batch directions"], B: Float64[Tensor, "values directions"]
 ) -> Float64[Tensor, "*batch directions"]:
     """Return `A R'` for the root R' after a measurement of any values: `A R L^-T` with `L L^T = 1 + B^T B`.
@@ -67,25 +69,27 @@ class CovarianceRoot:
     """
 
     directions: Float64[Tensor, "unknowns directions"]
-    weights: FewValues | None = None
+    weights: ImplicitCovarianceRoot | None = None
 
     @cached_property
-    def dense(self) -> Float64[Tensor, "unknowns directions"]:
+    def as_matrix(self) -> Float64[Tensor, "unknowns directions"]:
         """R as a matrix."""
         if self.weights is None:
             return self.directions
         count = len(self.weights.size)
-        below = self.weights.along(torch.eye(count).to(self.directions))
+        below = self.weights.left_multiply(torch.eye(count).to(self.directions))
         above = self.directions.new_zeros((len(self.directions) - count, count))
         return torch.cat([self.directions, torch.cat([above, below])], 1)
 
-    def along(self, columns: Float64[Tensor, "*batch unknowns"]) -> Float64[Tensor, "*batch directions"]:
+    def left_multiply(
+        self, columns: Float64[Tensor, "*batch unknowns"]
+    ) -> Float64[Tensor, "*batch directions"]:
         """Return `columns @ R`."""
         # one product of two matrices, because torch would read R once for every row of a non-contiguous view
         result = columns.flatten(0, -2) @ self.directions
         if self.weights is not None:
             first = self.directions.shape[0] - len(self.weights.size)
-            result = torch.cat([result, self.weights.along(columns.flatten(0, -2)[:, first:])], -1)
+            result = torch.cat([result, self.weights.left_multiply(columns.flatten(0, -2)[:, first:])], -1)
         return result.reshape(*columns.shape[:-1], result.shape[-1])
 
     def covariance_times(
@@ -95,7 +99,7 @@ class CovarianceRoot:
         result = self.directions @ (self.directions.t() @ matrix)
         if self.weights is not None:
             first = len(result) - len(self.weights.size)
-            result[first:] += self.weights.times(self.weights.along(matrix[first:].t()).t())
+            result[first:] += self.weights.right_multiply(self.weights.left_multiply(matrix[first:].t()).t())
         return result
 
     def extended(

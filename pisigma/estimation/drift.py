@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Bool, Float64, Int64
 from torch import Tensor
 
-from pisigma.estimation.cholesky import covariance_factor, factored
+from pisigma.estimation.cholesky import covariance_factor, scaled_cholesky
 from pisigma.estimation.regression import SensorCount
 
 SIZES = torch.logspace(-6, -0.5, 56, dtype=torch.float64)
@@ -338,5 +338,5 @@ class PosteriorUpdate:
         # Every update adds columns; many of them are compressed to a triangle with the same product.
         if root.shape[1] <= MAX_DIRECTIONS * len(root):
             return root
-        scale, factor = factored(lambda: root @ root.t())
+        scale, factor = scaled_cholesky(lambda: root @ root.t())
         return torch.where(root.any(1)[:, None], factor / scale[:, None], 0.0)

@@ -7,8 +7,8 @@ import torch
 from jaxtyping import Float64, Int64
 from torch import Tensor
 
-from pisigma.estimation.cholesky import factored, inverted, log_determinant
-from pisigma.estimation.covariance_root import CovarianceRoot, FewValues
+from pisigma.estimation.cholesky import invert_from_factor, log_determinant, scaled_cholesky
+from pisigma.estimation.covariance_root import CovarianceRoot, ImplicitCovarianceRoot
 from pisigma.estimation.primal_regression import PrimalRegression, log_noise
 from pisigma.estimation.prior import GaussianPrior
 from pisigma.estimation.regression import AbstractRegression, Posterior, SensorCount
@@ -52,19 +52,19 @@ class DualRegression(AbstractRegression):
 
     def solve(self, prior: GaussianPrior, noise: tuple[float, ...]) -> Posterior:
         """See `AbstractRegression.solve`."""
-        if self.is_ill(prior, noise):
-            return self.primal.solve(prior, noise)
+        if self.is_ill_conditioned(prior, noise):
+            return self.primal_regression.solve(prior, noise)
         P, parameters, covariance, log_det = self.projection(prior, noise)
         active, precision = self.active, prior.precision
         variance = self.y.new_tensor(noise).square()[self.sensor]
         # alpha = V^-1 (y - G parameters): weights and residuals both are products with it.
         alpha = P @ self.y
         x = torch.cat([parameters, (self.X.t() @ alpha)[active:] / precision[active:]])
-        square = prior.of_groups(x.square() * prior.base)
+        square = prior.sum_by_group(x.square() * prior.base)
         # A parameter is determined by the data as far as its posterior variance is below the prior variance.
         held = torch.zeros_like(x)
         held[:active] = 1 - precision[:active] * covariance.diagonal()
-        determined = prior.of_groups(held)
+        determined = prior.sum_by_group(held)
         # Both matrices are symmetric, so the trace of their product needs only one triangle.
         traces = self.K @ (P.flatten().index_select(0, self._pairs) * self._counts)
         determined[prior.classes :] = prior.sizes[prior.classes :].square() * traces
@@ -78,8 +78,8 @@ class DualRegression(AbstractRegression):
 
     def covariance_root(self, posterior: Posterior) -> CovarianceRoot:
         """See `AbstractRegression.covariance_root`; weights depend on the parameters by `-Λ^-1 X^T V^-1 G`."""
-        if self.is_ill(posterior.prior, posterior.noise):
-            return self.primal.covariance_root(posterior)
+        if self.is_ill_conditioned(posterior.prior, posterior.noise):
+            return self.primal_regression.covariance_root(posterior)
         active, precision = self.active, posterior.prior.precision
         sigma = self.y.new_tensor(posterior.noise)[self.sensor]
         size = precision[active:].rsqrt()
@@ -91,19 +91,19 @@ class DualRegression(AbstractRegression):
         inner = torch.linalg.solve_triangular(factor, G, upper=False)
         normal = inner.t() @ inner
         normal.diagonal().add_(precision[:active])
-        scale, lower = factored(normal.clone)
+        scale, lower = scaled_cholesky(normal.clone)
         root = torch.linalg.solve_triangular(lower, torch.diag(scale), upper=False).t()
         follow = torch.linalg.solve_triangular(factor.t(), inner @ root, upper=True)
         directions = torch.cat([root, -size[:, None] * (Z.t() @ follow)])
-        return CovarianceRoot(directions, FewValues(size, Z, factor))
+        return CovarianceRoot(directions, ImplicitCovarianceRoot(size, Z, factor))
 
     @cached_property
-    def primal(self) -> PrimalRegression:
+    def primal_regression(self) -> PrimalRegression:
         """The same regression as normal equations."""
-        return PrimalRegression(*self.sums, self.sensors)
+        return PrimalRegression(*self.normal_equation_sums, self.sensors)
 
     @property
-    def sums(self) -> tuple[Tensor, Tensor, tuple[float, ...]]:
+    def normal_equation_sums(self) -> tuple[Tensor, Tensor, tuple[float, ...]]:
         """Sums of the normal equations for every sensor: `X^T X`, `X^T y` and `y^T y`."""
         parts = [
             (self.X[rows], self.y[rows]) for rows in (self.sensor == k for k in range(len(self.sensors)))
@@ -111,7 +111,7 @@ class DualRegression(AbstractRegression):
         normal = torch.stack([X.t() @ X for X, _ in parts])
         return normal, torch.stack([X.t() @ y for X, y in parts]), tuple(float(y @ y) for _, y in parts)
 
-    def is_ill(self, prior: GaussianPrior, noise: tuple[float, ...]) -> bool:
+    def is_ill_conditioned(self, prior: GaussianPrior, noise: tuple[float, ...]) -> bool:
         """Return whether traces of P cancel because the noise is very small; normal equations are then accurate."""
         diagonal = torch.arange(len(self.y)).add(1).cumsum(0) - 1
         trace = float(prior.sizes[prior.classes :].square() @ self.K[:, diagonal].sum(1))
@@ -139,16 +139,16 @@ class DualRegression(AbstractRegression):
     ) -> tuple[Tensor, Tensor, Tensor, float]:
         """Return P, the parameters and their covariance, and `log |V| + log |G^T V^-1 G + Λ|`."""
         active = self.active
-        factor = factored(lambda: self._covariance(prior, noise))
+        factor = scaled_cholesky(lambda: self._covariance(prior, noise))
         log_det = log_determinant(*factor)
-        inverse, G = inverted(*factor), self.X[:, :active]
+        inverse, G = invert_from_factor(*factor), self.X[:, :active]
         along = inverse @ G
         normal = G.t() @ along
         normal.diagonal().add_(prior.precision[:active])
-        factor = factored(normal.clone)
+        factor = scaled_cholesky(normal.clone)
         # Determinant lemma: |V + G Λ^-1 G^T| |Λ| = |V| |G^T V^-1 G + Λ|.
         log_det += log_determinant(*factor)
-        covariance = inverted(*factor)
+        covariance = invert_from_factor(*factor)
         parameters = covariance @ (along.t() @ self.y)
         return inverse - along @ covariance @ along.t(), parameters, covariance, log_det
 
@@ -182,7 +182,7 @@ def without_nuisance(
     return inverse - along @ solution, solution, int(certain.sum())
 
 
-def gram(X: Tensor, prior: GaussianPrior, group: int, active: int) -> Tensor:
+def group_gram(X: Tensor, prior: GaussianPrior, group: int, active: int) -> Tensor:
     """Return K of one group of weights, whose columns come after those of the parameters."""
     columns = (prior.group == group).nonzero()[:, 0]
     columns = columns[columns >= active]
@@ -197,13 +197,13 @@ def _upper_triangle(size: int) -> Int64[Tensor, " pairs"]:
     return pairs[1] * size + pairs[0]
 
 
-def places_of_pairs(values: Int64[Tensor, " values"]) -> Int64[Tensor, " pairs"]:
+def pair_indices(values: Int64[Tensor, " values"]) -> Int64[Tensor, " pairs"]:
     """Return the indices of the pairs of some values (ascending) among the pairs of all values."""
     first, second = values[torch.tril_indices(len(values), len(values))]
     pairs: Tensor = first * (first + 1) // 2 + second
     return pairs
 
 
-def stacked(K: list[Tensor], y: Tensor) -> Tensor:
+def stack_groups(K: list[Tensor], y: Tensor) -> Tensor:
     """Stack the matrices K of all groups; the result is empty if there are no weights."""
     return torch.stack(K) if K else y.new_zeros((0, len(y) * (len(y) + 1) // 2))

@@ -53,7 +53,7 @@ class Population:
     covariance: Float64[Tensor, "unknowns unknowns"]
     geometric: int
 
-    def of_another(self, robots: int) -> "Population":
+    def predictive_distribution(self, robots: int) -> "Population":
         """Return the predictive distribution of a robot that was not used for the estimate.
 
         With n robots the mean has the covariance `Σ / n`, and the estimate of Σ is biased by `(n - 1) / n`: together a
@@ -64,7 +64,7 @@ class Population:
         """
         return replace(self, covariance=(robots + 1) / (robots - 1) * self.covariance)
 
-    def surprise(self, robot: Information) -> tuple[float, int]:
+    def squared_distance(self, robot: Information) -> tuple[float, int]:
         """Return the distance of a robot from the fleet: a sum of squares, chi-squared for its robots, and its degrees.
 
         In coordinates in which the covariance is the identity and the information diagonal, `λ`, the descent minus its
@@ -111,7 +111,7 @@ def without_outliers(
     for _ in range(MAX_CONCENTRATIONS):
         chosen = [evidence[number] for number in alike]
         population = expectation_maximisation(chosen, start, usual, SEARCH_CLASS_ROBOTS, SEARCH_STEPS)
-        surprises = [population.surprise(one) for one in evidence]
+        surprises = [population.squared_distance(one) for one in evidence]
         ratios = sorted(square / max(count, 1) for square, count in surprises)
         # The chosen half scatters less than all robots, so the median robot sets the unit.
         unit = max(ratios[len(ratios) // 2], 1.0)
@@ -136,7 +136,7 @@ def _nearest_to_median(evidence: Sequence[Information], start: Population) -> li
     # Scatter by the median deviation, which outliers do not move, plus what the rows leave undetermined.
     scatter = (x - median).abs().median(0).values.square() + inverses.diagonal(dim1=1, dim2=2).mean(0)
     population = Population(median, scatter.diag(), start.geometric)
-    distances = [square / max(count, 1) for square, count in map(population.surprise, evidence)]
+    distances = [square / max(count, 1) for square, count in map(population.squared_distance, evidence)]
     order = sorted(range(len(evidence)), key=lambda number: distances[number])
     return sorted(order[: max(MIN_ROBOTS, len(evidence) // 2 + 1)])
 

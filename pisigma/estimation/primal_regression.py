@@ -11,10 +11,10 @@ from torch import Tensor
 from pisigma.estimation.cholesky import (
     BLOCK,
     blocks,
-    factored,
     invert_triangle,
     log_determinant,
     return_free_memory,
+    scaled_cholesky,
 )
 from pisigma.estimation.covariance_root import CovarianceRoot
 from pisigma.estimation.prior import GaussianPrior
@@ -90,7 +90,7 @@ class PrimalRegression(AbstractRegression):
         fit = sum(total / sigma**2 for total, sigma in zip(misfit, noise, strict=True))
         evidence = fit + float((x.square() * precision).sum()) + solved.log_det - log_prior
         evidence = -0.5 * (evidence + log_noise(self.sensors, noise))
-        square, determined = prior.of_groups(x.square() * prior.base), prior.of_groups(1 - held)
+        square, determined = prior.sum_by_group(x.square() * prior.base), prior.sum_by_group(1 - held)
         return Posterior(x, evidence, prior, noise, square, determined, misfit, tuple(used))
 
     def covariance_root(self, posterior: Posterior) -> CovarianceRoot:
@@ -116,7 +116,7 @@ class PrimalRegression(AbstractRegression):
             descent = torch.zeros_like(self.descent[0])
             for b, sigma in zip(self.descent, noise, strict=True):
                 descent.add_(b, alpha=sigma**-2)
-            scale, factor = factored(normal)
+            scale, factor = scaled_cholesky(normal)
             log_det = log_determinant(scale, factor)
             inner = torch.linalg.solve_triangular(factor, (scale * descent)[:, None], upper=False)
             x = scale * torch.linalg.solve_triangular(factor.mT, inner, upper=True)[:, 0]

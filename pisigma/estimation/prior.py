@@ -37,8 +37,8 @@ class GaussianPrior:
         """1 / variance."""
         return self.base / self.sizes[self.group].square()
 
-    def of_groups(self, values: Float64[Tensor, " unknowns"]) -> Float64[Tensor, " groups"]:
-        """Return the sum over the unknowns with a prior in every group."""
+    def sum_by_group(self, values: Float64[Tensor, " unknowns"]) -> Float64[Tensor, " groups"]:
+        """Sum values over the unknowns with a prior in every group."""
         return torch.zeros_like(self.sizes).index_add(0, self.group, values * (self.base > 0))
 
     def updated(

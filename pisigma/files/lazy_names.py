@@ -5,7 +5,7 @@ from importlib import import_module
 from typing import Any
 
 
-def lazily(package: str, names: Mapping[str, str]) -> Callable[[str], Any]:
+def lazy_getattr(package: str, names: Mapping[str, str]) -> Callable[[str], Any]:
     """Return a `__getattr__` function for a package.
 
     Args:

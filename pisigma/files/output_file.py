@@ -8,7 +8,7 @@ from typing import TextIO
 
 from pisigma.files.conflicts import Input, check_conflicts
 from pisigma.files.errors import OutputError, Place
-from pisigma.files.scratch import FILE, scratch_beside, sweep
+from pisigma.files.scratch import FILE, remove_stale_scratch, scratch_beside
 
 
 def check_output(
@@ -87,7 +87,7 @@ def writing_whole(path: Path) -> Iterator[TextIO]:
     check_output(path)
     try:
         target = Path(os.path.realpath(path))
-        sweep(target)
+        remove_stale_scratch(target)
         with scratch_beside(target, FILE) as scratch:
             with scratch.open("w", newline="\n", encoding="utf-8", errors="backslashreplace") as file:
                 yield file

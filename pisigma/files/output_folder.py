@@ -9,7 +9,7 @@ from pisigma.files.conflicts import Input, check_conflicts
 from pisigma.files.errors import OutputError, Place
 from pisigma.files.model_files import MODEL_FILES, is_model
 from pisigma.files.output_file import not_writable
-from pisigma.files.scratch import ASIDE, FOLDER, KEPT, scratch_beside, sweep
+from pisigma.files.scratch import ASIDE, FOLDER, KEPT, remove_stale_scratch, scratch_beside
 
 MAX_NEW_FOLDERS = 100
 """Most nested folders that are created for a model."""
@@ -44,7 +44,7 @@ def check_folder(
             problem = f"the output needs more than {MAX_NEW_FOLDERS} nested new folders"
             raise _refusal(folder, problem, expected=f"{MAX_NEW_FOLDERS} new folders or fewer", value=new)
         if parent == target.parent:
-            sweep(target)
+            remove_stale_scratch(target)
         check_conflicts(folder, inputs)
         _check_content(folder, target, overwrite, names)
         with scratch_beside(parent / target.name, FOLDER):

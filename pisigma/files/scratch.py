@@ -44,7 +44,7 @@ def scratch_beside(target: Path, suffix: str) -> Iterator[Path]:
             _remove(path)
 
 
-def sweep(target: Path) -> None:
+def remove_stale_scratch(target: Path) -> None:
     """Remove the scratch of killed processes next to `target`, and restore a moved `target` if it is missing.
 
     Args:

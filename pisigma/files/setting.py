@@ -58,7 +58,7 @@ FILE = Option(kind=Path, read=str)
 """For settings that are a path as text."""
 
 
-def texts(stated: Iterable[object]) -> tuple[str, ...]:
+def as_texts(stated: Iterable[object]) -> tuple[str, ...]:
     """Convert several command-line values to texts."""
     return tuple(map(str, stated))
 

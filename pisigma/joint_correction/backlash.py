@@ -63,4 +63,4 @@ class Backlash(AbstractFeature):
         doc = (
             "approach direction of every joint: 1 if its value increased, -1 if it decreased, 0 if not stated"
         )
-        return graph.node("Mul", graph.add_input(APPROACH, [len(weight)], doc), weight[:, 0])
+        return graph.add_node("Mul", graph.add_input(APPROACH, [len(weight)], doc), weight[:, 0])

@@ -104,7 +104,9 @@ class ConditionFeatures(AbstractFeature):
         if not any(name in state.stated for name in self.names):
             return q.new_zeros((*q.shape, self.count))
         missing = torch.full_like(q[..., 0], torch.nan)
-        scaled = self.scaled(torch.stack([state.stated.get(name, missing).to(q) for name in self.names], -1))
+        scaled = self.scaled_conditions(
+            torch.stack([state.stated.get(name, missing).to(q) for name in self.names], -1)
+        )
         turning = torch.tensor(self.robot.revolute, device=q.device)
         sine = torch.where(turning, q.sin(), scaled_joints(self.robot, q))
         cosine = torch.where(turning, q.cos(), torch.zeros_like(q))
@@ -115,7 +117,9 @@ class ConditionFeatures(AbstractFeature):
             columns.append(torques * scaled[..., self.names.index("payload_kg"), None, None])
         return torch.cat(columns, -1)
 
-    def scaled(self, stated: Float[Tensor, "*batch conditions"]) -> Float[Tensor, "*batch conditions"]:
+    def scaled_conditions(
+        self, stated: Float[Tensor, "*batch conditions"]
+    ) -> Float[Tensor, "*batch conditions"]:
         """Conditions [kg, deg C] in standard deviations from their means; 0 where one is NaN.
 
         A temperature beyond the measured ones counts as the nearest of these.

@@ -185,7 +185,7 @@ class FourierSeries(AbstractFeature):
     def add_onnx(self, graph: OnnxGraph, weight: Float64[np.ndarray, "dof columns"], q: str) -> str:
         """See `AbstractFeature.add_onnx`."""
         orders = np.arange(1.0, self.harmonics + 1)
-        return add_harmonics(graph, graph.node("Mul", q, self._rate.numpy()), orders, weight)
+        return add_harmonics(graph, graph.add_node("Mul", q, self._rate.numpy()), orders, weight)
 
 
 def sines_cosines(
@@ -218,8 +218,8 @@ def add_harmonics(
     Returns:
         Name of the sums `(batch, dof)` in the graph.
     """
-    multiple = graph.node("Mul", graph.reshape(angle, [len(weight), 1]), orders)
+    multiple = graph.add_node("Mul", graph.reshape(angle, [len(weight), 1]), orders)
     sines, cosines = np.split(weight, 2, axis=1)
-    sine = graph.total(graph.node("Mul", graph.node("Sin", multiple), sines), 2)
-    cosine = graph.total(graph.node("Mul", graph.node("Cos", multiple), cosines), 2)
-    return graph.node("Add", sine, cosine)
+    sine = graph.add_sum(graph.add_node("Mul", graph.add_node("Sin", multiple), sines), 2)
+    cosine = graph.add_sum(graph.add_node("Mul", graph.add_node("Cos", multiple), cosines), 2)
+    return graph.add_node("Add", sine, cosine)

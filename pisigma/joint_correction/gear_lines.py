@@ -105,4 +105,6 @@ class GearLines(AbstractFeature):
 
     def add_onnx(self, graph: OnnxGraph, weight: Float64[np.ndarray, "dof columns"], q: str) -> str:
         """See `AbstractFeature.add_onnx`."""
-        return add_harmonics(graph, graph.node("Mul", q, self._rate.numpy()), self._orders.numpy(), weight)
+        return add_harmonics(
+            graph, graph.add_node("Mul", q, self._rate.numpy()), self._orders.numpy(), weight
+        )

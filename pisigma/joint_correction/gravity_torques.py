@@ -147,17 +147,17 @@ class GravityTorques(AbstractFeature):
 
     def add_onnx(self, graph: OnnxGraph, weight: Float64[np.ndarray, "dof columns"], q: str) -> str:
         """See `AbstractFeature.add_onnx`."""
-        node, dof, g = graph.node, self.robot.dof, np.array(self.gravity)
+        node, dof, g = graph.add_node, self.robot.dof, np.array(self.gravity)
         axes, origins, carried = add_joint_frames(graph, self.robot, q)
         z = node("Mul", axes, self.robot.directions[:, None])
         across = np.array([[0, -g[2], g[1]], [g[2], 0, -g[0]], [-g[1], g[0], 0]])
         lever = node("MatMul", z, across.T)
         cells = node("MatMul", lever, node("Transpose", carried, perm=[0, 2, 1]))
-        own = graph.reshape(graph.total(node("Mul", lever, origins), 2), [dof, 1])
+        own = graph.reshape(graph.add_sum(node("Mul", lever, origins), 2), [dof, 1])
         origin = np.tile([1.0, 0.0, 0.0, 0.0], dof)
         scale = np.tile([1 / self.robot.reach, *[self.ARM] * 3], dof)
         turns = np.array(self.robot.revolute, dtype=np.float64)
         weight = weight * self.used.numpy()
         torques = node("Mul", node("Sub", cells, node("Mul", own, origin)), scale * weight * turns[:, None])
-        force = node("Mul", graph.total(node("Mul", z, g), 2), (weight * origin).sum(1) * (1 - turns))
-        return node("Add", graph.total(torques, 2), force)
+        force = node("Mul", graph.add_sum(node("Mul", z, g), 2), (weight * origin).sum(1) * (1 - turns))
+        return node("Add", graph.add_sum(torques, 2), force)

@@ -68,7 +68,7 @@ class JointCorrection(nn.Module):
         pairs = zip(self.features, self.linear, strict=True)
         return all(feature.is_periodic(weight.detach().cpu().numpy()) for feature, weight in pairs)
 
-    def of_rows(self, measurements: Measurements) -> Float[Tensor, "rows dof"]:
+    def for_rows(self, measurements: Measurements) -> Float[Tensor, "rows dof"]:
         """Compute the corrections of measured rows; data that a row does not state have their usual values."""
         delta: Tensor = self(JointState.from_measurements(measurements))
         return delta

@@ -24,7 +24,7 @@ class _Step(NamedTuple):
 def add_pose(graph: OnnxGraph, robot: Robot, q: str) -> tuple[str, str]:
     """Add the position `(batch, 3)` of T_base_tool and the entries of its rotation `(batch, 9)`, row-major."""
     (*_, last) = _add_chain(graph, robot, q, _matrix(robot.base))
-    cells = graph.reshape(graph.node("MatMul", last.after, _matrix(robot.tool)), [16])
+    cells = graph.reshape(graph.add_node("MatMul", last.after, _matrix(robot.tool)), [16])
     return graph.columns(cells, [3, 7, 11]), graph.columns(cells, [0, 1, 2, 4, 5, 6, 8, 9, 10])
 
 
@@ -34,7 +34,7 @@ def add_joint_frames(graph: OnnxGraph, robot: Robot, q: str) -> tuple[str, str, 
     All are in the frame of the first row, without base and tool. The frames `(batch, 4 dof, 3)` are the origin and the
     three axes of every joint's row.
     """
-    node, dof = graph.node, robot.dof
+    node, dof = graph.add_node, robot.dof
     steps = [step for step in _add_chain(graph, robot, q, np.eye(4)) if step.row.type != "fixed"]
     before = [graph.reshape(step.before, [16]) for step in steps]
     after = [graph.reshape(step.after, [16]) for step in steps]
@@ -51,7 +51,7 @@ def add_joint_frames(graph: OnnxGraph, robot: Robot, q: str) -> tuple[str, str, 
 
 def add_roll_pitch_yaw(graph: OnnxGraph, cells: str) -> list[str]:
     """Add roll, pitch, yaw of rotations `(batch, 9)`, each `(batch, 1)`; see `pisigma.robot.se3.rpy_from_rotation`."""
-    node = graph.node
+    node = graph.add_node
     entry = {(i, j): graph.column(cells, 3 * i + j) for i in range(3) for j in range(3)}
     square = node("Add", *(node("Mul", entry[i, 0], entry[i, 0]) for i in range(2)))
     regular = node("Greater", square, 1e-24)
@@ -65,15 +65,17 @@ def add_roll_pitch_yaw(graph: OnnxGraph, cells: str) -> list[str]:
 
 def _add_chain(graph: OnnxGraph, robot: Robot, q: str, base: np.ndarray) -> Iterator[_Step]:
     """Yield the rows: `RotZ(q)` or `Trans(0, 0, q)` is followed by the constant transform of the row."""
-    ones = graph.node("Add", graph.node("Mul", graph.column(q, 0), 0.0), 1.0)  # of the batch size of q
-    frame, joint = graph.node("Mul", graph.reshape(ones, [1, 1]), base), 0
+    ones = graph.add_node(
+        "Add", graph.add_node("Mul", graph.column(q, 0), 0.0), 1.0
+    )  # of the batch size of q
+    frame, joint = graph.add_node("Mul", graph.reshape(ones, [1, 1]), base), 0
     for row, still in zip(robot.rows, _still(robot), strict=True):
         before = frame
         if row.type != "fixed":
-            value = graph.reshape(graph.node("Mul", graph.column(q, joint), float(row.direction)), [1, 1])
-            frame = graph.node("MatMul", frame, _combined(graph, value, _moving(row)))
+            value = graph.reshape(graph.add_node("Mul", graph.column(q, joint), float(row.direction)), [1, 1])
+            frame = graph.add_node("MatMul", frame, _combined(graph, value, _moving(row)))
             joint += 1
-        frame = graph.node("MatMul", frame, still)
+        frame = graph.add_node("MatMul", frame, still)
         yield _Step(row, before, frame)
 
 
@@ -91,12 +93,12 @@ def _moving(row: Row) -> list[np.ndarray]:
 def _combined(graph: OnnxGraph, value: str, parts: Sequence[np.ndarray]) -> str:
     """Add the sum of `_moving` at joint values `(batch, 1, 1)`, as `(batch, 4, 4)`."""
     constant, *others = parts
-    factors = [value] if len(others) == 1 else [graph.node("Cos", value), graph.node("Sin", value)]
+    factors = [value] if len(others) == 1 else [graph.add_node("Cos", value), graph.add_node("Sin", value)]
     total = ""
     for factor, part in zip(factors, others, strict=True):
-        term = graph.node("Mul", factor, part)
-        total = graph.node("Add", total, term) if total else term
-    return graph.node("Add", total, constant)
+        term = graph.add_node("Mul", factor, part)
+        total = graph.add_node("Add", total, term) if total else term
+    return graph.add_node("Add", total, constant)
 
 
 def _still(robot: Robot) -> list[np.ndarray]:

@@ -62,7 +62,7 @@ class OnnxGraph:
         self.nodes.append(self._onnx.helper.make_node("Identity", [value], [name]))
         self.outputs.append(self._described(name, shape, doc))
 
-    def constant(self, values: Any) -> str:
+    def add_constant(self, values: Any) -> str:
         """Add a constant of floats (as double) or integers, and return its name."""
         array = np.asarray(values)
         array = array.astype(np.int64 if array.dtype.kind in "iu" else np.float64)
@@ -70,16 +70,16 @@ class OnnxGraph:
         self._constants.append(self._onnx.numpy_helper.from_array(np.ascontiguousarray(array), name))
         return name
 
-    def node(self, operator: str, *operands: Any, **attributes: Any) -> str:
+    def add_node(self, operator: str, *operands: Any, **attributes: Any) -> str:
         """Apply an operator to values (by name) and constants (numbers or arrays), and return the result's name."""
-        names = [value if isinstance(value, str) else self.constant(value) for value in operands]
+        names = [value if isinstance(value, str) else self.add_constant(value) for value in operands]
         result = f"{operator.lower()}_{len(self.nodes)}"
         self.nodes.append(self._onnx.helper.make_node(operator, names, [result], **attributes))
         return result
 
     def columns(self, value: str, indices: Sequence[int]) -> str:
         """Select columns of `(batch, n)`, or slices of the second dimension."""
-        return self.node("Gather", value, np.array(indices, dtype=np.int64), axis=1)
+        return self.add_node("Gather", value, np.array(indices, dtype=np.int64), axis=1)
 
     def column(self, value: str, index: int) -> str:
         """Select one column of `(batch, n)` as `(batch, 1)`."""
@@ -87,19 +87,19 @@ class OnnxGraph:
 
     def reshape(self, value: str, shape: Sequence[int]) -> str:
         """Reshape a value to `(batch, *shape)`; one dimension may be -1."""
-        return self.node("Reshape", value, np.array([0, *shape], dtype=np.int64))
+        return self.add_node("Reshape", value, np.array([0, *shape], dtype=np.int64))
 
-    def total(self, value: str, axis: int) -> str:
+    def add_sum(self, value: str, axis: int) -> str:
         """Sum over a dimension, which is removed."""
-        return self.node("ReduceSum", value, np.array([axis], dtype=np.int64), keepdims=0)
+        return self.add_node("ReduceSum", value, np.array([axis], dtype=np.int64), keepdims=0)
 
     def sum_of_products(self, factors: str, orders: Sequence[int]) -> str:
         """Sum over units of the products of their factors: `(batch, outputs, factors)` to `(batch, outputs)`."""
         total, first = "", 0
         for order in orders:
-            own = self.node("Gather", factors, np.arange(first, first + order), axis=2)
-            value = self.node("ReduceProd", own, axes=[2], keepdims=0)
-            total = self.node("Add", total, value) if total else value
+            own = self.add_node("Gather", factors, np.arange(first, first + order), axis=2)
+            value = self.add_node("ReduceProd", own, axes=[2], keepdims=0)
+            total = self.add_node("Add", total, value) if total else value
             first += order
         return total
 
@@ -109,7 +109,7 @@ class OnnxGraph:
         Runtimes have no inverse trigonometric functions in double. The one in float returns an angle a; the exact angle
         is `a + asin(u)` with `u = (sine cos a - cosine sin a) / length`, about 1e-7, so that two terms of asin suffice.
         """
-        node, doubles, floats = self.node, self._onnx.TensorProto.DOUBLE, self._onnx.TensorProto.FLOAT
+        node, doubles, floats = self.add_node, self._onnx.TensorProto.DOUBLE, self._onnx.TensorProto.FLOAT
         high, wide = node("Abs", sine), node("Abs", cosine)
         ratio = node("Div", node("Min", high, wide), node("Max", high, wide, _TINY))
         a = node("Cast", node("Atan", node("Cast", ratio, to=floats)), to=doubles)
@@ -124,7 +124,7 @@ class OnnxGraph:
         third = node("Div", node("Mul", u, node("Mul", u, u)), 6.0)
         return node("Add", a, node("Add", u, third))
 
-    def finish(self, name: str, doc: str, metadata: dict[str, str]) -> bytes:
+    def to_bytes(self, name: str, doc: str, metadata: dict[str, str]) -> bytes:
         """Check the model, and return it as the content of a file."""
         from pisigma import __version__
 

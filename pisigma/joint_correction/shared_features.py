@@ -40,7 +40,7 @@ class AbstractSharedFeature(AbstractFeature):
 
     def add_onnx(self, graph: OnnxGraph, weight: Float64[np.ndarray, "dof columns"], q: str) -> str:
         """See `AbstractFeature.add_onnx`."""
-        return graph.node("MatMul", self.add_values(graph, q), weight.T)
+        return graph.add_node("MatMul", self.add_values(graph, q), weight.T)
 
     @abstractmethod
     def add_values(self, graph: OnnxGraph, q: str) -> str:
@@ -116,15 +116,15 @@ class NominalPose(AbstractSharedFeature):
     def add_values(self, graph: OnnxGraph, q: str) -> str:
         """See `AbstractSharedFeature.add_values`."""
         position, R = add_pose(graph, self.robot, q)
-        scaled = graph.node("Div", position, self.robot.reach)
-        return graph.node("Concat", scaled, *add_roll_pitch_yaw(graph, R), axis=1)
+        scaled = graph.add_node("Div", position, self.robot.reach)
+        return graph.add_node("Concat", scaled, *add_roll_pitch_yaw(graph, R), axis=1)
 
 
 def add_scaled_joints(graph: OnnxGraph, robot: Robot, q: str) -> str:
     """Add `scaled_joints` `(batch, dof)` to an ONNX graph."""
     zero = scaled_joints(robot, torch.zeros(robot.dof, dtype=torch.float64)).numpy()
     one = scaled_joints(robot, torch.ones(robot.dof, dtype=torch.float64)).numpy()
-    return graph.node("Add", graph.node("Mul", q, one - zero), zero)
+    return graph.add_node("Add", graph.add_node("Mul", q, one - zero), zero)
 
 
 def add_unit_inputs(graph: OnnxGraph, robot: Robot, q: str) -> str:
@@ -132,7 +132,7 @@ def add_unit_inputs(graph: OnnxGraph, robot: Robot, q: str) -> str:
     turning = np.flatnonzero(robot.revolute).tolist()
     sliding = np.flatnonzero(~np.array(robot.revolute)).tolist()
     angle = graph.columns(q, turning)
-    inputs = [graph.node("Sin", angle), graph.node("Cos", angle)] if turning else []
+    inputs = [graph.add_node("Sin", angle), graph.add_node("Cos", angle)] if turning else []
     if sliding:
         inputs.append(graph.columns(add_scaled_joints(graph, robot, q), sliding))
-    return graph.node("Concat", *inputs, axis=1)
+    return graph.add_node("Concat", *inputs, axis=1)

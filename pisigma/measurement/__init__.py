@@ -4,9 +4,9 @@ Names are loaded on first use, so that settings of cameras are read without torc
 type checkers.
 """
 
-from pisigma.files.lazy_names import lazily
+from pisigma.files.lazy_names import lazy_getattr
 
-__getattr__ = lazily(
+__getattr__ = lazy_getattr(
     __name__,
     {
         "dataset": "Measurements join",

@@ -47,7 +47,7 @@ class JointState:
         """Return rows by slice, index or mask of the first axis."""
         return JointState(self.q[rows], {name: values[rows] for name, values in self.stated.items()})
 
-    def split(self, size: int) -> Iterator["JointState"]:
+    def split_rows(self, size: int) -> Iterator["JointState"]:
         """Yield at most `size` rows at a time."""
         return (self[start : start + size] for start in range(0, len(self.q), size))
 

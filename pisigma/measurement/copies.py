@@ -165,7 +165,7 @@ def _steps(
     return found
 
 
-def originals(values: RowValues, known: int = 0) -> Int64[Tensor, " rows"]:
+def original_rows(values: RowValues, known: int = 0) -> Int64[Tensor, " rows"]:
     """Return, for every row, the number of the row that it is a copy of, or its own number.
 
     A copy has the joint values and all readings of another row to the coarser of both roundings. How many rows agree by
@@ -343,7 +343,7 @@ def copies_of_known(rows: MeasuredFields, robot: Robot, known: RowValues) -> Boo
         return torch.zeros(rows.rows, dtype=torch.bool)
     count = len(known.numbers)
     values = known + RowValues.from_rows(rows, robot)
-    original = originals(values, count)[count:]
+    original = original_rows(values, count)[count:]
     return _whole_pairs(rows, original != torch.arange(count, count + rows.rows))
 
 
@@ -354,7 +354,7 @@ def without_copies(rows: MeasuredFields, robot: Robot) -> MeasuredFields:
     """
     if rows.rows < 2 or rows.numbers["q"].shape[1] != robot.dof:
         return rows
-    original = originals(RowValues.from_rows(rows, robot))
+    original = original_rows(RowValues.from_rows(rows, robot))
     copied = _whole_pairs(rows, original != torch.arange(rows.rows))
     if not copied.any():
         return rows

@@ -198,12 +198,12 @@ class Measurements:
             )
         return transform(self.rotation, self.position)
 
-    def at(self, row: int, column: str | None = None) -> RowPlace:
+    def place_of(self, row: int, column: str | None = None) -> RowPlace:
         """Return the place of a row (from 0), for the `at` of an exception: file and line, or source and row."""
-        return self.as_fields().at(row, column)
+        return self.as_fields().place_of(row, column)
 
     def place(self, row: int) -> str:
-        """Return the place of a row as a text; see `at`."""
+        """Return the place of a row as a text; see `place_of`."""
         return self.as_fields().label(row)
 
     def split_sets(self) -> "tuple[Measurements, Measurements | None]":

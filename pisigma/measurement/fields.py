@@ -103,15 +103,15 @@ class MeasuredFields:
         array: np.ndarray = values.detach().cpu().numpy()
         return array
 
-    def at(self, row: int, column: str | None = None) -> RowPlace:
+    def place_of(self, row: int, column: str | None = None) -> RowPlace:
         """Return the place of a row (from 0) for messages: file and line, or source and row, and its image."""
         line = self.line[row] if row < len(self.line) else 0
         source, image = self.origin[row] if self.origin else self.source, self.text("image")[row]
         return RowPlace(source, line or None, column, None if line else row, image)
 
     def label(self, row: int) -> str:
-        """Return the place of a row as a text; see `at`."""
-        return str(self.at(row))
+        """Return the place of a row as a text; see `place_of`."""
+        return str(self.place_of(row))
 
     def measured(self, kind: Kind) -> Bool[Tensor, " rows"]:
         """Return which rows contain a measurement of a kind.

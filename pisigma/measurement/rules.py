@@ -45,7 +45,7 @@ class Labels:
         """Return the name of a field or a sensor."""
         return self.names.get(name, name)
 
-    def shown(self, name: str, value: float) -> float:
+    def format_value(self, name: str, value: float) -> float:
         """Return an SI value of a field in the unit of messages, with 6 digits."""
         return float(f"{float(from_si(np.array([value]), self.units.get(name, ''))[0]):.6g}")
 
@@ -67,7 +67,7 @@ def check_fields(data: MeasuredFields) -> None:
     sound = np.ones(data.rows, dtype=bool)
     for faults in (row_faults(data, Labels()), group_faults(data, Labels(), sound, data.label)):
         for row, fault in faults:
-            raise fault.error(data.at(row))
+            raise fault.error(data.place_of(row))
 
 
 def _check_shapes(data: MeasuredFields) -> None:
@@ -142,7 +142,7 @@ def _refuse(data: MeasuredFields, bad: Bool[Tensor, " rows"], name: str, expecte
     if bad.any():
         row = int(bad.nonzero()[0])
         value = data.numbers[name][row].tolist()
-        raise MeasurementError(expected=expected, value=value, at=data.at(row, name), remedy=remedy)
+        raise MeasurementError(expected=expected, value=value, at=data.place_of(row, name), remedy=remedy)
 
 
 RowAndFault = tuple[int, Fault]
@@ -197,7 +197,7 @@ def _value_faults(data: MeasuredFields, labels: Labels) -> Iterator[RowAndFault]
     ):
         values = data.array(name)
         unit = {"temperature": "deg C", "payload": "kg"}.get(name, labels.units.get(name, ""))
-        lower = f"{labels.shown(name, least):.3g}"
+        lower = f"{labels.format_value(name, least):.3g}"
         expected = (
             f"{lower} {unit} or more".replace("  ", " ")
             if most == math.inf
@@ -205,13 +205,13 @@ def _value_faults(data: MeasuredFields, labels: Labels) -> Iterator[RowAndFault]
         )
         formula = " (deg C = K - 273.15 = (deg F - 32) / 1.8)" if unit == "deg C" else ""
         for row in rows_where((values < least) | (values > most)):
-            shown = labels.shown(name, values[row])
+            shown = labels.format_value(name, values[row])
             yield row, Fault("", labels(name), expected, shown, f"correct it{formula} or leave it empty")
     if "approach" in data.numbers:
         expected = "+1 (the joint value increased) or -1 (it decreased)"
         for joint, values in enumerate(data.array("approach").T, start=1):
             for row in rows_where(~np.isnan(values) & (np.abs(values) != 1)):
-                shown = labels.shown("approach", values[row])
+                shown = labels.format_value("approach", values[row])
                 yield row, Fault("", labels(f"approach{joint}"), expected, shown, _CORRECT)
     for row, split in enumerate(data.texts.get("split", ())):
         if split not in SPLITS:
@@ -280,7 +280,13 @@ def _distance_faults(
     for row in rows_where(values < 0):
         yield (
             row,
-            Fault("", column, "a distance of 0 or more", labels.shown("distance", values[row]), "correct it"),
+            Fault(
+                "",
+                column,
+                "a distance of 0 or more",
+                labels.format_value("distance", values[row]),
+                "correct it",
+            ),
         )
     for row in rows_where(distance & ~anchor & ~pair):
         remedy = "name its anchor, or the pair of rows that it lies between"
@@ -380,7 +386,7 @@ def _pair_fault(
     for quantity in ("distance", "sigma_position"):
         a, b = data.array(quantity)[rows].tolist()
         if a != b and not (np.isnan(a) and np.isnan(b)):
-            shown = f"{labels.shown(quantity, a):g} and {labels.shown(quantity, b):g}"
+            shown = f"{labels.format_value(quantity, a):g} and {labels.format_value(quantity, b):g}"
             problem = f"expected one value of '{labels(quantity)}' in both rows of pair '{name}', got {shown}"
             return Fault(problem, column, value=shown, remedy="give the same value in both rows")
     return None

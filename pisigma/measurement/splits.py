@@ -369,7 +369,7 @@ def _group_positions(
         raise MeasurementError(
             "no position was measured, so that the rows cannot be split by space",
             option="by",
-            at=measurements.at(row),
+            at=measurements.place_of(row),
             remedy="split by joints or by time",
         )
     total = torch.zeros(groups, 3, dtype=torch.float64).index_add(0, group[measured], position[measured])

@@ -260,11 +260,11 @@ def known_names(
         if len(set(names)) > 1:
             other = next(row for row, name in enumerate(names) if name != names[0])
             raise MeasurementError(
-                f"{what} '{names[other]}' differs from '{names[0]}' ({measurements.at(0)}), but the model has only one "
-                f"{what}",
+                f"{what} '{names[other]}' differs from '{names[0]}' ({measurements.place_of(0)}), but the model has "
+                f"only one {what}",
                 expected=f"{what} '{names[0]}'",
                 value=names[other],
-                at=measurements.at(other, what),
+                at=measurements.place_of(other, what),
                 remedy=f"give a file for each {what}",
             )
         return ("",) * len(names)
@@ -277,7 +277,7 @@ def known_names(
             raise MeasurementError(
                 f"the model was not calibrated for {what} '{name}'{hint}",
                 value=name,
-                at=measurements.at(row, what),
+                at=measurements.place_of(row, what),
                 remedy=nearest_choice(name, known),
             )
     return names
@@ -321,7 +321,7 @@ def hybrid_poses(arm: HybridArm, q: Float[Tensor, "*batch dof"]) -> Float[Tensor
 
 def corrected_joints(arm: HybridArm, measurements: Measurements) -> Float64[Tensor, "rows dof"]:
     """Compute the corrected joint values `q + Δ(q)` [rad or m] of measured rows at their measured conditions."""
-    chunks = JointState.from_measurements(measurements).split(CHUNK)
+    chunks = JointState.from_measurements(measurements).split_rows(CHUNK)
     with torch.no_grad():
         return torch.cat([state.q + arm.correction(state) for state in chunks])
 

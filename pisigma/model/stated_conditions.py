@@ -64,7 +64,7 @@ def under_stated_conditions(
     assert learned is not None
     usual = dict(zip(learned.names, learned.mean, strict=True))
     values = torch.tensor([{**usual, **stated}[name] for name in learned.names], dtype=torch.float64)
-    correction, shift = at_conditions(arm.correction, learned.scaled(values))
+    correction, shift = at_conditions(arm.correction, learned.scaled_conditions(values))
     under = replace(arm, robot=_shifted(arm.robot, shift), correction=correction)
     measured = {
         name: ends for name, ends in zip(learned.names, learned.measured, strict=True) if name in stated

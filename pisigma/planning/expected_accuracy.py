@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float64, Int64
 from torch import Tensor
 
-from pisigma.estimation.covariance_root import after_values
+from pisigma.estimation.covariance_root import multiply_updated_root
 from pisigma.measurement.camera.camera_files import Repeatability
 from pisigma.planning.board_views import BoardViews
 from pisigma.planning.candidates import Candidates
@@ -78,9 +78,9 @@ def accuracy_curve(
     orders = [torch.randperm(len(B), generator=generator) for _ in range(RANDOM_SELECTIONS)]
     points = []
     for count in counts:
-        after = after_values(D, B[chosen[:count]].flatten(0, 1))
+        after = multiply_updated_root(D, B[chosen[:count]].flatten(0, 1))
         random = torch.stack(
-            [after_values(D, B[order[:count]].flatten(0, 1)).square().sum() for order in orders]
+            [multiply_updated_root(D, B[order[:count]].flatten(0, 1)).square().sum() for order in orders]
         )
         points.append(
             ExpectedAccuracy(

@@ -12,10 +12,10 @@ from pisigma.calibration.geometric.problem.parameters import ParameterSpace
 from pisigma.calibration.geometric.problem.prior_sizes import PriorGroup, prior_group_of
 from pisigma.calibration.geometric.problem.setup import IdentifiedGeometry
 from pisigma.calibration.hybrid.calibrator import HybridCalibrator
-from pisigma.calibration.hybrid.gravity import USUAL, in_first_row
+from pisigma.calibration.hybrid.gravity import USUAL, to_first_row_frame
 from pisigma.calibration.hybrid.result import HybridResult
 from pisigma.calibration.hybrid.uncertainty import PositionUncertainty
-from pisigma.estimation.covariance_root import CovarianceRoot, after_values
+from pisigma.estimation.covariance_root import CovarianceRoot, multiply_updated_root
 from pisigma.files.errors import IdentificationError, ImplausibleError, MeasurementError
 from pisigma.joint_correction.feature import AbstractFeature
 from pisigma.joint_correction.fourier_series import FourierSeries
@@ -75,7 +75,7 @@ class RobotPosterior:
     instrument: Instrument = Instrument()
 
     @staticmethod
-    def of_robot(
+    def from_robot(
         robot: Robot,
         instrument: Instrument = Instrument(),
         *,
@@ -96,7 +96,7 @@ class RobotPosterior:
         usual, sizes = RobotClass.from_robot(robot), [_geometric_sizes(space)]
         features: tuple[AbstractFeature, ...] = ()
         if hybrid:
-            torques = GravityTorques(robot, in_first_row(robot, gravity))
+            torques = GravityTorques(robot, to_first_row_frame(robot, gravity))
             series = FourierSeries(robot, usual.harmonics)
             sizes += [_weight_sizes(torques, (usual.gravity,)), _weight_sizes(series, usual.bands)]
             features = torques, series
@@ -107,7 +107,7 @@ class RobotPosterior:
         return RobotPosterior(PositionUncertainty(space, geometry, features, root, 1.0), None, instrument)
 
     @staticmethod
-    def of_model(model: CalibratedModel, instrument: Instrument = Instrument()) -> "RobotPosterior":
+    def from_model(model: CalibratedModel, instrument: Instrument = Instrument()) -> "RobotPosterior":
         """Return the posterior that a calibrated model keeps.
 
         Raises:
@@ -124,13 +124,13 @@ class RobotPosterior:
         )
 
     @staticmethod
-    def of_result(result: HybridResult, instrument: Instrument) -> "RobotPosterior":
+    def from_result(result: HybridResult, instrument: Instrument) -> "RobotPosterior":
         """Return the posterior of a hybrid calibration."""
         return RobotPosterior(
             result.uncertainty, None if result.learned is None else result.learned.correction, instrument
         )
 
-    def after(self, rows: Measurements) -> "RobotPosterior":
+    def updated_with(self, rows: Measurements) -> "RobotPosterior":
         """Return the posterior given measured rows: that of a hybrid calibration with them.
 
         Where they are too few for one, the posterior covariance given their joint values alone.
@@ -140,7 +140,7 @@ class RobotPosterior:
             ImplausibleError: no calibration error explains the rows.
         """
         try:
-            return RobotPosterior.of_result(
+            return RobotPosterior.from_result(
                 HybridCalibrator(self.uncertainty.space.robot).fit(rows), self.instrument
             )
         except ImplausibleError:
@@ -154,10 +154,10 @@ class RobotPosterior:
         Args:
             q: commanded joint values [rad or m].
         """
-        root = after_values(self.uncertainty.root, self.measured(q).flatten(0, 1))
+        root = multiply_updated_root(self.uncertainty.root, self.measured(q).flatten(0, 1))
         return replace(self, uncertainty=replace(self.uncertainty, covariance_root=CovarianceRoot(root)))
 
-    def moved(self, q: Float64[Tensor, "*batch dof"]) -> Float64[Tensor, "*batch dof"]:
+    def corrected_joints(self, q: Float64[Tensor, "*batch dof"]) -> Float64[Tensor, "*batch dof"]:
         """Return joint values with the mean joint correction [rad or m]."""
         if self.correction is None:
             return q
@@ -167,7 +167,7 @@ class RobotPosterior:
 
     def columns(self, q: Float64[Tensor, "poses dof"]) -> Float64[Tensor, "poses 6 unknowns"]:
         """Compute the derivatives of the target's position [m] and rotation vector [rad] by all unknowns."""
-        return self.uncertainty.columns(JointState(q), self.moved(q))
+        return self.uncertainty.columns(JointState(q), self.corrected_joints(q))
 
     def tool(self, q: Float64[Tensor, "poses dof"]) -> Float64[Tensor, "poses 3 directions"]:
         """Compute the derivative D of the target's position by standard normal numbers; its covariance is `D D^T`.
@@ -178,14 +178,14 @@ class RobotPosterior:
         """
         columns = self.columns(q)[:, :3]
         if self.instrument.sight is not None:
-            points = forward_kinematics(self.uncertainty.geometry.robot, self.moved(q))[:, :3, 3]
+            points = forward_kinematics(self.uncertainty.geometry.robot, self.corrected_joints(q))[:, :3, 3]
             shifts = torch.eye(3).to(points).expand(len(points), 3, 3)
             rigid = torch.linalg.qr(torch.cat([shifts, skew(points - points.mean(0))], -1).flatten(0, 1)).Q
             flat = columns.flatten(0, 1)
             columns = (flat - rigid @ (rigid.t() @ flat)).view_as(columns)
         if self.instrument.kind == "distance":
             columns[..., [*self.uncertainty.space.indices_of("base")]] = 0.0
-        return self.uncertainty.covariance_root.along(columns)
+        return self.uncertainty.covariance_root.left_multiply(columns)
 
     def measured(self, q: Float64[Tensor, "poses dof"]) -> Float64[Tensor, "poses values directions"]:
         """Compute the derivative B of measured values over their noise; the covariance of these is `B B^T + 1`."""
@@ -195,7 +195,7 @@ class RobotPosterior:
         columns, instrument = self.columns(q), self.instrument
         if instrument.kind == "distance":
             geometry = self.uncertainty.geometry
-            away = forward_kinematics(geometry.robot, self.moved(q))[:, :3, 3] - q.new_tensor(
+            away = forward_kinematics(geometry.robot, self.corrected_joints(q))[:, :3, 3] - q.new_tensor(
                 instrument.anchor
             )
             # A wire measures the motion along its direction only.
@@ -203,12 +203,12 @@ class RobotPosterior:
         elif instrument.kind == "position":
             columns = columns[:, :3] / instrument.sigma
         elif instrument.sight is not None:
-            T = forward_kinematics(self.uncertainty.geometry.robot, self.moved(q))
+            T = forward_kinematics(self.uncertainty.geometry.robot, self.corrected_joints(q))
             columns = instrument.sight.weight(T) @ columns
         else:
             noise = q.new_tensor([instrument.sigma] * 3 + [instrument.sigma_rotation] * 3)
             columns = columns / noise[:, None]
-        return self.uncertainty.covariance_root.along(columns)
+        return self.uncertainty.covariance_root.left_multiply(columns)
 
     def with_unknown_base_and_tool(
         self, base: Float64[np.ndarray, " 6"], tool: Float64[np.ndarray, " 6"]
@@ -238,7 +238,7 @@ class RobotPosterior:
         """Compute the standard deviation of the predicted position [m], `sqrt(σx² + σy² + σz²)`."""
         return self.tool(q).square().sum((1, 2)).sqrt()
 
-    def surprise(self, rows: Measurements) -> Float64[Tensor, " rows"]:
+    def normalised_residual(self, rows: Measurements) -> Float64[Tensor, " rows"]:
         """Compute how improbable measured rows are: the RMS of `(B B^T + 1)^-1/2 r`.
 
         r is measured minus predicted, over the noise. A row that fits has about 1; under the predictive distribution
@@ -258,7 +258,7 @@ class RobotPosterior:
         if instrument.kind in ("distance", "camera") or rows.position is None:
             raise MeasurementError(expected="rows with positions", value="none", option="rows")
         T = predicted_poses(
-            geometry.robot, geometry.bases, geometry.tools, replace(rows, q=self.moved(rows.q))
+            geometry.robot, geometry.bases, geometry.tools, replace(rows, q=self.corrected_joints(rows.q))
         )
         r = (rows.position - T[:, :3, 3]) / instrument.sigma
         if instrument.kind == "pose" and rows.rotation is not None:

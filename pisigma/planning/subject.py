@@ -116,13 +116,13 @@ class Subject:
             if self.model is not None:
                 T = self._from_cell()
                 anchor = None if anchor is None else T[:3, :3] @ anchor + T[:3, 3]
-                posterior = RobotPosterior.of_model(self.model, instrument_of(settings, anchor))
+                posterior = RobotPosterior.from_model(self.model, instrument_of(settings, anchor))
             else:
-                posterior = RobotPosterior.of_robot(arm.robot, instrument_of(settings, anchor))
+                posterior = RobotPosterior.from_robot(arm.robot, instrument_of(settings, anchor))
         if settings.measured is None:
             return posterior
         rows = read_planned_rows(settings, settings.measured, arm.robot).split_sets()[0]
-        return posterior.after(rows) if self.model is None else posterior.informed(rows.q)
+        return posterior.updated_with(rows) if self.model is None else posterior.informed(rows.q)
 
     def _seen_by_camera(
         self, arm: ArmInSurroundings, settings: PlanSettings, views: BoardViews
@@ -136,8 +136,8 @@ class Subject:
         tool = arm.robot.tool
         if self.model is None:
             robot = arm.robot.with_geometry(base=_regular(base), tool=_regular(tool))
-            return RobotPosterior.of_robot(robot, instrument)
-        posterior, fitted = RobotPosterior.of_model(self.model, instrument), self.model.identified
+            return RobotPosterior.from_robot(robot, instrument)
+        posterior, fitted = RobotPosterior.from_model(self.model, instrument), self.model.identified
         if _is_same(base, fitted.base) and _is_same(tool, fitted.tool):
             return posterior
         return posterior.with_unknown_base_and_tool(_regular(base), _regular(tool))

@@ -161,7 +161,7 @@ def draw_corrections(correction: JointCorrection, measurements: Measurements, pa
     panels = figure.subplots(rows, 2, squeeze=False).flatten()
     set_margins(figure, left=0.7, right=0.05, bottom=0.7, top=0.25, across=0.75, up=0.7)
     with torch.no_grad():
-        corrections = correction.of_rows(measurements).numpy()
+        corrections = correction.for_rows(measurements).numpy()
     for j, (axes, joint) in enumerate(zip(panels, joints, strict=False)):
         unit, factor, small, scale = JOINT_UNITS[joint.type]
         values, line = _over_own_value(correction, q, j)

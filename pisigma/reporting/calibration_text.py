@@ -15,7 +15,7 @@ from pisigma.reporting.calibration_verdict import (
     scale_matters,
     scale_text,
 )
-from pisigma.reporting.result_text import Block, ResultText, sentences, table
+from pisigma.reporting.result_text import Block, ResultText, sentences, table_block
 from pisigma.reporting.tables import distance_table
 from pisigma.validation.held_out.calibration_summary import CalibrationSummary
 
@@ -58,10 +58,10 @@ def _accuracy(summary: CalibrationSummary) -> Iterator[Block]:
     judged = [one for one in (summary.cross_validation, summary.held_out, summary.test) if one is not None]
     for figures in judged:
         title = f"errors of {of_what(summary)}, {how_held_out(figures, summary)}"
-        yield table(title, *error_table(figures), "errors of held-out rows")
+        yield table_block(title, *error_table(figures), "errors of held-out rows")
         if figures.socket_distance is not None:
             what = "stated distances of sockets, under calibrations without them"
-            yield table(what, *distance_table(figures.socket_distance), "distances of sockets")
+            yield table_block(what, *distance_table(figures.socket_distance), "distances of sockets")
         yield sentences("remarks on the held-out rows", tables.held_out_lines(figures))
 
 
@@ -69,19 +69,19 @@ def _learned(summary: CalibrationSummary) -> Iterator[Block]:
     """Lay out the joint correction, and what else was tried."""
     if summary.hybrid is not None:
         yield sentences("joint correction", tables.learned_lines(summary.hybrid))
-        yield table("joint corrections that were tried", *tables.trial_table(summary.hybrid), "trials")
+        yield table_block("joint corrections that were tried", *tables.trial_table(summary.hybrid), "trials")
     if summary.judged is not None and (coverage := tables.coverage_line(summary.judged)):
         yield sentences("predicted intervals", [coverage])
     if summary.learning_curve is not None:
         what = "errors of held-out rows by number of training rows"
-        yield table(what, *tables.curve_table(summary.learning_curve), "learning curve")
+        yield table_block(what, *tables.curve_table(summary.learning_curve), "learning curve")
 
 
 def _fit(summary: CalibrationSummary) -> Iterator[Block]:
     """Lay out the errors of the rows that were calibrated with, and how the search ended."""
     if summary.calibrated is not None:
         what = f"errors of the rows used in the calibration, {how_held_out(summary.calibrated, summary)}"
-        yield table(what, *error_table(summary.calibrated), "errors of the fit")
+        yield table_block(what, *error_table(summary.calibrated), "errors of the fit")
     count = len(summary.outliers)
     worst = f"; the worst is {summary.outliers[0].place}" if count else ""
     line = f"Rank {summary.rank}, {summary.iterations} iterations, {count} outliers{worst}."
@@ -90,6 +90,8 @@ def _fit(summary: CalibrationSummary) -> Iterator[Block]:
 
 def _parameters(summary: CalibrationSummary) -> Iterator[Block]:
     """Lay out all parameters, and what the data cannot determine."""
-    yield table("parameters", *parameter_table(summary.parameters), f"{len(summary.parameters)} parameters")
+    yield table_block(
+        "parameters", *parameter_table(summary.parameters), f"{len(summary.parameters)} parameters"
+    )
     lines = ["What these data cannot determine:", *(f"- {one}" for one in undetermined_lines(summary))]
     yield sentences("undetermined parameters", lines, "  ")

@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from pisigma.reporting.result_text import Block, table
+from pisigma.reporting.result_text import Block, table_block
 from pisigma.reporting.tables import Table, distance_table
 from pisigma.reporting.verdict import rounded
 from pisigma.validation.held_out.model_comparison import (
@@ -60,13 +60,13 @@ def comparison_blocks(
     def blocks(whole: bool) -> list[Block]:
         tables = comparison_tables(comparison, Path(data).name, width, whole)
         return [
-            table(title, *cells, "all statistics" if whole else title.split()[0].lower())
+            table_block(title, *cells, "all statistics" if whole else title.split()[0].lower())
             for title, cells in tables
         ]
 
     shown = blocks(whole=verbose)
     if comparison.socket_distance is not None:
-        shown.append(table("stated distances of sockets", *distance_table(comparison.socket_distance)))
+        shown.append(table_block("stated distances of sockets", *distance_table(comparison.socket_distance)))
     return shown, [] if verbose else blocks(whole=True)
 
 

@@ -68,7 +68,9 @@ ERRORS_NOTE = (
 
 def state_table(status: FleetStatus) -> Table:
     """Make a table of the number of robots in each state."""
-    return Table(("state", "robots"), tuple((state, str(len(status.in_state(state)))) for state in STATES))
+    return Table(
+        ("state", "robots"), tuple((state, str(len(status.robots_in_state(state)))) for state in STATES)
+    )
 
 
 def robot_table(robots: Sequence[RobotStatus]) -> Table:

@@ -35,7 +35,7 @@ class Block:
     indent: str = ""
 
 
-def table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]], what: str = "") -> Block:
+def table_block(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]], what: str = "") -> Block:
     """Return a table with its title; `what` is a shorter name of it."""
     return Block(what or title, (title,), tuple(columns), tuple(map(tuple, rows)))
 
@@ -64,7 +64,7 @@ class ResultText:
     closing: tuple[str, ...] = ()
 
 
-def together(warnings: Iterable[str]) -> list[str]:
+def merge_alike_warnings(warnings: Iterable[str]) -> list[str]:
     """Join more than `MAX_ALIKE` warnings that differ in numbers only into one with their lines."""
     kinds: dict[str, list[str]] = {}
     for one in dict.fromkeys(warnings):

@@ -3,9 +3,9 @@
 Names are loaded on first use, so that kernels do not import torch; `__init__.pyi` declares them to type checkers.
 """
 
-from pisigma.files.lazy_names import lazily
+from pisigma.files.lazy_names import lazy_getattr
 
-__getattr__ = lazily(
+__getattr__ = lazy_getattr(
     __name__,
     {
         "description": "Robot",

@@ -55,7 +55,7 @@ class MeasuredPoses:
         """Select the rows of a mask or an index."""
         return MeasuredPoses(self.position[rows], self.rotation[rows], self.has_rotation[rows], self.lever)
 
-    def scaled(self, factor: float) -> "MeasuredPoses":
+    def scale_positions(self, factor: float) -> "MeasuredPoses":
         """Multiply the positions by a factor."""
         return replace(self, position=self.position * factor)
 
@@ -66,13 +66,13 @@ class MeasuredPoses:
 
     @property
     def spread(self) -> float:
-        """Root mean square distance [m] from the mean pose, as `squares` measures it."""
+        """Root mean square distance [m] from the mean pose, as `squared_errors` measures it."""
         off = (self.position - self.position.mean(0)).square().sum(-1).mean()
         R = self.rotation[self.has_rotation]
         turn = (3 - R.mean(0).square().sum()) / 2 if len(R) else torch.zeros(())
         return float((off + self.lever**2 * turn * self.has_rotation.double().mean()).sqrt())
 
-    def squares(self, T: Float64[Tensor, "*batch rows 4 4"]) -> Float64[Tensor, "*batch rows"]:
+    def squared_errors(self, T: Float64[Tensor, "*batch rows 4 4"]) -> Float64[Tensor, "*batch rows"]:
         """Compute squared errors `|dp|² + lever² |dR|² / 2` [m²] of poses; |dR|²/2 is about the angle squared."""
         off = (self.position - T[..., :3, 3]).square().sum(-1)
         turn = (self.rotation - T[..., :3, :3]).square().sum((-2, -1)) / 2
@@ -146,11 +146,11 @@ def best_base_and_tool(
     base, tool = _affine_base_and_tool(T, measured)
     # The closed form minimises another norm than the errors, so a few steps of Levenberg-Marquardt follow.
     damping = torch.full_like(T[..., 0, 0, 0], INITIAL_DAMPING)
-    cost = measured.squares(base[..., None, :, :] @ T @ tool[..., None, :, :]).sum(-1)
+    cost = measured.squared_errors(base[..., None, :, :] @ T @ tool[..., None, :, :]).sum(-1)
     for _ in range(MAX_ITERATIONS):
         step = base_and_tool_step(T, measured, base, tool, damping)
         new_base, new_tool = moved_base_and_tool(base, tool, step)
-        new_cost = measured.squares(new_base[..., None, :, :] @ T @ new_tool[..., None, :, :]).sum(-1)
+        new_cost = measured.squared_errors(new_base[..., None, :, :] @ T @ new_tool[..., None, :, :]).sum(-1)
         better = new_cost < cost
         converged = bool(((cost - new_cost).abs() <= CONVERGENCE_TOLERANCE * cost).all())
         # Every batch accepts or rejects its own step.

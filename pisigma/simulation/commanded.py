@@ -154,7 +154,7 @@ class AbstractCommanded(Section):
             )
         return self
 
-    def commanded(self, robot: TrueRobot) -> Float64[Tensor, "rows dof"]:
+    def commanded_joints(self, robot: TrueRobot) -> Float64[Tensor, "rows dof"]:
         """Return the joint values to command [rad or m], the same at every call. See `joints_for_poses`."""
         if isinstance(self.poses, JointsRandom):
             return self.poses.joints(robot.nominal)

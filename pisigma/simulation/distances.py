@@ -117,7 +117,7 @@ class SimulatedDistances(AbstractCommanded):
         Raises:
             RecipeError: a distance is negative.
         """
-        q = self.commanded(robot)
+        q = self.commanded_joints(robot)
         draws = draw_noise(self.noise, len(q))
         anchor = torch.tensor(self.anchor.point_mm, dtype=torch.float64) / 1e3
         approach = robot.draw_approach(q)
@@ -159,7 +159,7 @@ class SimulatedPairs(AbstractCommanded):
         Raises:
             RecipeError: the number of poses is odd, or a distance is negative.
         """
-        q = self.commanded(robot)
+        q = self.commanded_joints(robot)
         if len(q) % 2:
             raise RecipeError(
                 option="pairs", expected="an even number of poses", value=len(q), remedy="add or remove one"

@@ -37,7 +37,7 @@ class SimulatedMeasurements(AbstractCommanded):
 
     def measure(self, robot: TrueRobot) -> Measurements:
         """Simulate the measurements, the same at every call. See `simulate`."""
-        measured = simulate(robot, self.commanded(robot), self.sensor, self.noise)
+        measured = simulate(robot, self.commanded_joints(robot), self.sensor, self.noise)
         rows = measured.rows
         return replace(measured, frame=(self.frame,) * rows, target=(self.target,) * rows)
 

@@ -135,7 +135,7 @@ class TrueRobot:
         for index, source in enumerate(self.errors):
             place = f"errors[{index}] ({source.kind})"
             if isinstance(source, AbstractGeometrySource):
-                change = source.change(self.nominal, place)
+                change = source.parameter_errors(self.nominal, place)
                 dh, base, tool = dh + change.dh, base + change.base, tool + change.tool
                 continue
             if isinstance(source, AbstractPlaySource):

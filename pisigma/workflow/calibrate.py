@@ -26,7 +26,7 @@ from pisigma.reporting.cards import CardTexts, write_calibration_card
 from pisigma.robot.description import Robot
 from pisigma.validation.checks.check import CheckedCalibration
 from pisigma.validation.checks.registry import diagnostics_of
-from pisigma.validation.checks.row_order import explained
+from pisigma.validation.checks.row_order import explain_refusal
 from pisigma.validation.checks.scale import scale_figures
 from pisigma.validation.checks.setup_fault import setup_diagnostics
 from pisigma.validation.held_out.calibration_summary import CalibrationSummary, summarise
@@ -37,9 +37,9 @@ from pisigma.validation.held_out.pose_statistics import predicted_at_other_poses
 from pisigma.validation.held_out.trained_calibrations import (
     Calibrator,
     Result,
+    fit_compared_calibrations,
     geometric_of,
     geometric_result,
-    trained,
 )
 from pisigma.workflow.result import AbstractModelResult
 from pisigma.workflow.settings.calibration import CalibrationSettings, ModelKind
@@ -137,11 +137,11 @@ def calibrate(
     try:
         result, judged = fit_with_folds(calibrator, rows, training, splits, progress, settings.jobs)
     except IdentificationError as refusal:
-        raise explained(refusal, nominal, rows) from refusal
+        raise explain_refusal(refusal, nominal, rows) from refusal
     validation = joined_repeats(training, splits, judged) if splits else None
     test = None if test_rows is None else judge(calibrator, result, rows, test_rows)
     summary = summarise(result)
-    summary = summary.having(
+    summary = summary.with_figures(
         warnings=(*summary.warnings, *((ONLY_GEOMETRY,) if faulty else ()), *beyond),
         command=_call(nominal, measurements, settings),
         rows=rows.rows,
@@ -184,11 +184,11 @@ def compose(
         IdentificationError: the measurements cannot come from this robot.
     """
     checked = CheckedCalibration(
-        geometric_of(calibrator), rows, trained(calibrator, rows, result=result), validation
+        geometric_of(calibrator), rows, fit_compared_calibrations(calibrator, rows, result=result), validation
     )
     diagnostics, nominal = diagnostics_of(checked), checked.robot
     warnings = tuple(one.sentence for one in diagnostics if one.severity == "warning")
-    summary = summary.having(
+    summary = summary.with_figures(
         calibrated=checked.figures,
         scale=scale_figures(checked),
         diagnostics=diagnostics,
@@ -196,12 +196,12 @@ def compose(
     )
     if validation is None and summary.test is None and summary.held_out is None:
         predicted = predicted_at_other_poses(result, rows)
-        summary = summary.having(predicted_rms_mm=None if predicted is None else predicted * 1e3)
+        summary = summary.with_figures(predicted_rms_mm=None if predicted is None else predicted * 1e3)
     kept = (
         None if validation is None or held_out is None else HeldOutRows.from_validation(validation, held_out)
     )
     if kept is not None:
-        summary = summary.having(held_out_rows=kept.hashes(kept.to_csv(nominal)))
+        summary = summary.with_figures(held_out_rows=kept.hashes(kept.to_csv(nominal)))
     model = model_of_calibration(recipe[0] or nominal.name, nominal, geometric_result(result), rows, recipe)
     if isinstance(result, HybridResult):
         model = with_hybrid(model, result)

@@ -215,11 +215,11 @@ def compare(
         models=models,
         settings=settings,
         parameters=parameter_differences(pair, settings.level),
-        workspace=Displacement.at(pair, pair.workspace, "the workspace"),
+        workspace=Displacement.from_pair(pair, pair.workspace, "the workspace"),
         rows=compared,
         program=None
         if program is None
-        else Displacement.at(pair, read_task(program, pair.first), Path(program).name),
+        else Displacement.from_pair(pair, read_task(program, pair.first), Path(program).name),
         diagnostics=diagnostics,
         warnings=warnings,
         seconds=time.perf_counter() - started,

@@ -7,7 +7,7 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from pisigma.files.errors import IdentificationError
-from pisigma.files.progress import Progress, stage
+from pisigma.files.progress import Progress, staged_progress
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.network.correction_network import CorrectionNetwork, JointGroup
 from pisigma.network.inputs import Inputs
@@ -106,7 +106,7 @@ def choose_network(
     pairs = _pairs(poses, chosen[0])
     fits: list[tuple[CorrectionNetwork, Size, float]] = []
     for size in sizes:
-        of_size = stage(progress, f"orders {size.orders}, harmonics {size.harmonics}")
+        of_size = staged_progress(progress, f"orders {size.orders}, harmonics {size.harmonics}")
         network = _fit_size(parent.robot, size, pairs, *search, of_size)
         T, q = poses.T[chosen[1]], poses.q_nominal[chosen[1]]
         with torch.no_grad():

@@ -18,7 +18,7 @@ from pisigma.model.folder.model_folder import load_model
 from pisigma.model.model_source import HasModel, ModelSource, model_or_folder
 from pisigma.model.stated_conditions import condition_warnings
 from pisigma.model.training_rows import training_row_warnings
-from pisigma.validation.checks.other_sensors import missed_distances
+from pisigma.validation.checks.other_sensors import distance_diagnostics
 from pisigma.validation.checks.wrong_rows import without_wrong_rows
 from pisigma.validation.gate import check_rows
 from pisigma.validation.held_out.diagnostic import Diagnostic
@@ -169,7 +169,7 @@ def evaluate(
             for figures in judged
             for diagnostic in (
                 *_diagnostics(loaded[figures.name], figures, rows, settings.fitted),
-                *missed_distances(comparison, figures),
+                *distance_diagnostics(comparison, figures),
             )
         ),
         warnings=(

@@ -20,8 +20,13 @@ from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.fields import UnusableRow
 from pisigma.planning.plan_file import StoredPlan, read_plan
 from pisigma.planning.plan_inputs import find_candidates, with_measured
-from pisigma.planning.session.reached import Reached, cross_validated, expected, reached
 from pisigma.planning.session.row_alarms import NEAR_POSE, joint_differences, of_all_rows
+from pisigma.planning.session.session_accuracy import (
+    SessionAccuracy,
+    cross_validated,
+    expected,
+    session_accuracy,
+)
 from pisigma.planning.session.session_rows import FurtherPoses, SessionRows, advice, setup_sentence
 from pisigma.planning.session.state import (
     AccuracyPoint,
@@ -82,9 +87,9 @@ class MeasuringSession:
         self._reached: list[AccuracyPoint] = []
         self._expected: tuple[AccuracyPoint, ...] = ()
         self._worked_out = 0
-        self._so_far: Reached | None = None
-        self._ahead_of: Reached | None = None
-        self._validated: Reached | None = None
+        self._so_far: SessionAccuracy | None = None
+        self._ahead_of: SessionAccuracy | None = None
+        self._validated: SessionAccuracy | None = None
         self._poses = int((~plan.check).sum())
 
     @staticmethod
@@ -164,7 +169,10 @@ class MeasuringSession:
         # a session that starts with rows also gets the point before its first one, like an uninterrupted session
         counts = [training.rows] if self._reached else [training.rows - self._settings.every, training.rows]
         parts = [training.select(torch.arange(max(count, 0))) for count in counts]
-        found = [reached(self.plan, self._before, some, kept_apart, self._task, progress) for some in parts]
+        found = [
+            session_accuracy(self.plan, self._before, some, kept_apart, self._task, progress)
+            for some in parts
+        ]
         with self._lock:
             if found[-1] is not None:
                 self._so_far = found[-1]

@@ -149,7 +149,7 @@ class Monitoring:
         )
         changes: tuple[Jump | Trend, ...] = (
             *self.jumps,
-            *(one for one in self.trends if one.clear),
+            *(one for one in self.trends if one.is_significant),
         )
         moves = (f"{one.sentence}." for one in changes)
         forecast = () if self.forecast is None else (self.forecast.sentence,)

@@ -15,7 +15,7 @@ from pisigma.calibration.hybrid.calibrator import HybridCalibrator
 from pisigma.calibration.hybrid.result import HybridResult
 from pisigma.files.errors import IdentificationError, ModelError
 from pisigma.files.model_files import model_hash
-from pisigma.files.progress import Progress, stage
+from pisigma.files.progress import Progress, staged_progress
 from pisigma.lifetime.recalibration.adaptation import Adaptation, adapt
 from pisigma.lifetime.recalibration.candidates import CLEAR_RATIO, CandidateChoice, choose_candidate
 from pisigma.lifetime.recalibration.movement import Movement, movements_text, significant_movements
@@ -150,11 +150,11 @@ def recalibrate(
     rows, adaptation, outliers = _adapted(parent, posterior, rows, elsewhere, right.numbers)
     calibrator = HybridCalibrator(nominal)
     choice = choose_candidate(
-        parent, adaptation, elsewhere, rows, calibrator, stage(progress, "cross-validation")
+        parent, adaptation, elsewhere, rows, calibrator, staged_progress(progress, "cross-validation")
     )
     consistency = _fleet_consistency(parent, rows)
     odd = consistency is not None and consistency.is_inconsistent
-    from_scratch = stage(progress, "from scratch")
+    from_scratch = staged_progress(progress, "from scratch")
     choice, kept = _kept(choice, odd, parent, adaptation, rows, calibrator, from_scratch)
     moved = (
         significant_movements(adaptation) if consistency is None and _believable(choice, nominal) else None
@@ -163,7 +163,7 @@ def recalibrate(
     diagnostics = verdict.implausible or recalibration_diagnostics(parent, choice, every, wrong, moved or ())
     moved = None if diagnostics else moved
     summary = _summary(parent, rows, adaptation, choice, moved)
-    summary = summary.having(
+    summary = summary.with_figures(
         diagnostics=diagnostics,
         warnings=(*again, *summary.warnings),
         parent=ParentFigures(name=parent.name, kind=parent.kind, sha256=sha256),
@@ -171,9 +171,9 @@ def recalibrate(
         elsewhere=tuple(" ".join(owner).strip() for owner in sorted(elsewhere)),
     )
     if diagnostics:
-        summary = summary.having(changed=NOT_TRUSTED)
+        summary = summary.with_figures(changed=NOT_TRUSTED)
     if consistency is not None:
-        summary = summary.having(changed=consistency.sentence)
+        summary = summary.with_figures(changed=consistency.sentence)
     kept = with_wide_limits(replace(kept, metrics=summary.to_json()), rows)
     return Recalibration(
         kept, parent, adaptation, choice, moved or (), summary, seconds=time.perf_counter() - started
@@ -235,7 +235,7 @@ def _kept_model(
         assert isinstance(result, HybridResult)
         return replace(model_of_hybrid(parent.name, calibrator.geometric.robot, result, rows), kind=KIND)
     if choice.kept == "old":
-        adaptation = adapt(adaptation.problem.without_arm(), adaptation.drift.noise)
+        adaptation = adapt(adaptation.problem.with_fixed_arm(), adaptation.drift.noise)
     return recalibrated_model(parent, adaptation, rows)
 
 

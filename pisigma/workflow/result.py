@@ -73,7 +73,7 @@ class AbstractModelResult(ABC):
                 remedy="correct what the diagnostics name, or accept implausible results explicitly "
                 "(accept_implausible, --accept-implausible)",
             )
-        summary = self.summary.having(command=command)
+        summary = self.summary.with_figures(command=command)
         name = printable(name or Path(folder).resolve().name, cut=False)
         model = replace(self.model, name=name, metrics=summary.to_json())
         with staged_folder(folder, overwrite) as scratch:

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from pisigma.reporting.comparison_tables import comparison_blocks, model_rms
-from pisigma.reporting.result_text import ResultText, sentences, table
+from pisigma.reporting.result_text import ResultText, sentences, table_block
 from pisigma.reporting.verdict import Verdict, counted, rounded, uncapitalised
 from pisigma.workflow.plan import Plan
 from pisigma.workflow.verify import Verification
@@ -45,12 +45,12 @@ def plan_text(planned: Plan, files: Sequence[Path]) -> ResultText:
         tuple(planned.warnings),
         (
             sentences("criterion and limit", _curve_lines(planned)),
-            table(title, columns, list(dict.fromkeys(short))),
+            table_block(title, columns, list(dict.fromkeys(short))),
             sentences("what remains uncertain", weak, "  "),
             sentences("what limits a camera", () if planned.camera is None else planned.camera.sentences),
         ),
         (
-            *([table(f"{title}, all", columns, rows)] if len(short) < len(rows) else []),
+            *([table_block(f"{title}, all", columns, rows)] if len(short) < len(rows) else []),
             sentences("candidates and way points", lines),
         ),
         (f"Written to {', '.join(map(str, files))}.",),

@@ -12,7 +12,7 @@ import torch
 from pisigma.calibration.geometric.initial_guess.base_and_tool import fit_base_and_tool
 from pisigma.files.engines.processes import run_in_processes
 from pisigma.files.errors import MeasurementError, RecipeError
-from pisigma.files.progress import Progress, silent, stage
+from pisigma.files.progress import Progress, ignore_progress, staged_progress
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.groups import groups_of_equal_joints
 from pisigma.model.calibrated_model import CalibratedModel, Provenance
@@ -154,7 +154,7 @@ def _train_geometric(
     calibrator = recipe.calibration.calibrator(data.robot)
     result = calibrator.fit(rows)
     errors = errors_under(result, held_out).figures
-    summary = summarise(result).having(
+    summary = summarise(result).with_figures(
         command=_call(recipe),
         redundant_sets=tuple(tuple(members) for members in result.pairwise.sets),
         no_effect=tuple(result.pairwise.no_effect),
@@ -180,16 +180,18 @@ def _train_hybrid(
     judged, splits = data.splits()
     calibrator = recipe.calibrator(data.robot)
     started = time.perf_counter()
-    result = calibrator.fit(rows, stage(progress, "calibration"))
+    result = calibrator.fit(rows, staged_progress(progress, "calibration"))
     seconds = time.perf_counter() - started
-    validation = validate(calibrator, judged, splits, stage(progress, "held-out rows"), settings.jobs)
+    validation = validate(
+        calibrator, judged, splits, staged_progress(progress, "held-out rows"), settings.jobs
+    )
     test = None if data.test is None else judge(calibrator, result, rows, data.test)
     curve = None
     if (stated := recipe.learning_curve) is not None:
-        of_curve = stage(progress, "learning curve")
+        of_curve = staged_progress(progress, "learning curve")
         sizes, seed, jobs = stated.rows, stated.seed, settings.jobs
         curve = learning_curve(calibrator, judged, splits, sizes, seed, of_curve, validation, jobs)
-    summary = summarise(result).having(
+    summary = summarise(result).with_figures(
         command=_call(recipe),
         rows=rows.rows,
         fit_seconds=round(seconds, 3),
@@ -224,7 +226,7 @@ def _train_inverse(
     test = None
     if data.test is not None:
         test = ComparisonFigures.from_comparison(compare_on(run.model, data.test), rows=data.test.rows)
-    summary = summarise_training(run, recipe.paper, validation, test).having(command=_call(recipe))
+    summary = summarise_training(run, recipe.paper, validation, test).with_figures(command=_call(recipe))
     model = replace(run.model, metrics=summary.to_json())
     return InverseTraining(model, recipe, run, summary)
 
@@ -314,22 +316,25 @@ def cross_validate(
         )
     measurements, folds = data.splits()
     with_orientation, not_predicted = measurements.rotation is not None, 0
-    nominal, corrected = (PoseErrors.unknown(measurements.rows, with_orientation) for _ in range(2))
+    nominal, corrected = (PoseErrors.all_nan(measurements.rows, with_orientation) for _ in range(2))
     tasks = [
         partial(
             _compared_fold,
             recipe,
             replace(data, training=measurements.select(training)),
             measurements.select(test),
-            partial(progress if jobs is None else silent, f"cross-validation: fold {number} of {len(folds)}"),
+            partial(
+                progress if jobs is None else ignore_progress,
+                f"cross-validation: fold {number} of {len(folds)}",
+            ),
         )
         for number, (training, test) in enumerate(folds, start=1)
     ]
     comparisons = (task() for task in tasks) if jobs is None else run_in_processes(tasks, jobs)
     for (_, test), comparison in zip(folds, comparisons, strict=True):
         not_predicted += comparison.not_predicted
-        nominal.put(test, comparison.nominal)
-        corrected.put(test, comparison.corrected)
+        nominal.set_rows(test, comparison.nominal)
+        corrected.set_rows(test, comparison.corrected)
     return ComparisonFigures.from_comparison(Comparison(nominal, corrected, not_predicted), folds=len(folds))
 
 

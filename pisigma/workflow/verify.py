@@ -21,7 +21,7 @@ from pisigma.model.model_source import HasModel, ModelSource, model_or_folder
 from pisigma.model.stated_conditions import condition_warnings
 from pisigma.model.training_rows import training_row_warnings
 from pisigma.robot.row import Row
-from pisigma.validation.checks.other_sensors import missed_distances
+from pisigma.validation.checks.other_sensors import distance_diagnostics
 from pisigma.validation.checks.wrong_rows import without_wrong_rows
 from pisigma.validation.gate import check_rows
 from pisigma.validation.held_out.diagnostic import Diagnostic
@@ -198,7 +198,7 @@ def verify(
     else:
         verdict = _verdict(loaded, comparison, difference, ratio, faults)
         sentence = _sentence(verdict, comparison, difference, ratio, faults)
-    wrong = (*gate.implausible, *missed_distances(comparison, comparison.models[-1]))
+    wrong = (*gate.implausible, *distance_diagnostics(comparison, comparison.models[-1]))
     if wrong and not faults:
         verdict, motion = "implausible", None
         sentence = f"{NOTHING_SHOWN}: {wrong[0].sentence}"

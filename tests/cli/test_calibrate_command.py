@@ -157,7 +157,7 @@ def test_a_wrong_scale_of_the_sensor_is_a_warning_where_it_matters(capsys, calib
     ):
         scale = ScaleFigures(factor=1.00123, sigma=0.0002, odds=odds, rms_mm=share * rms)
         with no_type_checker():
-            print_result(calibration_text(summary.having(scale=scale), folder, 1.0), verbose=False)
+            print_result(calibration_text(summary.with_figures(scale=scale), folder, 1.0), verbose=False)
         text = " ".join(capsys.readouterr().out.split())
         assert ("1.00123 +- 0.00020" in text) == is_said
         assert (text.count("Warning: ") > len(summary.warnings)) == is_warning

@@ -3,9 +3,9 @@
 import pytest
 
 from pisigma.cli import progress
-from pisigma.cli.progress import progress_of, share_done, step_of
+from pisigma.cli.progress import progress_of, share_done, step_name
 from pisigma.cli.screen import MAX_LINES, print_screen
-from pisigma.reporting.result_text import MAX_ALIKE, Block, ranges, together
+from pisigma.reporting.result_text import MAX_ALIKE, Block, merge_alike_warnings, ranges
 from pisigma.reporting.verdict import Verdict, rounded, uncapitalised
 
 VERDICT = Verdict("0.12 mm RMS, held out; nominal 1 mm.", "yes, for all: nothing is wrong.", "verify it.")
@@ -46,7 +46,7 @@ def test_warnings_are_never_hidden(capsys):
 @pytest.mark.parametrize(("count", "shown"), [(MAX_ALIKE, MAX_ALIKE), (MAX_ALIKE + 1, 1)])
 def test_many_warnings_of_a_kind_become_one_with_their_lines(count, shown):
     warnings = [f"a.csv, line {2 + number}: is {number}.5 mm off." for number in range(count)]
-    joined = together([*warnings, "something else."])
+    joined = merge_alike_warnings([*warnings, "something else."])
     assert len(joined) == shown + 1
     if shown == 1:
         assert joined[0].startswith(warnings[0])
@@ -87,7 +87,7 @@ def test_a_sentence_continues_another():
 )
 def test_steps_of_a_long_computation(what, share, step):
     assert share_done(what) == share
-    assert step_of(what) == step
+    assert step_name(what) == step
 
 
 def test_without_a_terminal_each_step_is_a_line_with_the_time_left(capsys, monkeypatch):

@@ -4,7 +4,7 @@ import torch
 from testing.closeness import assert_close
 from torch import Tensor
 
-from pisigma.estimation.covariance_root import CovarianceRoot, FewValues
+from pisigma.estimation.covariance_root import CovarianceRoot, ImplicitCovarianceRoot
 
 PARAMETERS, WEIGHTS, VALUES = 3, 12, 5
 
@@ -16,13 +16,13 @@ def normal(*shape: int, seed: int) -> Tensor:
 def factored() -> CovarianceRoot:
     Z, size = normal(VALUES, WEIGHTS, seed=1), normal(WEIGHTS, seed=2).abs() + 0.1
     factor = torch.linalg.cholesky(Z @ Z.t() + torch.eye(VALUES, dtype=torch.float64))
-    return CovarianceRoot(normal(PARAMETERS + WEIGHTS, 4, seed=3), FewValues(size, Z, factor))
+    return CovarianceRoot(normal(PARAMETERS + WEIGHTS, 4, seed=3), ImplicitCovarianceRoot(size, Z, factor))
 
 
 def test_the_covariance_after_few_values_is_the_inverse_of_the_information() -> None:
     few = factored().weights
     assert few is not None
-    root = few.along(torch.eye(WEIGHTS, dtype=torch.float64))
+    root = few.left_multiply(torch.eye(WEIGHTS, dtype=torch.float64))
     precision = few.Z.t() @ few.Z + torch.eye(WEIGHTS, dtype=torch.float64)
     expected = few.size[:, None] * torch.linalg.inv(precision) * few.size
     assert_close(root @ root.t(), expected, rtol=1e-12)
@@ -31,16 +31,16 @@ def test_the_covariance_after_few_values_is_the_inverse_of_the_information() -> 
 def test_products_are_those_of_the_matrix() -> None:
     root = factored()
     columns, matrix = normal(2, 3, PARAMETERS + WEIGHTS, seed=4), normal(PARAMETERS + WEIGHTS, 2, seed=5)
-    assert_close(root.along(columns), columns @ root.dense, rtol=1e-12)
-    assert_close(root.covariance_times(matrix), root.dense @ root.dense.t() @ matrix, rtol=1e-12)
-    dense = CovarianceRoot(root.dense)
-    assert_close(dense.along(columns), columns @ root.dense, rtol=1e-12)
-    assert_close(dense.covariance_times(matrix), root.dense @ root.dense.t() @ matrix, rtol=1e-12)
+    assert_close(root.left_multiply(columns), columns @ root.as_matrix, rtol=1e-12)
+    assert_close(root.covariance_times(matrix), root.as_matrix @ root.as_matrix.t() @ matrix, rtol=1e-12)
+    dense = CovarianceRoot(root.as_matrix)
+    assert_close(dense.left_multiply(columns), columns @ root.as_matrix, rtol=1e-12)
+    assert_close(dense.covariance_times(matrix), root.as_matrix @ root.as_matrix.t() @ matrix, rtol=1e-12)
 
 
 def test_extended_by_columns_scale_and_coordinates() -> None:
     root, added, change = factored(), normal(PARAMETERS + WEIGHTS, 2, seed=6), normal(6, PARAMETERS, seed=7)
     extended = root.extended(added, 3.0, change)
     whole = torch.block_diag(change, torch.eye(WEIGHTS, dtype=torch.float64))
-    C = whole @ (root.dense @ root.dense.t() + added @ added.t()) @ whole.t() * 9.0
-    assert_close(extended.dense @ extended.dense.t(), C, rtol=1e-12)
+    C = whole @ (root.as_matrix @ root.as_matrix.t() + added @ added.t()) @ whole.t() * 9.0
+    assert_close(extended.as_matrix @ extended.as_matrix.t(), C, rtol=1e-12)

@@ -12,7 +12,7 @@ from sklearn.linear_model import BayesianRidge
 from testing.closeness import assert_close
 from torch import Tensor
 
-from pisigma.estimation.dual_regression import DualRegression, gram, stacked
+from pisigma.estimation.dual_regression import DualRegression, group_gram, stack_groups
 from pisigma.estimation.primal_regression import PrimalRegression
 from pisigma.estimation.prior import GaussianPrior
 from pisigma.estimation.regression import AbstractRegression, SensorCount
@@ -35,7 +35,7 @@ def both_forms(X: Tensor, y: Tensor, prior: GaussianPrior) -> dict[str, Abstract
     sensors = (SensorCount(float(len(y)), stated=False, exact=False),)
     active = int((prior.base == 0).sum())
     primal = PrimalRegression((X.t() @ X)[None], (X.t() @ y)[None], (float(y @ y),), sensors)
-    K = stacked([gram(X, prior, 1, active)], y)
+    K = stack_groups([group_gram(X, prior, 1, active)], y)
     sensor = torch.zeros(len(y), dtype=torch.int64)
     return {"primal": primal, "dual": DualRegression(X, y, sensor, prior, active, K, sensors)}
 
@@ -58,7 +58,7 @@ def test_the_covariance_is_that_of_bayesian_ridge(form: str):
     peer = BayesianRidge(max_iter=2000, tol=1e-13, fit_intercept=False).fit(X.numpy(), y.numpy())
     prior = replace(prior, sizes=torch.tensor([1.0, peer.lambda_**-0.5]).double())
     regression = both_forms(X, y, prior)[form]
-    root = regression.covariance_root(regression.solve(prior, (float(peer.alpha_) ** -0.5,))).dense
+    root = regression.covariance_root(regression.solve(prior, (float(peer.alpha_) ** -0.5,))).as_matrix
     assert_close(root @ root.t(), torch.from_numpy(peer.sigma_), rtol=1e-9)
 
 
@@ -83,7 +83,7 @@ def test_parameters_without_prior_are_exact_in_fifty_digits(form: str, scale: fl
     noise = 0.3
     regression = both_forms(X, y, prior)[form]
     posterior = regression.solve(prior, (noise,))
-    root = regression.covariance_root(posterior).dense
+    root = regression.covariance_root(posterior).as_matrix
     with mpmath.workdps(50):
         A, b = mpmath.matrix(X.tolist()), mpmath.matrix(y.tolist())
         normal = A.T * A / mpmath.mpf(noise) ** 2 + mpmath.diag(prior.precision.tolist())

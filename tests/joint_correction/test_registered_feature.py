@@ -49,11 +49,12 @@ class Coupling(AbstractFeature):
 
     def add_onnx(self, graph: OnnxGraph, weight: np.ndarray, q: str) -> str:
         """See `AbstractFeature.add_onnx`."""
-        angle = graph.node("Add", q, graph.column(q, 0))
+        angle = graph.add_node("Add", q, graph.column(q, 0))
         sine, cosine = (
-            graph.node("Mul", graph.node(name, angle), weight[:, k]) for k, name in enumerate(("Sin", "Cos"))
+            graph.add_node("Mul", graph.add_node(name, angle), weight[:, k])
+            for k, name in enumerate(("Sin", "Cos"))
         )
-        return graph.node("Add", sine, cosine)
+        return graph.add_node("Add", sine, cosine)
 
 
 @pytest.fixture(autouse=True)

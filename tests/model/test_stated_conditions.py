@@ -124,7 +124,7 @@ def test_temperature_is_clamped_and_payload_extrapolated(name: str) -> None:
             assert_close(kernels.forward(q.numpy())[0], at_edge.forward(q), atol=1e-13)
     assert model.hybrid is not None
     usual, measured, beyond = (
-        model.hybrid.correction.of_rows(rows_under(q, payload, 25.0)) for payload in (2.0, 5.0, 11.0)
+        model.hybrid.correction.for_rows(rows_under(q, payload, 25.0)) for payload in (2.0, 5.0, 11.0)
     )
     assert_close(beyond - usual, 3 * (measured - usual), atol=1e-15)
     assert float((measured - usual).abs().max()) > 1e-5

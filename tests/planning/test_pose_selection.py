@@ -20,7 +20,7 @@ def random_joints(count: int, seed: int) -> torch.Tensor:
 
 @pytest.fixture(scope="module")
 def posterior() -> RobotPosterior:
-    return RobotPosterior.of_robot(Robot.load("ur5"), hybrid=False)
+    return RobotPosterior.from_robot(Robot.load("ur5"), hybrid=False)
 
 
 def log_det(B: torch.Tensor) -> float:
@@ -62,7 +62,7 @@ def test_gains_and_exchange_are_those_of_the_criterion(
 @pytest.mark.parametrize("hybrid", [False, True])
 def test_condensed_rows_keep_the_variance_after_measuring(hybrid: bool) -> None:
     # before it is all where base and tool are, metres against tenths of a millimetre
-    posterior, task = RobotPosterior.of_robot(Robot.load("ur5"), hybrid=hybrid), random_joints(50, 1)
+    posterior, task = RobotPosterior.from_robot(Robot.load("ur5"), hybrid=hybrid), random_joints(50, 1)
     q, goal = random_joints(60, 0), condensed(posterior.tool(task))
     for count in (5, 20, 60):
         left = rms_of(posterior.informed(q[:count]).tool(task)) ** 2
@@ -71,7 +71,7 @@ def test_condensed_rows_keep_the_variance_after_measuring(hybrid: bool) -> None:
 
 def test_criterion_i_leaves_less_error_of_the_tool_than_criterion_d_and_random_poses() -> None:
     posterior, q, task = (
-        RobotPosterior.of_robot(Robot.load("ur5")),
+        RobotPosterior.from_robot(Robot.load("ur5")),
         random_joints(200, 4),
         random_joints(50, 5),
     )
@@ -118,7 +118,7 @@ def test_remaining_errors_are_attributed_to_groups(posterior: RobotPosterior) ->
     errors = remaining_errors(posterior, task)
     assert {"base", "tool", "joint offsets"} <= {error.name for error in errors}
     assert errors[0].name == "base"
-    hybrid = RobotPosterior.of_robot(Robot.load("ur5")).informed(random_joints(300, 7))
+    hybrid = RobotPosterior.from_robot(Robot.load("ur5")).informed(random_joints(300, 7))
     assert any(error.name.startswith("correction of joint") for error in remaining_errors(hybrid, task))
 
 

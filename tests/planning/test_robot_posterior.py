@@ -27,7 +27,7 @@ def robot() -> Robot:
 @pytest.mark.parametrize("kind", ["position", "pose", "distance"])
 def test_columns_are_the_derivative_of_the_measured_values(robot: Robot, kind: str) -> None:
     instrument = Instrument(kind, 1e-4, 2e-4, (1.0, 2.0, 0.5))
-    posterior = RobotPosterior.of_robot(robot, instrument)
+    posterior = RobotPosterior.from_robot(robot, instrument)
     q = random_joints(robot, 4, 0)
     B = posterior.measured(q)
     assert B.shape[1] == {"position": 3, "pose": 6, "distance": 1}[kind]
@@ -45,7 +45,7 @@ def test_columns_are_the_derivative_of_the_measured_values(robot: Robot, kind: s
 
 
 def test_conditioning_agrees_with_a_normal_distribution(robot: Robot) -> None:
-    posterior = RobotPosterior.of_robot(robot, hybrid=False)
+    posterior = RobotPosterior.from_robot(robot, hybrid=False)
     q, task = random_joints(robot, 20, 1), random_joints(robot, 30, 2)
     A = posterior.columns(q)[:, :3].flatten(0, 1)
     C = posterior.uncertainty.root.square()
@@ -59,14 +59,16 @@ def test_conditioning_agrees_with_a_normal_distribution(robot: Robot) -> None:
 
 
 def test_few_rows_are_conditioned_on_without_a_fit(robot: Robot) -> None:
-    posterior, q = RobotPosterior.of_robot(robot), random_joints(robot, 2, 3)
+    posterior, q = RobotPosterior.from_robot(robot), random_joints(robot, 2, 3)
     rows = Measurements(q=q, position=forward_kinematics(robot, q)[:, :3, 3])
     task = random_joints(robot, 5, 4)
-    assert_close(posterior.after(rows).deviation(task), posterior.informed(q).deviation(task), rtol=1e-9)
+    assert_close(
+        posterior.updated_with(rows).deviation(task), posterior.informed(q).deviation(task), rtol=1e-9
+    )
 
 
 def test_surprise_is_chi_square_distributed_and_larger_for_wrong_rows(robot: Robot) -> None:
-    posterior = RobotPosterior.of_robot(robot, Instrument("pose", 1e-4, 2e-4)).informed(
+    posterior = RobotPosterior.from_robot(robot, Instrument("pose", 1e-4, 2e-4)).informed(
         random_joints(robot, 60, 5)
     )
     q = random_joints(robot, 400, 6)
@@ -77,20 +79,22 @@ def test_surprise_is_chi_square_distributed_and_larger_for_wrong_rows(robot: Rob
     off = spread @ numbers + torch.randn(400, 6, generator=generator, dtype=torch.float64)
     position = T[:, :3, 3] + off[:, :3] * 1e-4
     rotation = rotation_from_vector(off[:, 3:] * 2e-4) @ T[:, :3, :3]
-    surprise = posterior.surprise(Measurements(q=q, position=position, rotation=rotation))
+    surprise = posterior.normalised_residual(Measurements(q=q, position=position, rotation=rotation))
     assert 0.8 < float(surprise.square().mean()) < 1.2
     position[7, 0] += 5e-3
-    assert float(posterior.surprise(Measurements(q=q, position=position, rotation=rotation))[7]) > 4
+    assert (
+        float(posterior.normalised_residual(Measurements(q=q, position=position, rotation=rotation))[7]) > 4
+    )
 
 
 def test_rows_without_positions_are_refused(robot: Robot) -> None:
     rows = Measurements(q=random_joints(robot, 2, 0), position=torch.zeros(2, 3).double())
     with refused(MeasurementError, option="rows"):
-        RobotPosterior.of_robot(robot, Instrument("distance")).surprise(rows)
+        RobotPosterior.from_robot(robot, Instrument("distance")).normalised_residual(rows)
 
 
 def test_distances_do_not_determine_the_pose_of_the_base(robot: Robot) -> None:
-    known = RobotPosterior.of_robot(robot, Instrument("distance", anchor=(1.5, -1.0, 0.3)), hybrid=False)
+    known = RobotPosterior.from_robot(robot, Instrument("distance", anchor=(1.5, -1.0, 0.3)), hybrid=False)
     q = torch.rand(40, robot.dof, dtype=torch.float64, generator=torch.Generator().manual_seed(3))
     after = known.informed(q).deviation(q)
     assert bool((after < 0.5 * known.deviation(q)).all())
@@ -101,7 +105,7 @@ def test_unknown_base_and_tool_have_a_wide_prior(robot: Robot) -> None:
     """In another frame, at another target, with nothing known of either."""
     base, tool = (np.array([0.3, -0.2, 0.1, *angles]) for angles in ((0.1, 0.2, 3.0), (0.5, -0.3, 0.2)))
     q = torch.linspace(-1, 1, 5 * robot.dof, dtype=torch.float64).view(5, robot.dof)
-    unknown = RobotPosterior.of_robot(robot, hybrid=False).with_unknown_base_and_tool(base, tool)
-    expected = RobotPosterior.of_robot(robot.with_geometry(base=base, tool=tool), hybrid=False)
+    unknown = RobotPosterior.from_robot(robot, hybrid=False).with_unknown_base_and_tool(base, tool)
+    expected = RobotPosterior.from_robot(robot.with_geometry(base=base, tool=tool), hybrid=False)
     for D, reference in ((unknown.tool(q), expected.tool(q)), (unknown.measured(q), expected.measured(q))):
         assert_close(D @ D.mT, reference @ reference.mT, rtol=1e-9)

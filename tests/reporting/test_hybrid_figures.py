@@ -65,7 +65,7 @@ def test_predicted_deviations_near_and_far_apart(tmp_path, generator, far):
 
 
 def test_one_value_can_be_drawn(tmp_path):
-    one = PredictedSpread.unknown(1)
+    one = PredictedSpread.all_nan(1)
     one.error[0, 0], one.sigma[0, 0] = 1e-5, 2e-5
     draw_spread(one, tmp_path / "spread.png")
     assert one.coverage == 1.0

@@ -47,13 +47,13 @@ def test_perturbed_transforms_fit_worse(T, generator, turned):
     rows = measured_as(spoilt, turned)
     for fit, behind in ((best_base, False), (best_tool, True)):
         X = fit(T, rows)
-        least = rows.squares(T @ X if behind else X @ T).sum()
+        least = rows.squared_errors(T @ X if behind else X @ T).sum()
         steps = 1e-3 * torch.eye(6, dtype=torch.float64)
         for step in torch.cat([steps, -steps]):
             if behind and not turned and bool(step[3:].any()):
                 continue  # a turn of the tool shows in no position
             near = X @ transform(rotation_from_vector(step[3:]), step[:3])
-            assert float(rows.squares(T @ near if behind else near @ T).sum()) > float(least)
+            assert float(rows.squared_errors(T @ near if behind else near @ T).sum()) > float(least)
 
 
 def test_batches_equal_single_ones(T):
@@ -61,4 +61,4 @@ def test_batches_equal_single_ones(T):
     rows = measured_as(T, True)
     for fit in (best_base, best_tool):
         assert_close(fit(batch, rows), torch.stack([fit(one, rows) for one in batch]), atol=1e-12)
-    assert_close(rows.squares(batch)[0], torch.zeros(40), atol=1e-15)
+    assert_close(rows.squared_errors(batch)[0], torch.zeros(40), atol=1e-15)

@@ -23,7 +23,7 @@ def test_given_errors_are_in_their_columns():
         base={"x_mm": 1, "yaw_deg": 2},
         tool={"z_mm": 3, "roll_deg": 4},
     )
-    change = source.change(UR10, "here")
+    change = source.parameter_errors(UR10, "here")
     dh = np.zeros((6, 5))
     dh[1] = [math.radians(1), 0.002, 0.003, math.radians(4), math.radians(5)]
     dh[5, 2] = -0.001
@@ -35,13 +35,13 @@ def test_given_errors_are_in_their_columns():
 def test_unknown_row_is_refused_with_the_nearest_name():
     source = GeometricDeviation(kind="geometric", rows={"tetha_2": {"a_mm": 1}})
     with refused(RecipeError, option="errors[3]", value="tetha_2") as caught:
-        source.change(UR10, "errors[3]")
+        source.parameter_errors(UR10, "errors[3]")
     assert "'theta_2'" in caught.value.remedy
 
 
 def drawn(**fields):
     settings = {"distribution": "uniform", "seed": 1, "length_mm": 1, "angle_deg": 1} | fields
-    return RandomGeometricDeviation(kind="geometric_random", **settings).change(UR10, "here")
+    return RandomGeometricDeviation(kind="geometric_random", **settings).parameter_errors(UR10, "here")
 
 
 def test_uniform_errors_are_within_their_bounds():

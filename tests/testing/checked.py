@@ -4,12 +4,12 @@ from pisigma.calibration.geometric.calibrator import GeometricCalibrator
 from pisigma.measurement.dataset import Measurements
 from pisigma.validation.checks.check import CheckedCalibration
 from pisigma.validation.checks.registry import diagnostics_of
-from pisigma.validation.held_out.trained_calibrations import trained
+from pisigma.validation.held_out.trained_calibrations import fit_compared_calibrations
 
 
 def checked(calibrator: GeometricCalibrator, rows: Measurements) -> CheckedCalibration:
     """Calibrate, and return the input of the checks."""
-    return CheckedCalibration(calibrator, rows, trained(calibrator, rows))
+    return CheckedCalibration(calibrator, rows, fit_compared_calibrations(calibrator, rows))
 
 
 def kinds_of(calibrator: GeometricCalibrator, rows: Measurements) -> list[tuple[str, str]]:

@@ -78,8 +78,8 @@ class DenseRegression(AbstractDesignRegression):
             log_evidence=evidence,
             prior=prior,
             noise=noise,
-            square=prior.of_groups(prior.base * x.square()),
-            determined=prior.of_groups(1 - precision * covariance.diagonal()),
+            square=prior.sum_by_group(prior.base * x.square()),
+            determined=prior.sum_by_group(1 - precision * covariance.diagonal()),
             misfit=self._by_sensor(residual.square()),
             used=self._by_sensor(used),
         )
@@ -92,7 +92,7 @@ class DenseRegression(AbstractDesignRegression):
         """Return the regression of some columns, by their indices."""
         return replace(self, X=self.X[:, design])
 
-    def without(self, groups: Tensor) -> "DenseRegression":
+    def without_groups(self, groups: Tensor) -> "DenseRegression":
         """Return the regression of the values of the other groups."""
         kept = ~torch.isin(self.group, groups)
         share = [float(kept[self.sensor == k].double().mean()) for k in range(len(self.sensors))]
@@ -110,7 +110,7 @@ class DenseRegression(AbstractDesignRegression):
         parts = []
         for groups in folds:
             chosen = torch.isin(self.group, groups)
-            x, root, unknown = self.without(groups)._solution(posterior.prior, posterior.noise)
+            x, root, unknown = self.without_groups(groups)._solution(posterior.prior, posterior.noise)
             sigma, sensor = self._sigma(posterior.noise)[chosen], self.sensor[chosen]
             X, error = self.X[chosen] / sigma[:, None], (self.y - self.X @ x)[chosen] / sigma
             U, size, _ = torch.linalg.svd(X @ unknown, full_matrices=False)

@@ -4,7 +4,7 @@ import os
 import time
 from collections.abc import Callable
 
-from pisigma.files.engines.engine import AbstractEngine, packed, unpacked, work_on
+from pisigma.files.engines.engine import AbstractEngine, pack_arguments, process_chunk, unpack_results
 from pisigma.files.errors import IdentificationError
 
 
@@ -38,6 +38,6 @@ class PicklingEngine(AbstractEngine):
 
     def _chunks(self, work, chunks):
         """See `AbstractEngine`."""
-        for chunk, arguments in [(chunk, packed(work, chunk)) for chunk in chunks]:
+        for chunk, arguments in [(chunk, pack_arguments(work, chunk)) for chunk in chunks]:
             self._before_each()
-            yield chunk, unpacked(work_on(*arguments))
+            yield chunk, unpack_results(process_chunk(*arguments))

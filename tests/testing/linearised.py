@@ -8,11 +8,11 @@ import torch
 from torch import Tensor
 
 from pisigma.calibration.geometric.calibrator import GeometricCalibrator
-from pisigma.calibration.geometric.problem.noise import view_of
+from pisigma.calibration.geometric.problem.noise import sensor_view_of
 from pisigma.calibration.geometric.problem.setup import CalibrationSetup
 from pisigma.calibration.hybrid.design import Design, Rows
 from pisigma.calibration.hybrid.regression import NormalEquations
-from pisigma.calibration.hybrid.search import Fitted
+from pisigma.calibration.hybrid.search import FeatureFit
 from pisigma.calibration.hybrid.sensor_values import sensor_values
 from pisigma.estimation.loss import SquaredLoss
 from pisigma.joint_correction.feature import AbstractFeature
@@ -85,18 +85,20 @@ class LinearisedArm:
     noise: tuple[float, ...]
     prior_scale: tuple[float, ...]
 
-    def fitted(self, features: Sequence[AbstractFeature], iterations: int = 40) -> Fitted:
+    def fitted(self, features: Sequence[AbstractFeature], iterations: int = 40) -> FeatureFit:
         """Fit geometry and a unit of order 1, with prior sizes and noise by the evidence."""
         design = Design(self.rows.problem, tuple(features))
         sums = NormalEquations.from_rows(design, self.rows)
-        return Fitted(design, sums.maximise_evidence(design.prior(self.prior_scale), self.noise, iterations))
+        return FeatureFit(
+            design, sums.maximise_evidence(design.prior(self.prior_scale), self.noise, iterations)
+        )
 
 
 def linearised(robot: Robot, measurements: Measurements, **options: object) -> LinearisedArm:
     """Calibrate the geometry by unweighted least squares, and linearise at the solution."""
     solved = GeometricCalibrator(robot, loss=SquaredLoss(), **options).solve(measurements)  # type: ignore[arg-type]
     here, problem = solved.solution.linearisation, solved.problem
-    view = view_of(here)
+    view = sensor_view_of(here)
     values, design = sensor_values(problem, here.point), Design(problem, ())
     weights = [torch.ones_like(sensor.root) for sensor in values]
     x, group = (here.point - problem.nominal)[problem.active], held_out_groups(solved.setup.measurements)

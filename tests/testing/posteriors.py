@@ -13,7 +13,7 @@ from pisigma.estimation.regression import Posterior
 
 def covariance(fit: AbstractDesignRegression, posterior: Posterior) -> Tensor:
     """Compute the covariance of the unknowns from its root."""
-    root = fit.covariance_root(posterior).dense
+    root = fit.covariance_root(posterior).as_matrix
     return root @ root.t()
 
 

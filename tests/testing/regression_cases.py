@@ -82,7 +82,7 @@ def poses() -> RegressionCase:
     q = random_joints(robot, 30, 0)
     arm = linearised(robot, tracker_data(robot, q, 1e-4 * (3 * q).sin(), 1e-5, turn_noise=1e-5, several=True))
     weight = torch.linspace(0.5, 2.0, 30, dtype=torch.float64)
-    values = tuple(sensor.weighted(weight) for sensor in arm.rows.values)
+    values = tuple(sensor.apply_weights(weight) for sensor in arm.rows.values)
     features = (ScaledJoints(robot), GravityTorques(robot), FourierSeries(robot, 3))
     smaller = (features[1], FourierSeries(robot, 2))
     return case_of(replace(arm, rows=replace(arm.rows, values=values)), features, smaller)

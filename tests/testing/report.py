@@ -42,9 +42,9 @@ def hybrid_under_test(frames: bool = False) -> tuple[HybridArmUnderTest, Calibra
     """Return a simulated arm, and its model with all metrics, tested on other rows."""
     arm = hybrid_of("rb5", 200, frames=frames)
     with no_type_checker():
-        summary = summarise(arm.result).having(rows=200)
+        summary = summarise(arm.result).with_figures(rows=200)
         if not frames:
-            summary = summary.having(cross_validation=judged_on(arm, measured(arm, 60, 5)).figures())
+            summary = summary.with_figures(cross_validation=judged_on(arm, measured(arm, 60, 5)).figures())
         model = model_of_hybrid("arm", arm.true.nominal, arm.result, arm.measurements)
     return arm, replace(model, metrics=summary.to_json())
 
@@ -62,7 +62,7 @@ def geometric_under_test() -> tuple[HybridArmUnderTest, CalibratedModel]:
     with no_type_checker():
         result = arm.result.geometric
         model = model_of_calibration("plain", arm.true.nominal, result, arm.measurements)
-        return arm, replace(model, metrics=summarise(result).having(rows=200).to_json())
+        return arm, replace(model, metrics=summarise(result).with_figures(rows=200).to_json())
 
 
 def folder_with_held_out(arm: HybridArmUnderTest, model: CalibratedModel, folder: Path) -> CalibratedModel:
@@ -73,7 +73,7 @@ def folder_with_held_out(arm: HybridArmUnderTest, model: CalibratedModel, folder
             errors.position.mul_(1.1)
         held_out = HeldOutRows.from_validation(found, arm.measurements)
         text = held_out.to_csv(model.robot)
-        summary = CalibrationSummary.read(model).having(held_out_rows=held_out.hashes(text))
+        summary = CalibrationSummary.read(model).with_figures(held_out_rows=held_out.hashes(text))
         model = replace(model, metrics=summary.to_json())
         folder.mkdir()
         save_model(model, folder)
@@ -100,4 +100,4 @@ def bare_summary(**figures: object) -> CalibrationSummary:
         outliers=(),
         warnings=(),
         rmse_mm=(),
-    ).having(**figures)
+    ).with_figures(**figures)

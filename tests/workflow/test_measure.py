@@ -13,7 +13,7 @@ from testing.refusals import refused
 from pisigma.files.errors import PlanningError
 from pisigma.measurement.fields import UnusableRow
 from pisigma.planning.plan_file import read_plan
-from pisigma.planning.session import reached
+from pisigma.planning.session import session_accuracy
 from pisigma.workflow.measure import MeasuringSession
 from pisigma.workflow.settings.measuring import MeasureSettings
 
@@ -139,14 +139,14 @@ def test_the_expected_accuracy_comes_first_and_the_cross_validation_while_idle()
         assert session.next_step() is None
         outdated = session.idle_step()
     assert session.state.expected
-    validate = reached.validate
+    validate = session_accuracy.validate
 
     def while_a_row_comes(calibrator, rows_, folds, progress):
         session.add(rows.select(torch.tensor([14])))
         return validate(calibrator, rows_, folds, progress)
 
     with pytest.MonkeyPatch.context() as patch, no_type_checker():
-        patch.setattr(reached, "validate", while_a_row_comes)
+        patch.setattr(session_accuracy, "validate", while_a_row_comes)
         outdated()
     assert isnan(session.state.accuracy.cross_validated_rms)
     with no_type_checker():

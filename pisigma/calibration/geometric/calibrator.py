@@ -18,16 +18,16 @@ from pisigma.calibration.geometric.identifiability.redundancy import (
     rank_extension,
 )
 from pisigma.calibration.geometric.identifiability.sufficiency import (
-    after_unknowns,
     candidates_at_start,
     floating_bases,
     free_parameters,
     refuse_too_few,
+    without_sensor_unknowns,
 )
 from pisigma.calibration.geometric.initial_guess.initial_guess import chosen_rows
 from pisigma.calibration.geometric.problem.information import information
 from pisigma.calibration.geometric.problem.least_squares import SHORTEST_STEP, Solution, levenberg_marquardt
-from pisigma.calibration.geometric.problem.noise import view_of
+from pisigma.calibration.geometric.problem.noise import sensor_view_of
 from pisigma.calibration.geometric.problem.parameters import ParameterSpace, Prior
 from pisigma.calibration.geometric.problem.setup import (
     CalibrationSetup,
@@ -147,15 +147,15 @@ class GeometricCalibrator:
         rough, findings, active = self._solve_roughly(setup, findings, candidates, active)
         problem = setup.problem.with_active(active)
         start = rough.linearisation
-        if findings.extended or len(view_of(start).sums[0].distance) < problem.rows:
+        if findings.extended or len(sensor_view_of(start).sums[0].distance) < problem.rows:
             start = problem.linearise(start.point, start)
         else:
-            start = problem.combined(start.point, view_of(start))
+            start = problem.combined(start.point, sensor_view_of(start))
         left = self.maximum_iterations - rough.iterations
         fine = levenberg_marquardt(problem, start, left, close_enough=SHORTEST_STEP)
         refuse_implausible(problem, fine.linearisation, measurements.source)
         geometry = identified_geometry(setup, fine.linearisation.point)
-        return SolvedCalibration(measurements, setup, problem, rough.before(fine), findings, geometry)
+        return SolvedCalibration(measurements, setup, problem, rough.continued_by(fine), findings, geometry)
 
     def build(self, measurements: Measurements) -> CalibrationSetup:
         """Build the problem and its start values, without solving it.
@@ -259,7 +259,7 @@ class GeometricCalibrator:
         most = problem.space.most_independent(problem.turning)
         if self.elimination != "exact" or not others or len(kept) >= most:
             return rough, findings, active
-        now = information(problem, here.point, unknowns + kept + others, view_of(here))
-        columns = rank_extension(after_unknowns(setup, now), len(kept))
+        now = information(problem, here.point, unknowns + kept + others, sensor_view_of(here))
+        columns = rank_extension(without_sensor_unknowns(setup, now), len(kept))
         extended = [(kept + others)[i] for i in columns]
         return rough, replace(findings, extended=extended), [*active, *extended]

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from pisigma.calibration.geometric.identifiability.redundancy import Findings, Redundancy
 from pisigma.calibration.geometric.problem.least_squares import Linearisation
-from pisigma.calibration.geometric.problem.noise import view_of
+from pisigma.calibration.geometric.problem.noise import sensor_view_of
 from pisigma.calibration.geometric.problem.problem import CalibrationProblem
 from pisigma.calibration.geometric.problem.setup import (
     CalibrationSetup,
@@ -84,7 +84,7 @@ def parameter_table(
     held = errors * np.sqrt(_prior_precision(problem, here)) > HELD
     active = set(problem.active.tolist())
     silent = _without_rows(problem, here.normal.cpu(), findings)
-    undetermined = (geometry.change[:, silent] != 0).any(1).tolist()
+    undetermined = (geometry.coordinate_jacobian[:, silent] != 0).any(1).tolist()
     rows = []
     columns = (nominal.tolist(), values.tolist(), change.tolist())
     for index, (parameter, before, after, moved) in enumerate(zip(space.parameters, *columns, strict=True)):
@@ -134,7 +134,9 @@ def _determines_all(information: Float64[Tensor, "own own"]) -> bool:
 def _prior_precision(problem: CalibrationProblem, here: Linearisation[Tensor]) -> np.ndarray:
     """Return the prior precision (1 / variance) of all parameters; 0 for those that are not free."""
     full = torch.zeros_like(problem.precision)
-    full[problem.active] = view_of(here).scaled(problem.precision[problem.active], problem.prior_group)
+    full[problem.active] = sensor_view_of(here).scaled_precision(
+        problem.precision[problem.active], problem.prior_group
+    )
     precision: np.ndarray = full.cpu().numpy()
     return precision
 
@@ -149,7 +151,7 @@ def _remark(name: str, free: bool, extended: bool, redundancy: Redundancy) -> tu
         return remark, "only at solution"
     if name in redundancy.no_effect:
         return "without effect on the measured values", "no effect"
-    if (sentence := redundancy.group(name)) is not None:
+    if (sentence := redundancy.dependency_sentence_of(name)) is not None:
         return sentence, "in a sum"
     remark = "identified" if free else "left out"
     return remark, remark

@@ -49,7 +49,7 @@ def _of_rows(
             raise IdentificationError(
                 f"{what} '{name}' was not calibrated",
                 value=name,
-                at=measurements.at(row, what),
+                at=measurements.place_of(row, what),
                 remedy=nearest_choice(name, order),
             )
     T = transform_from_xyzrpy(torch.from_numpy(np.stack([frames[name] for name in order])))

@@ -7,7 +7,7 @@ from typing import Literal
 from torch import Tensor
 
 from pisigma.calibration.geometric.problem.least_squares import Linearisation, covariance_of
-from pisigma.calibration.geometric.problem.noise import view_of
+from pisigma.calibration.geometric.problem.noise import sensor_view_of
 from pisigma.calibration.geometric.problem.prior_sizes import LENGTH_GROUPS, PriorGroup, effective_parameters
 from pisigma.calibration.geometric.problem.problem import CalibrationProblem
 
@@ -49,7 +49,7 @@ def prior_ratios_of(problem: CalibrationProblem, here: Linearisation[Tensor]) ->
         problem: the problem with its free parameters.
         here: the problem at its solution.
     """
-    view = view_of(here)
+    view = sensor_view_of(here)
     precision, group = problem.precision[problem.active], problem.prior_group
     effective = effective_parameters(precision, group, view.prior_scale, covariance_of(here.normal)).tolist()
     ratios = []

@@ -21,7 +21,7 @@ from pisigma.calibration.geometric.identifiability.pairwise import (
 )
 from pisigma.calibration.geometric.identifiability.plausibility import misfitting_frames
 from pisigma.calibration.geometric.identifiability.redundancy import Findings, Redundancy
-from pisigma.calibration.geometric.identifiability.sufficiency import what_to_measure
+from pisigma.calibration.geometric.identifiability.sufficiency import measurement_advice
 from pisigma.calibration.geometric.outliers import Outlier, outliers_of
 from pisigma.calibration.geometric.parameter_table import ParameterEstimate, parameter_table
 from pisigma.calibration.geometric.posterior import ParameterPosterior
@@ -33,7 +33,7 @@ from pisigma.calibration.geometric.problem.least_squares import (
     SolutionStatus,
     covariance_of,
 )
-from pisigma.calibration.geometric.problem.noise import values_used, view_of
+from pisigma.calibration.geometric.problem.noise import parameters_used, sensor_view_of
 from pisigma.calibration.geometric.problem.problem import CalibrationProblem
 from pisigma.calibration.geometric.problem.setup import CalibrationSetup, IdentifiedGeometry
 from pisigma.measurement.dataset import Measurements
@@ -102,7 +102,7 @@ class SolvedCalibration:
     @cached_property
     def covariance(self) -> Float64[np.ndarray, "parameters parameters"]:
         """Covariance of all parameters in the user's coordinates (SI); 0 for those that were not free."""
-        change = self.geometry.change[:, self.problem.active.cpu()]
+        change = self.geometry.coordinate_jacobian[:, self.problem.active.cpu()]
         covariance: np.ndarray = (change @ covariance_of(self.refined.normal).cpu() @ change.mT).numpy()
         return covariance
 
@@ -115,7 +115,7 @@ class SolvedCalibration:
         inverse = torch.where(scale > 0, 1 / scale, 0.0)
         values, axes = torch.linalg.eigh(covariance * inverse * inverse[:, None])
         half = scale[:, None] * axes * values.clamp(min=0.0).sqrt()
-        root: Tensor = self.geometry.change[:, self.problem.active.cpu()] @ half
+        root: Tensor = self.geometry.coordinate_jacobian[:, self.problem.active.cpu()] @ half
         return root
 
 
@@ -198,7 +198,7 @@ class CalibrationResult:
     def observability(self) -> Observability:
         """Indices O1 to O5 of the free parameters at the solution."""
         problem, here = self.solved.problem, self.solved.refined
-        gram = sum((sums.normal for sums in view_of(here).sums), torch.zeros_like(here.normal))
+        gram = sum((sums.normal for sums in sensor_view_of(here).sums), torch.zeros_like(here.normal))
         usual = problem.step_scale * 1e3  # to rows in mm and mrad, columns per 1 mm and 1 mrad
         poses = int(torch.stack([sensor.present for sensor in problem.sensors]).any(0).sum())
         return observability_of(gram * usual * usual[:, None], poses)
@@ -226,7 +226,10 @@ class CalibrationResult:
     @cached_property
     def warning_details(self) -> tuple[CalibrationWarning, ...]:
         """What the measurements do not determine, what to measure next, and what does not fit."""
-        return (*what_to_measure(self.solved.setup, self.solved.findings.estimated), *_warnings(self.solved))
+        return (
+            *measurement_advice(self.solved.setup, self.solved.findings.estimated),
+            *_warnings(self.solved),
+        )
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -287,7 +290,7 @@ class CalibrationResult:
 
 def _warnings(solved: SolvedCalibration) -> tuple[CalibrationWarning, ...]:
     """Warn of angles that disagree with lengths, and of frames that do not fit."""
-    disagreement = float(view_of(solved.refined).disagreement.max())
+    disagreement = float(sensor_view_of(solved.refined).disagreement.max())
     warnings = []
     if disagreement > DISAGREEING:
         sentence = (
@@ -304,7 +307,7 @@ def _residuals(solved: SolvedCalibration) -> dict[str, Float64[np.ndarray, "rows
     measurements, setup, problem = solved.measurements, solved.setup, solved.problem
     R = setup.anchors.bases[:, :3, :3].to(problem.frame.device)[problem.frame]
     residuals = {}
-    for sensor, sums in zip(problem.sensors, view_of(solved.refined).sums, strict=True):
+    for sensor, sums in zip(problem.sensors, sensor_view_of(solved.refined).sums, strict=True):
         own = sums.residual.t()
         if sensor.components == 3:
             own = (R @ own[..., None])[..., 0]
@@ -316,7 +319,7 @@ def _residuals(solved: SolvedCalibration) -> dict[str, Float64[np.ndarray, "rows
 
 def _outliers(solved: SolvedCalibration) -> tuple[Outlier, ...]:
     found = []
-    view = view_of(solved.refined)
+    view = sensor_view_of(solved.refined)
     for number, (sensor, sums) in enumerate(zip(solved.problem.sensors, view.sums, strict=True)):
         deviations = sums.distance / view.scales[number]
         weight = solved.problem.loss_of(sensor).weight(deviations, sensor.components)
@@ -330,8 +333,8 @@ def _outliers(solved: SolvedCalibration) -> tuple[Outlier, ...]:
 def _noise(solved: SolvedCalibration) -> tuple[SensorNoise, ...]:
     noise = []
     problem, here = solved.problem, solved.refined
-    view = view_of(here)
-    used = values_used(view, covariance_of(here.normal)).tolist()
+    view = sensor_view_of(here)
+    used = parameters_used(view, covariance_of(here.normal)).tolist()
     for k, (sensor, sums) in enumerate(zip(problem.sensors, view.sums, strict=True)):
         if sensor.certain:
             continue

@@ -61,7 +61,7 @@ class JointCoverage:
             angles.append(torch.cat(of_joint))
         return JointCoverage._around(angles, self.rate, self.turning)
 
-    def beyond(self, q: Float[Tensor, "*batch dof"]) -> Float[Tensor, "*batch dof"]:
+    def distance_outside(self, q: Float[Tensor, "*batch dof"]) -> Float[Tensor, "*batch dof"]:
         """Compute the angle from every joint value to the nearest measured range [rad]; 0 within one."""
         angle = q * self.rate.to(q)
         columns = []
@@ -75,7 +75,7 @@ class JointCoverage:
 
     def contains(self, q: Float[Tensor, "*batch dof"]) -> Bool[Tensor, "*batch"]:
         """Say whether all joint values are in measured ranges, up to rounding; NaN never is."""
-        return self.beyond(q).amax(-1) <= MEASURED_ROUNDING
+        return self.distance_outside(q).amax(-1) <= MEASURED_ROUNDING
 
 
 def _stretches(angles: np.ndarray, turns: bool) -> list[tuple[float, float]]:

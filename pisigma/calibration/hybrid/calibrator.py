@@ -10,20 +10,31 @@ from torch import Tensor
 from pisigma.calibration.geometric.calibrator import GeometricCalibrator
 from pisigma.calibration.geometric.initial_guess.initial_guess import chosen_rows
 from pisigma.calibration.geometric.outliers import Outlier, outliers_of
-from pisigma.calibration.geometric.problem.noise import renumbered, view_of
+from pisigma.calibration.geometric.problem.noise import renumber, sensor_view_of
 from pisigma.calibration.geometric.problem.problem import CalibrationProblem
 from pisigma.calibration.geometric.problem.setup import identified_geometry
 from pisigma.calibration.geometric.result import SolvedCalibration
 from pisigma.calibration.hybrid.arm import JointCoverage
-from pisigma.calibration.hybrid.delivery import Delivered, delivered
+from pisigma.calibration.hybrid.delivery import FinalCorrection, choose_final_correction
 from pisigma.calibration.hybrid.design import Design, Rows, weigh
-from pisigma.calibration.hybrid.gravity import USUAL, gravity_by_evidence, gravity_sentence, in_first_row
-from pisigma.calibration.hybrid.refinement import Refined, in_chunks, linearised, refine, with_frames_of
-from pisigma.calibration.hybrid.regression import regression
+from pisigma.calibration.hybrid.gravity import (
+    USUAL,
+    gravity_by_evidence,
+    gravity_sentence,
+    to_first_row_frame,
+)
+from pisigma.calibration.hybrid.refinement import (
+    Refined,
+    evaluate_in_chunks,
+    linearise_rows,
+    refine,
+    with_frames_of,
+)
+from pisigma.calibration.hybrid.regression import build_regression
 from pisigma.calibration.hybrid.result import HybridResult, LearnedPart
-from pisigma.calibration.hybrid.search import FIRST_MODEL_SIZES, Choice, Fitted, Search
+from pisigma.calibration.hybrid.search import FIRST_MODEL_SIZES, FeatureChoice, FeatureFit, FeatureSearch
 from pisigma.calibration.hybrid.sensor_values import sensor_values
-from pisigma.calibration.hybrid.spectrum import lines, odds_against_a_line
+from pisigma.calibration.hybrid.spectrum import find_spectral_lines, log_number_of_orders
 from pisigma.calibration.hybrid.uncertainty import position_uncertainty
 from pisigma.estimation.regression import SMALLEST_NOISE
 from pisigma.files.errors import IdentificationError, check_choice
@@ -122,7 +133,7 @@ class HybridCalibrator:
         if not choice.best.design.features:
             return _geometric_alone(solved, choice, _NOTHING_FOUND)
         progress("predicting held-out rows by exact fits")
-        serving = delivered(solved, choice, progress)
+        serving = choose_final_correction(solved, choice, progress)
         if serving is None:
             return _geometric_alone(solved, choice, _NOTHING_HELPS)
         choice = serving.choice
@@ -161,7 +172,7 @@ class HybridCalibrator:
 
     def _chosen(
         self, solved: SolvedCalibration, group: Int64[Tensor, " rows"], progress: Callable[[str], None]
-    ) -> Choice:
+    ) -> FeatureChoice:
         """Select features on at most `SEARCHED_ROWS` rows.
 
         Rows that the geometric calibration does not explain need not be outliers. Therefore a first hybrid model is
@@ -170,12 +181,12 @@ class HybridCalibrator:
         If gravity seems to act in another direction than down, both are tried, because torques along other axes may
         imitate products.
         """
-        problem, view = solved.problem, view_of(solved.solution.linearisation)
+        problem, view = solved.problem, sensor_view_of(solved.solution.linearisation)
         noise, prior_scale = tuple(view.noise.tolist()), tuple(view.prior_scale.tolist())
         if problem.q.shape[0] > SEARCHED_ROWS:
             chosen = chosen_rows(problem.q.shape[0], SEARCHED_ROWS).to(problem.q.device)
             chosen = problem.with_partners(chosen)
-            problem, group = problem.select(chosen), renumbered(group[chosen])
+            problem, group = problem.select(chosen), renumber(group[chosen])
         design, point = Design(problem, ()), solved.solution.linearisation.point
         values = sensor_values(problem, point)
         distances = [one.residual.norm(dim=1) * one.root / view.scales[k] for k, one in enumerate(values)]
@@ -187,33 +198,33 @@ class HybridCalibrator:
         pairs = zip(noise, values, strict=True)
         if all(sigma <= SMALLEST_NOISE for sigma, one in pairs if not one.certain):
             # The geometry explains exact data, so features would only fit the errors of the linearisation.
-            search = Search(rows, noise, prior_scale, [], progress)
-            return search.extended(search.geometry, None)
+            search = FeatureSearch(rows, noise, prior_scale, [], progress)
+            return search.try_derived_feature(search.geometry, None)
         robot = self.geometric.robot
         gravity = self.gravity or gravity_by_evidence(robot, rows, noise, prior_scale)
         directions = dict.fromkeys((gravity, self.gravity or USUAL))
-        tried = [self._features(solved, problem, in_first_row(robot, one)) for one in directions]
+        tried = [self._features(solved, problem, to_first_row_frame(robot, one)) for one in directions]
         growing, others = tried[0]
         first = Design(problem, (*others, *growing[:FIRST_MODEL_SIZES][-1:]))
-        posterior = regression(first, rows).maximise_evidence(first.prior(prior_scale), noise)
-        rows = linearised(first, posterior.x, posterior.effective, group)
+        posterior = build_regression(first, rows).maximise_evidence(first.prior(prior_scale), noise)
+        rows = linearise_rows(first, posterior.x, posterior.effective, group)
         products = [InputProducts(robot)] if self.products and robot.dof > 1 else []
         choices = []
         for growing, others in tried:
             largest = [*others, *growing[-1:], *products]
-            search = Search(rows, noise, prior_scale, largest, progress)
-            best = search.best(growing, others, products)
+            search = FeatureSearch(rows, noise, prior_scale, largest, progress)
+            best = search.select_features(growing, others, products)
             orders = self._lines(rows, best)
-            odds = odds_against_a_line(robot.dof) * sum(map(len, orders))
-            choices.append(search.extended(best, GearLines(robot, orders) if odds else None, odds))
+            odds = log_number_of_orders(robot.dof) * sum(map(len, orders))
+            choices.append(search.try_derived_feature(best, GearLines(robot, orders) if odds else None, odds))
         return max(choices, key=lambda choice: choice.best.posterior.log_evidence)
 
-    def _lines(self, rows: Rows, best: Fitted) -> tuple[tuple[int, ...], ...]:
+    def _lines(self, rows: Rows, best: FeatureFit) -> tuple[tuple[int, ...], ...]:
         """Find the orders of the lines in the residuals of a fit, beyond the harmonics of its series."""
         if "lines" not in self.features:
             return ()
         lowest = 1 + (max((one.size for one in best.design.features), default=0) or USUAL_HARMONICS)
-        return lines(best.design, rows, best.posterior, lowest)
+        return find_spectral_lines(best.design, rows, best.posterior, lowest)
 
     def _features(
         self, solved: SolvedCalibration, problem: CalibrationProblem, gravity: Direction
@@ -248,7 +259,7 @@ class HybridCalibrator:
 def _outliers(solved: SolvedCalibration, refined: Refined) -> tuple[Outlier, ...]:
     """List rows with less than half of the full weight under the hybrid, the worst first."""
     problem, setup, found = solved.problem, solved.setup, []
-    values = sensor_values(problem, refined.point, in_chunks(refined.correction))
+    values = sensor_values(problem, refined.point, evaluate_in_chunks(refined.correction))
     weights = weigh(problem, values, refined.posterior.effective)
     for number, (one, weight) in enumerate(zip(values, weights, strict=True)):
         length, sensor = one.residual.norm(dim=1), problem.sensors[number]
@@ -257,7 +268,7 @@ def _outliers(solved: SolvedCalibration, refined: Refined) -> tuple[Outlier, ...
     return tuple(sorted(found, key=lambda outlier: -outlier.deviations))
 
 
-def _kept_sentence(serving: Delivered) -> str:
+def _kept_sentence(serving: FinalCorrection) -> str:
     """Write which correction was kept, and how much better held-out rows are predicted with it."""
     best = serving.choice.best
     return (
@@ -266,11 +277,11 @@ def _kept_sentence(serving: Delivered) -> str:
     )
 
 
-def _geometric_alone(solved: SolvedCalibration, choice: Choice, verdict: str) -> HybridResult:
+def _geometric_alone(solved: SolvedCalibration, choice: FeatureChoice, verdict: str) -> HybridResult:
     """Return the geometric calibration, with the uncertainty of its positions."""
     geometry = identified_geometry(solved.setup, solved.solution.linearisation.point)
     first = choice.geometry
-    fit = regression(first.design, choice.rows)
+    fit = build_regression(first.design, choice.rows)
     uncertainty = position_uncertainty(
         choice.rows, first.design, fit, first.posterior, geometry, first.held_out
     )

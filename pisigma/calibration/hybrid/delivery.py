@@ -7,20 +7,20 @@ import torch
 from jaxtyping import Bool, Float64, Int64
 from torch import Tensor
 
-from pisigma.calibration.geometric.problem.noise import view_of
+from pisigma.calibration.geometric.problem.noise import sensor_view_of
 from pisigma.calibration.geometric.result import SolvedCalibration
 from pisigma.calibration.hybrid.design import Design, Rows, weigh
 from pisigma.calibration.hybrid.refinement import (
     CONVERGENCE_TOLERANCE,
     MAX_LINEARISATIONS,
     Refined,
-    in_chunks,
-    linearised,
+    evaluate_in_chunks,
+    linearise_rows,
     network,
     refine,
 )
-from pisigma.calibration.hybrid.regression import regression
-from pisigma.calibration.hybrid.search import CLEAR_GAIN, ROUGHLY, Choice, Fitted
+from pisigma.calibration.hybrid.regression import build_regression
+from pisigma.calibration.hybrid.search import CLEAR_GAIN, ROUGHLY, FeatureChoice, FeatureFit
 from pisigma.calibration.hybrid.sensor_values import SensorValues, sensor_values
 from pisigma.estimation.held_out import standard_errors
 from pisigma.estimation.regression import Posterior
@@ -116,12 +116,12 @@ def held_out_rows(
     values = _values(design, posterior.x)
     weights = weigh(design.problem, values, posterior.effective)
     rows = Rows.linearised(design, posterior.x, values, weights, group)
-    fit = regression(design, rows)
+    fit = build_regression(design, rows)
     held_out = [torch.full_like(one.root, torch.nan) for one in values]
     for groups in folds:
         held = torch.isin(group, groups.to(group.device))
         others = torch.unique(group[~held])
-        rest = fit.without(groups).maximise_evidence(posterior.prior, posterior.noise, updates)
+        rest = fit.without_groups(groups).maximise_evidence(posterior.prior, posterior.noise, updates)
         here, x = rows, rest.x
         for _ in range(MAX_LINEARISATIONS):
             seen = _values(design, x)
@@ -131,7 +131,7 @@ def held_out_rows(
             )
             if not differs >= CONVERGENCE_TOLERANCE * rest.effective:
                 break
-            rest = regression(design, there).without(groups).solve(rest.prior, rest.noise)
+            rest = build_regression(design, there).without_groups(groups).solve(rest.prior, rest.noise)
             here, x = there, rest.x
         x = _with_own_unknowns(design, x, posterior.x, values, held)
         for errors, one in zip(held_out, _values(design, x), strict=True):
@@ -147,7 +147,7 @@ def _values(design: Design, x: Float64[Tensor, " unknowns"]) -> tuple[SensorValu
     """Linearise all rows at some unknowns."""
     problem = design.problem
     point = problem.nominal.index_add(0, problem.active, x[: design.active])
-    return sensor_values(problem, point, in_chunks(network(design, x)) if design.features else None)
+    return sensor_values(problem, point, evaluate_in_chunks(network(design, x)) if design.features else None)
 
 
 def _with_own_unknowns(
@@ -190,7 +190,7 @@ Errors = Sequence[SensorErrors | None]
 
 
 @dataclass(frozen=True, eq=False)
-class Delivered:
+class FinalCorrection:
     """A joint correction that reduces held-out errors.
 
     Attributes:
@@ -199,12 +199,14 @@ class Delivered:
         held_out: held-out RMS error over that of the geometric calibration, for the sensor with the largest gain [1].
     """
 
-    choice: Choice
+    choice: FeatureChoice
     refined: Refined
     held_out: float
 
 
-def delivered(solved: SolvedCalibration, choice: Choice, progress: Callable[[str], None]) -> Delivered | None:
+def choose_final_correction(
+    solved: SolvedCalibration, choice: FeatureChoice, progress: Callable[[str], None]
+) -> FinalCorrection | None:
     """Find the largest part of the selected features that increases no sensor's errors, with exact fits of each part.
 
     Leave-out errors by linearisation are those of an exact fit only if the linearisation is accurate. It is for many
@@ -220,7 +222,9 @@ def delivered(solved: SolvedCalibration, choice: Choice, progress: Callable[[str
     group = choice.rows.group if problem.pairs else groups_of_equal_joints(problem.q)
     count = int(group.max()) + 1
     if count > EXACT_GROUPS and set(solved.setup.measurements.kinds) <= {"position", "rotation"}:
-        return Delivered(choice, refine(problem, choice.rows.group, choice), _held_out_in_search(choice))
+        return FinalCorrection(
+            choice, refine(problem, choice.rows.group, choice), _held_out_in_search(choice)
+        )
     folds = replace(choice.rows, group=group).folds(FOLDS if count > FEW_GROUPS else FOLDS_OF_FEW, count)
     updates = int(count <= MANY_GROUPS)
     before = held_out_rows(Design(problem, ()), _geometric_posterior(solved, choice), group, folds, updates)
@@ -230,11 +234,11 @@ def delivered(solved: SolvedCalibration, choice: Choice, progress: Callable[[str
         errors = held_out_rows(refined.design, refined.posterior, group, folds, updates)
         compared = _compared(errors, before)
         if not any(one.is_worse for one in compared) and any(one.gain > CLEAR_GAIN for one in compared):
-            return Delivered(part, refined, min(one.held_out for one in compared))
+            return FinalCorrection(part, refined, min(one.held_out for one in compared))
     return None
 
 
-def _held_out_in_search(choice: Choice) -> float:
+def _held_out_in_search(choice: FeatureChoice) -> float:
     """Return the ratio of held-out errors by the search, with linearised rows."""
     return [trial.held_out for trial in choice.trials if trial.kept][-1]
 
@@ -245,17 +249,17 @@ def _compared(errors: Errors, before: Errors) -> list[Comparison]:
     return [one.compare(other) for one, other in pairs if one is not None and other is not None]
 
 
-def _geometric_posterior(solved: SolvedCalibration, choice: Choice) -> Posterior:
+def _geometric_posterior(solved: SolvedCalibration, choice: FeatureChoice) -> Posterior:
     """Compute the posterior of the geometric calibration with the rows of the search."""
     problem, group = choice.rows.problem, choice.rows.group
-    design, view = Design(problem, ()), view_of(solved.solution.linearisation)
+    design, view = Design(problem, ()), sensor_view_of(solved.solution.linearisation)
     x = (solved.solution.linearisation.point - problem.nominal)[problem.active]
-    rows = linearised(design, x, choice.geometry.posterior.effective, group)
+    rows = linearise_rows(design, x, choice.geometry.posterior.effective, group)
     prior = design.prior(view.prior_scale.tolist())
-    return regression(design, rows).solve(prior, tuple(view.noise.tolist()))
+    return build_regression(design, rows).solve(prior, tuple(view.noise.tolist()))
 
 
-def _parts(choice: Choice) -> Iterator[Choice]:
+def _parts(choice: FeatureChoice) -> Iterator[FeatureChoice]:
     """Yield the selected features, then fewer and fewer of them, removing the one that was tried last."""
     yield choice
     features = choice.best.design.features
@@ -263,10 +267,10 @@ def _parts(choice: Choice) -> Iterator[Choice]:
         yield _part(choice, features[:count])
 
 
-def _part(choice: Choice, features: tuple[AbstractFeature, ...]) -> Choice:
+def _part(choice: FeatureChoice, features: tuple[AbstractFeature, ...]) -> FeatureChoice:
     """Return the choice with some of its features as the best."""
     best, design = choice.best, Design(choice.rows.problem, features)
-    fit = (choice.regression or regression(best.design, choice.rows)).select(design)
+    fit = (choice.regression or build_regression(best.design, choice.rows)).select(design)
     prior = design.prior_like(best.design, best.posterior.prior)
     posterior = fit.maximise_evidence(prior, best.posterior.noise, tolerance=ROUGHLY)
-    return replace(choice, best=Fitted(design, posterior, best.largest_share), regression=fit)
+    return replace(choice, best=FeatureFit(design, posterior, best.largest_share), regression=fit)

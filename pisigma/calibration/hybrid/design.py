@@ -68,14 +68,14 @@ class Design:
             total = total + (chosen.columns(state) * weight).sum(-1)
         return total
 
-    def moved(
+    def predicted_change(
         self, values: SensorValues, change: Float64[Tensor, " unknowns"]
     ) -> Float64[Tensor, "values components"]:
         """Compute the change of a sensor's predicted values by a change of the unknowns, not weighted."""
         moved = values.geometry @ change[: self.active]
         if not self.features or not len(values.row):
             return moved
-        for row, joints in values.sides:
+        for row, joints in values.row_derivatives:
             for rows in chunks(len(row)):
                 delta = self.correction(change, self.problem.state[row[rows]])
                 moved[rows] += torch.einsum("rcj,rj->rc", joints[rows], delta)
@@ -220,12 +220,12 @@ class Rows:
         """
         problem, rows = design.problem, []
         for sensor, weight in zip(values, weights, strict=True):
-            one = sensor.weighted(weight)
+            one = sensor.apply_weights(weight)
             if problem.pose is not None:
-                one = one.collapsed(problem.pose)
+                one = one.merge_repeats(problem.pose)
             if problem.configuration is not None:
-                one = one.shared(problem.configuration)
-            rows.append(replace(one, residual=one.residual + design.moved(one, x)))
+                one = one.downweight_correlated(problem.configuration)
+            rows.append(replace(one, residual=one.residual + design.predicted_change(one, x)))
         return Rows(problem, tuple(rows), group)
 
     def difference(
@@ -243,7 +243,7 @@ class Rows:
         for here, there, sigma in zip(self.values, other.values, noise, strict=True):
             if not torch.equal(here.row, there.row):
                 return math.inf
-            moved = design.moved(here, x)
+            moved = design.predicted_change(here, x)
             first, second = ((one.residual - moved) * one.root[:, None] for one in (here, there))
             total += float((first - second).square().sum()) / sigma**2
         return total

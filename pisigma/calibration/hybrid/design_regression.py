@@ -27,7 +27,7 @@ class AbstractDesignRegression(AbstractRegression):
         """Return the regression for a design with some of the features, or smaller ones."""
 
     @abstractmethod
-    def without(self, groups: Int64[Tensor, " groups"]) -> "AbstractDesignRegression":
+    def without_groups(self, groups: Int64[Tensor, " groups"]) -> "AbstractDesignRegression":
         """Return the regression without the values of some groups of rows (see `Rows.group`), except certain ones."""
 
     @abstractmethod
@@ -47,11 +47,11 @@ class AbstractDesignRegression(AbstractRegression):
         """Leave out each fold, with updates of noise and prior sizes, which few rows leave uncertain."""
         parts = []
         for groups in folds:
-            rest = self.without(groups).maximise_evidence(posterior.prior, posterior.noise, updates)
+            rest = self.without_groups(groups).maximise_evidence(posterior.prior, posterior.noise, updates)
             parts.append(self.held_out_errors(rest, [groups]))
         return HeldOutErrors.joined(parts)
 
-    def first_sizes(
+    def initial_prior_sizes(
         self, posterior: Posterior, design: Design, features: AbstractFeature
     ) -> tuple[float, Float64[Tensor, " groups"] | None]:
         """Compute the gain of log evidence by additional features, with all other prior sizes and the noise fixed.

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import torch
 
 from pisigma.calibration.hybrid.design import Design, Rows
-from pisigma.calibration.hybrid.regression import regression
+from pisigma.calibration.hybrid.regression import build_regression
 from pisigma.calibration.hybrid.search import CLEARLY, ROUGHLY
 from pisigma.joint_correction.feature import AbstractFeature
 from pisigma.joint_correction.fourier_series import FourierSeries
@@ -22,7 +22,7 @@ HARMONICS = 8
 """Harmonics of a series that is fitted too: low harmonics of a gear look like torques of gravity along other axes."""
 
 
-def in_first_row(robot: Robot, direction: Direction) -> Direction:
+def to_first_row_frame(robot: Robot, direction: Direction) -> Direction:
     """Transform a direction from the robot's base frame to the frame of its first row."""
     turned = rotation_from_rpy(torch.tensor(robot.base[3:])).mT @ torch.tensor(direction).double()
     x, y, z = (turned + 0.0).tolist()
@@ -50,9 +50,9 @@ def gravity_by_evidence(
     """
     tried = []
     for direction in (USUAL, (-1.0, 0.0, 0.0), (0.0, -1.0, 0.0)):
-        torques = GravityTorques(robot, in_first_row(robot, direction))
+        torques = GravityTorques(robot, to_first_row_frame(robot, direction))
         design = Design(rows.problem, (torques, FourierSeries(robot, HARMONICS)))
-        fit = regression(design, rows)
+        fit = build_regression(design, rows)
         posterior = fit.maximise_evidence(design.prior(prior_scale), noise, tolerance=ROUGHLY)
         weight = torch.zeros(torques.used.shape).to(posterior.x)
         masses = weight.masked_scatter(torques.used, posterior.x[design.weights_of(0)])[:, ::4]

@@ -29,7 +29,7 @@ class CalibrationNoise:
         """Return whether the value of a sensor is a factor on stated standard deviations."""
         return self.value[name] > MAX_ABSOLUTE if self.stated is None else name in self.stated
 
-    def absolute(self, name: str) -> float:
+    def standard_deviation(self, name: str) -> float:
         """Return the standard deviation of a sensor [m or rad]; NaN where it is not known."""
         if name not in self.value or not self.is_factor(name):
             return self.value.get(name, math.nan)
@@ -43,7 +43,7 @@ class CalibrationNoise:
         kept = {name: sigma for name, sigma in (self.stated or {}).items() if name not in other.value}
         return CalibrationNoise(value, kept | dict(other.stated or {}))
 
-    def usual(self, sensor: AbstractSensor) -> float | None:
+    def noise_of_earlier_rows(self, sensor: AbstractSensor) -> float | None:
         """Return the noise of earlier rows of a sensor, in the form of its new rows; None for a new sensor.
 
         Args:
@@ -57,7 +57,7 @@ class CalibrationNoise:
         if name not in self.value:
             return None
         if sensor.sigma is None and self.is_factor(name):
-            if math.isnan(usual := self.absolute(name)):
+            if math.isnan(usual := self.standard_deviation(name)):
                 raise MeasurementError(
                     expected=f"rows that state the standard deviation of {name}, as those of the calibration do",
                     value="none",

@@ -13,8 +13,8 @@ from pisigma.calibration.geometric.problem.setup import IdentifiedGeometry, iden
 from pisigma.calibration.geometric.result import SolvedCalibration
 from pisigma.calibration.hybrid.design import Design, Rows, chunks, weigh
 from pisigma.calibration.hybrid.design_regression import AbstractDesignRegression
-from pisigma.calibration.hybrid.regression import regression
-from pisigma.calibration.hybrid.search import Choice
+from pisigma.calibration.hybrid.regression import build_regression
+from pisigma.calibration.hybrid.search import FeatureChoice
 from pisigma.calibration.hybrid.sensor_values import Shift, sensor_values
 from pisigma.estimation.held_out import HeldOutErrors
 from pisigma.estimation.regression import Posterior
@@ -56,7 +56,7 @@ class Refined:
     held_out: HeldOutErrors | None = None
 
 
-def refine(problem: CalibrationProblem, group: Int64[Tensor, " rows"], choice: Choice) -> Refined:
+def refine(problem: CalibrationProblem, group: Int64[Tensor, " rows"], choice: FeatureChoice) -> Refined:
     """Fit the selected features to all rows.
 
     Args:
@@ -67,15 +67,15 @@ def refine(problem: CalibrationProblem, group: Int64[Tensor, " rows"], choice: C
     design, posterior = Design(problem, choice.best.design.features), choice.best.posterior
     rows, fit, rounds = choice.rows, choice.regression, 1
     while rounds < MAX_LINEARISATIONS:
-        there = linearised(design, posterior.x, posterior.effective, group)
+        there = linearise_rows(design, posterior.x, posterior.effective, group)
         differs = there.difference(rows, posterior.x, design, posterior.noise)
         if differs < CONVERGENCE_TOLERANCE * posterior.effective:
             break
         rows, fit = there, None  # only one system of equations in memory at a time, because they are large
-        fit = regression(design, there)
+        fit = build_regression(design, there)
         posterior = fit.maximise_evidence(posterior.prior, posterior.noise)
         rounds += 1
-    refined = _refined(rows, design, posterior, fit or regression(design, rows), rounds)
+    refined = _refined(rows, design, posterior, fit or build_regression(design, rows), rounds)
     return replace(refined, held_out=choice.best.held_out) if rounds == 1 else refined
 
 
@@ -108,12 +108,12 @@ def network(design: Design, x: Float64[Tensor, " unknowns"]) -> JointCorrection:
     return made
 
 
-def in_chunks(correction: JointCorrection) -> Shift:
+def evaluate_in_chunks(correction: JointCorrection) -> Shift:
     """Return a function that evaluates the correction for many rows in chunks, to limit the memory."""
     return lambda state: torch.cat([correction(state[rows]) for rows in chunks(len(state.q))])
 
 
-def linearised(
+def linearise_rows(
     design: Design, x: Float64[Tensor, " unknowns"], effective: float, group: Int64[Tensor, " rows"]
 ) -> Rows:
     """Linearise all rows at some unknowns, with robust weights from their residuals.
@@ -126,7 +126,9 @@ def linearised(
     """
     problem = design.problem
     point = problem.nominal.index_add(0, problem.active, x[: design.active])
-    values = sensor_values(problem, point, in_chunks(network(design, x)) if design.features else None)
+    values = sensor_values(
+        problem, point, evaluate_in_chunks(network(design, x)) if design.features else None
+    )
     return Rows.linearised(design, x, values, weigh(problem, values, effective), group)
 
 
@@ -147,7 +149,7 @@ def with_frames_of(solved: SolvedCalibration, refined: Refined) -> IdentifiedGeo
     if not frames:
         return geometry
     with torch.no_grad():
-        moved = replace(rows, q=rows.q + refined.correction.of_rows(rows))
+        moved = replace(rows, q=rows.q + refined.correction.for_rows(rows))
     points = _points(geometry, moved), _points(solved.geometry, rows)
     bases = setup.anchors.bases.clone()
     for frame in frames:

@@ -12,7 +12,7 @@ from pisigma.calibration.hybrid.design import Design, Rows, chunks
 from pisigma.calibration.hybrid.design_regression import AbstractDesignRegression
 from pisigma.calibration.hybrid.sensor_values import SensorValues
 from pisigma.estimation.cholesky import BLOCK, blocks, return_free_memory
-from pisigma.estimation.dual_regression import DualRegression, gram, places_of_pairs, stacked
+from pisigma.estimation.dual_regression import DualRegression, group_gram, pair_indices, stack_groups
 from pisigma.estimation.held_out import HeldOutErrors
 from pisigma.estimation.primal_regression import PrimalRegression, Solved
 from pisigma.estimation.prior import GaussianPrior
@@ -61,7 +61,7 @@ class NormalEquations(PrimalRegression, AbstractDesignRegression):
             _copy_chosen(whole, columns, part)
         return replace(self, design=design, normal=normal, descent=self.descent[:, columns])
 
-    def extended(self, design: Design) -> "NormalEquations":
+    def with_feature(self, design: Design) -> "NormalEquations":
         """Return the equations for a design with some of the features and a new one as its last.
 
         Existing sums are copied.
@@ -85,8 +85,8 @@ class NormalEquations(PrimalRegression, AbstractDesignRegression):
             N[:first, new] = N[new, :first].t()
         return replace(self, design=design, normal=normal, descent=descent)
 
-    def without(self, groups: Int64[Tensor, " groups"]) -> "NormalEquations":
-        """See `AbstractDesignRegression.without`."""
+    def without_groups(self, groups: Int64[Tensor, " groups"]) -> "NormalEquations":
+        """See `AbstractDesignRegression.without_groups`."""
         other = NormalEquations.from_rows(self.design, self.rows.held_out(groups))
         counts = zip(self.sensors, other.sensors, strict=True)
         return replace(
@@ -125,10 +125,10 @@ class NormalEquations(PrimalRegression, AbstractDesignRegression):
             M.addmm_(S.t(), S, alpha=-1)
         return HeldOutErrors.from_fit(M, torch.cat(r), torch.cat(number), self.sensors)
 
-    def first_sizes(
+    def initial_prior_sizes(
         self, posterior: Posterior, design: Design, features: AbstractFeature
     ) -> tuple[float, Tensor | None]:
-        """See `AbstractDesignRegression.first_sizes`.
+        """See `AbstractDesignRegression.initial_prior_sizes`.
 
         The other unknowns are eliminated from the normal equations (Schur complement), so that only the weights of the
         features remain.
@@ -172,7 +172,11 @@ def _add_sums(design: Design, sensor: SensorValues, N: Tensor, b: Tensor) -> flo
         normal[:active, :active] += Gw.flatten(0, 1).t() @ G.flatten(0, 1)
         descent[:active] += Gw.flatten(0, 1).t() @ y.flatten()
         square += float((y.square() * w[:, None]).sum())
-        sides = [(_feature_columns(design, row[rows]), joints[rows]) for row, joints in sensor.sides if count]
+        sides = [
+            (_feature_columns(design, row[rows]), joints[rows])
+            for row, joints in sensor.row_derivatives
+            if count
+        ]
         for f, J in sides:
             # A weight moves joint j by the feature f, so its column is f · J_j: all blocks are products of f and J.
             Jw = J * w[:, None, None]
@@ -257,9 +261,9 @@ class ValueCovariance(DualRegression, AbstractDesignRegression):
             )
         X, y, number, group = (torch.cat(column) for column in zip(*parts, strict=True))
         prior = design.prior((1.0,) * design.classes)
-        K = [gram(X, prior, g, design.active) for g in range(prior.classes, len(prior.sizes))]
+        K = [group_gram(X, prior, g, design.active) for g in range(prior.classes, len(prior.sizes))]
         return ValueCovariance(
-            X, y, number, prior, design.active, stacked(K, y), rows.sensors, design, rows, group
+            X, y, number, prior, design.active, stack_groups(K, y), rows.sensors, design, rows, group
         )
 
     def select(self, design: Design) -> "ValueCovariance":
@@ -272,11 +276,11 @@ class ValueCovariance(DualRegression, AbstractDesignRegression):
             members = (prior.group == g).nonzero()[:, 0]
             other = int(before[members[0]]) if len(members) else prior.classes
             whole = 0 < len(members) == int((self.prior.group == other).sum())
-            K.append(self.K[other - prior.classes] if whole else gram(X, prior, g, design.active))
-        return replace(self, design=design, X=X, prior=prior, K=stacked(K, self.y))
+            K.append(self.K[other - prior.classes] if whole else group_gram(X, prior, g, design.active))
+        return replace(self, design=design, X=X, prior=prior, K=stack_groups(K, self.y))
 
-    def without(self, groups: Int64[Tensor, " groups"]) -> "ValueCovariance":
-        """See `AbstractDesignRegression.without`."""
+    def without_groups(self, groups: Int64[Tensor, " groups"]) -> "ValueCovariance":
+        """See `AbstractDesignRegression.without_groups`."""
         kept = (~torch.isin(self.group, groups)).nonzero()[:, 0]
         sensor = self.sensor[kept]
         left, all_ = (
@@ -290,7 +294,7 @@ class ValueCovariance(DualRegression, AbstractDesignRegression):
             y=self.y[kept],
             sensor=sensor,
             group=self.group[kept],
-            K=self.K[:, places_of_pairs(kept)],
+            K=self.K[:, pair_indices(kept)],
             sensors=tuple(replace(one, values=one.values * part) for one, part in counts),
         )
 
@@ -298,8 +302,8 @@ class ValueCovariance(DualRegression, AbstractDesignRegression):
         self, posterior: Posterior, folds: Sequence[Int64[Tensor, " _groups"]]
     ) -> HeldOutErrors:
         """See `AbstractDesignRegression.held_out_errors`; the residual is `noise² P y`, `noise² P = I - X C X^T`."""
-        if self.is_ill(posterior.prior, posterior.noise):
-            return self.primal.held_out_errors(posterior, folds)
+        if self.is_ill_conditioned(posterior.prior, posterior.noise):
+            return self.normal_equations.held_out_errors(posterior, folds)
         sigma = self.y.new_tensor(posterior.noise)[self.sensor]
         P = self.projection(posterior.prior, posterior.noise)[0].mul_(sigma).mul_(sigma[:, None])
         residual = P @ (self.y / sigma)
@@ -314,9 +318,9 @@ class ValueCovariance(DualRegression, AbstractDesignRegression):
         return HeldOutErrors.joined(parts)
 
     @cached_property
-    def primal(self) -> NormalEquations:
+    def normal_equations(self) -> NormalEquations:
         """Normal equations of the same values."""
-        return NormalEquations(*self.sums, self.sensors, self.design, self.rows)
+        return NormalEquations(*self.normal_equation_sums, self.sensors, self.design, self.rows)
 
     @cached_property
     def _values_of_groups(self) -> tuple[Tensor, ...]:
@@ -327,13 +331,17 @@ class ValueCovariance(DualRegression, AbstractDesignRegression):
         return torch.split(measured[group.argsort(stable=True)], counts)
 
 
-def regression(design: Design, rows: Rows) -> AbstractDesignRegression:
+def build_regression(design: Design, rows: Rows) -> AbstractDesignRegression:
     """Make normal equations, or the covariance of the values if there are few values and more unknowns."""
     values = sum(sensor.residual.numel() for sensor in rows.values)
     few = values <= min(MAX_VALUES, design.unknowns)
     return ValueCovariance.from_rows(design, rows) if few else NormalEquations.from_rows(design, rows)
 
 
-def extended(before: AbstractDesignRegression, design: Design, rows: Rows) -> AbstractDesignRegression:
+def extend_regression(
+    before: AbstractDesignRegression, design: Design, rows: Rows
+) -> AbstractDesignRegression:
     """Return the regression of the same rows on a design with some of the features and a new one as its last."""
-    return before.extended(design) if isinstance(before, NormalEquations) else regression(design, rows)
+    return (
+        before.with_feature(design) if isinstance(before, NormalEquations) else build_regression(design, rows)
+    )

@@ -108,4 +108,4 @@ class HybridResult:
         if self.learned is None:
             return measurements.q
         with torch.no_grad():
-            return measurements.q + self.learned.correction.of_rows(measurements)
+            return measurements.q + self.learned.correction.for_rows(measurements)

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from pisigma.calibration.hybrid.design import FOLDS, FOLDS_OF_FEW, MAX_GROUPS, Design, Rows
 from pisigma.calibration.hybrid.design_regression import AbstractDesignRegression
-from pisigma.calibration.hybrid.regression import extended, regression
+from pisigma.calibration.hybrid.regression import build_regression, extend_regression
 from pisigma.estimation.held_out import HeldOutErrors
 from pisigma.estimation.regression import Posterior
 from pisigma.joint_correction.feature import AbstractFeature
@@ -73,7 +73,7 @@ class Trial:
 
 
 @dataclass(frozen=True, eq=False)
-class Fitted:
+class FeatureFit:
     """Fit of the geometry and some features.
 
     Attributes:
@@ -93,7 +93,7 @@ class Fitted:
         """Labels of its features, for tables."""
         return " + ".join(chosen.label for chosen in self.design.features) or "geometry"
 
-    def gain(self, before: "Fitted") -> float:
+    def gain(self, before: "FeatureFit") -> float:
         """Compute by how many standard errors the held-out squares are smaller than another fit's; 0 without any."""
         if self.held_out is None or before.held_out is None:
             return 0.0
@@ -101,7 +101,7 @@ class Fitted:
 
 
 @dataclass(frozen=True, eq=False)
-class Choice:
+class FeatureChoice:
     """Result of a search.
 
     Attributes:
@@ -113,13 +113,13 @@ class Choice:
     """
 
     rows: Rows
-    geometry: Fitted
-    best: Fitted
+    geometry: FeatureFit
+    best: FeatureFit
     trials: tuple[Trial, ...]
     regression: AbstractDesignRegression | None = None
 
 
-class Search:
+class FeatureSearch:
     """Tries features one after the other on the same rows."""
 
     def __init__(
@@ -136,24 +136,24 @@ class Search:
             rows: the rows.
             noise: noise of the geometric calibration per sensor.
             prior_scale: prior scales of the geometric calibration.
-            largest: all features that `best` may try; growing ones in their largest size.
+            largest: all features that `select_features` may try; growing ones in their largest size.
             progress: called with the current trial.
         """
         self.noise, self.prior_scale = noise, prior_scale
         self.trials: list[Trial] = []
         self.progress = progress
         self.rows = rows
-        self._regression = regression(Design(rows.problem, tuple(largest)), rows)
+        self._regression = build_regression(Design(rows.problem, tuple(largest)), rows)
         self._order = [one.name for one in largest]
         self._folds = rows.folds(FOLDS if rows.groups > FEW_GROUPS else FOLDS_OF_FEW, MAX_GROUPS)
         began = time.monotonic()
-        self.geometry, self._unit = self.fitted(())
+        self.geometry, self._unit = self.fit_features(())
         self._least = self._unit
         self._note(self.geometry, 1.0, began, True)
 
-    def fitted(
-        self, features: Sequence[AbstractFeature], near: Fitted | None = None, sizes: Tensor | None = None
-    ) -> tuple[Fitted, float]:
+    def fit_features(
+        self, features: Sequence[AbstractFeature], near: FeatureFit | None = None, sizes: Tensor | None = None
+    ) -> tuple[FeatureFit, float]:
         """Fit geometry and features, starting with the noise and prior sizes of another fit.
 
         Args:
@@ -173,19 +173,19 @@ class Search:
         chosen = self._regression.select(design)
         posterior = chosen.maximise_evidence(prior, noise, tolerance=ROUGHLY)
         errors = chosen.held_out_errors(posterior, self._folds)
-        return Fitted(design, posterior, held_out=errors), errors.rms(posterior.noise, self.noise)
+        return FeatureFit(design, posterior, held_out=errors), errors.rms(posterior.noise, self.noise)
 
-    def _note(self, tried: Fitted, share: float, began: float, kept: bool) -> None:
+    def _note(self, tried: FeatureFit, share: float, began: float, kept: bool) -> None:
         """Add a trial to the table."""
         seconds, evidence = time.monotonic() - began, tried.posterior.log_evidence
         self.trials.append(Trial(tried.name, tried.design.unknowns, evidence, share, seconds, kept))
 
-    def best(
+    def select_features(
         self,
         growing: Sequence[AbstractFeature],
         others: Sequence[AbstractFeature],
         last: Sequence[AbstractFeature] = (),
-    ) -> Fitted:
+    ) -> FeatureFit:
         """Select features greedily: other features first, then growing ones as long as they improve the fit.
 
         With few rows, single features cannot be distinguished from the noise that the others cause; so all features are
@@ -215,12 +215,14 @@ class Search:
             for scale in dict.fromkeys((tuple(self.prior_scale), usual)):
                 best = self._from_usual_sizes(together, scale, best)
         for chosen in last:
-            gain, sizes = self._regression.first_sizes(best.posterior, best.design, chosen)
+            gain, sizes = self._regression.initial_prior_sizes(best.posterior, best.design, chosen)
             if gain > CLEARLY / 2:
                 best = self._tried([*best.design.features, chosen], best, sizes, least_gain=CLEAR_GAIN)
         return best
 
-    def extended(self, best: Fitted, feature: AbstractFeature | None, odds: float = 0.0) -> Choice:
+    def try_derived_feature(
+        self, best: FeatureFit, feature: AbstractFeature | None, odds: float = 0.0
+    ) -> FeatureChoice:
         """Finish the search, after trying a feature that was derived from its result.
 
         Args:
@@ -231,26 +233,28 @@ class Search:
         if feature is not None:
             largest = [*best.design.features, feature]
             design = Design(self.rows.problem, tuple(largest))
-            self._regression = extended(self._regression, design, self.rows)
+            self._regression = extend_regression(self._regression, design, self.rows)
             self._order = [one.name for one in largest]
             best = self._tried(largest, best, odds=odds)
         same = self._regression.design.features == best.design.features
-        return Choice(self.rows, self.geometry, best, tuple(self.trials), self._regression if same else None)
+        return FeatureChoice(
+            self.rows, self.geometry, best, tuple(self.trials), self._regression if same else None
+        )
 
     def _tried(
         self,
         features: Sequence[AbstractFeature],
-        best: Fitted,
+        best: FeatureFit,
         sizes: Tensor | None = None,
         odds: float = 0.0,
         least_gain: float = -math.inf,
-    ) -> Fitted:
+    ) -> FeatureFit:
         """Return the better of new features and the best fit so far, by evidence and held-out errors."""
         # In the order of the largest design: its equations need no copy if all of its features are tried.
         features = sorted(features, key=lambda one: self._order.index(one.name))
         self.progress(" + ".join(chosen.label for chosen in features))
         began = time.monotonic()
-        tried, held_out = self.fitted(features, best, sizes)
+        tried, held_out = self.fit_features(features, best, sizes)
         better = (
             tried.posterior.log_evidence - best.posterior.log_evidence > CLEARLY + odds
             and held_out < self._least * LEVEL
@@ -263,8 +267,8 @@ class Search:
         return tried if better else best
 
     def _from_usual_sizes(
-        self, features: Sequence[AbstractFeature], prior_scale: Sequence[float], best: Fitted
-    ) -> Fitted:
+        self, features: Sequence[AbstractFeature], prior_scale: Sequence[float], best: FeatureFit
+    ) -> FeatureFit:
         """Return the better of all features with about the usual sizes of the weights and the best fit so far.
 
         If features were kept before, strong evidence suffices, because few rows cannot give more. Without any, very
@@ -283,7 +287,7 @@ class Search:
             and held_out < self._least * LEVEL
             and fit.effective_share(posterior) < MAX_USUAL_SHARE
         )
-        tried = Fitted(design, posterior, MAX_USUAL_SHARE, errors)
+        tried = FeatureFit(design, posterior, MAX_USUAL_SHARE, errors)
         self._note(tried, held_out / self._unit, began, better)
         if better:
             self._least = min(self._least, held_out)

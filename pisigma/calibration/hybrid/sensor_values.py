@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float64, Int64
 from torch import Tensor
 
-from pisigma.calibration.geometric.problem.noise import renumbered
+from pisigma.calibration.geometric.problem.noise import renumber
 from pisigma.calibration.geometric.problem.parameters import ParameterSpace
 from pisigma.calibration.geometric.problem.problem import CalibrationProblem
 from pisigma.joint_correction.feature import AbstractFeature
@@ -49,7 +49,7 @@ class SensorValues:
     repetition: float = 1.0
 
     @property
-    def sides(self) -> list[tuple[Tensor, Tensor]]:
+    def row_derivatives(self) -> list[tuple[Tensor, Tensor]]:
         """Rows of the problem and derivatives by their joint values; two for distances between two rows."""
         sides = [(self.row, self.joints)]
         if self.other_row is not None and self.other_joints is not None:
@@ -66,7 +66,9 @@ class SensorValues:
             state: joint state of all rows of the problem.
             rows: the rows of this sensor to use.
         """
-        blocks = [weight_columns(joints[rows], chosen, state[row[rows]]) for row, joints in self.sides]
+        blocks = [
+            weight_columns(joints[rows], chosen, state[row[rows]]) for row, joints in self.row_derivatives
+        ]
         return blocks[0] if len(blocks) == 1 else blocks[0] + blocks[1]
 
     @property
@@ -87,12 +89,12 @@ class SensorValues:
             other_joints=None if self.other_joints is None else self.other_joints[chosen],
         )
 
-    def weighted(self, weight: Float64[Tensor, " values"]) -> "SensorValues":
+    def apply_weights(self, weight: Float64[Tensor, " values"]) -> "SensorValues":
         """Multiply the weights of the rows; rows with weight 0 are removed."""
         kept = weight > 0
         return replace(self.select(kept), root=(self.root * weight.sqrt())[kept])
 
-    def collapsed(self, pose: Int64[Tensor, " rows"]) -> "SensorValues":
+    def merge_repeats(self, pose: Int64[Tensor, " rows"]) -> "SensorValues":
         """Join repeats of a pose to one row with the sum of their weights.
 
         Repeats of a pose share the errors of the model, so they are not independent. Rows of a pose that measure
@@ -101,7 +103,7 @@ class SensorValues:
         """
         if not len(self.row) or self.other_row is not None:
             return self
-        key = renumbered(pose[self.row] * len(self.row) + self._sights())
+        key = renumber(pose[self.row] * len(self.row) + self._sights())
         poses = int(key.max()) + 1
         if poses == len(key):
             return self
@@ -124,11 +126,11 @@ class SensorValues:
             root=total.sqrt(),
         )
 
-    def shared(self, configuration: Int64[Tensor, " rows"]) -> "SensorValues":
+    def downweight_correlated(self, configuration: Int64[Tensor, " rows"]) -> "SensorValues":
         """Reduce the weights if the residuals of several targets in a configuration are correlated."""
         if not len(self.row) or self.certain or self.other_row is not None:
             return self
-        key = renumbered(configuration[self.row])
+        key = renumber(configuration[self.row])
         groups = int(key.max()) + 1
         weight = self.root.square()
         total = weight.new_zeros(groups).index_add(0, key, weight)
@@ -146,7 +148,7 @@ class SensorValues:
         key = self.geometry.new_zeros(len(self.row))
         for J in (self.geometry.flatten(1), self.joints.flatten(1)):
             key = key + J @ torch.arange(1, J.shape[1] + 1).to(J).sin()
-        return renumbered((key / key.abs().max().clamp(min=1e-300) * 1e6).round().to(torch.int64))
+        return renumber((key / key.abs().max().clamp(min=1e-300) * 1e6).round().to(torch.int64))
 
 
 def weight_columns(

@@ -21,7 +21,9 @@ BLOCK = 64
 """Powers of `exp(i angle)` that are computed directly; the others are products of these."""
 
 
-def lines(design: Design, rows: Rows, posterior: Posterior, lowest: int) -> tuple[tuple[int, ...], ...]:
+def find_spectral_lines(
+    design: Design, rows: Rows, posterior: Posterior, lowest: int
+) -> tuple[tuple[int, ...], ...]:
     """Find the orders of the lines of every joint, the strongest first.
 
     The periodogram of unevenly sampled values (Scargle 1982, The Astrophysical Journal 263, 835-853) of the joint
@@ -42,12 +44,12 @@ def lines(design: Design, rows: Rows, posterior: Posterior, lowest: int) -> tupl
     """
     slope, curvature = _slope_and_curvature(design, rows, posterior)
     angle = design.problem.q * torch.from_numpy(turning_rate(design.problem.space.robot)).to(slope)
-    least = odds_against_a_line(angle.shape[1])
+    least = log_number_of_orders(angle.shape[1])
     columns = zip(angle.t(), slope.t(), curvature.t(), strict=True)
     return tuple(_lines_of_joint(*column, lowest, least) for column in columns)
 
 
-def odds_against_a_line(joints: int) -> float:
+def log_number_of_orders(joints: int) -> float:
     """Return the logarithm of the number of orders of all joints, any of which may be a line."""
     return math.log(joints * HIGHEST)
 
@@ -60,8 +62,8 @@ def _slope_and_curvature(
     for sensor, sigma in zip(rows.values, posterior.noise, strict=True):
         if not sensor.certain:
             weight = (sensor.root / sigma).square()[:, None]
-            residual = sensor.residual - design.moved(sensor, posterior.x)
-            for row, joints in sensor.sides:
+            residual = sensor.residual - design.predicted_change(sensor, posterior.x)
+            for row, joints in sensor.row_derivatives:
                 slope.index_add_(0, row, torch.einsum("rcj,rc->rj", joints, residual) * weight)
                 curvature.index_add_(0, row, joints.square().sum(1) * weight)
     return slope, curvature

@@ -58,7 +58,7 @@ class PositionUncertainty:
     @property
     def root(self) -> Float64[Tensor, "unknowns directions"]:
         """Root `R` as a dense matrix."""
-        return self.covariance_root.dense
+        return self.covariance_root.as_matrix
 
     def deviation(
         self, measurements: Measurements, q_moved: Float64[Tensor, "rows dof"]
@@ -84,7 +84,7 @@ class PositionUncertainty:
         self, state: JointState, q_moved: Float64[Tensor, "rows dof"], frame: int, target: int
     ) -> Float64[Tensor, "rows 3"]:
         columns = self.columns(state, q_moved, frame, target)[:, :3]
-        return self.covariance_root.along(columns).square().sum(-1).sqrt()
+        return self.covariance_root.left_multiply(columns).square().sum(-1).sqrt()
 
     def columns(
         self, state: JointState, q_moved: Float64[Tensor, "rows dof"], frame: int = 0, target: int = 0
@@ -142,7 +142,7 @@ def position_uncertainty(
         missed = held_out or fit.held_out_errors(posterior, folds)
     prior_scale = held_out_scale(missed)
     root = fit.covariance_root(posterior)
-    change = geometry.change[:, design.problem.active.cpu()]
+    change = geometry.coordinate_jacobian[:, design.problem.active.cpu()]
     root = root.extended(root_of_sizes(posterior, root), prior_scale**0.5, change)
     value = {sensor.name: sigma for sensor, sigma in zip(rows.values, posterior.noise, strict=True)}
     noise = CalibrationNoise(value, stated_sigmas(design.problem.sensors))

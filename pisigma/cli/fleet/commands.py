@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from pisigma.cli.arguments import AsJson, Overwrite, Verbose
-from pisigma.cli.endings import NOT_ACCEPTED, tell_problems
+from pisigma.cli.endings import NOT_ACCEPTED, report_problems
 from pisigma.cli.help import ShortHelpCommand
 from pisigma.cli.output import command_line, print_json
 from pisigma.cli.progress import progress_of
 from pisigma.cli.screen import print_screen
 from pisigma.cli.settings_options import takes_settings
 from pisigma.files.errors import FleetError
-from pisigma.reporting.result_text import sentences, table
+from pisigma.reporting.result_text import sentences, table_block
 from pisigma.workflow.settings.calibration import CalibrationSettings
 from pisigma.workflow.settings.fleet import FleetSettings
 
@@ -66,7 +66,7 @@ fleet = typer.Typer(name="fleet", help="Calibrate, recalibrate or monitor many r
 
 
 @fleet.command(cls=ShortHelpCommand)
-@tell_problems
+@report_problems
 @takes_settings
 def run(
     source: Source,
@@ -95,7 +95,7 @@ def run(
 
 
 @fleet.command("prior", cls=ShortHelpCommand)
-@tell_problems
+@report_problems
 def estimate_prior(
     context: typer.Context,
     source: Source,
@@ -123,7 +123,7 @@ def estimate_prior(
 
 
 @fleet.command(cls=ShortHelpCommand)
-@tell_problems
+@report_problems
 def status(
     folder: Folder,
     page: Page = None,
@@ -171,9 +171,9 @@ def _print_prior(result: "FleetPriorResult", out: Path, verbose: bool) -> None:
     print_screen(
         verdict,
         summary.warnings,
-        [table("joint correction", *spectrum_table(summary))],
+        [table_block("joint correction", *spectrum_table(summary))],
         [
-            table(f"parameters that {summary.robots} robots have in common", *common_table(summary)),
+            table_block(f"parameters that {summary.robots} robots have in common", *common_table(summary)),
             sentences("undetermined parameters", [UNDETERMINED]),
         ],
         [f"Model written to {out} in {result.seconds:.1f} s; its README.md has all figures."],
@@ -217,15 +217,15 @@ def _print_status(seen: "FleetStatus", page: Path | None, verbose: bool) -> None
     """Print how many robots are in each state, the worst, and what is to be done."""
     from pisigma.reporting.lifetime_tables import ERRORS_NOTE, not_compared, robot_table, state_table
 
-    count, worst = len(seen.robots), seen.worst_first
+    count, worst = len(seen.robots), seen.robots_by_error
     title = f"{count} robot{'' if count == 1 else 's'}, as of {seen.today}"
-    details = [table("errors of all robots", *robot_table(worst))] if len(worst) > SHOWN else []
+    details = [table_block("errors of all robots", *robot_table(worst))] if len(worst) > SHOWN else []
     print_screen(
         _status_verdict(seen),
         [*_states(seen), *filter(None, [not_compared(seen)]), *seen.warnings],
         [
-            table(title, *state_table(seen)),
-            *([table("largest errors", *robot_table(worst[:SHOWN]))] if worst else []),
+            table_block(title, *state_table(seen)),
+            *([table_block("largest errors", *robot_table(worst[:SHOWN]))] if worst else []),
         ],
         [*details, sentences("which errors these are", [ERRORS_NOTE] if worst else [])],
         [] if page is None else [f"Page written to {page}."],
@@ -237,9 +237,11 @@ def _status_verdict(seen: "FleetStatus") -> "Verdict":
     """Judge a fleet by its worst robot and by those that need attention."""
     from pisigma.reporting.verdict import Verdict, counted, rounded
 
-    worst = next(iter(seen.worst_first), None)
+    worst = next(iter(seen.robots_by_error), None)
     error = None if worst is None or worst.last is None else worst.last.error_mm
-    states = {state: len(seen.in_state(state)) for state in ("drifting", "refused", "missing", "overdue")}
+    states = {
+        state: len(seen.robots_in_state(state)) for state in ("drifting", "refused", "missing", "overdue")
+    }
     found = ", ".join(f"{number} {state}" for state, number in states.items() if number)
     return Verdict(
         "no robot has an error yet."
@@ -256,13 +258,13 @@ def _status_verdict(seen: "FleetStatus") -> "Verdict":
 def _states(seen: "FleetStatus") -> Iterator[str]:
     """Name the robots that drift, were refused, are overdue or are missing."""
     for state in ("drifting", "refused"):
-        for one in seen.in_state(state):
+        for one in seen.robots_in_state(state):
             said = one.refused or one.last
             assert said is not None
             yield f"{state}: {one.robot}, {said.session}: {said.sentence}"
-    if overdue := sorted(seen.in_state("overdue"), key=lambda one: -(one.days or 0)):
+    if overdue := sorted(seen.robots_in_state("overdue"), key=lambda one: -(one.days or 0)):
         longest = ", ".join(f"{one.robot} ({one.days} days)" for one in overdue[:SHOWN])
         more = f", and {len(overdue) - SHOWN} more" if len(overdue) > SHOWN else ""
         yield f"overdue: {longest}{more}."
-    if missing := [one.robot for one in seen.in_state("missing")]:
+    if missing := [one.robot for one in seen.robots_in_state("missing")]:
         yield f"missing: {', '.join(missing)}; run the same `pisigma fleet run` again."

@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from pisigma.cli.arguments import AsJson, ModelOrCell, PayloadKg, TemperatureC
-from pisigma.cli.endings import fail
+from pisigma.cli.endings import exit_with_error
 from pisigma.cli.output import print_json, print_line, print_lines
 from pisigma.cli.progress import progress_of
-from pisigma.reporting.result_text import together
+from pisigma.reporting.result_text import merge_alike_warnings
 
 if TYPE_CHECKING:
     import numpy as np
@@ -147,7 +147,7 @@ def _print_pose(
     else:
         print_solutions(solution, solver)
     if problem := failure(solution, places, any_will_do=all_branches):
-        fail(problem)
+        exit_with_error(problem)
 
 
 def _write_file(
@@ -170,9 +170,11 @@ def _write_file(
         switches = [f"{poses}, line {line}: {switch.sentence}" for line, switch in outcome.switches]
         counts = ", ".join(f"{count} {status}" for status, count in outcome.statuses.most_common())
         warnings = (f"Warning: {sentence}" for sentence in solver.warnings)
-        print_lines([*together(switches), *warnings, f"{outcome.rows} rows written to {out}: {counts}."])
+        print_lines(
+            [*merge_alike_warnings(switches), *warnings, f"{outcome.rows} rows written to {out}: {counts}."]
+        )
     if problem := outcome.problem(poses):
-        fail(problem)
+        exit_with_error(problem)
 
 
 def _check_options(

@@ -52,7 +52,7 @@ class FailedRow:
 
 
 @dataclass
-class Outcome:
+class PoseFileResult:
     """How the poses of a file were solved.
 
     Attributes:
@@ -103,7 +103,7 @@ def write_joint_file(
     tell: Callable[[str], None],
     accuracy: bool = False,
     path: bool = False,
-) -> Outcome:
+) -> PoseFileResult:
     """Write one row per pose of a file, whole or not at all, however long the file is.
 
     A row contains the line of the pose, status, branch, corrected and nominal joint values, the residuals of the
@@ -124,7 +124,7 @@ def write_joint_file(
         OutputError: the file cannot be written there.
         PoseError: there is no such branch.
     """
-    outcome, begun = Outcome(), time.monotonic()
+    outcome, begun = PoseFileResult(), time.monotonic()
     with writing_whole(out) as file:
         writer = csv.writer(file, lineterminator="\n")
         header = _header(solver, accuracy)
@@ -146,7 +146,12 @@ def _header(solver: CorrectedIK, accuracy: bool) -> list[str]:
 
 
 def _solved_rows(
-    solver: CorrectedIK, chunk: PoseChunk, branch: str | None, accuracy: bool, outcome: Outcome, path: bool
+    solver: CorrectedIK,
+    chunk: PoseChunk,
+    branch: str | None,
+    accuracy: bool,
+    outcome: PoseFileResult,
+    path: bool,
 ) -> Iterator[list[str]]:
     """Return the first cells of the rows of a chunk, in the order of the file, and count them in the outcome."""
     too_far = _too_far(chunk, solver.model.robot)

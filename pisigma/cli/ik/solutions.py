@@ -7,7 +7,7 @@ from typing import Any
 from pisigma.cli.screen import print_screen
 from pisigma.model.inverse.corrected_ik import CorrectedIK
 from pisigma.model.inverse.solution import Solution
-from pisigma.reporting.result_text import Block, sentences, table
+from pisigma.reporting.result_text import Block, sentences, table_block
 from pisigma.reporting.verdict import Verdict
 from pisigma.robot.kinematics.status import Status
 
@@ -74,7 +74,7 @@ def _one(solution: Solution, solver: CorrectedIK, branch: str) -> Block:
         (joint, unit, *(f"{value:.4f}" for value in figures))
         for joint, unit, *figures in zip(solver.joints, file_units(solver), *values, strict=True)
     ]
-    return table(
+    return table_block(
         f"joint values, branch {branch}", ("joint", "unit", "corrected", "nominal", "correction"), rows
     )
 
@@ -87,7 +87,7 @@ def _several(solution: Solution, solver: CorrectedIK, branches: Sequence[str]) -
         for name, q in zip(branches, solution.q.tolist(), strict=True)
     ]
     title = f"corrected joint values [{' or '.join(units)}]; --json has nominal values and corrections too"
-    return table(title, ("branch", *solver.joints), rows)
+    return table_block(title, ("branch", *solver.joints), rows)
 
 
 def failure(solution: Solution, places: Sequence[str], any_will_do: bool) -> str | None:

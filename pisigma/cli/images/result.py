@@ -8,7 +8,7 @@ import typer
 
 from pisigma.cli.output import print_json
 from pisigma.cli.screen import print_screen
-from pisigma.reporting.result_text import sentences, table
+from pisigma.reporting.result_text import sentences, table_block
 from pisigma.reporting.verdict import Verdict, counted
 
 if TYPE_CHECKING:
@@ -49,7 +49,7 @@ def write_result(
     print_screen(
         verdict,
         [*result.warnings, *left_out],
-        [table(title, *cells) for title, cells in result.tables],
+        [table_block(title, *cells) for title, cells in result.tables],
         [sentences("remarks on the images", result.sentences)],
         [f"Written to {written}."],
         verbose,

@@ -12,7 +12,7 @@ from pisigma.cli.progress import progress_of
 from pisigma.cli.screen import print_screen
 from pisigma.cli.settings_options import StatedSettings, takes_settings
 from pisigma.files.errors import AcceptanceError
-from pisigma.reporting.result_text import sentences, table
+from pisigma.reporting.result_text import sentences, table_block
 from pisigma.reporting.verdict import Verdict, counted, rounded
 from pisigma.workflow.settings.comparison import ComparisonSettings
 
@@ -104,8 +104,8 @@ def _print(compared: "ComparedModels", page: Path | None, verbose: bool) -> None
     blocks = [
         sentences("what differs", compared.sentences),
         *short,
-        table("distances of the tool", head, [row for row in rows if "mean" not in row[0]]),
-        table(f"parameters of {first} (A) and {second} (B)", *parameters),
+        table_block("distances of the tool", head, [row for row in rows if "mean" not in row[0]]),
+        table_block(f"parameters of {first} (A) and {second} (B)", *parameters),
     ]
     closing = [] if page is None else [f"Page written to {page}."]
     print_screen(_verdict(compared), compared.warnings, blocks, whole, closing, verbose)

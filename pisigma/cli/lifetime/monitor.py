@@ -12,7 +12,7 @@ from pisigma.cli.output import print_json
 from pisigma.cli.progress import progress_of
 from pisigma.cli.screen import print_screen
 from pisigma.cli.settings_options import StatedSettings, takes_settings
-from pisigma.reporting.result_text import sentences, table
+from pisigma.reporting.result_text import sentences, table_block
 from pisigma.reporting.verdict import Verdict, counted, rounded, uncapitalised
 from pisigma.workflow.settings.monitoring import MonitorSettings
 
@@ -103,7 +103,7 @@ def _print(
     sessions = monitoring.sessions
     said = [f"{one.date}: {one.session.sentence}" for one in sessions if one.session.verdict != "unchanged"]
     unobservable = dict.fromkeys(line for one in sessions for line in one.session.unobservable)
-    charts = table(f"charts of {len(monitoring.records)} sessions", *chart_table(monitoring.charts))
+    charts = table_block(f"charts of {len(monitoring.records)} sessions", *chart_table(monitoring.charts))
     advice = next((line for line in monitoring.sentences if "`pisigma " in line), "")
     print_screen(
         _verdict(monitoring, advice),
@@ -113,11 +113,13 @@ def _print(
                 "what the sessions say together", (one for one in monitoring.sentences if one != advice)
             ),
             sentences("what has changed", [*said[-MAX_SESSIONS:], *unobservable], "  "),
-            table(f"last sessions of {monitoring.model.name}", *session_table(sessions[-MAX_SESSIONS:])),
+            table_block(
+                f"last sessions of {monitoring.model.name}", *session_table(sessions[-MAX_SESSIONS:])
+            ),
             *([charts] if len(monitoring.records) > 1 else []),
         ],
         [
-            table(f"sessions of {monitoring.model.name}", *session_table(sessions)),
+            table_block(f"sessions of {monitoring.model.name}", *session_table(sessions)),
             sentences("what has changed in all sessions", said, "  "),
         ]
         if len(sessions) > MAX_SESSIONS

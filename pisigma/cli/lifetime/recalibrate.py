@@ -8,12 +8,12 @@ import typer
 
 from pisigma.cli.arguments import AcceptImplausible, AsJson, ModelOrCell, Overwrite, Verbose
 from pisigma.cli.cell import cell_at, next_lines, refuse_with_cell, report_overrides
-from pisigma.cli.output import command_line, print_json, saved
+from pisigma.cli.output import command_line, print_json, saved_model_folder
 from pisigma.cli.progress import progress_of
 from pisigma.cli.screen import print_screen
 from pisigma.cli.settings_options import StatedSettings, takes_settings
 from pisigma.files.errors import AcceptanceError
-from pisigma.reporting.result_text import sentences, table
+from pisigma.reporting.result_text import sentences, table_block
 from pisigma.reporting.verdict import Verdict, counted, rounded, uncapitalised
 from pisigma.workflow.settings.recalibration import RecalibrationSettings
 
@@ -110,7 +110,9 @@ def recalibrate_into(
                 "the result must not be trusted, for the reasons above; nothing would be written."
             )
         return
-    with saved(recalibration, out, accept_implausible, overwrite, command=command_line(context)) as folder:
+    with saved_model_folder(
+        recalibration, out, accept_implausible, overwrite, command=command_line(context)
+    ) as folder:
         _print(recalibration, folder, as_json, verbose)
 
 
@@ -158,7 +160,7 @@ def _print(
         [*warnings, *(one.sentence for one in summary.outliers)],
         [
             sentences("which model is kept", [summary.verdict]),
-            table(f"errors of {summary.left_out} held-out rows", *candidate_table(summary)),
+            table_block(f"errors of {summary.left_out} held-out rows", *candidate_table(summary)),
         ],
         closing=[]
         if folder is None

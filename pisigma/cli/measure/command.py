@@ -65,7 +65,7 @@ class PageOptions:
     port: Annotated[int, Option("--view-port", min=1, max=65535)] = 8080
     urdf: Annotated[Path | None, Option("--view-urdf")] = None
 
-    def body(self, robot: "Robot") -> "MeshBody | None":
+    def load_meshes(self, robot: "Robot") -> "MeshBody | None":
         """Load the meshes of a robot; None to show capsules.
 
         Raises:
@@ -77,7 +77,7 @@ class PageOptions:
 
 
 @contextmanager
-def shown_in_browser(
+def serve_session_page(
     arm: "ArmInSurroundings",
     limit_mm: float | None,
     page: PageOptions | None,
@@ -104,9 +104,9 @@ def shown_in_browser(
 
     limit = None if limit_mm is None else limit_mm / 1e3
     sight = None if camera is None else sight_of(camera)
-    with SessionView(arm, page.body(arm.robot), limit, page.host, page.port, sight) as view:
+    with SessionView(arm, page.load_meshes(arm.robot), limit, page.host, page.port, sight) as view:
         print_line(f"The session is shown at {view.url}", to_stderr=True)
-        yield view.show
+        yield view.show_state
         if sys.stderr.isatty():
             print_line("The page stays until Ctrl-C.", to_stderr=True)
             threading.Event().wait()
@@ -146,7 +146,7 @@ def measure(
     check_programs(program or [], session.plan.arm.robot, (plan, rows, rest))
     try:
         with (
-            shown_in_browser(
+            serve_session_page(
                 session.plan.arm, chosen.limit_mm, page if view else None, session.plan.settings.camera
             ) as show_page,
             _printer(session, f"measure {plan}", as_json) as show,

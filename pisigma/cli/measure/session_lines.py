@@ -7,7 +7,7 @@ import numpy as np
 
 from pisigma.files.errors import printable
 from pisigma.planning.session.state import AccuracyPoint, SessionState
-from pisigma.reporting.result_text import MAX_ALIKE, ranges, together
+from pisigma.reporting.result_text import MAX_ALIKE, merge_alike_warnings, ranges
 from pisigma.reporting.verdict import Verdict, counted, rounded, uncapitalised
 from pisigma.workflow.follow import SessionStep
 
@@ -27,7 +27,9 @@ def step_lines(step: SessionStep) -> Iterator[str]:
     lines = [] if step.growth.rows is None else step.growth.rows.line
     alarms = {alarm.line for alarm in step.alarms if not alarm.counts}
     yield from _row_lines(state, [line for line in lines if line not in alarms])
-    yield from together(f"{'Remark' if alarm.counts else 'ALARM'}: {alarm.sentence}" for alarm in step.alarms)
+    yield from merge_alike_warnings(
+        f"{'Remark' if alarm.counts else 'ALARM'}: {alarm.sentence}" for alarm in step.alarms
+    )
     for point in step.points:
         yield f"Accuracy {accuracy_text(point)}"
     if lines or step.points:

@@ -13,7 +13,7 @@ from pisigma.cli.progress import progress_of
 from pisigma.cli.screen import print_screen
 from pisigma.cli.settings_options import takes_settings
 from pisigma.files.errors import PoseError, RecipeError
-from pisigma.reporting.result_text import sentences, table
+from pisigma.reporting.result_text import sentences, table_block
 from pisigma.reporting.verdict import Verdict, counted, rms_text
 from pisigma.workflow.settings.distillation import DistillationSettings
 
@@ -138,10 +138,12 @@ def _print(distillation: "Distillation", out: Path, as_json: bool, verbose: bool
         f"export it: `pisigma export {out} --format onnx --out MODEL.onnx`.",
     )
     head, rows = pose_rows(errors.models)
-    blocks = [table(f"errors of the tool against the full model, {count} held-out poses", head, rows)]
+    blocks = [table_block(f"errors of the tool against the full model, {count} held-out poses", head, rows)]
     details = [
-        table("absolute joint corrections, and errors of the distilled ones", *correction_table(summary)),
-        table("sizes tried", *size_table(summary)),
+        table_block(
+            "absolute joint corrections, and errors of the distilled ones", *correction_table(summary)
+        ),
+        table_block("sizes tried", *size_table(summary)),
         sentences("limitations", summary.limitations),
     ]
     closing = [f"Model written to {out} in {distillation.seconds:.1f} s; its README.md has all figures."]

@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from pisigma.cli.arguments import AcceptImplausible, AsJson, Overwrite, Verbose
-from pisigma.cli.output import print_json, saved
+from pisigma.cli.output import print_json, saved_model_folder
 from pisigma.cli.progress import progress_of
 from pisigma.cli.screen import print_result, print_screen
 from pisigma.cli.settings_options import takes_settings
 from pisigma.files.errors import printable
-from pisigma.reporting.result_text import Block, table
+from pisigma.reporting.result_text import Block, table_block
 from pisigma.reporting.verdict import Verdict, rms_text, rounded, uncapitalised
 from pisigma.workflow.settings.training import TrainSettings
 
@@ -65,7 +65,7 @@ def train(
         training = train_recipe(recipe, data, settings, progress)
     command = ["pisigma", "train", recipe.as_posix(), *(["--data", data.name] if data else [])]
     texts = {"name": read.name, "command": printable(shlex.join(command), cut=False)}
-    with saved(training, folder, accept_implausible, overwrite, **texts) as written:
+    with saved_model_folder(training, folder, accept_implausible, overwrite, **texts) as written:
         shutil.rmtree(checkpoints, ignore_errors=True)
         training = replace(training, seconds=time.perf_counter() - started)
         if as_json:
@@ -101,9 +101,9 @@ def _print_training(summary: "TrainingSummary", folder: Path, seconds: float, ve
             held_out = (
                 f"{rms_text(best, rows.used)} RMS, {which}; nominal {rms_text(figures.nominal, rows.used)}"
             )
-            blocks.insert(0, table(f"errors of poses, {which}", *pose_rows(figures.models)))
+            blocks.insert(0, table_block(f"errors of poses, {which}", *pose_rows(figures.models)))
     blocks.append(
-        table("absolute joint errors", ("joint", "unit", "rows", *columns), joint_rows(summary.joints))
+        table_block("absolute joint errors", ("joint", "unit", "rows", *columns), joint_rows(summary.joints))
     )
     reason = f" ({rows.rule})" if rows.left_out else ""
     verdict = Verdict(
@@ -145,7 +145,7 @@ def _redundancy(summary: "CalibrationSummary") -> Iterator[Block]:
         ("RMSE after [mm]", summary.rmse_mm[-1], "rmse_after_mm", "{:.2e}"),
     ):
         rows.append((label, form.format(value), form.format(paper[key]) if key in paper else ""))
-    yield table("redundancy and convergence", ("what", "pisigma", "paper"), rows)
+    yield table_block("redundancy and convergence", ("what", "pisigma", "paper"), rows)
 
 
 def _sets_side_by_side(

@@ -25,7 +25,7 @@ TABLE_SUFFIXES = (".csv", ".yaml", ".yml")
 
 def dh_yaml(robot: Robot, comments: tuple[str, ...] = ()) -> str:
     """Write a robot file, which `Robot.load` reads, with comments at the top."""
-    return head((CONVENTION, *comments)) + robot_to_yaml(robot)
+    return header_comment((CONVENTION, *comments)) + robot_to_yaml(robot)
 
 
 def dh_csv(robot: Robot, comments: tuple[str, ...] = ()) -> str:
@@ -65,7 +65,7 @@ def csv_table(
     writer = csv.DictWriter(text, tuple(columns), restval="", lineterminator="\n")
     writer.writeheader()
     writer.writerows(lines)
-    return head(sentences) + text.getvalue()
+    return header_comment(sentences) + text.getvalue()
 
 
 def cells(names: tuple[str, ...], values: np.ndarray) -> dict[str, str]:
@@ -73,7 +73,7 @@ def cells(names: tuple[str, ...], values: np.ndarray) -> dict[str, str]:
     return {column: repr(value) for column, value in in_file_units(names, values).items()}
 
 
-def head(sentences: tuple[str, ...]) -> str:
+def header_comment(sentences: tuple[str, ...]) -> str:
     """Format sentences as lines that start with #."""
     return "".join(f"# {' '.join(sentence.split())}\n" for sentence in sentences)
 

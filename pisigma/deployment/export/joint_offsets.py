@@ -5,7 +5,7 @@ from dataclasses import asdict, dataclass
 import numpy as np
 from jaxtyping import Float64
 
-from pisigma.deployment.export.dh_table import TABLE_SUFFIXES, cells, csv_table, head
+from pisigma.deployment.export.dh_table import TABLE_SUFFIXES, cells, csv_table, header_comment
 from pisigma.deployment.export.export_format import Exported, ExportFormat, ExportRequest, model_facts
 from pisigma.deployment.export.geometry import offset_remarks
 from pisigma.deployment.export.projection import Departure, joint_offsets, project_model
@@ -131,7 +131,7 @@ def offsets_yaml(offsets: JointOffsets, comments: tuple[str, ...] = ()) -> str:
     for part in ("base", "tool"):
         document[part] = in_file_units(FRAME_COLUMNS, getattr(offsets.robot, part))
     body = yaml_text(document | offsets.departures())
-    return head((*comments, *offset_sentences(offsets))) + body
+    return header_comment((*comments, *offset_sentences(offsets))) + body
 
 
 def _joints(offsets: JointOffsets) -> list[dict[str, object]]:

@@ -42,22 +42,22 @@ def add_network(graph: OnnxGraph, network: CorrectionNetwork, q: str, T: str | N
     for group, net in network.members():
         outputs.append(_add_group(graph, group, net, q, T))
         joints += group.joints
-    every = outputs[0] if len(outputs) == 1 else graph.node("Concat", *outputs, axis=1)
-    return graph.node("MatMul", every, np.eye(network.dof)[joints])
+    every = outputs[0] if len(outputs) == 1 else graph.add_node("Concat", *outputs, axis=1)
+    return graph.add_node("MatMul", every, np.eye(network.dof)[joints])
 
 
 def _add_group(graph: OnnxGraph, group: JointGroup, net: PiSigma, q: str, T: str | None) -> str:
     """Add one network, and return the name of its outputs `(batch, outputs)`."""
     values, order = _add_inputs(graph, group, q, T)
     offset, scale = (part.detach().numpy()[order] for part in (net.input_offset, net.input_scale))
-    scaled = graph.node("Div", graph.node("Sub", values, offset), scale)
+    scaled = graph.add_node("Div", graph.add_node("Sub", values, offset), scale)
     weight = (net.weight * net.fixed[..., None]).detach().numpy()[..., order].reshape(-1, net.inputs)
     bias = (net.bias * net.fixed).detach().numpy().ravel()
-    sums = graph.node("Add", graph.node("MatMul", scaled, weight.T), bias)
+    sums = graph.add_node("Add", graph.add_node("MatMul", scaled, weight.T), bias)
     factors = graph.reshape(sums, [net.outputs, sum(net.orders)])
     product = graph.sum_of_products(factors, net.orders)
-    scaled_back = graph.node("Mul", product, net.output_scale.detach().numpy())
-    return graph.node("Add", scaled_back, net.output_offset.detach().numpy())
+    scaled_back = graph.add_node("Mul", product, net.output_scale.detach().numpy())
+    return graph.add_node("Add", scaled_back, net.output_offset.detach().numpy())
 
 
 def _add_inputs(graph: OnnxGraph, group: JointGroup, q: str, T: str | None) -> tuple[str, list[int]]:
@@ -69,8 +69,8 @@ def _add_inputs(graph: OnnxGraph, group: JointGroup, q: str, T: str | None) -> t
     for function, operator in (("sin", "Sin"), ("cos", "Cos"), ("", "")):
         rows = [i for i, (kind, factors) in enumerate(terms) if factors and kind == function]
         if rows:
-            angle = graph.node("MatMul", q, np.array([terms[i][1] for i in rows]).T)
-            parts.append(graph.node(operator, angle) if operator else angle)
+            angle = graph.add_node("MatMul", q, np.array([terms[i][1] for i in rows]).T)
+            parts.append(graph.add_node(operator, angle) if operator else angle)
             order += rows
     coordinates = [i for i, (_, factors) in enumerate(terms) if not factors]
     if coordinates:
@@ -78,7 +78,7 @@ def _add_inputs(graph: OnnxGraph, group: JointGroup, q: str, T: str | None) -> t
         pose = _add_coordinates(graph, group.inputs.reference, T)
         parts += [pose[POSE_INPUTS.index(names[i])] for i in coordinates]
         order += coordinates
-    return (parts[0] if len(parts) == 1 else graph.node("Concat", *parts, axis=1)), order
+    return (parts[0] if len(parts) == 1 else graph.add_node("Concat", *parts, axis=1)), order
 
 
 def _add_coordinates(graph: OnnxGraph, reference: np.ndarray, T: str) -> Sequence[str]:
@@ -86,7 +86,9 @@ def _add_coordinates(graph: OnnxGraph, reference: np.ndarray, T: str) -> Sequenc
     cells = graph.reshape(T, [16])
     place = [graph.column(cells, 4 * axis + 3) for axis in range(3)]
     rotation = graph.columns(cells, [0, 1, 2, 4, 5, 6, 8, 9, 10])
-    turned = graph.node("MatMul", rotation, np.kron(reference, np.eye(3)))  # reference.T @ R, cell by cell
+    turned = graph.add_node(
+        "MatMul", rotation, np.kron(reference, np.eye(3))
+    )  # reference.T @ R, cell by cell
     return [*place, *add_roll_pitch_yaw(graph, turned)]
 
 
@@ -113,17 +115,17 @@ def add_joint_correction(graph: OnnxGraph, correction: JointCorrection, q: str) 
         weight = (correction.weight * correction.fixed[..., None]).detach().numpy()
         bias = (correction.bias * correction.fixed).detach().numpy().ravel()
         phi = add_unit_inputs(graph, robot, q)
-        sums = graph.node("Add", graph.node("MatMul", phi, weight.reshape(-1, inputs).T), bias)
+        sums = graph.add_node("Add", graph.add_node("MatMul", phi, weight.reshape(-1, inputs).T), bias)
         terms.append(graph.sum_of_products(graph.reshape(sums, [dof, factors]), correction.orders))
-    total = terms[0] if terms else graph.node("Mul", q, 0.0)
+    total = terms[0] if terms else graph.add_node("Mul", q, 0.0)
     for term in terms[1:]:
-        total = graph.node("Add", total, term)
+        total = graph.add_node("Add", total, term)
     return total
 
 
 def add_beyond(graph: OnnxGraph, coverage: JointCoverage, q: str) -> str:
     """Add the largest angle of a joint outside its measured values, `(batch, 1)` [rad]; see `JointCoverage`."""
-    node, joint = graph.node, coverage.joint.numpy()
+    node, joint = graph.add_node, coverage.joint.numpy()
     angle = node("Mul", graph.columns(q, joint.tolist()), coverage.rate.numpy()[joint])
     off = node("Sub", angle, coverage.middle.numpy())
     turning = np.array(coverage.turning)[joint].astype(np.float64)
@@ -201,7 +203,7 @@ def _inverse(model: CalibratedModel, network: CorrectionNetwork, sha256: str) ->
     if needs_pose(network):
         T = graph.add_input("T_base_tool", [4, 4], "target poses of the tool in the base frame [m]")
     correction = add_network(graph, network, q, T)
-    corrected = graph.node("Add", q, correction)
+    corrected = graph.add_node("Add", q, correction)
     graph.add_output(
         corrected, "q_corrected", [dof], f"joint values to command {about}: q_nominal + correction"
     )
@@ -212,7 +214,7 @@ def _inverse(model: CalibratedModel, network: CorrectionNetwork, sha256: str) ->
         f"Corrections of nominal joint values of robot {model.robot.name}, model {model.name}. Nominal joint values "
         "are the inverse kinematics of the nominal robot with the base and tool of the model."
     )
-    return graph.finish(f"pisigma {model.name}", doc, _metadata(model, INVERSE, sha256))
+    return graph.to_bytes(f"pisigma {model.name}", doc, _metadata(model, INVERSE, sha256))
 
 
 def _forward(model: CalibratedModel, arm: HybridArm, sha256: str) -> bytes:
@@ -235,7 +237,7 @@ def _forward(model: CalibratedModel, arm: HybridArm, sha256: str) -> bytes:
         "calibration. The pose is that of the hybrid geometry (pisigma export --geometry hybrid), not of the geometric "
         "fit, at q + correction."
     )
-    return graph.finish(f"pisigma {model.name}", doc, _metadata(model, FORWARD, sha256))
+    return graph.to_bytes(f"pisigma {model.name}", doc, _metadata(model, FORWARD, sha256))
 
 
 def _metadata(model: CalibratedModel, computes: str, sha256: str) -> dict[str, str]:

@@ -84,7 +84,7 @@ class ProjectionProblem:
         missing = torch.cat([missing[:, :3], self.lever * missing[:, 3:]], -1)
         return missing.flatten(), torch.cat([translations, rotations], 1).flatten(0, 1)
 
-    def moved(self, robot: Robot, step: Float64[Tensor, " unknowns"]) -> Robot:
+    def apply_step(self, robot: Robot, step: Float64[Tensor, " unknowns"]) -> Robot:
         """Return the robot with parameters, base and tool changed by a step."""
         count = len(self.parameters)
         dh = robot.dh.copy()
@@ -111,7 +111,7 @@ def solve_projection(problem: ProjectionProblem) -> tuple[Robot, tuple[bool, ...
     for _ in range(MAX_ITERATIONS):
         step = torch.zeros(len(free), dtype=torch.float64)
         step[free] = _step(J[:, free], missing, damping)
-        there = problem.moved(robot, step)
+        there = problem.apply_step(robot, step)
         left, J_there = problem.residual(there)
         if left @ left < missing @ missing:
             converged = float(step.abs().max()) < CONVERGENCE_TOLERANCE

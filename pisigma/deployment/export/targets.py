@@ -8,7 +8,7 @@ from collections import Counter
 import numpy as np
 import torch
 
-from pisigma.deployment.export.dh_table import head
+from pisigma.deployment.export.dh_table import header_comment
 from pisigma.deployment.export.export_format import Exported, ExportFormat, ExportRequest
 from pisigma.deployment.export.programs.languages import LANGUAGES, cautions, check_program, program_text
 from pisigma.deployment.export.programs.targets import Targets, targets_of
@@ -62,7 +62,7 @@ def targets_csv(targets: Targets) -> str:
     for line, status, branch, row in zip(targets.line, targets.status, targets.branch, values, strict=True):
         cells = ["" if math.isnan(value) else repr(value) for value in row]
         writer.writerow([line, status.name.lower(), branch, *cells])
-    return head(sentences(targets)) + text.getvalue()
+    return header_comment(sentences(targets)) + text.getvalue()
 
 
 def _check(request: ExportRequest) -> None:

@@ -47,7 +47,7 @@ class BinaryFrames(AbstractProtocol):
     def __init__(self, models: ServedModels, metrics: Metrics) -> None:
         self._models, self._metrics = models, metrics
 
-    def cut(self, received: bytearray) -> int:
+    def message_length(self, received: bytearray) -> int:
         """Return the length of the first frame; see `AbstractProtocol`.
 
         Raises:
@@ -55,7 +55,7 @@ class BinaryFrames(AbstractProtocol):
         """
         count = len(received)
         if not received.startswith(MAGIC[:count]):
-            raise BrokenStreamError(self.broken())
+            raise BrokenStreamError(self.invalid_message_answer())
         if count < HEAD.size:
             return 0
         _, length, name, _, flags = HEAD.unpack_from(received)
@@ -64,7 +64,7 @@ class BinaryFrames(AbstractProtocol):
             raise BrokenStreamError(_refusal(name, Refusal.BROKEN_FRAME))
         return length if count >= length else 0
 
-    def answer(self, message: bytes) -> Reply:
+    def answer_message(self, message: bytes) -> Reply:
         """Answer a frame."""
         begun = time.perf_counter_ns()
         _, _, name, index, flags = HEAD.unpack_from(message)
@@ -75,11 +75,11 @@ class BinaryFrames(AbstractProtocol):
         except RequestError:
             why = Refusal.MODEL_REFUSED if self._models.is_refused else Refusal.NO_SUCH_MODEL
             return self._refuse(name, why, begun)
-        if model.quick:
+        if model.is_fast:
             return self._solve(model, message, name, begun)
         return lambda: self._solve(model, message, name, begun)
 
-    def broken(self) -> bytes:
+    def invalid_message_answer(self) -> bytes:
         """Return the answer to bytes that are not a frame."""
         return _refusal(0, Refusal.BROKEN_FRAME)
 

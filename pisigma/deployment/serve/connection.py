@@ -44,7 +44,7 @@ class Connection:
             stream: socket of the client.
             protocol: protocol of the client.
             selector: selector that reports when the socket can be read or written.
-            submit: function that has another thread compute an answer and pass it to `take`.
+            submit: function that has another thread compute an answer and pass it to `send_answer`.
             token: token that the first message must have; None if none is required.
         """
         stream.setblocking(False)
@@ -56,9 +56,9 @@ class Connection:
         self._ending = self._stopping = self.closed = self.busy = False
         self.waits_since = time.monotonic() if token is not None else None
         self._watched = selectors.EVENT_READ
-        selector.register(stream, self._watched, self.ready)
+        selector.register(stream, self._watched, self.handle_events)
 
-    def ready(self, events: int) -> None:
+    def handle_events(self, events: int) -> None:
         """Continue after the client has sent something or can receive something."""
         try:
             if self._unsent:
@@ -67,24 +67,24 @@ class Connection:
                 data = self._stream.recv(CHUNK)
                 self._received += data
                 self._ending = not data
-            self.proceed()
+            self.answer_messages()
         except BlockingIOError:
             pass
         except OSError:
             self.close()
 
-    def take(self, reply: bytes) -> None:
+    def send_answer(self, reply: bytes) -> None:
         """Send the answer that another thread computed, and continue."""
         self.busy = False
         if self.closed:
             return
         try:
             self._send(reply)
-            self.proceed()
+            self.answer_messages()
         except OSError:
             self.close()
 
-    def drain(self) -> None:
+    def read_remaining(self) -> None:
         """Read what the client has sent before the server stops; later bytes are not read."""
         self._stopping = self._ending = True
         try:
@@ -101,7 +101,7 @@ class Connection:
         """Answer some of the complete messages, close after the last one, and return whether there are more."""
         try:
             if not self.closed:
-                self.proceed()
+                self.answer_messages()
         except OSError:
             self.close()
         return not (self.closed or self.busy or self._unsent)
@@ -114,12 +114,12 @@ class Connection:
                 self._selector.unregister(self._stream)
             self._stream.close()
 
-    def proceed(self) -> None:
+    def answer_messages(self) -> None:
         """Answer the complete messages as far as answers can be sent; when the server stops, only some at a time."""
         answered = 0
         try:
             while not self.busy and not self._unsent:
-                if not self._received or not (length := self._protocol.cut(self._received)):
+                if not self._received or not (length := self._protocol.message_length(self._received)):
                     break
                 if self._stopping and answered == MESSAGES_PER_TURN:
                     self.waits_since = None
@@ -129,7 +129,7 @@ class Connection:
                 answered += 1
                 if self._token is not None:
                     self._admit(message, self._token)
-                elif isinstance(reply := self._protocol.answer(message), bytes):
+                elif isinstance(reply := self._protocol.answer_message(message), bytes):
                     self._send(reply)
                 else:
                     self.busy = True
@@ -173,7 +173,7 @@ class Connection:
         if not watched:
             self._selector.unregister(self._stream)
         elif not self._watched:
-            self._selector.register(self._stream, watched, self.ready)
+            self._selector.register(self._stream, watched, self.handle_events)
         else:
-            self._selector.modify(self._stream, watched, self.ready)
+            self._selector.modify(self._stream, watched, self.handle_events)
         self._watched = watched

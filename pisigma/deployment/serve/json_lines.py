@@ -92,7 +92,7 @@ class JsonLines(AbstractProtocol):
     def __init__(self, models: ServedModels, metrics: Metrics) -> None:
         self._models, self._metrics = models, metrics
 
-    def cut(self, received: bytearray) -> int:
+    def message_length(self, received: bytearray) -> int:
         """Return the length of the first line with its end; see `AbstractProtocol`.
 
         Raises:
@@ -100,10 +100,10 @@ class JsonLines(AbstractProtocol):
         """
         length = received.find(b"\n") + 1
         if length > MAX_LINE_BYTES or (not length and len(received) > MAX_LINE_BYTES):
-            raise BrokenStreamError(self.broken())
+            raise BrokenStreamError(self.invalid_message_answer())
         return length
 
-    def answer(self, message: bytes) -> Reply:
+    def answer_message(self, message: bytes) -> Reply:
         """Answer a line."""
         begun = time.perf_counter_ns()
         request: dict[str, Any] = {}
@@ -116,7 +116,7 @@ class JsonLines(AbstractProtocol):
             return lambda: self._carry_out(request, job, names, begun)
         return self._carry_out(request, job, names, begun)
 
-    def broken(self) -> bytes:
+    def invalid_message_answer(self) -> bytes:
         """Return the answer to bytes that are not a line."""
         problem = RequestError(
             expected=f"a line of at most {MAX_LINE_BYTES} bytes", remedy="send long paths in several requests"
@@ -162,7 +162,7 @@ class JsonLines(AbstractProtocol):
         if task == "ask":
             return *self._question(request), {}
         model = self._models.find(request.get("model"))
-        slow = not model.quick or task == "path" or read_flag(request, "accuracy")
+        slow = not model.is_fast or task == "path" or read_flag(request, "accuracy")
         solve = {"pose": _solve, "path": _follow}.get(task, _forward)
         names = model.short_name if request.get("brief") else model.whole_name
         return (lambda: solve(model, request)), slow, names
@@ -237,9 +237,9 @@ def _read(message: bytes) -> dict[str, Any]:
 def _solve(model: ServedModel, request: dict[str, Any]) -> tuple[str, dict[str, Any]]:
     """Solve one pose."""
     entries, near = pose_entries(request["pose"], "pose"), _near(model, request)
-    if model.direct is not None and request.keys() <= _PLAIN:
+    if model.byte_solver is not None and request.keys() <= _PLAIN:
         near_bytes = b"" if near is None else struct.pack(f"<{len(near)}d", *near)
-        row = model.direct.solve_packed(_POSE.pack(*entries), near_bytes)
+        row = model.byte_solver.solve_packed(_POSE.pack(*entries), near_bytes)
         values = _record(model, row, model.ik.axes.ignored)
     else:
         approach = read_numbers(request, "approach", len(model.ik.joints)) if "approach" in request else None

@@ -78,7 +78,7 @@ class ServedModel:
         return "q_deg" if self.ik.revolute.all() else "q"
 
     @cached_property
-    def quick(self) -> bool:
+    def is_fast(self) -> bool:
         """Whether compiled kernels solve its poses in microseconds, for coupled joints in DH values."""
         controller = self.ik.controller
         if controller is None:
@@ -91,7 +91,7 @@ class ServedModel:
         return struct.Struct(f"<{len(self.ik.joints)}d")
 
     @cached_property
-    def direct(self) -> CompiledIK | None:
+    def byte_solver(self) -> CompiledIK | None:
         """The kernels, if they can solve poses directly from the bytes of a message, else None."""
         return self.ik.compiled if self.ik.controller is None and sys.byteorder == "little" else None
 
@@ -105,7 +105,7 @@ class ServedModel:
         Returns:
             The row of `CompiledIK.solve_packed`.
         """
-        values, kernels = self._near.unpack(near), self.direct
+        values, kernels = self._near.unpack(near), self.byte_solver
         if kernels is not None and self.ik.postures.contains(values):
             return kernels.solve_packed(T_base_tool, near)
         none = all(map(math.isnan, values))

@@ -23,7 +23,7 @@ class Polling:
         self._selector, self._duration = selector, duration
         self._last, self._often, self._resting_until = -math.inf, False, -math.inf
 
-    def ready(self) -> list[tuple[selectors.SelectorKey, int]]:
+    def wait_for_connections(self) -> list[tuple[selectors.SelectorKey, int]]:
         """Return ready connections as soon as there are some; an empty list when it is time to sleep."""
         now = time.monotonic()
         while self._often and self._resting_until < now < self._last + self._duration:

@@ -28,7 +28,7 @@ class AbstractProtocol(ABC):
     """Conversion of bytes to messages and of messages to answers. One object serves all connections."""
 
     @abstractmethod
-    def cut(self, received: bytearray) -> int:
+    def message_length(self, received: bytearray) -> int:
         """Return the length of the first message in the received bytes; 0 while it is incomplete.
 
         Raises:
@@ -36,11 +36,11 @@ class AbstractProtocol(ABC):
         """
 
     @abstractmethod
-    def answer(self, message: bytes) -> Reply:
+    def answer_message(self, message: bytes) -> Reply:
         """Answer one complete message; never raises an error."""
 
     @abstractmethod
-    def broken(self) -> bytes:
+    def invalid_message_answer(self) -> bytes:
         """Return the answer to bytes that are not a message."""
 
     @abstractmethod

@@ -156,7 +156,7 @@ class Server:
 
     def _step(self, timeout: float) -> None:
         """Wait for ready connections and process them."""
-        for key, events in self._polling.ready() or self._selector.select(timeout):
+        for key, events in self._polling.wait_for_connections() or self._selector.select(timeout):
             key.data(events)
         self._polling.record_activity()
 
@@ -179,7 +179,7 @@ class Server:
         self._woken.recv(4096)
         while self._ready:
             connection, reply = self._ready.popleft()
-            connection.take(reply)
+            connection.send_answer(reply)
 
     def _sweep(self, now: float) -> None:
         """Remove closed connections, and close those that are too slow."""
@@ -200,7 +200,7 @@ class Server:
                 pass
         self._listen_no_more()
         for connection in self._connections:
-            connection.drain()
+            connection.read_remaining()
         if self.zmq is not None:
             self.zmq.stop()
         while self._stops < 2 and (self._connections or (self.zmq is not None and self.zmq.is_running)):

@@ -123,11 +123,11 @@ class ZeroMq:
         if protocol is self._json:
             message = message.removesuffix(b"\n") + b"\n"
         try:
-            if protocol.cut(bytearray(message)) != len(message):
-                return protocol.broken()
+            if protocol.message_length(bytearray(message)) != len(message):
+                return protocol.invalid_message_answer()
         except BrokenStreamError as problem:
             return problem.final_answer
-        reply = protocol.answer(message)
+        reply = protocol.answer_message(message)
         return reply if isinstance(reply, bytes) else reply()
 
     def _close(self) -> None:

@@ -58,19 +58,19 @@ class AbstractEngine(ABC):
         """Number of workers."""
 
 
-def packed(work: Callable[[Item], Result], chunk: Sequence[Item]) -> tuple[Plugins, bytes]:
-    """Return the arguments of `work_on`; plug-ins are separate, to be loaded before their objects are unpickled."""
+def pack_arguments(work: Callable[[Item], Result], chunk: Sequence[Item]) -> tuple[Plugins, bytes]:
+    """Return the arguments of `process_chunk`; plug-ins are separate, as they have to be loaded first."""
     return loaded(), pickle.dumps((work, list(chunk)))
 
 
-def work_on(plugins: Plugins, pickled: bytes) -> bytes:
+def process_chunk(plugins: Plugins, pickled: bytes) -> bytes:
     """Process a chunk in a worker, and return the pickled results."""
     plugins.load()
     work, chunk = pickle.loads(pickled)
     return pickle.dumps([work(item) for item in chunk])
 
 
-def unpacked(pickled: bytes) -> list[Any]:
-    """Return the results of `work_on`."""
+def unpack_results(pickled: bytes) -> list[Any]:
+    """Return the results of `process_chunk`."""
     results: list[Any] = pickle.loads(pickled)
     return results

@@ -11,7 +11,15 @@ from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from typing import Any
 
-from pisigma.files.engines.engine import ONE_THREAD, AbstractEngine, Item, Result, packed, unpacked, work_on
+from pisigma.files.engines.engine import (
+    ONE_THREAD,
+    AbstractEngine,
+    Item,
+    Result,
+    pack_arguments,
+    process_chunk,
+    unpack_results,
+)
 from pisigma.files.errors import PisigmaError
 
 
@@ -40,14 +48,14 @@ class ProcessEngine(AbstractEngine):
                     while waiting and not broken and len(running) < self._workers:
                         chunk = waiting.pop()
                         try:
-                            running[pool.submit(work_on, *packed(work, chunk))] = chunk
+                            running[pool.submit(process_chunk, *pack_arguments(work, chunk))] = chunk
                         except BrokenProcessPool:
                             waiting.append(chunk)
                             broken = True
                     for ended in wait(running, return_when=FIRST_COMPLETED).done:
                         chunk = running.pop(ended)
                         try:
-                            yield chunk, unpacked(ended.result())
+                            yield chunk, unpack_results(ended.result())
                         except BrokenProcessPool:
                             broken = True
                             yield chunk, None

@@ -6,7 +6,15 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
-from pisigma.files.engines.engine import ONE_THREAD, AbstractEngine, Item, Result, packed, unpacked, work_on
+from pisigma.files.engines.engine import (
+    ONE_THREAD,
+    AbstractEngine,
+    Item,
+    Result,
+    pack_arguments,
+    process_chunk,
+    unpack_results,
+)
 
 
 class RayEngine(AbstractEngine):
@@ -45,12 +53,12 @@ class RayEngine(AbstractEngine):
         self, work: Callable[[Item], Result], chunks: Sequence[Sequence[Item]]
     ) -> Iterator[tuple[Sequence[Item], list[Result] | None]]:
         """See `AbstractEngine`."""
-        task = self._ray.remote(num_cpus=1, max_retries=0)(work_on)
-        running = {task.remote(*packed(work, chunk)): chunk for chunk in chunks}
+        task = self._ray.remote(num_cpus=1, max_retries=0)(process_chunk)
+        running = {task.remote(*pack_arguments(work, chunk)): chunk for chunk in chunks}
         while running:
             (ended,), _ = self._ray.wait(list(running), num_returns=1)
             chunk = running.pop(ended)
             try:
-                yield chunk, unpacked(self._ray.get(ended))
+                yield chunk, unpack_results(self._ray.get(ended))
             except (self._ray.exceptions.WorkerCrashedError, self._ray.exceptions.OutOfMemoryError):
                 yield chunk, None

@@ -35,7 +35,7 @@ class Displacement:
     not_predicted: int
 
     @staticmethod
-    def at(pair: ModelPair, q: Float64[Tensor, "poses dof"], source: str) -> "Displacement":
+    def from_pair(pair: ModelPair, q: Float64[Tensor, "poses dof"], source: str) -> "Displacement":
         """Compare a pair of models at joint values.
 
         Args:

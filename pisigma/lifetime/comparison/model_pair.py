@@ -79,7 +79,7 @@ class ModelPair:
         return ModelPair(first, second, frames, frame_names, *best_base_and_tool(T_second[there], measured))
 
     @property
-    def points(self) -> Float64[Tensor, "points dof"]:
+    def training_joints(self) -> Float64[Tensor, "points dof"]:
         """Joint values that the models keep of their training rows, half from each [rad or m]."""
         generator = torch.Generator().manual_seed(0)
         sampled = [

@@ -109,12 +109,12 @@ def parameter_differences(pair: ModelPair, level: float = LEVEL) -> ParameterDif
     effects = ParameterEffects(pair)
     threshold = NormalDist().inv_cdf(1 - level / (2 * max(len(effects.tested), 1)))
     chosen: list[int] = []
-    while float((scores := effects.scores(chosen)).abs().amax()) > threshold:
+    while float((scores := effects.standard_scores(chosen)).abs().amax()) > threshold:
         chosen.append(int(scores.abs().argmax()))
-    p = effects.remainder(chosen)
+    p = effects.unexplained_probability(chosen)
     tested = (_tested(effects, number, one, chosen, parameters) for number, one in enumerate(parameters))
     return ParameterDifferences(
-        tuple(tested), *effects.differing(chosen), remainder=Remainder(p, p < level), level=level
+        tuple(tested), *effects.estimate_shifts(chosen), remainder=Remainder(p, p < level), level=level
     )
 
 
@@ -126,7 +126,7 @@ def _tested(
     parameters: Sequence[ParameterDifference],
 ) -> ParameterDifference:
     """Test a parameter given the significant ones, without itself and those with the same effect."""
-    alike = effects.alike(number)
+    alike = effects.parameters_with_same_effect(number)
     estimate = effects.shift(number, [one for one in chosen if one not in (number, *alike)])
     if estimate is None:
         return parameter

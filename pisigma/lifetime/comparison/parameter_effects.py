@@ -70,7 +70,7 @@ class ParameterEffects:
 
     def __init__(self, pair: ModelPair) -> None:
         """Linearise at the first model."""
-        q = pair.points
+        q = pair.training_joints
         d = pair.displacement(q)
         there = torch.isfinite(d).all(1)
         q, d = q[there], d[there]
@@ -109,7 +109,7 @@ class ParameterEffects:
         first = torch.where(self._alike, rank, 2 * len(rank)).amin(1) == rank
         self.tested = (first & self._observable).nonzero()[:, 0].tolist()
 
-    def alike(self, number: int) -> tuple[int, ...]:
+    def parameters_with_same_effect(self, number: int) -> tuple[int, ...]:
         """Return the other parameters with the same effect as one."""
         return tuple(other for other in self._alike[number].nonzero()[:, 0].tolist() if other != number)
 
@@ -125,7 +125,7 @@ class ParameterEffects:
         size = float(left[:, number].norm())
         return float(left[:, number] @ self._y[:, 0]) / size**2, 1 / size
 
-    def scores(self, given: Sequence[int]) -> Float64[Tensor, " parameters"]:
+    def standard_scores(self, given: Sequence[int]) -> Float64[Tensor, " parameters"]:
         """Compute shift over standard deviation of every tested parameter given others; 0 for those not tested."""
         left, observable = self._left(given)
         tested = torch.zeros_like(observable)
@@ -134,7 +134,7 @@ class ParameterEffects:
         scores[~(tested & observable)] = 0.0
         return scores
 
-    def remainder(self, given: Sequence[int]) -> float:
+    def unexplained_probability(self, given: Sequence[int]) -> float:
         """Compute the probability by chance of the displacement that the given parameters do not explain.
 
         The sum of squares is compared with that of normal values with the covariance of the posteriors, by
@@ -148,7 +148,7 @@ class ParameterEffects:
         of_both = torch.tensor([mean**2, square * mean], dtype=torch.float64) / half_variance / 2
         return float(torch.special.gammaincc(of_both[0], of_both[1]))
 
-    def differing(self, chosen: Sequence[int]) -> tuple[tuple[Difference, ...], tuple[Movement, ...]]:
+    def estimate_shifts(self, chosen: Sequence[int]) -> tuple[tuple[Difference, ...], tuple[Movement, ...]]:
         """Estimate the shifts of chosen parameters together with base and tool.
 
         Returns:
@@ -171,7 +171,7 @@ class ParameterEffects:
         if self._is_zero(number):
             row = self._pair.first.identified.rows[number // 5]
             name, factor = f"joint {name.partition('_')[2]}", factor * row.direction
-        alike = tuple(map(self._name, self.alike(number)))
+        alike = tuple(map(self._name, self.parameters_with_same_effect(number)))
         return Difference(Movement(name, shift * factor, deviation * abs(factor), unit), alike)
 
     def _name(self, number: int) -> str:
@@ -261,7 +261,7 @@ def _spread(
         tools={**there.tools, list(there.tools)[number[1]]: tool},
     )
     columns = replace(known, geometry=geometry).columns(JointState(q), _corrected(model, q), *number)
-    return known.covariance_root.along(columns)
+    return known.covariance_root.left_multiply(columns)
 
 
 def _frame_columns(

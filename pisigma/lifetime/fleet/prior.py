@@ -87,7 +87,7 @@ def fleet_prior(name: str, robot: Robot, fleet: Sequence[Measurements]) -> Fleet
         raise FleetError(
             expected=f"{MIN_ROBOTS} robots or more of one type", value=len(fleet), option="fleet"
         )
-    posterior = RobotPosterior.of_robot(robot)
+    posterior = RobotPosterior.from_robot(robot)
     space = posterior.uncertainty.space
     first = population = class_population(robot)
     usual = first.covariance.diagonal()
@@ -98,13 +98,15 @@ def fleet_prior(name: str, robot: Robot, fleet: Sequence[Measurements]) -> Fleet
         evidence = [evidence_of(model, population.mean, rows) for rows in fleet]
         population, odd = without_outliers(evidence, first, usual)
         noise = _medians([one.noise for one in evidence])
-    model = mean_robot(name, posterior, population.of_another(len(fleet) - len(odd)), fleet, noise)
+    model = mean_robot(
+        name, posterior, population.predictive_distribution(len(fleet) - len(odd)), fleet, noise
+    )
     return FleetPrior(model, population, space.names[: space.arm_size], odd)
 
 
 def class_population(robot: Robot) -> Population:
     """Return the distribution of errors of a robot's class, see `pisigma.robot.robot_class`."""
-    uncertainty = RobotPosterior.of_robot(robot).uncertainty
+    uncertainty = RobotPosterior.from_robot(robot).uncertainty
     usual = of_arm(uncertainty.root, uncertainty.space).square().sum(1)
     return Population(torch.zeros_like(usual), usual.diag(), uncertainty.space.arm_size)
 
@@ -219,7 +221,9 @@ def _medians(noises: Sequence[CalibrationNoise]) -> CalibrationNoise:
         stating = [noise for noise in of_sensor if noise.is_factor(name)]
         value[name] = float(np.median([noise.value[name] for noise in stating or of_sensor]))
         if stating:
-            stated[name] = float(np.median([noise.absolute(name) / noise.value[name] for noise in stating]))
+            stated[name] = float(
+                np.median([noise.standard_deviation(name) / noise.value[name] for noise in stating])
+            )
     return CalibrationNoise(value, stated)
 
 
@@ -253,7 +257,7 @@ class FleetConsistency:
         mean = torch.cat([errors.flatten(), posterior.weights])
         evidence = evidence_of(model, mean, rows)
         fleet = Population(mean, root @ root.t(), posterior.space.arm_size)
-        square, count = fleet.surprise(evidence)
+        square, count = fleet.squared_distance(evidence)
         gain = fleet.log_evidence(evidence) - class_population(nominal).log_evidence(evidence)
         return FleetConsistency(float(chi2.sf(square, count)), gain)
 

@@ -30,7 +30,7 @@ class RobotStatus:
     compared: bool = True
 
     @property
-    def drifting(self) -> bool:
+    def is_drifting(self) -> bool:
         """Whether something moved since the session before, or a recalibration is recommended."""
         last = self.last
         return last is not None and (last.recalibrate or last.moved or last.verdict in ("moved", "unclear"))
@@ -42,7 +42,7 @@ class RobotStatus:
             return "refused"
         if self.last is None:
             return "missing"
-        return "drifting" if self.drifting else "overdue" if self.overdue else "fine"
+        return "drifting" if self.is_drifting else "overdue" if self.overdue else "fine"
 
 
 @dataclass(frozen=True)
@@ -86,7 +86,7 @@ class FleetStatus:
         return FleetStatus(tuple(sorted(robots, key=lambda one: one.robot)), today, overdue_days, warnings)
 
     @property
-    def worst_first(self) -> tuple[RobotStatus, ...]:
+    def robots_by_error(self) -> tuple[RobotStatus, ...]:
         """Robots with known errors, the largest first."""
         judged = [one for one in self.robots if one.last is not None and one.last.error_mm is not None]
         return tuple(sorted(judged, key=lambda one: -_rms(one)))
@@ -96,7 +96,7 @@ class FleetStatus:
         """Whether a robot was refused, is missing or drifts."""
         return any(one.state in ("refused", "missing", "drifting") for one in self.robots)
 
-    def in_state(self, state: str) -> tuple[RobotStatus, ...]:
+    def robots_in_state(self, state: str) -> tuple[RobotStatus, ...]:
         """Return the robots in a state."""
         return tuple(one for one in self.robots if one.state == state)
 
@@ -105,11 +105,11 @@ class FleetStatus:
         return {
             "robots": len(self.robots),
             "today": self.today.isoformat(),
-            "worst": [{"robot": one.robot, "rms_mm": _rms(one)} for one in self.worst_first],
-            "drifting": [one.robot for one in self.robots if one.drifting],
+            "worst": [{"robot": one.robot, "rms_mm": _rms(one)} for one in self.robots_by_error],
+            "drifting": [one.robot for one in self.robots if one.is_drifting],
             "overdue": [{"robot": one.robot, "days": one.days} for one in self.robots if one.overdue],
             "not_compared": [one.robot for one in self.robots if not one.compared],
-            "missing": [one.robot for one in self.in_state("missing")],
+            "missing": [one.robot for one in self.robots_in_state("missing")],
             "refused": [
                 {"robot": one.robot, "reason": one.refused.sentence}
                 for one in self.robots

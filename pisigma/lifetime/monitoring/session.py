@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
-from pisigma.calibration.hybrid.refinement import linearised
+from pisigma.calibration.hybrid.refinement import linearise_rows
 from pisigma.estimation.drift import Drift, DriftGroup, LinearValues, PosteriorUpdate
 from pisigma.estimation.hypotheses import Explanation, Motion, SessionEvidence
 from pisigma.estimation.wrong_rows import Explained, with_wrong_rows
@@ -215,7 +215,7 @@ class _Solved:
         return self.explanation.noise_factor <= MAX_NOISE_FACTOR
 
     @property
-    def suspected(self) -> tuple[Motion, ...]:
+    def probable_movements(self) -> tuple[Motion, ...]:
         """Movements, or the most probable one where these are ambiguous."""
         return self.explanation.motions or self.explanation.candidates[:1]
 
@@ -227,11 +227,11 @@ class _Solved:
     @property
     def frame_moved(self) -> bool:
         """Whether a base or a tool has moved so far that its motion is not linear."""
-        return any(is_frame(one.group.what) and one.size >= MIN_MOVE for one in self.suspected)
+        return any(is_frame(one.group.what) and one.size >= MIN_MOVE for one in self.probable_movements)
 
     def arm_with(self, motions: tuple[DriftGroup, ...]) -> AdaptedArm:
         """Return the arm with moved bases and tools and some movements fitted; all else as in the model."""
-        return AdaptedArm.at(self.problem, self.unknowns(motions))
+        return AdaptedArm.from_unknowns(self.problem, self.unknowns(motions))
 
     def score_ratio(self, before: tuple[DriftGroup, ...], after: tuple[DriftGroup, ...]) -> float:
         """Compute the ratio of the RMS standardised residuals that two sets of movements leave."""
@@ -258,10 +258,10 @@ def _solve(
     x = problem.mean
     wrong: Mapping[int, float] = {}
     for _ in range(MAX_LINEARISATIONS):
-        values = linear_values(problem, linearised(problem.design, x, 0.0, group))
+        values = linear_values(problem, linearise_rows(problem.design, x, 0.0, group))
         solved = _explained(problem, noise, replace(values, wrong=wrong))
         values, wrong = solved.values, solved.values.wrong
-        there = solved.unknowns(tuple(_sized(one) for one in solved.suspected))
+        there = solved.unknowns(tuple(_sized(one) for one in solved.probable_movements))
         step = values.X @ (there - x) / values.deviation(noise)
         x = there
         if float(step.square().mean().sqrt()) < CONVERGENCE_TOLERANCE or (
@@ -283,7 +283,7 @@ def _explained(
         there, explanation = evidence.values, evidence.explain()
         solved = _Solved(problem, there, noise, evidence, explanation)
         factor = explanation.noise_factor
-        V = evidence.covariance([_sized(one) for one in solved.suspected], factor)
+        V = evidence.covariance([_sized(one) for one in solved.probable_movements], factor)
         return Explained(solved, there, explanation.log_evidence, V, factor * there.deviation(noise))
 
     return with_wrong_rows(explain(values.wrong), explain).what
@@ -303,7 +303,7 @@ def _judged(solved: _Solved, relocated: dict[FrameKey, float]) -> Session:
     every, wrong = solved.problem.setup.measurements, solved.problem.wrong_rows(solved.values)
     rows = every.select((~wrong).nonzero()[:, 0])
     explanation, evidence = solved.explanation, solved.evidence
-    motions = tuple(_sized(one) for one in solved.suspected)
+    motions = tuple(_sized(one) for one in solved.probable_movements)
     of_arm = tuple(group for group in motions if not is_frame(group.what))
     frames = tuple(group for group in motions if is_frame(group.what))
     before = solved.arm_with(frames)

@@ -46,7 +46,7 @@ class Trend:
     deviation: float
 
     @property
-    def clear(self) -> bool:
+    def is_significant(self) -> bool:
         """Whether the drift is significant."""
         return abs(self.slope) > CLEAR * self.deviation
 
@@ -65,7 +65,7 @@ class Trend:
     def to_json(self) -> dict[str, Any]:
         """Return slope and interval as plain values."""
         slope = {f"{self.unit}_per_{self.over}": self.slope}
-        return {"what": self.what, **slope, "interval": list(self.interval), "clear": self.clear}
+        return {"what": self.what, **slope, "interval": list(self.interval), "clear": self.is_significant}
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from pisigma.calibration.geometric.prediction import predicted_poses
 from pisigma.calibration.geometric.problem.setup import IdentifiedGeometry, identified_geometry
 from pisigma.calibration.hybrid.design import Rows
 from pisigma.calibration.hybrid.noise import CalibrationNoise, stated_sigmas
-from pisigma.calibration.hybrid.refinement import linearised, network
+from pisigma.calibration.hybrid.refinement import linearise_rows, network
 from pisigma.estimation.drift import Drift, DriftGroup, DriftSearch, LinearValues, PosteriorUpdate
 from pisigma.estimation.wrong_rows import Explained, with_wrong_rows
 from pisigma.joint_correction.joint_correction import JointCorrection
@@ -44,7 +44,7 @@ class AdaptedArm:
     correction: JointCorrection | None
 
     @staticmethod
-    def at(problem: RecalibrationProblem, x: Float64[Tensor, " unknowns"]) -> "AdaptedArm":
+    def from_unknowns(problem: RecalibrationProblem, x: Float64[Tensor, " unknowns"]) -> "AdaptedArm":
         """Return the arm at unknowns x of a problem, parameters counted from `design.problem.nominal`."""
         design = problem.design
         point = design.problem.nominal.index_add(0, design.problem.active, x[: design.active])
@@ -57,7 +57,7 @@ class AdaptedArm:
         moved = measurements
         if self.correction is not None:
             with torch.no_grad():
-                moved = replace(moved, q=moved.q + self.correction.of_rows(moved))
+                moved = replace(moved, q=moved.q + self.correction.for_rows(moved))
         geometry = self.geometry
         T = predicted_poses(geometry.robot, geometry.bases, geometry.tools, moved)
         return measured_errors(T, measurements, geometry.unknowns)
@@ -136,7 +136,7 @@ def adapt(
     rounds = 0
     while rounds < MAX_LINEARISATIONS:
         rounds += 1
-        rows = linearised(design, x, effective, group)
+        rows = linearise_rows(design, x, effective, group)
         values = replace(linear_values(problem, rows), wrong=wrong)
         # Sizes of the drift and wrong rows first: both decide how far the posterior may follow the values.
         search = _searched(problem, values, drift, usual)
@@ -150,7 +150,7 @@ def adapt(
             break
     return Adaptation(
         problem=problem,
-        arm=AdaptedArm.at(problem, x),
+        arm=AdaptedArm.from_unknowns(problem, x),
         drift=drift,
         shift=update.shift,
         effective=effective,
@@ -165,12 +165,12 @@ def usual_noise(problem: RecalibrationProblem) -> Float64[Tensor, " sensors"]:
     """Return the noise of all sensors of a problem in the calibration [m or rad]; a factor where the new rows state it.
 
     Raises:
-        MeasurementError: see `CalibrationNoise.usual`.
+        MeasurementError: see `CalibrationNoise.noise_of_earlier_rows`.
     """
     known = problem.posterior.noise
     sensors = problem.design.problem.sensors
     first = [1.0 if sensor.sigma is not None else FIRST_NOISE[sensor.unit] for sensor in sensors]
-    usual = [known.usual(sensor) for sensor in sensors]
+    usual = [known.noise_of_earlier_rows(sensor) for sensor in sensors]
     chosen = [new if old is None else old for old, new in zip(usual, first, strict=True)]
     return torch.tensor(chosen, dtype=torch.float64)
 

@@ -20,7 +20,7 @@ from pisigma.measurement.splits import k_folds
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.model_posterior import FLEET_PRIOR
 from pisigma.validation.held_out.calibration_validation import PredictsErrors, errors_under
-from pisigma.validation.held_out.trained_calibrations import Calibrator, fit, judgeable
+from pisigma.validation.held_out.trained_calibrations import Calibrator, fit, judgeable_rows
 
 Kept = Literal["recalibrated", "old", "scratch"]
 NAMES: dict[Kept, str] = {
@@ -120,7 +120,7 @@ def choose_candidate(
         problem = recalibration_problem(model, posterior, training, relocated)
         candidates: dict[Kept, Callable[[], PredictsErrors]] = {
             "recalibrated": partial(adapt, problem, noise, whole.drift),
-            "old": partial(adapt, problem.without_arm(), noise),
+            "old": partial(adapt, problem.with_fixed_arm(), noise),
             "scratch": partial(fit, calibrator, training, lambda what: None),
         }
         for name, candidate in candidates.items():
@@ -178,6 +178,6 @@ def _predictable(rows: Measurements, test: Tensor, training: Measurements) -> Te
     frames = set(training.frame)
     framed = torch.tensor([rows.frame[row] in frames for row in test.tolist()])
     try:
-        return framed & judgeable(rows, test, training)
+        return framed & judgeable_rows(rows, test, training)
     except IdentificationError:
         return torch.zeros_like(framed)

@@ -78,7 +78,7 @@ def session_diagnostics(
             "is wrong; run `pisigma verify` on these rows."
         )
         return (Diagnostic(kind="implausible_errors", severity="implausible", sentence=sentence),)
-    return beyond_wear(model.robot, session.moved)
+    return excessive_change_diagnostics(model.robot, session.moved)
 
 
 def motion_sentence(motion: Session, comparison: ModelComparison) -> str:
@@ -121,7 +121,7 @@ def _subject(what: str) -> str:
     return f"the parameter {what} has changed" if "_" in what else f"{what} has moved"
 
 
-def beyond_wear(robot: Robot, moved: Sequence[Movement]) -> tuple[Diagnostic, ...]:
+def excessive_change_diagnostics(robot: Robot, moved: Sequence[Movement]) -> tuple[Diagnostic, ...]:
     """Return a diagnostic of changes larger than wear or a collision causes.
 
     Bases, tools and the zero of a single joint may move by any amount.

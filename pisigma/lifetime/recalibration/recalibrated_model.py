@@ -13,7 +13,7 @@ from pisigma.calibration.hybrid.uncertainty import PositionUncertainty
 from pisigma.estimation.covariance_root import CovarianceRoot
 from pisigma.lifetime.recalibration.adaptation import Adaptation
 from pisigma.lifetime.recalibration.candidates import CandidateChoice
-from pisigma.lifetime.recalibration.motion import beyond_wear
+from pisigma.lifetime.recalibration.motion import excessive_change_diagnostics
 from pisigma.lifetime.recalibration.movement import Movement
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel, Frames, Provenance
@@ -141,7 +141,7 @@ def recalibration_diagnostics(
         implausible := check_rows(rows, parent.nominal or parent.robot).implausible
     ):
         return implausible
-    return (*_large_errors(parent, judged, rows), *beyond_wear(parent.robot, moved))
+    return (*_large_errors(parent, judged, rows), *excessive_change_diagnostics(parent.robot, moved))
 
 
 def _large_errors(
@@ -151,7 +151,9 @@ def _large_errors(
     error, limit = judged.rms[judged.kept], PLAUSIBLE_SHARE * parent.robot.reach
     if error is None:
         return ()
-    noise = math.nan if parent.uncertainty is None else parent.uncertainty.noise.absolute("position")
+    noise = (
+        math.nan if parent.uncertainty is None else parent.uncertainty.noise.standard_deviation("position")
+    )
     usual = max(math.sqrt(3) * (0.0 if math.isnan(noise) else noise), image_deviation(rows))
     missed = f"{rows.source}: the RMS error of held-out rows is {error * 1e3:.3g} mm"
     if error > limit:

@@ -16,7 +16,7 @@ from pisigma.calibration.geometric.problem.setup import (
     CalibrationSetup,
     SetupOptions,
     coordinate_change,
-    setup_around,
+    setup_from_guess,
     usable_rows,
 )
 from pisigma.calibration.hybrid.design import Design
@@ -82,7 +82,7 @@ class RecalibrationProblem:
         wrong = ~torch.isin(self.configuration, values.configuration)
         return wrong | torch.isin(self.configuration, torch.tensor([*values.wrong]))
 
-    def without_arm(self) -> "RecalibrationProblem":
+    def with_fixed_arm(self) -> "RecalibrationProblem":
         """Return the problem with the arm held fixed: only moved bases and tools are unknown."""
         relocated = tuple(group for group in self.groups if group.fixed_size)
         return replace(self, root=self.standing, groups=relocated, standing=self.root)
@@ -112,7 +112,7 @@ def recalibration_problem(
     new = {("base", name) for name in rows.frame} | {("tool", name) for name in rows.target}
     new = (new - known) | set(relocated)
     guessed = _guess(model, posterior, space, rows, new)
-    setup = setup_around(space, guessed, (usable, rows), SetupOptions(True, True), None, HampelLoss())
+    setup = setup_from_guess(space, guessed, (usable, rows), SetupOptions(True, True), None, HampelLoss())
     start = setup.start.clone()
     start[: space.arm_size] = torch.from_numpy(posterior.geometry.robot.dh.ravel().copy())
     problem = replace(setup.problem, nominal=start).with_active(range(len(start)))
@@ -176,7 +176,7 @@ def _guess(
         moved = rows
         if model.hybrid is not None:
             with torch.no_grad():
-                moved = replace(rows, q=rows.q + model.hybrid.correction.of_rows(rows))
+                moved = replace(rows, q=rows.q + model.hybrid.correction.for_rows(rows))
         there = ParameterSpace(
             geometry.robot,
             tuple(dict.fromkeys(rows.frame)),

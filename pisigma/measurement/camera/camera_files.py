@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Annotated, Literal, get_args
 
 from pisigma.files.errors import IdentificationError, MeasurementError, check_choice
-from pisigma.files.setting import KEY, Option, texts
+from pisigma.files.setting import KEY, Option, as_texts
 
 IntrinsicsChoice = Literal["fixed", "prior", "free"]
 MAX_REPEATABILITY = 0.01, 0.105
@@ -55,8 +55,8 @@ class CameraFiles:
         IdentificationError: `intrinsics` is not a valid choice.
     """
 
-    cameras: Annotated[tuple[str, ...], Option("--camera", kind=list[Path], read=texts)]
-    boards: Annotated[tuple[str, ...], Option("--board", kind=list[Path], read=texts)]
+    cameras: Annotated[tuple[str, ...], Option("--camera", kind=list[Path], read=as_texts)]
+    boards: Annotated[tuple[str, ...], Option("--board", kind=list[Path], read=as_texts)]
     is_fixed: Annotated[bool, Option("--fixed-camera")] = False
     repeatability: Repeatability = field(default_factory=Repeatability)
     intrinsics: Annotated[IntrinsicsChoice, KEY] = "prior"

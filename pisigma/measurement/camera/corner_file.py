@@ -165,7 +165,7 @@ def _stated(table: Table, column: str, choices: Collection[str]) -> list[str]:
             raise MeasurementError(
                 expected=f"the name of a {column}",
                 value=name,
-                at=table.at(row, column),
+                at=table.place_of(row, column),
                 remedy=nearest_choice(name, choices),
             )
     return [name or next(iter(choices)) for name in names]
@@ -181,12 +181,12 @@ def _are_corners(table: Table) -> list[bool]:
     for row, fields in enumerate(table.records):
         if row in table.broken:
             fault = Fault(f"the row is not valid CSV: {table.broken[row]}", remedy="check the quotes")
-            raise fault.error(table.at(row))
+            raise fault.error(table.place_of(row))
         if len(fields) != len(table.header):
             raise MeasurementError(
                 expected=f"{len(table.header)} fields as in the header",
                 value=len(fields),
-                at=table.at(row),
+                at=table.place_of(row),
                 remedy="complete the row",
             )
     named, *_ = (text_column(table, name) for name in ("image", *CORNERS))
@@ -269,18 +269,20 @@ def _check_corners(
             raise MeasurementError(
                 expected=f"a whole number from 0 to {corners - 1} for the {corners} corners of board '{board.name}'",
                 value=float(corner),
-                at=table.at(row, "corner"),
+                at=table.place_of(row, "corner"),
                 remedy="check the board's rows and columns",
             )
         if not sigma[row] > 0:
             raise MeasurementError(
-                expected="a standard deviation > 0", value=float(sigma[row]), at=table.at(row, "sigma_px")
+                expected="a standard deviation > 0",
+                value=float(sigma[row]),
+                at=table.place_of(row, "sigma_px"),
             )
         if (pixels[row] < -1).any() or (pixels[row] > size).any():
             raise MeasurementError(
                 expected=f"a corner within the {camera.width} x {camera.height} px of camera '{camera.name}'",
                 value=f"u = {pixels[row, 0]:g}, v = {pixels[row, 1]:g} px",
-                at=table.at(row),
+                at=table.place_of(row),
                 remedy=_RESOLUTION_REMEDY,
             )
 

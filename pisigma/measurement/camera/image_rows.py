@@ -43,7 +43,7 @@ BEND_TOLERANCE = 1e-6
 MAX_MEDIAN_RESIDUAL = 10.0
 """[px] Median residual of an image's corners above which they are not those of the board."""
 SHAPES = 3
-"""Number of shapes of a bent board, see `shapes`."""
+"""Number of shapes of a bent board, see `bend_shapes`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,7 +172,7 @@ def _board_poses(
         if not board.flatness:
             break
         before, noise = bend, corner_noise(poses, loss)
-        bend = bent_further(bend, board, camera, *observed, poses, noise)
+        bend = update_bend(bend, board, camera, *observed, poses, noise)
         if np.abs(bend - before).max() < BEND_TOLERANCE:
             break
     return poses, bend
@@ -230,7 +230,7 @@ def _inverse_root(covariance: np.ndarray) -> np.ndarray:
     return root
 
 
-def shapes(board: Board) -> Float64[np.ndarray, "corners 3"]:
+def bend_shapes(board: Board) -> Float64[np.ndarray, "corners 3"]:
     """Return the relative heights of three smooth shapes above the board's plane at its corners, 1 at most.
 
     They are the squares and the product of the two coordinates in the plane, minus their best-fitting plane, so that
@@ -244,7 +244,7 @@ def shapes(board: Board) -> Float64[np.ndarray, "corners 3"]:
     return shape
 
 
-def bent_further(
+def update_bend(
     bend: Float64[np.ndarray, " 3"],
     board: Board,
     camera: Camera,
@@ -269,7 +269,7 @@ def bent_further(
         poses: poses of the board in every image.
         noise: standard deviation of u and v of a corner of median deviation [px].
     """
-    of_corner, corners = shapes(board), bent_corners(board, bend)
+    of_corner, corners = bend_shapes(board), bent_corners(board, bend)
     prior = max(noise, MIN_NOISE) / (board.flatness / 2)
     rows = [np.concatenate([prior * np.eye(SHAPES), -prior * bend[:, None]], 1)]
     for number, at, deviation, pose in zip(numbers, pixels, sigma, poses, strict=True):
@@ -285,6 +285,6 @@ def bent_further(
 
 def bent_corners(board: Board, bend: Float64[np.ndarray, " 3"]) -> Float64[np.ndarray, "corners 3"]:
     """Return the corners of a bent board in its frame [m], given the heights of its shapes [m]."""
-    height = shapes(board) @ bend
+    height = bend_shapes(board) @ bend
     corners: np.ndarray = board.corners + height[:, None] * [0.0, 0.0, 1.0]
     return corners

@@ -228,7 +228,10 @@ def number_column(table: Table, name: str) -> Float64[np.ndarray, " rows"]:
             numbers.append(math.nan)
         if not math.isfinite(numbers[-1]):
             raise MeasurementError(
-                expected="a number", value=cell, at=table.at(row, name), remedy="give one, or remove the row"
+                expected="a number",
+                value=cell,
+                at=table.place_of(row, name),
+                remedy="give one, or remove the row",
             )
     return np.array(numbers)
 

@@ -43,7 +43,7 @@ class Table:
         """The line of the header, for messages."""
         return Place(self.source, self.header_line)
 
-    def at(self, row: int, column: str | int | None = None) -> Place:
+    def place_of(self, row: int, column: str | int | None = None) -> Place:
         """Return the place of a row and a column, for messages."""
         return Place(self.source, self.lines[row], column)
 

@@ -83,7 +83,7 @@ def _check(data: MeasuredFields, texts: Mapping[str, Sequence[str]]) -> None:
     if bool(nothing.any()):
         raise MeasurementError(
             "nothing was measured in this row",
-            at=data.at(int(nothing.nonzero()[0])),
+            at=data.place_of(int(nothing.nonzero()[0])),
             remedy="omit it with select before writing",
         )
     for name, names in texts.items():
@@ -92,7 +92,7 @@ def _check(data: MeasuredFields, texts: Mapping[str, Sequence[str]]) -> None:
                 raise MeasurementError(
                     expected="a name that a CSV cell can contain",
                     value=text,
-                    at=data.at(names.index(text), name),
+                    at=data.place_of(names.index(text), name),
                     remedy="use one of a single line without blanks around it",
                 )
 

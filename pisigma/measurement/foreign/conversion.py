@@ -33,7 +33,7 @@ from pisigma.measurement.foreign.quantities import (
 )
 from pisigma.measurement.foreign.rotations import ROTATIONS, RotationEncoding
 from pisigma.measurement.foreign.time_stamps import ambiguous_date, day_first, has_open_date, iso_day
-from pisigma.measurement.foreign.units import AMBIGUOUS, UNITS, scaled
+from pisigma.measurement.foreign.units import AMBIGUOUS, UNITS, to_file_unit
 from pisigma.robot.se3 import quaternion_from_rotation
 
 
@@ -73,7 +73,7 @@ def check_complete(mapping: FileMapping) -> None:
         if other != column:
             raise MeasurementError(
                 f"the columns '{column.heading}' and '{other.heading}' are both {column.target.quantity}",
-                at=mapping.at(column),
+                at=mapping.place_of(column),
                 value=column.target.quantity,
                 remedy=f"omit one of them, such as with --map '{mapping.key(column)}=-'",
             )
@@ -83,7 +83,7 @@ def check_complete(mapping: FileMapping) -> None:
                 raise MeasurementError(
                     expected=f"{group[0].target.unit} as in '{group[0].heading}'",
                     value=column.target.unit,
-                    at=mapping.at(column),
+                    at=mapping.place_of(column),
                     remedy="give both in one unit",
                 )
     if mapping.rotations:
@@ -111,7 +111,7 @@ def check_complete(mapping: FileMapping) -> None:
             f"the column{many} {names} have no unit{meanings}"
             if many
             else f"the column {names} has no unit{meanings}",
-            at=mapping.at(lacking[0]),
+            at=mapping.place_of(lacking[0]),
             option="--unit",
             value=",".join(likely.values()),
             remedy=f"state it, --unit {','.join(likely.values())} if that is right, or "
@@ -154,7 +154,8 @@ def _key(file: ExportFile, quantity: str, texts: list[str], unit: str) -> tuple[
         return tuple(texts)
     numbers = [file.dialect.numbers.text(text) for text in texts]
     return tuple(
-        text if number is None else scaled(number, unit) for text, number in zip(texts, numbers, strict=True)
+        text if number is None else to_file_unit(number, unit)
+        for text, number in zip(texts, numbers, strict=True)
     )
 
 
@@ -206,7 +207,7 @@ def _numbers(file: ExportFile, column: MappedColumn) -> tuple[str, ...]:
                 at=Place(file.source, line, column.heading),
                 remedy="correct it, leave it empty if nothing was measured, or remove the row",
             )
-        numbers.append(scaled(number, column.target.unit) if number else "")
+        numbers.append(to_file_unit(number, column.target.unit) if number else "")
     return tuple(numbers)
 
 

@@ -14,7 +14,7 @@ from pisigma.measurement.foreign.proposal import (
     UNRECOGNISED,
     Proposal,
     incomplete_rotation,
-    propose,
+    propose_quantities,
 )
 from pisigma.measurement.foreign.quantities import (
     KEYS,
@@ -100,7 +100,7 @@ class FileMapping:
         """A line with file, number of rows and format."""
         return f"{self.file.source}: {len(self.file.records)} rows, {self.file.dialect}"
 
-    def at(self, column: MappedColumn, line: int = 0) -> Place:
+    def place_of(self, column: MappedColumn, line: int = 0) -> Place:
         """Return file, line and column for messages, by default the line of the headings."""
         return Place(self.file.source, line or self.file.header_line, column.heading)
 
@@ -141,7 +141,7 @@ def map_columns(
     proposal = Proposal(file)
     for name, text in stated.items():
         _take_stated(proposal, name, text)
-    propose(proposal, rotation)
+    propose_quantities(proposal, rotation)
     columns = tuple(proposal.columns[index] for index in range(len(file.headings)))
     incomplete = (
         () if rotation == NO_ROTATION else tuple(columns[index] for index in incomplete_rotation(proposal))
@@ -310,7 +310,7 @@ def _of_unit(mapping: FileMapping, name: str, columns: list[MappedColumn], unit:
     if name.startswith("angles") and largest < _MIN_TILT:
         return ""
     reason = reason_to_doubt(unit, largest, len(mapping.file.records))
-    return f"{mapping.at(column, line)}: the {name} have {reason}; check their unit." if reason else ""
+    return f"{mapping.place_of(column, line)}: the {name} have {reason}; check their unit." if reason else ""
 
 
 def _left_out(mapping: FileMapping, column: MappedColumn) -> str:
@@ -319,8 +319,8 @@ def _left_out(mapping: FileMapping, column: MappedColumn) -> str:
     if not values or min(values) == max(values):
         return ""
     return (
-        f"{mapping.at(column)}: the column varies from {min(values):g} to {max(values):g} and is left out; if it is a "
-        "joint of the robot, name it with --map."
+        f"{mapping.place_of(column)}: the column varies from {min(values):g} to {max(values):g} and is left out; if "
+        "it is a joint of the robot, name it with --map."
     )
 
 
@@ -331,7 +331,7 @@ def _no_values(mapping: FileMapping) -> list[str]:
         return []
     cells = zip(*(mapping.file.column(column.index) for column in columns), strict=True)
     return [
-        f"{mapping.at(columns[0], line)}: all coordinates of the position are {row[0]}; leave the cells empty if "
+        f"{mapping.place_of(columns[0], line)}: all coordinates of the position are {row[0]}; leave the cells empty if "
         "nothing was measured."
         for line, row in zip(mapping.file.lines, cells, strict=True)
         if len(set(row)) == 1 and not is_missing(row[0])
@@ -347,6 +347,7 @@ def _called_means(mapping: FileMapping) -> list[str]:
     row, name = next(iter(named.items()))
     column = next(one for one in mapping.columns if statistic(records[row][one.index]) == name)
     return [
-        f"{mapping.at(column, mapping.file.lines[row])}: {len(named)} rows are named '{records[row][column.index]}' "
-        "and used as measurements, as none is the mean of the rows before it; remove them if they summarise others."
+        f"{mapping.place_of(column, mapping.file.lines[row])}: {len(named)} rows are named "
+        f"'{records[row][column.index]}' and used as measurements, as none is the mean of the rows before it; remove "
+        "them if they summarise others."
     ]

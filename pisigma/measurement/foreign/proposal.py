@@ -66,7 +66,7 @@ class Proposal:
         """Quantities of the decided columns."""
         return {column.target.quantity for column in self.columns.values()}
 
-    def put(self, index: int, quantity: str, reason: str) -> None:
+    def set_quantity(self, index: int, quantity: str, reason: str) -> None:
         """Decide the quantity of a column."""
         target = Target(quantity, "" if quantity == LEFT_OUT else self.headings[index].unit)
         self.columns[index] = MappedColumn(index, self.file.headings[index], target, reason)
@@ -93,17 +93,17 @@ class Proposal:
             chosen = next(one for one in (side, "", *sides) if one in sides)
             for index in names[name]:
                 if self.headings[index].side == chosen:
-                    self.put(index, quantity, reason)
+                    self.set_quantity(index, quantity, reason)
                 else:
-                    self.put(index, LEFT_OUT, f"the {side} values are used")
+                    self.set_quantity(index, LEFT_OUT, f"the {side} values are used")
 
     def leave_out(self, group: Mapping[str, object], names: Mapping[str, list[int]], reason: str) -> None:
         """Leave out columns by their names."""
         for index in (index for name in group for index in names.get(name, ())):
-            self.put(index, LEFT_OUT, reason)
+            self.set_quantity(index, LEFT_OUT, reason)
 
 
-def propose(proposal: Proposal, rotation: str | None) -> None:
+def propose_quantities(proposal: Proposal, rotation: str | None) -> None:
     """Decide the quantities of all undecided columns.
 
     Args:
@@ -117,7 +117,7 @@ def propose(proposal: Proposal, rotation: str | None) -> None:
         _take_by_order(proposal, rotation)
     for index, heading in enumerate(proposal.headings):
         if heading.is_column and index not in proposal.columns:
-            proposal.put(index, heading.name, "heading")
+            proposal.set_quantity(index, heading.name, "heading")
     _take_joints(proposal)
     _take_position(proposal)
     _take_rotation(proposal, rotation)
@@ -162,7 +162,7 @@ def _take_by_order(proposal: Proposal, rotation: str | None) -> None:
         )
     for index, quantity in of_index.items():
         if index not in proposal.columns:
-            proposal.put(index, quantity, "order of the columns, because there is no heading")
+            proposal.set_quantity(index, quantity, "order of the columns, because there is no heading")
 
 
 def _has_place(stated: str | None) -> bool:
@@ -350,9 +350,9 @@ def _take_third_coordinate(proposal: Proposal) -> None:
     step = (second[1] - first[1]) / (POSITION.index(second[0]) - POSITION.index(first[0]))
     in_place = first[1] + step * (number - POSITION.index(first[0]))
     if len(lengths) == 1:
-        proposal.put(lengths[0], missing[0], "the only other length, with two stated coordinates")
+        proposal.set_quantity(lengths[0], missing[0], "the only other length, with two stated coordinates")
     elif abs(step) == 1 and in_place in free:
-        proposal.put(int(in_place), missing[0], "next to two stated coordinates")
+        proposal.set_quantity(int(in_place), missing[0], "next to two stated coordinates")
 
 
 def incomplete_rotation(proposal: Proposal) -> list[int]:
@@ -384,8 +384,8 @@ def _take_other(proposal: Proposal, name: str, index: int) -> None:
     of_unit = {"temperature": "temperature", "time": "time"}.get(UNITS[unit].kind if unit else "")
     quantity = of_unit or MEANINGS.get(name, LEFT_OUT)
     if quantity == LEFT_OUT:
-        proposal.put(index, LEFT_OUT, UNRECOGNISED)
+        proposal.set_quantity(index, LEFT_OUT, UNRECOGNISED)
     elif quantity in proposal.quantities:
-        proposal.put(index, LEFT_OUT, "another column has the same meaning")
+        proposal.set_quantity(index, LEFT_OUT, "another column has the same meaning")
     else:
-        proposal.put(index, quantity, "heading")
+        proposal.set_quantity(index, quantity, "heading")

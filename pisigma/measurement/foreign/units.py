@@ -121,7 +121,7 @@ def parse_units(text: str) -> dict[UnitKind, str]:
     return units
 
 
-def scaled(number: str, symbol: str) -> str:
+def to_file_unit(number: str, symbol: str) -> str:
     """Return a number in the unit of its column of measurement files, with every digit.
 
     Args:

@@ -19,7 +19,7 @@ from pisigma.measurement.sensors.sensor import (
     UnknownGroup,
     Unknowns,
     Values,
-    along,
+    component_along,
     names_of,
     numbers_of,
     owners_of,
@@ -78,7 +78,7 @@ class AnchorSensor(AbstractSensor):
 
     def derivative(self, motion: ToolMotion, unknowns: Unknowns, rows: slice) -> Derivative:
         """Return the shift of the tool away from the anchor."""
-        return along(unit_vectors(self._from_anchor(motion, unknowns, rows)), motion.derivative)
+        return component_along(unit_vectors(self._from_anchor(motion, unknowns, rows)), motion.derivative)
 
     def unknown_derivatives(
         self, motion: ToolMotion, unknowns: Unknowns, rows: slice
@@ -138,7 +138,7 @@ class AnchorSensor(AbstractSensor):
         if position is None:
             raise IdentificationError(
                 f"anchor '{owner}' was not calibrated and its position is not given",
-                at=measurements.at(row, "anchor"),
+                at=measurements.place_of(row, "anchor"),
                 value=owner,
                 remedy=nearest_choice(owner, calibrated),
             )
@@ -238,7 +238,7 @@ def _check_wire(
         f"the distance {shown:g} mm from anchor '{name}' is {'shorter' if short else 'longer'} than any position of "
         f"the anchor allows, because it is {other:g} mm in {measurements.place(int(rows[partner]))}, where the tool is "
         f"only {apart} away",
-        at=measurements.at(int(rows[worst]), "distance"),
+        at=measurements.place_of(int(rows[worst]), "distance"),
         value=shown,
         remedy="correct it, or remove the row",
     )

@@ -123,7 +123,7 @@ class CornerSensor(AbstractSensor):
     @classmethod
     def build(cls, rows: SensorRows) -> "CornerSensor | None":
         """Gather the poses by corners, as seen from the bases' anchors and freed of the tools' anchors."""
-        data, present = rows.measurements, rows.by_corners
+        data, present = rows.measurements, rows.has_corner_poses
         if data.position is None or data.rotation is None or not bool(present.any()):
             return None
         R, p = rows.bases[:, :3, :3], rows.bases[:, :3, 3]

@@ -212,7 +212,7 @@ class IntrinsicsSensor(AbstractSensor):
     def build(cls, rows: SensorRows) -> "IntrinsicsSensor | None":
         """Add up the information on every camera; None if no intrinsics are estimated."""
         data, names = rows.measurements, cameras(rows.measurements)
-        if names is None or not bool(rows.by_corners.any()):
+        if names is None or not bool(rows.has_corner_poses.any()):
             return None
         images = ImageIntrinsics.from_texts(texts_of(data, INTRINSICS_COLUMN))
         noise = torch.nan_to_num(rows.readings(NOISE_COLUMN), nan=1.0)
@@ -294,7 +294,7 @@ class BoardScaleSensor(AbstractSensor):
         """Assign every board with a free scale to its first row; None if there is none."""
         data, names = rows.measurements, boards(rows.measurements)
         deviations = scale_deviations(data)
-        if names is None or not bool((deviations > 0).any()) or not bool(rows.by_corners.any()):
+        if names is None or not bool((deviations > 0).any()) or not bool(rows.has_corner_poses.any()):
             return None
         noise = torch.nan_to_num(rows.readings(NOISE_COLUMN), nan=1.0)
         owner, weight = torch.full((data.rows,), -1).to(noise.device), torch.zeros_like(noise)

@@ -16,7 +16,7 @@ from pisigma.measurement.sensors.sensor import (
     SensorRows,
     Unknowns,
     Values,
-    along,
+    component_along,
     names_of,
     unit_vectors,
 )
@@ -63,11 +63,11 @@ class PairSensor(AbstractSensor):
 
     def derivative(self, motion: ToolMotion, unknowns: Unknowns, rows: slice) -> Derivative:
         """Return the relative shift of the tools along their connecting line."""
-        return along(unit_vectors(_apart(motion.position)), _apart(motion.derivative[:, :3]))
+        return component_along(unit_vectors(_apart(motion.position)), _apart(motion.derivative[:, :3]))
 
     def partner_derivative(self, motion: ToolMotion) -> Derivative:
         """Return the negative shift of the next row's tool along the line."""
-        return -along(unit_vectors(_apart(motion.position)), _following(motion.derivative[:, :3]))
+        return -component_along(unit_vectors(_apart(motion.position)), _following(motion.derivative[:, :3]))
 
     @classmethod
     def initial_guess(cls, measurements: Measurements, T: Poses, reach: float) -> InitialUnknowns | None:
@@ -90,7 +90,7 @@ class PairSensor(AbstractSensor):
             expected=f"about {float(apart[worst]) * 1e3:.4g} mm between the tool points of pair "
             f"'{measurements.pair[row]}', as for the nominal robot",
             value=float(f"{float(distance[worst]) * 1e3:.6g}"),
-            at=measurements.at(row, "distance"),
+            at=measurements.place_of(row, "distance"),
             remedy="correct the distance or the names of the pairs",
         )
 

@@ -114,13 +114,13 @@ class SensorRows:
             row = int(lacking.nonzero()[0, 0])
             raise IdentificationError(
                 "the standard deviation is given in some rows, but not in this one",
-                at=data.at(row, "sigma_mm" if unit == "m" else "sigma_deg"),
+                at=data.place_of(row, "sigma_mm" if unit == "m" else "sigma_deg"),
                 remedy="give it in every row, or in none to have it estimated",
             )
         return sigma
 
     @property
-    def by_corners(self) -> Bool[Tensor, " rows"]:
+    def has_corner_poses(self) -> Bool[Tensor, " rows"]:
         """Which rows contain a complete pose from the corners of a board in an image, with its covariance."""
         return self.measurements.measured("corner") & self.measurements.measured("pose")
 
@@ -248,7 +248,7 @@ class AbstractSensor(ABC):
         row = next(row for row in range(measurements.rows) if owner in _names_in(measurements, row))
         raise IdentificationError(
             f"'{owner}' of the sensor '{cls.name}' was not calibrated",
-            at=measurements.at(row),
+            at=measurements.place_of(row),
             value=owner,
             remedy=nearest_choice(owner, calibrated),
         )
@@ -288,7 +288,7 @@ def owners_of(
     return owners, tuple(measurements.frame[(names or ()).index(owner)] for owner in owners)
 
 
-def along(
+def component_along(
     axis: Float[Tensor, "3 poses"], derivative: Float[Tensor, "parameters six poses"]
 ) -> Float[Tensor, "parameters 1 poses"]:
     """Return the component along an axis of the shift of the tool by every parameter."""

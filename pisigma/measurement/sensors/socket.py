@@ -147,11 +147,11 @@ class SocketDistanceSensor(AbstractSensor):
 
     @classmethod
     def build(cls, rows: SensorRows) -> "SocketDistanceSensor | None":
-        """Return None: the distances are given by the user, see `between`."""
+        """Return None: the distances are given by the user, see `assign_distances`."""
         return None
 
     @classmethod
-    def between(
+    def assign_distances(
         cls, measurements: Measurements, distances: Mapping[PairOfSockets, float], sigma: float
     ) -> "SocketDistanceSensor | None":
         """Assign distances to different rows of their sockets; None if there is no distance.

@@ -6,7 +6,14 @@ import torch
 from jaxtyping import Bool, Float64
 from torch import Tensor
 
-from pisigma.measurement.sensors.sensor import AbstractSensor, Derivative, SensorRows, Unknowns, Values, along
+from pisigma.measurement.sensors.sensor import (
+    AbstractSensor,
+    Derivative,
+    SensorRows,
+    Unknowns,
+    Values,
+    component_along,
+)
 from pisigma.robot.kinematics.parameter_jacobian import ToolMotion
 
 
@@ -47,4 +54,4 @@ class TouchSensor(AbstractSensor):
 
     def derivative(self, motion: ToolMotion, unknowns: Unknowns, rows: slice) -> Derivative:
         """Return the shift of the tool along the axis."""
-        return along(self.axis[:, rows], motion.derivative)
+        return component_along(self.axis[:, rows], motion.derivative)

@@ -119,15 +119,15 @@ class ControllerValues:
             self._motion, rows, starts, lambda q: self.coupling.is_inside(self.coupling.to_dh(q))
         )
         nominal = solve(partial(self._motion, nominal=True), rows, found.q)
-        q, q_nominal = found.known(found.q), nominal.known(nominal.q)
+        q, q_nominal = found.mask_unreached(found.q), nominal.mask_unreached(nominal.q)
         solution = Solution(
             q.reshape(*batch, axes),
             np.where(np.isfinite(q), q_nominal, np.nan).reshape(*batch, axes),
             np.zeros(batch, dtype=int),
             self.ik.branches[:1],
             np.where(found.reached, int(Status.REACHED), int(Status.UNREACHABLE)).reshape(batch),
-            found.known(found.position).reshape(batch),
-            found.known(found.rotation).reshape(batch),
+            found.mask_unreached(found.position).reshape(batch),
+            found.mask_unreached(found.rotation).reshape(batch),
             np.full(batch, np.nan),
             owner,
         )
@@ -214,7 +214,7 @@ class Reached:
     position: Float64[np.ndarray, " rows"]
     rotation: Float64[np.ndarray, " rows"]
 
-    def known(self, values: np.ndarray) -> np.ndarray:
+    def mask_unreached(self, values: np.ndarray) -> np.ndarray:
         """Replace values of poses that are not reached by NaN."""
         return np.where(self.reached if values.ndim == 1 else self.reached[:, None], values, np.nan)
 

@@ -14,7 +14,7 @@ from pisigma.files.errors import ModelError, Place, PoseError
 from pisigma.files.model_files import COMPILED, hash_if_compiled, model_hash
 from pisigma.model.inverse.joint_input import Postures, as_array, checked_approach, pose_array
 from pisigma.model.inverse.solution import AbstractInverse, Solution
-from pisigma.robot.kernels.array_kinematics import by_torch, is_tensor
+from pisigma.robot.kernels.array_kinematics import call_with_tensors, is_tensor
 from pisigma.robot.kinematics.task_axes import TaskAxes, task_axes
 
 if TYPE_CHECKING:  # full names, which run-time type checkers resolve without these imports
@@ -229,7 +229,7 @@ class CorrectedIK(AbstractInverse):
                 remedy="give q as an array",
             )
         if kernels is None:
-            return by_torch(self.model.forward, q)
+            return call_with_tensors(self.model.forward, q)
         values = np.asarray(q, dtype=np.float64)
         T = kernels.forward(values.reshape(-1, values.shape[-1]), approach=_flat(approach))[0]
         return T.reshape(*values.shape[:-1], 4, 4)
@@ -243,7 +243,7 @@ class CorrectedIK(AbstractInverse):
             return self.controller.jacobian(q)
         kernels = self._kernels_of(q, forward=False)
         if kernels is None:
-            return by_torch(self.model.jacobian, q)
+            return call_with_tensors(self.model.jacobian, q)
         values = np.asarray(q, dtype=np.float64)
         J = kernels.forward(values.reshape(-1, values.shape[-1]))[1]
         return J.reshape(*values.shape[:-1], 6, values.shape[-1])
@@ -271,7 +271,7 @@ class CorrectedIK(AbstractInverse):
 
         if self.controller is not None:
             return self.controller.accuracy(q)
-        return by_torch(partial(position_accuracy, self.model), q)
+        return call_with_tensors(partial(position_accuracy, self.model), q)
 
     def to_pytorch_kinematics(self) -> "pytorch_kinematics.SerialChain":
         """Return the geometry as a chain of pytorch-kinematics; see `CalibratedModel.to_pytorch_kinematics`."""

@@ -265,7 +265,7 @@ class NumericIK:
             if not self.model.hybrid.correction.is_periodic:  # the correction differs between wraps
                 commanded, reached = self._arm.reach(T, commanded)
                 inside = (wrap_into_limits(robot, commanded)[0] == commanded).all(-1) & inside
-            measure = 1 + self.model.hybrid.coverage.beyond(commanded).amax(-1)
+            measure = 1 + self.model.hybrid.coverage.distance_outside(commanded).amax(-1)
         nominal = nearest_turn(robot, nominal, commanded, within_limits=False)
         singular = self._arm.singularity_measure(T, nominal if self._network else commanded)
         status = torch.where(

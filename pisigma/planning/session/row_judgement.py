@@ -19,7 +19,7 @@ from pisigma.calibration.geometric.problem.setup import (
     identified_geometry,
 )
 from pisigma.calibration.hybrid.design import Design
-from pisigma.calibration.hybrid.gravity import USUAL, in_first_row
+from pisigma.calibration.hybrid.gravity import USUAL, to_first_row_frame
 from pisigma.calibration.hybrid.sensor_values import SensorValues, sensor_values
 from pisigma.estimation.dual_regression import DETERMINED, without_nuisance
 from pisigma.files.errors import IdentificationError
@@ -124,7 +124,7 @@ class RowModel:
         chosen = [index for index in calibrator.candidates(setup.problem.space) if index not in floating]
         active = [*setup.free_unknowns, *chosen]
         setup = replace(setup, problem=setup.problem.with_active(active))
-        gravity = GravityTorques(robot, in_first_row(robot, USUAL))
+        gravity = GravityTorques(robot, to_first_row_frame(robot, USUAL))
         design = Design(
             setup.problem, (gravity, FourierSeries(robot, RobotClass.from_robot(robot).harmonics))
         )
@@ -306,7 +306,7 @@ class RowJudgement:
     errors: LeaveOneOutErrors | None = None
 
     @property
-    def judged(self) -> Bool[Tensor, " rows"]:
+    def is_predictable(self) -> Bool[Tensor, " rows"]:
         """Rows that can be predicted from the others."""
         none = torch.zeros_like(self.counts)
         return none if self.errors is None else self.errors.chance.isfinite()

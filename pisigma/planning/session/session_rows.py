@@ -16,7 +16,6 @@ from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.planning.candidates import Candidates
 from pisigma.planning.plan_file import StoredPlan
 from pisigma.planning.pose_selection import select_poses
-from pisigma.planning.session.reached import Reached
 from pisigma.planning.session.row_alarms import (
     NEAR_POSE,
     cleared,
@@ -28,6 +27,7 @@ from pisigma.planning.session.row_alarms import (
     unreadable,
 )
 from pisigma.planning.session.row_judgement import FEW_ROWS, RowJudgement, judge_rows
+from pisigma.planning.session.session_accuracy import SessionAccuracy
 from pisigma.planning.session.state import AccuracyPoint, Advice, Alarm
 from pisigma.planning.surroundings.motion import Motions
 from pisigma.planning.tour import order_of_use, tour
@@ -212,7 +212,7 @@ class FurtherPoses:
         self,
         plan: StoredPlan,
         poses: int,
-        so_far: Reached,
+        so_far: SessionAccuracy,
         measured: Float64[Tensor, "rows dof"],
         remaining: Int64[Tensor, " remaining"],
     ) -> StoredPlan | None:

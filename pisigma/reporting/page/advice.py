@@ -88,9 +88,9 @@ def _more_rows(model: CalibratedModel, summary: CalibrationSummary, limit: Accur
         doublings = math.log2(last[0] / before[0])
         each = 1 - (1 - gain) ** (1 / doublings) if doublings > 0 and gain < 1 else 0.0
         return say("more_rows", before, last, max(each, 0.0), each >= MIN_GAIN_PER_DOUBLING)
-    if limit.share is None or limit.share >= DOMINANT_SHARE:
+    if limit.scatter_share is None or limit.scatter_share >= DOMINANT_SHARE:
         return ()
-    return say("little_scatter", limit.share, model.provenance.rows)
+    return say("little_scatter", limit.scatter_share, model.provenance.rows)
 
 
 def _trust(summary: CalibrationSummary) -> tuple[str, ...]:

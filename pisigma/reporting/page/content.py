@@ -198,7 +198,7 @@ class ReportContent:
             "worst": self.verdict.worst,
             "limit": {
                 "noise_rms_mm": self.limit.noise,
-                "share": self.limit.share,
+                "share": self.limit.scatter_share,
                 "says": self.verdict.limit if self.accuracies else say("limit", self.limit)[0],
             },
             "accuracy": [

@@ -27,7 +27,7 @@ from pisigma.reporting.page.content import ReportContent
 from pisigma.reporting.page.wording import LAYER_LABELS, curve_text, dependence_text
 from pisigma.validation.held_out.validation_figures import LearningPoint
 from pisigma.validation.report.corrections import CorrectionCurve, Correlations
-from pisigma.validation.report.dependence import Dependence, binned
+from pisigma.validation.report.dependence import Dependence, bin_errors
 from pisigma.validation.report.error_map import Layer
 
 SIZE = (5.2, 3.1)
@@ -314,7 +314,7 @@ def _lengths(axes: Axes, dependence: Dependence) -> None:
         finite = np.isfinite(lengths)
         if finite.sum() < 3:
             continue
-        bins = binned(dependence.values[finite], lengths[finite])
+        bins = bin_errors(dependence.values[finite], lengths[finite])
         style = {"color": color, "linestyle": line, "linewidth": 2, "label": f"RMS {name}"}
         axes.stairs(bins.rms, bins.edges, baseline=None, **style)  # type: ignore[arg-type]
     axes.set(yscale="log", ylabel=f"error [{dependence.error_unit}]")

@@ -129,7 +129,7 @@ def fleet_page(status: FleetStatus, name: str) -> str:
         status: status of the fleet.
         name: name of the fleet.
     """
-    order = {one.robot: place for place, one in enumerate(status.worst_first)}
+    order = {one.robot: place for place, one in enumerate(status.robots_by_error)}
     robots = sorted(
         status.robots, key=lambda one: (STATES.index(one.state), order.get(one.robot, len(order)))
     )

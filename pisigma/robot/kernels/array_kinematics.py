@@ -45,7 +45,7 @@ def forward_kinematics(robot: "pisigma.robot.description.Robot", q: Any) -> Any:
         return chain.move(q, False)[0]
     from pisigma.robot.kinematics.forward import forward_kinematics as of_tensors
 
-    return by_torch(functools.partial(of_tensors, robot), q)
+    return call_with_tensors(functools.partial(of_tensors, robot), q)
 
 
 def joint_jacobian(robot: "pisigma.robot.description.Robot", q: Any) -> Any:
@@ -75,7 +75,7 @@ def joint_jacobian(robot: "pisigma.robot.description.Robot", q: Any) -> Any:
         return chain.move(q, True)[1]
     from pisigma.robot.kinematics.jacobian import joint_jacobian as of_tensors
 
-    return by_torch(lambda values: of_tensors(robot, values)[1], q)
+    return call_with_tensors(lambda values: of_tensors(robot, values)[1], q)
 
 
 def is_tensor(values: Any) -> bool:
@@ -84,7 +84,7 @@ def is_tensor(values: Any) -> bool:
     return torch is not None and isinstance(values, torch.Tensor)
 
 
-def by_torch(function: Callable[[Any], Any], q: Any) -> Any:
+def call_with_tensors(function: Callable[[Any], Any], q: Any) -> Any:
     """Call a function of tensors; arrays are converted to float64 tensors and back."""
     import torch
 

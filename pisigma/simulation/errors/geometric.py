@@ -36,8 +36,8 @@ class GeometricDeviation(AbstractGeometrySource):
     base: FrameSection = FrameSection()
     tool: FrameSection = FrameSection()
 
-    def change(self, robot: Robot, place: str) -> GeometryChange:
-        """Return the given errors in SI units. See `AbstractGeometrySource.change`."""
+    def parameter_errors(self, robot: Robot, place: str) -> GeometryChange:
+        """Return the given errors in SI units. See `AbstractGeometrySource.parameter_errors`."""
         dh = np.zeros_like(robot.dh)
         for name, error in self.rows.items():
             dh[row_index(robot, name, place)] = error.to_si()
@@ -81,8 +81,8 @@ class RandomGeometricDeviation(AbstractGeometrySource):
     tool_length_mm: float = Field(default=0.0, ge=0)
     tool_angle_deg: float = Field(default=0.0, ge=0)
 
-    def change(self, robot: Robot, place: str) -> GeometryChange:
-        """Return the random errors in SI units, the same at every call. See `AbstractGeometrySource.change`."""
+    def parameter_errors(self, robot: Robot, place: str) -> GeometryChange:
+        """Return the random errors, the same at every call; see `AbstractGeometrySource.parameter_errors`."""
         generator = torch.Generator().manual_seed(self.seed)
         dh = self._draw(generator, len(robot.rows), 5)
         base, tool = self._draw(generator, 6), self._draw(generator, 6)

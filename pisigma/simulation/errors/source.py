@@ -48,7 +48,7 @@ class AbstractGeometrySource(AbstractErrorSource):
     """An error source that changes geometric parameters; the changes of several sources are added."""
 
     @abstractmethod
-    def change(self, robot: Robot, place: str) -> GeometryChange:
+    def parameter_errors(self, robot: Robot, place: str) -> GeometryChange:
         """Return the errors of the parameters of the nominal robot.
 
         Args:

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
-from pisigma.calibration.geometric.problem.noise import view_of
+from pisigma.calibration.geometric.problem.noise import sensor_view_of
 from pisigma.calibration.geometric.result import CalibrationResult
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.sensors.intrinsics import (
@@ -140,7 +140,7 @@ def _tool(images: Measurements, rows: Measurements, result: CalibrationResult) -
 
 def _limit(images: Measurements, result: CalibrationResult) -> Iterator[Diagnostic]:
     """Warn that the images limit the accuracy, with the shares of the predicted error by intrinsics and boards."""
-    problem, view = result.solved.problem, view_of(result.solved.refined)
+    problem, view = result.solved.problem, sensor_view_of(result.solved.refined)
     number = next(k for k, sensor in enumerate(problem.sensors) if sensor.name == "corner")
     ratio = view.noise[number] / float(torch.as_tensor(images.readings[NOISE_COLUMN]).median())
     if ratio >= EXPLAINED:

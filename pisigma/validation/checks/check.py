@@ -144,24 +144,27 @@ class RowsUnderModel:
         return RowsUnderModel(model, some, kinds, frozenset(may_move), nominal)
 
     @cached_property
-    def known(self) -> Measurements:
+    def renamed_rows(self) -> Measurements:
         """The rows, with fitted frames and targets named as in the model."""
         return with_names_of(self.model, self.rows, self.fitted)
 
     @cached_property
-    def unfitted(self) -> Float64[Tensor, "rows 4 4"]:
+    def poses_before_fit(self) -> Float64[Tensor, "rows 4 4"]:
         """Predicted poses before anything is fitted."""
-        return poses_of_rows(self.model, self.known)
+        return poses_of_rows(self.model, self.renamed_rows)
 
     def zero_columns(
         self, zeros: Float64[Tensor, " dof"] | None = None
     ) -> tuple[Float64[Tensor, "rows 4 4"], Float64[Tensor, "dof rows 4 4"]]:
         """Predict poses with joint zeros moved [rad or m], and differentiate them by the zeros (finite differences)."""
-        zeros = torch.zeros(self.known.dof, dtype=torch.float64) if zeros is None else zeros
-        moved = [zeros, *(zeros + STEP * torch.eye(self.known.dof).double())]
+        zeros = torch.zeros(self.renamed_rows.dof, dtype=torch.float64) if zeros is None else zeros
+        moved = [zeros, *(zeros + STEP * torch.eye(self.renamed_rows.dof).double())]
         here, *there = (
             poses_of_rows(
-                self.model, Measurements(self.known.q + by, frame=self.known.frame, target=self.known.target)
+                self.model,
+                Measurements(
+                    self.renamed_rows.q + by, frame=self.renamed_rows.frame, target=self.renamed_rows.target
+                ),
             )
             for by in moved
         )
@@ -171,9 +174,9 @@ class RowsUnderModel:
     def predicted(self) -> Float64[Tensor, "rows 4 4"]:
         """Predicted poses, after fitting."""
         return (
-            fit_frames(self.unfitted, self.measured, self.rows, self.fitted)[0]
+            fit_frames(self.poses_before_fit, self.measured, self.rows, self.fitted)[0]
             if self.fitted
-            else self.unfitted
+            else self.poses_before_fit
         )
 
     @cached_property
@@ -194,9 +197,9 @@ class RowsUnderModel:
         return result
 
     @cached_property
-    def usual(self) -> Float64[Tensor, " rows"]:
+    def predicted_deviation(self) -> Float64[Tensor, " rows"]:
         """Standard deviation of every row's error by the model's posterior and noise [m]; NaN if it has none."""
-        deviation = deviation_of_rows(self.model, self.known).square().sum(-1)
+        deviation = deviation_of_rows(self.model, self.renamed_rows).square().sum(-1)
         known = self.model.uncertainty
         noise = torch.as_tensor(math.nan if known is None else _position_noise(known.noise))
         if known is not None and self.rows.sigma_position is not None:
@@ -206,9 +209,9 @@ class RowsUnderModel:
         return result
 
     @cached_property
-    def large(self) -> bool:
+    def has_large_errors(self) -> bool:
         """Whether the errors of positions and orientations are too large for wear."""
-        error = float(self.measured.squares(self.predicted).mean().sqrt())
+        error = float(self.measured.squared_errors(self.predicted).mean().sqrt())
         return error > LARGE_SHARE * self.model.robot.reach
 
     @cached_property
@@ -254,4 +257,4 @@ def _unknown(names: tuple[str, ...], known: Collection[str]) -> bool:
 
 def _position_noise(noise: CalibrationNoise) -> float:
     """Return the noise of a coordinate [m]; 0 where the calibration had no positions, NaN where it is not known."""
-    return noise.absolute("position") if "position" in noise.value else 0.0
+    return noise.standard_deviation("position") if "position" in noise.value else 0.0

@@ -69,8 +69,8 @@ def find_lag(rows: OrderedRows, measurements: Measurements) -> Lag | None:
     if len(rows.residual) < MIN_ROWS:
         return None
     r = rows.clipped.ravel()
-    X = rows.X.reshape(len(r), -1)
-    covariance, spare = rows.covariance, max(rows.values - rows.used, 1.0)
+    X = rows.jacobian.reshape(len(r), -1)
+    covariance, spare = rows.covariance, max(rows.values - rows.effective_parameters, 1.0)
     left = r - X @ (covariance @ (X.T @ r))
     found = []
     for before, motion in zip((True, False), _motions(measurements), strict=True):
@@ -81,7 +81,9 @@ def find_lag(rows: OrderedRows, measurements: Measurements) -> Lag | None:
             continue
         share = float(free @ left) / information
         ratio = max(1 - share**2 * information / float(left @ left), 1e-12)
-        gain = -rows.independent / 2 * math.log(ratio) - math.log(max(rows.independent, 2.0)) / 2
+        gain = (
+            -rows.degrees_of_freedom / 2 * math.log(ratio) - math.log(max(rows.degrees_of_freedom, 2.0)) / 2
+        )
         found.append(Lag(before, share, math.sqrt(spare / max(spare - 1, 1.0) / ratio), gain))
     return max(found, key=lambda lag: lag.log_bayes_factor, default=None)
 

@@ -24,7 +24,7 @@ from pisigma.validation.setup_faults.populations import (
     find_populations,
     two_populations,
 )
-from pisigma.validation.setup_faults.setup_fault import either
+from pisigma.validation.setup_faults.setup_fault import combine_alternatives
 from pisigma.validation.setup_faults.setup_faults import find_setup_faults
 
 MIN_WRONG_SHARE = 0.25
@@ -56,7 +56,7 @@ def check_mixed_rows(judged: RowsUnderModel) -> Iterator[Diagnostic]:
     mixed, or it is not known which are wrong. Moved joint zeros cause errors of all sizes, so they are fitted to all
     rows first.
     """
-    if not bool(torch.isfinite(judged.usual).all()):
+    if not bool(torch.isfinite(judged.predicted_deviation).all()):
         return
     found = [one for one in (_apart(judged, T) for T in _agreements(judged)) if one is not None]
     if found and not _joints_explain(judged):
@@ -88,7 +88,7 @@ def _cause(judged: RowsUnderModel, wrong: Bool[Tensor, " rows"]) -> str:
     faults = find_setup_faults(judged.model, None, judged.rows.select(wrong), judged.fitted)
     if not faults:
         return ""
-    fault = either(faults)
+    fault = combine_alternatives(faults)
     fall = joined(length_text(error) for error in (fault.before, fault.after))
     return f" In these rows, {fault.clause} (errors without and with this correction: {fall})."
 
@@ -96,10 +96,10 @@ def _cause(judged: RowsUnderModel, wrong: Bool[Tensor, " rows"]) -> str:
 def _agreements(judged: RowsUnderModel) -> Iterator[Float64[Tensor, "rows 4 4"]]:
     """Yield the predicted poses, and those with a base or a tool that agrees with as many rows as possible."""
     if not judged.fitted:
-        yield judged.unfitted
+        yield judged.poses_before_fit
     if len(set(judged.rows.frame)) > 1 or len(set(judged.rows.target)) > 1:
         return
-    limit = AGREES * judged.usual
+    limit = AGREES * judged.predicted_deviation
     samples = list(_samples(judged.rows.rows))
     for kind in ("base", "tool"):
         best, most = None, SAMPLE + SPARE_ROWS - 1
@@ -127,15 +127,15 @@ def _samples(rows: int) -> Iterator[Tensor]:
 
 def _fitted(judged: RowsUnderModel, kind: str, chosen: Tensor) -> Float64[Tensor, "rows 4 4"]:
     """Predict the poses with the base or the tool fitted to some rows."""
-    some, measured = judged.unfitted[chosen], judged.measured.select(chosen)
+    some, measured = judged.poses_before_fit[chosen], judged.measured.select(chosen)
     if kind == "base":
-        return best_base(some, measured) @ judged.unfitted
-    return judged.unfitted @ best_tool(some, measured)
+        return best_base(some, measured) @ judged.poses_before_fit
+    return judged.poses_before_fit @ best_tool(some, measured)
 
 
 def _apart(judged: RowsUnderModel, T: Float64[Tensor, "rows 4 4"]) -> Bool[Tensor, " rows"] | None:
     """Find the rows that are far from what the others agree on; None if these are few or not clearly separated."""
-    ratio = judged.lengths(T) / (AGREES * judged.usual)
+    ratio = judged.lengths(T) / (AGREES * judged.predicted_deviation)
     near, far = ratio <= 1, ratio > APART
     count = judged.rows.rows
     if not int(far.sum()) > MIN_WRONG_SHARE * count or not int(near.sum()) >= MIN_AGREEING_SHARE * count:
@@ -151,7 +151,7 @@ def _joints_explain(judged: RowsUnderModel) -> bool:
     J = judged.zero_columns()[1][..., :3, 3].flatten(1).t()
     solution = torch.linalg.lstsq(J, error.flatten(), driver="gelsd").solution
     left = (error.flatten() - J @ solution).view(-1, 3).norm(dim=-1)
-    return float((left / judged.usual).square().mean().sqrt()) <= EXPLAINED
+    return float((left / judged.predicted_deviation).square().mean().sqrt()) <= EXPLAINED
 
 
 CERTAIN = 30.0

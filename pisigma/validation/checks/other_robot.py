@@ -49,7 +49,7 @@ def check_other_robot(checked: CheckedCalibration) -> Iterator[Diagnostic]:
 
 def check_other_robot_of_rows(judged: RowsUnderModel) -> Iterator[Diagnostic]:
     """Look for another robot of the catalogue that fits rows with large errors better."""
-    if judged.large and not judged.setup_faults:
+    if judged.has_large_errors and not judged.setup_faults:
         yield from other_robot_diagnostics(judged.model.robot, judged.rows)
 
 

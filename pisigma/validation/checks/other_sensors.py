@@ -34,7 +34,7 @@ MAX_ITERATIONS, MIN_GAIN, STEP, MAX_STEP = 8, 0.9, 1e-6, 0.3
 step [rad or m]."""
 
 
-def missed_distances(comparison: ModelComparison, figures: ModelFigures) -> Iterator[Diagnostic]:
+def distance_diagnostics(comparison: ModelComparison, figures: ModelFigures) -> Iterator[Diagnostic]:
     """Report stated distances of sockets that a model contradicts by more than its rows scatter.
 
     Args:

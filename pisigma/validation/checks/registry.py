@@ -18,7 +18,7 @@ from pisigma.validation.checks.stated_noise import check_stated_noise
 from pisigma.validation.checks.temperature import check_temperature
 from pisigma.validation.checks.unexplained import check_residual, check_unexplained, check_unexplained_rows
 from pisigma.validation.held_out.diagnostic import Diagnostic
-from pisigma.validation.held_out.trained_calibrations import trained
+from pisigma.validation.held_out.trained_calibrations import fit_compared_calibrations
 
 CHECKS: tuple[Check, ...] = (
     check_other_robot,
@@ -68,7 +68,7 @@ def diagnostics_of_rows(calibrator: GeometricCalibrator, rows: Measurements) -> 
         IdentificationError: the rows cannot belong to this robot.
     """
     try:
-        results = trained(calibrator, rows)
+        results = fit_compared_calibrations(calibrator, rows)
     except ImplausibleError:
         raise
     except IdentificationError:

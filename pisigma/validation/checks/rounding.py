@@ -104,7 +104,9 @@ def joint_rounding(result: CalibrationResult, measurements: Measurements) -> Rou
     if rows is None or len(rows.residual) < MIN_ROWS:
         return None
     made = rows.by_joints * steps / math.sqrt(12)
-    left = rows.left * math.sqrt(rows.values / max(rows.values - rows.used, 1.0))
+    left = rows.residual_after_fit * math.sqrt(
+        rows.values / max(rows.values - rows.effective_parameters, 1.0)
+    )
     share = float(np.square(made).sum() / max(np.square(left).sum(), 1e-300))
     if not MIN_SHARE < share < MAX_SHARE or _gain(left, made) < LIKELY:
         return None

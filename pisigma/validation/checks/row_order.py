@@ -103,7 +103,7 @@ def _sentence(motion: Motion, rows: Measurements) -> str:
     )
 
 
-def explained(refusal: IdentificationError, robot: Robot, rows: Measurements) -> IdentificationError:
+def explain_refusal(refusal: IdentificationError, robot: Robot, rows: Measurements) -> IdentificationError:
     """Replace a refusal by one that names the setup fault, if one explains the errors; else return it unchanged."""
     if moved := new_setup(robot, rows):
         return moved
@@ -152,7 +152,7 @@ def new_setup(robot: Robot, measurements: Measurements) -> IdentificationError |
             return IdentificationError(
                 "the instrument or the tool was moved before this row: the rows before it fit the nominal robot "
                 f"'{robot.name}' to {length_text(fits[0])} and the others to {length_text(fits[1])}, but not together",
-                at=measurements.at(row),
+                at=measurements.place_of(row),
                 remedy=f"give this row and the later ones another frame (--set new_frame_at="
                 f"{measurements.line[row] or 'LINE'}) and, if the tool was changed, another target",
             )

@@ -10,7 +10,7 @@ from jaxtyping import Float64
 from scipy.special import logsumexp
 from torch import Tensor
 
-from pisigma.calibration.geometric.problem.noise import UNDETERMINED, view_of
+from pisigma.calibration.geometric.problem.noise import UNDETERMINED, sensor_view_of
 from pisigma.calibration.geometric.problem.parameters import USUAL_LENGTH
 from pisigma.calibration.geometric.result import CalibrationResult
 from pisigma.robot.frame_fits import best_base_and_tool
@@ -124,7 +124,9 @@ def common_scale(result: CalibrationResult) -> CommonScale | None:
         None if no length that is nominally not 0 was estimated.
     """
     problem, here = result.solved.problem, result.solved.refined
-    precision = view_of(here).scaled(problem.precision[problem.active], problem.prior_group).numpy()
+    precision = (
+        sensor_view_of(here).scaled_precision(problem.precision[problem.active], problem.prior_group).numpy()
+    )
     parameters = [problem.space.parameters[index] for index in problem.active.tolist()]
     nominal = problem.nominal[problem.active].numpy()
     erring = np.array([one.group in ("a", "d") for one in parameters])
@@ -171,12 +173,12 @@ MIN_DEVIATIONS = 5.0
 
 def check_scale_of_rows(judged: RowsUnderModel) -> Iterator[Diagnostic]:
     """Fit a factor on the measured positions together with base and tool, and compares it with moved joint zeros."""
-    usual = float(judged.usual.square().mean().sqrt())
+    usual = float(judged.predicted_deviation.square().mean().sqrt())
     single = len(set(judged.rows.frame)) == len(set(judged.rows.target)) == 1
     if not single or 3 * judged.rows.rows < 2 * FITTED or not usual > 0:
         return
-    base, tool = best_base_and_tool(judged.unfitted, judged.measured)
-    T = base @ judged.unfitted @ tool
+    base, tool = best_base_and_tool(judged.poses_before_fit, judged.measured)
+    T = base @ judged.poses_before_fit @ tool
     error = (judged.measured.position - T[:, :3, 3]).flatten()
     before, _, _ = _fit(_frames(T), error)
     if not before > UNUSUAL * usual:

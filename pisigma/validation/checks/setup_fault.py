@@ -23,7 +23,7 @@ from pisigma.validation.setup_faults.nominal_robot_faults import (
     largest_group,
     usual_error,
 )
-from pisigma.validation.setup_faults.setup_fault import either, fault_of_cause
+from pisigma.validation.setup_faults.setup_fault import combine_alternatives, fault_of_cause
 
 UNRELATED = (
     "The measured positions are unrelated to the joint values of their rows, so the joint values and positions of "
@@ -54,7 +54,7 @@ def check_setup_fault(checked: CheckedCalibration) -> Iterator[Diagnostic]:
 def setup_diagnostics(robot: Robot, rows: Measurements) -> tuple[Diagnostic, ...]:
     """Report the setup faults that explain the errors of the nominal robot; see `check_setup_fault`."""
     if faults := find_nominal_robot_faults(robot, rows):
-        fault = either(faults)
+        fault = combine_alternatives(faults)
         severity: Severity = "implausible" if fault.moved > HOBBY.largest.joint_offset else "warning"
         return (fault.diagnostic(severity),)
     if are_unrelated(robot, rows):
@@ -70,12 +70,12 @@ def check_setup_of_rows(judged: RowsUnderModel) -> Iterator[Diagnostic]:
     A moved base, tool or zero of one joint is not a fault if it may have moved. If base and tool may not have moved,
     their motion is reported even if it is small.
     """
-    if judged.large:
+    if judged.has_large_errors:
         faults = judged.setup_faults
     else:
         faults = () if {"frame", "tool"} <= judged.may_move else judged.moved_frames
     if faults and not any(map(judged.is_move, faults)):
-        yield either(faults).diagnostic()
+        yield combine_alternatives(faults).diagnostic()
 
 
 def size_of_positions(robot: Robot, rows: Measurements) -> Iterator[Diagnostic]:
@@ -134,6 +134,6 @@ def _errors(robot: Robot, rows: Measurements, q: Float64[Tensor, "maps rows dof"
     errors = []
     for T in forward_kinematics(robot, q):
         base, tool = best_base_and_tool(T, measured)
-        square = measured.squares(base @ T @ tool).mean()
+        square = measured.squared_errors(base @ T @ tool).mean()
         errors.append(float((square * 3 * rows.rows / (3 * rows.rows - FITTED)).sqrt()))
     return errors

@@ -4,7 +4,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import replace
 
-from pisigma.calibration.geometric.problem.noise import view_of
+from pisigma.calibration.geometric.problem.noise import sensor_view_of
 from pisigma.files.errors import IdentificationError
 from pisigma.validation.checks.check import CheckedCalibration
 from pisigma.validation.held_out.calibration_validation import errors_under
@@ -26,7 +26,7 @@ def check_stated_noise(checked: CheckedCalibration) -> Iterator[Diagnostic]:
     """
     solved = checked.geometric.solved
     learned = None if checked.hybrid is None else checked.hybrid.learned
-    for sensor, sums in zip(solved.problem.sensors, view_of(solved.refined).sums, strict=True):
+    for sensor, sums in zip(solved.problem.sensors, sensor_view_of(solved.refined).sums, strict=True):
         if sensor.sigma is None or sensor.certain or sensor.components not in CHI_MEDIAN:
             continue
         distance = sums.distance[sensor.present]

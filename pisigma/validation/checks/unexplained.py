@@ -73,13 +73,13 @@ MAX_STEP = 0.3
 def check_unexplained_rows(judged: RowsUnderModel) -> Iterator[Diagnostic]:
     """Fit all joint zeros, a base and a tool to rows whose errors are too large for a calibrated robot."""
     limit = PLAUSIBLE_SHARE * judged.model.robot.reach
-    if judged.large and not judged.setup_faults and _left(judged) > limit:
+    if judged.has_large_errors and not judged.setup_faults and _left(judged) > limit:
         yield unexplained(judged.model)
 
 
 def _left(judged: RowsUnderModel) -> float:
     """Compute the RMS residual after the fit [m], corrected for its degrees of freedom."""
-    known, robot = judged.known, judged.model.robot
+    known, robot = judged.renamed_rows, judged.model.robot
     zeros = torch.zeros(known.dof, dtype=torch.float64)
     largest = (
         MAX_STEP * torch.tensor([1.0 if revolute else robot.reach for revolute in robot.revolute]).double()

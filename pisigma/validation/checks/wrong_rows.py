@@ -87,7 +87,7 @@ def _far_rows(
     judged = RowsUnderModel.from_rows(model, rows.select(numbers), fitted, ())
     if judged is None or judged.rows.rows != len(numbers):
         return None
-    far, texts = _far(judged, _fitted_to_usual_rows(judged) if judged.fitted else judged.unfitted)
+    far, texts = _far(judged, _fitted_to_usual_rows(judged) if judged.fitted else judged.poses_before_fit)
     return {int(numbers[row]): texts[row] for row in far.nonzero()[:, 0].tolist()}
 
 
@@ -119,7 +119,7 @@ def _fitted_to_usual_rows(judged: RowsUnderModel) -> Float64[Tensor, "rows 4 4"]
             position=torch.where(suspicious[:, None], T[:, :3, 3], judged.measured.position),
             rotation=torch.where(suspicious[:, None, None], T[:, :3, :3], judged.measured.rotation),
         )
-        T = fit_frames(judged.unfitted, usual, judged.rows, judged.fitted)[0]
+        T = fit_frames(judged.poses_before_fit, usual, judged.rows, judged.fitted)[0]
     return T
 
 

@@ -298,7 +298,7 @@ def summarise(result: Result) -> CalibrationSummary:
         warnings=geometric.warnings,
         rmse_mm=tuple(value * 1e3 for value in geometric.rms_path),
     )
-    return summary.having(hybrid=_hybrid(result)) if isinstance(result, HybridResult) else summary
+    return summary.with_figures(hybrid=_hybrid(result)) if isinstance(result, HybridResult) else summary
 
 
 def _parameters(result: CalibrationResult) -> tuple[ParameterFigures, ...]:

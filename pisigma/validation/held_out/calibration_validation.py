@@ -13,7 +13,7 @@ from pisigma.calibration.geometric.calibrator import GeometricCalibrator
 from pisigma.calibration.hybrid.result import HybridResult
 from pisigma.files.engines.processes import run_in_processes, run_in_threads
 from pisigma.files.errors import IdentificationError
-from pisigma.files.progress import Progress, silent, stage
+from pisigma.files.progress import Progress, ignore_progress, staged_progress
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.sensors.registry import SENSORS
 from pisigma.measurement.sensors.socket import PairOfSockets
@@ -29,12 +29,12 @@ from pisigma.validation.held_out.trained_calibrations import (
     DistanceErrors,
     Result,
     distance_figures,
+    drop_missing_frames,
+    fit_compared_calibrations,
     geometric_of,
     held_out_of_folds,
-    judgeable,
-    trained,
+    judgeable_rows,
     with_frames,
-    without_missing,
 )
 from pisigma.validation.held_out.validation_figures import LearningPoint, ValidationFigures
 
@@ -146,13 +146,13 @@ def _joined(measurements: Measurements, judged: Sequence[JudgedFold], folds: int
     """Combine the folds, in the order of the rows."""
     units = {SENSORS[kind].unit for kind in measurements.kinds if kind in SENSORS}
     turned = measurements.rotation is not None or "rad" in units
-    errors = {name: PoseErrors.unknown(measurements.rows, turned) for name in judged[0].errors}
+    errors = {name: PoseErrors.all_nan(measurements.rows, turned) for name in judged[0].errors}
     spread = None
     for fold in judged:
         for name, of_fold in fold.errors.items():
-            errors[name].put(fold.test, of_fold)
+            errors[name].set_rows(fold.test, of_fold)
         if fold.spread is not None:
-            spread = spread or PredictedSpread.unknown(measurements.rows)
+            spread = spread or PredictedSpread.all_nan(measurements.rows)
             spread.error[fold.test], spread.sigma[fold.test] = fold.spread.error, fold.spread.sigma
     distances = DistanceErrors.joined([fold.distances for fold in judged])
     frames, sockets, not_judged = (
@@ -194,7 +194,7 @@ def judged_folds(
     jobs: int | None = None,
 ) -> Iterator[JudgedFold]:
     """Judge every fold of every repeat, in threads or processes; see `fold_tasks` and `validate`."""
-    tasks = fold_tasks(calibrator, measurements, repeats, progress if jobs is None else silent)
+    tasks = fold_tasks(calibrator, measurements, repeats, progress if jobs is None else ignore_progress)
     return (
         run_in_threads(tasks, measurements.rows > FEW_ROWS) if jobs is None else run_in_processes(tasks, jobs)
     )
@@ -218,7 +218,7 @@ def fold_tasks(
     for number, splits in enumerate(repeats, 1):
         of_repeat = progress
         if len(repeats) > 1:
-            of_repeat = stage(progress, f"repeat {number} of {len(repeats)}", ", ")
+            of_repeat = staged_progress(progress, f"repeat {number} of {len(repeats)}", ", ")
         held_out = held_out_of_folds(geometric_of(calibrator).socket_distances, measurements, splits)
         for fold, (split, without) in enumerate(zip(splits, held_out, strict=True), 1):
             name = f"fold {fold} of {len(splits)}"
@@ -246,11 +246,11 @@ def _judged_fold(
     progress(fold)
     train, test = split
     training = measurements.select(train)
-    judged_rows = test[judgeable(measurements, test, training)]
+    judged_rows = test[judgeable_rows(measurements, test, training)]
     held_out = measurements.select(judged_rows)
-    chosen = without_missing(calibrator, training, measurements, distances)
+    chosen = drop_missing_frames(calibrator, training, measurements, distances)
     try:
-        results = trained(chosen, training, stage(progress, fold))
+        results = fit_compared_calibrations(chosen, training, staged_progress(progress, fold))
     except IdentificationError as problem:
         raise IdentificationError(
             f"{fold}, calibrated with {training.rows} of the {measurements.rows} rows: {problem} A calibration with "
@@ -300,7 +300,7 @@ def learning_curve(
     points = []
     for rows in sorted(sizes):
         fewer = with_fewer(measurements, splits, rows, seed)
-        of_rows = stage(progress, f"{rows} training rows")
+        of_rows = staged_progress(progress, f"{rows} training rows")
         points.append((rows, validate(calibrator, measurements, fewer, of_rows, jobs)))
     if whole is not None:
         points.append((min(len(train) for train, _ in splits), whole))
@@ -325,7 +325,7 @@ def judge(
     Raises:
         IdentificationError: a test row has a frame or target that was not calibrated.
     """
-    results = trained(calibrator, training, result=result)
+    results = fit_compared_calibrations(calibrator, training, result=result)
     return _joined(test, [_judge(None, results, test, {}, test)], 0)
 
 

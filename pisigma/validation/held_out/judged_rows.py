@@ -170,7 +170,7 @@ def predicted_at(model: CalibratedModel, rows: Measurements) -> Float64[Tensor, 
     return predicted
 
 
-def inside(model: CalibratedModel, q: Float64[Tensor, "rows dof"]) -> Bool[Tensor, " rows"]:
+def is_inside_range(model: CalibratedModel, q: Float64[Tensor, "rows dof"]) -> Bool[Tensor, " rows"]:
     """Say whether every joint value is in the measured range; always true if the model does not store it."""
     if model.hybrid is None:
         return torch.ones(len(q), dtype=torch.bool)
@@ -192,7 +192,7 @@ def _judged(
         residual=residual,
         residual_origin=origins[1],
         predicted=predicted_at(model, rows),
-        inside=inside(model, rows.q),
+        inside=is_inside_range(model, rows.q),
     )
 
 
@@ -229,7 +229,7 @@ def _errors(
     rotation = None
     if rows.rotation is not None:
         turned = Measurements(q=rows.q, position=T[:, :3, 3].nan_to_num(), rotation=rows.rotation)
-        rotation = PoseErrors.between(turned, T).rotation
+        rotation = PoseErrors.from_prediction(turned, T).rotation
     return PoseErrors(residual.norm(dim=-1), rotation), residual
 
 

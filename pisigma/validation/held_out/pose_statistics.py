@@ -40,7 +40,7 @@ class ErrorVectors:
     rotation: Float64[Tensor, "rows 3"] | None
 
     @staticmethod
-    def between(measurements: Measurements, expected: Float64[Tensor, "rows 4 4"]) -> "ErrorVectors":
+    def from_prediction(measurements: Measurements, expected: Float64[Tensor, "rows 4 4"]) -> "ErrorVectors":
         """Compute the errors of measurements relative to predicted poses T_base_tool.
 
         Raises:
@@ -80,17 +80,17 @@ class PoseErrors:
     rotation: Float64[Tensor, " rows"] | None
 
     @staticmethod
-    def between(measurements: Measurements, expected: Float64[Tensor, "rows 4 4"]) -> "PoseErrors":
-        """Compute the errors of measurements relative to predicted poses; see `ErrorVectors.between`."""
-        return ErrorVectors.between(measurements, expected).sizes
+    def from_prediction(measurements: Measurements, expected: Float64[Tensor, "rows 4 4"]) -> "PoseErrors":
+        """Compute the errors of measurements relative to predicted poses; see `ErrorVectors.from_prediction`."""
+        return ErrorVectors.from_prediction(measurements, expected).sizes
 
     @staticmethod
-    def unknown(rows: int, turned: bool) -> "PoseErrors":
+    def all_nan(rows: int, turned: bool) -> "PoseErrors":
         """Make errors that are all NaN, with orientations or without."""
         nothing = torch.full((rows,), torch.nan, dtype=torch.float64)
         return PoseErrors(nothing, nothing.clone() if turned else None)
 
-    def put(self, rows: Int64[Tensor, " some"], errors: "PoseErrors") -> None:
+    def set_rows(self, rows: Int64[Tensor, " some"], errors: "PoseErrors") -> None:
         """Set the errors of some rows in place; rotations only if both have some."""
         self.position[rows] = errors.position
         if self.rotation is not None and errors.rotation is not None:
@@ -104,7 +104,7 @@ class PoseErrors:
             torch.cat([errors.position for errors in several]), torch.cat(rotations) if rotations else None
         )
 
-    def only(self, rows: Bool[Tensor, " rows"]) -> "PoseErrors":
+    def mask_other_rows(self, rows: Bool[Tensor, " rows"]) -> "PoseErrors":
         """Set the errors of all other rows to NaN."""
         position = torch.where(rows, self.position, torch.nan)
         return PoseErrors(
@@ -180,7 +180,7 @@ class Comparison:
     def from_errors(nominal: PoseErrors, corrected: PoseErrors) -> "Comparison":
         """Compare on the rows for which both have errors."""
         both = ~(torch.isfinite(nominal.position) & torch.isnan(corrected.position))
-        return Comparison(nominal.only(both), corrected, int((~both).sum()))
+        return Comparison(nominal.mask_other_rows(both), corrected, int((~both).sum()))
 
 
 def compare_on(model: CalibratedModel, measurements: Measurements) -> Comparison:
@@ -190,7 +190,7 @@ def compare_on(model: CalibratedModel, measurements: Measurements) -> Comparison
         MeasurementError: there are no positions, or the model does not have a frame or target.
     """
     nominal, corrected = (
-        PoseErrors.between(measurements, poses(model, measurements))
+        PoseErrors.from_prediction(measurements, poses(model, measurements))
         for poses in (nominal_poses_of_rows, poses_of_rows)
     )
     return Comparison.from_errors(nominal, corrected)
@@ -210,7 +210,7 @@ class PredictedSpread:
     sigma: Float64[Tensor, "rows 3"]
 
     @staticmethod
-    def unknown(rows: int) -> "PredictedSpread":
+    def all_nan(rows: int) -> "PredictedSpread":
         """Make a spread that is all NaN."""
         nothing = torch.full((rows, 3), torch.nan, dtype=torch.float64)
         return PredictedSpread(nothing, nothing.clone())
@@ -255,7 +255,7 @@ def predicted_spread(result: HybridResult, measurements: Measurements) -> Predic
     Raises:
         IdentificationError: a row has a target that was not calibrated.
     """
-    spread = PredictedSpread.unknown(measurements.rows)
+    spread = PredictedSpread.all_nan(measurements.rows)
     errors = result.errors_of(measurements).get("position")
     if measurements.position is None or errors is None:
         return spread

@@ -29,7 +29,7 @@ class AbstractSummary(Section):
         """Return everything that is set as JSON values, by name."""
         return self.model_dump(mode="json", exclude_unset=True)
 
-    def having(self: Summary, **figures: object) -> Summary:
+    def with_figures(self: Summary, **figures: object) -> Summary:
         """Return a copy with more figures; those that are None are left out."""
         return self.model_copy(update={name: value for name, value in figures.items() if value is not None})
 

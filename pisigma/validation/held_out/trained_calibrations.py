@@ -53,7 +53,7 @@ def fit(calibrator: Calibrator, rows: Measurements, progress: Progress) -> Resul
     )
 
 
-def trained(
+def fit_compared_calibrations(
     calibrator: Calibrator,
     rows: Measurements,
     progress: Progress = lambda what: None,
@@ -85,7 +85,7 @@ def base_and_tool(calibrator: GeometricCalibrator) -> GeometricCalibrator:
     return replace(calibrator, free=(), loss=SquaredLoss())
 
 
-def without_missing(
+def drop_missing_frames(
     calibrator: Calibrator,
     rows: Measurements,
     of: Measurements,
@@ -100,7 +100,7 @@ def without_missing(
         held_out: socket distances to remove in addition.
     """
     if isinstance(calibrator, HybridCalibrator):
-        geometric = without_missing(calibrator.geometric, rows, of, held_out)
+        geometric = drop_missing_frames(calibrator.geometric, rows, of, held_out)
         assert isinstance(geometric, GeometricCalibrator)
         return replace(calibrator, robot=geometric)
     no_frame = set(of.frame) - set(rows.frame)
@@ -149,7 +149,7 @@ def with_frames(calibrator: GeometricCalibrator, result: Result, rows: Measureme
     learned = result.learned
     if learned is not None:
         with torch.no_grad():
-            moved = replace(missed, q=missed.q + learned.correction.of_rows(missed))
+            moved = replace(missed, q=missed.q + learned.correction.for_rows(missed))
         learned_bases = learned.geometry.bases | _bases(calibrator, learned.geometry.robot, moved)
         learned = replace(learned, geometry=replace(learned.geometry, bases=learned_bases))
     return replace(result, geometric=replace(geometric, bases=bases), learned=learned)
@@ -173,7 +173,7 @@ def _bases(
     return only_bases.fit(rows).bases
 
 
-def judgeable(measurements: Measurements, test: Tensor, training: Measurements) -> Tensor:
+def judgeable_rows(measurements: Measurements, test: Tensor, training: Measurements) -> Tensor:
     """Say which test rows have a target, and an anchor (or its stated position), that the training rows have.
 
     Args:
@@ -199,7 +199,7 @@ def judgeable(measurements: Measurements, test: Tensor, training: Measurements) 
     if not any(rows_judged):
         raise IdentificationError(
             "neither this row nor any other row held out with it has a target and an anchor that other rows have",
-            at=measurements.at(rows[0]),
+            at=measurements.place_of(rows[0]),
             remedy="measure more poses with each, or omit the cross-validation",
         )
     return torch.tensor(rows_judged, device=test.device)

@@ -56,10 +56,10 @@ class Accuracy:
     @property
     def unit(self) -> str:
         """Unit of the leading quantity: "mm" of positions, "deg" of orientations where no position was measured."""
-        return "deg" if self.last.rms_mm is None else "mm"
+        return "deg" if self.model_figures.rms_mm is None else "mm"
 
     @property
-    def last(self) -> ErrorFigures:
+    def model_figures(self) -> ErrorFigures:
         """Error figures of the model of the report."""
         return list(self.models.values())[-1]
 
@@ -70,7 +70,7 @@ class Accuracy:
             statistic: "rms", "mean", "p95" or "max".
             model: name of a model; "" for the model of the report.
         """
-        return float(getattr(self.models[model] if model else self.last, f"{statistic}_{self.unit}"))
+        return float(getattr(self.models[model] if model else self.model_figures, f"{statistic}_{self.unit}"))
 
     @property
     def factor(self) -> float | None:
@@ -189,14 +189,14 @@ class AccuracyLimit:
     limitations: tuple[str, ...] = ()
 
     @property
-    def share(self) -> float | None:
+    def scatter_share(self) -> float | None:
         """Share of the scatter in the squared error; None if it is unknown or the scatter exceeds the error."""
         return None if self.noise is None or self.noise >= self.error else (self.noise / self.error) ** 2
 
     @property
-    def mostly_scatter(self) -> bool:
+    def is_mostly_scatter(self) -> bool:
         """Whether scatter makes up most of the squared error."""
-        return self.share is not None and self.share >= DOMINANT_SHARE
+        return self.scatter_share is not None and self.scatter_share >= DOMINANT_SHARE
 
 
 def limit_of(

@@ -143,7 +143,7 @@ def correction_curves(model: CalibratedModel) -> tuple[CorrectionCurve, ...]:
         at[:, j] = torch.linspace(*_range(robot, q, j), POINTS_PER_CURVE, dtype=torch.float64)
         measured = torch.ones(POINTS_PER_CURVE, dtype=torch.bool)
         if hybrid is not None:
-            measured = hybrid.coverage.beyond(at)[:, j] <= MEASURED_ROUNDING
+            measured = hybrid.coverage.distance_outside(at)[:, j] <= MEASURED_ROUNDING
         curve = correction_at(model, at)[:, j]
         if not (bool((curve != 0).any()) or bool((at_rows[:, j] != 0).any())):
             continue

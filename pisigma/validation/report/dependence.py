@@ -53,7 +53,7 @@ class BinTest:
         return self.p < SIGNIFICANT
 
     @property
-    def notable(self) -> bool:
+    def is_notable(self) -> bool:
         """Whether the RMS errors of bins differ by `NOTABLE_RATIO` or more."""
         return self.high >= NOTABLE_RATIO * self.low
 
@@ -259,7 +259,7 @@ def _over_joint(values: np.ndarray, errors: np.ndarray, groups: np.ndarray) -> B
     """Test errors against a joint's values; rows of equal joint values count once."""
     if len(errors) < 3 or np.ptp(values) == 0:
         return "joint not moved"
-    bins = binned(values, errors)
+    bins = bin_errors(values, errors)
     if np.isnan(bins.rms).all():
         return "too few rows"
     # repeated rows are not independent: each joint configuration enters the test with its mean error
@@ -308,7 +308,7 @@ def root_mean_square(values: Float64[np.ndarray, " values"]) -> float:
     return float(np.sqrt(np.mean(values**2))) if len(values) else math.nan
 
 
-def binned(
+def bin_errors(
     values: Float64[np.ndarray, " rows"], errors: Float64[np.ndarray, " rows"], bins: int = MAX_BINS
 ) -> Binned:
     """Compute RMS errors in bins of equal width; of few rows in fewer bins."""

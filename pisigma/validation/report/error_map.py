@@ -12,7 +12,7 @@ from torch import Tensor
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.robot.kinematics.forward import forward_kinematics
-from pisigma.validation.held_out.judged_rows import JudgedRows, inside, place_of, predicted_at
+from pisigma.validation.held_out.judged_rows import JudgedRows, is_inside_range, place_of, predicted_at
 
 MAX_POINTS = 20_000
 """Points of a map; of more rows the largest errors and an even selection of the others are shown."""
@@ -151,6 +151,6 @@ def _map(
         points.q.numpy() * factor,
         points.frame,
         points.target,
-        inside(model, points.q).numpy(),
+        is_inside_range(model, points.q).numpy(),
         *about,
     )

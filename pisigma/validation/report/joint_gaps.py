@@ -41,7 +41,7 @@ class JointGap:
     whole_turn: bool
 
     @property
-    def moved(self) -> bool:
+    def was_moved(self) -> bool:
         """Whether the joint was moved at all."""
         return self.share >= NOT_MOVED
 

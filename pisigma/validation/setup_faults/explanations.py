@@ -73,7 +73,7 @@ def largest_explained(here: Hypothesis, reach: float) -> float:
     return min(COLLAPSED * here.error, PLAUSIBLE_SHARE * reach)
 
 
-def simplest(hypotheses: Sequence[Hypothesis], most: float) -> list[Hypothesis]:
+def choose_simplest(hypotheses: Sequence[Hypothesis], most: float) -> list[Hypothesis]:
     """Choose the simplest of the hypotheses that explain the errors about equally well, to at most `most` [m].
 
     The remaining errors must also be small relative to the spread of the poses, which a wrong unit can shrink.
@@ -92,22 +92,22 @@ def simplest(hypotheses: Sequence[Hypothesis], most: float) -> list[Hypothesis]:
 
 def hypotheses(arm: PredictingArm, some: Measurements, here: Hypothesis, most: float) -> Iterator[Hypothesis]:
     """Yield all hypotheses that may explain the errors to `most` [m]; the first is that nothing is wrong."""
-    yield from in_frames(arm, some, here, most)
+    yield from frame_hypotheses(arm, some, here, most)
     for measured, cause in units_and_frames(here.measured, here.T[:, :3, 3], "corner" in some.kinds):
-        yield from in_frames(arm, some, replace(here, measured=measured, causes=(cause,)), most)
+        yield from frame_hypotheses(arm, some, replace(here, measured=measured, causes=(cause,)), most)
     if arm.model is not None:
         for T, cause in _other_corrections(arm.model, some):
-            yield from in_frames(arm, some, here.with_cause(cause, T, fitted=0), most)
+            yield from frame_hypotheses(arm, some, here.with_cause(cause, T, fitted=0), most)
     if not here.error > SMALL_SHARE * arm.robot.reach:
         return
     for measured, cause in _likely_conventions(arm, here):
-        yield from in_frames(arm, some, replace(here, measured=measured, causes=(cause,)), most)
+        yield from frame_hypotheses(arm, some, replace(here, measured=measured, causes=(cause,)), most)
     maps = likely_maps(arm, some, here.measured)
     for number, q in enumerate(maps.apply(some.q)):
         T = arm.poses(replace(some, q=q))
         if bool(torch.isfinite(T).all()):
             causes = joint_causes(maps, number, arm.robot)
-            yield from in_frames(arm, some, Hypothesis(q, T, here.measured, causes, 1), most)
+            yield from frame_hypotheses(arm, some, Hypothesis(q, T, here.measured, causes, 1), most)
 
 
 def _likely_conventions(arm: PredictingArm, here: Hypothesis) -> Iterator[tuple[MeasuredPoses, Cause]]:
@@ -146,7 +146,7 @@ def _other_corrections(
     yield T_less, Cause("correction", clause, advice, 1.0, amount=-1.0)
 
 
-def in_frames(
+def frame_hypotheses(
     arm: PredictingArm, some: Measurements, here: Hypothesis, most: float = math.inf
 ) -> Iterator[Hypothesis]:
     """Yield a hypothesis as it is, and with another frame, another tool, and both; without a model, both are fitted.
@@ -194,7 +194,7 @@ def _moved(
     Args:
         kind: "frame" or "tool".
         X: its motions.
-        frames: its poses before the motion, in the coordinates of `X`; None for their origin.
+        frames: its poses before the motion, in the coordinates of `jacobian`; None for their origin.
     """
     what, advice = _MOVED[kind]
     origin = torch.zeros(3, 1).to(X) if frames is None else frames[:, :3, 3:]

@@ -95,7 +95,9 @@ class PredictingArm:
         if self.model is None:
             return bound[None]
         fitted = best_base(T, measured)[..., None, :, :] @ T
-        return torch.stack([measured.squares(T).mean(-1), measured.squares(fitted).mean(-1), bound])
+        return torch.stack(
+            [measured.squared_errors(T).mean(-1), measured.squared_errors(fitted).mean(-1), bound]
+        )
 
     def _screened(self, rows: Measurements, q: Tensor, measured: MeasuredPoses) -> Tensor:
         if self.model is None:
@@ -136,7 +138,7 @@ class Hypothesis:
         spare = self.measured.values - self.fitted
         if spare < MIN_FREEDOM:
             return float("inf")
-        mean = float(self.measured.squares(self.T).mean()) * self.measured.values / spare
+        mean = float(self.measured.squared_errors(self.T).mean()) * self.measured.values / spare
         return float(np.sqrt(mean)) if np.isfinite(mean) else float("inf")
 
     def rms(self) -> tuple[float, float]:
@@ -145,7 +147,7 @@ class Hypothesis:
         R = (self.measured.rotation @ self.T[:, :3, :3].mT)[self.measured.has_rotation]
         return position, float(rotation_vector(R).square().sum(-1).mean().sqrt())
 
-    def without(self, kinds: Set[str]) -> "Hypothesis":
+    def without_causes(self, kinds: Set[str]) -> "Hypothesis":
         """Remove causes of some kinds, which are not reported."""
         return replace(self, causes=tuple(cause for cause in self.causes if cause.kind not in kinds))
 
@@ -199,7 +201,7 @@ def _shifted_from_a_row(
     third = len(chosen) // ENDS
     for at_start, end in ((True, chosen[:third] - MARGIN), (False, chosen[-third:] - MARGIN)):
         base, tool = best_base_and_tool(T[0][end], measured.select(end))
-        errors = {shift: measured.squares(base @ poses @ tool) for shift, poses in T.items()}
+        errors = {shift: measured.squared_errors(base @ poses @ tool) for shift, poses in T.items()}
         for shift in SHIFTS:
             gain = errors[0] - errors[shift] if at_start else errors[shift] - errors[0]
             change = int(gain.flip(0).cumsum(0).flip(0).argmax())
@@ -217,7 +219,7 @@ def _count(shift: int) -> str:
     return "one row" if abs(shift) == 1 else f"{abs(shift)} rows"
 
 
-def freed_joints(
+def estimate_joint_values(
     robot: Robot, rows: Measurements, measured: MeasuredPoses
 ) -> list[tuple[Float64[Tensor, "rows dof"], Cause]]:
     """Estimate the values of each revolute joint, with those of the others as logged.
@@ -251,7 +253,7 @@ def _freed(
     for number in range(MAX_ITERATIONS):
         turned, free = _turned(robot, rows, joint, tried[0], tried[1], measured)
         T = forward_kinematics(robot, turned)
-        error = measured.squares(tried[1][0] @ T @ tried[1][1]).sum()
+        error = measured.squared_errors(tried[1][0] @ T @ tried[1][1]).sum()
         if error < cost:
             settled = bool(cost - error < CONVERGENCE_TOLERANCE * cost)
             first = error if number == 0 else first

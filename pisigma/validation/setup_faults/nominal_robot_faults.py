@@ -22,19 +22,19 @@ from pisigma.robot.robot_class import HOBBY
 from pisigma.validation.setup_faults.cause import Cause, joined
 from pisigma.validation.setup_faults.explanations import (
     AS_GOOD,
+    choose_simplest,
+    frame_hypotheses,
     hypotheses,
-    in_frames,
     largest_explained,
-    simplest,
 )
 from pisigma.validation.setup_faults.hypothesis import (
     MARGIN,
     Hypothesis,
     PredictingArm,
-    freed_joints,
+    estimate_joint_values,
     shifted_rows,
 )
-from pisigma.validation.setup_faults.setup_fault import SetupFault, fault_of
+from pisigma.validation.setup_faults.setup_fault import SetupFault, fault_from_hypothesis
 
 MAX_ROWS = 1_000
 """Rows that hypotheses are tried on, evenly over all rows."""
@@ -84,7 +84,7 @@ def find_nominal_robot_faults(robot: Robot, measurements: Measurements) -> tuple
     some, arm = rows.select(chosen), PredictingArm(robot)
     measured = MeasuredPoses.from_tensors(some.position, some.rotation, LEVER_SHARE * robot.reach)
     raw = Hypothesis(some.q, arm.poses(some), measured)
-    here, usual = next(in_frames(arm, some, raw)), usual_error(robot, some.q)
+    here, usual = next(frame_hypotheses(arm, some, raw)), usual_error(robot, some.q)
     if len(set(measurements.target)) > 1:
         named = _named_otherwise(robot, measurements, usual)
         if named or not here.error > usual:
@@ -96,13 +96,15 @@ def find_nominal_robot_faults(robot: Robot, measurements: Measurements) -> tuple
         *hypotheses(arm, some, raw, most),
         *_with_joints(arm, shifted_rows(robot, rows, chosen, measured), most),
     ]
-    faults = simplest(tried, most)
+    faults = choose_simplest(tried, most)
     if not faults and not are_unrelated(robot, rows):
-        freed = ((q, measured, cause) for q, cause in freed_joints(robot, some, measured))
-        faults = simplest(_with_joints(arm, freed, most, values=1) + _labelled(some, raw.T, measured), most)
+        freed = ((q, measured, cause) for q, cause in estimate_joint_values(robot, some, measured))
+        faults = choose_simplest(
+            _with_joints(arm, freed, most, values=1) + _labelled(some, raw.T, measured), most
+        )
     if faults:
         faults = _better_than_zeros(faults, _error_with_zeros(robot, some, measured), usual)
-    return tuple(fault_of(here, other, float("nan")) for other in faults)
+    return tuple(fault_from_hypothesis(here, other, float("nan")) for other in faults)
 
 
 def _better_than_zeros(faults: Sequence[Hypothesis], error: float, usual: float) -> list[Hypothesis]:
@@ -133,7 +135,7 @@ def _error_with_zeros(robot: Robot, rows: Measurements, measured: MeasuredPoses)
     if np.abs(moved[:, 0]).max() > MAX_ZERO or np.abs(moved[:, 1]).max() > MAX_SLIDE:
         return math.inf
     arm = PredictingArm(robot.with_geometry(dh=fitted.dh))
-    here = next(in_frames(arm, rows, Hypothesis(rows.q, arm.poses(rows), measured)))
+    here = next(frame_hypotheses(arm, rows, Hypothesis(rows.q, arm.poses(rows), measured)))
     return replace(here, fitted=here.fitted + robot.dof).error
 
 
@@ -151,7 +153,8 @@ def _named_otherwise(robot: Robot, measurements: Measurements, usual: float) -> 
         return ()
     most = largest_explained(here, robot.reach)
     return tuple(
-        fault_of(here, other, float("nan")) for other in simplest(_labelled(rows, T, measured), most)
+        fault_from_hypothesis(here, other, float("nan"))
+        for other in choose_simplest(_labelled(rows, T, measured), most)
     )
 
 
@@ -183,7 +186,7 @@ def _with_joints(
         other
         for q, measured, cause in tried
         for rows in [Measurements(q=q)]
-        for other in in_frames(
+        for other in frame_hypotheses(
             arm, rows, Hypothesis(q, arm.poses(rows), measured, (cause,), values * len(q)), most
         )
     ]
@@ -309,7 +312,7 @@ def fit_targets(
         of_rows[:, :3, 3] += (T[:, :3, :3] @ places[number][..., None])[..., 0]
         base, tool = best_base_and_tool(of_rows, measured)
         fitted = base @ of_rows @ tool
-        error = float(measured.squares(fitted).mean())
+        error = float(measured.squared_errors(fitted).mean())
         if error > (1 - TARGET_TOLERANCE) * last:
             break
         last = error

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float64, Int64
 
 from pisigma.calibration.geometric.initial_guess.initial_guess import chosen_rows
-from pisigma.calibration.geometric.problem.noise import ALWAYS_GOOD, UNDETERMINED, renumbered, view_of
+from pisigma.calibration.geometric.problem.noise import ALWAYS_GOOD, UNDETERMINED, renumber, sensor_view_of
 from pisigma.calibration.geometric.problem.problem import CalibrationProblem
 from pisigma.calibration.geometric.result import CalibrationResult
 from pisigma.calibration.hybrid.result import HybridResult
@@ -57,7 +57,7 @@ class OrderedRows:
         learned = result.learned if isinstance(result, HybridResult) else None
         geometric = result.geometric if isinstance(result, HybridResult) else result
         solved = geometric.solved
-        data, view, rows = solved.measurements, view_of(solved.refined), solved.setup.rows.cpu()
+        data, view, rows = solved.measurements, sensor_view_of(solved.refined), solved.setup.rows.cpu()
         errors = None if learned is None else result.errors_of(data)
         present = [sensor.present for sensor in solved.problem.sensors if sensor.name in SENSORS]
         if not present:
@@ -124,7 +124,7 @@ class OrderedRows:
         return derivative
 
     @cached_property
-    def X(self) -> Float64[np.ndarray, "rows values unknowns"]:
+    def jacobian(self) -> Float64[np.ndarray, "rows values unknowns"]:
         """Derivative by the parameters of the calibration, and by the weights of a series of joint errors."""
         robot = self.problem.space.robot
         series = FourierSeries(robot, HARMONICS).columns(self.problem.state).cpu().numpy()
@@ -137,40 +137,45 @@ class OrderedRows:
         """Prior precision (1 / variance) of the parameters and of the weights."""
         robot = self.problem.space.robot
         active = self.problem.precision[self.problem.active]
-        precision = view_of(self.result.solved.refined).scaled(active, self.problem.prior_group).cpu().numpy()
+        precision = (
+            sensor_view_of(self.result.solved.refined)
+            .scaled_precision(active, self.problem.prior_group)
+            .cpu()
+            .numpy()
+        )
         size = JOINT_ERROR * np.where(robot.revolute, 1.0, robot.reach)
-        weights: np.ndarray = np.repeat(size**-2, (self.X.shape[2] - len(precision)) // robot.dof)
+        weights: np.ndarray = np.repeat(size**-2, (self.jacobian.shape[2] - len(precision)) // robot.dof)
         return np.concatenate([precision, weights])
 
     @cached_property
     def covariance(self) -> Float64[np.ndarray, "unknowns unknowns"]:
         """Covariance of the parameters and weights, with full weight of all rows."""
-        flat = self.X.reshape(-1, self.X.shape[2])
+        flat = self.jacobian.reshape(-1, self.jacobian.shape[2])
         return inverse_of(flat.T @ flat + np.diag(self.precision))
 
     @cached_property
-    def left(self) -> Float64[np.ndarray, "rows values"]:
+    def residual_after_fit(self) -> Float64[np.ndarray, "rows values"]:
         """Residuals after fitting the parameters and the series of joint errors."""
-        X, r = self.X.reshape(-1, self.X.shape[2]), self.residual.ravel()
+        X, r = self.jacobian.reshape(-1, self.jacobian.shape[2]), self.residual.ravel()
         left: np.ndarray = r - X @ (self.covariance @ (X.T @ r))
         return left.reshape(self.residual.shape)
 
     @cached_property
-    def used(self) -> float:
+    def effective_parameters(self) -> float:
         """Effective number of parameters and weights."""
-        return float((self.X * (self.X @ self.covariance)).sum())
+        return float((self.jacobian * (self.jacobian @ self.covariance)).sum())
 
     @cached_property
     def configuration(self) -> Int64[np.ndarray, " rows"] | None:
         """Number of every row's configuration (joint values and frame, or target too); None if all rows differ."""
         group = self.problem.pose if self.problem.configuration is None else self.problem.configuration
-        return None if group is None else renumbered(group).cpu().numpy()
+        return None if group is None else renumber(group).cpu().numpy()
 
     @property
-    def independent(self) -> float:
+    def degrees_of_freedom(self) -> float:
         """Degrees of freedom after the calibration, with at most one pose per configuration."""
         count = len(self.residual) if self.configuration is None else int(self.configuration.max()) + 1
-        return min(self.values, VALUES_PER_POSE * count) - self.used
+        return min(self.values, VALUES_PER_POSE * count) - self.effective_parameters
 
 
 def inverse_of(normal: Float64[np.ndarray, "unknowns unknowns"]) -> Float64[np.ndarray, "unknowns unknowns"]:

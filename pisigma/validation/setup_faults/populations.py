@@ -80,10 +80,10 @@ def find_populations(rows: OrderedRows, count: int) -> Populations | None:
         return None
     index = np.unique(np.linspace(0, len(rows.residual) - 1, MAX_ROWS).round().astype(int))
     some = index if len(rows.residual) > MAX_ROWS else np.arange(len(rows.residual))
-    independent = rows.independent / max(rows.values - rows.used, 1.0)
+    independent = rows.degrees_of_freedom / max(rows.values - rows.effective_parameters, 1.0)
     found = []
     for differing, Z, precision in _differences(rows):
-        fit = _Mixture(rows, Z, precision).best(some)
+        fit = _Mixture(rows, Z, precision).fit_from_starts(some)
         if fit.used > _most_used(rows.residual.shape[1]) * fit.values:
             continue
         second = np.zeros(count, dtype=bool)
@@ -138,7 +138,7 @@ def _differences(
         Z = rows.by_motion(kind)[1]
         yield differing, Z, np.zeros(Z.shape[2])
     active = len(rows.problem.active)
-    yield "arm", rows.X[:, :, :active], rows.precision[:active] / DIFFERENCE
+    yield "arm", rows.jacobian[:, :, :active], rows.precision[:active] / DIFFERENCE
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,9 +178,9 @@ class _Mixture:
     Z: Float64[np.ndarray, "rows values numbers"]
     precision: Float64[np.ndarray, " numbers"]
 
-    def best(self, some: Int64[np.ndarray, " some"]) -> _Fit:
+    def fit_from_starts(self, some: Int64[np.ndarray, " some"]) -> _Fit:
         """Fit the mixture to some rows from several starts, and assign all rows to a population."""
-        r, X, Z = self.rows.residual[some], self.rows.X[some], self.Z[some]
+        r, X, Z = self.rows.residual[some], self.rows.jacobian[some], self.Z[some]
         rng = np.random.default_rng(0)
         starts = [np.arange(len(some)) % 2 * 0.8 + 0.1, *rng.uniform(0, 1, (STARTS - 1, len(some)))]
         alone = _Em(r, X, Z[:, :, :0], np.r_[self.rows.precision])
@@ -191,7 +191,7 @@ class _Mixture:
         difference = state.x[X.shape[2] :]
         made = float(np.square(Z @ difference).mean()) * state.share * (1 - state.share)
         left = state.variance * r.size / max(r.size - state.used, 1.0) * TAILS / (TAILS - 2)
-        every = _Em(self.rows.residual, self.rows.X, self.Z, em.precision)
+        every = _Em(self.rows.residual, self.rows.jacobian, self.Z, em.precision)
         return _Fit(
             probability=every.probabilities(state.x, state.share, state.variance)[0],
             difference=difference,
@@ -257,7 +257,7 @@ class _Em:
         inverse = inverse_of(normal)
         x = inverse @ np.concatenate([wX.T @ flat, wZ.T @ flat])
         used = float(np.einsum("ij,ji->", inverse, data))
-        squares = self.squares(x)
+        squares = self.squared_residuals(x)
         probability = np.stack([1 - state.probability, state.probability])
         variance = max(float((probability * state.weights * squares).sum()) / self.r.size, 1e-12)
         share = float(np.clip(state.probability.mean(), 1e-3, 1 - 1e-3))
@@ -265,7 +265,7 @@ class _Em:
         weights = (TAILS + values) / (TAILS + squares / variance)
         return _State(fresh, weights, x, share, variance, used, log_likelihood)
 
-    def squares(self, x: Float64[np.ndarray, " unknowns"]) -> Float64[np.ndarray, "2 rows"]:
+    def squared_residuals(self, x: Float64[np.ndarray, " unknowns"]) -> Float64[np.ndarray, "2 rows"]:
         """Compute the squared residuals of every row under either population."""
         common = self.X.shape[2]
         left = self.r - self.X @ x[:common]
@@ -276,7 +276,7 @@ class _Em:
     ) -> tuple[Float64[np.ndarray, " rows"], float]:
         """Compute the probability that a row belongs to the second population, and the log likelihood of all rows."""
         values = self.r.shape[1]
-        logs = -(TAILS + values) / 2 * np.log1p(self.squares(x) / variance / TAILS)
+        logs = -(TAILS + values) / 2 * np.log1p(self.squared_residuals(x) / variance / TAILS)
         if not self.Z.shape[2]:
             return np.zeros(len(self.r)), float(logs[0].sum()) - self.r.size / 2 * math.log(variance)
         logs = logs + np.log([1 - share, share])[:, None]

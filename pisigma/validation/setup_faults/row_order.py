@@ -213,17 +213,22 @@ class _Search:
 
     def _best_step(self, residual: Float64[np.ndarray, "rows values"], candidate: _Candidate) -> int:
         """Find the row of the sudden motion that explains most of the residuals, in closed form for all rows."""
-        index, Z, X = candidate.index, candidate.full, self.rows.X[candidate.index]
+        index, Z, X = candidate.index, candidate.full, self.rows.jacobian[candidate.index]
 
-        def behind(terms: np.ndarray) -> np.ndarray:
+        def sum_of_later_rows(terms: np.ndarray) -> np.ndarray:
             """Sum over each row and all later ones."""
             sums: np.ndarray = terms[::-1].cumsum(0)[::-1]
             return sums
 
         # Frisch-Waugh: eliminating x leaves `information · m = gain` for every row, with x's covariance in between.
-        ZX, ZZ = behind(np.einsum("nvm,nva->nma", Z, X)), behind(np.einsum("nvm,nvk->nmk", Z, Z))
-        pull = np.einsum("nva,nv->a", self.rows.X, residual)
-        gain = behind(np.einsum("nvm,nv->nm", Z, residual[index])) - ZX @ self.rows.covariance @ pull
+        ZX, ZZ = (
+            sum_of_later_rows(np.einsum("nvm,nva->nma", Z, X)),
+            sum_of_later_rows(np.einsum("nvm,nvk->nmk", Z, Z)),
+        )
+        pull = np.einsum("nva,nv->a", self.rows.jacobian, residual)
+        gain = (
+            sum_of_later_rows(np.einsum("nvm,nv->nm", Z, residual[index])) - ZX @ self.rows.covariance @ pull
+        )
         scale = 1 / np.sqrt(np.maximum(ZZ[0].diagonal(), 1e-300))
         information = (ZZ - ZX @ self.rows.covariance @ ZX.transpose(0, 2, 1)) * scale * scale[:, None]
         solution = np.linalg.solve(information + 1e-6 * np.eye(len(scale)), (scale * gain)[..., None])
@@ -245,7 +250,7 @@ class _Search:
         return fit if first == candidate.first else self.reweighted(candidate.from_row(first))
 
     @cached_property
-    def still(self) -> _Fit:
+    def fit_without_motion(self) -> _Fit:
         """The fit without a motion."""
         nothing = np.zeros((len(self.rows.residual), self.rows.residual.shape[1], 0))
         index = np.arange(len(self.rows.residual))
@@ -253,12 +258,12 @@ class _Search:
 
     def reweighted(self, candidate: _Candidate) -> _Fit:
         """Fit a candidate by iteratively reweighted least squares, starting with full weights."""
-        size, motions = self.rows.X.shape[2], candidate.columns.shape[2]
-        A = np.concatenate([self.rows.X, np.zeros((*self.rows.X.shape[:2], motions))], 2)
+        size, motions = self.rows.jacobian.shape[2], candidate.columns.shape[2]
+        A = np.concatenate([self.rows.jacobian, np.zeros((*self.rows.jacobian.shape[:2], motions))], 2)
         A[candidate.index, :, size:] = candidate.columns
         A = A.reshape(-1, size + motions)
         held = np.diag(np.concatenate([self.rows.precision, np.zeros(motions)]))
-        left = max(1 - (self.rows.used + motions) / self.rows.values, 1e-2)
+        left = max(1 - (self.rows.effective_parameters + motions) / self.rows.values, 1e-2)
         weight, scale = np.ones_like(self.rows.residual), np.ones(self.rows.residual.shape[1] // 3)
         for _ in range(MAX_ITERATIONS):
             weighted = A * (weight / np.repeat(scale, 3) ** 2).reshape(-1, 1)
@@ -287,9 +292,16 @@ class _Search:
         if fit.effective > MAX_USED * self.rows.values:
             return -math.inf
         values = max(
-            min((self.rows.values - self.rows.used) / values_per_independent, self.rows.independent), 1.0
+            min(
+                (self.rows.values - self.rows.effective_parameters) / values_per_independent,
+                self.rows.degrees_of_freedom,
+            ),
+            1.0,
         )
-        before = min(float(fit.costs(residual).sum()) for residual in (self.rows.residual, self.still.after))
+        before = min(
+            float(fit.costs(residual).sum())
+            for residual in (self.rows.residual, self.fit_without_motion.after)
+        )
         left = float(fit.costs(fit.after).sum()) / max(before, 1e-300)
         gain = (values - len(fit.motion)) * math.log1p(values) - values * math.log1p(values * min(left, 1.0))
         return gain / 2 - math.log(fit.candidate.tried)

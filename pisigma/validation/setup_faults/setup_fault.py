@@ -95,7 +95,7 @@ class SetupFault:
         return {"kinds": list(self.kinds), "sentence": self.sentence, **measured}
 
 
-def either(faults: Sequence[SetupFault]) -> SetupFault:
+def combine_alternatives(faults: Sequence[SetupFault]) -> SetupFault:
     """Combine faults that explain the errors about equally well, the best first, into one with alternatives."""
     clauses = dict.fromkeys(fault.clause for fault in faults)
     advice = dict.fromkeys(fault.advice for fault in faults)
@@ -112,7 +112,7 @@ def fault_of_cause(cause: Cause, before: float, after: float) -> SetupFault:
     )
 
 
-def fault_of(here: Hypothesis, other: Hypothesis, after_nominal: float) -> SetupFault:
+def fault_from_hypothesis(here: Hypothesis, other: Hypothesis, after_nominal: float) -> SetupFault:
     """Make the fault of a hypothesis, with the errors before (`here`) and after, and those of the nominal robot [m]."""
     (before, before_rotation), (after, after_rotation) = here.rms(), other.rms()
     return SetupFault(

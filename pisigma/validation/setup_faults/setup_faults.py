@@ -16,10 +16,10 @@ from pisigma.validation.held_out.model_comparison import ModelFigures
 from pisigma.validation.setup_faults.explanations import (
     PLAUSIBLE_SHARE,
     PLAUSIBLE_TURN,
+    choose_simplest,
+    frame_hypotheses,
     hypotheses,
-    in_frames,
     largest_explained,
-    simplest,
 )
 from pisigma.validation.setup_faults.hypothesis import Hypothesis, PredictingArm
 from pisigma.validation.setup_faults.joint_faults import NOTICED
@@ -29,7 +29,7 @@ from pisigma.validation.setup_faults.nominal_robot_faults import (
     measured_rows,
     spread,
 )
-from pisigma.validation.setup_faults.setup_fault import SetupFault, fault_of
+from pisigma.validation.setup_faults.setup_fault import SetupFault, fault_from_hypothesis
 
 CAUSES = {"base": "frame", "tool": "tool"}
 """Kind of the cause "moved" by the kind of frame."""
@@ -81,11 +81,11 @@ def find_setup_faults(
         return ()
     arm = PredictingArm(model.robot, model)
     most = largest_explained(here, model.robot.reach)
-    tried = in_frames(arm, known, here, most) if frames_only else hypotheses(arm, known, here, most)
+    tried = frame_hypotheses(arm, known, here, most) if frames_only else hypotheses(arm, known, here, most)
     free = {CAUSES[kind] for kind in fitted}
     faults = tuple(
-        fault_of(here, other.without(free), _nominal_error(nominal, known, other))
-        for other in simplest(list(tried), most)
+        fault_from_hypothesis(here, other.without_causes(free), _nominal_error(nominal, known, other))
+        for other in choose_simplest(list(tried), most)
         if not {cause.kind for cause in other.causes} <= free
     )
     if not faults and not frames_only:
@@ -99,7 +99,9 @@ def _nominal_error(nominal: CalibratedModel | None, some: Measurements, other: H
     if nominal is None or "correction" in kinds:
         return float("nan")
     T = poses_of_rows(nominal, replace(some, q=other.q))
-    tried = in_frames(PredictingArm(nominal.robot, nominal), some, Hypothesis(other.q, T, other.measured))
+    tried = frame_hypotheses(
+        PredictingArm(nominal.robot, nominal), some, Hypothesis(other.q, T, other.measured)
+    )
     wanted = kinds & {"frame", "tool"}
     return next(one.rms()[0] for one in tried if {cause.kind for cause in one.causes} == wanted)
 

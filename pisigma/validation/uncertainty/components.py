@@ -90,7 +90,7 @@ def scatter_component(model: CalibratedModel) -> Component | str:
     `s² = Σ r² / (n - p)` of the n residuals r with the effective number p of parameters, with `ν = n - p` degrees of
     freedom.
     """
-    sigma = math.nan if model.uncertainty is None else model.uncertainty.noise.absolute(POSITION)
+    sigma = math.nan if model.uncertainty is None else model.uncertainty.noise.standard_deviation(POSITION)
     if math.isnan(sigma):
         return f"{SCATTER}: the calibration did not estimate the standard deviation of a coordinate."
     noise = _noise(model)

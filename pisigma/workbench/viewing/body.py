@@ -184,7 +184,7 @@ def _surface(visual: Any, path: Path) -> Surface:
             f"the <visual> cannot be drawn: {type(problem).__name__}: {problem}",
             at=Place(path, visual.sourceline),
         ) from None
-    return Surface(mesh.vertices, mesh.faces).moved(T[:3, :3], T[:3, 3])
+    return Surface(mesh.vertices, mesh.faces).transformed(T[:3, :3], T[:3, 3])
 
 
 def _mesh(shape: Any, path: Path) -> "trimesh.Trimesh":

@@ -250,7 +250,7 @@ def draw_sight(
     beam = np.stack([surroundings.tracker.position.numpy(), T_base_tool[:3, 3]])
     scene.add_line_segments(f"{name}/beam", beam[None], SIGHT, thickness=BEAM * reach)
     if surroundings.reflector is not None:
-        cone = acceptance_cone(surroundings.reflector, CONE * reach).moved(
+        cone = acceptance_cone(surroundings.reflector, CONE * reach).transformed(
             T_base_tool[:3, :3], T_base_tool[:3, 3]
         )
         scene.add_mesh_simple(
@@ -273,4 +273,4 @@ def acceptance_cone(reflector: ReflectorSection, length: float) -> Surface:
     """
     half = np.deg2rad(reflector.acceptance_deg)
     cone = revolve(np.array([0.0, length * np.sin(half)]), np.array([0.0, length * np.cos(half)]))
-    return cone.moved(rotation_to(np.array(reflector.axis)), np.zeros(3))
+    return cone.transformed(rotation_to(np.array(reflector.axis)), np.zeros(3))

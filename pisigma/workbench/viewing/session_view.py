@@ -104,7 +104,7 @@ class SessionView:
         self._behind.close()
         self._front.close()
 
-    def show(self, state: SessionState) -> None:
+    def show_state(self, state: SessionState) -> None:
         """Show a state of the session on all open pages."""
         top = top_of_scale(state.rows)
         with self._lock, self._server.atomic():
@@ -116,7 +116,7 @@ class SessionView:
             if state.base is not None:
                 self._scene.show_sensor(state.base)
             self._scene.show_rows(state.rows, top, self._panel.magnification.value)
-            self._panel.show(state, top)
+            self._panel.show_state(state, top)
         self._server.flush()
 
     def _magnify(self, event: "viser.GuiEvent[Any]") -> None:
@@ -181,7 +181,7 @@ class SessionPanel:
         self.magnification = gui.add_slider("errors magnified by", min=0, max=2000, step=10, initial_value=0)
         self._rows = gui.add_html("")
 
-    def show(self, state: SessionState, top: float) -> None:
+    def show_state(self, state: SessionState, top: float) -> None:
         """Show a state of the session.
 
         Args:

@@ -21,7 +21,7 @@ class Surface:
     points: Float64[np.ndarray, "points 3"]
     faces: Int64[np.ndarray, "faces 3"]
 
-    def moved(self, R: Float64[np.ndarray, "3 3"], t: Float64[np.ndarray, " 3"]) -> "Surface":
+    def transformed(self, R: Float64[np.ndarray, "3 3"], t: Float64[np.ndarray, " 3"]) -> "Surface":
         """Return the surface after a rotation and a translation [m]."""
         return Surface(self.points @ R.T + t, self.faces)
 
@@ -55,7 +55,7 @@ def capsule(start: Float64[np.ndarray, " 3"], end: Float64[np.ndarray, " 3"], ra
     length = float(np.linalg.norm(end - start))
     angles = np.linspace(-np.pi / 2, np.pi / 2, 16)
     heights = radius * np.sin(angles) + np.where(angles > 0, length, 0.0)
-    return revolve(radius * np.cos(angles), heights).moved(rotation_to(end - start), start)
+    return revolve(radius * np.cos(angles), heights).transformed(rotation_to(end - start), start)
 
 
 def rotation_to(direction: Float64[np.ndarray, " 3"]) -> Float64[np.ndarray, "3 3"]:

@@ -157,7 +157,7 @@ class CellFile:
     def robot(self) -> str:
         """The robot as an argument of `Robot.load`."""
         name = self.document.robot
-        return name if robot_file(name) is None else str(inside(self.path.parent, name))
+        return name if robot_file(name) is None else str(path_inside_cell(self.path.parent, name))
 
     def stated(self, step: str) -> dict[str, Any]:
         """Return the values that the file states for a step, by its keys, including the shared keys that it uses."""
@@ -256,14 +256,14 @@ def _with_paths(
     known = by_key(group)
     for key, value in values.items():
         if key not in outside and known[key].kind is Path:
-            yield key, inside(folder, value)
+            yield key, path_inside_cell(folder, value)
         elif key not in outside and get_args(known[key].kind) == (Path,):
-            yield key, [inside(folder, one) for one in value]
+            yield key, [path_inside_cell(folder, one) for one in value]
         else:
             yield key, value
 
 
-def inside(folder: Path, path: str | os.PathLike[str]) -> Path:
+def path_inside_cell(folder: Path, path: str | os.PathLike[str]) -> Path:
     """Return the full path of a file that a cell states; it must be inside the cell.
 
     Raises:

@@ -255,7 +255,7 @@ class Sessions:
         events, parts = self.history.events(), []
         for one in sessions:
             days = newest_day(events, "instrument", one.day), newest_day(events, "tool", one.day)
-            parts.append(named(self.as_measured(one), *days))
+            parts.append(with_setup_names(self.as_measured(one), *days))
         if any(one.split is not None for one in parts):
             # all rows of a session without a column "set" are for calibration
             parts = [one if one.split else replace(one, split=("train",) * one.rows) for one in parts]
@@ -299,10 +299,10 @@ class Sessions:
         events = self.history.events()
         changed = {"base": "instrument", "tool": "tool"}
         moved = tuple(what for what, kind in changed.items() if model.day < newest_day(events, kind, day))
-        return ModelRows(named(rows, model.frame_day, model.target_day), moved)
+        return ModelRows(with_setup_names(rows, model.frame_day, model.target_day), moved)
 
 
-def named(rows: Measurements, frame_day: str, target_day: str) -> Measurements:
+def with_setup_names(rows: Measurements, frame_day: str, target_day: str) -> Measurements:
     """Return rows whose frame and target names state the day of their setup; "": the names of the file."""
     frame = tuple(since(name, frame_day) for name in rows.frame)
     target = tuple(since(name, target_day) for name in rows.target)

@@ -91,7 +91,7 @@ def estimate_fleet_prior(
     for some in rows.values():
         wide = with_limits_of_rows(wide, some)
     prior = fleet_prior(Path(source).resolve().stem, wide, list(rows.values()))
-    summary = summarise_prior(prior, list(rows)).having(
+    summary = summarise_prior(prior, list(rows)).with_figures(
         command=f"pisigma.estimate_fleet_prior({Path(source).name!r})", refused=refused, remarks=remarks
     )
     model = replace(prior.model, metrics=summary.to_json())

@@ -214,7 +214,10 @@ def test_what_the_data_do_not_determine_stays_nominal_and_is_reported() -> None:
     assert all("theta_5" in sentence or "alpha_5" in sentence for sentence in result.weak_directions)
     assert "target_on_axis" in [warning.kind for warning in result.warning_details]
     assert "prior" in result.parameter("alpha_5").label
-    assert result.redundancy.group("d_2") == "d_2 + d_3 + d_4 is identified, the single values are not"
+    assert (
+        result.redundancy.dependency_sentence_of("d_2")
+        == "d_2 + d_3 + d_4 is identified, the single values are not"
+    )
 
 
 def test_joint_offsets_alone() -> None:

@@ -42,7 +42,7 @@ def with_tool_off(off: float) -> Robot:
 @pytest.mark.parametrize("off", [0.0, 0.137, 0.3])
 def test_a_tool_that_is_not_nominal_is_found(sensor: str, off: float) -> None:
     result = GeometricCalibrator(with_tool_off(off)).fit(SENSORS[sensor]())
-    assert result.status.good
+    assert result.status.is_minimum
     assert_close(result.robot.tool[2], true_robot().geometric_robot.tool[2], atol=1e-3)
     assert all(found.sigma < 1e-6 for found in result.noise)
 
@@ -64,7 +64,7 @@ def test_neither_a_far_frame_nor_a_long_tool_has_to_be_drawn(anchors: int, off: 
     T = transform_from_xyzrpy(torch.tensor([2.5, -1.2, 0.4, 2.3, 0.1, -0.05], dtype=torch.float64))
     nominal = with_tool_off(off)
     result = GeometricCalibrator(nominal).fit(seen_from(T, anchors))
-    assert result.status.good
+    assert result.status.is_minimum
     assert result.noise[0].sigma < 1e-6
     if anchors == 3:
         found = transform_from_xyzrpy(torch.tensor(result.robot.base))
@@ -88,7 +88,7 @@ def test_anchors_at_stated_places_say_where_the_frame_is(anchors: int) -> None:
 @pytest.mark.parametrize("off", [0.0, 0.137])
 def test_sockets_with_stated_distances_find_the_tool(off: float) -> None:
     result = GeometricCalibrator(with_tool_off(off), socket_distances=SOCKETS).fit(socket_data())
-    assert result.status.good
+    assert result.status.is_minimum
     assert_close(result.robot.tool[2], true_robot().geometric_robot.tool[2], atol=1e-3)
 
 

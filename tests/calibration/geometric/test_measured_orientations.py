@@ -11,7 +11,7 @@ from testing.simulated_arm import BASE, TOOL, dh_errors
 from pisigma.calibration.geometric.calibrator import GeometricCalibrator
 from pisigma.calibration.geometric.prediction import predicted_poses
 from pisigma.calibration.geometric.problem import problem as calibration_problem
-from pisigma.calibration.geometric.problem.noise import SensorView, angle_disagreement, view_of
+from pisigma.calibration.geometric.problem.noise import SensorView, angle_disagreement, sensor_view_of
 from pisigma.calibration.geometric.result import CalibrationResult
 from pisigma.measurement.dataset import Measurements
 from pisigma.robot import Robot
@@ -59,7 +59,7 @@ def position_errors(seed: int, wobble: float) -> tuple[float, float, Calibration
 
 def factor_of(result: CalibrationResult) -> float:
     """By how much the variance of the orientations was enlarged."""
-    return view_of(result.solved.solution.linearisation).disagreement[1]
+    return sensor_view_of(result.solved.solution.linearisation).disagreement[1]
 
 
 def ratio(wobble: float) -> tuple[float, list[float]]:
@@ -90,8 +90,8 @@ def test_the_factor_makes_lengths_move_by_as_much_as_expected() -> None:
     """Against the definition, with inverses written out."""
     result = position_errors(0, 5e-4)[2]
     problem, here = result.solved.problem, result.solved.solution.linearisation
-    view = view_of(here)
-    held = view.scaled(problem.precision[problem.active], problem.prior_group)
+    view = sensor_view_of(here)
+    held = view.scaled_precision(problem.precision[problem.active], problem.prior_group)
     off = (here.point - problem.nominal)[problem.active]
     factor = angle_disagreement(problem.sensors, view, held, -held * off)[1]
     usual = torch.diag(problem.step_scale)
@@ -115,5 +115,5 @@ def test_angles_alone_and_lengths_alone_keep_their_variance() -> None:
     T = forward_kinematics(robot, q)
     for rows in (Measurements(q, T[:, :3, 3]), Measurements(q, rotation=T[:, :3, :3])):
         solved = GeometricCalibrator(robot).solve(rows)
-        view: SensorView = view_of(solved.solution.linearisation)
+        view: SensorView = sensor_view_of(solved.solution.linearisation)
         assert view.disagreement.tolist() == [1.0]

@@ -19,7 +19,7 @@ from testing.sensors import (
 
 from pisigma.calibration.geometric.calibrator import GeometricCalibrator
 from pisigma.calibration.geometric.identifiability.redundancy import find_redundancy
-from pisigma.calibration.geometric.problem.noise import view_of
+from pisigma.calibration.geometric.problem.noise import sensor_view_of
 from pisigma.estimation.loss import SquaredLoss
 from pisigma.measurement.dataset import Measurements
 from pisigma.robot.kinematics.forward import forward_kinematics
@@ -76,9 +76,9 @@ def test_23_parameters_come_back_from_exact_touches_without_a_guess() -> None:
     solved = calibrator.solve(touch_data())
     result, at_start = solved.result(), solved.findings.information
     assert len(result.free) == result.rank == 23
-    of_arm = at_start.after([k for k, p in enumerate(at_start.parameters) if p.group in ("base", "tool")])
+    of_arm = at_start.eliminate([k for k, p in enumerate(at_start.parameters) if p.group in ("base", "tool")])
     assert find_redundancy(of_arm, np.zeros(len(of_arm.parameters))).rank == len(ARM)
-    assert result.status.good
+    assert result.status.is_minimum
     true = arm.geometric_robot
     assert_close(result.robot.dh, true.dh, atol=1e-9)
     assert_close(result.tools[""][:3], true.tool[:3], atol=1e-9)
@@ -133,7 +133,7 @@ def test_pairs_in_any_order_and_many_rows_stay_together() -> None:
     tool = setup.problem.space.split(setup.start)[2][0].numpy()
     started = arm.nominal.with_geometry(tool=tool)
     for chosen in (problem, part):
-        sums = view_of(chosen.linearise(setup.start, None)).sums[0]
+        sums = sensor_view_of(chosen.linearise(setup.start, None)).sums[0]
         p = forward_kinematics(started, chosen.q)[:, :3, 3]
         expected = chosen.sensors[0].measured[::2] - (p[::2] - p[1::2]).norm(dim=-1)  # type: ignore[attr-defined]
         assert_close(sums.residual[0, ::2], expected, atol=1e-12)

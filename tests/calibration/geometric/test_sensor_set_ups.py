@@ -55,7 +55,7 @@ def test_touches_that_fit_nowhere_ask_for_a_start() -> None:
 def test_sockets_alone_have_no_scale() -> None:
     result = calibrator().fit(socket_data())
     assert kinds_of_warnings(result) >= {"scale_of_sockets"}
-    assert result.status.good
+    assert result.status.is_minimum
     known = calibrator(socket_distances={("plate/0", "plate/1"): 0.05}).fit(socket_data())
     assert not kinds_of_warnings(known) & {"scale_of_sockets"}
 
@@ -166,7 +166,7 @@ def test_nothing_depends_on_where_the_base_of_a_floating_frame_starts() -> None:
     assert_close(other, first, atol=1e-9)
     for one in solved:
         result = one.result()
-        assert one.solution.status.good
+        assert one.solution.status.is_minimum
         assert {f"base_{column}" for column in FRAME_COLUMNS} <= set(result.redundancy.no_effect)
         assert not any(name.startswith("base") for name in result.free)
         errors = [p.standard_error for p in result.parameters if p.name.startswith("socket")]

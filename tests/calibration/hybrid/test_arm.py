@@ -34,7 +34,7 @@ def beyond(coverage: JointCoverage, *angles: float) -> Tensor:
     """Of values of the first joint [deg], in degrees."""
     q = torch.zeros(len(angles), len(coverage.turning), dtype=torch.float64)
     q[:, 0] = torch.tensor(angles, dtype=torch.float64).deg2rad()
-    return coverage.beyond(q)[:, 0].rad2deg()
+    return coverage.distance_outside(q)[:, 0].rad2deg()
 
 
 def test_a_gap_wider_than_allowed_was_not_measured_and_a_narrower_one_was() -> None:
@@ -70,14 +70,14 @@ def test_a_joint_measured_all_around_has_nothing_beyond() -> None:
 def test_values_a_full_turn_apart_are_the_same_for_turning_joints_only() -> None:
     found = coverage_of(line((0, 40)))
     q = torch.linspace(-3, 3, 50, dtype=torch.float64)[:, None].expand(50, 6)
-    assert_close(found.beyond(q + 2 * math.pi), found.beyond(q), atol=1e-12)
+    assert_close(found.distance_outside(q + 2 * math.pi), found.distance_outside(q), atol=1e-12)
     sliding = coverage_of(torch.linspace(-0.3, -0.1, 50, dtype=torch.float64), "kiro3", 2)
     assert sliding.turning == (True, True, False, True)
     travel = float(np.diff(Robot.load("kiro3").limits)[2, 0])
     q = torch.zeros(3, 4, dtype=torch.float64)
     q[:, 2] = torch.tensor([-0.2, -0.1 + 0.05, -0.3 - 2 * travel])
     expected = torch.tensor([0.0, 0.05, 2 * travel]).double() * math.pi / travel
-    assert_close(sliding.beyond(q)[:, 2], expected, atol=1e-7)
+    assert_close(sliding.distance_outside(q)[:, 2], expected, atol=1e-7)
 
 
 def test_one_row_is_a_stretch_of_no_length() -> None:
@@ -94,7 +94,7 @@ def test_one_row_is_a_stretch_of_no_length() -> None:
 def test_one_joint_beyond_its_measured_values_is_enough_but_rounding_is_not() -> None:
     found = JointCoverage.from_joints(Robot.load("ur5"), torch.zeros(1, 6, dtype=torch.float64))
     q = torch.tensor([[0.05, -0.1, 0.0, 0.0, 0.02, 0.0], [1e-10] * 6, [math.nan] * 6], dtype=torch.float64)
-    assert_close(found.beyond(q)[0], q[0].abs())
+    assert_close(found.distance_outside(q)[0], q[0].abs())
     assert found.contains(q).tolist() == [False, True, False]
 
 

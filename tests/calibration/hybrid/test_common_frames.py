@@ -83,5 +83,5 @@ def test_a_moved_frame_moves_what_stands_in_it_with_its_uncertainty():
     )
     assert_close(transform_from_xyzrpy(torch.from_numpy(moved.bases[""])), base, atol=1e-12)
     anchor = solved.problem.space.indices_of("anchor").start
-    place = moved.change[anchor : anchor + 3, anchor : anchor + 3]
+    place = moved.coordinate_jacobian[anchor : anchor + 3, anchor : anchor + 3]
     assert_close(place, moved.setup.anchors.bases[0, :3, :3], atol=1e-12)

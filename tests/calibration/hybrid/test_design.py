@@ -39,10 +39,10 @@ def test_what_unknowns_move_is_their_columns_times_them(monkeypatch: pytest.Monk
         monkeypatch.setattr("pisigma.calibration.hybrid.design.CHUNK", chunk)
         for values in case.rows.values:
             expected = case.design.columns(values, slice(None)) @ x
-            assert_close(case.design.moved(values, x), expected, atol=1e-14)
+            assert_close(case.design.predicted_change(values, x), expected, atol=1e-14)
     geometry = Design(case.rows.problem, ())
     values = case.rows.values[0]
-    moved = geometry.moved(values, x[: geometry.unknowns])
+    moved = geometry.predicted_change(values, x[: geometry.unknowns])
     assert_close(moved, values.geometry @ x[: geometry.unknowns], atol=1e-15)
 
 

@@ -10,7 +10,7 @@ from testing.models import no_type_checker
 from testing.refusals import refused
 
 from pisigma.calibration.hybrid.calibrator import HybridCalibrator
-from pisigma.calibration.hybrid.gravity import gravity_in_base, in_first_row
+from pisigma.calibration.hybrid.gravity import gravity_in_base, to_first_row_frame
 from pisigma.calibration.hybrid.result import HybridResult
 from pisigma.files.errors import IdentificationError
 from pisigma.measurement.dataset import Measurements
@@ -89,7 +89,7 @@ def test_a_robot_on_a_wall_is_as_accurate_as_one_on_the_floor():
 def test_a_stated_direction_is_turned_with_the_base():
     robot = Robot.load("ur5")
     turned = robot.with_geometry(base=np.array([0.0, 0.0, 0.0, math.pi / 2, 0.0, 0.0]))
-    assert in_first_row(turned, (0.0, 1.0, 0.0)) == pytest.approx((1.0, 0.0, 0.0))
+    assert to_first_row_frame(turned, (0.0, 1.0, 0.0)) == pytest.approx((1.0, 0.0, 0.0))
     result = fit(robot, measured(robot, (0.0, 0.6, -0.8), 100, seed=0), (0.0, 0.6, -0.8))
     assert gravity_of(robot, result) == pytest.approx((0.0, 0.6, -0.8))
     with refused(IdentificationError, option="gravity"):

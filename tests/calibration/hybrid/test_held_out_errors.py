@@ -64,7 +64,7 @@ def test_the_noise_of_a_sensor_stands_of_which_a_fold_takes_all_values(form: str
     assert len(wire) == 1
     fit: AbstractDesignRegression = FORMS[form].from_rows(case.design, case.rows)
     posterior = fit.solve(case.prior, case.noise)
-    rest = fit.without(wire).maximise_evidence(posterior.prior, posterior.noise, 2)
+    rest = fit.without_groups(wire).maximise_evidence(posterior.prior, posterior.noise, 2)
     assert rest.noise[number] == case.noise[number]
     errors = fit.held_out_errors_refitted(posterior, [wire], 2)
     assert float(errors.error.square().mean()) < 4.0

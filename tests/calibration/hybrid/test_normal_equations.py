@@ -47,7 +47,7 @@ def test_the_cases_are_what_they_are_for() -> None:
     values = {one.name: one for one in CASES["all kinds"]().rows.values}
     assert len(values["socket distance"].row) == 1
     assert values["socket distance"].certain
-    assert len(values["pair"].sides) == 2
+    assert len(values["pair"].row_derivatives) == 2
     assert len(poses().rows.values[0].root.unique()) > 20
     assert not bool(poses().design.features[1].used.all())
     assert several_targets().rows.values[0].repetition > 1.2
@@ -81,7 +81,7 @@ def test_sums_with_another_feature_are_those_of_all_columns_at_once(name: str) -
     features = [one for one in case.design.features if one.name != case.smaller[0].name]
     first = NormalEquations.from_rows(Design(case.rows.problem, tuple(features)), case.rows)
     design = Design(case.rows.problem, (*features[:1], case.smaller[0]))
-    assert_same_sums(first.extended(design), DenseRegression.from_rows(design, case.rows))
+    assert_same_sums(first.with_feature(design), DenseRegression.from_rows(design, case.rows))
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -90,8 +90,8 @@ def test_sums_without_some_groups_are_those_of_the_others(name: str) -> None:
     case = CASES[name]()
     groups = torch.cat(case.folds[1:])
     found, expected = (
-        NormalEquations.from_rows(case.design, case.rows).without(groups),
-        case.dense.without(groups),
+        NormalEquations.from_rows(case.design, case.rows).without_groups(groups),
+        case.dense.without_groups(groups),
     )
     assert_close(
         np.array([one.values for one in found.sensors]),
@@ -145,7 +145,7 @@ def test_first_sizes_say_nearly_what_the_whole_fit_gains() -> None:
     largest = NormalEquations.from_rows(Design(arm.rows.problem, (*design.features, products)), arm.rows)
     own = largest.select(design)
     before = own.maximise_evidence(design.prior(arm.prior_scale), arm.noise, 400, 1e-6)
-    gain, sizes = largest.first_sizes(before, design, products)
+    gain, sizes = largest.initial_prior_sizes(before, design, products)
     assert sizes is not None
     assert len(sizes) == robot.dof
     held = largest.design.prior_like(design, before.prior)

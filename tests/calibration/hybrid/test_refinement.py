@@ -10,8 +10,8 @@ from testing.linearised import random_joints, tracker_data
 from pisigma.calibration.geometric.calibrator import GeometricCalibrator
 from pisigma.calibration.hybrid.calibrator import HybridCalibrator
 from pisigma.calibration.hybrid.design import Rows
-from pisigma.calibration.hybrid.refinement import Refined, linearised, refine
-from pisigma.calibration.hybrid.search import Choice, Fitted
+from pisigma.calibration.hybrid.refinement import Refined, linearise_rows, refine
+from pisigma.calibration.hybrid.search import FeatureChoice, FeatureFit
 from pisigma.measurement.conditions import JointState
 from pisigma.measurement.groups import held_out_groups
 from pisigma.robot import Robot
@@ -65,10 +65,10 @@ def test_the_network_predicts_what_the_design_does(refined: Refined) -> None:
     assert bool(orders) == any(chosen.name == "products" for chosen in design.features)
 
 
-def chosen_as(refined: Refined, rows: Rows) -> Choice:
+def chosen_as(refined: Refined, rows: Rows) -> FeatureChoice:
     """A choice that came to a solution on some rows."""
-    fitted = Fitted(refined.design, refined.posterior)
-    return Choice(rows, fitted, fitted, ())
+    fitted = FeatureFit(refined.design, refined.posterior)
+    return FeatureChoice(rows, fitted, fitted, ())
 
 
 def test_a_solution_that_has_settled_is_not_linearised_again(refined: Refined) -> None:
@@ -82,7 +82,7 @@ def test_rows_on_which_nothing_was_chosen_are_fitted_as_well(refined: Refined) -
     """Chosen on every other row, it is fitted to all."""
     problem = refined.rows.problem
     half = torch.arange(0, ROWS, 2)
-    rows = linearised(
+    rows = linearise_rows(
         replace(refined.design, problem=problem.select(half)),
         refined.posterior.x,
         10.0,

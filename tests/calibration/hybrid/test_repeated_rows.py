@@ -35,7 +35,7 @@ def sums_of(design: Design, values: SensorValues) -> NormalEquations:
 
 def test_rows_that_do_not_count_are_left_out_and_the_others_weighted() -> None:
     values = values_of(5)
-    found = values.weighted(torch.tensor([1.0, 0.0, 0.25, 0.0, 4.0], dtype=torch.float64))
+    found = values.apply_weights(torch.tensor([1.0, 0.0, 0.25, 0.0, 4.0], dtype=torch.float64))
     assert found.row.tolist() == [0, 2, 4]
     assert found.components == 3
     assert_close(found.root, values.root[[0, 2, 4]] * torch.tensor([1.0, 0.5, 2.0]), atol=1e-15)
@@ -56,7 +56,7 @@ def test_repeats_as_one_row_come_to_the_same_normal_equations() -> None:
         joints=torch.cat([own.joints, own.joints[..., :1]], -1)[pose],
     )
     design = Design(problem, (FourierSeries(robot, 1),))
-    collapsed = values.collapsed(torch.arange(problem.q.shape[0]))
+    collapsed = values.merge_repeats(torch.arange(problem.q.shape[0]))
     assert collapsed.row.tolist() == [0, 1, 2, 3]
     many, few = (sums_of(design, one) for one in (values, collapsed))
     assert_close(few.normal, many.normal, atol=1e-11)
@@ -82,7 +82,7 @@ def test_other_sights_of_a_pose_are_no_repeats() -> None:
     problem = GeometricCalibrator(robot, frames={"jig": (0.0,) * 6}).build(data).problem
     assert problem.pose is not None
     (values,) = sensor_values(problem.with_active(range(30)), problem.nominal)
-    collapsed = values.collapsed(problem.pose)
+    collapsed = values.merge_repeats(problem.pose)
     assert len(values.row) == 120
     assert len(collapsed.row) == 60
     assert_close(collapsed.root, torch.full((60,), 2.0).double().sqrt(), atol=1e-12)
@@ -94,9 +94,9 @@ def test_other_sights_of_a_pose_are_no_repeats() -> None:
 
 def test_rows_without_repeats_are_left_alone() -> None:
     values = values_of(6)
-    assert values.collapsed(torch.arange(6)) is values
+    assert values.merge_repeats(torch.arange(6)) is values
     none = values.select(torch.zeros(6, dtype=torch.bool))
-    assert none.collapsed(torch.arange(6)) is none
+    assert none.merge_repeats(torch.arange(6)) is none
 
 
 def alike(copies: int) -> SensorValues:
@@ -109,7 +109,7 @@ def alike(copies: int) -> SensorValues:
 def test_three_identical_targets_of_a_configuration_count_as_one() -> None:
     """The design effect: three times the values say as much as one of them."""
     copies = alike(3)
-    found = copies.shared(torch.arange(8).repeat_interleave(3))
+    found = copies.downweight_correlated(torch.arange(8).repeat_interleave(3))
     assert_close(found.repetition, 3.0, rtol=1e-12)
     assert_close(found.root, copies.root / 3**0.5, rtol=1e-12)
     one = values_of(8)
@@ -123,7 +123,7 @@ def test_identical_targets_come_to_the_regression_of_one() -> None:
     problem = GeometricCalibrator(robot).build(tracker_data(robot, random_joints(robot, 24, 0))).problem
     problem = problem.with_active(range(2))
     design = Design(problem, ())
-    three = alike(3).shared(torch.arange(8).repeat_interleave(3))
+    three = alike(3).downweight_correlated(torch.arange(8).repeat_interleave(3))
     rows = [Rows(problem, (values,), torch.arange(24)) for values in (three, values_of(8))]
     many, single = (NormalEquations.from_rows(design, one) for one in rows)
     assert_close(many.normal, single.normal, rtol=1e-12)
@@ -140,20 +140,20 @@ def test_identical_targets_come_to_the_regression_of_one() -> None:
 def test_targets_that_err_each_for_themselves_count_in_full() -> None:
     values = values_of(3_000)
     values = replace(values, residual=values.residual / values.root[:, None])
-    independent = values.shared(torch.arange(1_000).repeat_interleave(3))
+    independent = values.downweight_correlated(torch.arange(1_000).repeat_interleave(3))
     assert 1.0 <= independent.repetition < 1.1
     opposite = alike(2)
     sign = torch.tensor([1.0, -1.0]).double().repeat(8)[:, None]
     opposite = replace(opposite, residual=opposite.residual * sign)
-    assert opposite.shared(torch.arange(8).repeat_interleave(2)).repetition == 1.0
+    assert opposite.downweight_correlated(torch.arange(8).repeat_interleave(2)).repetition == 1.0
 
 
 def test_what_is_certain_and_pairs_and_configurations_of_one_target_count_in_full() -> None:
     copies, configuration = alike(3), torch.arange(8).repeat_interleave(3)
     certain = replace(copies, certain=True)
-    assert certain.shared(configuration) is certain
+    assert certain.downweight_correlated(configuration) is certain
     pair = replace(copies, other_row=copies.row, other_joints=copies.joints)
-    assert pair.shared(configuration) is pair
+    assert pair.downweight_correlated(configuration) is pair
     none = copies.select(slice(0, 0))
-    assert none.shared(configuration) is none
-    assert_close(copies.shared(torch.arange(24)).repetition, 1.0, rtol=1e-12)
+    assert none.downweight_correlated(configuration) is none
+    assert_close(copies.downweight_correlated(torch.arange(24)).repetition, 1.0, rtol=1e-12)

@@ -10,7 +10,7 @@ from testing.linearised import LinearisedArm, random_joints, tracker_data
 from testing.linearised import linearised as linearised_at_solution
 
 from pisigma.calibration.hybrid.design import Design, Rows, weigh
-from pisigma.calibration.hybrid.refinement import linearised, network
+from pisigma.calibration.hybrid.refinement import linearise_rows, network
 from pisigma.calibration.hybrid.sensor_values import sensor_values
 from pisigma.estimation.loss import HampelLoss, SquaredLoss
 from pisigma.joint_correction.fourier_series import FourierSeries
@@ -80,7 +80,7 @@ def test_residuals_are_counted_from_nominal_and_no_correction(arm: LinearisedArm
     for there, sensor in zip(values, found.values, strict=True):
         left = sensor.residual - design.columns(sensor, slice(None)) @ x
         assert_close(left, there.residual, atol=1e-15)
-    with_network = linearised(design, x, 10.0, arm.rows.group)
+    with_network = linearise_rows(design, x, 10.0, arm.rows.group)
     assert with_network.difference(with_network, x, design, (1e-5, 1e-4)) == 0.0
 
 

@@ -8,7 +8,7 @@ import torch
 from testing.closeness import assert_close
 from testing.linearised import LinearisedArm, linearised, random_joints, tracker_data
 
-from pisigma.calibration.hybrid.search import CLEAR_GAIN, CLEARLY, MAX_USUAL_SHARE, Search
+from pisigma.calibration.hybrid.search import CLEAR_GAIN, CLEARLY, MAX_USUAL_SHARE, FeatureSearch
 from pisigma.joint_correction.fourier_series import FourierSeries
 from pisigma.joint_correction.gravity_torques import GravityTorques
 from pisigma.joint_correction.input_products import InputProducts
@@ -25,9 +25,9 @@ def rows_of(delta: torch.Tensor, q: torch.Tensor, noise: float = 3e-5) -> Linear
     return linearised(ROBOT, tracker_data(ROBOT, q, delta, noise))
 
 
-def search_of(arm: LinearisedArm, said: list[str] | None = None) -> Search:
+def search_of(arm: LinearisedArm, said: list[str] | None = None) -> FeatureSearch:
     progress = (lambda what: None) if said is None else said.append
-    return Search(arm.rows, arm.noise, arm.prior_scale, [SMALL, SERIES[-1], PRODUCTS], progress)
+    return FeatureSearch(arm.rows, arm.noise, arm.prior_scale, [SMALL, SERIES[-1], PRODUCTS], progress)
 
 
 def product(q: torch.Tensor) -> torch.Tensor:
@@ -62,7 +62,7 @@ def test_geometry_is_the_first_line_and_the_unit(series: LinearisedArm) -> None:
 def test_larger_series_are_tried_until_the_evidence_is_clearly_against_them(series: LinearisedArm) -> None:
     said: list[str] = []
     search = search_of(series, said)
-    best = search.best(SERIES, [SMALL], [PRODUCTS])
+    best = search.select_features(SERIES, [SMALL], [PRODUCTS])
     assert best.name.endswith("series 4")
     kept = [line for line in search.trials if line.kept]
     assert kept[-1].name == best.name
@@ -73,7 +73,7 @@ def test_larger_series_are_tried_until_the_evidence_is_clearly_against_them(seri
 
 def test_products_come_last_and_stay_where_they_help(products: LinearisedArm) -> None:
     search = search_of(products)
-    best = search.best(SERIES[:1], [SMALL], [PRODUCTS])
+    best = search.select_features(SERIES[:1], [SMALL], [PRODUCTS])
     assert best.name.endswith("products")
     assert search.trials[-1].kept
     assert search.trials[-1].held_out < 0.6
@@ -92,14 +92,14 @@ def test_products_come_last_and_stay_where_they_help(products: LinearisedArm) ->
 
 def test_products_have_to_gain_more_than_the_scatter(products: LinearisedArm, monkeypatch) -> None:
     """More evidence alone does not keep them."""
-    kept = search_of(products).best(SERIES[:1], [SMALL], [PRODUCTS])
+    kept = search_of(products).select_features(SERIES[:1], [SMALL], [PRODUCTS])
     search = search_of(products)
-    without = search.best(SERIES[:1], [SMALL])
+    without = search.select_features(SERIES[:1], [SMALL])
     gain = kept.gain(without)
     assert gain > CLEAR_GAIN
     assert without.gain(kept) < -CLEAR_GAIN
     monkeypatch.setattr("pisigma.calibration.hybrid.search.CLEAR_GAIN", gain + 1e-6)
-    assert search.best(SERIES[:1], [SMALL], [PRODUCTS]).name == without.name
+    assert search.select_features(SERIES[:1], [SMALL], [PRODUCTS]).name == without.name
     assert search.trials[-1].log_evidence > without.posterior.log_evidence + CLEARLY
 
 
@@ -110,7 +110,7 @@ def test_few_rows_are_fitted_with_all_features_from_usual_sizes() -> None:
     gravity = 2e-4 * (SMALL.columns(JointState(q)) * weights).sum(-1)
     gears = torch.stack([2e-4 * (k * q + torch.arange(6) * k).sin() for k in (1, 2, 6)]).sum(0)
     search = search_of(rows_of(gravity + gears, q))
-    best = search.best(SERIES, [SMALL])
+    best = search.select_features(SERIES, [SMALL])
     assert best.name == "gravity + series 6"
     assert best.largest_share == MAX_USUAL_SHARE
     *before, together, wider = search.trials
@@ -122,19 +122,19 @@ def test_few_rows_are_fitted_with_all_features_from_usual_sizes() -> None:
 def test_what_does_not_help_leaves_the_geometry() -> None:
     q = random_joints(ROBOT, 80, 4)
     search = search_of(rows_of(torch.zeros_like(q), q))
-    best = search.best(SERIES, [SMALL], [PRODUCTS])
+    best = search.select_features(SERIES, [SMALL], [PRODUCTS])
     assert best is search.geometry
     assert not any(line.kept for line in search.trials[1:])
 
 
 def test_a_fit_starts_from_the_sizes_and_the_noise_of_another(series: LinearisedArm) -> None:
     search = search_of(series)
-    near, held_out = search.fitted([SERIES[1]])
-    again, held_out_again = search.fitted([SERIES[1]], near)
+    near, held_out = search.fit_features([SERIES[1]])
+    again, held_out_again = search.fit_features([SERIES[1]], near)
     assert_close(held_out_again, held_out, rtol=0.02)
     assert abs(again.posterior.log_evidence - near.posterior.log_evidence) < 2.0
     sizes = torch.full((ROBOT.dof,), 1e-6, dtype=torch.float64)
-    given, _ = search.fitted([SERIES[1], PRODUCTS], near, sizes)
+    given, _ = search.fit_features([SERIES[1], PRODUCTS], near, sizes)
     assert given.design.unknowns == near.design.unknowns + PRODUCTS.used.numel()
     assert given.posterior.log_evidence > near.posterior.log_evidence - 2.0
 
@@ -142,8 +142,8 @@ def test_a_fit_starts_from_the_sizes_and_the_noise_of_another(series: Linearised
 def test_many_groups_are_held_out_in_few_folds(
     series: LinearisedArm, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    every = search_of(series).best(SERIES[:2], [SMALL])
+    every = search_of(series).select_features(SERIES[:2], [SMALL])
     monkeypatch.setattr("pisigma.calibration.hybrid.search.FEW_GROUPS", 50)
     search = search_of(replace(series))
     assert [len(fold) for fold in search._folds] == [30] * 4
-    assert search.best(SERIES[:2], [SMALL]).name == every.name
+    assert search.select_features(SERIES[:2], [SMALL]).name == every.name

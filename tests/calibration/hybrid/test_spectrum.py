@@ -8,7 +8,7 @@ import torch
 from testing.linearised import LinearisedArm, linearised, random_joints, tracker_data
 
 from pisigma.calibration.hybrid.calibrator import HybridCalibrator
-from pisigma.calibration.hybrid.spectrum import HIGHEST, lines
+from pisigma.calibration.hybrid.spectrum import HIGHEST, find_spectral_lines
 from pisigma.joint_correction.fourier_series import FourierSeries
 from pisigma.robot import Robot
 
@@ -29,7 +29,7 @@ def rippled(q: torch.Tensor) -> torch.Tensor:
 
 def lines_of(arm: LinearisedArm, lowest: int = 60) -> tuple[tuple[int, ...], ...]:
     fitted = arm.fitted([FourierSeries(arm.rows.problem.space.robot, 3)])
-    return lines(fitted.design, arm.rows, fitted.posterior, lowest)
+    return find_spectral_lines(fitted.design, arm.rows, fitted.posterior, lowest)
 
 
 def arm_of(q: torch.Tensor, delta: torch.Tensor | float) -> LinearisedArm:

@@ -15,7 +15,7 @@ from torch import Tensor
 from pisigma.calibration.geometric.prediction import predicted_poses
 from pisigma.calibration.geometric.problem.setup import identified_geometry
 from pisigma.calibration.hybrid.regression import NormalEquations
-from pisigma.calibration.hybrid.search import Fitted
+from pisigma.calibration.hybrid.search import FeatureFit
 from pisigma.calibration.hybrid.uncertainty import PositionUncertainty, position_uncertainty
 from pisigma.estimation.held_out import MAX_SCALE, HeldOutErrors, held_out_scale
 from pisigma.estimation.prior import GaussianPrior
@@ -100,7 +100,7 @@ def arm() -> LinearisedArm:
     return linearised(robot, tracker_data(robot, q, 2e-4 * torch.sin(q), 3e-5, 1e-4, several=True))
 
 
-def uncertainty(arm: LinearisedArm) -> tuple[PositionUncertainty, Fitted, JointCorrection]:
+def uncertainty(arm: LinearisedArm) -> tuple[PositionUncertainty, FeatureFit, JointCorrection]:
     robot = arm.rows.problem.space.robot
     fitted = arm.fitted((GravityTorques(robot), FourierSeries(robot, 1)), 5)
     problem = arm.rows.problem
@@ -163,7 +163,7 @@ def test_deviation_is_that_of_drawn_calibrations(arm: LinearisedArm) -> None:
     """The covariance of positions at the training rows, as their columns give it, widened."""
     found, fitted, correction = uncertainty(arm)
     root = NormalEquations.from_rows(fitted.design, arm.rows).covariance_root(fitted.posterior)
-    root = torch.cat([root.dense, root_of_sizes(fitted.posterior, root)], 1)
+    root = torch.cat([root.as_matrix, root_of_sizes(fitted.posterior, root)], 1)
     C = root @ root.t()
     values = arm.rows.values[0].select(torch.arange(10))
     X = fitted.design.columns(values, slice(None))

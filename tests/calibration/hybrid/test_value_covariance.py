@@ -56,8 +56,8 @@ def test_without_some_groups_it_is_that_of_the_others(name: str) -> None:
     case = CASES[name]()
     groups = torch.cat(case.folds[1:])
     found, expected = (
-        ValueCovariance.from_rows(case.design, case.rows).without(groups),
-        case.dense.without(groups),
+        ValueCovariance.from_rows(case.design, case.rows).without_groups(groups),
+        case.dense.without_groups(groups),
     )
     values = [np.array([one.values for one in form.sensors]) for form in (found, expected)]
     assert_close(values[0], values[1], rtol=1e-6)
@@ -74,7 +74,7 @@ def test_more_features_are_fitted_at_once() -> None:
     found = ValueCovariance.from_rows(case.design, case.rows)
     small = Design(case.rows.problem, case.design.features[:2])
     posterior = found.select(small).solve(small.prior((1.0,) * 4), case.noise)
-    assert found.first_sizes(posterior, small, case.design.features[2]) == (math.inf, None)
+    assert found.initial_prior_sizes(posterior, small, case.design.features[2]) == (math.inf, None)
 
 
 def test_values_that_are_not_finite_are_refused() -> None:
@@ -94,7 +94,7 @@ def test_noise_that_is_small_beside_the_values_is_left_to_normal_equations() -> 
         ValueCovariance.from_rows(case.design, case.rows),
         NormalEquations.from_rows(case.design, case.rows),
     )
-    here, there = dual.solve(prior, noise), dual.primal.solve(prior, noise)
+    here, there = dual.solve(prior, noise), dual.normal_equations.solve(prior, noise)
     assert torch.equal(here.x, there.x)
     assert here.log_evidence == there.log_evidence
     expected = normal.solve(prior, noise)

@@ -128,7 +128,7 @@ def test_the_correction_of_a_hybrid_is_that_of_the_model(name, names, rows):
         q += 0.01  # where an angle of the pose is half a turn, its sign is a matter of rounding
     delta, found = model.hybrid.correction(q), run(export_onnx(model), q=q)
     assert_close(found["correction"], delta, atol=1e-12)
-    beyond = model.hybrid.coverage.beyond(q).amax(-1, keepdim=True)
+    beyond = model.hybrid.coverage.distance_outside(q).amax(-1, keepdim=True)
     assert_close(found["beyond_measured"], beyond, atol=1e-12)
     assert rows < 2 or float(delta.abs().max()) > 1e-3
     assert rows < 2 or float(beyond.max()) > 0.1

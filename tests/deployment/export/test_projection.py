@@ -39,7 +39,7 @@ def test_the_derivative_agrees_with_finite_differences(free):
     for i in range(J.shape[1]):
         step = torch.zeros(J.shape[1], dtype=torch.float64)
         step[i] = 1e-6
-        there, back = (problem.residual(problem.moved(robot, s * step))[0] for s in (1, -1))
+        there, back = (problem.residual(problem.apply_step(robot, s * step))[0] for s in (1, -1))
         assert_close((back - there) / 2e-6, J[:, i], atol=1e-8)
 
 

@@ -48,10 +48,12 @@ def test_every_protocol_names_the_model_that_answers(cell):
 def test_a_path_that_was_begun_is_answered_by_one_model(cell):
     models = ServedModels(cell=cell.folder)
     protocol = JsonLines(models, Metrics())
-    begun = protocol.answer(json.dumps({"path": [POSE] * 3}).encode())
+    begun = protocol.answer_message(json.dumps({"path": [POSE] * 3}).encode())
     put_into_use(cell, SECOND)
     assert models.reload() == []
-    answers = [json.loads(one()) for one in (begun, protocol.answer(json.dumps({"path": [POSE]}).encode()))]
+    answers = [
+        json.loads(one()) for one in (begun, protocol.answer_message(json.dumps({"path": [POSE]}).encode()))
+    ]
     assert [one["model"] for one in answers] == [FIRST, SECOND]
     assert len(answers[0]["q_deg"]) == 3
 

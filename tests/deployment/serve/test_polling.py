@@ -41,26 +41,26 @@ def _after_two_requests(sockets, apart=0.0, duration=DURATION):
 
 def test_the_next_of_frequent_requests_is_polled_for(sockets):
     sockets.request_at = 3
-    assert _after_two_requests(sockets).ready() == ["request"]
+    assert _after_two_requests(sockets).wait_for_connections() == ["request"]
     assert sockets.looks == 3
 
 
 def test_the_server_sleeps_when_no_request_comes_in_time(sockets):
     begun = sockets.now
-    assert _after_two_requests(sockets).ready() == []
+    assert _after_two_requests(sockets).wait_for_connections() == []
     assert DURATION <= sockets.now - begun < 1.1 * DURATION
 
 
 @pytest.mark.parametrize(("apart", "duration"), [(2 * DURATION, DURATION), (0.0, 0.0)])
 def test_after_rare_requests_or_without_a_duration_the_server_sleeps_at_once(sockets, apart, duration):
-    assert _after_two_requests(sockets, apart, duration).ready() == []
+    assert _after_two_requests(sockets, apart, duration).wait_for_connections() == []
     assert sockets.looks == 0
 
 
 def test_a_single_request_does_not_start_polling(sockets):
     polling = Polling(sockets, DURATION)
     polling.record_activity()
-    assert polling.ready() == []
+    assert polling.wait_for_connections() == []
     assert sockets.looks == 0
 
 
@@ -71,5 +71,5 @@ def test_polling_pauses_when_others_need_the_processor(sockets):
         sockets.now += pause * REST_FACTOR * sockets.look
         busy.record_activity()
         busy.record_activity()
-        assert busy.ready() == []
+        assert busy.wait_for_connections() == []
         assert sockets.looks == looks

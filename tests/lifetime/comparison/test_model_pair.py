@@ -33,11 +33,11 @@ def test_moved_base_and_tool_do_not_matter_with_fitted_frames():
 def test_corrections_of_networks_are_compared():
     first, second = hand_made_model("kiro3", scale=0.0), hand_made_model("kiro3", scale=0.002)
     pair = ModelPair.from_models(first, second, "fixed")
-    q = pair.points
+    q = pair.training_joints
     T = forward_kinematics(second.robot, second.nominal_joints(q))
     expected = T[:, :3, 3] - forward_kinematics(first.robot, q)[:, :3, 3]
     assert_close(pair.displacement(q)[:, :3], expected, atol=1e-12)
-    displacement = Displacement.at(pair, pair.workspace, "the workspace")
+    displacement = Displacement.from_pair(pair, pair.workspace, "the workspace")
     assert len(displacement.q) + displacement.not_predicted == 3000
 
 

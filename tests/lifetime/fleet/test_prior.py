@@ -93,8 +93,8 @@ def test_the_prior_of_few_robots_is_wider():
         x = torch.randn(6, 2, generator=g, dtype=torch.float64)
         robots = [RobotEvidence(1e8 * torch.eye(2).double(), 1e8 * one, CalibrationNoise()) for one in x]
         off = x[:5] - x[:5].mean(0)
-        population = Population(x[:5].mean(0), off.square().mean(0).diag(), 0).of_another(5)
-        square, count = population.surprise(robots[5])
+        population = Population(x[:5].mean(0), off.square().mean(0).diag(), 0).predictive_distribution(5)
+        square, count = population.squared_distance(robots[5])
         beyond.append(chi2.sf(square, count) < 0.05)
     assert sum(beyond) < 0.2 * len(beyond)
 

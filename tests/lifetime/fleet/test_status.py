@@ -46,7 +46,7 @@ def test_every_robot_has_its_state():
 
 
 def test_robots_are_sorted_by_error():
-    assert [one.robot for one in STATUS.worst_first] == ["moved", "pays", "old", "fine"]
+    assert [one.robot for one in STATUS.robots_by_error] == ["moved", "pays", "old", "fine"]
 
 
 def test_json_lists_the_robots_by_state():

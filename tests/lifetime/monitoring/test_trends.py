@@ -42,7 +42,7 @@ def test_a_drift_is_charted_and_measured():
     assert joint.alarm <= 4
     assert other.alarm is error.alarm is None
     assert bool(other.values[1].isnan())
-    clear = [one for one in trends_of(REVOLUTE, drifting) if one.clear]
+    clear = [one for one in trends_of(REVOLUTE, drifting) if one.is_significant]
     assert [(one.what, one.over) for one in clear] == [("joint 1", "month")]
     low, high = clear[0].interval
     assert low < 0.01 < high
@@ -55,7 +55,7 @@ def test_a_jump_is_not_a_drift():
     (jump,) = jumps_of(REVOLUTE, made)
     assert (jump.what, jump.before, jump.after) == ("joint 1", "2026-06-01", "2026-07-01")
     assert_close(jump.size, 0.05, atol=0.005)
-    assert not [one for one in trends_of(REVOLUTE, made) if one.clear]
+    assert not [one for one in trends_of(REVOLUTE, made) if one.is_significant]
     assert jumps_of(REVOLUTE, records(8, per_month=0.01)) == jumps_of(REVOLUTE, records(8)) == ()
 
 
@@ -81,7 +81,7 @@ def test_jumps_and_outliers_are_distinguished_from_a_drift(off, changes, per_mon
     assert [(one.what, one.after, one.alone) for one in found] == [("joint 1", *one[:2]) for one in changes]
     for one, (_, _, size) in zip(found, changes, strict=True):
         assert_close(one.size, size, atol=0.012)
-    clear = [one for one in trends_of(REVOLUTE, made) if one.clear]
+    clear = [one for one in trends_of(REVOLUTE, made) if one.is_significant]
     assert len(clear) == (per_month > 0)
 
 
@@ -92,7 +92,7 @@ def test_a_jump_of_the_error_is_not_extrapolated():
 
 def test_warming_is_not_a_drift_with_time():
     warmed = records(10, per_kelvin=0.002, warm=lambda month: 20.0 + 8.0 * math.sin(month))
-    clear = [one for one in trends_of(REVOLUTE, warmed) if one.clear]
+    clear = [one for one in trends_of(REVOLUTE, warmed) if one.is_significant]
     assert [(one.what, one.over) for one in clear] == [("joint 1", "kelvin")]
     assert_close(clear[0].slope, 0.002, rtol=0.3)
 

@@ -64,7 +64,7 @@ def test_a_move_is_found_whatever_states_its_noise(models, of_model, of_rows):
     assert recalibrated.summary.kept == "recalibrated"
     found = recalibrated.model.uncertainty.noise
     assert found.is_factor("position") == (of_rows == "stated")
-    assert_close(found.absolute("position"), SIGMA, rtol=0.5)
+    assert_close(found.standard_deviation("position"), SIGMA, rtol=0.5)
 
 
 @pytest.mark.parametrize("of_rows", KINDS)
@@ -81,7 +81,9 @@ def test_nothing_is_found_where_nothing_moved(models, of_model, of_rows):
 def test_checks_of_rows_know_the_noise_whatever_states_it(models, of_model):
     with no_type_checker():
         usual = [
-            RowsUnderModel.from_rows(models[of_model], rows_with(sigma, 12, 3), (), (), None).usual
+            RowsUnderModel.from_rows(
+                models[of_model], rows_with(sigma, 12, 3), (), (), None
+            ).predicted_deviation
             for sigma in KINDS.values()
         ]
     assert_close(usual[0], usual[1], rtol=0.1)
@@ -117,13 +119,13 @@ def test_an_older_folder_with_a_standard_deviation_takes_rows_of_both_kinds(mode
 def test_no_factor_is_taken_for_metres(value):
     older = CalibrationNoise({"position": value}, None)
     assert older.is_factor("position")
-    assert math.isnan(older.absolute("position"))
+    assert math.isnan(older.standard_deviation("position"))
 
 
 def test_a_coarse_instrument_of_a_new_folder_has_its_own_standard_deviation():
     noise = CalibrationNoise({"position": 0.02})
     assert not noise.is_factor("position")
-    assert noise.absolute("position") == 0.02
+    assert noise.standard_deviation("position") == 0.02
 
 
 def test_other_rows_replace_the_noise_of_their_sensors_only():

@@ -22,7 +22,7 @@ def recalibrated(rows, relocated=frozenset(), arm=True):
     model = model_before()
     posterior = ModelPosterior.from_model(model)
     problem = recalibration_problem(model, posterior, rows, relocated)
-    adaptation = adapt(problem if arm else problem.without_arm())
+    adaptation = adapt(problem if arm else problem.with_fixed_arm())
     return recalibrated_model(model, adaptation, rows), adaptation
 
 

@@ -38,7 +38,7 @@ def test_the_prior_is_the_posterior_of_the_model():
     base = elsewhere.design.problem.space.indices_of("base")
     assert not elsewhere.root[base.start : base.stop].any()
     assert [group.what for group in elsewhere.groups if group.fixed_size] == ["base"]
-    still = problem.without_arm()
+    still = problem.with_fixed_arm()
     assert still.root.shape[1] == 0
     assert still.groups == ()
     assert_close(still.standing, problem.root)

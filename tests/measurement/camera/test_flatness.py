@@ -7,7 +7,7 @@ from testing.camera_cell import BOARD, CAMERA, CameraCell, camera_cell
 from testing.closeness import assert_close
 
 from pisigma.measurement.camera.camera_files import Repeatability
-from pisigma.measurement.camera.image_rows import Images, bent_corners, image_measurements, shapes
+from pisigma.measurement.camera.image_rows import Images, bend_shapes, bent_corners, image_measurements
 from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.robot.se3 import invert
 from pisigma.simulation.camera.simulated_images import ImageNoise
@@ -28,7 +28,7 @@ def bent_images(cell: CameraCell, noise: float) -> Images:
 
 
 def test_shapes_leave_the_plane_of_the_board_where_it_is() -> None:
-    of_corner, corners = shapes(BOARD), BOARD.corners
+    of_corner, corners = bend_shapes(BOARD), BOARD.corners
     plane = np.concatenate([np.ones((54, 1)), corners[:, :2]], 1)
     assert_close(plane.T @ of_corner, np.zeros((3, 3)), atol=1e-12)
     assert_close(np.abs(of_corner).max(0), np.ones(3), atol=1e-12)

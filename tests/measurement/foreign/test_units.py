@@ -10,8 +10,8 @@ from pisigma.measurement.foreign.units import (
     is_certain,
     parse_units,
     reason_to_doubt,
-    scaled,
     stated_units,
+    to_file_unit,
     unit_symbol,
 )
 
@@ -50,7 +50,7 @@ def test_spellings(text: str, symbol: str):
     ],
 )
 def test_numbers_are_scaled_exactly(number: str, symbol: str, written: str):
-    assert scaled(number, symbol) == written
+    assert to_file_unit(number, symbol) == written
 
 
 @pytest.mark.parametrize(

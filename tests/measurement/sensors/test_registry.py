@@ -29,7 +29,7 @@ from pisigma.measurement.sensors import (
     Unknowns,
     register_sensor,
 )
-from pisigma.measurement.sensors.sensor import along, names_of, numbers_of, owners_of
+from pisigma.measurement.sensors.sensor import component_along, names_of, numbers_of, owners_of
 from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.robot.kinematics.parameter_jacobian import ToolMotion
 
@@ -122,7 +122,7 @@ class HeightGauge(AbstractSensor):
         return (self.measured[rows] - predicted)[None]
 
     def derivative(self, motion: ToolMotion, unknowns: Unknowns, rows: slice) -> Tensor:
-        return along(self.up[:, rows], motion.derivative)
+        return component_along(self.up[:, rows], motion.derivative)
 
     def unknown_derivatives(
         self, motion: ToolMotion, unknowns: Unknowns, rows: slice

@@ -163,7 +163,7 @@ def test_the_status_reports_unmeasured_joint_values():
     arm, ik = solver_of("kiro4")
     q = joints_in(arm.true.nominal, 120, seed=3)
     coverage = ik.model.hybrid.coverage
-    beyond, inside = coverage.beyond(q).amax(-1), coverage.contains(q)
+    beyond, inside = coverage.distance_outside(q).amax(-1), coverage.contains(q)
     T = ik.model.forward(q)
     solution = ik(T, near=q)
     back = found(solution) & ((solution.q - q).abs().amax(-1) < 1e-6)

@@ -164,7 +164,7 @@ def test_a_geometric_model_has_no_curves_and_no_noise(tmp_path):
     assert list(content.accuracies[0].models) == ["nominal", "geometric"]
     assert content.curves == ()
     assert len(content.missing) == 1  # no predicted accuracy
-    assert (content.limit.noise, content.limit.share) == (None, None)
+    assert (content.limit.noise, content.limit.scatter_share) == (None, None)
     assert content.summary == CalibrationSummary.read(model)
 
 
@@ -180,7 +180,7 @@ def test_a_network_alone_is_reported(name, tmp_path):
     rows = Measurements(q=q, position=T[:, :3, 3], rotation=T[:, :3, :3])
     content = report_content(model, tmp_path, rows)
     assert list(content.accuracies[0].models) == ["nominal", "corrected"]
-    assert content.accuracies[0].last.max_mm < 1e-6 < content.accuracies[0].models["nominal"].rms_mm
+    assert content.accuracies[0].model_figures.max_mm < 1e-6 < content.accuracies[0].models["nominal"].rms_mm
     assert {layer.key for layer in content.map.layers} >= {"before", "after", "before_deg", "after_deg"}
 
 
@@ -190,7 +190,7 @@ def test_orientations_alone_are_reported(hybrid, tmp_path):
     rows = Measurements(q=q, rotation=poses_of_rows(model, Measurements(q=q))[:, :3, :3])
     content = report_content(model, tmp_path, rows)
     assert content.accuracies[0].unit == "deg"
-    assert content.accuracies[0].last.max_deg < 1e-6
+    assert content.accuracies[0].model_figures.max_deg < 1e-6
 
 
 def test_repeated_rows_show_the_scatter(hybrid, tmp_path):
@@ -215,8 +215,8 @@ def test_the_noise_that_a_hybrid_identified_is_the_limit(hybrid, tmp_path):
     assert_close(limit.noise, math.sqrt(3) * sigma, rtol=1e-12)
     larger = replace(accuracy, models={"hybrid": ErrorFigures(rms_mm=2 * limit.noise)})
     limit = limit_of(model, CalibrationSummary.read(model), larger, None)
-    assert_close(limit.share, 0.25, rtol=1e-12)
-    assert (limit.source, limit.mostly_scatter) == ("hybrid", False)
+    assert_close(limit.scatter_share, 0.25, rtol=1e-12)
+    assert (limit.source, limit.is_mostly_scatter) == ("hybrid", False)
 
 
 def test_scatter_above_the_error_has_no_share(hybrid, tmp_path):
@@ -225,7 +225,7 @@ def test_scatter_above_the_error_has_no_share(hybrid, tmp_path):
     smaller = replace(accuracy, models={"hybrid": ErrorFigures(rms_mm=1e-3)})
     limit = limit_of(model, CalibrationSummary.read(model), smaller, None)
     assert limit.noise > 1e-3
-    assert limit.share is None
+    assert limit.scatter_share is None
     assert limit.error == 1e-3
 
 
@@ -286,7 +286,10 @@ def test_a_dependence_on_temperature_is_found(hybrid, tmp_path):
 def test_the_summary_is_json(hybrid, tmp_path):
     content = report_content(hybrid[1], tmp_path, measured(hybrid[0], 40, seed=9))
     text = json.dumps(content.to_json(), allow_nan=False)
-    assert json.loads(text)["accuracy"][0]["models"]["hybrid"]["rms_mm"] == content.accuracies[0].last.rms_mm
+    assert (
+        json.loads(text)["accuracy"][0]["models"]["hybrid"]["rms_mm"]
+        == content.accuracies[0].model_figures.rms_mm
+    )
 
 
 def test_a_distilled_model_is_judged_by_its_parent(tmp_path):

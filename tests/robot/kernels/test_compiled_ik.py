@@ -157,7 +157,7 @@ def test_statuses_describe_the_result(arms):
     q[0, 0] = 3.0
     outside = kernels.solve(model.forward(q)[0].numpy(), near=q[0].numpy())
     assert outside.status == Status.OUTSIDE_DOMAIN
-    assert_close(outside.domain_measure, 1 + model.hybrid.coverage.beyond(q).max(), atol=1e-12)
+    assert_close(outside.domain_measure, 1 + model.hybrid.coverage.distance_outside(q).max(), atol=1e-12)
     assert outside.domain_measure > 1
     stretched = torch.tensor([0.3, -0.7, 0.0, 0.5, 0.6, 0.2], dtype=torch.float64)
     geometric = arms.calibrated("ur5", hybrid=False)

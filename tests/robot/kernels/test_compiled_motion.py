@@ -39,7 +39,7 @@ def test_hybrid_arms_agree_with_torch_inside_and_beyond_measured_joint_values(na
     q = arms.draw_joints(model.robot, 400, seed=4, share=0.6)
     T, J, _, beyond = arms.compiled(name, covered=0.5).forward(q.numpy())
     assert 10 < (beyond > 0).sum() < 390
-    assert_close(beyond, model.hybrid.coverage.beyond(q).amax(-1), atol=1e-13)
+    assert_close(beyond, model.hybrid.coverage.distance_outside(q).amax(-1), atol=1e-13)
     assert_close(T, model.hybrid.forward(q), atol=1e-13)
     assert_close(J, hybrid_motion(model.hybrid, q, exact=False)[1], atol=1e-13)
 

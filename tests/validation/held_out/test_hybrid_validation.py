@@ -96,7 +96,7 @@ def test_coverage_of_errors_drawn_as_predicted(generator):
     assert spread.values < 12000
     assert_close(spread.coverage, 0.95, atol=0.01)
     assert_close(PredictedSpread(0.5 * error, sigma).coverage, 1.0, atol=1e-3)
-    assert PredictedSpread.unknown(5).in_file_units() == {}
+    assert PredictedSpread.all_nan(5).in_file_units() == {}
 
 
 def test_stated_noise_counts_row_by_row_and_rows_without_are_exact(arm):

@@ -62,10 +62,10 @@ def test_pose_errors_are_lengths_and_angles(generator):
     shift = torch.randn(6, 3, generator=generator, dtype=torch.float64)
     turn = torch.randn(6, 3, generator=generator, dtype=torch.float64)
     moved = transform(rotation_from_vector(turn) @ T[:, :3, :3], T[:, :3, 3] + shift)
-    errors = PoseErrors.between(measured(moved, q), T)
+    errors = PoseErrors.from_prediction(measured(moved, q), T)
     assert_close(errors.position, shift.norm(dim=-1), atol=1e-12)
     assert_close(errors.rotation, turn.norm(dim=-1), atol=1e-9)
-    assert PoseErrors.between(measured(moved, q, orientation=False), T).rotation is None
+    assert PoseErrors.from_prediction(measured(moved, q, orientation=False), T).rotation is None
     assert {"rms_mm", "rms_deg"} < set(errors.figures.by_name)
 
 
@@ -73,7 +73,7 @@ def test_pose_errors_need_positions():
     q = joints_around("kiro4", 2)
     T = forward_kinematics(hand_made_model("kiro4").robot, q)
     with refused(MeasurementError, expected="positions", value="none"):
-        PoseErrors.between(Measurements(q=q, rotation=T[:, :3, :3].clone()), T)
+        PoseErrors.from_prediction(Measurements(q=q, rotation=T[:, :3, :3].clone()), T)
 
 
 def test_a_model_explains_what_it_predicts():
@@ -102,7 +102,7 @@ def test_error_vectors_are_measured_minus_expected_along_the_axes(generator):
     shift = torch.randn(6, 3, generator=generator, dtype=torch.float64)
     turn = torch.randn(6, 3, generator=generator, dtype=torch.float64)
     moved = transform(rotation_from_vector(turn) @ T[:, :3, :3], T[:, :3, 3] + shift)
-    errors = ErrorVectors.between(measured(moved, q), T)
+    errors = ErrorVectors.from_prediction(measured(moved, q), T)
     assert_close(errors.position, shift, atol=1e-12)
     assert_close(errors.rotation, turn, atol=1e-9)
     for index in range(3):
@@ -111,7 +111,7 @@ def test_error_vectors_are_measured_minus_expected_along_the_axes(generator):
         assert_close(figures["rms"], np.sqrt((values**2).mean()), rtol=1e-8)
         assert_close(figures["p95"], np.quantile(np.abs(values), 0.95), rtol=1e-8)
         assert_close(figures["max"], np.abs(values).max(), rtol=1e-8)
-    some = errors.sizes.only(torch.tensor([True, False] * 3))
+    some = errors.sizes.mask_other_rows(torch.tensor([True, False] * 3))
     assert torch.equal(some.position.isnan(), torch.tensor([False, True] * 3))
     assert torch.equal(some.rotation.isnan(), torch.tensor([False, True] * 3))
 
@@ -125,4 +125,4 @@ def test_rows_without_positions_are_told_what_is_missing():
     q = joints_around("kiro4", 2)
     T = forward_kinematics(hand_made_model("kiro4").robot, q)
     with refused(MeasurementError, expected="positions", value="socket"):
-        PoseErrors.between(Measurements(q=q, socket=("a", "b")), T)
+        PoseErrors.from_prediction(Measurements(q=q, socket=("a", "b")), T)

@@ -5,7 +5,7 @@ import pytest
 from testing.closeness import assert_close
 
 from pisigma.validation.held_out.rank_tests import SIGNIFICANT
-from pisigma.validation.report.dependence import binned
+from pisigma.validation.report.dependence import bin_errors
 from pisigma.validation.report.largest_errors import CELLS, worst_region
 
 
@@ -49,9 +49,9 @@ def test_a_plane_of_places_has_cells():
 def test_binned_errors_are_root_mean_squares():
     rng = np.random.default_rng(0)
     values, errors = rng.uniform(-3, 5, 600), rng.normal(size=600)
-    found = binned(values, errors)
+    found = bin_errors(values, errors)
     for k, rms in enumerate(found.rms):
         low, high = found.edges[k : k + 2]
         own = (values >= low) & ((values < high) | (k == len(found.rms) - 1))
         assert_close(rms, np.sqrt((errors[own] ** 2).mean()), rtol=1e-12)
-    assert len(binned(np.ones(3), np.ones(3)).rms) == 1
+    assert len(bin_errors(np.ones(3), np.ones(3)).rms) == 1

@@ -60,7 +60,7 @@ def test_no_rigid_base_and_tool_leave_less_than_affine_ones(arm):
     measured = MeasuredPoses.from_tensors(arm.measurements.position, arm.measurements.rotation, 0.2)
     T = forward_kinematics(arm.nominal, arm.measurements.q)
     base, tool = best_base_and_tool(T, measured)
-    rigid = measured.squares(base @ T @ tool).mean()
+    rigid = measured.squared_errors(base @ T @ tool).mean()
     assert (1 - 13 / len(T)) * affine_error(T, measured) < rigid
     batch = torch.stack([T, T.flip(0)])
     assert_close(affine_error(batch, measured)[0], affine_error(T, measured), atol=1e-12)

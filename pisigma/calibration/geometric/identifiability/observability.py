@@ -7,7 +7,7 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from pisigma.calibration.geometric.problem.least_squares import Linearisation
-from pisigma.calibration.geometric.problem.noise import view_of
+from pisigma.calibration.geometric.problem.noise import sensor_view_of
 from pisigma.calibration.geometric.problem.problem import CalibrationProblem
 
 ROUNDING = 1e-12
@@ -72,12 +72,12 @@ def find_weak_directions(problem: CalibrationProblem, here: Linearisation[Tensor
         problem: the problem with its free parameters.
         here: its linearisation at the solution.
     """
-    view, stated = view_of(here), problem.precision[problem.active]
-    precision = view.scaled(stated, problem.prior_group)
+    view, stated = sensor_view_of(here), problem.precision[problem.active]
+    precision = view.scaled_precision(stated, problem.prior_group)
     held = bool((precision > 0).any())
     data = here.normal - torch.diag(precision)
     wide = replace(view, prior_scale=view.prior_scale.clamp(min=1.0))
-    precision = wide.scaled(stated, problem.prior_group)
+    precision = wide.scaled_precision(stated, problem.prior_group)
     usual = torch.where(precision > 0, precision.clamp(min=1e-30).rsqrt(), problem.step_scale)
     data = data * usual * usual[:, None]
     arm = problem.active < problem.space.arm_size

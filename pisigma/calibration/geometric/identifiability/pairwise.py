@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64
 
-from pisigma.calibration.geometric.identifiability.redundancy import NO_EFFECT, preferences
+from pisigma.calibration.geometric.identifiability.redundancy import NO_EFFECT, selection_weights
 from pisigma.calibration.geometric.problem.information import Information
 
 CORRELATION_TOLERANCE = 1e-6
@@ -74,14 +74,14 @@ def find_pairwise_redundancy(
     columns = information.jacobian
     lengths = np.linalg.norm(columns, axis=0)
     acting = lengths > NO_EFFECT * max(lengths.max(initial=0.0), 1e-300)
-    parameters, preference = information.parameters, preferences(information.parameters, sizes)
+    parameters, preference = information.parameters, selection_weights(information.parameters, sizes)
     order = sorted(range(len(parameters)), key=lambda i: (PAPER_ORDER.index(parameters[i].group), i))
     tables, sets, dropped = [], [], set()
     for unit in ("m", "rad"):
         chosen = [i for i in order if parameters[i].unit == unit]
         table = CorrelationTable(
             tuple(parameters[i].name for i in chosen),
-            _correlations(information.centred[:, chosen], acting[chosen]),
+            _correlations(information.centred_jacobian[:, chosen], acting[chosen]),
         )
         tables.append(table)
         for members, signs in _sets(table.values, tolerance):

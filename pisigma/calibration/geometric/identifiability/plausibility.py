@@ -7,7 +7,7 @@ from torch import Tensor
 
 from pisigma.calibration.geometric.identifiability.calibration_warning import CalibrationWarning
 from pisigma.calibration.geometric.problem.least_squares import Linearisation
-from pisigma.calibration.geometric.problem.noise import view_of
+from pisigma.calibration.geometric.problem.noise import sensor_view_of
 from pisigma.calibration.geometric.problem.problem import CalibrationProblem
 from pisigma.files.errors import ImplausibleError, Place
 
@@ -127,7 +127,7 @@ def misfitting_frames(
 def residual_sizes(problem: CalibrationProblem, here: Linearisation[Tensor]) -> Float64[Tensor, " rows"]:
     """Compute the length of every row's residual per component [m]; NaN where no length was measured."""
     sizes = problem.q.new_full((problem.rows,), torch.nan)
-    for sensor, sums in zip(problem.sensors, view_of(here).sums, strict=True):
+    for sensor, sums in zip(problem.sensors, sensor_view_of(here).sums, strict=True):
         if sensor.unit == "m" and not sensor.certain:
             size = sums.residual.norm(dim=0) / sensor.components**0.5
             sizes = torch.where(sensor.present, size, sizes)

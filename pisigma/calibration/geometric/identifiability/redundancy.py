@@ -81,7 +81,7 @@ class Redundancy:
         """The identifiable combinations, one for every kept parameter with dependent ones."""
         return _dependencies(self.information, self.kept, self.removed)
 
-    def group(self, name: str) -> str | None:
+    def dependency_sentence_of(self, name: str) -> str | None:
         """Return the sentence of the dependency of a parameter, the shortest if there are several; None without."""
         having = [dependency for dependency in self.dependencies if name in dependency.names]
         return min(having, key=lambda dependency: len(dependency.names)).sentence if having else None
@@ -124,9 +124,9 @@ def find_redundancy(
         tolerance: see `RANK_TOLERANCE`.
     """
     jacobian, names = information.jacobian, np.array(information.names)
-    lengths, preference = _lengths(jacobian), preferences(information.parameters, sizes)
+    lengths, preference = _lengths(jacobian), selection_weights(information.parameters, sizes)
     scale = np.divide(preference, lengths, out=np.zeros_like(lengths), where=lengths > 0)
-    triangle, pivots = pivoted_triangle(jacobian * scale)
+    triangle, pivots = pivoted_qr(jacobian * scale)
     rank = _rank(triangle / preference[pivots], tolerance)
     acting = int((lengths > 0).sum())  # the others are the last pivots
 
@@ -167,7 +167,7 @@ def _rank(R: Float64[np.ndarray, "rank columns"], tolerance: float) -> int:
     return rank
 
 
-def preferences(
+def selection_weights(
     parameters: Sequence[Parameter], sizes: Float64[np.ndarray, " parameters"]
 ) -> Float64[np.ndarray, " parameters"]:
     """Compute weights by which parameters are kept; of equal ones the earlier is kept."""
@@ -176,7 +176,7 @@ def preferences(
     return result
 
 
-def pivoted_triangle(
+def pivoted_qr(
     A: Float64[np.ndarray, "rows columns"],
 ) -> tuple[Float64[np.ndarray, "rank columns"], Int64[np.ndarray, " columns"]]:
     """Return R and the pivots of a QR factorisation with column pivoting (LAPACK's `geqp3`)."""
@@ -209,11 +209,13 @@ def _dependencies(
             coefficients.append(float(change * usual[index] / usual[removed[k]]))
         members = [information.parameters[index], *(information.parameters[removed[k]] for k in partners)]
         names = tuple(member.name for member in members)
-        dependencies.append(Dependency(names, tuple(coefficients), sentence_of(members, coefficients)))
+        dependencies.append(
+            Dependency(names, tuple(coefficients), dependency_sentence(members, coefficients))
+        )
     return tuple(dependencies)
 
 
-def sentence_of(members: list[Parameter], coefficients: list[float]) -> str:
+def dependency_sentence(members: list[Parameter], coefficients: list[float]) -> str:
     """Write that only a combination is identifiable: "d_2 + d_3 + d_4 is identified, the single values are not"."""
     terms = sorted(zip(members, coefficients, strict=True), key=lambda term: (term[1] < 0, term[0].name))
     text = ""

@@ -75,7 +75,7 @@ def refuse_too_few(
     )
 
 
-def what_to_measure(setup: CalibrationSetup, estimated: int) -> tuple[CalibrationWarning, ...]:
+def measurement_advice(setup: CalibrationSetup, estimated: int) -> tuple[CalibrationWarning, ...]:
     """Warn of free parameters that the data hardly determine, and say what to measure next.
 
     Args:
@@ -194,7 +194,7 @@ def candidates_at_start(
     Returns:
         The candidates, without the length that sets the scale, and the information on them.
     """
-    at_start = after_unknowns(setup, information)
+    at_start = without_sensor_unknowns(setup, information)
     if determines_scale(setup):
         return candidates, at_start
     size = np.linalg.norm(at_start.jacobian, axis=0)
@@ -204,10 +204,10 @@ def candidates_at_start(
     if not lengths.any():
         return candidates, at_start
     longest = int(lengths.argmax())
-    return [i for i in candidates if i != candidates[longest]], at_start.without(longest)
+    return [i for i in candidates if i != candidates[longest]], at_start.without_parameter(longest)
 
 
-def after_unknowns(setup: CalibrationSetup, information: Information) -> Information:
+def without_sensor_unknowns(setup: CalibrationSetup, information: Information) -> Information:
     """Eliminate the sensors' unknowns, and set the columns of floating bases to zero.
 
     Measurements in a floating frame do not change if base and sensors move together. The first-order change of a
@@ -219,7 +219,7 @@ def after_unknowns(setup: CalibrationSetup, information: Information) -> Informa
         {parameters[i] for i in indices} for indices in (setup.free_unknowns, floating_bases(setup))
     )
     names = information.names
-    return information.after(
+    return information.eliminate(
         [i for i, name in enumerate(names) if name in unknowns],
         [i for i, name in enumerate(names) if name in floating],
     )

@@ -128,7 +128,7 @@ class BaseToolProblem(AbstractLeastSquares[BaseToolState]):
             sums.append((A.mT @ A, A.mT @ r, float(r @ r)))
         return self._combined(point, _View(tuple(sums), noise))
 
-    def renewed(
+    def with_updated_noise(
         self, linearisation: Linearisation[BaseToolState]
     ) -> tuple[Linearisation[BaseToolState], bool]:
         """Weight positions and rotations by the inverse of their scatter if no standard deviation is stated."""
@@ -151,7 +151,7 @@ class BaseToolProblem(AbstractLeastSquares[BaseToolState]):
         rounding = descent.new_tensor(sum(3 * len(self.position) * (self._rounding / s) ** 2 for s in noise))
         return Linearisation(point, cost, descent, normal, cost, rounding, view)
 
-    def moved(self, point: BaseToolState, step: Float64[Tensor, " active"]) -> BaseToolState:
+    def apply_step(self, point: BaseToolState, step: Float64[Tensor, " active"]) -> BaseToolState:
         """Rotate and shift base and tool."""
         full = step.new_zeros(9 + 3 * len(self.targets)).index_copy(0, self.active, step)
         return BaseToolState(

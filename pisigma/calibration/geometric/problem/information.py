@@ -52,17 +52,17 @@ class Information:
         return self.root[:, -2]
 
     @property
-    def centred(self) -> Float64[np.ndarray, "rank parameters"]:
+    def centred_jacobian(self) -> Float64[np.ndarray, "rank parameters"]:
         """The condensed Jacobian after subtracting the mean of every column of J."""
         ones_first: np.ndarray = np.linalg.qr(np.roll(self.root, 1, axis=1), mode="r")  # type: ignore[assignment]
         return ones_first[1:, 1:-1]
 
-    def without(self, column: int) -> "Information":
+    def without_parameter(self, column: int) -> "Information":
         """Return the information without one parameter."""
         parameters = self.parameters[:column] + self.parameters[column + 1 :]
         return replace(self, parameters=parameters, root=np.delete(self.root, column, 1))
 
-    def after(self, nuisance: list[int], silent: Sequence[int] = ()) -> "Information":
+    def eliminate(self, nuisance: list[int], silent: Sequence[int] = ()) -> "Information":
         """Eliminate nuisance parameters: project the other columns onto the complement of theirs.
 
         Args:

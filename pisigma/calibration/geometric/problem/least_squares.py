@@ -35,7 +35,7 @@ class SolutionStatus(Enum):
     )
 
     @property
-    def good(self) -> bool:
+    def is_minimum(self) -> bool:
         """Whether the point is a minimum."""
         return self in (SolutionStatus.CONVERGED, SolutionStatus.EXACT)
 
@@ -70,16 +70,16 @@ class AbstractLeastSquares(ABC, Generic[Point]):
     def linearise(self, point: Point, like: Linearisation[Point] | None) -> Linearisation[Point]:
         """Linearise the problem at a point with the noise of `like`, or with a default noise if None."""
 
-    def begin(self, point: Point) -> Linearisation[Point]:
+    def linearise_at_start(self, point: Point) -> Linearisation[Point]:
         """Linearise the problem at a start, with the noise estimated from its residuals."""
-        return self.renewed(self.linearise(point, None))[0]
+        return self.with_updated_noise(self.linearise(point, None))[0]
 
     @abstractmethod
-    def renewed(self, linearisation: Linearisation[Point]) -> tuple[Linearisation[Point], bool]:
+    def with_updated_noise(self, linearisation: Linearisation[Point]) -> tuple[Linearisation[Point], bool]:
         """Estimate the noise from the residuals; return the linearisation with it, and whether it has converged."""
 
     @abstractmethod
-    def moved(self, point: Point, step: Float[Tensor, " unknowns"]) -> Point:
+    def apply_step(self, point: Point, step: Float[Tensor, " unknowns"]) -> Point:
         """Return the point after a step."""
 
     @property
@@ -108,7 +108,7 @@ class Solution(Generic[Point]):
     status: SolutionStatus
     path: tuple[float, ...]
 
-    def before(self, other: "Solution[Point]") -> "Solution[Point]":
+    def continued_by(self, other: "Solution[Point]") -> "Solution[Point]":
         """Return the result of a search that continued this one, with the iterations and the path of both."""
         return replace(other, iterations=self.iterations + other.iterations, path=self.path + other.path[1:])
 
@@ -137,13 +137,17 @@ def levenberg_marquardt(
     Returns:
         The best point, with the reason for stopping (see `SolutionStatus`).
     """
-    first = problem.renewed(start)[0] if isinstance(start, Linearisation) else problem.begin(start)
+    first = (
+        problem.with_updated_noise(start)[0]
+        if isinstance(start, Linearisation)
+        else problem.linearise_at_start(start)
+    )
     search = _Search(problem, first)
     status: SolutionStatus | None = None
     while status is None and search.iterations < maximum_iterations:
-        search.propose()
+        search.propose_step()
         near = search.at_best and search.decrement < close_enough**2
-        status = SolutionStatus.CONVERGED if near else search.advance()
+        status = SolutionStatus.CONVERGED if near else search.try_step()
     ended = status or SolutionStatus.ITERATION_LIMIT
     return Solution(search.best, search.iterations, ended, tuple(search.path))
 
@@ -166,15 +170,15 @@ class _Search(Generic[Point]):
         self.damping, self.decrement, self.step = START_DAMPING, 0.0, best.descent
         self.path = [float(problem.rms(best))]
 
-    def propose(self) -> None:
+    def propose_step(self) -> None:
         """Compute the next step."""
         self.step = solve_damped(self.here, self.problem.step_scale, self.damping)
         self.decrement = float((self.here.normal @ self.step) @ self.step)
 
-    def advance(self) -> SolutionStatus | None:
+    def try_step(self) -> SolutionStatus | None:
         """Try the step, and choose the start of the next one, or return why the search has ended."""
         self.iterations += 1
-        there = self.problem.linearise(self.problem.moved(self.here.point, self.step), self.best)
+        there = self.problem.linearise(self.problem.apply_step(self.here.point, self.step), self.best)
         if not bool(there.cost <= self.best.cost):
             return self._climb(there)
         settled = self._descend(there)
@@ -186,7 +190,7 @@ class _Search(Generic[Point]):
         """Accept a point with a lower cost, and return whether the noise has converged."""
         settled = True
         if self.iterations <= MAX_NOISE_UPDATES:
-            there, settled = self.problem.renewed(there)
+            there, settled = self.problem.with_updated_noise(there)
         self.best = self.here = there
         self.damping = max(self.damping / 10, SMALLEST_DAMPING)
         self.uphill, self.at_best = 0, True
@@ -208,7 +212,7 @@ class _Search(Generic[Point]):
         if self.at_best:
             self.here, self.uphill, self.damping = self.best, 0, max(100 * self.damping, 0.1)
         else:
-            self.here, self.uphill = self.problem.renewed(there)[0], self.uphill + 1
+            self.here, self.uphill = self.problem.with_updated_noise(there)[0], self.uphill + 1
         return None
 
 

@@ -103,20 +103,20 @@ class SensorView:
         """Variances of the sensors' values, with all factors."""
         return self.noise.square() * self.repetition * self.disagreement
 
-    def scaled(
+    def scaled_precision(
         self, precision: Float64[Tensor, " active"], group: Int64[Tensor, " active"]
     ) -> Float64[Tensor, " active"]:
         """Return the prior precision of parameters with the current scale."""
         return scaled_precision(precision, group, self.prior_scale)
 
 
-def view_of(linearisation: Linearisation[Tensor]) -> SensorView:
+def sensor_view_of(linearisation: Linearisation[Tensor]) -> SensorView:
     """Return the sensors' part of a linearisation of a `CalibrationProblem`."""
     assert isinstance(linearisation.detail, SensorView)
     return linearisation.detail
 
 
-def values_used(
+def parameters_used(
     view: SensorView, covariance: Float64[Tensor, "active active"]
 ) -> Float64[Tensor, " sensors"]:
     """Compute the effective number of parameters estimated from every sensor's values (Förstner 1979)."""
@@ -156,7 +156,7 @@ def loss_scale(
     return torch.stack(scales)
 
 
-def rejecting(sensors: Sequence[AbstractSensor], losses: Sequence[AbstractLoss], view: SensorView) -> bool:
+def rejects_rows(sensors: Sequence[AbstractSensor], losses: Sequence[AbstractLoss], view: SensorView) -> bool:
     """Say whether the loss gives any row of a sensor weight 0."""
     of_each = zip(sensors, losses, view.sums, view.scales, strict=True)
     return any(
@@ -165,7 +165,7 @@ def rejecting(sensors: Sequence[AbstractSensor], losses: Sequence[AbstractLoss],
     )
 
 
-def renumbered(keys: Int64[Tensor, " rows"]) -> Int64[Tensor, " rows"]:
+def renumber(keys: Int64[Tensor, " rows"]) -> Int64[Tensor, " rows"]:
     """Map keys to numbers from 0, equal for equal keys."""
     numbers: Tensor = torch.unique(keys, return_inverse=True)[1]
     return numbers

@@ -20,10 +20,10 @@ from pisigma.calibration.geometric.problem.noise import (
     group_variance_ratio,
     joined_sums,
     loss_scale,
-    rejecting,
-    renumbered,
-    values_used,
-    view_of,
+    parameters_used,
+    rejects_rows,
+    renumber,
+    sensor_view_of,
 )
 from pisigma.calibration.geometric.problem.parameters import EVERYWHERE, ParameterSpace, PriorSizes
 from pisigma.calibration.geometric.problem.prior_sizes import (
@@ -155,8 +155,8 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
             frame=self.frame[rows],
             target=self.target[rows],
             sensors=tuple(sensor.select(rows) for sensor in self.sensors),
-            pose=None if self.pose is None else renumbered(self.pose[rows]),
-            configuration=None if self.configuration is None else renumbered(self.configuration[rows]),
+            pose=None if self.pose is None else renumber(self.pose[rows]),
+            configuration=None if self.configuration is None else renumber(self.configuration[rows]),
             pairs=int((rows < 2 * self.pairs).sum()) // 2,
             stated={name: values[rows] for name, values in self.stated.items()},
             memory=MotionMemory(),
@@ -167,17 +167,17 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         """Joint values and stated conditions of the rows."""
         return JointState(self.q, self.stated)
 
-    def moved(self, point: Tensor, step: Tensor) -> Tensor:
+    def apply_step(self, point: Tensor, step: Tensor) -> Tensor:
         """Return the parameters after a step of the free ones."""
         return point.index_add(0, self.active, step)
 
     def rms(self, linearisation: Linearisation[Tensor]) -> Float64[Tensor, ""]:
         """Return the RMS residual length of the first sensor [m or rad]."""
-        return view_of(linearisation).sums[0].rms
+        return sensor_view_of(linearisation).sums[0].rms
 
     def linearise(self, point: Tensor, like: Linearisation[Tensor] | None) -> Linearisation[Tensor]:
         """Sum the normal equations, with rows weighted by the noise of `like`, or equally if None."""
-        before = None if like is None else view_of(like)
+        before = None if like is None else sensor_view_of(like)
         unknowns = self.space.sensor_unknowns(point)
         chunks = []
         for rows in self.chunks():
@@ -187,18 +187,18 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         view = SensorView.without_noise(sums) if before is None else replace(before, sums=sums)
         return self.combined(point, view)
 
-    def begin(self, point: Tensor) -> Linearisation[Tensor]:
+    def linearise_at_start(self, point: Tensor) -> Linearisation[Tensor]:
         """Linearise the problem at a start, with rows weighted by the noise estimated from them.
 
         If the loss rejects rows, they are linearised twice; otherwise gross errors would dominate the first step.
         """
-        weighted = self.renewed(self.linearise(point, None))[0]
+        weighted = self.with_updated_noise(self.linearise(point, None))[0]
         losses = [self.loss_of(sensor) for sensor in self.sensors]
-        if not rejecting(self.sensors, losses, view_of(weighted)):
+        if not rejects_rows(self.sensors, losses, sensor_view_of(weighted)):
             return weighted
-        return self.renewed(self.linearise(point, weighted))[0]
+        return self.with_updated_noise(self.linearise(point, weighted))[0]
 
-    def renewed(self, linearisation: Linearisation[Tensor]) -> tuple[Linearisation[Tensor], bool]:
+    def with_updated_noise(self, linearisation: Linearisation[Tensor]) -> tuple[Linearisation[Tensor], bool]:
         """Estimate noise (robustly), the weight of repeats, and the prior scales."""
         return self._renewed(linearisation, refine=False)
 
@@ -209,9 +209,9 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
     def _renewed(
         self, linearisation: Linearisation[Tensor], refine: bool
     ) -> tuple[Linearisation[Tensor], bool]:
-        view = view_of(linearisation)
+        view = sensor_view_of(linearisation)
         covariance = covariance_of(linearisation.normal)
-        used = values_used(view, covariance)
+        used = parameters_used(view, covariance)
         noise = loss_scale(self.sensors, self.loss, view, used, refine)
         repetition = view.repetition
         if self.pose is not None or self.configuration is not None:
@@ -221,7 +221,7 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         off = self._off(linearisation.point)
         renewed = replace(view, noise=noise, repetition=repetition)
         if not refine and any(sensor.unit == "rad" for sensor in self.sensors):
-            held = view.scaled(self._prior, self.prior_group)
+            held = view.scaled_precision(self._prior, self.prior_group)
             renewed = replace(
                 renewed, disagreement=angle_disagreement(self.sensors, renewed, held, -held * off)
             )
@@ -311,7 +311,7 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
     def combined(self, point: Tensor, view: SensorView) -> Linearisation[Tensor]:
         """Combine the sensors' sums, divided by their variances, and the prior to a linearisation."""
         off = self._off(point)
-        precision = view.scaled(self._prior, self.prior_group)
+        precision = view.scaled_precision(self._prior, self.prior_group)
         pull = off * precision
         normal, descent = self._data_sums(view)
         normal.diagonal().add_(precision)

@@ -11,7 +11,7 @@ from jaxtyping import Float64, Int64
 from torch import Tensor
 
 from pisigma.calibration.geometric.initial_guess.initial_guess import InitialGuess, guess
-from pisigma.calibration.geometric.problem.noise import renumbered
+from pisigma.calibration.geometric.problem.noise import renumber
 from pisigma.calibration.geometric.problem.parameters import ParameterSpace, Prior, PriorSizes
 from pisigma.calibration.geometric.problem.problem import CalibrationProblem
 from pisigma.estimation.loss import AbstractLoss
@@ -114,10 +114,10 @@ def build_setup(
     guessed = guess(
         space, measurements, options.free_base, options.free_tool, options.turn_tool, options.frames
     )
-    return setup_around(space, guessed, (rows, measurements), options, prior, loss)
+    return setup_from_guess(space, guessed, (rows, measurements), options, prior, loss)
 
 
-def setup_around(
+def setup_from_guess(
     space: ParameterSpace,
     guessed: InitialGuess,
     usable: tuple[Tensor, Measurements],
@@ -147,7 +147,9 @@ def setup_around(
     sensors = build_sensors(
         SensorRows(measurements, anchors.bases.to(device)[frame], anchors.tools.to(device)[target])
     )
-    distances = SocketDistanceSensor.between(measurements, options.socket_distances, options.socket_sigma)
+    distances = SocketDistanceSensor.assign_distances(
+        measurements, options.socket_distances, options.socket_sigma
+    )
     repeats = repeat_key(measurements)
     problem = CalibrationProblem(
         space=space,
@@ -212,7 +214,7 @@ def repeated(q: Tensor, *names: Tensor) -> Tensor | None:
     Returns:
         None if all rows differ.
     """
-    numbers = renumbered(_mixed_keys(q, *names))
+    numbers = renumber(_mixed_keys(q, *names))
     return None if int(numbers.max()) + 1 == len(q) else numbers
 
 
@@ -285,7 +287,7 @@ class IdentifiedGeometry:
     point: Float64[Tensor, " parameters"] | None = field(default=None, repr=False)
 
     @cached_property
-    def change(self) -> Float64[Tensor, "parameters parameters"]:
+    def coordinate_jacobian(self) -> Float64[Tensor, "parameters parameters"]:
         """Derivative of all parameters in these coordinates by those of the problem; requires `setup` and `point`."""
         assert self.setup is not None
         assert self.point is not None

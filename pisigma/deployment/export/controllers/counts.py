@@ -23,7 +23,7 @@ COLUMNS = ("counts_per_turn", "present_count", "new_count")
 
 
 @dataclass(frozen=True)
-class Counts:
+class EncoderCounts:
     """Zero positions of joints in encoder counts.
 
     The controller computes a joint value as (encoder - count) / (counts per turn), so an offset that is added to the
@@ -63,7 +63,7 @@ def write_counts(content: FileText) -> str:
             value=request.present_counts if (present % 1).any() else request.counts_per_turn,
         )
     moved = offsets_between(nominal, robot) / _unit(nominal) * per_turn
-    counts = Counts(per_turn, present.astype(np.int64), np.rint(present - moved).astype(np.int64))
+    counts = EncoderCounts(per_turn, present.astype(np.int64), np.rint(present - moved).astype(np.int64))
     lines: list[dict[str, object]] = []
     columns = (counts.per_turn, counts.present, counts.new, counts.offsets(nominal))
     for axis, *values, offset in zip(nominal.axes, *columns, strict=True):

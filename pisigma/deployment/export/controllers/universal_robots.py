@@ -13,7 +13,7 @@ from pisigma.deployment.export.controllers.controller_file import (
     with_frames,
 )
 from pisigma.deployment.export.controllers.ur_models import JOINTS, check_robot, convention, own_geometry
-from pisigma.deployment.export.dh_table import head
+from pisigma.deployment.export.dh_table import header_comment
 from pisigma.files.errors import Place, RobotError
 from pisigma.files.input_file import read_text
 from pisigma.robot.chains import in_few_rows, robot_of_origins
@@ -65,7 +65,7 @@ def write_calibration(content: FileText) -> str:
         key: f"{key} = [{', '.join(repr(value) for value in difference[:, column].tolist())}]"
         for key, column in KEYS.items()
     }
-    comments = head((*content.comments, *frame_sentences(robot)))
+    comments = header_comment((*content.comments, *frame_sentences(robot)))
     if content.request.like is None:
         return comments + "\n".join(["[mounting]", *lines.values()]) + "\n"
     text = read_text(content.request.like, RobotError, "calibration.conf")

@@ -12,7 +12,7 @@ from pisigma.deployment.export.controllers.controller_file import (
 )
 from pisigma.deployment.export.controllers.universal_robots import without_beta
 from pisigma.deployment.export.controllers.ur_models import JOINTS, check_robot, convention, own_geometry
-from pisigma.deployment.export.dh_table import head
+from pisigma.deployment.export.dh_table import header_comment
 from pisigma.files.errors import RobotError
 from pisigma.files.yaml_file import Section, parse_yaml, yaml_text
 from pisigma.robot.chains import robot_of_origins
@@ -85,7 +85,7 @@ def write_kinematics(content: FileText) -> str:
         for link, origin in zip(LINKS, origins, strict=True)
     }
     links["hash"] = calibration_hash(without_beta(origins, own))
-    return head((*content.comments, *frame_sentences(own))) + yaml_text({"kinematics": links})
+    return header_comment((*content.comments, *frame_sentences(own))) + yaml_text({"kinematics": links})
 
 
 def read_kinematics(text: str, source: str, nominal: Robot) -> Robot:

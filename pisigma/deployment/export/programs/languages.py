@@ -63,7 +63,7 @@ class Program:
     config: str = ""
 
     @staticmethod
-    def of_targets(targets: Targets, name: str, cartesian: bool, config: str = "") -> "Program":
+    def from_targets(targets: Targets, name: str, cartesian: bool, config: str = "") -> "Program":
         """Make the program that moves to targets, none of which may be missing."""
         sentences = [targets.title, TEST, COUNTING.format(robot=targets.robot.name)]
         sentences += [*CARTESIAN, *targets.remarks] if cartesian else []
@@ -176,19 +176,21 @@ def _templates() -> jinja2.Environment:
     )
 
 
-def words(text: str) -> frozenset[str]:
+def reserved_words(text: str) -> frozenset[str]:
     """Split words of a language, in capitals, for `Language.reserved`."""
     return frozenset(text.upper().split())
 
 
-FILES_OF_SYSTEMS = words("con prn aux nul") | {f"{p}{i}" for p in ("COM", "LPT") for i in range(1, 10)}
+FILES_OF_SYSTEMS = reserved_words("con prn aux nul") | {
+    f"{p}{i}" for p in ("COM", "LPT") for i in range(1, 10)
+}
 """Names that some controllers' file systems reserve for devices."""
 
 URSCRIPT = Language(
     name="URScript",
     template="urscript.j2",
     longest=64,
-    reserved=words(
+    reserved=reserved_words(
         "and break continue def elif else end enum false for global halt if local not or pass return run sec "
         "struct then thread true while xor movej get_inverse_kin pose_trans set_tcp p speed acceleration frame"
     ),
@@ -204,7 +206,7 @@ KRL = Language(
     template="krl.j2",
     longest=24,
     reserved=FILES_OF_SYSTEMS
-    | words(
+    | reserved_words(
         "and anin anout b_and b_exor b_not b_or bool brake bas case ccomp channel char circ circ_rel confirm "
         "const continue ct_i decl def default defdat deffct digin do else end enddat endfct endfor endif "
         "endloop endspline endswitch endwhile enum exit exor ext extfct false for frame global goto halt if "
@@ -217,7 +219,7 @@ RAPID = Language(
     name="RAPID",
     template="rapid.j2",
     longest=27,  # of 32, with _tool appended
-    reserved=words(
+    reserved=reserved_words(
         "alias and backward bool case connect const default div do else elseif endfor endfunc endif endmodule endproc "
         "endrecord endtest endtrap endwhile error exit false for from func goto if inout local mod module nostepin not "
         "noview num or pers proc raise readonly record retry return step string sysmodule task test then to trap true "
@@ -320,7 +322,7 @@ def program_text(targets: Targets, path: Path, cartesian: bool, config: str | No
         )
     if cartesian and language.configuration:
         _check_turns(targets)
-    return language.write(Program.of_targets(targets, language.program_name(path), cartesian, config or ""))
+    return language.write(Program.from_targets(targets, language.program_name(path), cartesian, config or ""))
 
 
 def _check_turns(targets: Targets) -> None:

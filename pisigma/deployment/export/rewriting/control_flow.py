@@ -25,7 +25,7 @@ class Step(NamedTuple):
     name: str = ""
 
 
-class FramesInForce:
+class ActiveFrames:
     """Frame or tool of every name, or the reason why it is not certain, while a reader advances through the steps.
 
     A value is certain if all paths through the program lead to the same one. A value that is set in a loop or a branch

@@ -85,7 +85,7 @@ class CommandedPoses:
     branches: frozenset[int]
 
     @property
-    def reached(self) -> bool:
+    def all_reached(self) -> bool:
         """Whether all poses are reached."""
         return set(self.status) <= set(WITH_TARGET)
 
@@ -104,7 +104,7 @@ class ProgramCorrection:
     branch: str | None
     tolerance: float
 
-    def correct(self, program: ScannedProgram) -> CorrectedProgram:
+    def correct_program(self, program: ScannedProgram) -> CorrectedProgram:
         """Rewrite all targets that are understood and reached; other text is kept.
 
         A target is the pose for the real tool. It is replaced by the nominal robot's pose at the corrected joint
@@ -113,7 +113,7 @@ class ProgramCorrection:
         """
         targets, ways = program.targets, {move: self.path(move) for move in program.moves}
         paths = {move: way for move, way in ways.items() if isinstance(way, Tensor)}
-        answers = self.commanded(
+        answers = self.commanded_poses(
             [*targets, *(move.end for move in paths)],
             [*(target.pose.T[None] for target in targets), *paths.values()],
         )
@@ -124,7 +124,7 @@ class ProgramCorrection:
         reasons = {move.line: why for move, why in (ways | points).items() if isinstance(why, str)}
         cuts = [(move, way) for move, way in points.items() if way and not isinstance(way, str)]
         answered = list(zip(targets, answers, strict=False))
-        reached = [(target.pose, there) for target, there in answered if there.reached]
+        reached = [(target.pose, there) for target, there in answered if there.all_reached]
         text = program.finish(_edited(program.text, _edits(reached, cuts)))
         branches = sorted({index for _, there in reached for index in there.branches})
         return CorrectedProgram(
@@ -136,7 +136,7 @@ class ProgramCorrection:
             tuple(self.solver.branches[index] for index in branches),
         )
 
-    def commanded(
+    def commanded_poses(
         self, targets: Sequence[Target], poses: Sequence[Float64[Tensor, "_poses 4 4"]]
     ) -> list[CommandedPoses]:
         """Compute the poses to command for target poses of each target's tool in its frame."""
@@ -167,7 +167,7 @@ class ProgramCorrection:
         via = _seen_from(move.end, move.via)
         if is_straight(*(T[:, :3, 3] for T in (start, via, end))):
             return COLLINEAR
-        arc = Arcs.through(*(T[:, :3, 3] for T in (start, via, end)))
+        arc = CircularArcs.through_points(*(T[:, :3, 3] for T in (start, via, end)))
         between = start[:, :3, :3] @ rotation_from_vector(arc.passing / arc.angle * _turn(start, end))
         if LEVER * float(rotation_vector(between.mT @ via[:, :3, :3]).norm()) > self.tolerance:
             return OTHER_ORIENTATION
@@ -176,7 +176,7 @@ class ProgramCorrection:
 
     def way_points(self, move: PathMove, there: CommandedPoses) -> list[Frame] | str:
         """Return the way points of a move, see `PathMove.way_points`, or the reason why it is not split."""
-        if not there.reached:
+        if not there.all_reached:
             return f"the {_kind(move)} has poses that are not reached, so it has no way points"
         if len(there.branches) > 1:
             return f"the {_kind(move)} changes from one branch to another, so it has no way points"
@@ -248,8 +248,8 @@ def _round(
     steps: int,
 ) -> Float64[Tensor, "ways points 4 4"]:
     """Interpolate poses from start by via to end: an arc, and a rotation about one axis from start to end."""
-    arcs = Arcs.through(*(T[:, :3, 3] for T in (start, via, end)))
-    return transform(_between(start, end, steps)[..., :3, :3], arcs.points(steps))
+    arcs = CircularArcs.through_points(*(T[:, :3, 3] for T in (start, via, end)))
+    return transform(_between(start, end, steps)[..., :3, :3], arcs.sample(steps))
 
 
 def _between(
@@ -271,7 +271,7 @@ def _edited(text: str, edits: Sequence[Edit]) -> str:
 
 
 @dataclass(frozen=True, eq=False)
-class Arcs:
+class CircularArcs:
     """Arcs that start at first points, pass second ones and end at third ones.
 
     Attributes:
@@ -289,7 +289,7 @@ class Arcs:
     angle: Float64[Tensor, " arcs"]
 
     @staticmethod
-    def through(first: Points, second: Points, third: Points) -> "Arcs":
+    def through_points(first: Points, second: Points, third: Points) -> "CircularArcs":
         """Construct arcs through points [m], which must not be collinear, see `is_straight`."""
         u, v = second - first, third - first
         normal = torch.linalg.cross(u, v)
@@ -299,9 +299,9 @@ class Arcs:
         middle = torch.linalg.cross(u_square * v - v_square * u, normal) / (2 * normal_square)
         axis = normal / normal_square.sqrt()
         passing, angle = (_angle(-middle, way - middle, axis) for way in (u, v))
-        return Arcs(first + middle, -middle, axis, passing, angle)
+        return CircularArcs(first + middle, -middle, axis, passing, angle)
 
-    def points(self, steps: int) -> Float64[Tensor, "arcs points 3"]:
+    def sample(self, steps: int) -> Float64[Tensor, "arcs points 3"]:
         """Return equidistant points along the arcs [m], from the first points to the third ones."""
         angles = torch.linspace(0, 1, steps + 1, dtype=torch.float64) * self.angle[:, None]
         turned = rotation_from_vector(angles[..., None] * self.axis[:, None]) @ self.radius[:, None, :, None]

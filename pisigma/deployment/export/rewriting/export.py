@@ -97,7 +97,7 @@ def rewrite_program(request: ExportRequest) -> Exported:
             remedy="export --poses with joint values instead",
         )
     tolerance = TOLERANCE_MM if request.tolerance_mm is None else request.tolerance_mm
-    corrected = ProgramCorrection(solver, request.branch, tolerance / 1e3).correct(scanned)
+    corrected = ProgramCorrection(solver, request.branch, tolerance / 1e3).correct_program(scanned)
     return _exported(request, solver.model, scanned, corrected, tolerance)
 
 

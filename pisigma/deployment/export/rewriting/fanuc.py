@@ -75,13 +75,13 @@ class _Reader:
         self.positions = {match["number"]: match for match in _POSITION.finditer(self.text)}
         for position in self.positions.values():
             for name in axes_in_use(dict(_EXTERNAL.findall(position["body"]))):
-                self.axes_in_use.setdefault(name, self.scan.line(position.start()))
+                self.axes_in_use.setdefault(name, self.scan.line_number(position.start()))
         self.numbers = count(1 + max(map(int, self.positions), default=0))
         lines = [(line.start(), re.sub(r"!.*", "", line["body"])) for line in _LINE.finditer(self.text)]
         self.redefined = [match for _, body in lines for match in _REDEFINED.finditer(body)]
         for start, body in lines:
             for match in _CALL.finditer(body):
-                if self.call is None and not self.stated.sets_neither(match[1]):
+                if self.call is None and not self.stated.sets_no_frame(match[1]):
                     self.call, self.uncertain = match, start
         if self.call and any(_AGAIN.search(body) for _, body in lines):
             self.uncertain = 0
@@ -89,14 +89,14 @@ class _Reader:
         for line in _LINE.finditer(self.text):
             body = re.sub(r"!.*", "", line["body"])
             if _FLOW.match(body):
-                self.scan.interrupt()
+                self.scan.mark_unknown_start()
             if move := _MOVE.match(body):
                 self._move(line, move)
             else:
                 computed |= set(re.findall(r"\bP\[(\d+)", body))
         for name in computed & set(self.positions):
             if isinstance(pose := self._pose(name), Pose):
-                self.scan.blur(pose)
+                self.scan.mark_not_understood(pose)
         return self.scan.program(finish=_numbered)
 
     def _move(self, line: re.Match[str], move: re.Match[str]) -> None:
@@ -116,12 +116,14 @@ class _Reader:
                 tool = IDENTITY if match["ut"] == "0" else self._stated("UTOOL", match["ut"], line.start())
                 if modified := _MODIFIED.search(move["rest"]):
                     if isinstance(pose, Pose):
-                        self.scan.blur(pose)
+                        self.scan.mark_not_understood(pose)
                     pose = f"{modified[0]} moves the target"
             circular = move["kind"] == "C" and order == 1
             cuttable = isinstance(pose, Pose) and (circular or move["kind"] == "L")
             if move["kind"] == "A":
-                self.scan.leave(line.start(), "arcs of A have no way points, only their poses are corrected")
+                self.scan.leave_unchanged(
+                    line.start(), "arcs of A have no way points, only their poses are corrected"
+                )
             cut = partial(self._way_points, line, move, match, len(names)) if cuttable and match else None
             self.scan.move(line.start(), pose, frame, tool, cut, circular)
 
@@ -140,7 +142,7 @@ class _Reader:
         if values is None or "GP2" in match["body"]:
             return f"the values of P[{name}] are not understood"
         if used := external_axes(dict(_EXTERNAL.findall(match["body"])), self.axes_in_use):
-            return f"{used} (P[{name}], line {self.scan.line(match.start())})"
+            return f"{used} (P[{name}], line {self.scan.line_number(match.start())})"
         six = torch.tensor([float(match[2]) for match in _VALUE.finditer(values["six"])], dtype=torch.float64)
         x, y, z, w, p, r = torch.cat([six[:3] / 1e3, torch.deg2rad(six[3:])])
         T = transform_from_xyzrpy(torch.stack([x, y, z, r, p, w]))

@@ -38,7 +38,7 @@ class FrameFile(Section):
         """Return a frame by name, or the reason why it is not known."""
         return _lookup(self.frames, name, "frame")
 
-    def sets_neither(self, routine: str) -> bool:
+    def sets_no_frame(self, routine: str) -> bool:
         """Return whether a routine of another file is stated to set neither frame nor tool."""
         return routine.upper() in map(str.upper, self.routines)
 

@@ -8,7 +8,7 @@ from functools import partial
 import torch
 
 from pisigma.deployment.export.programs.text import labelled, millimetres_and_euler
-from pisigma.deployment.export.rewriting.control_flow import FramesInForce, Step
+from pisigma.deployment.export.rewriting.control_flow import ActiveFrames, Step
 from pisigma.deployment.export.rewriting.frame_file import FrameFile
 from pisigma.deployment.export.rewriting.known_routines import KRL
 from pisigma.deployment.export.rewriting.scan import (
@@ -21,11 +21,11 @@ from pisigma.deployment.export.rewriting.scan import (
     Pose,
     Scan,
     ScannedProgram,
-    arguments,
+    argument_spans,
     axes_in_use,
     external_axes,
     groups_of,
-    masked,
+    mask_comments,
     numbers_in,
 )
 from pisigma.robot.se3 import transform_from_xyzrpy
@@ -71,7 +71,7 @@ def scan_krl(text: str, stated: FrameFile) -> ScannedProgram:
         text: text of the program.
         stated: frames that the program names but does not state, such as `BASE_DATA[1]` and `TOOL_DATA[2]`.
     """
-    return _Reader(Scan(text), masked(text, _HIDDEN), stated).read()
+    return _Reader(Scan(text), mask_comments(text, _HIDDEN), stated).read()
 
 
 _POINT = re.compile(r"(?im)^[ \t]*(?:DECL\s+|GLOBAL\s+)+E?\d?POS\s+X(\w+)\s*=\s*(?=\{)")
@@ -90,7 +90,7 @@ def scan_krl_data(text: str, stated: FrameFile) -> ScannedProgram:
         text: text of the data list.
         stated: `BASE_DATA[n]` and `TOOL_DATA[n]`; number 0 is the origin and the flange.
     """
-    scan, visible = Scan(text), masked(text, _HIDDEN)
+    scan, visible = Scan(text), mask_comments(text, _HIDDEN)
     frames = {match[1].upper(): match for match in _FRAMES.finditer(visible)}
     in_use = _axes_in_use(scan, visible)
     for match in _POINT.finditer(visible):
@@ -112,7 +112,7 @@ class _Reader:
     scan: Scan
     text: str
     stated: FrameFile
-    frames: FramesInForce = field(init=False)
+    frames: ActiveFrames = field(init=False)
     axes_in_use: dict[str, int] = field(init=False)
 
     def __post_init__(self) -> None:
@@ -124,17 +124,17 @@ class _Reader:
             literal = _AGGREGATE.match(self.text, match.end())
             if literal and self.names.is_set_once(match[1]):
                 pose = _target_pose(literal, self.axes_in_use)
-                where = f" (line {self.scan.line(match.start())})"
+                where = f" (line {self.scan.line_number(match.start())})"
                 self.names.add(match[1], pose if isinstance(pose, Pose) else pose + where)
         steps = [(match, step) for match in _STATEMENT.finditer(self.text) for step in self._steps(match)]
         unknown = FIXED_TOOL if _FIXED_TOOL.search(self.text) else ""
-        self.frames = FramesInForce(
+        self.frames = ActiveFrames(
             [step for _, step in steps],
             {name: unknown or f"{name} is not stated before the move" for name in _FRAMES_OF_MOVES},
         )
         for place, (match, step) in enumerate(steps):
             if match["flow"] or step.kind == "routine":
-                self.scan.interrupt()
+                self.scan.mark_unknown_start()
             if match["move"]:
                 self._move(match)
             self.frames.advance(place, unknown or self._value(match, step))
@@ -144,7 +144,7 @@ class _Reader:
         """Convert a statement to steps of control flow."""
         return [
             Step("other")
-            if step.kind == "call" and (step.name in KRL or self.stated.sets_neither(step.name))
+            if step.kind == "call" and (step.name in KRL or self.stated.sets_no_frame(step.name))
             else step
             for step in _steps(match)
         ]
@@ -165,7 +165,7 @@ class _Reader:
 
     def _move(self, match: re.Match[str]) -> None:
         start, kind = match.start("target"), match["move"].upper()
-        spans = [(start + begin, start + end) for begin, end in arguments(match["target"] + ";", 0)]
+        spans = [(start + begin, start + end) for begin, end in argument_spans(match["target"] + ";", 0)]
         operands = []
         for begin, _ in spans[: 2 if kind.endswith("CIRC") else 1]:
             if _AXES.match(self.text, begin):
@@ -176,7 +176,7 @@ class _Reader:
             circular, cut = len(operands) == 2, None
             if isinstance(pose, Pose) and (circular or kind.endswith("LIN")):
                 if circular and (len(spans) > 2 or _TURNING.search(self.text)):
-                    self.scan.leave(match.start(), STATED_ARC)
+                    self.scan.leave_unchanged(match.start(), STATED_ARC)
                 else:
                     cut = partial(self._way_points, match, operands)
             self.scan.move(match.start(), pose, *self._frames(match["target"]), cut, circular)
@@ -239,7 +239,7 @@ def _axes_in_use(scan: Scan, visible: str) -> dict[str, int]:
     lines: dict[str, int] = {}
     for match in _EXTERNAL.finditer(visible):
         for name in axes_in_use({match[1].upper(): match[2].strip()}):
-            lines.setdefault(name, scan.line(match.start()))
+            lines.setdefault(name, scan.line_number(match.start()))
     return lines
 
 

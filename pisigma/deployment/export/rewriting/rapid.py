@@ -21,11 +21,11 @@ from pisigma.deployment.export.rewriting.scan import (
     Pose,
     Scan,
     ScannedProgram,
-    arguments,
+    argument_spans,
     axes_in_use,
     external_axes,
     groups_of,
-    masked,
+    mask_comments,
     numbers_in,
 )
 from pisigma.measurement.foreign.rotations import MAX_SKEWNESS
@@ -86,7 +86,7 @@ def scan_rapid(text: str, stated: FrameFile) -> ScannedProgram:
         text: text of the module.
         stated: tools and work objects that are declared in other modules.
     """
-    return _Reader(Scan(text), masked(text, _HIDDEN), stated).read()
+    return _Reader(Scan(text), mask_comments(text, _HIDDEN), stated).read()
 
 
 @dataclass
@@ -105,7 +105,7 @@ class _Reader:
         self.names = NamedPoses(self.text, _SET, str.upper)
         for match in _EXTERNAL.finditer(self.text):
             for name in axes_in_use(_axes(match[1])):
-                self.axes_in_use.setdefault(name, self.scan.line(match.start(1)))
+                self.axes_in_use.setdefault(name, self.scan.line_number(match.start(1)))
 
     def read(self) -> ScannedProgram:
         self.foreign = self._foreign()
@@ -121,7 +121,7 @@ class _Reader:
                     self.frames[name] = self._placed(_product(literal), match)
         for match in _STATEMENT.finditer(self.text):
             if match["flow"]:
-                self.scan.interrupt()
+                self.scan.mark_unknown_start()
             elif match["move"].upper() == "MOVEABSJ":
                 self.scan.joints(match.start())
             else:
@@ -134,26 +134,28 @@ class _Reader:
         Its data persist, and a module begins again, so that the place of the call does not matter.
         """
         own = {match[1].upper() for match in _ROUTINE.finditer(self.text)}
-        for match in _CALL.finditer(masked(self.text, _RECORD)):
+        for match in _CALL.finditer(mask_comments(self.text, _RECORD)):
             name = match["name"].upper()
             is_move = _STATEMENT.match(self.text, match.start("name"))
-            if name in own | RAPID or is_move or self.stated.sets_neither(name):
+            if name in own | RAPID or is_move or self.stated.sets_no_frame(name):
                 continue
             called = (
                 "a routine that is named at run time"
                 if name == "%"
                 else f"the routine {match['name']} of another file"
             )
-            return f"tool and work object may be set by {called} (line {self.scan.line(match.start('name'))})"
+            return f"tool and work object may be set by {called} (line {self.scan.line_number(match.start('name'))})"
         return ""
 
     def _placed(self, read: _Read | str, match: re.Match[str]) -> _Read | str:
         """Return the value of a declaration, or the reason why there is none with its line."""
-        return f"{read} (line {self.scan.line(match.start())})" if isinstance(read, str) else read
+        return f"{read} (line {self.scan.line_number(match.start())})" if isinstance(read, str) else read
 
     def _move(self, match: re.Match[str]) -> None:
         spans = [
-            span for span in arguments(self.text, match.end()) if not self.text[slice(*span)].startswith("\\")
+            span
+            for span in argument_spans(self.text, match.end())
+            if not self.text[slice(*span)].startswith("\\")
         ]
         kind = re.match(r"Move([JLC])", match["move"], re.IGNORECASE)
         count = 2 if kind and kind[1].upper() == "C" else 1
@@ -171,9 +173,9 @@ class _Reader:
             circular, cut = index == 1, None
             if isinstance(pose, Pose) and (circular or kind[1].upper() == "L"):
                 if timed:
-                    self.scan.leave(match.start(), "the move has a time, so it has no way points")
+                    self.scan.leave_unchanged(match.start(), "the move has a time, so it has no way points")
                 elif circular and _TURNING.search(self.text):
-                    self.scan.leave(
+                    self.scan.leave_unchanged(
                         match.start(),
                         "the module states the orientation along arcs, so they have no way points",
                     )

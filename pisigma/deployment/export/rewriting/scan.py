@@ -143,7 +143,7 @@ class NamedPoses:
         self._uses[self._fold(name)] += target and pose is not None
         return pose
 
-    def used_otherwise(self) -> list[Pose]:
+    def poses_used_elsewhere(self) -> list[Pose]:
         """Return poses whose names also occur outside their assignment and moves to them."""
         return [pose for name, pose in self._poses.items() if self._words[name] - 1 > self._uses[name]]
 
@@ -163,7 +163,7 @@ class Scan:
         self._joint_lines: list[int] = []
         self._last_two: tuple[Target | None, Target | None] = (None, None)
 
-    def line(self, position: int) -> int:
+    def line_number(self, position: int) -> int:
         """Return the line of a position in the text, from 1."""
         return bisect.bisect_left(self._breaks, position) + 1
 
@@ -171,20 +171,20 @@ class Scan:
         """Return the start of the line of a position."""
         return self.text.rfind("\n", 0, position) + 1
 
-    def leave(self, position: int, reason: str) -> None:
+    def leave_unchanged(self, position: int, reason: str) -> None:
         """Record that a line is left unchanged; its first reason is kept."""
-        self._left.setdefault(self.line(position), reason)
+        self._left.setdefault(self.line_number(position), reason)
 
-    def interrupt(self) -> None:
+    def mark_unknown_start(self) -> None:
         """Record that the next statement may be reached from elsewhere, so the start of the next move is unknown."""
         self._last_two = (None, None)
 
     def joints(self, position: int) -> None:
         """Record a move to joint values, which is not changed."""
-        self._joint_lines.append(self.line(position))
+        self._joint_lines.append(self.line_number(position))
         self._last_two = (None, None)
 
-    def blur(self, pose: Pose) -> None:
+    def mark_not_understood(self, pose: Pose) -> None:
         """Record that a pose is used in a way that is not understood, so it is not changed."""
         self._unclear.add(pose.span)
 
@@ -211,29 +211,29 @@ class Scan:
         self._last_two = (self._last_two[1], None)
         for part in (pose, frame, tool):
             if isinstance(part, str):
-                self.leave(position, part)
+                self.leave_unchanged(position, part)
                 if isinstance(pose, Pose):
-                    self.blur(pose)
+                    self.mark_not_understood(pose)
                 return
         assert isinstance(pose, Pose)
         assert isinstance(frame, Tensor)
         assert isinstance(tool, Tensor)
-        target = Target(self.line(pose.span[0]), pose, frame, tool)
+        target = Target(self.line_number(pose.span[0]), pose, frame, tool)
         same = self._targets.setdefault(pose.span, target)
         if not (torch.equal(same.T_root_frame, frame) and torch.equal(same.T_flange_tool, tool)):
-            self.leave(position, "the pose is used with several frames or tools")
-            self.blur(pose)
+            self.leave_unchanged(position, "the pose is used with several frames or tools")
+            self.mark_not_understood(pose)
             return
         if way_points is not None:
-            self._moves.append(PathMove(self.line(position), start, via, target, circular, way_points))
+            self._moves.append(PathMove(self.line_number(position), start, via, target, circular, way_points))
         self._last_two = (self._last_two[0], target)
 
     def program(
         self, names: NamedPoses | None = None, finish: Callable[[str], str] = lambda text: text
     ) -> ScannedProgram:
         """Return the collected program, without poses that are used in ways that are not understood."""
-        for pose in names.used_otherwise() if names else ():
-            self.blur(pose)
+        for pose in names.poses_used_elsewhere() if names else ():
+            self.mark_not_understood(pose)
         for span, target in self._targets.items():
             if span in self._unclear:
                 self._left.setdefault(target.line, "the pose is also used in a way that is not understood")
@@ -252,12 +252,12 @@ def _among(kept: Mapping[tuple[int, int], Target], target: Target | None) -> Tar
     return None if target is None else kept.get(target.pose.span)
 
 
-def masked(text: str, hidden: re.Pattern[str]) -> str:
+def mask_comments(text: str, hidden: re.Pattern[str]) -> str:
     """Replace comments and strings by blanks, so that all positions are preserved."""
     return hidden.sub(lambda match: re.sub(r"[^\n]", " ", match[0]), text)
 
 
-def arguments(text: str, start: int) -> Iterator[tuple[int, int]]:
+def argument_spans(text: str, start: int) -> Iterator[tuple[int, int]]:
     """Yield the spans between commas at one level of brackets, from `start` to the closing bracket.
 
     Args:

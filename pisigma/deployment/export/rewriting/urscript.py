@@ -8,7 +8,7 @@ from functools import partial
 import torch
 
 from pisigma.deployment.export.programs.text import metres_and_rotation_vector, number, numbers
-from pisigma.deployment.export.rewriting.control_flow import FramesInForce, Step
+from pisigma.deployment.export.rewriting.control_flow import ActiveFrames, Step
 from pisigma.deployment.export.rewriting.frame_file import FrameFile
 from pisigma.deployment.export.rewriting.known_routines import URSCRIPT
 from pisigma.deployment.export.rewriting.scan import (
@@ -21,9 +21,9 @@ from pisigma.deployment.export.rewriting.scan import (
     Pose,
     Scan,
     ScannedProgram,
-    arguments,
+    argument_spans,
     groups_of,
-    masked,
+    mask_comments,
     numbers_in,
 )
 from pisigma.robot.se3 import rotation_from_vector, transform
@@ -53,7 +53,7 @@ def scan_urscript(text: str, stated: FrameFile) -> ScannedProgram:
         text: text of the program.
         stated: frames that the program does not state; its tool `tcp` applies until a `set_tcp` with numbers.
     """
-    return _Reader(Scan(text), masked(text, _HIDDEN), stated).read()
+    return _Reader(Scan(text), mask_comments(text, _HIDDEN), stated).read()
 
 
 @dataclass
@@ -63,7 +63,7 @@ class _Reader:
     scan: Scan
     text: str
     stated: FrameFile
-    frames: FramesInForce = field(init=False)
+    frames: ActiveFrames = field(init=False)
 
     def __post_init__(self) -> None:
         self.names = NamedPoses(self.text, _ASSIGNMENT, str)
@@ -74,13 +74,13 @@ class _Reader:
             if literal and self.names.is_set_once(match[1]):
                 self.names.add(match[1], _pose(self.text, literal.span()))
         statements = list(_STATEMENT.finditer(self.text))
-        self.frames = FramesInForce(
+        self.frames = ActiveFrames(
             [self._step(match) for match in statements], {_TOOL: self.stated.tool("tcp")}
         )
         for place, match in enumerate(statements):
             tool: Frame | str = f"{_TOOL} is computed"
             if match["routine"] or match["flow"]:
-                self.scan.interrupt()
+                self.scan.mark_unknown_start()
             elif match["name"] in _MOVES:
                 self._move(match)
             elif literal := _LITERAL.match(self.text, match.end()):
@@ -91,11 +91,11 @@ class _Reader:
     def _step(self, match: re.Match[str]) -> Step:
         """Convert a statement to steps of control flow."""
         step = _step(match)
-        is_harmless = step.name in URSCRIPT or self.stated.sets_neither(step.name)
+        is_harmless = step.name in URSCRIPT or self.stated.sets_no_frame(step.name)
         return Step("other") if step.kind == "call" and is_harmless else step
 
     def _move(self, call: re.Match[str]) -> None:
-        spans = list(arguments(self.text, call.end()))
+        spans = list(argument_spans(self.text, call.end()))
         circular = call["name"] in ("movec", "servoc")
         operands = []
         for span in spans[: 2 if circular else 1]:
@@ -117,10 +117,10 @@ class _Reader:
         if isinstance(pose, str) or call["name"] == "servoc":
             return None
         if any(re.match(r"t\s*=", argument) for argument in rest):
-            self.scan.leave(call.start(), "the move has a time, so it has no way points")
+            self.scan.leave_unchanged(call.start(), "the move has a time, so it has no way points")
             return None
         if sum("=" not in argument for argument in rest) > 2 or any(map(_TURNING.match, rest)):
-            self.scan.leave(
+            self.scan.leave_unchanged(
                 call.start(), "an unnamed radius or a mode is stated, so the move has no way points"
             )
             return None
@@ -130,7 +130,7 @@ class _Reader:
         """Return the pose of an argument, its frame, and its span."""
         expression = self.text[slice(*span)]
         if function := re.match(r"(get_inverse_kin|pose_trans)\s*\(", expression):
-            inner = list(arguments(self.text, span[0] + function.end()))
+            inner = list(argument_spans(self.text, span[0] + function.end()))
             if len(inner) < (1 if function[1] == "get_inverse_kin" else 2):
                 return COMPUTED, IDENTITY, span
             if function[1] == "get_inverse_kin":

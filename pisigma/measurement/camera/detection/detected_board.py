@@ -69,7 +69,7 @@ class NoBoard:
     is_mirrored: bool = False
 
 
-def shown_edges(detected: DetectedBoard, board: Board) -> Float64[np.ndarray, "edges 2 2"]:
+def edge_pixels(detected: DetectedBoard, board: Board) -> Float64[np.ndarray, "edges 2 2"]:
     """Return the pixels of both ends of the board's edges between detected corners [px]."""
     pixels = np.full((len(board.corners), 2), np.nan)
     pixels[detected.corners] = detected.pixels
@@ -90,7 +90,7 @@ def refined(image: Image, detected: DetectedBoard, board: Board) -> DetectedBoar
         detected: approximate corners.
         board: the board.
     """
-    ends = shown_edges(detected, board)
+    ends = edge_pixels(detected, board)
     shortest = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1).min(initial=np.inf)
     half = max(round(WINDOW * board.clearance * shortest), 2) if len(ends) else 2
     start = np.ascontiguousarray(detected.pixels, dtype=np.float32).reshape(-1, 1, 2)
@@ -169,7 +169,7 @@ class EdgeProfiles:
         return float(np.nanquantile(blur, 0.75)) if np.isfinite(blur).any() else np.nan
 
     @property
-    def points(self) -> Float64[np.ndarray, "edges crossings 2"]:
+    def edge_positions(self) -> Float64[np.ndarray, "edges crossings 2"]:
         """Positions of the edge on every crossing [px], with half of the blurred area on either side.
 
         Edges without contrast keep their position.

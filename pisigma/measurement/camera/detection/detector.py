@@ -17,8 +17,8 @@ from pisigma.measurement.camera.detection.detected_board import (
     EdgeProfiles,
     Image,
     NoBoard,
+    edge_pixels,
     refined,
-    shown_edges,
 )
 from pisigma.measurement.camera.detection.detected_boards import BoardImage
 from pisigma.measurement.camera.detection.markers import detect_apriltags, detect_charuco
@@ -157,7 +157,7 @@ def detect_board(path: Path, board: Board, max_blur: float) -> BoardImage:
         if isinstance(flipped, DetectedBoard):
             detected = NoBoard("it is mirrored, as its markers show; do not mirror images", is_mirrored=True)
         return BoardImage(path, size, detected, np.nan)
-    blur = EdgeProfiles.from_image(image, shown_edges(detected, board), board.clearance).blur
+    blur = EdgeProfiles.from_image(image, edge_pixels(detected, board), board.clearance).blur
     if len(detected.corners) < MIN_CORNERS:
         reason = f"expected {MIN_CORNERS} or more corners in it, got {len(detected.corners)}"
     elif blur > max_blur:

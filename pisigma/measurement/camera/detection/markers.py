@@ -51,7 +51,7 @@ def _crossings(
 ) -> Float64[np.ndarray, "tags 4 2"]:
     """Return corners of tags as intersections of the lines fitted to their sides, the first one after the last side."""
     ends = np.stack([tags, np.roll(tags, -1, 1)], 2).reshape(-1, 2, 2)
-    points = EdgeProfiles.from_image(image, ends, clearance).points
+    points = EdgeProfiles.from_image(image, ends, clearance).edge_positions
     middle = points.mean(1)
     normal = np.linalg.svd(points - middle[:, None])[2][:, -1].reshape(tags.shape)
     distance = (normal * middle.reshape(tags.shape)).sum(-1)

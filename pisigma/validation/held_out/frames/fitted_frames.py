@@ -115,7 +115,7 @@ def errors_in_fitted_frames(
     T = T.index_put((usable.nonzero()[:, 0],), fit)
     U, size, _ = torch.linalg.svd(columns.flatten(0, 1), full_matrices=False)
     leverage = U[:, size > DETERMINED * size.max()].square().sum(-1).view(-1, 2, 3).sum((0, 2)).tolist()
-    errors = ErrorVectors.between(measurements, T)
+    errors = ErrorVectors.from_prediction(measurements, T)
     turned = rows.select(measured.has_rotation.nonzero()[:, 0])
     return ErrorVectors(
         errors.position * _enlargement(rows, leverage[0]),

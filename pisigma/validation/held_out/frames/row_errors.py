@@ -30,11 +30,11 @@ def errors_of_rows(T: Float64[Tensor, "rows 4 4"], measurements: Measurements) -
         IdentificationError: an anchor has too few rows to determine its position.
     """
     if measurements.position is not None:
-        errors = ErrorVectors.between(measurements, T)
+        errors = ErrorVectors.from_prediction(measurements, T)
     else:
         nowhere = torch.full((measurements.rows, 3), torch.nan, dtype=torch.float64)
         poses = replace(measurements, position=nowhere)
-        errors = ErrorVectors.between(poses, T)
+        errors = ErrorVectors.from_prediction(poses, T)
     rows = (
         _whole_pairs(measurements, torch.isfinite(T).flatten(1).all(-1)) & other_lengths(measurements)
     ).nonzero()[:, 0]

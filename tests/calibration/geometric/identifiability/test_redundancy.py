@@ -10,7 +10,7 @@ from testing.simulated_arm import BASE, TOOL, draw_joints
 
 from pisigma.calibration.geometric.calibrator import GeometricCalibrator
 from pisigma.calibration.geometric.identifiability.pairwise import find_pairwise_redundancy
-from pisigma.calibration.geometric.identifiability.redundancy import find_redundancy, pivoted_triangle
+from pisigma.calibration.geometric.identifiability.redundancy import find_redundancy, pivoted_qr
 from pisigma.calibration.geometric.problem.information import Information, information
 from pisigma.measurement.dataset import Measurements
 from pisigma.robot import Robot
@@ -139,9 +139,14 @@ def test_every_dependency_holds(name: str) -> None:
 def test_dependencies_are_said_in_words_and_the_preferred_are_kept() -> None:
     seen, sizes = condensed(Robot.load("rb5"), 0, rows=40, poses=False, arm_only=True)
     redundancy = find_redundancy(seen, sizes)
-    assert redundancy.group("d_3") == "d_2 + d_3 + d_4 is identified, the single values are not"
-    assert redundancy.group("beta_4") == "theta_4 - beta_4 is identified, the single values are not"
-    assert redundancy.group("a_2") is None
+    assert (
+        redundancy.dependency_sentence_of("d_3") == "d_2 + d_3 + d_4 is identified, the single values are not"
+    )
+    assert (
+        redundancy.dependency_sentence_of("beta_4")
+        == "theta_4 - beta_4 is identified, the single values are not"
+    )
+    assert redundancy.dependency_sentence_of("a_2") is None
     assert {"theta_1", "theta_4", "d_4", "a_6"} <= set(redundancy.kept)
     assert {"beta_1", "beta_4", "d_2", "d_3", "a_EE"} <= set(redundancy.removed)
 
@@ -165,7 +170,7 @@ def test_correlations_are_pearsons() -> None:
 def test_pivots_span_the_columns(rank: int, seed: int) -> None:
     rng = np.random.default_rng(seed)
     A = rng.normal(size=(12, rank)) @ rng.normal(size=(rank, 8))
-    pivots = pivoted_triangle(A)[1][:rank]
+    pivots = pivoted_qr(A)[1][:rank]
     assert len(set(pivots.tolist())) == rank
     basis, _ = np.linalg.qr(A[:, pivots])
     assert_close(A - basis @ (basis.T @ A), 0.0, atol=1e-6 * float(np.abs(A).max()))

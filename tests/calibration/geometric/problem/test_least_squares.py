@@ -89,14 +89,14 @@ def test_the_best_point_is_kept_and_costs_fall() -> None:
 def test_a_remaining_residual_ends_by_convergence() -> None:
     solution = levenberg_marquardt(Curve(10.0, offset=0.5), START)
     assert solution.status is SolutionStatus.CONVERGED
-    assert solution.status.good
+    assert solution.status.is_minimum
     assert_close(solution.linearisation.point, torch.ones(2), atol=1e-3)
 
 
 def test_the_iteration_limit_is_said() -> None:
     solution = levenberg_marquardt(Curve(10.0), START, maximum_iterations=1)
     assert solution.status is SolutionStatus.ITERATION_LIMIT
-    assert not solution.status.good
+    assert not solution.status.is_minimum
     assert "iteration limit" in solution.status.value
 
 

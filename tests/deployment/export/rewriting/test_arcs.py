@@ -22,7 +22,12 @@ from testing.rewritten_programs import (
 from pisigma.deployment.export.export_format import ExportRequest
 from pisigma.deployment.export.programs.text import millimetres_and_euler
 from pisigma.deployment.export.registry import export_model
-from pisigma.deployment.export.rewriting.correction import COLLINEAR, OTHER_ORIENTATION, Arcs, is_straight
+from pisigma.deployment.export.rewriting.correction import (
+    COLLINEAR,
+    OTHER_ORIENTATION,
+    CircularArcs,
+    is_straight,
+)
 from pisigma.deployment.export.rewriting.krl import STATED_ARC
 from pisigma.model.folder.model_folder import load_model
 
@@ -103,11 +108,11 @@ def test_the_real_tool_stays_on_the_arc(suffix, arm, tmp_path):
     assert len(moves) > 1
     assert exported.facts["way_points"] == 2 * len(moves) - 1
     assert _reasons(exported)[1:] == []
-    meant, worst = Arcs.through(*T[:, None, :3, 3]), 0.0
+    meant, worst = CircularArcs.through_points(*T[:, None, :3, 3]), 0.0
     for move in moves:
         ends = (target.pose.T[None, :3, 3] for target in (move.start, move.via, move.end))
         commanded = move.start.pose.T.repeat(9, 1, 1)
-        commanded[:, :3, 3] = Arcs.through(*ends).points(8)[0]
+        commanded[:, :3, 3] = CircularArcs.through_points(*ends).sample(8)[0]
         real = really(arm, commanded, commanded)[:, :3, 3] - meant.centre
         height = (real * meant.axis).sum(-1)
         off = torch.hypot(height, (real - height[:, None] * meant.axis).norm(dim=-1) - meant.radius.norm())
@@ -156,12 +161,12 @@ def test_an_arc_beyond_its_end_point_is_reported(arm, tmp_path):
 def test_arcs_pass_through_their_points():
     angles = torch.tensor([[0.3, 1.0, 2.0], [0.3, 5.0, 6.0]], dtype=torch.float64)
     circle = torch.stack([angles.cos(), angles.sin(), torch.zeros_like(angles)], -1) * 0.2
-    arcs = Arcs.through(*circle.unbind(1))
+    arcs = CircularArcs.through_points(*circle.unbind(1))
     assert_close(arcs.angle, angles[:, 2] - angles[:, 0], atol=1e-12)
     assert_close(arcs.passing, angles[:, 1] - angles[:, 0], atol=1e-12)
-    assert_close(arcs.points(4)[:, [0, -1]], circle[:, [0, 2]], atol=1e-12)
-    assert_close(arcs.points(4).norm(dim=-1), 0.2, atol=1e-12)
-    back = Arcs.through(*circle.flip(1).unbind(1))
+    assert_close(arcs.sample(4)[:, [0, -1]], circle[:, [0, 2]], atol=1e-12)
+    assert_close(arcs.sample(4).norm(dim=-1), 0.2, atol=1e-12)
+    back = CircularArcs.through_points(*circle.flip(1).unbind(1))
     assert_close(back.angle, arcs.angle, atol=1e-12)
     assert float(arcs.angle[1]) > math.pi
     assert not is_straight(*circle.unbind(1))

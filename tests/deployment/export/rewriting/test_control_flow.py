@@ -8,7 +8,7 @@ import torch
 from pisigma.deployment.export.rewriting.control_flow import (
     DEPENDS_ON_CALLER,
     DEPENDS_ON_PATH,
-    FramesInForce,
+    ActiveFrames,
     Step,
 )
 from pisigma.deployment.export.rewriting.fanuc import scan_fanuc
@@ -167,7 +167,7 @@ def test_a_frame_that_a_fanuc_program_sets_is_not_as_stated(line, understood):
 
 
 def test_values_outside_routines_apply_after_their_statement():
-    frames = FramesInForce([Step("set", "tool"), Step("loop"), Step("end"), Step("end")], {"tool": "unknown"})
+    frames = ActiveFrames([Step("set", "tool"), Step("loop"), Step("end"), Step("end")], {"tool": "unknown"})
     assert frames["tool"] == "unknown"
     frames.advance(0, IDENTITY)
     for number in (1, 2, 3):

@@ -45,7 +45,7 @@ def test_edges_without_contrast_have_no_blur_and_are_not_moved() -> None:
     ends = np.array([[[100.0, 100.0], [150.0, 110.0]]])
     profiles = EdgeProfiles.from_image(np.full((400, 640), 90, dtype=np.uint8), ends, 0.2)
     assert np.isnan(profiles.blur)
-    assert_close(profiles.points, profiles.at)
+    assert_close(profiles.edge_positions, profiles.at)
 
 
 @pytest.mark.parametrize("blur", [1.0, 2.5])

@@ -12,7 +12,7 @@ from pisigma.measurement.camera.detection.detected_board import (
     DetectedBoard,
     EdgeProfiles,
     NoBoard,
-    shown_edges,
+    edge_pixels,
 )
 from pisigma.measurement.camera.detection.detector import detect_board
 from pisigma.measurement.camera.detection.markers import detect_apriltags, detect_charuco, dictionary_of
@@ -31,7 +31,7 @@ def test_corners_of_a_whole_board_and_of_a_piece(board, detect, largest) -> None
     assert sorted(whole.corners.tolist()) == list(range(len(true)))
     assert_close(whole.pixels, true[whole.corners], atol=largest)
     assert_close(np.sqrt(np.square(whole.pixels - true[whole.corners]).mean()), 0.0, atol=largest / 2.5)
-    profiles = EdgeProfiles.from_image(image, shown_edges(whole, board), board.clearance)
+    profiles = EdgeProfiles.from_image(image, edge_pixels(whole, board), board.clearance)
     assert_close(profiles.blur, np.hypot(0.8, 0.4), rtol=0.25)
     t[0] -= 0.15  # so that a part of the board is outside
     piece, true = detect(draw_board(board, R, t), board), CAMERA.project(board.corners @ R.T + t)[0]

@@ -27,7 +27,7 @@ FOLDS = 5
 
 
 @dataclass(frozen=True, eq=False)
-class Reached:
+class SessionAccuracy:
     """Accuracy and posterior given the rows so far.
 
     Attributes:
@@ -41,14 +41,14 @@ class Reached:
     rows: Measurements | None = None
 
 
-def reached(
+def session_accuracy(
     plan: StoredPlan,
     before: RobotPosterior,
     rows: Measurements,
     check: Measurements | None,
     task: Float64[Tensor, "tasks dof"],
     progress: Progress = lambda what: None,
-) -> Reached | None:
+) -> SessionAccuracy | None:
     """Compute accuracy and posterior given the rows of a plan; None if they are too few or contradict each other.
 
     Args:
@@ -72,7 +72,7 @@ def reached(
             return None
     D = posterior.tool(task)
     point = AccuracyPoint(rows.rows, rms_of(D), p95_of(D), checked_rms=checked[0], checked_p95=checked[1])
-    return Reached(point, posterior, rows if plan.model is None else None)
+    return SessionAccuracy(point, posterior, rows if plan.model is None else None)
 
 
 def _calibrated(
@@ -90,13 +90,15 @@ def _calibrated(
         # with too few rows the arm stays nominal, so that the posterior of the fit does not contain its errors
         posterior = before.informed(rows.q)
     else:
-        posterior = RobotPosterior.of_result(result, before.instrument)
+        posterior = RobotPosterior.from_result(result, before.instrument)
     if check is None:
         return posterior, (math.nan, math.nan)
     return posterior, _rms_p95(errors_under(result, check).position)
 
 
-def cross_validated(robot: Robot, so_far: Reached, progress: Progress = lambda what: None) -> AccuracyPoint:
+def cross_validated(
+    robot: Robot, so_far: SessionAccuracy, progress: Progress = lambda what: None
+) -> AccuracyPoint:
     """Return the accuracy with cross-validated errors, where the rows allow a cross-validation.
 
     Args:
@@ -131,7 +133,7 @@ def expected(
         measured: number of poses so far.
         poses: joint values of the remaining poses, the next one first [rad or m].
         candidates: joint values of poses that could be measured instead [rad or m].
-        task: see `reached`.
+        task: see `session_accuracy`.
         step: poses between two points of the curve.
     """
     counts = [*range(step, len(poses), step), len(poses)] if len(poses) else []
