@@ -153,6 +153,10 @@ class Controller:
         newest = [one for one in sessions if one.name == model.sessions.split(",")[-1]]
         return self.during(newest[0]) if newest else self.active(model.day or model.made[:10], model.made)
 
+    def fits(self, model: ModelEntry, sessions: tuple[SessionEntry, ...]) -> bool:
+        """Return whether the joint zeros that are active now are those with which the rows of a model were measured."""
+        return _hash(self.behind(model, sessions)) == _hash(self.active())
+
     def findings(
         self,
         command: str,

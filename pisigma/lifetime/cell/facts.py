@@ -15,7 +15,8 @@ from pisigma.files.yaml_file import read_yaml
 from pisigma.lifetime.cell.controller import Controller, records
 from pisigma.lifetime.cell.history import HISTORY, History, ModelEntry, SessionEntry
 from pisigma.lifetime.cell.layout import CELL_FILE, PLANS, SESSIONS
-from pisigma.lifetime.cell.status import CellFacts, Step, next_step
+from pisigma.lifetime.cell.status import CellFacts, next_step
+from pisigma.lifetime.cell.step import Step
 from pisigma.measurement.dates import date_in_name
 
 

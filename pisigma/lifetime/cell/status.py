@@ -4,19 +4,17 @@ import datetime
 import shlex
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal
 
 from pisigma.lifetime.cell.controller import Controller
 from pisigma.lifetime.cell.history import ARM_EVENTS, Check, Event, ModelEntry, SessionEntry
 from pisigma.lifetime.cell.layout import SESSIONS
+from pisigma.lifetime.cell.step import State, Step
 
 MAX_DAYS_UNVERIFIED = 92
 """[days] Time without a session after which the model in use has to be verified again: a quarter of a year."""
 VERIFICATION_POSES = 10
 """Number of poses of a session for verification or monitoring."""
 
-COMPUTED = ("calibrate", "verify", "monitor", "recalibrate")
-"""Commands that need neither new rows nor a decision of a person."""
 ATTENTION = (
     "edited_session",
     "file_refused",
@@ -24,56 +22,12 @@ ATTENTION = (
     "session_not_trusted",
     "verification_failed",
     "moved",
+    "other_joint_zeros",
     "outside_limit",
 )
 """States in which a limit is missed, or rows or a model must not be trusted."""
 NOT_TRUSTED = ("implausible", "setup_fault", "not_trusted")
 """Verdicts of `verify`, `monitor` and `recalibrate` after which nothing is concluded from a session."""
-
-State = Literal[
-    "edited_session",
-    "not_taken_in",
-    "file_refused",
-    "no_plan",
-    "not_measured",
-    "not_calibrated",
-    "not_trusted",
-    "not_verified",
-    "verification_failed",
-    "session_not_judged",
-    "session_not_trusted",
-    "moved",
-    "older_than_evidence",
-    "outside_limit",
-    "better_model",
-    "verification_due",
-    "up_to_date",
-]
-
-
-@dataclass(frozen=True)
-class Step:
-    """The next step of a cell.
-
-    Attributes:
-        state: state of the cell.
-        reason: why the step is due, in one sentence.
-        command: command to run; empty if nothing has to be done.
-    """
-
-    state: State
-    reason: str
-    command: str = ""
-
-    @property
-    def verb(self) -> str | None:
-        """The command to run, if neither rows nor a decision of a person are needed for it; else None."""
-        words = self.command.split()[1:2]
-        return words[0] if words and words[0] in COMPUTED else None
-
-    def to_json(self) -> dict[str, Any]:
-        """Return the step as plain values."""
-        return {"state": self.state, "reason": self.reason, "command": self.command or None}
 
 
 @dataclass(frozen=True)
@@ -224,9 +178,7 @@ def _no_session(facts: CellFacts) -> Step | None:
     ended = [one for one in facts.events if one.kind in ARM_EVENTS] if facts.sessions else []
     why = f"{ended[-1].kind} on {ended[-1].day} ended the validity of all sessions" if ended else ""
     if any(not one.set_aside and not facts.controller.is_present(one) for one in facts.sessions):
-        zeros = facts.controller.active().get("joint_zeros")
-        now = "no exported joint zeros are" if zeros is None else f"those of {zeros} are"
-        why = f"all sessions were measured with other joint zeros of the controller; {now} active now"
+        why = "all sessions were measured with other joint zeros than those that are active on the controller"
     if not facts.plans or why:
         return Step("no_plan", why or "there is no plan and no session", facts.command("plan"))
     return _to_measure(facts, f"plan '{facts.plans[-1]}'")
@@ -290,6 +242,23 @@ def _after(facts: CellFacts, last: Check, failed: tuple[str, ...]) -> Step | Non
     if last.verdict in failed and not any(one.made >= last.checked for one in facts.models):
         return _calibrate(facts, "verification_failed", last.summary)
     return None
+
+
+def _other_joint_zeros(facts: CellFacts) -> Step | None:
+    model = facts.in_use
+    state: State = "other_joint_zeros"
+    assert model is not None
+    if facts.controller.fits(model, facts.sessions):
+        return None
+    why = f"model '{model.name}' needs other joint zeros than those that are active on the controller"
+    if fitting := [one.name for one in facts.models if facts.controller.fits(one, facts.sessions)]:
+        return Step(state, f"{why}; model '{fitting[-1]}' needs these", facts.command("use", fitting[-1]))
+    if not (new := facts.new_sessions(model)):
+        return Step(state, why, facts.command("plan"))
+    tried = [one for one in facts.checks_of(model.name, "recalibrate") if one.session == new[-1].name]
+    if tried and tried[-1].verdict in NOT_TRUSTED:
+        return _calibrate(facts, state, why)
+    return Step(state, why, facts.command("recalibrate"))
 
 
 def _session_not_judged(facts: CellFacts) -> Step | None:
@@ -390,6 +359,7 @@ RULES: tuple[Callable[[CellFacts], Step | None], ...] = (
     _no_session,
     _not_calibrated,
     _not_verified,
+    _other_joint_zeros,
     _session_not_judged,
     _last_verdict,
     _better_model,

@@ -6,15 +6,16 @@ from typing import get_args
 import pytest
 
 from pisigma.lifetime.cell.controller import Controller
+from pisigma.lifetime.cell.exports import ControllerEntry, ExportEntry
 from pisigma.lifetime.cell.history import ARM_EVENTS, Check, Event, ModelEntry, SessionEntry
 from pisigma.lifetime.cell.status import (
     MAX_DAYS_UNVERIFIED,
     CellFacts,
-    State,
     next_step,
     plans_check,
     valid_sessions,
 )
+from pisigma.lifetime.cell.step import State
 
 
 def session(name, rows=40, **changed):
@@ -45,6 +46,11 @@ THIRD = session("2026-03-10", rows=10)
 MONITORED = replace(VERIFIED, sessions=(FIRST, SECOND, THIRD), today="2026-03-11")
 NEWER = model("b", "2026-01-10,2026-02-10", day="2026-02-10", p95_mm=0.1)
 
+OFFSETS = Controller(
+    (ControllerEntry("2026-02-20", "hash", "", "2026-02-20T08:00:00+00:00"),),
+    (ExportEntry("offsets.csv", "hash", "offsets", "joint_zeros", "a", "2026-02-19T08:00:00+00:00"),),
+)
+
 CASES = {
     "no_plan": (EMPTY, "plan"),
     "not_measured": (PLANNED, "import"),
@@ -67,6 +73,7 @@ CASES = {
         replace(MEASURED_AGAIN, checks=(check("verify", "a", "2026-02-10", "not_better"),)),
         "calibrate",
     ),
+    "other_joint_zeros": (replace(MONITORED, controller=OFFSETS), "recalibrate"),
     "session_not_judged": (MONITORED, "monitor"),
     "moved": (
         replace(
@@ -222,3 +229,18 @@ def test_a_limit_that_no_rows_have_confirmed_is_verified():
     facts = replace(VERIFIED, models=(MODEL, recalibrated), in_use=recalibrated)
     assert next_step(facts).state == "verification_due"
     assert next_step(replace(facts, limit_mm=None)).state == "up_to_date"
+
+
+def test_a_model_that_fits_the_joint_zeros_is_used_and_else_one_is_made():
+    facts = replace(MONITORED, controller=OFFSETS)
+    fitting = model("b", "2026-01-10,2026-03-10", day="2026-03-10", parent="a")
+    step = next_step(replace(facts, models=(MODEL, fitting)))
+    assert step.command.split()[1:] == ["use", "cell", "b"]
+    refused = check("recalibrate", "a", "2026-03-10", "not_trusted", at="2026-03-11T08:00:00+00:00")
+    step = next_step(replace(facts, checks=(*facts.checks, refused)))
+    assert (step.state, step.verb) == ("other_joint_zeros", "calibrate")
+    without = Controller(
+        (*OFFSETS.changes, replace(OFFSETS.changes[0], day="2026-03-20", sha256="")), OFFSETS.exports
+    )
+    step = next_step(replace(facts, models=(fitting,), in_use=fitting, controller=without))
+    assert (step.state, step.command.split()[1]) == ("other_joint_zeros", "plan")

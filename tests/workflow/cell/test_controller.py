@@ -133,7 +133,7 @@ def test_joint_zeros_ask_for_a_model_that_was_measured_with_them(cell, used):
     assert (session.judged_by, "offsets.csv" in session.remark) == ("robot", True)
     assert [len(one["controller"]) for one in cell.status().to_json()["sessions"]] == [0, 0, 1]
     assert "offsets.csv" in cell.monitor().warnings[0]
-    assert cell.status().step.state == "moved"
+    assert (cell.status().step.state, cell.status().step.verb) == ("other_joint_zeros", "recalibrate")
     result, entry = cell.recalibrate()
     assert "offsets.csv" in result.warnings[0]
     assert "offsets.csv" in (cell.model_folder(entry.name) / "README.md").read_text()
@@ -144,6 +144,7 @@ def test_joint_zeros_ask_for_a_model_that_was_measured_with_them(cell, used):
     set_controller(cell, "none", day(1))
     with refused(ModelError, file=cell.folder):
         pisigma.load(cell.folder)
+    assert cell.status().step.command.split()[1:] == ["use", str(cell.folder), old.name]
     assert cell.use(None, "the zeros were removed") == ()
     assert pisigma.load(cell.folder).name == old.name
     assert cell.use(entry.name, "back") != ()

@@ -1,0 +1,53 @@
+"""The next step of a cell: its state, the reason and the command."""
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+COMPUTED = ("calibrate", "verify", "monitor", "recalibrate")
+"""Commands that need neither new rows nor a decision of a person."""
+
+State = Literal[
+    "edited_session",
+    "not_taken_in",
+    "file_refused",
+    "no_plan",
+    "not_measured",
+    "not_calibrated",
+    "not_trusted",
+    "not_verified",
+    "verification_failed",
+    "other_joint_zeros",
+    "session_not_judged",
+    "session_not_trusted",
+    "moved",
+    "older_than_evidence",
+    "outside_limit",
+    "better_model",
+    "verification_due",
+    "up_to_date",
+]
+
+
+@dataclass(frozen=True)
+class Step:
+    """The next step of a cell.
+
+    Attributes:
+        state: state of the cell.
+        reason: why the step is due, in one sentence.
+        command: command to run; empty if nothing has to be done.
+    """
+
+    state: State
+    reason: str
+    command: str = ""
+
+    @property
+    def verb(self) -> str | None:
+        """The command to run, if neither rows nor a decision of a person are needed for it; else None."""
+        words = self.command.split()[1:2]
+        return words[0] if words and words[0] in COMPUTED else None
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the step as plain values."""
+        return {"state": self.state, "reason": self.reason, "command": self.command or None}
