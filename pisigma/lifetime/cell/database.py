@@ -105,6 +105,15 @@ class Database:
                 self._upgrade(database)
         return before
 
+    def copy(self, path: Path) -> None:
+        """Write a copy of the file without the changes that other processes are making.
+
+        Raises:
+            OutputError: the file cannot be read, or the copy cannot be written; see `opened`.
+        """
+        with self.opened() as database, closing(sqlite3.connect(path)) as other:
+            database.backup(other)
+
     @contextmanager
     def writing(self) -> Iterator[sqlite3.Connection]:
         """Open the file for changes that are made together, or not at all; other processes wait before they write.

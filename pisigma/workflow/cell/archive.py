@@ -39,17 +39,23 @@ def pack(cell: Cell, path: str | os.PathLike[str]) -> int:
             at=Place(cell.folder),
             remedy="restore the measured file, or set the session aside",
         )
-    files = sorted(one for one in cell.folder.rglob("*") if not one.is_dir() or one.is_symlink())
+    journal = cell.history.path.with_name(f"{cell.history.path.name}-journal")
+    files = sorted(
+        one for one in cell.folder.rglob("*") if (not one.is_dir() or one.is_symlink()) and one != journal
+    )
     for one in files:
         if one.is_symlink() or not one.is_file():
             raise OutputError(expected="regular files in the cell", value="a link or a device", at=Place(one))
     if (size := sum(one.stat().st_size for one in files)) > MAX_BYTES:
         raise OutputError(expected=f"at most {MAX_BYTES:,} bytes", value=size, at=Place(cell.folder))
     try:
-        with scratch_beside(target, FILE) as scratch:
+        with scratch_beside(target, FILE) as scratch, scratch_beside(target, FILE) as history:
+            if cell.history.path in files:
+                cell.history.database.copy(history)  # as a whole, even if another process writes
             with zipfile.ZipFile(scratch, "w", zipfile.ZIP_DEFLATED) as archive:
                 for one in files:
-                    archive.write(one, one.relative_to(cell.folder).as_posix())
+                    source = history if one == cell.history.path else one
+                    archive.write(source, one.relative_to(cell.folder).as_posix())
             scratch.chmod(0o644)
             os.replace(scratch, target)
     except OSError as problem:

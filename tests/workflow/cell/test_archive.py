@@ -7,6 +7,7 @@ import pytest
 from testing.refusals import refused
 
 from pisigma.files.errors import MeasurementError, OutputError, PlanningError
+from pisigma.lifetime.cell.history import HISTORY
 from pisigma.lifetime.cell.layout import CELL_FILE
 from pisigma.workflow.cell.archive import pack, unpack
 from pisigma.workflow.cell.cell import Cell
@@ -21,7 +22,8 @@ def cell(tmp_path, repository):
 
 
 def files(folder):
-    return {path.relative_to(folder): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    paths = (path for path in folder.rglob("*") if path.is_file())
+    return {path.relative_to(folder): path.name == HISTORY or path.read_bytes() for path in paths}
 
 
 def test_an_unpacked_cell_has_the_same_files(cell, tmp_path):
@@ -31,6 +33,17 @@ def test_an_unpacked_cell_has_the_same_files(cell, tmp_path):
     assert count == len(files(cell.folder))
     assert other.history.events() == cell.history.events()
     assert other.status().step.state == cell.status().step.state
+
+
+def test_a_cell_is_packed_without_the_changes_that_another_process_is_making(cell, tmp_path):
+    with cell.history.database.writing() as database:
+        cell.history.database.insert(database, cell.history.events())
+        assert cell.history.path.with_name(f"{HISTORY}-journal").exists()
+        pack(cell, tmp_path / "welder7.zip")
+    other = unpack(tmp_path / "welder7.zip", tmp_path / "there")
+    assert [one.kind for one in other.history.events()] == ["maintenance"]
+    assert not list(other.folder.glob("*-journal"))
+    assert len(cell.history.events()) == 2
 
 
 def archive(path, *members):
