@@ -1,4 +1,4 @@
-"""`pisigma new`, `status`, `use`, `session`, `event`, `pack` and `unpack`: the commands of cells."""
+"""`pisigma status`, `use`, `session`, `event`, `pack` and `unpack`: the commands of cells."""
 
 import time
 from collections.abc import Mapping
@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from pisigma.cli.arguments import AsJson, complete_robot
+from pisigma.cli.arguments import AsJson
 from pisigma.cli.endings import NOT_ACCEPTED
+from pisigma.cli.fleet.commands import show_fleet
 from pisigma.cli.output import print_json, print_line, print_lines, print_table, wrapped
 from pisigma.cli.settings_options import Group, StatedSettings
 
@@ -20,49 +21,6 @@ CellFolder = Annotated[Path, typer.Argument(metavar="CELL", help="Folder of a ce
 Reason = Annotated[str, typer.Option(help="Reason to record in the history.")]
 MAX_LINES = 12
 """Number of newest sessions that are printed."""
-
-
-def new(
-    robot: Annotated[
-        str,
-        typer.Argument(
-            metavar="ROBOT",
-            help="Catalogue name or robot file (YAML or URDF).",
-            autocompletion=complete_robot,
-        ),
-    ],
-    out: Annotated[Path, typer.Option(help="Folder to write.")],
-    sensor: Annotated[
-        str, typer.Option(help="Sensor: tracker, camera, sockets, draw-wire or touch.")
-    ] = "tracker",
-    limit_mm: Annotated[
-        float | None, typer.Option(help="Limit of the 95 % quantile of the position errors [mm].")
-    ] = None,
-    base: Annotated[
-        str | None, typer.Option(help="Link of the URDF file in whose frame poses are given.")
-    ] = None,
-    tip: Annotated[str | None, typer.Option(help="Link of the URDF file that is the tool.")] = None,
-    camera: Annotated[list[Path] | None, typer.Option(help="Camera file (YAML); may be repeated.")] = None,
-    board: Annotated[list[Path] | None, typer.Option(help="Board file (YAML); may be repeated.")] = None,
-    fixed_camera: Annotated[
-        bool,
-        typer.Option("--fixed-camera", help="State that the camera is fixed and the board is on the flange."),
-    ] = False,
-    as_json: AsJson = False,
-) -> None:
-    """Create a cell: the folder of one robot on its mount, with its settings, sessions, models and history."""
-    from pisigma.measurement.camera.camera_files import CameraFiles
-    from pisigma.workflow.cell.cell import Cell
-
-    cameras = None
-    if camera or board:
-        cameras = CameraFiles(tuple(map(str, camera or ())), tuple(map(str, board or ())), fixed_camera)
-    cell = Cell.create(out, robot, sensor, limit_mm, base, tip, cameras)
-    if as_json:
-        print_json({"cell": str(out), **cell.status().to_json()})
-        return
-    print_lines([f"Cell written to {out}; its cell.yaml states every setting with its default."])
-    print_next(cell.status())
 
 
 def status(
@@ -89,7 +47,6 @@ def _status(path: Path, as_json: bool) -> set[str]:
     """Print the status of a cell or of a folder of cells; return the states."""
     from pisigma.lifetime.cell.layout import is_cell
     from pisigma.workflow.cell.cell import Cell
-    from pisigma.workflow.cell.cell_file import cells_in
 
     if is_cell(path):
         one = Cell.open(path).status()
@@ -98,21 +55,7 @@ def _status(path: Path, as_json: bool) -> set[str]:
         else:
             _print_status(one)
         return {one.step.state}
-    found = [Cell.open(folder).status() for folder in cells_in(path)]
-    if as_json:
-        print_json({"cells": [one.to_json() for one in found]})
-    else:
-        rows = [
-            (
-                Path(one.facts.folder).name,
-                one.facts.in_use.name if one.facts.in_use else "",
-                one.facts.sessions[-1].day if one.facts.sessions else "",
-                one.step.state,
-            )
-            for one in found
-        ]
-        print_table(f"{len(found)} cells in {path}", ("cell", "model in use", "last session", "state"), rows)
-    return {one.step.state for one in found}
+    return set(show_fleet(path, as_json=as_json).states)
 
 
 def _print_status(status: "CellStatus") -> None:
@@ -125,7 +68,7 @@ def _print_status(status: "CellStatus") -> None:
         accuracy = (
             "" if model.p95_mm is None else f", 95 % of held-out position errors below {model.p95_mm:.3f} mm"
         )
-        count = len(model.sessions.split(","))
+        count = len(model.made_of)
         made = f"fitted to {count} session{'s' if count > 1 else ''} until {model.day}"
         print_lines([f"{facts.folder}: model '{model.name}' is in use, {made}{accuracy}; {limit}."])
     verdicts = {one.session: one.verdict for one in facts.checks}

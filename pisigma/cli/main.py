@@ -9,11 +9,12 @@ import typer
 
 from pisigma import __version__
 from pisigma.cli.calibrate import calibrate
-from pisigma.cli.cell import event, new, pack, session, status, unpack, use
+from pisigma.cli.cell import event, pack, session, status, unpack, use
 from pisigma.cli.endings import exit_with_problem, report_problems
 from pisigma.cli.evaluate import evaluate
 from pisigma.cli.export import export
 from pisigma.cli.fleet.commands import fleet
+from pisigma.cli.fleet.new import new
 from pisigma.cli.help import ShortHelpCommand
 from pisigma.cli.ik.command import ik
 from pisigma.cli.images.camera import camera

@@ -44,10 +44,6 @@ class Plugins:
             load_installed()
         load_files(self.files)
 
-    def content(self) -> tuple[str, ...]:
-        """Return the SHA-256 of every file, for caches of results that depend on the plug-ins."""
-        return tuple(hashlib.sha256(Path(file).read_bytes()).hexdigest() for file in self.files)
-
 
 _loaded = Plugins()
 

@@ -206,7 +206,7 @@ def test_no_file_that_others_may_have_sent_names_a_plug_in(run, tmp_path, reposi
         ("simulate", tmp_path / "recipe.yaml", "--out", tmp_path / "x.csv"),
         ("robots", "--check", tmp_path / "robot.yaml"),
         ("plan", "kiro4", "--out", tmp_path / "p.csv", "--surroundings", tmp_path / "cell.yaml"),
-        ("fleet", "run", tmp_path / "fleet.csv", "--out", tmp_path / "fleet"),
+        ("new", "--from", tmp_path / "fleet.csv", "--out", tmp_path / "fleet"),
         ("evaluate", model, tmp_path / "rows.csv"),
     ):
         assert run(*arguments).exit_code == 2, arguments
@@ -215,11 +215,3 @@ def test_no_file_that_others_may_have_sent_names_a_plug_in(run, tmp_path, reposi
         plugins.load_files([tmp_path / "nothing.py"])
     plugins.load_files([evil])
     assert evil.with_suffix(".ran").exists(), "the file of this test does what it shall"
-
-
-def test_the_fleet_is_worked_out_again_where_a_plug_in_has_changed(tmp_path):
-    (tmp_path / "one.py").write_text("")
-    plugins.load_files([tmp_path / "one.py"])
-    before = plugins.loaded().content()
-    (tmp_path / "one.py").write_text("x = 1\n")
-    assert plugins.loaded().content() != before

@@ -9,24 +9,24 @@ from testing.aged import model_before
 from testing.measured_plans import measured_plan
 from testing.models import no_type_checker
 
-from pisigma.files.errors import PisigmaError
-from pisigma.lifetime.fleet.members import Member, SessionFile
-from pisigma.lifetime.fleet.record import REFUSED
+from pisigma.files.errors import AcceptanceError, PisigmaError
+from pisigma.lifetime.cell.status import ATTENTION
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.folder.model_folder import save_model
 from pisigma.planning.plan_settings import PlanSettings
 from pisigma.robot import Robot
 from pisigma.workflow.calibrate import calibrate
+from pisigma.workflow.cell.advance import advance
+from pisigma.workflow.cell.cell import Cell
+from pisigma.workflow.cell.new_cell import NewCell, of_model
 from pisigma.workflow.compare import compare
 from pisigma.workflow.evaluate import evaluate
-from pisigma.workflow.fleet.one_robot import process_robot, settings_for
 from pisigma.workflow.measure import MeasuringSession
 from pisigma.workflow.monitor import monitor
 from pisigma.workflow.plan import plan
 from pisigma.workflow.recalibrate import recalibrate
 from pisigma.workflow.report import report
 from pisigma.workflow.settings.calibration import CalibrationSettings
-from pisigma.workflow.settings.fleet import FleetSettings
 from pisigma.workflow.verify import verify
 
 ROBOT = "rb5"
@@ -99,17 +99,14 @@ def _measure(rows: Measurements, folder: Path) -> Answer:
     return _of(state.advice.action != "correct", state.advice.sentence)
 
 
-def _fleet(rows: Measurements, folder: Path) -> Answer:
-    rows.write_csv(folder / "session.csv", Robot.load(ROBOT))
-    member = Member(
-        "one", ROBOT, (SessionFile("s1", "", folder / "session.csv"),), model=model_folder(folder)
-    )
-    settings = FleetSettings(task="recalibrate")
-    record = process_robot(
-        member, settings, folder / "fleet", {"one": "k"}, {"one": settings_for(settings, member)}
-    )
-    last = record.sessions[-1]
-    return _of(last.verdict != REFUSED, last.sentence)
+def _advance(rows: Measurements, folder: Path) -> Answer:
+    of_model(model_folder(folder), NewCell("")).write(folder / "cell")
+    rows.write_csv(folder / "cell" / "sessions" / "s1.csv", Robot.load(ROBOT))
+    try:
+        step = advance(Cell.open(folder / "cell")).step
+    except AcceptanceError as refusal:
+        return Answer(3, str(refusal))
+    return _of(step.state not in ATTENTION, step.reason)
 
 
 def model_folder(folder: Path) -> Path:
@@ -131,7 +128,7 @@ COMMANDS: Mapping[str, Command] = {
     "report": _report,
     "plan --measured": _plan,
     "measure": _measure,
-    "fleet recalibrate": _fleet,
+    "fleet run": _advance,
 }
 
 

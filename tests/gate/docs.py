@@ -143,7 +143,7 @@ class Page:
                 self._need(word.rstrip("/"))
         for out in map(Path, outputs):
             out.parent.mkdir(parents=True, exist_ok=True)
-            if out.is_dir() and "--overwrite" not in words and words[1] != "fleet":
+            if out.is_dir() and "--overwrite" not in words:
                 shutil.rmtree(out)  # another way to do the same
         words = [f"{HASH_OF}{_model(words)}" if word.endswith("...") else word for word in words]
         status, printed = _session(words) if words[1] == "measure" else self._call(words)
@@ -211,7 +211,11 @@ MADE: Mapping[str, Mapping[str, inputs.Maker]] = {
     f"{HOW_TO}coupled-joints.md": {
         "my_robot.yaml": yaml_block(f"{HOW_TO}coupled-joints.md", 1, "name: mine\nmaker: we\nsource: ours\n")
     },
-    f"{HOW_TO}fleet.md": {"fleet.csv": inputs.fleet, "few.csv": inputs.measured("ur10", 0, 10, 9)},
+    f"{HOW_TO}fleet.md": {
+        "fleet.csv": inputs.fleet,
+        "few.csv": inputs.measured("ur10", 0, 10, 9),
+        "models/welder7": inputs.MY_UR10,
+    },
     f"{HOW_TO}fewer-freedoms.md": {"models/my_ur10": inputs.MY_UR10},
     f"{HOW_TO}import.md": {
         "tracker.txt": inputs.copy("exports/kuka.csv"),

@@ -6,10 +6,11 @@ import pytest
 from testing.refusals import refused
 
 from pisigma.files.errors import FleetError, MeasurementError
-from pisigma.lifetime.fleet.members import read_fleet
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.dates import date_in_name, is_date
 from pisigma.robot import Robot
+from pisigma.workflow.cell.new_cell import NewCell
+from pisigma.workflow.fleet.manifest import new_cells
 from pisigma.workflow.settings.monitoring import MonitorSettings
 
 SLIPS = ("0206-11-22", "1969-12-31", "2206-11-22", "9999-12-31")
@@ -49,4 +50,4 @@ def test_a_mistyped_year_is_refused(slip, tmp_path):
         Measurements.read_csv(tmp_path / "rows.csv", Robot.load("kiro3"))
     (tmp_path / "fleet.csv").write_text(f"id,robot,data,date\na,kiro3,rows.csv,{slip}\n")
     with pytest.raises(FleetError):
-        read_fleet(tmp_path / "fleet.csv")
+        new_cells(tmp_path / "fleet.csv", tmp_path / "cells", NewCell(""))

@@ -16,8 +16,10 @@ from pisigma.model.folder.model_folder import load_model, save_model
 from pisigma.robot import Robot
 from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.robot.writing import robot_to_yaml
+from pisigma.workflow.cell.new_cell import NewCell
 from pisigma.workflow.compare import compare
 from pisigma.workflow.evaluate import evaluate
+from pisigma.workflow.fleet.manifest import new_cells
 from pisigma.workflow.fleet.prior import estimate_fleet_prior
 from pisigma.workflow.monitor import monitor
 from pisigma.workflow.recalibrate import recalibrate
@@ -93,7 +95,8 @@ def test_a_fleet_prior_warns_and_widens(tmp_path):
         lines.append(f"r{number},arm.yaml,r{number}.csv")
     (tmp_path / "fleet.csv").write_text("\n".join(lines) + "\n")
     with no_type_checker():
-        prior = estimate_fleet_prior(tmp_path / "fleet.csv")
+        new_cells(tmp_path / "fleet.csv", tmp_path / "cells", NewCell(""))
+        prior = estimate_fleet_prior(tmp_path / "cells")
     assert sum("'theta_3'" in one for one in prior.summary.warnings) == 5
     assert abs(prior.model.robot.limits[2]).max() > abs(arm.limits[2]).max()
 

@@ -13,7 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from pisigma.files.errors import PlanningError
 from pisigma.files.yaml_file import read_yaml
 from pisigma.lifetime.cell.controller import Controller, records
-from pisigma.lifetime.cell.history import HISTORY, History, ModelEntry, SessionEntry
+from pisigma.lifetime.cell.history import HISTORY, Check, History, ModelEntry, SessionEntry
 from pisigma.lifetime.cell.layout import CELL_FILE, PLANS, SESSIONS
 from pisigma.lifetime.cell.status import CellFacts, next_step
 from pisigma.lifetime.cell.step import Step
@@ -32,13 +32,32 @@ class CellStatus:
     facts: CellFacts
     step: Step
 
+    @property
+    def name(self) -> str:
+        """Name of the folder of the cell."""
+        return Path(self.facts.folder).name
+
+    @property
+    def is_due(self) -> bool:
+        """Whether there are steps that need neither new rows nor a decision of a person."""
+        return self.step.verb is not None or self.step.state in ("not_taken_in", "file_refused")
+
+    @property
+    def last_error(self) -> Check | None:
+        """The last check that found an RMS error of the model in use or, if there is none, of the newest model."""
+        model = self.facts.in_use or (self.facts.models[-1] if self.facts.models else None)
+        known = [
+            one for one in self.facts.checks if model and one.model == model.name and one.rms_mm is not None
+        ]
+        return known[-1] if known else None
+
     def to_json(self) -> dict[str, Any]:
         """Return the status as plain values; `next.command` and `next.reason` are the next step."""
         facts, model = self.facts, self.facts.in_use
         return {
             "cell": facts.folder,
             "model": None if model is None else model.name,
-            "made_of": [] if model is None else model.sessions.split(","),
+            "made_of": [] if model is None else list(model.made_of),
             "p95_mm": None if model is None else model.p95_mm,
             "limit_mm": facts.limit_mm,
             "controller": records(facts.controller.active()),

@@ -127,6 +127,11 @@ class ModelEntry:
     p95_mm: float | None = None
     remark: str = ""
 
+    @property
+    def made_of(self) -> tuple[str, ...]:
+        """Names of the sessions that it was fitted to; empty if it was made outside of the cell."""
+        return tuple(filter(None, self.sessions.split(",")))
+
 
 @dataclass(frozen=True)
 class Check:
@@ -314,8 +319,8 @@ class History:
         """
         self.database.add(entries)
 
-    def add_session(self, session: SessionEntry) -> bool:
-        """Add a session unless another session in use has the same content; return whether it was added.
+    def add_session(self, session: SessionEntry, *also: Entry) -> bool:
+        """Add a session and other entries, unless another session in use has its content; return whether it did.
 
         Raises:
             OutputError: the history cannot be written.
@@ -326,7 +331,7 @@ class History:
                 (session.sha256, session.name),
             ).fetchone()
             if known is None:
-                self.database.insert(database, [session])
+                self.database.insert(database, [session, *also])
         return known is None
 
     def rename_model(self, before: str, after: str) -> None:
@@ -355,7 +360,7 @@ class History:
             MeasurementError: the kind is unknown, the day is not a valid date, or nobody is named who accepted.
             ModelError: no model is in use that could be accepted.
         """
-        check_choice(MeasurementError, "event", kind, event_kinds())
+        check_choice(MeasurementError, "event", kind, get_args(EventKind))
         day, model = day or datetime.date.today().isoformat(), ""
         if not is_date(day):
             raise MeasurementError(expected=EXPECTED_DATE, value=day, option="--date")
@@ -393,8 +398,3 @@ class History:
         table = TABLES[MonitoredSession].name
         database.executemany(f"INSERT OR REPLACE INTO {table} VALUES ({marks})", rows)
         return moved
-
-
-def event_kinds() -> tuple[str, ...]:
-    """Return the kinds of events."""
-    return get_args(EventKind)

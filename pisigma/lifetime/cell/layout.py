@@ -78,3 +78,19 @@ def history_of_model(folder: str | os.PathLike[str]) -> History:
     if model.parent.name == MODELS and is_cell(cell):
         return History(cell / HISTORY)
     return History(model.parent / f"{model.name}{MODEL_HISTORY}")
+
+
+def cells_in(folder: str | os.PathLike[str]) -> tuple[Path, ...]:
+    """Return the cells in a folder, sorted by name.
+
+    Raises:
+        PlanningError: the folder contains no cell.
+    """
+    found = tuple(sorted(path.parent for path in Path(folder).glob(f"*/{CELL_FILE}")))
+    if not found:
+        raise PlanningError(
+            expected=f"a cell (a folder with a {CELL_FILE}) or a folder of cells",
+            value=os.fspath(folder),
+            remedy="create one with `pisigma new`",
+        )
+    return found

@@ -73,7 +73,7 @@ class CellFacts:
     def newest_model(self) -> ModelEntry | None:
         """The newest model that was fitted to valid sessions only; None if there is none."""
         valid = {one.name for one in self.valid_sessions}
-        made = [one for one in self.models if valid.issuperset(one.sessions.split(","))]
+        made = [one for one in self.models if one.made_of and valid.issuperset(one.made_of)]
         return made[-1] if made else None
 
     @property
@@ -99,8 +99,7 @@ class CellFacts:
 
     def new_sessions(self, model: ModelEntry) -> list[SessionEntry]:
         """Return the valid sessions that a model was not fitted to, measured on its newest day or later."""
-        made_of = model.sessions.split(",")
-        return [one for one in self.valid_sessions if one.name not in made_of and one.day >= model.day]
+        return [one for one in self.valid_sessions if one.name not in model.made_of and one.day >= model.day]
 
 
 def valid_sessions(

@@ -1,48 +1,21 @@
-"""Status of a fleet: robots that have the largest errors, drift, are overdue, were refused or are missing."""
+"""Status of a fleet, a folder of cells: which cells need attention, and the largest errors."""
 
 import datetime
-from collections.abc import Sequence
+import os
+from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
 from typing import Any
 
-from pisigma.lifetime.fleet.record import RobotRecord, SessionRecord
-from pisigma.measurement.dates import EXPECTED_DATE, is_date
+from pisigma.files.errors import PisigmaError
+from pisigma.lifetime.cell.facts import CellStatus, status_of
+from pisigma.lifetime.cell.history import Check
+from pisigma.lifetime.cell.layout import cells_in
+from pisigma.lifetime.cell.status import ATTENTION
 
-
-@dataclass(frozen=True)
-class RobotStatus:
-    """Status of a robot.
-
-    Attributes:
-        robot: id of the robot.
-        last: last session that was not refused; None if there is none.
-        refused: session that was refused; None if none was.
-        days: days since the last session; None if that has no date.
-        overdue: whether that is too long.
-        compared: whether the last session was compared with an earlier one, or there is no earlier one.
-    """
-
-    robot: str
-    last: SessionRecord | None
-    refused: SessionRecord | None
-    days: int | None = None
-    overdue: bool = False
-    compared: bool = True
-
-    @property
-    def is_drifting(self) -> bool:
-        """Whether something moved since the session before, or a recalibration is recommended."""
-        last = self.last
-        return last is not None and (last.recalibrate or last.moved or last.verdict in ("moved", "unclear"))
-
-    @property
-    def state(self) -> str:
-        """The first that applies of: refused, missing (not processed yet), drifting, overdue, fine."""
-        if self.refused is not None:
-            return "refused"
-        if self.last is None:
-            return "missing"
-        return "drifting" if self.is_drifting else "overdue" if self.overdue else "fine"
+UNREADABLE = "unreadable"
+"""State of a cell whose file or history cannot be read."""
 
 
 @dataclass(frozen=True)
@@ -50,91 +23,66 @@ class FleetStatus:
     """Status of a fleet.
 
     Attributes:
-        robots: status of each robot, sorted by id.
-        today: date of the status.
-        overdue_days: days without a session after which a robot is overdue.
-        warnings: warnings on sessions with impossible dates, which are ignored.
+        folder: folder of the cells.
+        cells: status of every cell that can be read, sorted by name.
+        unreadable: why the status of other cells cannot be read, by their names.
     """
 
-    robots: tuple[RobotStatus, ...]
-    today: datetime.date
-    overdue_days: int
-    warnings: tuple[str, ...] = ()
+    folder: Path
+    cells: tuple[CellStatus, ...]
+    unreadable: Mapping[str, str]
 
     @staticmethod
-    def from_records(
-        records: Sequence[RobotRecord], today: datetime.date, overdue_days: int, expected: Sequence[str] = ()
-    ) -> "FleetStatus":
-        """Compute the status of a fleet.
+    def read(folder: str | os.PathLike[str]) -> "FleetStatus":
+        """Read the status of all cells in a folder.
 
-        Args:
-            records: records of the robots.
-            today: date of the status.
-            overdue_days: days without a session after which a robot is overdue.
-            expected: ids of all robots; those without a record are missing.
+        Raises:
+            PlanningError: the folder contains no cell.
         """
-        robots = [_status(one, today, overdue_days) for one in records]
-        missing = set(expected) - {one.robot for one in records}
-        robots += [RobotStatus(robot, None, None) for robot in missing]
-        warnings = tuple(
-            f"robot {record.robot}: expected {EXPECTED_DATE} as the date of session {one.session}, got {one.date}; "
-            "correct it in the manifest and run the fleet again."
-            for record in records
-            for one in record.sessions
-            if one.date and not is_date(one.date)
-        )
-        return FleetStatus(tuple(sorted(robots, key=lambda one: one.robot)), today, overdue_days, warnings)
+        cells, unreadable = list[CellStatus](), dict[str, str]()
+        for cell in cells_in(folder):
+            try:
+                cells.append(status_of(cell))
+            except PisigmaError as problem:  # one cell does not hide the others
+                unreadable[cell.name] = str(problem)
+        return FleetStatus(Path(folder), tuple(cells), unreadable)
 
-    @property
-    def robots_by_error(self) -> tuple[RobotStatus, ...]:
-        """Robots with known errors, the largest first."""
-        judged = [one for one in self.robots if one.last is not None and one.last.error_mm is not None]
-        return tuple(sorted(judged, key=lambda one: -_rms(one)))
+    @cached_property
+    def states(self) -> dict[str, tuple[str, ...]]:
+        """Names of the cells in every state, states that need attention first."""
+        states: dict[str, tuple[str, ...]] = {UNREADABLE: tuple(self.unreadable)} if self.unreadable else {}
+        for one in sorted(self.cells, key=urgency):
+            states[one.step.state] = (*states.get(one.step.state, ()), one.name)
+        return states
+
+    @cached_property
+    def by_error(self) -> tuple[tuple[CellStatus, Check], ...]:
+        """Cells with a known error and the check that found it, the largest RMS error first."""
+        known = [(one, check) for one in self.cells if (check := one.last_error) is not None]
+        return tuple(sorted(known, key=lambda one: -(one[1].rms_mm or 0.0)))
 
     @property
     def action(self) -> bool:
-        """Whether a robot was refused, is missing or drifts."""
-        return any(one.state in ("refused", "missing", "drifting") for one in self.robots)
-
-    def robots_in_state(self, state: str) -> tuple[RobotStatus, ...]:
-        """Return the robots in a state."""
-        return tuple(one for one in self.robots if one.state == state)
+        """Whether a cell needs attention, has steps that `pisigma fleet run` carries out, or cannot be read."""
+        return bool(self.unreadable) or any(one.step.state in ATTENTION or one.is_due for one in self.cells)
 
     def to_json(self) -> dict[str, Any]:
         """Return all figures as plain values."""
         return {
-            "robots": len(self.robots),
-            "today": self.today.isoformat(),
-            "worst": [{"robot": one.robot, "rms_mm": _rms(one)} for one in self.robots_by_error],
-            "drifting": [one.robot for one in self.robots if one.is_drifting],
-            "overdue": [{"robot": one.robot, "days": one.days} for one in self.robots if one.overdue],
-            "not_compared": [one.robot for one in self.robots if not one.compared],
-            "missing": [one.robot for one in self.robots_in_state("missing")],
-            "refused": [
-                {"robot": one.robot, "reason": one.refused.sentence}
-                for one in self.robots
-                if one.refused is not None
+            "today": datetime.date.today().isoformat(),
+            "states": {state: list(cells) for state, cells in self.states.items()},
+            "worst": [
+                {"cell": one.name, "rms_mm": check.rms_mm, "command": check.command}
+                for one, check in self.by_error
             ],
-            "warnings": list(self.warnings),
+            "unreadable": [{"cell": name, "reason": reason} for name, reason in self.unreadable.items()],
+            "cells": [one.to_json() for one in self.cells],
         }
 
 
-def _rms(one: RobotStatus) -> float:
-    assert one.last is not None
-    return one.last.error_mm or 0.0
-
-
-def _status(record: RobotRecord, today: datetime.date, overdue_days: int) -> RobotStatus:
-    """Compute the status of one robot."""
-    done = [one for one in record.sessions if not one.refused]
-    last = done[-1] if done else None
-    date = last.date if last is not None and is_date(last.date) else None
-    days = None if date is None else (today - datetime.date.fromisoformat(date)).days
-    return RobotStatus(
-        robot=record.robot,
-        last=last,
-        refused=next((one for one in record.sessions if one.refused), None),
-        days=days,
-        overdue=days is not None and days > overdue_days,
-        compared=len(done) < 2 or done[-1].verdict != "calibrated",
-    )
+def urgency(one: CellStatus) -> tuple[int, str]:
+    """Return a sort key: first cells that need attention, then those with steps that can be carried out."""
+    state = one.step.state
+    if state in ATTENTION:
+        return ATTENTION.index(state), state
+    return len(ATTENTION) + (0 if one.is_due else 2 if state == "up_to_date" else 1), state

@@ -10,22 +10,14 @@ from matplotlib.dates import AutoDateLocator, ConciseDateFormatter
 
 from pisigma.lifetime.comparison.displacement import Displacement
 from pisigma.lifetime.comparison.parameter_differences import ParameterDifferences
-from pisigma.lifetime.fleet.status import FleetStatus
+from pisigma.lifetime.fleet.status import FleetStatus, urgency
 from pisigma.lifetime.monitoring.charts import FALSE_ALARMS_PER_YEAR, SESSIONS_PER_YEAR, Chart
 from pisigma.lifetime.monitoring.history import Record
 from pisigma.lifetime.recalibration.movement import NORMAL_95
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.reporting.comparison_tables import comparison_tables
-from pisigma.reporting.lifetime_tables import (
-    ERRORS_NOTE,
-    STATES,
-    chart_table,
-    difference_table,
-    not_compared,
-    robot_table,
-    session_table,
-    state_table,
-)
+from pisigma.reporting.fleet_tables import ERRORS_NOTE, cell_table, state_table
+from pisigma.reporting.lifetime_tables import chart_table, difference_table, session_table
 from pisigma.reporting.page.figures import AFTER, BEFORE, OTHER, Drawing, draw_map, drawing_style, panel
 from pisigma.reporting.page.page import image, resource
 from pisigma.reporting.rendering import render
@@ -122,25 +114,23 @@ def _dates(axes: Axes) -> None:
     axes.xaxis.set_major_formatter(ConciseDateFormatter(locator))  # type: ignore[no-untyped-call]
 
 
-def fleet_page(status: FleetStatus, name: str) -> str:
-    """Render the robots of a fleet as HTML; texts are escaped.
+def fleet_page(status: FleetStatus) -> str:
+    """Render the cells of a fleet as HTML, the most urgent first; texts are escaped.
 
     Args:
         status: status of the fleet.
-        name: name of the fleet.
     """
-    order = {one.robot: place for place, one in enumerate(status.robots_by_error)}
-    robots = sorted(
-        status.robots, key=lambda one: (STATES.index(one.state), order.get(one.robot, len(order)))
-    )
+    place = {one.name: number for number, (one, _) in enumerate(status.by_error)}
+    cells = sorted(status.cells, key=lambda one: (*urgency(one), place.get(one.name, len(place))))
     return render(
         "fleet.html.j2",
-        name=name,
+        name=status.folder.resolve().name,
         status=status,
+        today=datetime.date.today().isoformat(),
         states=state_table(status),
-        robots=robots,
-        table=robot_table(robots),
-        notes=(ERRORS_NOTE, *filter(None, [not_compared(status)]), *status.warnings),
+        cells=cells,
+        table=cell_table(cells),
+        note=ERRORS_NOTE,
         style=Markup(resource("style.css")),  # ours
     )
 

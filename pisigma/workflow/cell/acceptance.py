@@ -3,7 +3,7 @@
 from jaxtyping import Float64
 from torch import Tensor
 
-from pisigma.files.errors import PisigmaError
+from pisigma.files.errors import MeasurementError, PisigmaError, Place
 from pisigma.lifetime.cell.acceptance import Acceptance, MeasuredAccuracy, missing_statements
 from pisigma.lifetime.cell.history import ModelEntry, SessionEntry
 from pisigma.measurement.dataset import Measurements
@@ -32,15 +32,21 @@ def acceptance_of(cell: Cell) -> Acceptance:
 
     Raises:
         ModelError: no model is in use.
-        MeasurementError: the file of a session was changed.
+        MeasurementError: the file of a session was changed, or there is no session with which the model was used.
     """
     model = load_model(folder := cell.model_folder())
     entry = cell.history.model(folder.name)
     document = cell.file.document
     sessions = cell.status().facts.valid_sessions
-    made_of = entry.sessions.split(",")
+    made_of = entry.made_of
     later = [one for one in sessions if one.name not in made_of and one.day >= entry.day]
-    new = (later or [one for one in cell.history.sessions() if one.name == made_of[-1]])[-1]
+    known = later or [one for one in cell.history.sessions() if one.name in made_of[-1:]]
+    if not known:  # the model was made outside of the cell
+        remedy = "import rows that were measured with it"
+        raise MeasurementError(
+            f"the cell has no session of model '{entry.name}'", at=Place(cell.folder), remedy=remedy
+        )
+    new = known[-1]
     seen = cell.sessions.rows_for(entry, cell.sessions.as_measured(new), new.day)
     measured, problem = _measured(cell, entry, new, seen) if later else (None, NO_SESSION)
     instrument = document.instrument or Instrument()

@@ -36,12 +36,11 @@ from pisigma.workflow.cell.model_choice import (
     put_into_use,
     with_warnings,
 )
-from pisigma.workflow.cell.new_cell import write_new_cell
+from pisigma.workflow.cell.new_cell import NewCell
+from pisigma.workflow.cell.new_files import free_path, save_new
 from pisigma.workflow.cell.sessions import (
     ModelRows,
     Sessions,
-    free_path,
-    save_new,
 )
 from pisigma.workflow.evaluate import Evaluation, evaluate
 from pisigma.workflow.monitor import Monitoring, monitor
@@ -102,7 +101,7 @@ class Cell:
             RobotError: there is no such robot.
             PlanningError: a value is not valid.
         """
-        write_new_cell(Path(folder), os.fspath(robot), sensor, limit_mm, base, tip, cameras)
+        NewCell(os.fspath(robot), sensor, limit_mm, base, tip, cameras).write(Path(folder))
         return Cell.open(folder)
 
     @property
@@ -336,7 +335,7 @@ class Cell:
         remark, (p95, rms) = result.summary.verdict, errors_of(result)
         entry = replace(
             entry_of(self.history, path, [chosen], remark, p95),
-            sessions=",".join((*parent.sessions.split(","), chosen.name)),
+            sessions=",".join((*parent.made_of, chosen.name)),
             day=max(parent.day, chosen.day),
             frame_day=parent.frame_day,
             target_day=parent.target_day,

@@ -13,7 +13,7 @@ from pydantic import Field
 from pisigma.files.errors import PisigmaError, Place, PlanningError
 from pisigma.files.setting import attributes_of, build_settings, by_key, flat_settings
 from pisigma.files.setting_values import checked_values
-from pisigma.files.yaml_file import Section, place_of_key, read_yaml
+from pisigma.files.yaml_file import Section, place_of_key, read_yaml, yaml_text
 from pisigma.lifetime.cell.layout import CELL_FILE
 from pisigma.lifetime.cell.status import VERIFICATION_POSES, CellFacts, plans_check
 from pisigma.planning.plan_settings import PlanSettings
@@ -280,12 +280,16 @@ def path_inside_cell(folder: Path, path: str | os.PathLike[str]) -> Path:
     return whole
 
 
-def template(document: Mapping[str, Any]) -> str:
+def template(document: Mapping[str, Any], calibrate: Mapping[str, Any] | None = None) -> str:
     """Return the text of a new `cell.yaml`: the known values, and every setting as a comment with help and default.
 
     Args:
         document: known values by the keys of `CellDocument`.
+        calibrate: settings of `pisigma calibrate`, for a short text without comments; None for all settings.
     """
+    if calibrate is not None:
+        stated = {key: value for key, value in document.items() if value is not None}
+        return yaml_text(stated | ({"calibrate": dict(calibrate)} if calibrate else {}))
     lines = ["# A cell: one robot on its mount, and its sensor. Lines that begin with # state defaults."]
     meaning = {key: text.partition("; None")[0] for key, text in attributes_of(CellDocument).items()}
     for key in ("robot", "base", "tip", "sensor", "limit_mm", "pose_repeatability_mm", "expansion_per_k"):
@@ -325,19 +329,3 @@ def _yaml(value: Any) -> str:
     if value is None:
         return ""
     return yaml.safe_dump(value, default_flow_style=True, width=1000).removesuffix("\n...\n").strip()
-
-
-def cells_in(folder: str | os.PathLike[str]) -> tuple[Path, ...]:
-    """Return the cells in a folder, sorted by name.
-
-    Raises:
-        PlanningError: the folder contains no cell.
-    """
-    found = tuple(sorted(path.parent for path in Path(folder).glob(f"*/{CELL_FILE}")))
-    if not found:
-        raise PlanningError(
-            expected=f"a cell (a folder with a {CELL_FILE}) or a folder of cells",
-            value=os.fspath(folder),
-            remedy="create one with `pisigma new`",
-        )
-    return found

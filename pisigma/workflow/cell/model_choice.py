@@ -49,7 +49,7 @@ def is_better(
         progress: called with the name of each step.
     """
     newest, older = sessions[-1], list(sessions[:-1])
-    if newest.name in in_use.sessions.split(",") or newest.rows < MIN_ROWS or not older:
+    if newest.name in in_use.made_of or newest.rows < MIN_ROWS or not older:
         return False, f"there is no session of {MIN_ROWS} rows or more to compare it with '{in_use.name}'"
     progress("calibration without the newest session")
     alone = replace(settings, cameras=None, folds=0, hold_out=None)
@@ -166,9 +166,13 @@ def found_events(
 def calibrated(
     robot: Robot, rows: Measurements, settings: CalibrationSettings, prior: Path | None, progress: Progress
 ) -> Calibration | Recalibration:
-    """Calibrate a robot with rows that were read, from scratch or from the prior of a fleet."""
+    """Calibrate a robot with rows that were read, from scratch or from the prior of a fleet.
+
+    A calibration from scratch without a validation is stored without figures, which take longer than itself.
+    """
     if prior is None:
-        return calibrate(robot, rows, replace(settings, cameras=None), progress)
+        result = calibrate(robot, rows, replace(settings, cameras=None), progress)
+        return replace(result, figures=result.summary.judged is not None)
     settings.check_unused()
     return recalibrate(prior, rows, RecalibrationSettings(), progress, robot)
 

@@ -4,7 +4,7 @@ import datetime
 import hashlib
 import os
 import tempfile
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -14,12 +14,10 @@ import torch
 from pisigma.files.errors import (
     AcceptanceError,
     MeasurementError,
-    OutputError,
     PisigmaError,
     Place,
     check_choice,
 )
-from pisigma.files.scratch import FILE, scratch_beside
 from pisigma.lifetime.cell.controller import Controller
 from pisigma.lifetime.cell.facts import facts_of, not_taken_in, sha256_of
 from pisigma.lifetime.cell.history import Check, Event, History, ModelEntry, SessionEntry, now
@@ -30,13 +28,12 @@ from pisigma.measurement.copies import RowValues, copies_of_known
 from pisigma.measurement.dataset import Measurements, join
 from pisigma.measurement.dates import EXPECTED_DATE, date_in_name, is_date
 from pisigma.model.folder.model_folder import load_model
+from pisigma.model.training_rows import known_rows
 from pisigma.robot.description import Robot
 from pisigma.validation.gate import check_rows
+from pisigma.workflow.cell.new_files import write_new
 from pisigma.workflow.recalibrate import may_move
 from pisigma.workflow.settings.recalibration import RecalibrationSettings
-
-MAX_NAMES = 10_000
-"""Largest number of files with the date of one day in a folder."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,6 +88,8 @@ class Sessions:
     ) -> SessionEntry:
         """Check the rows of a session and store them; they are never changed afterwards.
 
+        Rows that the model in use was fitted to outside of the cell become a session that it is made of.
+
         Args:
             file: measurements (CSV), or rows in memory.
             accept_implausible: add them even if the check finds that they must not be trusted.
@@ -115,7 +114,7 @@ class Sessions:
         day = day or _day_of(rows)
         if not is_date(day):
             raise MeasurementError(expected=EXPECTED_DATE, value=day, option="--date")
-        entry = self._judged(rows, day, accept_implausible)
+        entry, fitted = self._judged(rows, day, accept_implausible)
         inside: Path | None = None
         if isinstance(file, Measurements):
             with tempfile.TemporaryDirectory() as scratch:
@@ -126,7 +125,8 @@ class Sessions:
             inside = Path(file) if Path(file).parent.resolve() == self.folder.resolve() else None
         path = inside or write_new(self.folder, day, content, {one.name for one in self.history.sessions()})
         entry = replace(entry, name=path.stem, sha256=hashlib.sha256(content).hexdigest())
-        if not self.history.add_session(entry):  # another process was faster
+        models = [] if fitted is None else [with_session(fitted, entry)]
+        if not self.history.add_session(entry, *models):  # another process was faster
             if inside is None:
                 path.unlink()
             raise _known(rows)
@@ -151,8 +151,10 @@ class Sessions:
             raise
         return True
 
-    def _judged(self, rows: Measurements, day: str, accept_implausible: bool) -> SessionEntry:
-        """Check rows and return the entry of their session, still without name and hash."""
+    def _judged(
+        self, rows: Measurements, day: str, accept_implausible: bool
+    ) -> tuple[SessionEntry, ModelEntry | None]:
+        """Check rows; return the entry of their session without name and hash, and the model fitted to them."""
         known = [one for one in self.history.sessions() if not one.set_aside]
         again = torch.zeros(rows.rows, dtype=torch.bool)
         for one in known:
@@ -160,7 +162,7 @@ class Sessions:
             again |= copies_of_known(rows.as_fields(), self.robot, values)
         if bool(again.all()):
             raise _known(rows)
-        model, controller = self.history.in_use, Controller.from_history(self.history)
+        model, fitted, controller = self.history.in_use, False, Controller.from_history(self.history)
         at = controller.active(day, now())
         found = controller.findings("import", model, self.history.sessions(), at).accepted(self.folder.parent)
         if model is None or found:  # with other joint zeros, the model does not describe the arm
@@ -170,6 +172,7 @@ class Sessions:
             stated = RecalibrationSettings(seen.moved or None)
             loaded = load_model(self.folder.parent / MODELS / model.name)
             verdict = check_rows(seen.rows, loaded, stated.fitted, may_move(stated))
+            fitted = bool(known_rows(loaded, seen.rows).all())
         if verdict.implausible and not accept_implausible:
             raise AcceptanceError(
                 f"the rows must not be trusted: {verdict.implausible[0].sentence.rstrip('.')}",
@@ -177,7 +180,7 @@ class Sessions:
                 remedy="correct the file, or import it with --accept-implausible",
             )
         temperature = None if rows.temperature is None else float(rows.temperature.nanmean())
-        return SessionEntry(
+        entry = SessionEntry(
             name="",
             sha256="",
             taken_in=now(),
@@ -188,6 +191,7 @@ class Sessions:
             judged_by="robot" if model is None else model.name,
             remark=" ".join((*found, *(one.sentence for one in verdict.diagnostics))),
         )
+        return entry, model if fitted else None
 
     def set_aside(self, session: str, reason: str) -> None:
         """Exclude a session from all further steps; its file is kept.
@@ -224,8 +228,7 @@ class Sessions:
         Raises:
             MeasurementError: there is none.
         """
-        made_of = model.sessions.split(",")
-        found = [one for one in self.valid() if one.name not in made_of and one.day >= model.day]
+        found = [one for one in self.valid() if one.name not in model.made_of and one.day >= model.day]
         if not found:
             raise MeasurementError(
                 f"every valid session is older than model '{model.name}' or was used to fit it",
@@ -302,6 +305,12 @@ class Sessions:
         return ModelRows(with_setup_names(rows, model.frame_day, model.target_day), moved)
 
 
+def with_session(model: ModelEntry, session: SessionEntry) -> ModelEntry:
+    """Return a model that was fitted to a session, too."""
+    day = max(model.day, session.day) if model.made_of else session.day
+    return replace(model, sessions=",".join((*model.made_of, session.name)), day=day)
+
+
 def with_setup_names(rows: Measurements, frame_day: str, target_day: str) -> Measurements:
     """Return rows whose frame and target names state the day of their setup; "": the names of the file."""
     frame = tuple(since(name, frame_day) for name in rows.frame)
@@ -331,66 +340,3 @@ def _day_of(rows: Measurements) -> str:
     if rows.date is not None and all(rows.date):
         return min(rows.date)
     return date_in_name(Path(rows.source).name) or datetime.date.today().isoformat()
-
-
-def free_path(folder: Path, name: str, suffix: str, taken: Collection[str] = ()) -> Path:
-    """Return a path in a folder that is not taken: NAME, NAME-2, NAME-3 and so on.
-
-    Raises:
-        OutputError: all names are taken.
-    """
-    for number in range(1, MAX_NAMES):
-        stem = name if number == 1 else f"{name}-{number}"
-        path = folder / f"{stem}{suffix}"
-        if not path.exists() and stem not in taken:
-            return path
-    raise OutputError(f"the folder already contains {MAX_NAMES:,} files named after {name}", at=Place(folder))
-
-
-def save_new(folder: Path, save: Callable[[Path], object]) -> Path:
-    """Save a model under a new name, the date of today, even if other processes save models in the same folder.
-
-    Args:
-        folder: folder of the models.
-        save: function that writes the folder of the model, and refuses an existing one.
-
-    Raises:
-        OutputError: the model cannot be written.
-    """
-    while True:
-        path = free_path(folder, datetime.date.today().isoformat(), "")
-        try:
-            save(path)
-            return path
-        except OutputError:
-            if not path.exists():  # else another process took the name
-                raise
-
-
-def write_new(folder: Path, name: str, content: bytes, taken: Collection[str]) -> Path:
-    """Write a session under a new name, whole or not at all, even if other processes write to the folder.
-
-    Args:
-        folder: folder of the sessions.
-        name: name of the file without ".csv"; see `free_path`.
-        content: content of the file.
-        taken: further names that are taken.
-
-    Raises:
-        OutputError: the file cannot be written.
-    """
-    while True:
-        path = free_path(folder, name, ".csv", taken)
-        try:
-            with scratch_beside(path, FILE) as scratch:
-                with scratch.open("wb") as file:
-                    file.write(content)
-                    file.flush()
-                    os.fsync(file.fileno())
-                scratch.chmod(0o644)
-                os.link(scratch, path)  # unlike a rename, it never replaces what another process wrote
-            return path
-        except FileExistsError:
-            continue
-        except OSError as problem:
-            raise OutputError(f"the session cannot be written: {problem.strerror}", at=Place(path)) from None

@@ -10,18 +10,18 @@ from typing import Any
 import numpy as np
 
 from pisigma.estimation.population import MIN_ROBOTS
-from pisigma.files.errors import FleetError, MeasurementError, RobotError
+from pisigma.files.errors import FleetError, PisigmaError
 from pisigma.files.progress import Progress
-from pisigma.lifetime.fleet.members import Member, read_fleet
+from pisigma.lifetime.cell.layout import cells_in
 from pisigma.lifetime.fleet.prior import FleetPrior, fleet_prior
 from pisigma.lifetime.fleet.prior_summary import FleetPriorSummary, summarise_prior
-from pisigma.measurement.camera.corner_file import read_rows
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.joint_range import row_warnings, with_limits_of_rows
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.reporting.derived_cards import write_fleet_prior_card
 from pisigma.robot.description import Robot
 from pisigma.validation.checks.setup_fault import setup_diagnostics
+from pisigma.workflow.cell.cell import Cell
 from pisigma.workflow.result import AbstractModelResult
 
 
@@ -46,76 +46,52 @@ class FleetPriorResult(AbstractModelResult):
 
 
 def estimate_fleet_prior(
-    source: str | os.PathLike[str],
-    robot: str | None = None,
-    progress: Progress = lambda what: None,
+    folder: str | os.PathLike[str], progress: Progress = lambda what: None
 ) -> FleetPriorResult:
-    """Estimate means and covariances of the errors of robots of one type from the first session of each.
+    """Estimate means and covariances of the errors of robots of one type from the first valid session of each cell.
 
     Args:
-        source: manifest (CSV) or folder; see `pisigma.lifetime.fleet.members.read_fleet`.
-        robot: nominal robot of those robots that do not state one.
+        folder: folder of cells; files in their `sessions/` that have not been added yet are added.
         progress: called with the current step.
 
     Raises:
-        FleetError: the fleet cannot be used, its robots are of several types, or too few have readable files. Single
-            unreadable files are listed in the figures.
+        PlanningError: the folder contains no cell.
+        FleetError: the robots are of several types, or too few have rows. Single cells without rows are listed in the
+            figures.
         IdentificationError: the rows of a robot do not determine its base.
     """
     started = time.perf_counter()
-    members = read_fleet(source, robot)
-    robots, refused = _robots(members)
-    readable = [one for one in members if one.id in robots]
-    nominal = _common_robot(robots)
-    progress(f"{len(members)} robots")
-    rows: dict[str, Measurements] = {}
-    for one in readable:
+    cells = cells_in(folder)
+    robots, rows, refused = dict[str, Robot](), dict[str, Measurements](), dict[str, str]()
+    for number, path in enumerate(cells, 1):
+        progress(f"{number} of {len(cells)} cells")
         try:
-            some = read_rows(one.sessions[0].data, nominal, one.cameras).split_sets()[0]
-        except MeasurementError as problem:  # one bad file does not stop the others
-            refused[one.id] = str(problem)
-            continue
-        causes = [cause for cause in setup_diagnostics(nominal, some) if cause.severity == "implausible"]
-        if causes:  # a wrong unit would count as a large scatter between robots
-            refused[one.id] = f"{some.source}: {causes[0].sentence}"
-        else:
-            rows[one.id] = some
-    if refused and len(rows) < MIN_ROBOTS:
+            cell = Cell.open(path)
+            some = cell.sessions.as_measured(cell.sessions.valid()[0]).split_sets()[0]
+            causes = [one for one in setup_diagnostics(cell.robot, some) if one.severity == "implausible"]
+            if causes:  # a wrong unit would count as a large scatter between robots
+                raise FleetError(f"{some.source}: {causes[0].sentence}")
+            robots[path.name], rows[path.name] = cell.robot, some
+        except PisigmaError as problem:  # one cell does not stop the others
+            refused[path.name] = str(problem)
+    if len(rows) < MIN_ROBOTS and refused:
         raise FleetError(
-            f"expected {MIN_ROBOTS} robots or more, got {len(rows)} with readable files; the first refused file: "
+            f"expected {MIN_ROBOTS} robots or more, got {len(rows)} with rows; the first without: "
             f"{next(iter(refused.values()))}",
             value=len(rows),
         )
+    nominal = _common_robot(robots)
     remarks = tuple(f"Robot '{one}': {said}" for one in rows for said in row_warnings(nominal, rows[one]))
     wide = nominal
     for some in rows.values():
         wide = with_limits_of_rows(wide, some)
-    prior = fleet_prior(Path(source).resolve().stem, wide, list(rows.values()))
+    name = Path(folder).resolve().name
+    prior = fleet_prior(name, wide, list(rows.values()))
     summary = summarise_prior(prior, list(rows)).with_figures(
-        command=f"pisigma.estimate_fleet_prior({Path(source).name!r})", refused=refused, remarks=remarks
+        command=f"pisigma.estimate_fleet_prior({name!r})", refused=refused, remarks=remarks
     )
     model = replace(prior.model, metrics=summary.to_json())
     return FleetPriorResult(model, prior, summary, time.perf_counter() - started)
-
-
-def _robots(members: tuple[Member, ...]) -> tuple[dict[str, Robot], dict[str, str]]:
-    """Return the nominal robots by their ids, and why others cannot be read.
-
-    Raises:
-        FleetError: none can be read.
-    """
-    robots: dict[str, Robot] = {}
-    refused: dict[str, str] = {}
-    for member in members:
-        try:
-            if member.fault:
-                raise FleetError(member.fault)
-            robots[member.id] = Robot.load(member.robot)
-        except (FleetError, RobotError) as problem:  # one bad file does not stop the others
-            refused[member.id] = str(problem)
-    if not robots:
-        raise FleetError(f"no description of a robot can be read: {next(iter(refused.values()))}")
-    return robots, refused
 
 
 def _common_robot(robots: Mapping[str, Robot]) -> Robot:
@@ -130,6 +106,6 @@ def _common_robot(robots: Mapping[str, Robot]) -> Robot:
             raise FleetError(
                 f"expected robots of one type, got '{name}' ({first.name}) and '{other_name}' ({other.name})",
                 value=other_name,
-                remedy="give a manifest of the robots of one type only",
+                remedy="put the cells of each type into a folder of their own",
             )
     return first

@@ -1,44 +1,39 @@
-"""Calibrate, recalibrate or monitor the robots of a fleet; the results are records, model folders and one table."""
+"""Carry out the steps that are due in the cells of a folder, in processes or on Ray, and write one table of results."""
 
 import functools
-import hashlib
-import json
 import os
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from pisigma.files.conflicts import check_conflicts
 from pisigma.files.engines.engine import AbstractEngine
 from pisigma.files.engines.processes import ProcessEngine
-from pisigma.files.errors import OutputError, PisigmaError, Place
-from pisigma.files.model_files import is_model, model_hash
-from pisigma.files.plugins import loaded
+from pisigma.files.errors import PisigmaError
 from pisigma.files.progress import Progress
-from pisigma.lifetime.fleet.members import Member, read_fleet
-from pisigma.lifetime.fleet.record import (
-    MARKER_FILE,
+from pisigma.lifetime.cell.facts import status_of
+from pisigma.lifetime.cell.layout import MODELS, cells_in
+from pisigma.lifetime.cell.status import ATTENTION, CellFacts
+from pisigma.lifetime.fleet.results import (
     RESULTS,
-    RobotRecord,
-    expect_robots,
-    read_record,
-    read_records,
-    record_path,
+    ParameterValue,
+    read_parameters,
     write_results,
 )
+from pisigma.lifetime.fleet.status import FleetStatus
+from pisigma.measurement.sensors.sensor import SHOWN_UNITS
+from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.folder.model_folder import load_model
 from pisigma.model.model_posterior import check_fleet_prior
-from pisigma.workflow.fleet.one_robot import process_robot, settings_for
-from pisigma.workflow.settings.calibration import CalibrationSettings
+from pisigma.workflow.cell.advance import advance
+from pisigma.workflow.cell.cell import Cell
 from pisigma.workflow.settings.fleet import FleetSettings
 
-ROBOTS_PER_CHUNK = 4
-"""Robots that a worker processes at once, which takes some seconds."""
-
+CELLS_PER_CHUNK = 4
+"""Cells that a worker processes at once, which takes some seconds."""
 _LOST = "the process that worked on it ended twice; check the memory and its files."
 
 
@@ -47,112 +42,132 @@ class FleetRun:
     """Result of `run_fleet`.
 
     Attributes:
-        records: records of the robots of this call, in the order of the fleet.
-        refused: ids of the robots without results, and reasons.
-        resumed: number of robots that an earlier call had already processed.
-        results: file of the table of all robots in the folder.
+        cells: number of cells.
+        unchanged: number of cells in which nothing was due.
+        refused: names of the cells that need attention, and reasons.
+        results: file of the table of all checks.
         seconds: computing time [s].
     """
 
-    records: tuple[RobotRecord, ...]
+    cells: int
+    unchanged: int
     refused: tuple[tuple[str, str], ...]
-    resumed: int
     results: Path
     seconds: float
 
     @property
     def done(self) -> int:
-        """Number of robots with results for all of their sessions."""
-        return len(self.records) - len(self.refused)
+        """Number of cells that need no attention."""
+        return self.cells - len(self.refused)
 
     def to_json(self) -> dict[str, Any]:
         """Return all figures as plain values."""
         return {
-            "robots": len(self.records),
+            "cells": self.cells,
             "done": self.done,
-            "resumed": self.resumed,
-            "refused": [{"robot": robot, "reason": reason} for robot, reason in self.refused],
+            "unchanged": self.unchanged,
+            "refused": [{"cell": cell, "reason": reason} for cell, reason in self.refused],
             "seconds": round(self.seconds, 3),
             "results": str(self.results),
         }
 
 
 def run_fleet(
-    source: str | os.PathLike[str],
-    out: str | os.PathLike[str],
-    settings: FleetSettings | None = None,
-    robot: str | None = None,
+    folder: str | os.PathLike[str],
+    settings: FleetSettings = FleetSettings(),
     progress: Progress = lambda what: None,
 ) -> FleetRun:
-    """Process all robots of a fleet, and keep the results of earlier calls with the same folder.
+    """Advance all cells in a folder: calibrate, verify, monitor and recalibrate as the status of each says.
 
-    A robot with bad files or options is reported and does not stop the others. Every robot has a record, which is
-    written whole when the robot is done. A robot is processed again where its files or the settings have changed, its
-    model is missing, or it was refused because the disk was full.
+    See `pisigma.workflow.cell.advance.advance`. A cell with bad rows is reported and does not stop the others. What a
+    cell contains is always whole, so that a later call continues after an interruption; a cell whose status names no
+    step is not opened.
 
     Args:
-        source: manifest (CSV) or folder; see `pisigma.lifetime.fleet.members.read_fleet`.
-        out: folder to write: `results.parquet`, `records/ID.json` and `models/ID/SESSION`.
-        settings: see `FleetSettings`. None: the defaults.
-        robot: nominal robot of those robots that do not state one.
-        progress: called with the number of processed robots.
+        folder: folder of cells; `results.parquet` is written there.
+        settings: see `FleetSettings`.
+        progress: called with the number of processed cells.
 
     Raises:
-        FleetError: the fleet cannot be used, or the options of none of its robots can.
-        MeasurementError: the manifest is not a CSV file.
+        PlanningError: the folder contains no cell.
         ModelError: the prior is not a model of `pisigma fleet prior`.
-        OutputError: the folder is not that of a fleet, or cannot be written to.
+        OutputError: the table cannot be written.
         ImportError: the extra of the engine or of the table is not installed.
     """
-    started, settings = time.perf_counter(), settings or FleetSettings()
+    started, path = time.perf_counter(), Path(folder) / RESULTS
     for extra in ("pyarrow", *(("ray",) if settings.engine == "ray" else ())):
         import_module(extra)  # before the work, and before anything is written
-    members = read_fleet(source, robot)
-    plans = _plans(members, settings)
-    folder = Path(out)
+    cells = cells_in(folder)
     if settings.prior is not None:
         check_fleet_prior(load_model(settings.prior))
-    keys = {member.id: _key(member, settings, plans[member.id]) for member in members}
-    _prepare(folder, Path(source), members)
-    finished = [_finished(folder, member, keys[member.id]) for member in members]
-    records = {record.robot: record for record in finished if record is not None}
-    resumed, waiting = len(records), [member for member in members if member.id not in records]
-    lost: dict[str, str] = {}
-    work = functools.partial(process_robot, settings=settings, out=folder.absolute(), keys=keys, plans=plans)
+    before = FleetStatus.read(folder)
+    reasons = dict(before.unreadable) | {
+        one.name: one.step.reason for one in before.cells if one.step.state in ATTENTION
+    }
+    due = {one.name for one in before.cells if one.is_due}
+    waiting = [cell for cell in cells if cell.name in due]
+    parameters = dict(read_parameters(path))
+    work = functools.partial(_advance, prior=settings.prior)
     with _engine(settings, len(waiting)) as engine:
-        for member, record in engine.results(work, waiting, ROBOTS_PER_CHUNK) if waiting else ():
-            if record is None:
-                lost[member.id] = _LOST
-                record = RobotRecord(member.id, keys[member.id], ())
-            records[member.id] = record
-            progress(f"{len(records)} of {len(members)} robots")
-    of_call = tuple(records[member.id] for member in members)
-    reasons = {record.robot: lost.get(record.robot) or record.reason for record in of_call}
-    write_results(folder / RESULTS, read_records(folder))
+        results = engine.results(work, waiting, CELLS_PER_CHUNK) if waiting else iter(())
+        for number, (cell, result) in enumerate(results, len(cells) - len(waiting) + 1):
+            reason, found = (_LOST, {}) if result is None else result
+            parameters |= found
+            reasons.pop(cell.name, None)
+            reasons |= {cell.name: reason} if reason else {}
+            progress(f"{number} of {len(cells)} cells")
+    after = [one.facts for one in FleetStatus.read(folder).cells]
+    for facts in after:
+        parameters |= _parameters(facts, parameters.keys())
+    write_results(path, after, parameters)
     return FleetRun(
-        records=of_call,
-        refused=tuple((name, reason) for name, reason in reasons.items() if reason),
-        resumed=resumed,
-        results=folder / RESULTS,
+        cells=len(cells),
+        unchanged=len(cells) - len(waiting),
+        refused=tuple(sorted(reasons.items())),
+        results=path,
         seconds=time.perf_counter() - started,
     )
 
 
-def _plans(members: Sequence[Member], settings: FleetSettings) -> dict[str, CalibrationSettings | str]:
-    """Return the settings of every robot's calibration, or why its options cannot be used.
+def _advance(folder: Path, prior: Path | None) -> tuple[str, dict[str, list[ParameterValue]]]:
+    """Advance a cell; return why it needs attention, "" if it does not, and the parameters of its models."""
+    reason = ""
+    try:
+        step = advance(Cell.open(folder), prior).step
+        reason = step.reason if step.state in ATTENTION else ""
+    except Exception as problem:  # one cell must not stop the others; a later call tries it again
+        known = isinstance(problem, PisigmaError | OSError | MemoryError)
+        defect = f"a defect of pisigma ({type(problem).__name__}: {problem}); please report it."
+        reason = str(problem) if known else defect
+    try:
+        return reason, _parameters(status_of(folder).facts)
+    except PisigmaError as problem:
+        return reason or str(problem), {}
 
-    Raises:
-        PisigmaError: the options of no robot can be used.
-    """
-    plans: dict[str, CalibrationSettings | str] = {}
-    for member in members:
-        try:
-            plans[member.id] = settings_for(settings, member)
-        except PisigmaError as problem:
-            plans[member.id] = str(problem)
-            if len(plans) == len(members) and all(isinstance(plan, str) for plan in plans.values()):
-                raise
-    return plans
+
+def _parameters(facts: CellFacts, known: Iterable[str] = ()) -> dict[str, list[ParameterValue]]:
+    """Return the estimated parameters of the models of a cell, except known ones, by the SHA-256 of the models."""
+    new = [one for one in facts.models if one.sha256 not in known]
+    return {one.sha256: parameters_of(load_model(Path(facts.folder) / MODELS / one.name)) for one in new}
+
+
+def parameters_of(model: CalibratedModel) -> list[ParameterValue]:
+    """Return the geometric parameters of a calibration, or those of which a recalibrated model has a posterior."""
+    estimated = model.metrics.get("parameters")
+    if estimated is not None:
+        names = ("name", "unit", "estimated", "change", "standard_error")
+        rows = [[one.get(name) for name in names] for one in estimated]
+        return [ParameterValue(*row) for row in rows if row[-1] is not None]
+    if (posterior := model.uncertainty) is None:
+        return []
+    space, values = posterior.space, posterior.geometry.robot.dh.ravel()
+    changes, deviations = values - space.robot.dh.ravel(), posterior.root[: space.arm_size].norm(dim=1)
+    parameters = []
+    for number in deviations.nonzero()[:, 0].tolist():
+        unit, scale = SHOWN_UNITS[space.parameters[number].unit]
+        figures = (float(those[number]) * scale for those in (values, changes, deviations))
+        parameters.append(ParameterValue(space.names[number], unit, *figures))
+    return parameters
 
 
 @contextmanager
@@ -169,67 +184,3 @@ def _engine(settings: FleetSettings, items: int) -> Iterator[AbstractEngine]:
         yield engine
     finally:
         engine.close()
-
-
-def _prepare(folder: Path, source: Path, members: tuple[Member, ...]) -> None:
-    """Create the folder of a fleet, or check that an existing one is that of a fleet.
-
-    Raises:
-        OutputError: it is something else, contains an input or is inside one, or cannot be written to.
-    """
-    inputs = [source, *(one.data for member in members for one in member.sessions)]
-    inputs += [member.model for member in members if member.model is not None]
-    inputs += [Path(file) for member in members if member.cameras for file in member.cameras.files]
-    mark = folder / MARKER_FILE
-    try:
-        check_conflicts(folder, inputs)
-        if folder.exists() and not folder.is_dir():
-            raise OutputError(expected="a folder", at=Place(folder), remedy="choose another --out")
-        if folder.is_dir() and any(folder.iterdir()) and not mark.is_file():
-            raise OutputError(
-                expected="the folder of a fleet, or an empty folder",
-                at=Place(folder),
-                remedy="choose another --out",
-            )
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as problem:
-        raise OutputError(
-            f"cannot be written: {problem.strerror}", at=Place(folder), remedy="choose another --out"
-        ) from None
-    expect_robots(folder, [member.id for member in members])
-
-
-def _finished(out: Path, member: Member, key: str) -> RobotRecord | None:
-    """Return the record of an earlier call if its inputs were the same and its models still exist, else None."""
-    record = read_record(record_path(out, member.id))
-    if record is None or record.key != key:
-        return None
-    return record if all(not one.model or is_model(out / one.model) for one in record.sessions) else None
-
-
-def _key(member: Member, settings: FleetSettings, plan: CalibrationSettings | str) -> str:
-    """Return the SHA-256 of all that a robot's results depend on: files, settings and the version of pisigma."""
-    from pisigma import __version__
-
-    description, model = Path(member.robot), member.model
-    stated = {
-        "version": __version__,
-        "task": settings.task,
-        "validate": settings.validate,
-        "prior": None if settings.prior is None else model_hash(settings.prior),
-        "plan": repr(plan),
-        "plugins": loaded().content(),
-        "robot": _hash_of(description) if description.is_file() else member.robot,
-        "model": None if model is None else model_hash(model) if is_model(model) else str(model),
-        "cameras": [_hash_of(Path(file)) for file in (member.cameras.files if member.cameras else ())],
-        "sessions": [(one.name, one.date, one.data.name, _hash_of(one.data)) for one in member.sessions],
-    }
-    return hashlib.sha256(json.dumps(stated, sort_keys=True).encode()).hexdigest()
-
-
-def _hash_of(path: Path) -> str:
-    """Return the SHA-256 of a file; the system's message where it cannot be read, which the robot's record reports."""
-    try:
-        return hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else "no file"
-    except OSError as problem:
-        return str(problem.strerror)

@@ -1,93 +1,83 @@
-"""Status of a fleet."""
+"""Status of a fleet: cells by their states, and the largest errors."""
 
-import datetime
+from dataclasses import replace
+from pathlib import Path
 
-from pisigma.lifetime.fleet.record import RobotRecord, SessionRecord
+import pytest
+from testing.refusals import refused
+
+from pisigma.files.errors import PlanningError
+from pisigma.lifetime.cell.history import HISTORY, Check, History, ModelEntry, SessionEntry, Use
 from pisigma.lifetime.fleet.status import FleetStatus
-from pisigma.reporting.lifetime_tables import not_compared, robot_table, state_table
+from pisigma.reporting.fleet_tables import cell_table, fleet_verdict, state_table
 
-TODAY = datetime.date(2026, 11, 22)
-
-
-def session(date, verdict, rms=None, **more):
-    return SessionRecord(
-        session=date, date=date, file="x.csv", rows=10, verdict=verdict, sentence=f"It is {verdict}.", rms_mm=rms,
-        **more,
-    )  # fmt: skip
+SESSION = SessionEntry("2026-03-01", "hash", "2026-03-02T09:00:00+00:00", "2026-03-01", 30, "position")
+MODEL = ModelEntry("a", "hash", "2026-03-02T12:00:00+00:00", "2026-03-01", "2026-03-01")
+CHECK = Check("calibrate", "a", "", "trusted", "", None, False, "2026-03-02T12:00:00+00:00", 0.05)
 
 
-STATUS = FleetStatus.from_records(
-    [
-        RobotRecord(
-            "moved", "", (session("2026-01-01", "calibrated", 0.1), session("2026-11-01", "moved", 0.9))
-        ),
-        RobotRecord("fine", "", (session("2026-11-01", "calibrated", 0.05),)),
-        RobotRecord("old", "", (session("2025-11-01", "calibrated", 0.2),)),
-        RobotRecord("bad", "", (session("2026-01-01", "refused"),)),
-        RobotRecord("pays", "", (session("2026-11-01", "unchanged", 0.3, recalibrate=True),)),
-    ],
-    TODAY,
-    180,
-    ["fine", "killed"],
-)
+def cell(folder, name, *entries, text="robot: ur10\n"):
+    path = folder / name
+    (path / "sessions").mkdir(parents=True)
+    (path / "cell.yaml").write_text(text)
+    (path / "sessions" / "2026-03-01.csv").write_text("rows")
+    if entries:
+        History(path / HISTORY).add(*entries)
+    return path
 
 
-def test_every_robot_has_its_state():
-    states = {one.robot: one.state for one in STATUS.robots}
-    assert states == {
-        "bad": "refused",
-        "fine": "fine",
-        "killed": "missing",
-        "moved": "drifting",
-        "old": "overdue",
-        "pays": "drifting",
+@pytest.fixture
+def fleet(tmp_path):
+    """One cell in each of six states."""
+    import hashlib
+
+    session = replace(SESSION, sha256=hashlib.sha256(b"rows").hexdigest())
+    cell(tmp_path, "new")
+    cell(tmp_path, "measured", session, MODEL, replace(CHECK, rms_mm=0.2))
+    cell(tmp_path, "edited", replace(session, sha256="other"), MODEL, CHECK)
+    moved = Check("verify", "a", "x", "moved", "joint 3 moved", 0.9, True, "2026-04-01T00:00:00+00:00", 0.8)
+    used = Use("a", "2026-03-03T00:00:00+00:00", "")
+    cell(tmp_path, "moved", session, MODEL, CHECK, moved, used)
+    cell(tmp_path, "broken", text="robot: [\n")
+    cell(tmp_path, "negative", text="robot: ur10\nlimit_mm: -1\n")
+    return FleetStatus.read(tmp_path)
+
+
+def test_cells_are_grouped_by_state_the_most_urgent_first(fleet):
+    assert fleet.states == {
+        "unreadable": ("broken", "negative"),
+        "edited_session": ("edited",),
+        "moved": ("moved",),
+        "not_taken_in": ("new",),
+        "not_verified": ("measured",),
     }
-    assert STATUS.action
+    assert fleet.action
+    assert dict(state_table(fleet).rows)["unreadable"] == "2"
 
 
-def test_robots_are_sorted_by_error():
-    assert [one.robot for one in STATUS.robots_by_error] == ["moved", "pays", "old", "fine"]
+def test_the_last_error_of_each_model_counts(fleet):
+    assert [(one.name, check.rms_mm) for one, check in fleet.by_error] == [
+        ("moved", 0.8),
+        ("measured", 0.2),
+        ("edited", 0.05),
+    ]
+    assert cell_table(fleet.cells).rows[2] == ("moved", "a", "2026-03-01", "0.800", "verify", "moved")
+    assert "moved" in fleet_verdict(fleet).accuracy
 
 
-def test_json_lists_the_robots_by_state():
-    figures = STATUS.to_json()
-    assert figures["drifting"] == ["moved", "pays"]
-    assert figures["overdue"] == [{"robot": "old", "days": 386}]
-    assert figures["refused"] == [{"robot": "bad", "reason": "It is refused."}]
+def test_all_figures_are_json(fleet):
+    printed = fleet.to_json()
+    assert [one["cell"] for one in printed["unreadable"]] == ["broken", "negative"]
+    assert printed["worst"][0] == {"cell": "moved", "rms_mm": 0.8, "command": "verify"}
+    assert [Path(one["cell"]).name for one in printed["cells"]] == ["edited", "measured", "moved", "new"]
 
 
-def test_tables_have_all_robots():
-    counts = {"refused": "1", "missing": "1", "drifting": "2", "overdue": "1", "fine": "1"}
-    assert dict(state_table(STATUS).rows) == counts
-    rows = {row[0]: row[1:] for row in robot_table(STATUS.robots).rows}
-    assert rows["moved"] == ("2026-11-01", "10", "moved", "0.900", "21", "drifting")
-    assert rows["bad"] == ("2026-01-01", "", "", "", "", "refused")
-
-
-def test_a_moved_joint_counts_as_drift_after_a_recalibration():
-    sessions = session("2026-01-01", "calibrated"), session("2026-11-01", "recalibrated", 0.1, moved=True)
-    status = FleetStatus.from_records([RobotRecord("r", "", sessions)], TODAY, 180)
-    assert status.robots[0].state == "drifting"
-    assert status.robots[0].compared
-
-
-def test_separately_calibrated_sessions_do_not_show_drift():
-    sessions = session("2026-01-01", "calibrated"), session("2026-11-01", "calibrated")
-    status = FleetStatus.from_records([RobotRecord(name, "", sessions) for name in "ab"], TODAY, 180)
-    assert status.to_json()["not_compared"] == ["a", "b"]
-    assert not_compared(status).startswith("2 robots")
-    assert not_compared(STATUS) == ""
-
-
-def test_the_error_of_a_cross_validation_counts():
-    figures = RobotRecord("r", "", (session("2026-11-01", "calibrated", 0.04, held_out_rms_mm=0.11),))
-    assert robot_table(FleetStatus.from_records([figures], TODAY, 180).robots).rows[0][4] == "0.110"
-
-
-def test_an_impossible_date_is_reported_and_ignored():
-    record = RobotRecord("slip", "", (session("2206-01-01", "calibrated", 0.1),))
-    seen = FleetStatus.from_records([record], TODAY, 180)
-    assert seen.robots[0].days is None
-    assert "2206-01-01" in seen.to_json()["warnings"][0]
-    assert seen.to_json()["overdue"] == []
-    assert not STATUS.warnings
+def test_a_measured_fleet_needs_no_action(tmp_path, fleet):
+    for name in ("new", "edited", "moved", "broken", "negative"):
+        (tmp_path / name / "cell.yaml").unlink()
+    seen = FleetStatus.read(tmp_path)
+    assert not seen.action
+    assert fleet_verdict(seen).trust.startswith("yes")
+    (tmp_path / "measured" / "cell.yaml").unlink()
+    with refused(PlanningError, value=str(tmp_path)):
+        FleetStatus.read(tmp_path)

@@ -16,7 +16,7 @@ from pisigma.measurement.camera.camera_files import CameraFiles, Repeatability
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.folder.model_folder import load_model
 from pisigma.workflow.calibrate import calibrate
-from pisigma.workflow.cell import sessions
+from pisigma.workflow.cell import new_files
 from pisigma.workflow.cell.cell import Cell
 from pisigma.workflow.settings.calibration import CalibrationSettings
 
@@ -245,8 +245,8 @@ def test_load_takes_the_model_in_use(year, tmp_path):
 def test_a_session_never_replaces_a_file_that_appeared_meanwhile(tmp_path, monkeypatch):
     (tmp_path / "2026-01-10.csv").write_text("another process")
     offered = iter([tmp_path / "2026-01-10.csv", tmp_path / "2026-01-10-2.csv"])
-    monkeypatch.setattr(sessions, "free_path", lambda *arguments: next(offered))
-    path = sessions.write_new(tmp_path, "2026-01-10", b"rows", ())
+    monkeypatch.setattr(new_files, "free_path", lambda *arguments: next(offered))
+    path = new_files.write_new(tmp_path, "2026-01-10", b"rows", ())
     assert path.read_bytes() == b"rows"
     assert (tmp_path / "2026-01-10.csv").read_text() == "another process"
     assert sorted(one.name for one in tmp_path.iterdir()) == ["2026-01-10-2.csv", "2026-01-10.csv"]

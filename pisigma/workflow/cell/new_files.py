@@ -1,0 +1,75 @@
+"""Write sessions and models of a cell under new names, even if other processes write to the same folders."""
+
+import datetime
+import os
+from collections.abc import Callable, Collection
+from pathlib import Path
+
+from pisigma.files.errors import OutputError, Place
+from pisigma.files.scratch import FILE, scratch_beside
+
+MAX_NAMES = 10_000
+"""Largest number of files with the date of one day in a folder."""
+
+
+def free_path(folder: Path, name: str, suffix: str, taken: Collection[str] = ()) -> Path:
+    """Return a path in a folder that is not taken: NAME, NAME-2, NAME-3 and so on.
+
+    Raises:
+        OutputError: all names are taken.
+    """
+    for number in range(1, MAX_NAMES):
+        stem = name if number == 1 else f"{name}-{number}"
+        path = folder / f"{stem}{suffix}"
+        if not path.exists() and stem not in taken:
+            return path
+    raise OutputError(f"the folder already contains {MAX_NAMES:,} files named after {name}", at=Place(folder))
+
+
+def save_new(folder: Path, save: Callable[[Path], object]) -> Path:
+    """Save a model under a new name, the date of today, even if other processes save models in the same folder.
+
+    Args:
+        folder: folder of the models.
+        save: function that writes the folder of the model, and refuses an existing one.
+
+    Raises:
+        OutputError: the model cannot be written.
+    """
+    while True:
+        path = free_path(folder, datetime.date.today().isoformat(), "")
+        try:
+            save(path)
+            return path
+        except OutputError:
+            if not path.exists():  # else another process took the name
+                raise
+
+
+def write_new(folder: Path, name: str, content: bytes, taken: Collection[str]) -> Path:
+    """Write a session under a new name, whole or not at all, even if other processes write to the folder.
+
+    Args:
+        folder: folder of the sessions.
+        name: name of the file without ".csv"; see `free_path`.
+        content: content of the file.
+        taken: further names that are taken.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    while True:
+        path = free_path(folder, name, ".csv", taken)
+        try:
+            with scratch_beside(path, FILE) as scratch:
+                with scratch.open("wb") as file:
+                    file.write(content)
+                    file.flush()
+                    os.fsync(file.fileno())
+                scratch.chmod(0o644)
+                os.link(scratch, path)  # unlike a rename, it never replaces what another process wrote
+            return path
+        except FileExistsError:
+            continue
+        except OSError as problem:
+            raise OutputError(f"the session cannot be written: {problem.strerror}", at=Place(path)) from None
