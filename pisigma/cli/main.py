@@ -28,6 +28,7 @@ from pisigma.cli.plan import plan
 from pisigma.cli.report import report
 from pisigma.cli.robots import robots
 from pisigma.cli.serve.command import serve
+from pisigma.cli.serve.open_ import open_
 from pisigma.cli.simulate import simulate
 from pisigma.cli.training.distill import distill
 from pisigma.cli.training.train import train
@@ -44,6 +45,7 @@ app = typer.Typer(
 for command in (
     new,
     status,
+    open_,
     robots,
     simulate,
     plan,

@@ -1,5 +1,7 @@
 """Progress messages of long computations."""
 
+import re
+import time
 from collections.abc import Callable
 from functools import partial
 
@@ -21,3 +23,49 @@ def staged_progress(progress: Progress, name: str, separator: str = ": ") -> Pro
 
 def _within_stage(progress: Progress, prefix: str, what: str) -> None:
     progress(prefix + what)
+
+
+_STEP = re.compile(r"\b[a-z]+ (\d[\d,]*) of (\d+(?:,\d+)*)")
+"""A numbered step, such as "fold 2 of 5"."""
+
+
+def share_done(what: str) -> float | None:
+    """Return the share of nested steps that are done: 0.1 of "half 1 of 2, fold 2 of 5"; None without a step."""
+    steps = [tuple(int(number.replace(",", "")) for number in one) for one in _STEP.findall(what)]
+    share, width = 0.0, 1.0
+    for number, count in steps:
+        width /= max(count, 1)
+        share += (number - 1) * width
+    return share if steps else None
+
+
+def step_name(what: str) -> str:
+    """Return the step of what is being done, without its details."""
+    last = max((match.end() for match in _STEP.finditer(what)), default=0)
+    return what[:last] if last else what.partition(": ")[0]
+
+
+class TimeLeft:
+    """Time left of a computation whose steps are numbered."""
+
+    def __init__(self) -> None:
+        self._first: tuple[float, float] | None = None
+        self._last = 0.0
+
+    def after(self, what: str) -> str:
+        """Return what is being done now, with the time left where steps are numbered."""
+        share, now = share_done(what), time.monotonic()
+        if share is None:
+            return what
+        left = ""
+        if self._first is None or share < self._last:  # the first steps, or those of another stage
+            self._first = (share, now)
+        elif share > self._first[0]:
+            begun, since = self._first
+            left = f", about {_duration((now - since) * (1 - share) / (share - begun))} left"
+        self._last = share
+        return f"{what}{left}"
+
+
+def _duration(seconds: float) -> str:
+    return f"{seconds:.0f} s" if seconds < 120 else f"{seconds / 60:.0f} min"

@@ -1,15 +1,23 @@
 """Load corrected inverse kinematics from a model folder, or from a cell with the model that is in use there."""
 
+import math
 import os
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from jaxtyping import Float64
+
+from pisigma.files.errors import PoseError
 from pisigma.lifetime.cell.controller import checked_model_folder
 from pisigma.lifetime.cell.layout import is_cell
 from pisigma.lifetime.cell.model_in_use import ModelInUse
 from pisigma.model.inverse.corrected_ik import CorrectedIK
 from pisigma.model.inverse.corrected_ik import load as load_folder
 from pisigma.model.inverse.solution import Solution
+from pisigma.robot.kernels.array_kinematics import transform_of
+from pisigma.robot.row import FRAME_COLUMNS, MAX_MAGNITUDE
 
 
 class CellIK(CorrectedIK):
@@ -75,3 +83,26 @@ def load(folder: str | os.PathLike[str], pin: bool = False) -> CorrectedIK:
     ik = load_folder(path)
     ik.warnings += warnings
     return ik
+
+
+def stated_pose(values: Sequence[float]) -> Float64[np.ndarray, "1 4 4"]:
+    """Return a stated pose T_base_tool as a batch of one [m].
+
+    Args:
+        values: x, y, z [mm], roll, pitch and yaw [deg] of the tool in the base frame.
+
+    Raises:
+        PoseError: a pose cannot have such a value.
+    """
+    for name, value in zip(FRAME_COLUMNS, values, strict=True):
+        if not abs(value) <= MAX_MAGNITUDE:
+            raise PoseError(
+                expected=f"a length [mm] or angle [deg] of a pose for {name}",
+                value=value,
+                option="--pose",
+                remedy="give X Y Z ROLL PITCH YAW",
+            )
+    T: Float64[np.ndarray, "1 4 4"] = transform_of(
+        [*(value / 1e3 for value in values[:3]), *map(math.radians, values[3:])]
+    )[None]
+    return T

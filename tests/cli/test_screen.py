@@ -3,8 +3,9 @@
 import pytest
 
 from pisigma.cli import progress
-from pisigma.cli.progress import progress_of, share_done, step_name
+from pisigma.cli.progress import progress_of
 from pisigma.cli.screen import MAX_LINES, print_screen
+from pisigma.files.progress import share_done, step_name
 from pisigma.reporting.result_text import MAX_ALIKE, Block, merge_alike_warnings, ranges
 from pisigma.reporting.verdict import Verdict, rounded, uncapitalised
 

@@ -56,7 +56,7 @@ def calls() -> list[Call]:
 
 def run_call(call: Call) -> tuple[int, str]:
     """Run a call in this folder, and return exit status and output; servers are stopped as soon as they are ready."""
-    if call.words[0] == "serve":
+    if call.words[0] in ("serve", "open"):
         return _served(call)
     words = [_hash(word) if word.startswith(HASH_OF) else word for word in call.words]
     if "--plugin" in words:  # what it registers is known to its process

@@ -10,11 +10,10 @@ from pisigma.cli.arguments import AsJson, ModelOrCell, PayloadKg, TemperatureC
 from pisigma.cli.endings import exit_with_error
 from pisigma.cli.output import print_json, print_line, print_lines
 from pisigma.cli.progress import progress_of
+from pisigma.cli.screen import print_result
 from pisigma.reporting.result_text import merge_alike_warnings
 
 if TYPE_CHECKING:
-    import numpy as np
-
     from pisigma.model.inverse.corrected_ik import CorrectedIK
 
 Pose = tuple[float, float, float, float, float, float]
@@ -131,9 +130,11 @@ def _print_pose(
     """Print the solutions of one pose."""
     import numpy as np
 
-    from pisigma.cli.ik.solutions import failure, print_solutions, solution_records
+    from pisigma.cli.ik.solutions import failure, solution_records
+    from pisigma.reporting.solution_text import solution_text
+    from pisigma.workflow.load import stated_pose
 
-    T, places = _transform(pose), [f"the pose {' '.join(f'{value:g}' for value in pose)}"]
+    T, places = stated_pose(pose), [f"the pose {' '.join(f'{value:g}' for value in pose)}"]
     if all_branches:
         solution = solver.all_branches(T).select(0)
         if not solver.closed_form:  # a number of solutions, and nothing behind them
@@ -145,7 +146,7 @@ def _print_pose(
     if as_json:
         print_json({"solutions": solution_records(solution, solver), "warnings": solver.warnings})
     else:
-        print_solutions(solution, solver)
+        print_result(solution_text(solution, solver), verbose=False)
     if problem := failure(solution, places, any_will_do=all_branches):
         exit_with_error(problem)
 
@@ -187,21 +188,3 @@ def _check_options(
         raise typer.BadParameter("expected --poses and --out together", param_hint="'--out'")
     if all_branches and (pose is None or branch is not None):
         raise typer.BadParameter("use it with --pose and without --branch", param_hint="'--all-branches'")
-
-
-def _transform(pose: Pose) -> "np.ndarray":
-    """Return the pose T_base_tool as a batch of one; refuse values that a pose cannot have."""
-    from pisigma.files.errors import PoseError
-    from pisigma.robot.kernels.array_kinematics import transform_of
-    from pisigma.robot.row import FRAME_COLUMNS, MAX_MAGNITUDE
-
-    for name, value in zip(FRAME_COLUMNS, pose, strict=True):
-        if not abs(value) <= MAX_MAGNITUDE:
-            raise PoseError(
-                expected=f"a length [mm] or angle [deg] of a pose for {name}",
-                value=value,
-                option="--pose",
-                remedy="give X Y Z ROLL PITCH YAW",
-            )
-
-    return transform_of([*(value / 1e3 for value in pose[:3]), *map(math.radians, pose[3:])])[None]

@@ -13,13 +13,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pisigma.cli.ik.solutions import FAILURES, file_units
 from pisigma.files.output_file import writing_whole
 from pisigma.measurement.csv.poses import CHUNK_ROWS, PoseChunk, read_pose_chunks
 from pisigma.measurement.fields import UnusableRow
 from pisigma.model.inverse.corrected_ik import CorrectedIK
 from pisigma.model.inverse.path import PathSwitch
 from pisigma.model.inverse.solution import Solution
+from pisigma.reporting.solution_text import FAILURES, file_units
 from pisigma.robot.description import Robot
 from pisigma.robot.kinematics.status import Status
 

@@ -4,18 +4,11 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
-from pisigma.cli.screen import print_screen
 from pisigma.model.inverse.corrected_ik import CorrectedIK
 from pisigma.model.inverse.solution import Solution
-from pisigma.reporting.result_text import Block, sentences, table_block
-from pisigma.reporting.verdict import Verdict
-from pisigma.robot.kinematics.status import Status
+from pisigma.reporting.solution_text import FAILURES, QUANTITIES, file_units, in_file_units, statuses_of
 
-_QUANTITIES = ("q", "q_nominal", "correction")
 _LISTED = 10
-
-FAILURES = tuple(status for status in Status if status not in (Status.REACHED, Status.OUTSIDE_DOMAIN))
-"""What ends a command with exit status 2."""
 
 
 def solution_records(solution: Solution, solver: CorrectedIK) -> list[dict[str, Any]]:
@@ -26,10 +19,10 @@ def solution_records(solution: Solution, solver: CorrectedIK) -> list[dict[str, 
     """
     records = []
     measures = solution.domain_measure.tolist()
-    for row, status in enumerate(_statuses(solution)):
+    for row, status in enumerate(statuses_of(solution)):
         record: dict[str, Any] = {"status": status.name.lower(), "sentence": status.sentence}
-        for name in _QUANTITIES:
-            values = [_or_none(v) for v in _in_file_units(getattr(solution, name)[row].tolist(), solver)]
+        for name in QUANTITIES:
+            values = [_or_none(v) for v in in_file_units(getattr(solution, name)[row].tolist(), solver)]
             if all(solver.revolute):
                 record[f"{name}_deg"] = values
             else:
@@ -46,50 +39,6 @@ def solution_records(solution: Solution, solver: CorrectedIK) -> list[dict[str, 
     return records
 
 
-def print_solutions(solution: Solution, solver: CorrectedIK) -> None:
-    """Print what the statuses mean, warnings, and the joint values; one table where there are several solutions."""
-    statuses = _statuses(solution)
-    names = [solution.branches[int(branch)] for branch in solution.branch.tolist()]
-    reached = sum(status not in FAILURES for status in statuses)
-    found = (
-        f"{reached} of {len(statuses)} solutions reach" if len(statuses) > 1 else f"branch {names[0]} reaches"
-    )
-    meanings = [f"{status.name.lower()}: {status.sentence}" for status in dict.fromkeys(statuses)]
-    verdict = Verdict(
-        f"{found} the pose." if reached else "the pose is not reached.",
-        " ".join(meanings),
-        "command the corrected values, not the nominal ones." if reached else "",
-        "Solution",
-    )
-    axes = ", ".join(solution.ignored_axes)
-    remarks = sentences("ignored axes", [f"Axes of the tool that do not count: {axes}."] if axes else [])
-    tables = _one(solution, solver, names[0]) if len(statuses) == 1 else _several(solution, solver, names)
-    print_screen(verdict, solver.warnings, [remarks, tables] if reached else [])
-
-
-def _one(solution: Solution, solver: CorrectedIK, branch: str) -> Block:
-    """Lay out the joint values of a solution."""
-    values = [_in_file_units(getattr(solution, name)[0].tolist(), solver) for name in _QUANTITIES]
-    rows = [
-        (joint, unit, *(f"{value:.4f}" for value in figures))
-        for joint, unit, *figures in zip(solver.joints, file_units(solver), *values, strict=True)
-    ]
-    return table_block(
-        f"joint values, branch {branch}", ("joint", "unit", "corrected", "nominal", "correction"), rows
-    )
-
-
-def _several(solution: Solution, solver: CorrectedIK, branches: Sequence[str]) -> Block:
-    """Lay out the corrected joint values of several solutions."""
-    units = dict.fromkeys(file_units(solver))
-    rows = [
-        (name, *(f"{value:.3f}" for value in _in_file_units(q, solver)))
-        for name, q in zip(branches, solution.q.tolist(), strict=True)
-    ]
-    title = f"corrected joint values [{' or '.join(units)}]; --json has nominal values and corrections too"
-    return table_block(title, ("branch", *solver.joints), rows)
-
-
 def failure(solution: Solution, places: Sequence[str], any_will_do: bool) -> str | None:
     """Say which poses the robot cannot take as asked; None if it can take all.
 
@@ -98,7 +47,7 @@ def failure(solution: Solution, places: Sequence[str], any_will_do: bool) -> str
         places: name of each of them.
         any_will_do: whether one that reaches is enough (all branches of one pose).
     """
-    statuses = _statuses(solution)
+    statuses = statuses_of(solution)
     failed = [row for row, status in enumerate(statuses) if status in FAILURES]
     if not failed or (any_will_do and len(failed) < len(statuses)):
         return None
@@ -110,21 +59,6 @@ def failure(solution: Solution, places: Sequence[str], any_will_do: bool) -> str
     also = f" (Also: {more}{rest}.)" if others else ""
     status = statuses[failed[0]]
     return f"{places[failed[0]]}: {status.name.lower()}. {status.sentence}{also}"
-
-
-def _statuses(solution: Solution) -> list[Status]:
-    return [Status(status) for status in solution.status.tolist()]
-
-
-def file_units(solver: CorrectedIK) -> list[str]:
-    """Unit of every joint where values enter or leave."""
-    return ["deg" if revolute else "mm" for revolute in solver.revolute]
-
-
-def _in_file_units(values: Sequence[float], solver: CorrectedIK) -> list[float]:
-    return [
-        math.degrees(v) if revolute else v * 1e3 for v, revolute in zip(values, solver.revolute, strict=True)
-    ]
 
 
 def _or_none(value: float) -> float | None:

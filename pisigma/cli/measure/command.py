@@ -14,7 +14,7 @@ from pisigma.cli.arguments import AsJson
 from pisigma.cli.cell import settings_at
 from pisigma.cli.endings import NOT_ACCEPTED
 from pisigma.cli.output import print_json, print_line
-from pisigma.cli.screen import print_screen
+from pisigma.cli.screen import print_result
 from pisigma.cli.settings_options import StatedSettings, takes_settings
 from pisigma.files.setting import Option
 from pisigma.workflow.settings.measuring import MeasureSettings
@@ -188,7 +188,7 @@ def _printer(
 
 def _print_summary(session: "MeasuringSession", rest: Path, as_json: bool) -> None:
     """Print the verdict on the session."""
-    from pisigma.cli.measure.session_lines import coverage_lines, summary_verdict
+    from pisigma.workflow.result_texts import session_text
 
     state = session.state
     written = str(rest) if session.replanned else None
@@ -196,4 +196,4 @@ def _print_summary(session: "MeasuringSession", rest: Path, as_json: bool) -> No
         print_json({"rest": written, **state.to_json()})
         return
     again = [] if written is None else [f"The remaining poses were planned again: {written}."]
-    print_screen(summary_verdict(state), coverage_lines(state), closing=again)
+    print_result(session_text(state, again), verbose=False)

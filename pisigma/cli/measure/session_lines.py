@@ -8,8 +8,9 @@ import numpy as np
 from pisigma.files.errors import printable
 from pisigma.planning.session.state import AccuracyPoint, SessionState
 from pisigma.reporting.result_text import MAX_ALIKE, merge_alike_warnings, ranges
-from pisigma.reporting.verdict import Verdict, counted, rounded, uncapitalised
+from pisigma.reporting.verdict import rounded
 from pisigma.workflow.follow import SessionStep
+from pisigma.workflow.result_texts import accuracy_text
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -54,29 +55,6 @@ def _row_lines(state: SessionState, lines: Sequence[int]) -> Iterator[str]:
     )
 
 
-def summary_verdict(state: SessionState) -> Verdict:
-    """Judge a session: the accuracy so far, the rows that count, and whether to measure more."""
-    counting = int((~state.rows.alarmed).sum())
-    reached = "not known yet." if state.accuracy is None else accuracy_text(state.accuracy)
-    alarmed = len(state.rows.line) - counting
-    trust = (
-        f"{counted(counting, 'row')} counted, {alarmed} left out" if alarmed else f"all {counting} rows count"
-    )
-    if state.advice.action == "correct":
-        trust = "no: all rows have the same fault"
-    left = counted(len(state.remaining), "pose")
-    return Verdict(
-        reached, f"{trust}; {left} of the plan not measured.", uncapitalised(state.advice.sentence)
-    )
-
-
-def coverage_lines(state: SessionState) -> list[str]:
-    """Say which joints were measured over less than half of the planned range."""
-    narrow = [span for span in state.coverage if span.planned < 0.5]
-    names = ", ".join(f"{span.name} ({100 * span.planned:.0f} %)" for span in narrow)
-    return [f"less than half of the planned range was measured of: {names}."] if narrow else []
-
-
 def row_text(state: SessionState, row: int) -> str:
     """Say how far a row is from what the others predict."""
     error = float((state.rows.error[row] ** 2).sum() ** 0.5)
@@ -84,14 +62,6 @@ def row_text(state: SessionState, row: int) -> str:
     if error != error:
         return f"cannot be judged yet{kind}"
     return f"{error * 1e3:.2f} mm from what the other rows predict{kind}"
-
-
-def accuracy_text(point: AccuracyPoint) -> str:
-    """Say how accurate a calibration is."""
-    texts = [_errors("predicted", point.predicted_rms, point.predicted_p95)]
-    texts += [_errors("held-out rows", point.cross_validated_rms, point.cross_validated_p95)]
-    texts += [_errors("check poses", point.checked_rms, point.checked_p95)]
-    return f"with {point.poses} poses, RMS and 95 % of the errors: {'; '.join(filter(None, texts))}."
 
 
 def next_text(state: SessionState) -> str:
@@ -167,7 +137,3 @@ def _coverage(state: SessionState) -> list[tuple[str, ...]]:
         (span.name, f"{low:.1f} to {high:.1f} {'deg' if turns else 'mm'}", f"{100 * span.planned:.0f} %")
         for span, low, high, turns in zip(state.coverage, lower, upper, state.revolute, strict=False)
     ]
-
-
-def _errors(name: str, rms: float, p95: float) -> str:
-    return "" if rms != rms else f"{name} {rounded(rms * 1e3)} and {rounded(p95 * 1e3)} mm"

@@ -1,1 +1,1 @@
-"""`pisigma serve`: the command."""
+"""Commands that serve until they are ended: `pisigma serve`, and `pisigma open`."""

@@ -63,7 +63,8 @@ class Access:
         if not secrets.compare_digest(request.match_info["token"].encode(), self.token.encode()):
             raise web.HTTPForbidden(text=FORBIDDEN)
         page = (
-            f'<!doctype html><title>pisigma</title><meta http-equiv="refresh" content="0;url={self.root}/">'
+            '<!doctype html><title>pisigma</title><link rel="icon" href="data:,">'
+            f'<meta http-equiv="refresh" content="0;url={self.root}/">'
         )
         response = web.Response(text=page, content_type="text/html")
         response.set_cookie(COOKIE, self.cookie, path=self.root, httponly=True, samesite="Strict")

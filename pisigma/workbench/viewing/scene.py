@@ -90,6 +90,14 @@ class SessionScene:
         if len(state.remaining):
             self._dots("/next/remaining", self._poses(state.remaining)[:, :3, 3], PLANNED, 0.5)
 
+    def show_pose(self, name: str, q: Float64[np.ndarray, " dof"]) -> None:
+        """Draw the robot at joint values [rad or m], with the axes of its tool."""
+        self._body.draw(self._scene, f"{name}/arm", q, LINKS, None)
+        T, axes = self._poses(q), AXES * self._robot.reach / 2
+        self._scene.add_frame(
+            f"{name}/tool", axes_length=axes, axes_radius=axes / 20, wxyz=_quaternion(T), position=T[:3, 3]
+        )
+
     def show_sensor(self, T_sensor_base: Float64[np.ndarray, "4 4"]) -> None:
         """Draw the axes of the measuring frame, as determined by the rows."""
         T = invert(torch.from_numpy(T_sensor_base)).numpy()

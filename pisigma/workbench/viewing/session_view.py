@@ -27,6 +27,8 @@ ERROR_SHARE = 0.15
 FIELD, RISE, AROUND_ROBOT, CLOSER = 0.8, 0.5, 0.7, 0.92
 """First view: field of view [rad], downward slope, radius around the robot as a share of the reach, and distance of the
 camera as a share of that at which this radius is visible."""
+MAGNIFICATIONS = (0, 2000, 10)
+"""Smallest and largest magnification of errors, and its step."""
 MAX_ALARMS = 8
 """Latest alarms that are shown."""
 
@@ -110,7 +112,7 @@ class SessionView:
         with self._lock, self._server.atomic():
             self._state = state
             if not self._magnified_by_hand:
-                times = 10 * round(float(np.clip(ERROR_SHARE * self._reach / top, 10, 2000)) / 10)
+                times = magnification_of(top, self._reach)
                 self._panel.magnification.value = times  # type: ignore[misc]  # mypy misses its decorated setter
             self._scene.show_robot(state)
             if state.base is not None:
@@ -139,6 +141,17 @@ def first_view(arm: ArmInSurroundings) -> tuple[Float64[np.ndarray, " 3"], Float
     sideways = np.array([tracker[1], -tracker[0], 0.0]) if tracker[:2].any() else np.array([1.0, -1.0, 0.0])
     direction = sideways / np.linalg.norm(sideways) + np.array([0.0, 0.0, RISE])
     return middle + CLOSER * radius / np.sin(FIELD / 2) * direction / np.linalg.norm(direction), middle
+
+
+def magnification_of(top: float, reach: float) -> int:
+    """Return the magnification with which errors can be seen next to a robot.
+
+    Args:
+        top: error at the end of the colour scale [m].
+        reach: reach of the robot [m].
+    """
+    low, high, step = MAGNIFICATIONS
+    return step * round(float(np.clip(ERROR_SHARE * reach / top, low + step, high)) / step)
 
 
 def top_of_scale(rows: RowsSoFar) -> float:
@@ -178,7 +191,7 @@ class SessionPanel:
             aspect=1.6,
             visible=False,
         )
-        self.magnification = gui.add_slider("errors magnified by", min=0, max=2000, step=10, initial_value=0)
+        self.magnification = gui.add_slider("errors magnified by", *MAGNIFICATIONS, initial_value=0)
         self._rows = gui.add_html("")
 
     def show_state(self, state: SessionState, top: float) -> None:

@@ -214,10 +214,10 @@ class Cell:
         if doubt and not accept_implausible:
             self.history.add(Check("calibrate", "", "", "not_trusted", doubt, None, False, now()))
             return result, None
-        path = save_new(self.folder / MODELS, partial(result.save, accept_implausible=accept_implausible))
         remark, better = doubt or "not verified yet", False
         if not doubt and prior is None and (in_use := self.history.in_use) is not None:
             better, remark = is_better(self.sessions, in_use, sessions, settings, progress)
+        path = save_new(self.folder / MODELS, partial(result.save, accept_implausible=accept_implausible))
         p95, rms = errors_of(result)
         entry = entry_of(self.history, path, sessions, remark, p95)
         verdict = "accepted_implausible" if doubt else "trusted"

@@ -11,6 +11,7 @@ import yaml
 from pydantic import Field
 
 from pisigma.files.errors import PisigmaError, Place, PlanningError
+from pisigma.files.scratch import FILE, scratch_beside
 from pisigma.files.setting import attributes_of, build_settings, by_key, flat_settings
 from pisigma.files.setting_values import checked_values
 from pisigma.files.yaml_file import Section, place_of_key, read_yaml, yaml_text
@@ -18,6 +19,7 @@ from pisigma.lifetime.cell.layout import CELL_FILE
 from pisigma.lifetime.cell.status import VERIFICATION_POSES, CellFacts, plans_check
 from pisigma.planning.plan_settings import PlanSettings
 from pisigma.planning.surroundings.surroundings import Surroundings
+from pisigma.robot.description import Robot
 from pisigma.robot.robot_file import robot_file
 from pisigma.robot.row import Bounded
 from pisigma.validation.uncertainty.instrument import Instrument
@@ -144,7 +146,32 @@ class CellFile:
             PlanningError: the file is missing or not a valid `cell.yaml`; the message names file, line and key.
             PisigmaError: a setting of a step is not valid.
         """
+        return CellFile._checked(folder / CELL_FILE)
+
+    @staticmethod
+    def write(folder: Path, text: str) -> "CellFile":
+        """Replace the file of a cell by a text if it is valid, whole or not at all.
+
+        Raises:
+            PlanningError: the text is not a valid `cell.yaml`; the message names line and key.
+            RobotError: the robot cannot be loaded.
+        """
         path = folder / CELL_FILE
+        with scratch_beside(path, FILE) as scratch:
+            scratch.write_text(text, encoding="utf-8", newline="\n")
+            try:
+                read = CellFile._checked(scratch)
+                Robot.load(read.robot, read.document.base, read.document.tip)
+            except PisigmaError as problem:
+                refusal = PlanningError(str(problem).replace(str(scratch), str(path)))
+                refusal.file, refusal.line, refusal.column = str(path), problem.line, problem.column
+                raise refusal from None
+            scratch.chmod(0o644)
+            os.replace(scratch, path)
+        return CellFile.read(folder)
+
+    @staticmethod
+    def _checked(path: Path) -> "CellFile":
         read = CellFile(path, read_yaml(path, CellDocument, PlanningError))
         for step in STEPS:
             if step not in ("plan", "import"):

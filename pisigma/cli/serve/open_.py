@@ -1,0 +1,69 @@
+"""`pisigma open`: a cell as a page in the browser."""
+
+import contextlib
+import signal
+import sys
+import tempfile
+import threading
+import webbrowser
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from pisigma.cli.arguments import AsJson
+from pisigma.cli.cell import CellFolder
+from pisigma.cli.output import print_json, print_line
+from pisigma.cli.settings_options import takes_settings
+from pisigma.files.setting import Option
+
+
+@dataclass(frozen=True)
+class PageAddress:
+    """Where the page of a cell is served.
+
+    Attributes:
+        host: address to serve the page at; other machines can open it at an address of this machine or 0.0.0.0.
+        port: port of the page, or the next free one.
+    """
+
+    host: str = "127.0.0.1"
+    port: Annotated[int, Option(min=1, max=65535)] = 8080
+
+
+@takes_settings
+def open_(
+    cell: CellFolder,
+    address: PageAddress,
+    no_browser: Annotated[bool, typer.Option("--no-browser", help="Print the link only.")] = False,
+    as_json: AsJson = False,
+) -> None:
+    """Open a cell as a page in the browser, until Ctrl-C.
+
+    Prints the link to the page as its first line. Only who has this link can open the page.
+    """
+    from pisigma.workbench.workbench import Workbench
+
+    ended = threading.Event()
+    signal.signal(signal.SIGTERM, lambda *_: ended.set())
+    with Workbench(cell, address.host, address.port) as bench:
+        if as_json:
+            print_json({"url": bench.url})
+        else:
+            print_line(bench.url)
+            print_line("Only who has this link can open the page. It stays until Ctrl-C.", to_stderr=True)
+        sys.stdout.flush()
+        with tempfile.TemporaryDirectory(prefix="pisigma-") as folder:
+            if not no_browser:
+                _open_browser(bench.url, Path(folder))
+            with contextlib.suppress(KeyboardInterrupt):
+                ended.wait()
+
+
+def _open_browser(url: str, folder: Path) -> None:
+    """Open a link by way of a file of this user, because every user of a machine sees the command lines of others."""
+    page = folder / "open.html"
+    page.touch(mode=0o600)
+    page.write_text(f'<!doctype html><title>pisigma</title><meta http-equiv="refresh" content="0;url={url}">')
+    webbrowser.open(page.as_uri())

@@ -1,0 +1,77 @@
+"""Solutions of the corrected inverse kinematics as text."""
+
+import math
+from collections.abc import Sequence
+
+from pisigma.model.inverse.corrected_ik import CorrectedIK
+from pisigma.model.inverse.solution import Solution
+from pisigma.reporting.result_text import Block, ResultText, sentences, table_block
+from pisigma.reporting.verdict import Verdict
+from pisigma.robot.kinematics.status import Status
+
+QUANTITIES = ("q", "q_nominal", "correction")
+"""Joint values of a solution."""
+
+FAILURES = tuple(status for status in Status if status not in (Status.REACHED, Status.OUTSIDE_DOMAIN))
+"""What ends a command with exit status 2."""
+
+
+def solution_text(solution: Solution, solver: CorrectedIK) -> ResultText:
+    """Lay out what the statuses mean, warnings, and the joint values; one table where there are several solutions."""
+    statuses = statuses_of(solution)
+    names = [solution.branches[int(branch)] for branch in solution.branch.tolist()]
+    reached = sum(status not in FAILURES for status in statuses)
+    found = (
+        f"{reached} of {len(statuses)} solutions reach" if len(statuses) > 1 else f"branch {names[0]} reaches"
+    )
+    meanings = [f"{status.name.lower()}: {status.sentence}" for status in dict.fromkeys(statuses)]
+    verdict = Verdict(
+        f"{found} the pose." if reached else "the pose is not reached.",
+        " ".join(meanings),
+        "command the corrected values, not the nominal ones." if reached else "",
+        "Solution",
+    )
+    axes = ", ".join(solution.ignored_axes)
+    remarks = sentences("ignored axes", [f"Axes of the tool that do not count: {axes}."] if axes else [])
+    tables = _one(solution, solver, names[0]) if len(statuses) == 1 else _several(solution, solver, names)
+    return ResultText(verdict, tuple(solver.warnings), (remarks, tables) if reached else ())
+
+
+def _one(solution: Solution, solver: CorrectedIK, branch: str) -> Block:
+    """Lay out the joint values of a solution."""
+    values = [in_file_units(getattr(solution, name)[0].tolist(), solver) for name in QUANTITIES]
+    rows = [
+        (joint, unit, *(f"{value:.4f}" for value in figures))
+        for joint, unit, *figures in zip(solver.joints, file_units(solver), *values, strict=True)
+    ]
+    return table_block(
+        f"joint values, branch {branch}", ("joint", "unit", "corrected", "nominal", "correction"), rows
+    )
+
+
+def _several(solution: Solution, solver: CorrectedIK, branches: Sequence[str]) -> Block:
+    """Lay out the corrected joint values of several solutions."""
+    units = dict.fromkeys(file_units(solver))
+    rows = [
+        (name, *(f"{value:.3f}" for value in in_file_units(q, solver)))
+        for name, q in zip(branches, solution.q.tolist(), strict=True)
+    ]
+    title = f"corrected joint values [{' or '.join(units)}]; --json has nominal values and corrections too"
+    return table_block(title, ("branch", *solver.joints), rows)
+
+
+def statuses_of(solution: Solution) -> list[Status]:
+    """Return the status of every solution."""
+    return [Status(status) for status in solution.status.tolist()]
+
+
+def file_units(solver: CorrectedIK) -> list[str]:
+    """Unit of every joint where values enter or leave."""
+    return ["deg" if revolute else "mm" for revolute in solver.revolute]
+
+
+def in_file_units(values: Sequence[float], solver: CorrectedIK) -> list[float]:
+    """Return joint values in the units of `file_units`."""
+    return [
+        math.degrees(v) if revolute else v * 1e3 for v, revolute in zip(values, solver.revolute, strict=True)
+    ]

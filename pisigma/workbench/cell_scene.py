@@ -1,0 +1,111 @@
+"""The robot of a cell in three dimensions: the newest plan, rows with their errors, and a pose that was tried."""
+
+import threading
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from jaxtyping import Float64
+
+from pisigma.files.errors import PisigmaError, RobotError
+from pisigma.lifetime.cell.layout import PLANS, newest_plan
+from pisigma.planning.plan_inputs import sight_of
+from pisigma.planning.session.state import SessionState
+from pisigma.planning.surroundings.arm_in_surroundings import ArmInSurroundings
+from pisigma.workbench.viewing.body import AbstractBody, CapsuleBody, MeshBody
+from pisigma.workbench.viewing.scene import SessionScene
+from pisigma.workbench.viewing.session_view import (
+    FIELD,
+    MAGNIFICATIONS,
+    first_view,
+    magnification_of,
+    top_of_scale,
+)
+from pisigma.workflow.cell.cell import Cell
+from pisigma.workflow.measure import MeasuringSession
+from pisigma.workflow.settings.measuring import MeasureSettings
+
+if TYPE_CHECKING:  # a name in full, which type checkers at run time find without this import
+    import viser
+
+
+class CellScene:
+    """The scene of a cell; every call replaces what was drawn before."""
+
+    def __init__(self, server: "viser.ViserServer") -> None:
+        """Set up an empty scene.
+
+        Args:
+            server: viser.
+        """
+        self._server, self._lock = server, threading.Lock()
+        self._state: SessionState | None = None
+        self._scene: SessionScene | None = None
+        server.gui.configure_theme(show_logo=False, show_share_button=False)
+        self._slider = server.gui.add_slider("errors magnified by", *MAGNIFICATIONS, initial_value=0)
+        self._slider.on_update(self._magnify)
+        server.scene.configure_default_lights(cast_shadow=False)
+
+    def show_cell(self, cell: Cell) -> None:
+        """Show the robot, its surroundings, and the poses of the newest plan."""
+        planned: MeasuringSession | None = None
+        if any((cell.folder / PLANS).glob("*.csv")):
+            try:
+                planned = MeasuringSession.read(newest_plan(cell.folder), MeasureSettings())
+            except PisigmaError:
+                planned = None  # the tabs say what is wrong with it
+        arm = ArmInSurroundings.from_robot(cell.robot, cell.file.document.surroundings)
+        if planned is not None:
+            arm = planned.plan.arm
+        camera = None if planned is None else planned.plan.settings.camera
+        with self._lock, self._server.atomic():
+            self._server.scene.reset()
+            view = self._server.initial_camera
+            view.position, view.look_at = first_view(arm)
+            view.fov = FIELD
+            sight = None if camera is None else sight_of(camera)
+            self._scene = SessionScene(self._server.scene, arm, _body(cell, arm), sight)
+            self._reach, self._state = arm.robot.reach, None
+            if planned is None:
+                self._scene.show_pose("/tried", np.zeros(arm.robot.dof))
+            else:
+                self._scene.show_robot(planned.state)
+        self._server.flush()
+
+    def show_state(self, state: SessionState) -> None:
+        """Show the rows of a session with their errors."""
+        top = top_of_scale(state.rows)
+        with self._lock, self._server.atomic():
+            if self._scene is None:
+                return
+            self._state = state
+            self._slider.value = magnification_of(top, self._reach)  # type: ignore[misc]  # a decorated setter
+            self._scene.show_robot(state)
+            if state.base is not None:
+                self._scene.show_sensor(state.base)
+            self._scene.show_rows(state.rows, top, self._slider.value)
+        self._server.flush()
+
+    def show_pose(self, q: Float64[np.ndarray, " dof"]) -> None:
+        """Show the arm at joint values that were tried [rad or m]."""
+        with self._lock, self._server.atomic():
+            if self._scene is not None:
+                self._scene.show_pose("/tried", q)
+        self._server.flush()
+
+    def _magnify(self, event: "viser.GuiEvent[Any]") -> None:
+        """Draw the errors with the magnification of the slider, once a person has moved it."""
+        if event.client is None:  # set by `show_state`, which has the lock
+            return
+        with self._lock, self._server.atomic():
+            if self._scene is not None and self._state is not None:
+                rows = self._state.rows
+                self._scene.show_rows(rows, top_of_scale(rows), self._slider.value)
+
+
+def _body(cell: Cell, arm: ArmInSurroundings) -> AbstractBody:
+    """Return the meshes of a URDF file, or capsules if it has none."""
+    document = cell.file.document
+    try:
+        return MeshBody(arm.robot, cell.file.robot, document.base, document.tip)
+    except RobotError:
+        return CapsuleBody(arm.capsules)

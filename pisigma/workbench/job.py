@@ -1,0 +1,146 @@
+"""The step that runs: one at a time, with progress, who started it, and a way to stop it."""
+
+import datetime
+import sys
+import threading
+import traceback
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+from pisigma.files.errors import missing_extra
+from pisigma.files.progress import Progress, TimeLeft
+from pisigma.reporting.result_text import ResultText
+
+
+class StoppedError(Exception):
+    """A person stopped the step."""
+
+
+class BusyError(Exception):
+    """Another step runs."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a step found.
+
+    Attributes:
+        text: the result for people; None if the step was refused.
+        refusal: why the input was refused, or the result is not accepted.
+        command: command line that does the same.
+        curve: expected accuracy against the number of poses; () without one.
+        person: who started it.
+        ended: time of day at which it ended.
+        stopped: whether a person stopped it.
+    """
+
+    text: ResultText | None = None
+    refusal: str = ""
+    command: str = ""
+    curve: tuple[Any, ...] = ()
+    person: str = ""
+    ended: str = ""
+    stopped: bool = False
+
+
+Work = Callable[[Progress], Outcome]
+
+
+@dataclass
+class Job:
+    """A step while it runs.
+
+    Attributes:
+        step: name of the step.
+        person: who started it.
+        command: command line that does the same.
+        what: what is being done, with the time left.
+        stopped_by: who asked to stop it; "" if nobody did.
+    """
+
+    step: str
+    person: str
+    command: str
+    what: str = ""
+    stopped_by: str = ""
+    started: str = field(default_factory=lambda: _clock())
+    left: TimeLeft = field(default_factory=TimeLeft)
+
+    def progress(self, what: str) -> None:
+        """Note what is being done, or end the step if a person stopped it.
+
+        Raises:
+            StoppedError: a person stopped it.
+        """
+        if self.stopped_by:
+            raise StoppedError
+        self.what = self.left.after(what)
+
+
+class Jobs:
+    """The steps of a page.
+
+    Attributes:
+        running: the step that runs; None if none does.
+        outcomes: the last outcome of every step.
+        version: number of changes, by which pages notice them.
+        ended: number of steps that have ended.
+    """
+
+    def __init__(self) -> None:
+        self.running: Job | None = None
+        self.outcomes: dict[str, Outcome] = {}
+        self.version = self.ended = 0
+        self._lock, self._thread = threading.Lock(), threading.Thread()
+
+    def start(self, step: str, person: str, command: str, work: Work) -> None:
+        """Start a step in a thread.
+
+        Raises:
+            BusyError: another step runs.
+        """
+        with self._lock:
+            if self.running is not None:
+                raise BusyError
+            self.running = job = Job(step, person, command)
+            self._thread = threading.Thread(target=self._run, args=(job, work), daemon=True)
+            self._thread.start()
+            self.version += 1
+
+    def stop(self, person: str) -> None:
+        """Stop the running step when it next says what it does; it leaves nothing half written."""
+        with self._lock:
+            if self.running is not None:
+                self.running.stopped_by = person
+                self.version += 1
+
+    def close(self) -> None:
+        """Stop the running step, and wait for its end."""
+        self.stop("the end of the server")
+        if self._thread.is_alive():
+            self._thread.join()
+
+    def _run(self, job: Job, work: Work) -> None:
+        try:
+            found = work(job.progress)
+        except StoppedError:
+            found = Outcome(refusal=f"stopped by {job.stopped_by}; nothing was written.", stopped=True)
+        except ImportError as problem:
+            found = Outcome(refusal=str(missing_extra(problem) or problem))
+        except Exception as problem:
+            traceback.print_exc(file=sys.stderr)
+            found = Outcome(
+                refusal=f"a defect of pisigma ended the step ({type(problem).__name__}: {problem}). Nothing was left "
+                "half written. Please report it with the last lines of the terminal."
+            )
+        with self._lock:
+            self.outcomes[job.step] = Outcome(
+                found.text, found.refusal, job.command, found.curve, job.person, _clock(), found.stopped
+            )
+            self.running = None
+            self.version, self.ended = self.version + 1, self.ended + 1
+
+
+def _clock() -> str:
+    return datetime.datetime.now().strftime("%H:%M")

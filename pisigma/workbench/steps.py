@@ -1,0 +1,191 @@
+"""Steps of a page: each calls the function of the cell that its command calls, and lays out its result."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from pisigma.deployment.export.export_format import ExportRequest
+from pisigma.deployment.export.registry import export_format, export_model
+from pisigma.deployment.export.targets import POSE_COLUMNS
+from pisigma.files.errors import PoseError
+from pisigma.files.progress import Progress
+from pisigma.lifetime.cell.layout import newest_plan
+from pisigma.measurement.csv.reading import is_measurement_file
+from pisigma.measurement.dataset import Measurements
+from pisigma.measurement.growing_file import GrowingFile
+from pisigma.model.inverse.solution import Solution
+from pisigma.planning.session.growing_images import growing_file
+from pisigma.planning.session.state import SessionState
+from pisigma.reporting.calibration_text import calibration_text
+from pisigma.reporting.result_text import ResultText, sentences
+from pisigma.reporting.solution_text import FAILURES, solution_text, statuses_of
+from pisigma.reporting.verdict import Verdict, counted, uncapitalised
+from pisigma.workbench.forms import changed_settings
+from pisigma.workbench.job import Outcome
+from pisigma.workflow.calibrate import Calibration
+from pisigma.workflow.cell.cell import Cell
+from pisigma.workflow.import_rows import ImportProposal, import_rows, propose_import
+from pisigma.workflow.load import load, stated_pose
+from pisigma.workflow.measure import MeasuringSession
+from pisigma.workflow.result_texts import plan_text, session_text, verification_text
+from pisigma.workflow.settings.importing import ImportSettings
+
+Form = Mapping[str, str]
+WIDTH = 200
+"""Width of tables before models are divided among several [characters]."""
+EXPORT_OPTIONS = ("geometry", "targets", "branch", "config")
+NOT_STORED = "no model was stored, because the result must not be trusted, for the reasons below."
+
+
+def plan(cell: Cell, form: Form, progress: Progress) -> Outcome:
+    """Plan poses, and store the plan in the cell."""
+    planned, path = cell.plan(progress, **changed_settings("plan", form))
+    return Outcome(plan_text(planned, [path]), curve=planned.curve)
+
+
+def calibrate(cell: Cell, form: Form, progress: Progress) -> Outcome:
+    """Calibrate with the rows of the cell, and store the model."""
+    accept = form.get("accept_implausible") == "true"
+    found, entry = cell.calibrate(progress, accept, **changed_settings("calibrate", form))
+    folder = None if entry is None else cell.model_folder(entry.name)
+    also = [] if entry is None else [sentences("the cell", [f"Model '{entry.name}': {entry.remark}."])]
+    assert isinstance(found, Calibration)  # there is no prior
+    text = calibration_text(found.summary, folder, found.seconds, also)
+    return Outcome(text, NOT_STORED if entry is None else "")
+
+
+def verify(cell: Cell, form: Form, progress: Progress) -> Outcome:
+    """Verify a model with the newest session to which it was not fitted."""
+    progress("comparing the models and looking for setup faults")
+    found, entry = cell.verify(None, form.get("of_model") or None, **changed_settings("verify", form))
+    in_use = cell.history.in_use
+    used = [f"Model '{entry.name}' is in use."] if in_use is not None and in_use.name == entry.name else []
+    text = replace(verification_text(found, WIDTH), closing=tuple(used))
+    return Outcome(text, "" if found.accepted else found.sentence)
+
+
+def monitor(cell: Cell, form: Form, progress: Progress) -> Outcome:
+    """Compare every new session with the model in use."""
+    found = cell.monitor(progress, **changed_settings("monitor", form))
+    check = cell.history.checks()[-1]
+    verdict = Verdict(check.summary, check.verdict.replace("_", " "), cell.status().step.reason)
+    text = ResultText(verdict, tuple(found.warnings), (sentences("what has changed", found.sentences),))
+    return Outcome(text)
+
+
+def recalibrate(cell: Cell, form: Form, progress: Progress) -> Outcome:
+    """Recalibrate the model in use with the newest session."""
+    accept = form.get("accept_implausible") == "true"
+    found, entry = cell.recalibrate(None, progress, accept, **changed_settings("recalibrate", form))
+    name = "no model was stored" if entry is None else f"model '{entry.name}' was stored"
+    verdict = Verdict(found.summary.verdict, name, uncapitalised(cell.status().step.reason))
+    warnings = (*found.warnings, *(one.sentence for one in found.summary.outliers))
+    return Outcome(ResultText(verdict, warnings), "" if entry is not None else NOT_STORED)
+
+
+def proposal_of(files: list[Path], cell: Cell, form: Form) -> ImportProposal | None:
+    """Return the proposed meaning of the columns of uploaded files; None for a measurement file of pisigma.
+
+    Args:
+        files: uploaded files.
+        cell: the cell, which states the settings of the import.
+        form: what a person changed: "column 0 3" is the meaning of the fourth column of the first file.
+    """
+    if len(files) == 1 and is_measurement_file(files[0]):
+        return None
+    settings: ImportSettings = cell.file.settings("import", **changed_settings("import", form))
+    first = propose_import(files, settings)
+    stated = []
+    for number, mapping in enumerate(first.mappings):
+        entered = {
+            mapping.key(one): form.get(f"column {number} {one.index}", "").strip() for one in mapping.columns
+        }
+        stated.append({key: meaning for key, meaning in entered.items() if meaning})
+    if not any(stated):
+        return first
+    return propose_import(files, replace(settings, maps=[one for one in stated if one]))
+
+
+def take_in(files: list[Path], cell: Cell, form: Form) -> Outcome:
+    """Add uploaded rows to the cell as a session."""
+    accept, day = form.get("accept_implausible") == "true", form.get("date", "").strip()
+    proposal = proposal_of(files, cell, form)
+    rows: Path | Measurements = files[0]
+    said: tuple[str, ...] = ()
+    if proposal is not None:
+        imported = import_rows(proposal)
+        rows, said = imported.measurements, imported.sentences
+    entry = cell.take_in(rows, accept, day)
+    remarks = tuple(filter(None, (*said, entry.remark)))
+    trust = (
+        f"with caution ({counted(len(remarks), 'remark')})" if remarks else "yes: nothing contradicts them"
+    )
+    step = uncapitalised(cell.status().step.reason)
+    verdict = Verdict(
+        f"{counted(entry.rows, 'row')} were added as session '{entry.name}'.", trust, step, "Rows"
+    )
+    return Outcome(ResultText(verdict, remarks))
+
+
+def check_rows(cell: Cell, form: Form, progress: Progress) -> tuple[Outcome, SessionState]:
+    """Judge the rows of a session against the newest plan, as `measure --once --no-replan` does."""
+    session = MeasuringSession.read(newest_plan(cell.folder), cell.file.settings("measure", replan=False))
+    path = cell.sessions.path(
+        next(one for one in cell.sessions.valid() if one.name == form.get("session", ""))
+    )
+    growing: GrowingFile = growing_file(path, session.plan.arm.robot, session.plan.settings)
+    progress("checking the rows against each other")
+    growth = growing.read(final=True)
+    session.add(growth.rows, growth.left_out)
+    session.update(progress)
+    state = session.state
+    alarms = sentences("alarms", [one.sentence for one in state.alarms])
+    text = session_text(state)
+    return Outcome(replace(text, blocks=(alarms, *text.blocks))), state
+
+
+def export(cell: Cell, form: Form, out: Path, files: Mapping[str, Any]) -> Outcome:
+    """Write the model in use in a format.
+
+    Args:
+        cell: the cell.
+        form: "format", and options of the format.
+        out: file to write.
+        files: uploaded files, by the options that take them.
+    """
+    name = form["format"]
+    stated: dict[str, Any] = {key: form[key].strip() for key in EXPORT_OPTIONS if form.get(key, "").strip()}
+    exported = export_model(name, ExportRequest(cell.model_folder(), out, **files, **stated))
+    contents = export_format(name).contents
+    what = exported.summary or f"{contents[0].upper()}{contents[1:]}"
+    verdict = Verdict(
+        f"{what} written to {out.name}{exported.details}.", "test every program at low speed", "", "File"
+    )
+    blocks = (
+        sentences("remarks", exported.remarks),
+        sentences("what was changed", exported.shown.splitlines()),
+    )
+    text = ResultText(verdict, exported.warnings, tuple(one for one in blocks if one.sentences))
+    return Outcome(text, exported.failure or exported.shortfall or "")
+
+
+def try_pose(cell: Cell, form: Form) -> tuple[Outcome, Solution]:
+    """Compute the corrected joint values that reach a pose."""
+    solver = load(cell.folder)
+    solution = solver(stated_pose([number_of(form, name) for name in POSE_COLUMNS]))
+    failed = [one for one in statuses_of(solution) if one in FAILURES]
+    refusal = f"{failed[0].name.lower()}. {failed[0].sentence}" if failed else ""
+    return Outcome(solution_text(solution, solver), refusal), solution
+
+
+def number_of(form: Form, key: str) -> float:
+    """Return a number of a form.
+
+    Raises:
+        PoseError: it is not a number.
+    """
+    try:
+        return float(form.get(key, ""))
+    except ValueError:
+        raise PoseError(expected="a number", value=form.get(key, ""), option=key) from None

@@ -1,0 +1,166 @@
+"""What the tabs of a page show, read from the cell."""
+
+import shlex
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, get_args
+
+from pisigma.deployment.export.registry import BUILT_IN
+from pisigma.deployment.export.targets import POSE_COLUMNS
+from pisigma.files.errors import ModelError
+from pisigma.files.templates import template_environment
+from pisigma.lifetime.cell.facts import CellStatus
+from pisigma.lifetime.cell.history import EventKind
+from pisigma.lifetime.cell.layout import CELL_FILE, MODELS, PLANS
+from pisigma.planning.plan_file import yaml_of
+from pisigma.reporting.result_text import merge_alike_warnings
+from pisigma.workbench.forms import form_of, form_of_command
+from pisigma.workbench.job import Jobs
+from pisigma.workflow.cell.cell import Cell
+
+TABS = {
+    "status": "Status",
+    "cell": "Cell",
+    "plan": "Plan",
+    "measure": "Measure",
+    "calibrate": "Calibrate",
+    "verify": "Verify & watch",
+    "deliver": "Deliver",
+}
+"""Titles of the tabs by name."""
+TAB_OF = {
+    "import": "measure",
+    "monitor": "verify",
+    "recalibrate": "verify",
+    "session": "measure",
+    "use": "status",
+}
+"""Tab of a command that has not the name of a tab."""
+EXPORTS = tuple(name for name in BUILT_IN if name not in ("staubli", "xacro", "library", "ur-calibration"))
+"""Formats that need no file of the controller."""
+FIGURES = (".png", ".svg")
+
+
+@dataclass(frozen=True)
+class TimelineEntry:
+    """Something that happened to a cell.
+
+    Attributes:
+        day: day or time (ISO 8601).
+        kind: "session", "event", "model", "check" or "use".
+        text: what happened.
+        alarm: whether it asks for attention.
+    """
+
+    day: str
+    kind: str
+    text: str
+    alarm: bool = False
+
+
+class Tabs:
+    """Renders the page and its tabs."""
+
+    def __init__(self, jobs: Jobs) -> None:
+        self._jobs = jobs
+        self._environment = template_environment(
+            "pisigma.workbench",
+            {"together": merge_alike_warnings, "tab_of": lambda step: TAB_OF.get(step, step)},
+        )
+
+    def page(self, cell: Cell) -> str:
+        """Render the frame of the page, without the content of a tab."""
+        template = self._environment.get_template("page.html.j2")
+        return template.render(
+            tabs=TABS, name=cell.folder.resolve().name, robot=cell.robot.name, folder=str(cell.folder)
+        )
+
+    def tab(self, name: str, cell: Cell, status: CellStatus, downloads: Iterable[str]) -> str:
+        """Render the content of a tab; `downloads` are the names of exported files."""
+        context: dict[str, Any] = {
+            "facts": status.facts,
+            "step": status.step,
+            "downloads": tuple(downloads),
+            "outcomes": self._jobs.outcomes,
+            "folder": shlex.quote(str(cell.folder)),
+            "forms": lambda step: form_of(step, cell.file),
+            "words": form_of_command(status.step.command) if status.step.command else None,
+        }
+        return self._environment.get_template(f"{name}.html.j2").render(context | _more(name, cell, status))
+
+    def proposal(self, **context: Any) -> str:
+        """Render the proposed meaning of the columns of uploaded files."""
+        return self._environment.get_template("proposal.html.j2").render(context)
+
+
+def _more(name: str, cell: Cell, status: CellStatus) -> dict[str, Any]:
+    """Return what only one tab shows."""
+    match name:
+        case "status":
+            return {"timeline": timeline(status), "kinds": get_args(EventKind)}
+        case "cell":
+            return {"text": (cell.folder / CELL_FILE).read_text(encoding="utf-8")}
+        case "plan":
+            plans = sorted((cell.folder / PLANS).glob("*.csv"), reverse=True)
+            return {"plans": [(one.name, yaml_of(one).name) for one in plans]}
+        case "calibrate":
+            return {"figures": figures(cell, status)}
+        case "deliver":
+            return {"formats": {one: BUILT_IN[one][1] for one in EXPORTS}, "columns": POSE_COLUMNS}
+    return {}
+
+
+def timeline(status: CellStatus) -> list[TimelineEntry]:
+    """Return what happened to a cell, the newest first."""
+    facts = status.facts
+    entries = [
+        TimelineEntry(
+            one.taken_in,
+            "session",
+            f"{one.name}: {one.rows} rows, {one.sensor}{f'; set aside: {one.set_aside}' if one.set_aside else ''}",
+            bool(one.set_aside),
+        )
+        for one in facts.sessions
+    ]
+    entries += [TimelineEntry(one.day, "event", one.sentence) for one in facts.events]
+    entries += [TimelineEntry(one.made, "model", f"{one.name}: {one.remark}") for one in facts.models]
+    entries += [
+        TimelineEntry(
+            one.checked,
+            "check",
+            f"{one.command}{f' of {one.model}' if one.model else ''}: {one.verdict.replace('_', ' ')}"
+            f"{f'; {one.summary}' if one.summary else ''}",
+            one.verdict not in ("trusted", "better", "unchanged", "recalibrated"),
+        )
+        for one in facts.checks
+    ]
+    return sorted(entries, key=lambda one: one.day, reverse=True)
+
+
+def figures(cell: Cell, status: CellStatus) -> list[tuple[str, str]]:
+    """Return model and name of the figures of the newest model."""
+    models = status.facts.models
+    if not models:
+        return []
+    folder = cell.folder / MODELS / models[-1].name
+    return [(models[-1].name, one.name) for one in sorted(folder.rglob("*")) if one.suffix in FIGURES]
+
+
+def download_of(cell: Cell, kind: str, names: tuple[str, ...]) -> Path:
+    """Return a file of the cell that a page may download: a plan, or a figure or the card of a model.
+
+    Names are compared with those of the files that exist, so that no other path can be named.
+
+    Raises:
+        ModelError: there is no such file.
+    """
+    folder = cell.folder / (PLANS if kind == "plan" else MODELS)
+    files = list(folder.glob("*" if kind == "plan" else "*/**/*"))
+    for one in files:
+        is_one = (
+            (one.name,) == names if kind == "plan" else (one.relative_to(folder).parts[0], one.name) == names
+        )
+        if is_one and one.is_file() and not one.is_symlink():
+            return one
+    raise ModelError("there is no such file", value="/".join(names))

@@ -1,0 +1,69 @@
+"""Files that a page received, under names of their own in a folder that only this user can enter."""
+
+import re
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+
+from pisigma.files.errors import MeasurementError, printable
+
+MAX_FILES = 20
+"""Number of files that are kept; the oldest is removed first."""
+MAX_NAME = 100
+
+
+class Uploads:
+    """Uploaded files until the server ends."""
+
+    def __init__(self) -> None:
+        self._folder = tempfile.TemporaryDirectory(prefix="pisigma-")  # with mode 0700
+        self._files: dict[str, Path] = {}
+        self._count = 0
+
+    def add(self, name: str, content: bytes) -> str:
+        """Keep a file; return the number by which it is asked for.
+
+        Args:
+            name: name that the browser states; its folders are removed.
+            content: content of the file.
+        """
+        shown = printable(name.replace("\\", "/").rpartition("/")[2].replace("\0", ""))[-MAX_NAME:].strip(
+            ". "
+        )
+        self._count += 1
+        folder = Path(self._folder.name) / str(self._count)
+        folder.mkdir()
+        path = folder / (shown or "upload.csv")
+        path.write_bytes(content)
+        self._files[str(self._count)] = path
+        while len(self._files) > MAX_FILES:
+            self._files.pop(next(iter(self._files))).unlink()
+        return str(self._count)
+
+    def paths(self, numbers: Sequence[str]) -> list[Path]:
+        """Return the files with some numbers.
+
+        Raises:
+            MeasurementError: there is no such file.
+        """
+        for number in numbers:
+            if number not in self._files:
+                raise MeasurementError(
+                    "the file is not there any more", value=number, remedy="upload it again"
+                )
+        return [self._files[number] for number in numbers]
+
+    def free(self, name: str) -> Path:
+        """Return a path to write a download to."""
+        self._count += 1
+        folder = Path(self._folder.name) / str(self._count)
+        folder.mkdir()
+        return folder / name
+
+    def without_folder(self, text: str) -> str:
+        """Return a message that names uploaded files without the folder in which they are kept."""
+        return re.sub(rf"{re.escape(self._folder.name)}/\d+/", "", text)
+
+    def close(self) -> None:
+        """Remove all files."""
+        self._folder.cleanup()

@@ -1,0 +1,218 @@
+"""The page of a cell by its requests: what it shows, what it refuses, and that nothing is half written."""
+
+import json
+import re
+import threading
+import time
+from urllib.parse import quote
+
+import pytest
+from testing.cell_rows import ROBOT, day, measured
+from testing.models import no_type_checker
+from testing.pages import visitor
+from testing.report import HOSTILE
+
+pytest.importorskip("viser", reason="the extra view is not installed")
+
+from pisigma.lifetime.cell.layout import CELL_FILE
+from pisigma.workbench.job import Outcome
+from pisigma.workbench.tabs import TABS
+from pisigma.workbench.workbench import STEPS, Workbench
+from pisigma.workflow.cell.cell import Cell
+
+
+@pytest.fixture(scope="module")
+def cell(tmp_path_factory):
+    """A cell with two sessions, one of them set aside, and hostile texts."""
+    with no_type_checker():
+        made = Cell.create(tmp_path_factory.mktemp("cells") / "welder7", "ur10", limit_mm=0.5)
+        for number, ago in enumerate((20, 10)):
+            made.take_in(measured(20, number), day=day(ago))
+        made.sessions.set_aside(day(10), HOSTILE)
+        made.history.record("firmware", note=HOSTILE)
+    return made
+
+
+@pytest.fixture(scope="module")
+def bench(cell):
+    with no_type_checker(), Workbench(cell.folder, port=0) as opened:
+        yield opened
+
+
+@pytest.fixture(scope="module")
+def browser_with_link(bench):
+    return visitor(bench.url)
+
+
+def state(browser):
+    return json.loads(browser.ask("/state").body)
+
+
+def do(browser, name, **form):
+    """Start a step, and return its answer."""
+    return browser.ask(f"/step/{name}?person=Ada", "POST", json.dumps(form), Content_Type="application/json")
+
+
+def ended(browser, bench, name, **form) -> Outcome:
+    """Run a step to its end."""
+    before = bench.jobs.ended
+    answer = do(browser, name, **form)
+    assert answer.status == 200, answer.body
+    while bench.jobs.ended == before:
+        time.sleep(0.02)
+    return bench.jobs.outcomes[name]
+
+
+def upload(browser, name, content):
+    answer = browser.ask(f"/upload?name={name}", "POST", content)
+    return json.loads(answer.body)["file"]
+
+
+def test_every_tab_is_shown_and_texts_of_files_are_escaped(browser_with_link):
+    assert browser_with_link.ask().status == 200
+    for name in TABS:
+        answer = browser_with_link.ask(f"/tab/{name}")
+        assert answer.status == 200
+        text = answer.body.decode()
+        assert "<script>alert" not in text
+        assert "onerror=alert(2)>" not in text
+        assert re.search(r"<h2>|<form", text)
+    assert "&lt;script&gt;alert" in browser_with_link.ask("/tab/status").body.decode()
+
+
+def test_the_status_is_that_of_the_command(browser_with_link, cell):
+    step = cell.status().step
+    assert state(browser_with_link)["next"] == step.to_json()
+    assert step.reason in browser_with_link.ask("/tab/status").body.decode()
+
+
+@pytest.mark.parametrize(
+    "path",
+    ["/tab/x", "/tab/..%2fparts", "/static/..%2f__init__.py", "/download/plan/..%2fcell.yaml", "/absent"],
+)
+def test_other_pages_are_not_found(browser_with_link, path):
+    assert browser_with_link.ask(path).status in (404, 422)
+
+
+@pytest.mark.parametrize("kind", ["plan", "model", "export", "x"])
+def test_only_files_of_the_cell_can_be_downloaded(browser_with_link, kind):
+    for name in (
+        "cell.yaml",
+        "history.sqlite",
+        "%2fetc%2fpasswd",
+        "a/../../cell.yaml",
+        "%2e%2e/%2e%2e/cell.yaml",
+    ):
+        assert browser_with_link.ask(f"/download/{kind}/{name}").status in (404, 422)
+
+
+@pytest.mark.parametrize("body", [b"", b"{", b"[]", b'{"a": 1}', b"\xff", b'{"a": {}}'])
+def test_what_is_not_a_form_is_refused(browser_with_link, bench, body):
+    assert browser_with_link.ask("/step/plan", "POST", body).status == 400
+    assert bench.jobs.running is None
+    assert do(browser_with_link, "absent").status == 404
+
+
+def test_a_wrong_setting_is_refused_with_its_name(browser_with_link, bench, cell):
+    found = ended(browser_with_link, bench, "plan", count="many")
+    assert found.text is None
+    assert "count" in found.refusal
+    assert not list((cell.folder / "plans").iterdir())
+
+
+@pytest.mark.parametrize(
+    "text", ["robot: 'no such robot'\n", "robot: ur10\nplan:\n  count: many\n", "{", HOSTILE]
+)
+def test_an_invalid_cell_file_is_not_written(browser_with_link, bench, cell, text):
+    before = (cell.folder / CELL_FILE).read_bytes()
+    files = sorted(cell.folder.iterdir())
+    assert ended(browser_with_link, bench, "cell", text=text).refusal
+    assert (cell.folder / CELL_FILE).read_bytes() == before
+    assert sorted(cell.folder.iterdir()) == files
+
+
+def test_a_setting_can_be_changed(browser_with_link, bench, cell):
+    before = (cell.folder / CELL_FILE).read_text()
+    text = before.replace("limit_mm: 0.5", "limit_mm: 0.4")
+    assert ended(browser_with_link, bench, "cell", text=text).refusal == ""
+    assert Cell.open(cell.folder).file.document.limit_mm == 0.4
+    ended(browser_with_link, bench, "cell", text=before)
+
+
+def test_an_upload_is_shown_and_added_as_the_command_would(browser_with_link, bench, cell, tmp_path):
+    rows = measured(12, 5)
+    rows.write_csv(tmp_path / "rows.csv", ROBOT)
+    number = upload(browser_with_link, "..%2f..%2frows.csv", (tmp_path / "rows.csv").read_bytes())
+    shown = browser_with_link.ask("/propose", "POST", json.dumps({"files": number})).body.decode()
+    assert "<b>rows.csv</b>" in shown
+    found = ended(browser_with_link, bench, "import", files=number, date=day(3))
+    assert found.person == "Ada"
+    entry = Cell.open(cell.folder).history.sessions()[-1]
+    assert (entry.name, entry.rows) == (day(3), 12)
+    assert (cell.folder / "sessions" / f"{day(3)}.csv").read_bytes() == (tmp_path / "rows.csv").read_bytes()
+    again = ended(browser_with_link, bench, "import", files=number)
+    assert again.text is None
+    assert "rows.csv" in again.refusal
+    assert "pisigma-" not in again.refusal
+
+
+def test_the_meaning_of_columns_can_be_changed(browser_with_link):
+    lines = ["P,A1,A2,A3,A4,A5,A6,X,Y,Z", *(f"{k},{k},2,3,4,5,6,{1000 + k},20,30" for k in range(1, 9))]
+    number = upload(browser_with_link, "export.csv", "\n".join(lines).encode())
+
+    def proposed(**form):
+        return browser_with_link.ask("/propose", "POST", json.dumps({"files": number, **form}))
+
+    assert 'placeholder="x_mm"' in proposed(unit="mm,deg").body.decode()
+    assert 'placeholder="x_in"' in proposed(unit="mm,deg", **{"column 0 7": "x_in"}).body.decode()
+    wrong = proposed(**{"column 0 7": HOSTILE})
+    assert wrong.status == 422
+    assert json.loads(wrong.body)["error"]
+
+
+@pytest.mark.parametrize(
+    "content", [b"", b"\0" * 100, b"a,b\n1", HOSTILE.encode(), b"\xff\xfe\x00", b"q1_deg,x_mm\n"]
+)
+def test_hostile_uploads_are_refused(browser_with_link, bench, content):
+    number = upload(browser_with_link, quote(f"{HOSTILE}.csv"), content)
+    answer = browser_with_link.ask("/propose", "POST", json.dumps({"files": number}))
+    assert answer.status in (200, 422)
+    assert ended(browser_with_link, bench, "import", files=number).refusal
+
+
+def test_one_acts_and_others_see_who(browser_with_link, bench, cell, monkeypatch):
+    begun, go_on = threading.Event(), threading.Event()
+
+    def slow(bench, cell, form, progress):
+        progress("fold 1 of 2: geometry")
+        begun.set()
+        go_on.wait(20)
+        progress("fold 2 of 2: geometry")
+        raise AssertionError("it was stopped before")
+
+    monkeypatch.setitem(STEPS, "plan", slow)
+    assert do(browser_with_link, "plan").status == 200
+    begun.wait(20)
+    running = state(browser_with_link)["running"]
+    assert (running["step"], running["person"], running["what"]) == ("plan", "Ada", "fold 1 of 2: geometry")
+    refused = do(browser_with_link, "verify")
+    assert refused.status == 409
+    assert "Ada" in json.loads(refused.body)["error"]
+    before = bench.jobs.ended
+    assert browser_with_link.ask("/stop?person=Bo", "POST", b"{}").status == 200
+    go_on.set()
+    while bench.jobs.ended == before:
+        time.sleep(0.02)
+    found = bench.jobs.outcomes["plan"]
+    assert found.stopped
+    assert "Bo" in found.refusal
+
+
+def test_a_defect_ends_the_step_only(browser_with_link, bench, monkeypatch, capsys):
+    def broken(bench, cell, form, progress):
+        raise ZeroDivisionError
+
+    monkeypatch.setitem(STEPS, "verify", broken)
+    assert "ZeroDivisionError" in ended(browser_with_link, bench, "verify").refusal
+    assert "Traceback" in capsys.readouterr().err
+    assert browser_with_link.ask("/tab/verify").status == 200

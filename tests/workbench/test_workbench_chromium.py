@@ -1,0 +1,154 @@
+"""A cell in headless Chromium: from a plan to a corrected pose by clicks and keys, with the bits of the commands."""
+
+import math
+from contextlib import closing, contextmanager
+from pathlib import Path
+
+import pytest
+from testing.models import no_type_checker
+
+pytest.importorskip("viser", reason="the extra view is not installed")
+
+from pisigma.deployment.export.export_format import ExportRequest
+from pisigma.deployment.export.registry import export_model
+from pisigma.deployment.export.targets import POSE_COLUMNS
+from pisigma.lifetime.cell.layout import MODELS, PLANS, SESSIONS
+from pisigma.measurement.dataset import Measurements
+from pisigma.robot.kinematics.forward import forward_kinematics
+from pisigma.robot.kinematics.status import Status
+from pisigma.robot.se3 import xyzrpy_from_transform
+from pisigma.workbench.workbench import Workbench
+from pisigma.workflow.cell.cell import Cell
+from pisigma.workflow.load import load
+
+SETTINGS = {"plan:": "plan:\n  candidates: 100", "calibrate:": "calibrate:\n  model: geometric\n  folds: 0"}
+
+
+@pytest.fixture(scope="module")
+def simulated(shared_data) -> Path:
+    """The folder of simulated arms."""
+    folder = shared_data.parent / "simulated"
+    if not folder.is_dir():
+        pytest.skip(f"simulated arms not found in {folder}")
+    return folder
+
+
+@pytest.fixture
+def cells(simulated, tmp_path, blank_pictures) -> tuple[Cell, Cell]:
+    """Two equal cells: one for the page, one for the functions of the commands."""
+    made = []
+    for name in ("page", "commands"):
+        cell = Cell.create(tmp_path / name, simulated / "kr10.urdf")
+        text = cell.file.path.read_text()
+        for before, after in SETTINGS.items():
+            text = text.replace(f"\n{before}", f"\n{after}")
+        cell.file.path.write_text(text)
+        made.append(Cell.open(cell.folder))
+    return made[0], made[1]
+
+
+@contextmanager
+def opened(browser, url):
+    """The page without its scene, which has a test of its own, and what went wrong on it."""
+    faults = []
+    with closing(browser.new_context(viewport={"width": 800, "height": 900})) as context:
+        page = context.new_page()
+        page.set_default_timeout(60_000)
+        page.on("console", lambda one: faults.append(one.text) if one.type == "error" else None)
+        page.on("pageerror", lambda error: faults.append(str(error)))
+        origin = url.partition("/open/")[0]
+        page.on(
+            "request", lambda one: None if one.url.startswith((origin, "data:")) else faults.append(one.url)
+        )
+        page.route("**/scene/**", lambda route: route.fulfill(body="", content_type="text/html"))
+        page.goto(url)
+        page.wait_for_selector("form[data-step=plan]")
+        yield page
+        assert faults == []
+
+
+def show(page, tab):
+    """Open a tab."""
+    page.click(f"#tab-{tab}")
+    page.wait_for_selector(f"#tab-{tab}[aria-selected=true]")
+
+
+def do(page, step, **fields):
+    """Fill a form, press its button with a key and wait for the end; return what the page says."""
+    for name, value in fields.items():
+        page.fill(f"form[data-step={step}] [name={name}]", value)
+    before = int(page.get_attribute("body", "data-ended"))
+    page.press(f"form[data-step={step}] button[type=submit]", "Enter")
+    page.wait_for_selector(f"body[data-ended='{before + 1}']")
+    assert page.query_selector(".refusal") is None, page.inner_text(".refusal")
+    return page.inner_text("#content")
+
+
+def upload(page, path):
+    """Upload rows and add them to the cell."""
+    show(page, "measure")
+    page.set_input_files("#files", path)
+    page.wait_for_selector("#proposal form")
+    return do(page, "import")
+
+
+def rows_of(path: Path, target: Path, count: int) -> Path:
+    """Write the first rows of a file."""
+    target.write_text("".join(path.read_text().splitlines(keepends=True)[: 1 + count]))
+    return target
+
+
+def test_from_a_plan_to_a_corrected_pose(browser, cells, simulated, tmp_path):
+    page_cell, command_cell = cells
+    first = rows_of(simulated / "kr10.csv", tmp_path / "2026-11-01.csv", 60)
+    second = rows_of(simulated / "kr10_check.csv", tmp_path / "2026-11-02.csv", 20)
+    with no_type_checker(), Workbench(page_cell.folder, port=0) as bench, opened(browser, bench.url) as page:
+        show(page, "plan")
+        assert "pisigma plan" in do(page, "plan", count="12", check="2")
+        assert "60 rows were added" in upload(page, first)
+        show(page, "calibrate")
+        assert "Accuracy" in do(page, "calibrate")
+        upload(page, second)
+        show(page, "verify")
+        assert "is in use" in do(page, "verify")
+        command_cell.plan(count=12, check=2)
+        for rows in (first, second):
+            command_cell.take_in(rows)
+            if rows is first:
+                command_cell.calibrate()
+        command_cell.verify()
+        (model,) = (page_cell.folder / MODELS).iterdir()
+        for name in (
+            f"{PLANS}/{model.name}.csv",
+            f"{SESSIONS}/2026-11-02.csv",
+            f"{MODELS}/{model.name}/model.yaml",
+        ):
+            assert (page_cell.folder / name).read_bytes() == (command_cell.folder / name).read_bytes(), name
+
+        pose = reachable_pose(page_cell, first)
+        show(page, "deliver")
+        assert "reaches the pose" in do(page, "ik", **pose)
+        (tmp_path / "poses.csv").write_text(f"{','.join(pose)}\n{','.join(pose.values())}\n")
+        page.select_option("[name=format]", "targets")
+        page.set_input_files("[data-upload=poses]", tmp_path / "poses.csv")
+        do(page, "export", out="job.src")
+        with page.expect_download() as started:
+            page.click("text=job.src >> nth=-1")
+        written = export(command_cell, tmp_path / "poses.csv", tmp_path / "job.src")
+        assert Path(started.value.path()).read_bytes() == written.read_bytes()
+
+
+def reachable_pose(cell: Cell, rows: Path) -> dict[str, str]:
+    """Return the first pose of some rows that the model reaches, by the names of the fields."""
+    q = Measurements.read_csv(rows, cell.robot).q
+    T = forward_kinematics(cell.model.robot, q)
+    (reached, *_) = (load(cell.folder)(T).status == Status.REACHED).nonzero()[:, 0].tolist()
+    x, y, z, *angles = xyzrpy_from_transform(T[reached]).tolist()
+    values = (1e3 * x, 1e3 * y, 1e3 * z, *map(math.degrees, angles))
+    return dict(zip(POSE_COLUMNS, map(repr, values), strict=True))
+
+
+def export(cell: Cell, poses: Path, out: Path) -> Path:
+    """Export a program as the command does."""
+    export_model("targets", ExportRequest(cell.model_folder(), out, poses=poses))
+    return out
