@@ -103,7 +103,7 @@ def _assignments(known: Mapping[str, Setting]) -> inspect.Parameter:
 
 def _stated(values: dict[str, Any], known: Mapping[str, Setting], running: Any) -> dict[str, Any]:
     """Take the options of settings out of the values of a command; return what the command line states, by keys."""
-    stated = read_assignments(values.pop(_SET, None) or (), known)
+    stated = read_assignments(values.pop(_SET, None) or (), known, "--set")
     for key, setting in known.items():
         if setting.option.is_key:
             continue

@@ -1,4 +1,4 @@
-"""Values of settings by their keys, from a section of `cell.yaml` or from the option `--set`, with the same errors."""
+"""Values of settings by their keys, from `cell.yaml`, a manifest or the option `--set`, with the same errors."""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
@@ -11,12 +11,15 @@ _TYPES = {bool: "true or false", int: "an integer", float: "a number", str: "a t
 """Names of the types of settings in messages."""
 
 
-def read_assignments(assignments: Iterable[str], known: Mapping[str, Setting]) -> dict[str, Any]:
+def read_assignments(
+    assignments: Iterable[str], known: Mapping[str, Setting], option: str = ""
+) -> dict[str, Any]:
     """Return the values of "KEY=VALUE" by their keys; a key that appears again adds to its list.
 
     Args:
-        assignments: values of the option `--set`.
+        assignments: the texts.
         known: settings by their keys.
+        option: option that states them; empty in a file.
 
     Raises:
         SettingError: a text has another form, a key is unknown, or a value has the wrong type or is out of range.
@@ -25,7 +28,7 @@ def read_assignments(assignments: Iterable[str], known: Mapping[str, Setting]) -
     for one in assignments:
         key, sign, value = one.partition("=")
         if not sign:
-            raise SettingError(expected="KEY=VALUE, such as seed=1", value=one, option="--set")
+            raise SettingError(expected="KEY=VALUE, such as seed=1", value=one, option=option)
         stated.setdefault(key.strip(), []).append(value)
     return dict(checked_values(stated, known, lambda key: None))
 
