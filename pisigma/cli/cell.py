@@ -88,6 +88,10 @@ def _print_status(status: "CellStatus") -> None:
     print_lines(
         f"sessions/{name} will be added by the next command that reads rows." for name in facts.not_taken_in
     )
+    print_lines(
+        f"sessions/{name} is not read, as it is not a measurement file (.csv); import it if it contains rows."
+        for name in facts.not_read
+    )
     print_next(status)
 
 

@@ -1,6 +1,7 @@
 """`pisigma import`: exports of instruments and controllers as a measurement file."""
 
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -70,7 +71,7 @@ def import_(
     if cell is not None:
         if not as_json:
             print_lines(rows.sentences)
-        return _take_in(opened, rows.measurements, date, accept_implausible, as_json)
+        return _take_in(opened, rows.measurements, date, accept_implausible, as_json, files)
     if as_json:
         print_json({"file": str(out)} | rows.to_json())
         return
@@ -78,10 +79,16 @@ def import_(
 
 
 def _take_in(
-    cell: "Cell", rows: "Path | Measurements", date: str, accept_implausible: bool, as_json: bool
+    cell: "Cell",
+    rows: "Path | Measurements",
+    date: str,
+    accept_implausible: bool,
+    as_json: bool,
+    exports: Sequence[Path] = (),
 ) -> None:
-    """Take rows in as a session of a cell."""
+    """Take rows in as a session of a cell; `exports` are the files that they were converted from."""
     entry = cell.take_in(rows, accept_implausible, date)
+    cell.sessions.set_imported_aside(exports, entry)
     if as_json:
         print_json(
             {

@@ -4,6 +4,7 @@ import hashlib
 import json
 import shutil
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 from testing.cell_rows import ROBOT, day, measured
@@ -68,6 +69,22 @@ def test_what_is_not_there_is_refused(refuses, cell, tmp_path):
     refuses("event", cell, "earthquake", error=MeasurementError, option="event", value="earthquake")
     refuses("event", cell, "tool", "--date", "10.1.2026", error=MeasurementError, option="--date")
     refuses("event", cell, "accepted", error=MeasurementError, option="--by")
+
+
+def test_an_export_that_was_put_into_the_folder_is_imported_once(run, refuses, cell):
+    path = cell / "sessions" / "kuka.csv"
+    shutil.copyfile(Path(__file__).parents[1] / "measurement" / "foreign" / "exports" / "kuka.csv", path)
+    refuses("calibrate", cell, error=MeasurementError, file="kuka.csv")
+    status = json.loads(run("status", cell, "--json").stdout)
+    assert (status["next"]["state"], status["not_taken_in"]) == ("file_refused", ["kuka.csv"])
+    words = status["next"]["command"].split()[1:]
+    assert words == ["import", str(path), "--cell", str(cell)]
+    taken = json.loads(run(*words, "--yes", "--accept-implausible", "--json", "--date", day(3)).stdout)
+    assert (taken["session"], taken["rows"]) == (day(3), 6)
+    status = json.loads(run("status", cell, "--json").stdout)
+    aside = {one["name"]: bool(one["set_aside"]) for one in status["sessions"]}
+    assert (status["not_taken_in"], aside) == ([], {"kuka": True, day(3): False})
+    assert path.exists()
 
 
 def rows_file(folder, name, *arguments, **options):

@@ -75,6 +75,7 @@ class CellStatus:
             "events": [one.to_json() for one in facts.events],
             "models": [{"name": one.name, "remark": one.remark} for one in facts.models],
             "not_taken_in": list(facts.not_taken_in),
+            "not_read": list(facts.not_read),
             "next": self.step.to_json(),
         }
 
@@ -130,6 +131,7 @@ def facts_of(folder: Path) -> CellFacts:
         limit_mm=stated.limit_mm,
         today=datetime.date.today().isoformat(),
         not_taken_in=not_taken_in(folder / SESSIONS, sessions),
+        not_read=not_read(folder / SESSIONS, sessions),
         plans_nothing=stated.plans_nothing(in_use),
         controller=Controller.from_history(history),
     )
@@ -145,6 +147,13 @@ def not_taken_in(folder: Path, sessions: Sequence[SessionEntry]) -> tuple[str, .
     names = {one.name for one in sessions}
     found = [path.name for path in folder.glob("*.csv") if path.stem not in names]
     return tuple(sorted(found, key=lambda name: (date_in_name(name), name)))
+
+
+def not_read(folder: Path, sessions: Sequence[SessionEntry]) -> tuple[str, ...]:
+    """Return the names of the files in the folder of sessions that are not measurement files and were not imported."""
+    names = {one.name for one in sessions}
+    found = [path.name for path in folder.glob("[!.]*") if path.is_file() and path.suffix != ".csv"]
+    return tuple(sorted(name for name in found if name not in names))
 
 
 def edited_sessions(folder: Path, sessions: Sequence[SessionEntry]) -> tuple[str, ...]:

@@ -26,6 +26,8 @@ ATTENTION = (
     "outside_limit",
 )
 """States in which a limit is missed, or rows or a model must not be trusted."""
+FOREIGN = "foreign"
+"""Verdict on a file in `sessions/` that is not a measurement file."""
 NOT_TRUSTED = ("implausible", "setup_fault", "not_trusted")
 """Verdicts of `verify`, `monitor` and `recalibrate` after which nothing is concluded from a session."""
 
@@ -46,6 +48,7 @@ class CellFacts:
         limit_mm: limit of the 95 % quantile of the position errors [mm]; None if there is none.
         today: day (ISO 8601).
         not_taken_in: names of the files in `sessions/` that are not in the history yet, by their dates.
+        not_read: names of the files in `sessions/` that are not measurement files and were not imported.
         plans_nothing: why no poses can be planned; "" if they can.
         controller: what was active on the controller when.
     """
@@ -61,6 +64,7 @@ class CellFacts:
     limit_mm: float | None
     today: str
     not_taken_in: tuple[str, ...] = ()
+    not_read: tuple[str, ...] = ()
     plans_nothing: str = ""
     controller: Controller = field(default_factory=Controller)
 
@@ -163,11 +167,14 @@ def _file_to_take_in(facts: CellFacts) -> Step | None:
         return None
     name = facts.not_taken_in[0]
     command = facts.import_command(f"{facts.folder}/{SESSIONS}/{name}")
-    refusals = [
-        one.summary for one in facts.checks if one.command == "import" and f"{one.session}.csv" == name
-    ]
+    refusals = [one for one in facts.checks if one.command == "import" and f"{one.session}.csv" == name]
+    if refusals and refusals[-1].verdict == FOREIGN:
+        return Step(
+            "file_refused", f"{SESSIONS}/{name} is not a measurement file, but may be imported", command
+        )
     if refusals:
-        return Step("file_refused", f"{refusals[-1].rstrip('.')}; correct or remove the file", command)
+        why = f"{refusals[-1].summary.rstrip('.')}; correct the file, or set it aside"
+        return Step("file_refused", why, facts.command("session", name[:-4], "--set-aside", "refused"))
     return Step("not_taken_in", f"the file {SESSIONS}/{name} has not been added to the cell", command)
 
 

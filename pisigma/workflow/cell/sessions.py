@@ -19,12 +19,14 @@ from pisigma.files.errors import (
     check_choice,
 )
 from pisigma.lifetime.cell.controller import Controller
-from pisigma.lifetime.cell.facts import facts_of, not_taken_in, sha256_of
+from pisigma.lifetime.cell.facts import facts_of, not_read, not_taken_in, sha256_of
 from pisigma.lifetime.cell.history import Check, Event, History, ModelEntry, SessionEntry, now
 from pisigma.lifetime.cell.layout import MODELS, SESSIONS
+from pisigma.lifetime.cell.status import FOREIGN
 from pisigma.measurement.camera.camera_files import CameraFiles
 from pisigma.measurement.camera.corner_file import read_rows
 from pisigma.measurement.copies import RowValues, copies_of_known
+from pisigma.measurement.csv.reading import is_measurement_file
 from pisigma.measurement.dataset import Measurements, join
 from pisigma.measurement.dates import EXPECTED_DATE, date_in_name, is_date
 from pisigma.model.folder.model_folder import load_model
@@ -144,7 +146,8 @@ class Sessions:
         try:
             self.take_in(self.folder / waiting[0])
         except PisigmaError as refusal:
-            refused = Check("import", "", Path(waiting[0]).stem, "refused", str(refusal), None, False, now())
+            verdict = "refused" if is_measurement_file(self.folder / waiting[0]) else FOREIGN
+            refused = Check("import", "", Path(waiting[0]).stem, verdict, str(refusal), None, False, now())
             known = {(one.command, one.session, one.summary) for one in self.history.checks()}
             if (refused.command, refused.session, refused.summary) not in known:
                 self.history.add(refused)
@@ -194,16 +197,28 @@ class Sessions:
         return entry, model if fitted else None
 
     def set_aside(self, session: str, reason: str) -> None:
-        """Exclude a session from all further steps; its file is kept.
+        """Exclude a session, or a file in the folder that has not been added, from all further steps; it is kept.
 
         Raises:
-            MeasurementError: there is no session with this name, or the reason is empty.
+            MeasurementError: there is no session or file with this name, or the reason is empty.
         """
         sessions = {one.name: one for one in self.history.sessions()}
+        known = tuple(sessions.values())
+        for file in (*not_taken_in(self.folder, known), *not_read(self.folder, known)):
+            name, day = file.removesuffix(".csv"), date_in_name(file) or datetime.date.today().isoformat()
+            sessions[name] = SessionEntry(
+                name, sha256_of(self.folder / file), now(), day, 0, "", judged_by=""
+            )
         check_choice(MeasurementError, "session", session, tuple(sessions), Place(self.folder))
         if not reason.strip():
             raise MeasurementError(expected="a reason", value=reason, option="--set-aside")
         self.history.add(replace(sessions[session], set_aside=reason.strip()))
+
+    def set_imported_aside(self, files: Sequence[Path], session: SessionEntry) -> None:
+        """Set files in the folder aside whose rows were imported as a session, so that they are not read again."""
+        for file in files:
+            if file.parent.resolve() == self.folder.resolve():
+                self.set_aside(file.name.removesuffix(".csv"), f"imported as session '{session.name}'")
 
     def valid(self) -> list[SessionEntry]:
         """Return the sessions that describe the present arm by their days, after adding new files in the folder.

@@ -61,7 +61,7 @@ CASES = {
             not_taken_in=("2026-01-10.csv",),
             checks=(check("import", "", "2026-01-10", "refused"),),
         ),
-        "import",
+        "session",
     ),
     "not_calibrated": (MEASURED, "calibrate"),
     "not_trusted": (

@@ -1,7 +1,6 @@
 """Exports that are active on the controller: every command of a cell follows the table of rules."""
 
 import shutil
-from dataclasses import replace
 
 import pytest
 from testing.cell_rows import ROBOT, day, measured
@@ -26,21 +25,6 @@ ZERO = 0.08
 def quick_pictures(blank_pictures):
     with no_type_checker():
         yield
-
-
-@pytest.fixture(scope="module")
-def used(tmp_path_factory):
-    """A cell with a model in use, and files that were exported from it."""
-    folder = tmp_path_factory.mktemp("cells")
-    cell = Cell.create(folder / "cell", "ur10")
-    cell.take_in(measured(60, 1), day=day(60))
-    cell.calibrate(folds=0)
-    cell.take_in(measured(12, 2), day=day(30))
-    cell.verify()
-    for form, name in (("dh", "dh.csv"), ("offsets", "offsets.csv")):
-        export_from_cell(cell, form, ExportRequest(cell.folder, folder / name))
-    cell.history.add(*(replace(one, exported=f"{day(25)}T08:00:00+00:00") for one in cell.history.exports()))
-    return cell
 
 
 @pytest.fixture
